@@ -1,0 +1,289 @@
+"""The commands. Each reads its input, calls one thing that does the work, and says how it went."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from coupole.errors import CoupoleError, InputError, Interrupted, PreflightRefused
+
+app = typer.Typer(
+    name="coupole",
+    help="Acquisition controller of La Coupole: a plan in, proven frames out.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+plan_app = typer.Typer(help="Plan templates.", no_args_is_help=True)
+app.add_typer(plan_app, name="plan")
+
+PlanPath = Annotated[Path, typer.Argument(help="The plan (YAML).", show_default=False)]
+RigOption = Annotated[Path | None, typer.Option("--rig", help="Another rig than the plan names.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
+RunPath = Annotated[Path, typer.Argument(help="The run's folder.", show_default=False)]
+
+
+def main() -> None:
+    """Entry point: runs a command and turns Coupole's errors into messages and exit codes."""
+    signal.signal(signal.SIGTERM, _as_interrupt)
+    try:
+        code = app(standalone_mode=False)
+    except CoupoleError as error:
+        _say(error)
+        code = error.exit_code
+    except KeyboardInterrupt:
+        _say(Interrupted("stopped by the operator"))
+        code = Interrupted.exit_code
+    except typer.Abort:
+        code = Interrupted.exit_code
+    except Exception as error:  # noqa: BLE001  click's usage errors, which know their own exit code
+        if not hasattr(error, "exit_code") or not hasattr(error, "show"):
+            raise
+        error.show()
+        code = error.exit_code
+    sys.exit(code or 0)
+
+
+def _as_interrupt(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def _say(error: CoupoleError) -> None:
+    kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+    print(f"{kind}{error}", file=sys.stderr)
+
+
+def _fail(error: CoupoleError, *, as_json: bool, found: dict[str, Any] | None = None) -> None:
+    """Put an error into the JSON document, if that was asked for; the caller raises it on."""
+    if as_json:
+        document = {
+            **(found or {}),
+            "error": str(error),
+            "kind": type(error).__name__,
+            "exit_code": error.exit_code,
+        }
+        print(json.dumps(document))
+
+
+@app.command()
+def check(
+    plan: PlanPath,
+    rig: RigOption = None,
+    no_paths: Annotated[
+        bool, typer.Option("--no-paths", help="Leave out path planning and swept collisions.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Say everything that can be known of a plan before a device is touched."""
+    from coupole.console import make_console, show_preflight, show_views
+    from coupole.job import read_job
+    from coupole.session import preflight_of
+
+    console = make_console(quiet=as_json)
+    try:
+        job = read_job(plan, rig)
+    except InputError as error:
+        _fail(error, as_json=as_json, found={"ok": False, "refusals": []})
+        raise
+    report = preflight_of(job, job.cell.storage_folder, measure_disk=True)
+    show_preflight(console, report, name=job.plan.name, rig=job.cell.rig.name)
+    show_views(console, report)
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "ok": not report.refusals,
+                    "refusals": report.refusals,
+                    "warnings": report.warnings,
+                    "views": len(report.views),
+                    "shots": report.shots,
+                    "frames": report.frames,
+                    "bytes": report.bytes,
+                    "duration_s": report.duration_s,
+                    "ideal_s": report.ideal_s,
+                    "dose_lux_h": report.dose_lux_h,
+                    "peak_board_c": report.peak_board_c,
+                    "paths_checked": False,
+                }
+            )
+        )
+    if report.refusals:
+        raise PreflightRefused(report.refusals)
+    if not as_json:
+        console.print("the plan can be run" + ("" if no_paths else " (paths between views are not checked yet)"))
+
+
+@app.command()
+def acquire(
+    plan: PlanPath,
+    rig: RigOption = None,
+    output: Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")] = None,
+    resume: Annotated[Path | None, typer.Option("--resume", help="Go on with this run.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Rehearse on the rig's twin.")] = False,
+    speed: Annotated[float, typer.Option("--speed", min=0.1, max=1000, help="Pace of a dry run.")] = 20.0,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell moves.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a plan: check it, move, fire, prove, store.
+
+    Ctrl-C stops safely (lights off, arm still) and the run can be resumed. SIGUSR1 pauses between bursts, and
+    goes on when sent again.
+    """
+    from coupole.console import make_console
+    from coupole.job import read_job
+    from coupole.session import acquire_plan, rehearse
+
+    if dry_run and (resume or output):
+        raise typer.BadParameter("a dry run keeps nothing: --resume and --output do not go with --dry-run")
+    if resume and output:
+        raise typer.BadParameter("a resumed run stays where it is: --output does not go with --resume")
+    console = make_console(quiet=as_json)
+    found: dict[str, Any] = {}
+    try:
+        job = read_job(plan, rig)
+        if dry_run:
+            rehearse(job, console, speed=speed, found=found)
+        else:
+            confirm = not yes and not as_json and sys.stdin.isatty()
+            acquire_plan(job, console, parent=output, resume=resume, confirm=confirm, found=found)
+    except CoupoleError as error:
+        _fail(error, as_json=as_json, found=found)
+        raise
+    if as_json:
+        print(json.dumps(found))
+
+
+@app.command()
+def devices(
+    rig: Annotated[Path, typer.Option("--rig", help="The rig (YAML).")] = Path("configs/rigs/sim.yaml"),
+    as_json: JsonOption = False,
+) -> None:
+    """Open each device of a rig, let it say who it is and test itself, close it."""
+    from rich.table import Table
+
+    from coupole.cell import open_cell
+    from coupole.console import make_console
+    from coupole.job import read_cell
+
+    console = make_console(quiet=as_json)
+    cell = read_cell(rig)
+    found: dict[str, Any] = {}
+    table = Table("device", "identity", "self-test", box=None)
+    with open_cell(cell) as opened:
+        for kind in ("ledbox", "camera", "robot"):
+            identity, tested = opened.identities[kind], getattr(opened, kind).self_test()
+            found[kind] = {**vars(identity), "self_test": dict(tested)}
+            who = f"{identity.vendor} {identity.model} {identity.serial} ({identity.firmware})"
+            table.add_row(
+                kind,
+                who + (" [dim]simulated[/]" if identity.simulated else ""),
+                ", ".join(f"{key} {value}" for key, value in tested.items()),
+            )
+    console.print(table)
+    if as_json:
+        print(json.dumps(found))
+
+
+@app.command()
+def status(run: RunPath, as_json: JsonOption = False) -> None:
+    """How far a run is; works while it goes on."""
+    from coupole.console import make_console, show_status
+    from coupole.run import Run
+    from coupole.run import status as status_of
+
+    found = status_of(Run(run))
+    show_status(make_console(quiet=as_json), found)
+    if as_json:
+        print(json.dumps({**vars(found), "missing": found.missing}))
+
+
+@app.command()
+def verify(run: RunPath, as_json: JsonOption = False) -> None:
+    """Read every frame of a run back: completeness and every checksum."""
+    from rich.progress import track
+
+    from coupole.console import make_console
+    from coupole.errors import ChecksumMismatch, UnprovenError
+    from coupole.run import Run
+    from coupole.run import verify as verify_run
+
+    console = make_console(quiet=as_json)
+    opened = Run(run)
+    total = len(opened.proven())
+    ticks = iter(track(range(total), "verifying", console=console, disable=not console.is_terminal))
+    found = verify_run(opened, lambda done, of: next(ticks, None) and None)
+    for _ in ticks:
+        pass
+    for problem in found.bad:
+        console.print(f"[red]bad:[/] {problem}")
+    if found.missing:
+        console.print(f"[red]missing:[/] {len(found.missing)} frames, the first {found.missing[0]}")
+    if as_json:
+        print(json.dumps({"ok": found.ok, "frames": found.frames, "bad": found.bad, "missing": found.missing}))
+    if found.bad:
+        raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames are not as they were written")
+    if found.missing:
+        raise UnprovenError(f"{len(found.missing)} frames of the plan are missing; resume the run")
+    console.print(f"ok: {found.frames} frames, each of them once, all checksums right")
+
+
+@app.command()
+def sim(
+    rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
+    plan: Annotated[Path | None, typer.Option("--plan", help="Put this plan's object on the support.")] = None,
+    speed: Annotated[float | None, typer.Option("--speed", min=0.01, help="Pace of the world.")] = None,
+) -> None:
+    """Serve a rig's stand-ins for other clients; prints one JSON line with their endpoints, until Ctrl-C."""
+    from coupole.cell import world_config
+    from coupole.job import read_cell, read_job
+    from coupole.rig import load_class
+
+    job = read_job(plan, rig) if plan else None
+    cell = job.cell if job else read_cell(rig)
+    driver = cell.rig.world.driver if cell.rig.world else "sim.client:World"
+    world = load_class(driver).start(world_config(cell, job, cell.rig.sensor, speed=speed))
+    try:
+        print(json.dumps(world.endpoints), flush=True)
+        world.wait()
+    finally:
+        world.close()
+
+
+@app.command()
+def schema(what: Annotated[str, typer.Argument(help="plan or rig")]) -> None:
+    """JSON schema of plans or rigs, for editors."""
+    from coupole.plan import Plan
+    from coupole.rig import Rig
+
+    models: dict[str, type[Plan] | type[Rig]] = {"plan": Plan, "rig": Rig}
+    if what not in models:
+        raise typer.BadParameter(f"expected plan or rig, found {what}")
+    print(json.dumps(models[what].model_json_schema(), indent=2))
+
+
+@plan_app.command("new")
+def plan_new(
+    name: Annotated[str, typer.Argument(help="Name of the plan; the file is NAME.yaml.", show_default=False)],
+    template: Annotated[str, typer.Option("--template", help="Which template.")] = "views",
+    rig: Annotated[str, typer.Option("--rig", help="Path of the rig, relative to the plan.")] = "../rigs/sim.yaml",
+) -> None:
+    """Write a plan to start from."""
+    from coupole.templates import TEMPLATES
+
+    if template not in TEMPLATES:
+        raise typer.BadParameter(f"expected one of {', '.join(sorted(TEMPLATES))}; found {template}")
+    path = Path(f"{name}.yaml")
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(TEMPLATES[template].format(name=name, rig=rig))
+    except FileExistsError as error:
+        raise InputError(f"{path}: stands here already; choose another name") from error
+    print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""What the operator sees: progress bars on a terminal, plain lines elsewhere, tables of reports."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from coupole.preflight import Report
+from coupole.recorder import DryRecorder
+from coupole.run import Status
+from coupole.sequencer import Observer, Outcome
+from coupole.sequencer import Progress as RunProgress
+
+_PLAIN_LINE_EVERY_S = 5.0
+
+
+def make_console(*, quiet: bool) -> Console:
+    """The console for people: standard error, so that standard output stays free for `--json`."""
+    return Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=not sys.stderr.isatty())
+
+
+def duration_text(seconds: float) -> str:
+    """`2 h 05 min`, `3 min 20 s`, `12.3 s`."""
+    if seconds >= 3600:
+        return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"
+    return f"{int(seconds // 60)} min {seconds % 60:02.0f} s" if seconds >= 60 else f"{seconds:.1f} s"
+
+
+def bytes_text(count: float) -> str:
+    return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
+
+
+class RunObserver(Observer):
+    """Bars on a terminal, a line every few seconds elsewhere."""
+
+    def __init__(self, console: Console, frame_bytes: int, proven_before: int) -> None:
+        self._console, self._frame_bytes = console, frame_bytes
+        self._started_s = time.monotonic()
+        self._printed_s = 0.0
+        self._before = proven_before
+        self._bars: Progress | None = None
+        self._view_bar: Any = None
+        self._run_bar: Any = None
+
+    @contextmanager
+    def showing(self, frames: int, views: int) -> Iterator[None]:
+        """Bars for the time of the run, if this is a terminal."""
+        if not self._console.is_terminal or self._console.quiet:
+            yield
+            return
+        columns = (
+            SpinnerColumn(),
+            TextColumn("{task.description}", justify="left"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[detail]}"),
+            TimeRemainingColumn(elapsed_when_finished=True),
+        )
+        with Progress(*columns, console=self._console, expand=True) as self._bars:
+            self._run_bar = self._bars.add_task("frames", total=frames, completed=self._before, detail="")
+            self._view_bar = self._bars.add_task("views", total=views, detail="")
+            yield
+        self._bars = None
+
+    def progress(self, progress: RunProgress) -> None:
+        elapsed_s = max(1e-6, time.monotonic() - self._started_s)
+        rate = (progress.proven - self._before) / elapsed_s
+        detail = (
+            f"{rate:5.1f} frames/s  {rate * self._frame_bytes / 1e6:5.1f} MB/s  {progress.dose_lux_h:.3f} lux.h"
+        )
+        if self._bars is not None:
+            self._bars.update(self._run_bar, completed=progress.proven, detail=detail)
+            self._bars.update(
+                self._view_bar,
+                completed=progress.view_number,
+                description=f"view {progress.view}",
+                detail=progress.light,
+            )
+        elif time.monotonic() - self._printed_s > _PLAIN_LINE_EVERY_S:
+            self._printed_s = time.monotonic()
+            left_s = (progress.frames - progress.proven) / rate if rate > 0 else 0.0
+            self._console.print(
+                f"view {progress.view} ({progress.view_number + 1}/{progress.views}) {progress.light}: "
+                f"{progress.proven}/{progress.frames} frames proven, {detail}, {duration_text(left_s)} left"
+            )
+
+    def note(self, message: str) -> None:
+        self._console.print(message)
+
+
+def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> None:
+    """Summary of what will happen."""
+    table = Table(title=f"{name} on {rig}", title_justify="left", box=None, show_header=False)
+    table.add_row("views, shots, frames", f"{len(report.views)}, {report.shots}, {report.frames}")
+    table.add_row("on disk", f"{bytes_text(report.bytes)} at {bytes_text(report.asked_bytes_s)}/s" + _disk(report))
+    table.add_row("duration", f"{duration_text(report.duration_s)} (at best {duration_text(report.ideal_s)})")
+    budget = "" if report.dose_budget_lux_h is None else f" of {report.dose_budget_lux_h:g} allowed"
+    before = f" after {report.dose_before_lux_h:.3f} before" if report.dose_before_lux_h else ""
+    table.add_row("light on the object", f"{report.dose_lux_h:.3f} lux.h{before}{budget}")
+    table.add_row("hottest LED board", f"{report.peak_board_c:.1f} C")
+    console.print(table)
+    for warning in report.warnings:
+        console.print(f"[yellow]note:[/] {warning}")
+
+
+def _disk(report: Report) -> str:
+    return f"; the disk takes {bytes_text(report.disk_bytes_s)}/s" if report.disk_bytes_s else ""
+
+
+def show_views(console: Console, report: Report) -> None:
+    """One line for each view."""
+    table = Table("view", "joints (deg)", "move", "bursts", "lux.h", box=None)
+    for view in report.views:
+        joints = "-" if view.joints_deg is None else " ".join(f"{j:.1f}" for j in view.joints_deg)
+        table.add_row(
+            view.name, joints, duration_text(view.move_s), duration_text(view.burst_s), f"{view.dose_lux_h:.3f}"
+        )
+    console.print(table)
+
+
+def show_status(console: Console, status: Status) -> None:
+    """Progress of a run."""
+    console.print(
+        f"{status.state}: {status.proven} of {status.shots} shots proven, {status.darks_proven} dark frames, "
+        f"{status.reshot} re-shot; last event {status.last_event or 'none'}"
+    )
+    for view, (proven, expected) in status.views.items():
+        console.print(f"  {view}: {proven} of {expected} frames")
+    for fault in status.faults:
+        console.print(f"  [red]fault:[/] {fault}")
+
+
+def show_dry_run(console: Console, recorder: DryRecorder, outcome: Outcome, found: dict[str, Any]) -> None:
+    """What a dry run learnt."""
+    console.print(
+        f"dry run: {duration_text(found['duration_s'])} of the cell's time in {duration_text(found['machine_s'])} "
+        f"({found['speed']:.1f} times faster); preflight said {duration_text(found['preflight_s'])}"
+    )
+    table = Table("view", "pictures", "brightest", "saturated", "exposure", box=None)
+    for view, seen in recorder.exposures.items():
+        table.add_row(view, str(seen.pictures), f"{seen.brightest:.0%}", f"{seen.saturated:.2%}", seen.verdict())
+    console.print(table)
+    if outcome.reshot or outcome.over_triggers or outcome.lost_transfers:
+        console.print(
+            f"{outcome.reshot} shots re-shot, {outcome.over_triggers} edges came too early for the camera, "
+            f"{outcome.lost_transfers} frames lost in transfer"
+        )

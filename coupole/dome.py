@@ -1,0 +1,92 @@
+"""The LEDs of the dome: where each one is, where it points, how much light it gives."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coupole.errors import InputError, Problem
+
+COLUMNS = ("id", "board", "x_mm", "y_mm", "z_mm", "nx", "ny", "nz", "flux_lm")
+
+
+@dataclass(frozen=True)
+class LedTable:
+    """LEDs in the order of the file; positions and unit normals [n, 3] in the base frame."""
+
+    ids: NDArray[np.int64]
+    boards: NDArray[np.int64]
+    positions_mm: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    flux_lm: NDArray[np.float64]
+
+    def illuminance_lux(self, points_base_mm: ArrayLike, *, emission: str = "lambertian") -> NDArray[np.float64]:
+        """Illuminance [points, leds] on a surface that faces each LED: the most that a point can receive.
+
+        E = Phi / (pi d^2) cos(emission angle) for a small Lambertian emitter; `paper` takes the cosine twice
+        (seed 003, Eq. 2). Points are [points, 3] in mm in the base frame.
+        """
+        from_led = np.asarray(points_base_mm, dtype=np.float64)[:, None, :] - self.positions_mm[None, :, :]
+        distance_mm = np.linalg.norm(from_led, axis=2)
+        cosine = np.einsum("pij,ij->pi", from_led, self.normals) / distance_mm
+        cosine = np.where(cosine > 0.0, cosine, 0.0) ** (2 if emission == "paper" else 1)
+        lux: NDArray[np.float64] = self.flux_lm / np.pi / (distance_mm * 1e-3) ** 2 * cosine
+        return lux
+
+    def rows(self, ids: ArrayLike) -> NDArray[np.int64]:
+        """Rows of the table that hold these LED ids; KeyError for one that is not there."""
+        row_of_id = {int(led): row for row, led in enumerate(self.ids)}
+        return np.array([row_of_id[int(led)] for led in np.asarray(ids).ravel()], np.int64)
+
+
+def read_led_table(path: Path) -> LedTable:
+    """Read a dome's CSV (`#` comments, then a header, then one LED a line); InputError with all its problems."""
+    problems: list[Problem] = []
+    rows: list[list[float]] = []
+    first_line_of_id: dict[int, int] = {}
+
+    def wrong(line: int, message: str, key: str = "") -> None:
+        problems.append(Problem(str(path), line, 1 if line else 0, key, message))
+
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError([Problem(str(path), 0, 0, "", f"cannot read the LED table: {error}")]) from error
+    numbered = [(n, text) for n, text in enumerate(lines, 1) if text.strip() and not text.startswith("#")]
+    header = numbered[0] if numbered else (0, "")
+    if tuple(field.strip() for field in header[1].split(",")) != COLUMNS:
+        wrong(header[0], f"expected the header `{','.join(COLUMNS)}`, found `{header[1]}`")
+        raise InputError(problems)
+    for line, fields in zip(
+        (n for n, _ in numbered[1:]), csv.reader(text for _, text in numbered[1:]), strict=True
+    ):
+        try:
+            values = [float(field) for field in fields]
+        except ValueError as error:
+            wrong(line, str(error))
+            continue
+        if len(values) != len(COLUMNS) or not np.all(np.isfinite(values)):
+            wrong(line, f"expected {len(COLUMNS)} finite numbers, found {len(values)} fields")
+            continue
+        led, norm = int(values[0]), float(np.linalg.norm(values[5:8]))
+        if led in first_line_of_id:
+            wrong(line, f"LED {led} stands already in line {first_line_of_id[led]}", "id")
+        if values[0] != led or not 0 <= led < 65535:
+            wrong(line, f"expected an integer from 0 to 65534, found {values[0]:g}", "id")
+        if abs(norm - 1.0) > 1e-3:
+            wrong(line, f"expected a unit normal, found one of length {norm:.4f}", "nx, ny, nz")
+        if values[8] <= 0:
+            wrong(line, f"expected a positive flux in lm, found {values[8]:g}", "flux_lm")
+        first_line_of_id.setdefault(led, line)
+        rows.append(values)
+    if not rows and not problems:
+        wrong(header[0], "expected at least one LED after the header")
+    if problems:
+        raise InputError(problems)
+    table = np.array(rows)
+    normals = table[:, 5:8] / np.linalg.norm(table[:, 5:8], axis=1, keepdims=True)
+    return LedTable(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:5], normals, table[:, 8])

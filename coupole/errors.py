@@ -1,0 +1,124 @@
+"""Every error that Coupole raises on purpose, and the exit code that it ends with.
+
+::
+
+    CoupoleError
+    ├── InputError            2    plan, rig or arguments are wrong
+    ├── PreflightRefused      3    the plan is well formed but must not be run
+    ├── DeviceError           4    a device failed
+    │   ├── DeviceTimeout     4    ... did not answer in time
+    │   ├── DeviceLost        4    ... its link is gone
+    │   ├── DeviceRefused     4    ... said no to a command
+    │   └── DeviceFault       4    ... is in a latched fault; only the operator's word resumes it
+    ├── UnprovenError         5    frames are missing or unproven after re-shooting
+    ├── StorageError          6    the disk
+    │   ├── DiskFull          6    ... has no room left
+    │   └── ChecksumMismatch  6    ... does not give back what was written
+    └── Interrupted         130    the operator said stop
+
+A message names what was expected, what happened and what to do next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+class CoupoleError(Exception):
+    """Base of the tree; never raised itself."""
+
+    exit_code = 1
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing wrong in an input, where it stands and what would be right.
+
+    `line` and `column` count from 1; 0 means that the problem concerns the file as a whole.
+    """
+
+    file: str
+    line: int
+    column: int
+    key: str
+    message: str
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+        return f"{place}: {self.key}: {self.message}" if self.key else f"{place}: {self.message}"
+
+
+class InputError(CoupoleError):
+    """Plan, rig or arguments are wrong; `problems` holds all of them, in the order of the file."""
+
+    exit_code = 2
+
+    def __init__(self, problems: Sequence[Problem] | str) -> None:
+        self.problems: tuple[Problem, ...] = () if isinstance(problems, str) else tuple(problems)
+        super().__init__(problems if isinstance(problems, str) else "\n".join(map(str, problems)))
+
+
+class PreflightRefused(CoupoleError):
+    """Preflight found reasons not to run; `refusals` holds all of them."""
+
+    exit_code = 3
+
+    def __init__(self, refusals: Sequence[str]) -> None:
+        self.refusals = tuple(refusals)
+        super().__init__("\n".join(refusals))
+
+
+class DeviceError(CoupoleError):
+    """A device failed.
+
+    Attributes: `device` (its name in the rig), `expected`, `happened`, `remedy` (what to do next).
+    """
+
+    exit_code = 4
+
+    def __init__(self, device: str, *, expected: str, happened: str, remedy: str) -> None:
+        self.device, self.expected, self.happened, self.remedy = device, expected, happened, remedy
+        super().__init__(f"{device}: expected {expected}; {happened}. {remedy}")
+
+
+class DeviceTimeout(DeviceError):
+    """The device did not answer in the time that the work asked for allows."""
+
+
+class DeviceLost(DeviceError):
+    """The link to the device is gone: cable, port, socket or process."""
+
+
+class DeviceRefused(DeviceError):
+    """The device answered, and said no."""
+
+
+class DeviceFault(DeviceError):
+    """The device is in a latched fault (emergency stop, over-temperature, watchdog)."""
+
+
+class UnprovenError(CoupoleError):
+    """Shots are missing or unproven though re-shot up to the plan's limit."""
+
+    exit_code = 5
+
+
+class StorageError(CoupoleError):
+    """The run's folder cannot be written or read as it must."""
+
+    exit_code = 6
+
+
+class DiskFull(StorageError):
+    """No room is left where the run is written."""
+
+
+class ChecksumMismatch(StorageError):
+    """Bytes on disk are not those that were written."""
+
+
+class Interrupted(CoupoleError):
+    """The operator asked to stop (Ctrl-C, SIGTERM); the run can be resumed."""
+
+    exit_code = 130

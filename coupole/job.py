@@ -1,0 +1,159 @@
+"""One plan with everything that it names, read and checked together: what the commands work on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole import yamlfile
+from coupole.dome import LedTable, read_led_table
+from coupole.errors import InputError, Problem
+from coupole.geometry import apply
+from coupole.plan import MeasuredObject, Plan
+from coupole.rig import Rig, driver_problems
+from coupole.run import Inputs
+from coupole.shots import Schedule, build_schedule, missing_lights
+from coupole.yamlfile import Document
+
+MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A rig file, read, with its dome."""
+
+    rig: Rig
+    document: Document
+    leds: LedTable
+
+    @property
+    def leds_path(self) -> Path:
+        return self.document.resolve(self.rig.dome.leds)
+
+    @property
+    def storage_folder(self) -> Path:
+        return self.document.resolve(self.rig.storage.folder)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A plan, its cell, its object and the schedule that follows from them."""
+
+    plan: Plan
+    document: Document
+    cell: Cell
+    mesh_path: Path | None
+    object_points_support_mm: NDArray[np.float64]
+    """[n, 3] corners and centre of the object's bounding box, or the views' targets: where dose is reckoned."""
+    schedule: Schedule
+
+    @property
+    def inputs(self) -> Inputs:
+        others = [self.cell.leds_path] + ([self.mesh_path] if self.mesh_path else [])
+        return Inputs(self.document.path, self.cell.document.path, tuple(others))
+
+
+def read_cell(path: Path) -> Cell:
+    """Read a rig and its dome. Raises InputError with all problems."""
+    document = yamlfile.read(path)
+    rig, problems = document.problems(Rig)
+    if rig is None:
+        raise InputError(problems)
+    problems = driver_problems(document, rig)
+    leds: LedTable | None = None
+    leds_path = document.resolve(rig.dome.leds)
+    if not leds_path.is_file():
+        problems.append(document.problem(("dome", "leds"), f"expected the dome's CSV; there is no {leds_path}"))
+    else:
+        try:
+            leds = read_led_table(leds_path)
+        except InputError as error:
+            problems += error.problems
+    if problems or leds is None:
+        raise InputError(problems)
+    return Cell(rig, document, leds)
+
+
+def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
+    """Read a plan and everything that it names. Raises InputError with all problems of all files."""
+    document = yamlfile.read(plan_path)
+    plan, problems = document.problems(Plan)
+    cell: Cell | None = None
+    rig_path = rig_path or _named_rig(document)
+    if rig_path is not None and not rig_path.is_file():
+        problems.append(document.problem(("rig",), f"expected a rig file; there is no {rig_path}"))
+    elif rig_path is not None:
+        try:
+            cell = read_cell(rig_path)
+        except InputError as error:
+            problems += error.problems
+    if plan is None or cell is None:
+        raise InputError(problems)
+
+    problems += [document.problem(key, message) for key, message in missing_lights(plan, cell.leds)]
+    mesh_path = document.resolve(plan.object.mesh) if plan.object and plan.object.mesh else None
+    points, mesh_problem = _object_points(plan, mesh_path)
+    if mesh_problem:
+        problems.append(document.problem(("object", "mesh"), mesh_problem))
+    if isinstance(plan.calibrations, tuple):
+        problems += [
+            document.problem(("calibrations", i), f"expected a calibration record; there is no {path}")
+            for i, path in enumerate(plan.calibrations)
+            if not document.resolve(path).is_file()
+        ]
+    problems += _bad_exposures(document, plan, cell.rig)
+    if problems:
+        raise InputError(problems)
+    schedule = build_schedule(
+        plan,
+        cell.leds,
+        cell.rig.support.base_from_support.matrix(),
+        rise_us=cell.rig.led_limits.rise_us,
+        readout_us=1e6 / cell.rig.sensor.max_frames_per_s,
+        exposure_gap_us=cell.rig.sensor.exposure_gap_us,
+    )
+    return Job(plan, document, cell, mesh_path, points, schedule)
+
+
+def _named_rig(document: Document) -> Path | None:
+    named = document.data.get("rig")
+    return document.resolve(Path(named)) if isinstance(named, str) else None
+
+
+def _bad_exposures(document: Document, plan: Plan, rig: Rig) -> list[Problem]:
+    """Names that would collide are found by preflight; here, what no order of shots could make right."""
+    if plan.trigger == "software" and rig.led_limits.on_us[1] < max(plan.exposure.exposures_us):
+        return [document.problem(("exposure",), "longer than the rig's LEDs may be on")]
+    return []
+
+
+def _object_points(plan: Plan, mesh_path: Path | None) -> tuple[NDArray[np.float64], str]:
+    """Points in the support frame and, if the mesh cannot be read, why."""
+    targets = [view.target_mm for view in plan.views if hasattr(view, "target_mm")]
+    points = np.array(targets or [(0.0, 0.0, 0.0)])
+    if mesh_path is None:
+        return points, ""
+    assert plan.object is not None
+    if not mesh_path.is_file():
+        return points, f"expected a mesh file (PLY, STL, OBJ); there is no {mesh_path}"
+    try:
+        return bounding_points(mesh_path, plan.object), ""
+    except Exception as error:  # noqa: BLE001  whatever trimesh raises, the file is not a mesh to us
+        return points, f"cannot read the mesh {mesh_path}: {error}"
+
+
+def bounding_points(mesh_path: Path, measured: MeasuredObject) -> NDArray[np.float64]:
+    """Corners and centre [9, 3] of the object's bounding box, in the support frame, mm."""
+    import trimesh
+
+    loaded: Any = trimesh.load(mesh_path, process=False, force="mesh")
+    if len(loaded.vertices) == 0:
+        raise ValueError("it has no vertices")
+    low, high = np.asarray(loaded.bounds) * MM_PER_UNIT[measured.mesh_unit]
+    box = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    points = np.concatenate([box, [(low + high) / 2]])
+    return apply(measured.support_from_object.matrix(), points)

@@ -1,0 +1,353 @@
+"""Everything that can be known before the robot moves: one report, no device touched.
+
+Pure: what has to be looked up (disk, ledger) comes in as figures. A refusal names what is refused (view, shot,
+LED), the limit and the value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole import kinematics
+from coupole.devices import NO_LIGHT
+from coupole.dome import LedTable
+from coupole.geometry import Transform, apply, inverse
+from coupole.plan import Plan
+from coupole.rig import BoardThermal, KeepOutSphere, LedLimits, Rig
+from coupole.shots import Burst, Schedule, ViewPose
+
+BURST_OVERHEAD_S = 0.06
+"""Arm the camera, read the table's CRC back, start, wait for the last frame (measured on the simulated cell)."""
+SETTLE_CHECK_S = 0.1
+"""From the end of a motion to 'settled', dwell apart (measured on the simulated cell)."""
+STEP_BYTES, BITS_PER_BYTE = 16, 10
+UPLOAD_OVERHEAD_S = 0.1
+_DISK_SHARE = 0.9
+PAGE_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class StorageFacts:
+    """What is known of the disk: free bytes, and the speed measured on it (0: not measured)."""
+
+    free_bytes: int
+    write_bytes_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class ViewReport:
+    """What one view will cost."""
+
+    name: str
+    joints_deg: tuple[float, ...] | None
+    move_s: float
+    burst_s: float
+    dose_lux_h: float
+
+
+@dataclass
+class Report:
+    """What will happen, and why it must not, if it must not."""
+
+    views: list[ViewReport] = field(default_factory=list)
+    shots: int = 0
+    frames: int = 0
+    bytes: int = 0
+    duration_s: float = 0.0
+    ideal_s: float = 0.0
+    """The tables' own time plus motion and settling: what no controller could be faster than."""
+    dose_lux_h: float = 0.0
+    dose_before_lux_h: float = 0.0
+    dose_budget_lux_h: float | None = None
+    peak_board_c: float = 0.0
+    asked_bytes_s: float = 0.0
+    disk_bytes_s: float = 0.0
+    refusals: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def arm_of(rig: Rig) -> kinematics.Arm:
+    """The rig's arm with the speeds that plans are run at."""
+    return kinematics.slowed(
+        kinematics.KR10_R1100_SIXX,
+        speed_fraction=rig.motion.speed_fraction,
+        acceleration_deg_s2=rig.motion.acceleration_deg_s2,
+        jerk_deg_s3=rig.motion.jerk_deg_s3,
+    )
+
+
+def base_from_flange(view: ViewPose, rig: Rig) -> Transform:
+    """Where the flange must be for a view that is given as a camera pose."""
+    assert view.support_from_camera is not None
+    base_from_camera = rig.support.base_from_support.matrix() @ view.support_from_camera
+    flange: Transform = base_from_camera @ inverse(rig.flange_from_camera.matrix())
+    return flange
+
+
+def joints_for_views(
+    views: Sequence[ViewPose], rig: Rig, start_deg: Sequence[float]
+) -> tuple[list[NDArray[np.float64] | None], list[str]]:
+    """Joint angles [6] for each view, each the nearest to the one before; None and a refusal where there is none."""
+    arm = arm_of(rig)
+    here = np.asarray(start_deg, dtype=np.float64)
+    joints: list[NDArray[np.float64] | None] = []
+    refusals: list[str] = []
+    for view in views:
+        if view.joints_deg is not None:
+            there: NDArray[np.float64] | None = np.asarray(view.joints_deg, dtype=np.float64)
+            if violation := kinematics.limit_violations(arm, view.joints_deg):
+                refusals.append(f"view {view.name}: {violation}")
+                there = None
+        else:
+            pose = base_from_flange(view, rig)
+            solutions = kinematics.inverse(arm, pose)
+            if len(solutions) == 0:
+                refusals.append(f"view {view.name}: {kinematics.unreachable_reason(arm, pose)}")
+                there = None
+            else:
+                there = kinematics.nearest(arm, solutions, here)
+        if there is not None:
+            here = there
+        joints.append(there)
+    return joints, refusals
+
+
+def check(
+    plan: Plan,
+    rig: Rig,
+    schedule: Schedule,
+    leds: LedTable,
+    storage: StorageFacts,
+    *,
+    object_points_support_mm: NDArray[np.float64],
+    dose_before_lux_h: float = 0.0,
+    start_joints_deg: Sequence[float] | None = None,
+) -> Report:
+    """Check a whole plan. `object_points_support_mm` [n, 3] are where the dose is reckoned; the worst counts."""
+    report = Report(shots=schedule.shots, frames=schedule.frames)
+    report.dose_before_lux_h = dose_before_lux_h
+    report.dose_budget_lux_h = plan.object.dose_budget_lux_h if plan.object else None
+    start = start_joints_deg or rig.motion.home_joints_deg
+    joints, unreachable = joints_for_views(schedule.views, rig, start)
+    report.refusals += unreachable
+    report.refusals += _refuse_names(schedule)
+    report.refusals += _refuse_keep_out(schedule, joints, rig)
+    report.refusals += _refuse_optics(plan, rig)
+    report.refusals += _refuse_on_times(schedule.bursts[0], rig.led_limits)
+    _time_and_dose(report, plan, rig, schedule, joints, start, leds, object_points_support_mm)
+    _thermal(report, rig.led_limits, schedule, leds)
+    _storage(report, rig, schedule, storage)
+    return report
+
+
+def _refuse_names(schedule: Schedule) -> list[str]:
+    names = [view.name for view in schedule.views]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    return [f"view {name}: expected a name of its own, found it more than once in the plan" for name in twice]
+
+
+def _refuse_keep_out(schedule: Schedule, joints: Sequence[NDArray[np.float64] | None], rig: Rig) -> list[str]:
+    support_from_base = inverse(rig.support.base_from_support.matrix())
+    flange_from_camera = rig.flange_from_camera.matrix()
+    refusals = []
+    for view, there in zip(schedule.views, joints, strict=True):
+        if there is None:
+            continue
+        flange = kinematics.forward(kinematics.KR10_R1100_SIXX, there)
+        points = {"flange": flange[:3, 3], "camera": (flange @ flange_from_camera)[:3, 3]}
+        for part, point_base in points.items():
+            point = apply(support_from_base, point_base)
+            if point[2] <= 0:
+                refusals.append(f"view {view.name}: the {part} would be {-point[2]:.0f} mm below the support")
+            for volume in rig.keep_out:
+                if isinstance(volume, KeepOutSphere):
+                    inside = bool(np.linalg.norm(point - np.array(volume.center_mm)) < volume.radius_mm)
+                else:
+                    inside = bool(np.all(point > volume.min_mm) and np.all(point < volume.max_mm))
+                if inside:
+                    at = ", ".join(f"{v:.0f}" for v in point)
+                    refusals.append(
+                        f"view {view.name}: the {part} at ({at}) mm is inside keep-out `{volume.name}`"
+                    )
+    return refusals
+
+
+def _refuse_optics(plan: Plan, rig: Rig) -> list[str]:
+    refusals = []
+    for name, asked, have in (
+        ("focus distance", plan.optics.focus_distance_mm, rig.lens.focus_distance_mm),
+        ("f-number", plan.optics.f_number, rig.lens.f_number),
+    ):
+        if asked is not None and abs(asked - have) > 1e-3 * have:
+            refusals.append(f"optics: the plan is for {name} {asked:g}, the rig's lens is set to {have:g}")
+    return refusals
+
+
+def _refuse_on_times(bursts: Sequence[Burst], limits: LedLimits) -> list[str]:
+    low_us, high_us = limits.on_us
+    refusals = []
+    for burst in bursts:
+        lit = burst.table["led"] != NO_LIGHT
+        wrong = lit & ((burst.table["on_us"] < low_us) | (burst.table["on_us"] > high_us))
+        if wrong.any():
+            first = int(np.flatnonzero(wrong)[0])
+            refusals.append(
+                f"shot {burst.labels[first]}: LED {burst.table['led'][first]} would be on for "
+                f"{burst.table['on_us'][first]} us; the limits are {low_us} to {high_us} us"
+            )
+    return refusals
+
+
+def upload_s(burst: Burst, baud: int) -> float:
+    """Time to bring a burst's table into the box over a serial line."""
+    return STEP_BYTES * len(burst.table) * BITS_PER_BYTE / baud + UPLOAD_OVERHEAD_S if baud else 0.0
+
+
+def _time_and_dose(
+    report: Report,
+    plan: Plan,
+    rig: Rig,
+    schedule: Schedule,
+    joints: Sequence[NDArray[np.float64] | None],
+    start: Sequence[float],
+    leds: LedTable,
+    points_support_mm: NDArray[np.float64],
+) -> None:
+    arm = arm_of(rig)
+    points_base = apply(rig.support.base_from_support.matrix(), points_support_mm)
+    lux = leds.illuminance_lux(points_base, emission=rig.dome.emission)
+    row_of_id = {int(led): row for row, led in enumerate(leds.ids)}
+    dose_of_table: dict[int, NDArray[np.float64]] = {}
+    here = np.asarray(start, dtype=np.float64)
+    total = np.zeros(len(points_support_mm))
+    baud = int(rig.ledbox.settings.get("baud", 115_200))
+    for view, there, bursts in zip(schedule.views, joints, schedule.bursts, strict=True):
+        move_s = 0.0
+        if there is not None:
+            move_s = kinematics.move_duration_s(arm, here, there)
+            here = there
+        move_s += SETTLE_CHECK_S + rig.motion.settle_dwell_s
+        burst_s = sum(b.duration_s for b in bursts)
+        dose = np.zeros(len(total))
+        for burst in bursts:
+            if id(burst.table) not in dose_of_table:
+                lit = burst.table[burst.table["led"] != NO_LIGHT]
+                rows = [row_of_id[int(led)] for led in lit["led"]]
+                dose_of_table[id(burst.table)] = lux[:, rows] @ lit["on_us"] / 3.6e9
+            dose += dose_of_table[id(burst.table)]
+            if burst.panel:
+                dose += rig.dome.panel_lux * (burst.duration_s + BURST_OVERHEAD_S) / 3600.0
+        total += dose
+        waiting_s = max(0.0, upload_s(bursts[0], baud) - move_s) if not report.views else 0.0
+        report.ideal_s += move_s + burst_s
+        report.duration_s += move_s + waiting_s + burst_s + BURST_OVERHEAD_S * len(bursts)
+        report.views.append(
+            ViewReport(
+                view.name, None if there is None else tuple(there.tolist()), move_s, burst_s, float(dose.max())
+            )
+        )
+    report.dose_lux_h = float(total.max())
+    budget = report.dose_budget_lux_h
+    if budget is not None and report.dose_lux_h + report.dose_before_lux_h > budget:
+        assert plan.object is not None
+        report.refusals.append(
+            f"object {plan.object.id}: the plan gives it {report.dose_lux_h:.2f} lux.h after "
+            f"{report.dose_before_lux_h:.2f} lux.h before; its budget is {budget:g} lux.h"
+        )
+
+
+def _thermal(report: Report, limits: LedLimits, schedule: Schedule, leds: LedTable) -> None:
+    """Board temperatures (first order) and rest of each LED, over all bursts, moves left out (they only cool)."""
+    model = limits.board
+    board_of_led = dict(zip(leds.ids.tolist(), leds.boards.tolist(), strict=True))
+    n_boards = int(leds.boards.max()) + 1
+    rise = np.zeros(n_boards)
+    off_since = np.full(int(leds.ids.max()) + 1, -np.inf)
+    peak = 0.0
+    rest_refused = False
+    t_s = 0.0
+    for bursts, view in zip(schedule.bursts, report.views, strict=True):
+        rise *= np.exp(-view.move_s / model.time_constant_s)
+        t_s += view.move_s
+        for burst in bursts:
+            starts_s = np.concatenate([[0.0], np.cumsum(burst.table["period_us"][:-1], dtype=np.int64)]) / 1e6
+            lit = np.flatnonzero(burst.table["led"] != NO_LIGHT)
+            led = burst.table["led"][lit].astype(np.int64)
+            on_s = burst.table["on_us"][lit] / 1e6
+            rest_s = t_s + starts_s[lit] - off_since[led]
+            short = rest_s < limits.cooldown_ratio * on_s
+            if short.any() and not rest_refused:
+                rest_refused = True
+                k = int(np.flatnonzero(short)[0])
+                report.refusals.append(
+                    f"shot {burst.view}/{burst.labels[lit[k]]}: LED {led[k]} rests {rest_s[k]:.3f} s before it is "
+                    f"lit for {on_s[k]:.3f} s; it needs {limits.cooldown_ratio * on_s[k]:.3f} s"
+                )
+            off_since[led] = t_s + starts_s[lit] + on_s
+            boards = np.array([board_of_led[int(n)] for n in led], np.int64)
+            last_s = np.zeros(n_boards)
+            peak = max(peak, _heat(rise, last_s, boards, starts_s[lit] + on_s, on_s, model))
+            rise *= np.exp(-(burst.duration_s - last_s) / model.time_constant_s)
+            t_s += burst.duration_s
+    report.peak_board_c = model.ambient_c + peak
+    if report.peak_board_c > model.limit_c:
+        report.refusals.append(
+            f"LED boards: the hottest would reach {report.peak_board_c:.1f} C; the limit is {model.limit_c:g} C"
+        )
+
+
+def _heat(
+    rise: NDArray[np.float64],
+    last_s: NDArray[np.float64],
+    boards: NDArray[np.int64],
+    ends_s: NDArray[np.float64],
+    on_s: NDArray[np.float64],
+    model: BoardThermal,
+) -> float:
+    """Warm `rise` [boards] by lit LEDs in order of time, all boards at once; returns the highest rise."""
+    peak = 0.0
+    turn = np.zeros(len(boards), np.int64)
+    order = np.argsort(boards, kind="stable")
+    sorted_boards = boards[order]
+    first = np.searchsorted(sorted_boards, sorted_boards, side="left")
+    turn[order] = np.arange(len(boards)) - first
+    for k in range(int(turn.max()) + 1 if len(turn) else 0):
+        now = turn == k
+        b = boards[now]
+        rise[b] *= np.exp(-(ends_s[now] - last_s[b]) / model.time_constant_s)
+        rise[b] += model.rise_c_per_j * model.led_power_w * on_s[now]
+        last_s[b] = ends_s[now]
+        peak = max(peak, float(rise[b].max()))
+    return peak
+
+
+def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts) -> None:
+    frame_bytes = rig.sensor.frame_bytes
+    report.bytes = report.frames * frame_bytes
+    shortest_us = min(int(b.table["period_us"].min()) for b in schedule.bursts[0])
+    report.asked_bytes_s = frame_bytes / (shortest_us * 1e-6)
+    report.disk_bytes_s = storage.write_bytes_s
+    if report.bytes + rig.storage.reserve_bytes > storage.free_bytes:
+        report.refusals.append(
+            f"storage {rig.storage.folder}: the run needs {report.bytes / 1e9:.2f} GB and "
+            f"{rig.storage.reserve_bytes / 1e9:.2f} GB must stay free; {storage.free_bytes / 1e9:.2f} GB are free"
+        )
+    if storage.write_bytes_s and report.asked_bytes_s > storage.write_bytes_s:
+        report.refusals.append(
+            f"storage {rig.storage.folder}: frames come at {report.asked_bytes_s / 1e6:.0f} MB/s, the disk takes "
+            f"{storage.write_bytes_s / 1e6:.0f} MB/s; use a faster disk or longer exposures"
+        )
+    elif storage.write_bytes_s and report.asked_bytes_s > _DISK_SHARE * storage.write_bytes_s:
+        report.warnings.append(
+            f"frames come at {report.asked_bytes_s / 1e6:.0f} MB/s, close to the {storage.write_bytes_s / 1e6:.0f} "
+            "MB/s that the disk takes"
+        )
+    if frame_bytes % PAGE_BYTES:
+        report.warnings.append(
+            f"a frame of {rig.sensor.width_px} x {rig.sensor.height_px} is no multiple of {PAGE_BYTES} bytes: it is "
+            "written through the page cache, which is slower"
+        )

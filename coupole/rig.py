@@ -1,0 +1,256 @@
+"""The rig: which devices there are, where they stand, what they may do; and how they are opened.
+
+This is the only module that imports drivers, and it does so by the name in the rig's YAML
+(`driver: drivers.ledbox:LedBox`). A driver's `settings:` are checked by that class's own pydantic `Settings`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field
+
+from coupole.errors import Problem
+from coupole.plan import Model, Name, Pose, Vector
+from coupole.yamlfile import Document
+
+DriverName = Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
+
+
+class Twin(Model):
+    """The simulated counterpart that `--dry-run` opens in a device's place."""
+
+    driver: DriverName
+    settings: dict[str, Any] = {}
+
+
+class Device(Model):
+    """A driver and its settings. On a simulated rig the world's endpoint fills in the address."""
+
+    driver: DriverName
+    settings: dict[str, Any] = {}
+    twin: Twin | None = None
+
+
+class Sensor(Model):
+    """What the camera's frames look like; compared with what the camera says when it is opened."""
+
+    width_px: Annotated[int, Field(ge=8, le=65536)]
+    height_px: Annotated[int, Field(ge=8, le=65536)]
+    pixel_pitch_um: Annotated[float, Field(gt=0)]
+    bit_depth: Annotated[int, Field(ge=8, le=16)] = 12
+    bayer_pattern: Literal["GBRG", "GRBG", "RGGB", "BGGR", "MONO"] = "GBRG"
+    black_dn: Annotated[int, Field(ge=0)] = 64
+    max_frames_per_s: Annotated[float, Field(gt=0)] = 100.0
+    exposure_gap_us: Annotated[int, Field(ge=0)] = 100
+    """Least time between the end of one exposure and the start of the next."""
+
+    @property
+    def frame_bytes(self) -> int:
+        return self.width_px * self.height_px * 2
+
+    @property
+    def white_dn(self) -> int:
+        return 2**self.bit_depth - 1
+
+
+class Lens(Model):
+    focal_length_mm: Annotated[float, Field(gt=0)]
+    f_number: Annotated[float, Field(gt=0)]
+    focus_distance_mm: Annotated[float, Field(gt=0)]
+    """From the projection centre to the plane of best focus."""
+
+
+class Dome(Model):
+    """The LEDs: a CSV with columns id, board, x_mm, y_mm, z_mm, nx, ny, nz (base frame), flux_lm."""
+
+    leds: Path
+    emission: Literal["lambertian", "paper"] = "lambertian"
+    panel_lux: Annotated[float, Field(ge=0)] = 0.0
+    """Illuminance at the support's centre with one flat panel on, for the light dose."""
+
+
+class BoardThermal(Model):
+    """First-order thermal model of an LED board: each joule lifts it, it cools with one time constant."""
+
+    led_power_w: Annotated[float, Field(gt=0)] = 15.0
+    rise_c_per_j: Annotated[float, Field(gt=0)] = 0.02
+    time_constant_s: Annotated[float, Field(gt=0)] = 240.0
+    ambient_c: float = 22.0
+    limit_c: float = 70.0
+
+
+class LedLimits(Model):
+    """What an LED and its board may be asked; the box refuses more by itself as well."""
+
+    on_us: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (1_000, 2_000_000)
+    rise_us: Annotated[int, Field(ge=0)] = 1_000
+    """From switching on to full current: the trigger waits for it (facts: 1 ms)."""
+    cooldown_ratio: Annotated[float, Field(ge=0)] = 2.0
+    """An LED that was lit for t rests at least `cooldown_ratio` * t."""
+    board: BoardThermal = BoardThermal()
+
+
+class Motion(Model):
+    """How the arm moves between views: share of its joint speeds, acceleration, jerk, and how it settles."""
+
+    speed_fraction: Annotated[float, Field(gt=0, le=1)] = 0.3
+    acceleration_deg_s2: Annotated[float, Field(gt=0)] = 300.0
+    jerk_deg_s3: Annotated[float, Field(gt=0)] = 3000.0
+    settle_dwell_s: Annotated[float, Field(ge=0)] = 0.3
+    home_joints_deg: tuple[float, float, float, float, float, float] = (0.0, -170.0, 150.0, 0.0, -70.0, 0.0)
+    """Where the arm is taken to be when a plan is checked without it."""
+
+
+class Support(Model):
+    """The disk that carries the object, and the origin of the support frame."""
+
+    base_from_support: Pose
+    diameter_mm: Annotated[float, Field(gt=0)] = 1480.0
+
+
+class KeepOutSphere(Model):
+    """A volume of the support frame that the flange must stay out of."""
+
+    kind: Literal["sphere"]
+    name: Name
+    center_mm: Vector
+    radius_mm: Annotated[float, Field(gt=0)]
+
+
+class KeepOutBox(Model):
+    kind: Literal["box"]
+    name: Name
+    min_mm: Vector
+    max_mm: Vector
+
+
+KeepOut = Annotated[KeepOutSphere | KeepOutBox, Field(discriminator="kind")]
+
+
+class Storage(Model):
+    folder: Path
+    reserve_bytes: Annotated[int, Field(ge=0)] = 256 * 1024**2
+    """Free space that a run must leave on the disk."""
+
+
+class WorldSection(Model):
+    """The stand-ins: started with the rig (or for dry runs only), or joined where they already run."""
+
+    serves: Literal["always", "dry_run"] = "always"
+    join: Path | None = None
+    """File with the JSON line of a `coupole sim` that is running already."""
+    driver: DriverName = "sim.client:World"
+    settings: dict[str, Any] = {}
+
+
+class Rig(Model):
+    """One cell: devices, geometry, limits, storage."""
+
+    schema_version: Literal[1]
+    name: Name
+    ledbox: Device
+    camera: Device
+    robot: Device
+    sensor: Sensor
+    lens: Lens
+    flange_from_camera: Pose
+    dome: Dome
+    support: Support
+    keep_out: tuple[KeepOut, ...] = ()
+    led_limits: LedLimits = LedLimits()
+    motion: Motion = Motion()
+    storage: Storage
+    world: WorldSection | None = None
+
+
+DEVICES = ("ledbox", "camera", "robot")
+ENDPOINT_SETTINGS = {
+    "ledbox": ("port", "port", "loop://"),
+    "camera": ("address", "address", "/nowhere"),
+    "robot": ("sends_to", "listen", "127.0.0.1:49152"),
+}
+"""For each device: the key of the world's endpoint, the setting that it fills in, and a stand-in for it while
+settings are checked and no world runs yet."""
+DEFAULT_TWINS = {
+    "ledbox": "drivers.ledbox:LedBox",
+    "camera": "sim.memory_camera:MemoryCamera",
+    "robot": "drivers.kuka_rsi:KukaRsi",
+}
+_MOTION_SETTINGS = {
+    "speed_fraction": "speed_fraction",
+    "acceleration_deg_s2": "acceleration_deg_s2",
+    "jerk_deg_s3": "jerk_deg_s3",
+    "settle_dwell_s": "dwell_s",
+}
+"""Figures of the rig's `motion:` and the settings of a robot's driver that they become."""
+
+
+def load_class(name: DriverName) -> type[Any]:
+    """The class behind `package.module:Class`. Raises ImportError or AttributeError."""
+    module, _, attribute = name.partition(":")
+    found: type[Any] = getattr(importlib.import_module(module), attribute)
+    return found
+
+
+def settings_class(name: DriverName) -> type[BaseModel]:
+    """The `Settings` model that stands beside a driver's class."""
+    found: type[BaseModel] = load_class(name.partition(":")[0] + ":Settings")
+    return found
+
+
+def in_world(rig: Rig, *, dry_run: bool) -> bool:
+    """True if the rig's devices are stand-ins in a world."""
+    return dry_run or (rig.world is not None and rig.world.serves == "always")
+
+
+def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[str, Any]]:
+    """Driver and settings to open for a device: its twin in a dry run, itself otherwise."""
+    device: Device = getattr(rig, kind)
+    settings = dict(device.settings)
+    driver = device.driver
+    if dry_run and device.twin is not None:
+        driver, settings = device.twin.driver, dict(device.twin.settings)
+    elif dry_run and not (rig.world is not None and rig.world.serves == "always"):
+        driver = DEFAULT_TWINS[kind]
+        known = set(settings_class(driver).model_fields)
+        settings = {key: value for key, value in settings.items() if key in known}
+    if kind == "robot":
+        known = set(settings_class(driver).model_fields)
+        settings |= {
+            setting: getattr(rig.motion, figure)
+            for figure, setting in _MOTION_SETTINGS.items()
+            if setting in known and setting not in settings
+        }
+    return driver, settings
+
+
+def driver_problems(document: Document, rig: Rig) -> list[Problem]:
+    """Drivers that cannot be found and settings that their drivers do not take."""
+    problems = []
+    for kind in DEVICES:
+        device: Device = getattr(rig, kind)
+        _, filled, stand_in = ENDPOINT_SETTINGS[kind]
+        for at, part, has_endpoint in (
+            ((kind,), device, in_world(rig, dry_run=False)),
+            ((kind, "twin"), device.twin, True),
+        ):
+            if part is not None:
+                extra = {filled: stand_in} if has_endpoint else {}
+                problems += _settings_problems(document, at, part.driver, extra)
+    if rig.world is not None:
+        problems += _settings_problems(document, ("world",), rig.world.driver, {})
+    return problems
+
+
+def _settings_problems(
+    document: Document, at: tuple[str, ...], driver: DriverName, given: dict[str, Any]
+) -> list[Problem]:
+    try:
+        load_class(driver)
+        model = settings_class(driver)
+    except (ImportError, AttributeError) as error:
+        return [document.problem((*at, "driver"), f"cannot find `{driver}`: {error}")]
+    return document.problems(model, (*at, "settings"), given=given)[1]

@@ -1,0 +1,281 @@
+"""One `coupole acquire` from reading the plan to the last journal line, for real or as a rehearsal."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from coupole import ledger, report
+from coupole.cell import OpenedCell, coarse, open_cell
+from coupole.console import RunObserver, show_dry_run, show_preflight
+from coupole.devices import Identity
+from coupole.errors import CoupoleError, Interrupted, PreflightRefused, StorageError
+from coupole.job import Job
+from coupole.preflight import Report, StorageFacts, check
+from coupole.recorder import DryRecorder, RunRecorder
+from coupole.rig import in_world
+from coupole.run import Run, is_shot
+from coupole.sequencer import Control, Outcome, Sequencer
+from coupole.store import measure_write_speed
+
+UNLIMITED_BYTES = 2**62
+
+
+def preflight_of(job: Job, folder: Path, *, measure_disk: bool) -> Report:
+    """Preflight's report on a job whose run would lie in `folder`."""
+    existing = folder
+    while not existing.exists():
+        existing = existing.parent
+    speed = 0.0
+    if measure_disk:
+        try:
+            speed = measure_write_speed(existing)
+        except StorageError:
+            speed = 0.0
+    storage = StorageFacts(shutil.disk_usage(existing).free, speed)
+    return _check(job, storage)
+
+
+def _check(job: Job, storage: StorageFacts) -> Report:
+    before = ledger.total_lux_h(job.cell.storage_folder, job.plan.object.id) if job.plan.object else 0.0
+    return check(
+        job.plan,
+        job.cell.rig,
+        job.schedule,
+        job.cell.leds,
+        storage,
+        object_points_support_mm=job.object_points_support_mm,
+        dose_before_lux_h=before,
+    )
+
+
+def _refuse(found: Report) -> None:
+    if found.refusals:
+        raise PreflightRefused(found.refusals)
+
+
+@contextmanager
+def _operator(control: Control) -> Iterator[None]:
+    """Ctrl-C and SIGTERM stop, SIGUSR1 pauses and goes on; as before when this ends."""
+
+    def stop(*_: Any) -> None:
+        control.stop.set()
+
+    def pause(*_: Any) -> None:
+        (control.pause.clear if control.pause.is_set() else control.pause.set)()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    wanted = {signal.SIGINT: stop, signal.SIGTERM: stop, signal.SIGUSR1: pause}
+    before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+# -- the run ----------------------------------------------------------------------------------------------
+
+
+def acquire_plan(
+    job: Job,
+    console: Console,
+    *,
+    parent: Path | None,
+    resume: Path | None,
+    confirm: bool,
+    found: dict[str, Any],
+) -> None:
+    """Run a plan into a run folder; `found` is filled with the figures of `--json`, also when this raises."""
+    run = Run(resume) if resume else None
+    if run is not None:
+        run.refuse_changes(job.inputs)
+    folder = (run.folder if run else parent or job.cell.storage_folder).resolve()
+    preflight = preflight_of(job, folder, measure_disk=True)
+    if run is not None:
+        done_bytes = len(run.proven()) * job.cell.rig.sensor.frame_bytes
+        preflight.refusals = [r for r in preflight.refusals if done_bytes == 0 or not r.startswith("storage")]
+    show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
+    _refuse(preflight)
+    real = not in_world(job.cell.rig, dry_run=False)
+    if real and confirm and not console.input("Move the arm and light the object? [y/N] ").lower().startswith("y"):
+        raise Interrupted("not started")
+    console.print("opening the devices ...")
+    with open_cell(job.cell, job=job, on_opened=_teller(console)) as cell:
+        run = run or Run.create(folder, job.plan.name, job.inputs, _about(job, cell, preflight))
+        lock = run.lock()
+        console.print(f"run {run.folder}")
+        recorder = RunRecorder(run, _metadata(job, cell))
+        try:
+            _acquire(job, cell, run, recorder, console, resumed=resume is not None, found=found)
+        finally:
+            recorder.close()
+            report.write(run)
+            os.close(lock)
+
+
+def _teller(console: Console) -> Any:
+    def tell(kind: str, identity: Identity) -> None:
+        how = " (simulated)" if identity.simulated else ""
+        console.print(f"  {kind}: {identity.vendor} {identity.model} {identity.serial}{how}")
+
+    return tell
+
+
+def _about(job: Job, cell: OpenedCell, preflight: Report) -> dict[str, Any]:
+    """What stands in run.json beside the inputs."""
+    return {
+        "simulated": cell.simulated,
+        "object": job.plan.object.id if job.plan.object else None,
+        "calibrations": "none" if job.plan.calibrations == "none" else [str(p) for p in job.plan.calibrations],
+        "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
+        "scaling": cell.world_endpoints["camera"]["scaling"] if cell.world_endpoints else None,
+        "views": [view.name for view in job.schedule.views],
+        "labels": [label for burst in job.schedule.bursts[0] for label in burst.labels],
+        "expected": {"shots": preflight.shots, "frames": preflight.frames, "duration_s": preflight.duration_s},
+    }
+
+
+def _metadata(job: Job, cell: OpenedCell) -> dict[str, Any]:
+    """Attributes of every view's file."""
+    rig = job.cell.rig
+    return {
+        "program_name": "coupole",
+        "sample": job.plan.object.id if job.plan.object else "none",
+        "simulated": cell.simulated,
+        "pixel_pitch_um": cell.sensor.pixel_pitch_um,
+        "focal_length_mm": rig.lens.focal_length_mm,
+        "f_number": rig.lens.f_number,
+        "focus_distance_mm": rig.lens.focus_distance_mm,
+        "base_from_support": rig.support.base_from_support.matrix(),
+        "camera": " ".join((cell.identities["camera"].model, cell.identities["camera"].serial)),
+        "gain_db": job.plan.gain_db,
+    }
+
+
+def _acquire(
+    job: Job,
+    cell: OpenedCell,
+    run: Run,
+    recorder: RunRecorder,
+    console: Console,
+    *,
+    resumed: bool,
+    found: dict[str, Any],
+) -> None:
+    control = Control()
+    observer = RunObserver(console, job.cell.rig.sensor.frame_bytes, len(recorder.proven()))
+    sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
+    outcome = sequencer.outcome
+    ended = "done"
+    recorder.event("resume" if resumed else "start", simulated=cell.simulated)
+    try:
+        with _operator(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
+            sequencer.acquire()
+    except CoupoleError as error:
+        ended = "interrupted" if isinstance(error, Interrupted) else "failed"
+        recorder.event("fault", kind=type(error).__name__, message=str(error))
+        raise
+    finally:
+        cell.make_safe()
+        for trouble in cell.trouble:
+            recorder.event("fault", kind="unsafe", message=trouble)
+            console.print(f"[red]{trouble}[/]")
+        recorder.event("stop", outcome=ended, robot=dict(cell.robot.statistics()))
+        recorder.close_quietly()
+        if job.plan.object and not cell.simulated:
+            ledger.add(
+                job.cell.storage_folder,
+                job.plan.object.id,
+                run=run.folder.name,
+                dose_lux_h=outcome.dose_lux_h,
+            )
+        found.update(_figures(run, job, outcome))
+        _say_outcome(console, run, outcome, ended)
+
+
+def _figures(run: Run, job: Job, outcome: Outcome) -> dict[str, Any]:
+    """The figures of `--json`."""
+    frames = len(run.proven())
+    return {
+        "run": str(run.folder),
+        "shots": outcome.shots,
+        "proven": sum(map(is_shot, run.proven())),
+        "missing": len(outcome.missing),
+        "reshot": outcome.reshot,
+        "bad": len(outcome.bad),
+        "frames": frames,
+        "bytes": frames * job.cell.rig.sensor.frame_bytes,
+        "duration_s": round(outcome.duration_s, 3),
+        "ideal_s": round(outcome.ideal_s, 3),
+        "efficiency": round(outcome.ideal_s / outcome.duration_s, 4) if outcome.duration_s else 1.0,
+        "dose_lux_h": outcome.dose_lux_h,
+    }
+
+
+def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> None:
+    console.print(
+        f"{ended}: {outcome.proven} of {outcome.shots} shots proven, {outcome.reshot} re-shot, "
+        f"{outcome.duration_s:.1f} s (at best {outcome.ideal_s:.1f} s), {outcome.dose_lux_h:.3f} lux.h"
+    )
+    console.print(f"  frames  {run.folder / 'views'}\n  report  {run.folder / 'report.html'}")
+    if ended != "done":
+        console.print(f"  go on with --resume {run.folder}")
+
+
+# -- the rehearsal ----------------------------------------------------------------------------------------
+
+
+def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any]) -> None:
+    """Run a whole plan on the rig's twin, faster than life, and say what preflight could not know."""
+    preflight = _check(job, StorageFacts(UNLIMITED_BYTES))
+    show_preflight(console, preflight, name=job.plan.name, rig=f"the twin of {job.cell.rig.name}")
+    _refuse(preflight)
+    recorder, control = DryRecorder(), Control()
+    with open_cell(job.cell, job=job, dry_run=True, speed=speed, on_opened=_teller(console)) as cell:
+        observer = RunObserver(console, coarse(job.cell.rig.sensor).frame_bytes, 0)
+        sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
+        outcome = sequencer.outcome
+        started_s = time.monotonic()
+        try:
+            with _operator(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
+                sequencer.acquire()
+        finally:
+            machine_s = time.monotonic() - started_s
+            found.update(
+                {
+                    "dry_run": True,
+                    "shots": outcome.shots,
+                    "proven": outcome.proven,
+                    "missing": len(outcome.missing),
+                    "reshot": outcome.reshot,
+                    "duration_s": round(outcome.duration_s, 3),
+                    "preflight_s": round(preflight.duration_s, 3),
+                    "ideal_s": round(outcome.ideal_s, 3),
+                    "machine_s": round(machine_s, 3),
+                    "speed": round(outcome.duration_s / machine_s, 2),
+                    "speed_asked": speed,
+                    "over_triggers": outcome.over_triggers,
+                    "exposure": {
+                        view: {
+                            "pictures": seen.pictures,
+                            "brightest": round(seen.brightest, 4),
+                            "saturated": round(seen.saturated, 6),
+                            "verdict": seen.verdict(),
+                        }
+                        for view, seen in recorder.exposures.items()
+                    },
+                }
+            )
+            show_dry_run(console, recorder, outcome, found)

@@ -1,0 +1,1 @@
+"""Drivers of real devices. They know `coupole.devices`, `coupole.errors`, `coupole.geometry`, nothing more."""

@@ -1,0 +1,126 @@
+"""The memory that `KukaRsi` and the process that answers the controller share.
+
+Two records, each with one writer: `Command` from the driver, `State` from the loop. A sequence number before
+the record is odd while it is being written (a seqlock), so neither side ever waits for the other.
+Angles are degrees, times nanoseconds of the machine's monotonic clock.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import time
+from typing import Any, NamedTuple
+
+BLOCK_BYTES = 4096
+_COMMAND_AT, _STATE_AT = 0, 1024
+_SEQUENCE = struct.Struct("=Q")
+_COMMAND = struct.Struct("=QQ6d")
+_STATE = struct.Struct("=12Q18d32s200s")
+_TORN_S = 1.0
+
+HOLD, MOVE, STOP, LEAVE = range(4)
+"""What a command asks: nothing yet, move to the target, come to rest, come to rest and end the process."""
+STANDING, MOVING, STOPPING = range(3)
+"""What the commanded axes do."""
+NO_FAULT, LINK_LOST, LATE, NOT_FOLLOWING, RESTARTED, NO_TRAJECTORY = range(6)
+"""Faults, latched."""
+
+Six = tuple[float, ...]
+_ZEROS: Six = (0.0,) * 6
+
+
+class Command(NamedTuple):
+    number: int = 0
+    """Counts commands; a new number is a new command."""
+    verb: int = HOLD
+    target_deg: Six = _ZEROS
+
+
+class State(NamedTuple):
+    packets: int = 0
+    answers: int = 0
+    malformed: int = 0
+    """Packets that could not be read, and so were not answered."""
+    refused: int = 0
+    """Packets left unanswered because they belong to an RSI session that another program began."""
+    late: int = 0
+    """How far the controller's delay counter rose in all: answers that came too late or not at all."""
+    delay: int = 0
+    """The controller's delay counter in the last packet."""
+    max_gap_ns: int = 0
+    """Longest time between two packets."""
+    realtime: int = 0
+    """1 if the loop runs under SCHED_FIFO."""
+    command: int = 0
+    """Number of the last command taken."""
+    phase: int = STANDING
+    settled_cycles: int = 0
+    """Packets in a row in which the measured axes stood at the commanded ones, within tolerance."""
+    fault: int = NO_FAULT
+    measured_deg: Six = _ZEROS
+    velocity_deg_s: Six = _ZEROS
+    """Of the measured axes, over the last cycle."""
+    commanded_deg: Six = _ZEROS
+    controller: bytes = b""
+    """The Type that the controller's packets carry."""
+    fault_text: bytes = b""
+
+
+class Block:
+    """One side's view of the shared memory; `fd` is a memfd of BLOCK_BYTES."""
+
+    def __init__(self, fd: int) -> None:
+        self._memory = mmap.mmap(fd, BLOCK_BYTES)
+
+    def write_command(self, command: Command) -> None:
+        self._write(_COMMAND_AT, _COMMAND.pack(command.number, command.verb, *command.target_deg))
+
+    def read_command(self) -> Command:
+        number, verb, *target = self._read(_COMMAND_AT, _COMMAND)
+        return Command(number, verb, tuple(target))
+
+    def command_number(self) -> int:
+        """The number alone, for a cheap look: 8 aligned bytes, so never torn."""
+        number: int = _SEQUENCE.unpack_from(self._memory, _COMMAND_AT + _SEQUENCE.size)[0]
+        return number
+
+    def write_state(self, state: State) -> None:
+        self._write(
+            _STATE_AT,
+            _STATE.pack(
+                *state[:12],
+                *state.measured_deg,
+                *state.velocity_deg_s,
+                *state.commanded_deg,
+                state.controller[:32],
+                state.fault_text[:200],
+            ),
+        )
+
+    def read_state(self) -> State:
+        fields = self._read(_STATE_AT, _STATE)
+        controller, fault_text = (text.rstrip(b"\0") for text in fields[30:])
+        joints = (fields[12:18], fields[18:24], fields[24:30])
+        return State._make((*fields[:12], *joints, controller, fault_text))
+
+    def close(self) -> None:
+        self._memory.close()
+
+    def _write(self, at: int, record: bytes) -> None:
+        (sequence,) = _SEQUENCE.unpack_from(self._memory, at)
+        _SEQUENCE.pack_into(self._memory, at, sequence | 1)
+        self._memory[at + _SEQUENCE.size : at + _SEQUENCE.size + len(record)] = record
+        _SEQUENCE.pack_into(self._memory, at, (sequence | 1) + 1)
+
+    def _read(self, at: int, layout: struct.Struct) -> tuple[Any, ...]:
+        """Raises TimeoutError if the writer died in the middle of a record."""
+        give_up = time.monotonic() + _TORN_S
+        while time.monotonic() < give_up:
+            (before,) = _SEQUENCE.unpack_from(self._memory, at)
+            fields = layout.unpack_from(self._memory, at + _SEQUENCE.size)
+            (after,) = _SEQUENCE.unpack_from(self._memory, at)
+            if before == after and before % 2 == 0:
+                return fields
+            time.sleep(0)
+        raise TimeoutError("the shared record stays half written: its writer died")

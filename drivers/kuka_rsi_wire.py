@@ -1,0 +1,71 @@
+"""KUKA RSI's packets: read what the controller sends, write what it wants to hear.
+
+Names of elements are set by the controller's own RSI configuration, so they are parameters here.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import NamedTuple
+
+
+class Packet(NamedTuple):
+    ipoc: bytes
+    """As it came, to be sent back unchanged."""
+    joints_deg: tuple[float, ...]
+    delay: int
+
+
+_ATTRIBUTE = re.compile(rb"""([A-Za-z_]\w*)\s*=\s*["']\s*([^"']*?)\s*["']""")
+_TYPE = re.compile(rb"""<Rob\b[^>]*?\bTYPE\s*=\s*["']([^"']*)["']""", re.IGNORECASE)
+
+
+def packet_parser(measured_tag: str, delay_tag: str) -> Callable[[bytes], Packet | None]:
+    """A function that reads a controller's packet: any order of elements and attributes, others ignored.
+
+    It returns None where IPOC or an axis is missing or no number; a missing delay counter counts as 0.
+    """
+    measured, delay = re.escape(measured_tag).encode(), re.escape(delay_tag).encode()
+    usual_axes = re.compile(
+        rb"<%s " % measured + rb" ".join(rb'A%d="([^"]+)"' % axis for axis in range(1, 7)) + rb"\s*/>"
+    )
+    any_axes = re.compile(rb"<%s\b([^>]*)>" % measured)
+    usual_tail = re.compile(rb'<%s D="(\d+)"\s*/>\s*<IPOC>(\d+)</IPOC>' % delay)
+    any_delay = re.compile(rb"""<%s\b[^>]*?\bD\s*=\s*["']\s*(\d+)\s*["']""" % delay)
+    any_ipoc = re.compile(rb"<IPOC>\s*(\d+)\s*</IPOC>")
+    names = [b"A%d" % axis for axis in range(1, 7)]
+
+    def parse(packet: bytes) -> Packet | None:
+        try:
+            if match := usual_axes.search(packet):
+                joints_deg = tuple(map(float, match.groups()))
+            elif match := any_axes.search(packet):
+                attributes = dict(_ATTRIBUTE.findall(match[1]))
+                joints_deg = tuple(float(attributes[name]) for name in names)
+            else:
+                return None
+        except (KeyError, ValueError):
+            return None
+        if not math.isfinite(sum(joints_deg)):
+            return None
+        if match := usual_tail.search(packet):
+            return Packet(match[2], joints_deg, int(match[1]))
+        ipoc = any_ipoc.search(packet)
+        late = any_delay.search(packet)
+        return Packet(ipoc[1], joints_deg, int(late[1]) if late else 0) if ipoc else None
+
+    return parse
+
+
+def controller_type(packet: bytes) -> bytes:
+    """The Type (or TYPE) of the packet's root element; empty if it has none."""
+    match = _TYPE.search(packet)
+    return match[1] if match else b""
+
+
+def answer_template(sen_type: str, correction_tag: str) -> bytes:
+    """An answer with places for six corrections in degrees (floats) and the IPOC (bytes), for `%`."""
+    axes = " ".join(f'A{axis}="%.6f"' for axis in range(1, 7))
+    return f'<Sen Type="{sen_type}"><EStr></EStr><{correction_tag} {axes}/><IPOC>%b</IPOC></Sen>'.encode()

@@ -1,0 +1,312 @@
+"""What every Robot must do, run on each driver against the other end of its wire."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coupole.devices import Robot
+from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
+from coupole.kinematics import KR10_R1100_SIXX, forward, inverse, nearest
+from drivers.kuka_rsi import KukaRsi, Settings
+from sim.clock import ClockWriter, SharedClock
+from sim.kuka_controller import KukaController
+from sim.kuka_controller import Settings as ControllerSettings
+from sim.reactor import Reactor
+
+HOME_DEG = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
+AWAY_DEG = np.array([50.0, -50.0, 40.0, 30.0, 60.0, -70.0])
+
+
+class KukaCell:
+    """A KUKA controller in a world of its own, and drivers that talk to it."""
+
+    def __init__(self, folder: Path, cycle_ms: int) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.address = f"127.0.0.1:{probe.getsockname()[1]}"
+        self.cycle_ms = cycle_ms
+        self.clock_path = folder / "clock"
+        self.reactor = Reactor(ClockWriter(self.clock_path, speed=10.0))
+        self.controller = KukaController(
+            self.reactor, ControllerSettings.model_validate({"sends_to": self.address, "cycle_ms": cycle_ms})
+        )
+        self.trace_deg: list[tuple[float, ...]] = []
+        self.settings = Settings.model_validate(
+            {"listen": self.address, "cycle_ms": cycle_ms, "link_timeout_s": 0.5, "connect_timeout_s": 20.0}
+        )
+        self.reactor.after(0.5 * cycle_ms / 1e3, self._sample)
+        self._thread = threading.Thread(target=self.reactor.run)
+        self._thread.start()
+        self.clock = SharedClock(self.clock_path)
+        self._drivers = ExitStack()
+
+    def open(self) -> KukaRsi:
+        return self._drivers.enter_context(closing(KukaRsi(self.settings, self.clock)))
+
+    def in_world(self, action: Callable[[], object]) -> None:
+        """Do something on the world's thread and wait until it is done."""
+        done = threading.Event()
+        self.reactor.call_threadsafe(lambda: (action(), done.set()))
+        assert done.wait(30.0)
+
+    def joints_deg(self) -> NDArray[np.float64]:
+        return np.array(self.controller.joints_deg)
+
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        give_up = time.monotonic() + 30.0
+        while not condition():
+            assert time.monotonic() < give_up
+            time.sleep(0.001)
+
+    def wait_until_under_way(self) -> None:
+        self.wait_until(lambda: bool(np.max(np.abs(self.joints_deg() - HOME_DEG)) > 8.0))
+
+    def close(self) -> None:
+        self._drivers.close()
+        self.reactor.stop()
+        self._thread.join()
+        self.controller.close()
+
+    def _sample(self) -> None:
+        self.trace_deg.append(self.controller.joints_deg)
+        self.reactor.after(self.cycle_ms / 1e3, self._sample)
+
+    def assert_smooth(self) -> None:
+        """Speed, acceleration and jerk of all that was sampled are within the driver's limits."""
+        dt_s = self.cycle_ms / 1e3
+        axes_deg = np.array(self.trace_deg)
+        arm = self.settings.arm()
+        for order, limit in enumerate((arm.velocity_deg_s, arm.acceleration_deg_s2, arm.jerk_deg_s3), start=1):
+            rounding = 2.0**order * 1e-6 / dt_s**order
+            assert np.all(
+                np.abs(np.diff(axes_deg, order, axis=0)) / dt_s**order <= np.array(limit) * 1.001 + rounding
+            )
+
+    def assert_stands(self) -> None:
+        """The arm does not move for half a second of world time."""
+        before = self.joints_deg()
+        self.clock.sleep(0.5)
+        assert not self.controller.moving
+        assert np.array_equal(self.joints_deg(), before)
+
+
+class RobotConformance:
+    """Any driver passes that satisfies `coupole.devices.Robot`; `cell` is the arm it talks to."""
+
+    @pytest.fixture
+    def robot(self, cell: KukaCell) -> Robot:
+        return cell.open()
+
+    def test_opening_moves_nothing(self, cell: KukaCell, robot: Robot) -> None:
+        cell.clock.sleep(0.2)
+        assert robot.measured().fault == ""
+        assert not robot.measured().moving
+        assert set(cell.trace_deg) == {tuple(HOME_DEG)}
+
+    def test_it_says_who_it_is_and_that_it_is_simulated(self, cell: KukaCell, robot: Robot) -> None:
+        assert robot.identify().model == "KR10 R1100 sixx"
+        assert robot.identify().simulated
+        assert robot.self_test()
+
+    def test_it_reaches_poses_and_measures_them_right(self, cell: KukaCell, robot: Robot) -> None:
+        random = np.random.default_rng(5)
+        low, high = np.array(KR10_R1100_SIXX.limits_deg).T
+        for joints_deg in random.uniform(0.6 * low, 0.6 * high, (3, 6)):
+            wanted = forward(KR10_R1100_SIXX, joints_deg)
+            target_deg = nearest(KR10_R1100_SIXX, inverse(KR10_R1100_SIXX, wanted), cell.joints_deg())
+            robot.move_to(target_deg)
+            state = robot.wait_settled()
+            assert not state.moving
+            assert np.allclose(state.joints_deg, target_deg, atol=1e-3)
+            assert np.allclose(state.base_from_flange, wanted, atol=0.01)
+            assert np.allclose(cell.controller.true_base_from_flange()[:3, 3], wanted[:3, 3], atol=0.1)
+
+    def test_motion_is_jerk_limited(self, cell: KukaCell, robot: Robot) -> None:
+        robot.move_to(AWAY_DEG)
+        robot.wait_settled()
+        cell.assert_smooth()
+
+    def test_a_new_target_in_mid_motion_is_reached_smoothly(self, cell: KukaCell, robot: Robot) -> None:
+        robot.move_to(AWAY_DEG)
+        cell.wait_until_under_way()
+        robot.move_to(HOME_DEG)
+        assert np.allclose(robot.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
+        cell.assert_smooth()
+
+    def test_stop_in_mid_motion_brings_it_to_rest_smoothly(self, cell: KukaCell, robot: Robot) -> None:
+        robot.move_to(AWAY_DEG)
+        cell.wait_until_under_way()
+        robot.stop()
+        assert not robot.measured().moving
+        cell.assert_stands()
+        assert np.max(np.abs(cell.joints_deg() - AWAY_DEG)) > 1.0
+        cell.assert_smooth()
+
+    def test_it_moves_again_after_a_stop(self, cell: KukaCell, robot: Robot) -> None:
+        robot.move_to(AWAY_DEG)
+        cell.wait_until_under_way()
+        robot.stop()
+        robot.move_to(HOME_DEG)
+        assert np.allclose(robot.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
+
+    def test_closing_in_mid_motion_brings_it_to_rest_smoothly(self, cell: KukaCell, robot: Robot) -> None:
+        robot.move_to(AWAY_DEG)
+        cell.wait_until_under_way()
+        robot.close()
+        cell.assert_stands()
+        cell.assert_smooth()
+
+    def test_a_target_out_of_limits_is_refused_by_the_name_of_its_axis(self, cell: KukaCell, robot: Robot) -> None:
+        with pytest.raises(DeviceRefused, match="A5 would be 121"):
+            robot.move_to(np.array([0.0, -90.0, 90.0, 0.0, 121.0, 0.0]))
+        cell.assert_stands()
+
+    def test_an_emergency_stop_is_a_fault_that_only_a_new_driver_leaves_behind(
+        self, cell: KukaCell, robot: Robot
+    ) -> None:
+        robot.move_to(AWAY_DEG)
+        cell.wait_until_under_way()
+        cell.in_world(cell.controller.estop)
+        with pytest.raises(DeviceFault, match="does not follow"):
+            robot.wait_settled()
+        cell.assert_stands()
+        cell.in_world(cell.controller.reset)
+        with pytest.raises(DeviceFault, match="does not follow"):
+            robot.move_to(HOME_DEG)
+        assert "does not follow" in robot.measured().fault
+        cell.assert_stands()
+        robot.close()
+        again = cell.open()
+        again.move_to(HOME_DEG)
+        assert np.allclose(again.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
+
+    def test_a_lost_link_ends_all_motion(self, cell: KukaCell, robot: Robot) -> None:
+        robot.move_to(AWAY_DEG)
+        cell.wait_until_under_way()
+        cell.in_world(lambda: cell.controller.lose_link(1.0))
+        with pytest.raises(DeviceLost):
+            robot.wait_settled()
+        with pytest.raises(DeviceLost):
+            robot.move_to(HOME_DEG)
+        robot.stop()
+        cell.assert_stands()
+
+    def test_a_driver_opened_after_a_lost_link_starts_where_the_arm_stands(
+        self, cell: KukaCell, robot: Robot
+    ) -> None:
+        robot.move_to(AWAY_DEG)
+        cell.wait_until_under_way()
+        cell.in_world(lambda: cell.controller.lose_link(1.0))
+        with pytest.raises(DeviceLost):
+            robot.wait_settled()
+        cell.wait_until(lambda: not cell.controller.moving)
+        robot.close()
+        cell.trace_deg.clear()
+        again = cell.open()
+        again.move_to(AWAY_DEG)
+        assert np.allclose(again.wait_settled().joints_deg, AWAY_DEG, atol=1e-3)
+        cell.assert_smooth()
+
+    def test_an_arm_pushed_aside_is_a_fault(self, cell: KukaCell, robot: Robot) -> None:
+        cell.in_world(lambda: cell.controller.nudge((0.0, 2.0, 0.0, 0.0, 0.0, 0.0)))
+        with pytest.raises(DeviceFault, match="does not follow"):
+            robot.wait_settled()
+
+
+class TestKukaRsi(RobotConformance):
+    @pytest.fixture(params=[4, 12], ids=["4ms", "12ms"])
+    def cell(self, request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[KukaCell]:
+        with closing(KukaCell(tmp_path, request.param)) as cell:
+            yield cell
+
+    def test_a_few_late_answers_are_counted_and_survived(self, cell: KukaCell) -> None:
+        robot = cell.open()
+        robot.move_to(AWAY_DEG)
+        cell.wait_until_under_way()
+        cell.in_world(lambda: cell.controller.late(5))
+        assert np.allclose(robot.wait_settled().joints_deg, AWAY_DEG, atol=1e-3)
+        assert robot.statistics()["late_answers"] == 5
+
+    def test_many_late_answers_are_a_fault(self, cell: KukaCell) -> None:
+        robot = cell.open()
+        robot.move_to(AWAY_DEG)
+        cell.wait_until_under_way()
+        cell.in_world(lambda: cell.controller.late(70))
+        with pytest.raises(DeviceFault, match="late answers"):
+            robot.wait_settled()
+        cell.wait_until(lambda: not cell.controller.moving)
+        cell.assert_stands()
+
+    def test_without_a_controller_opening_fails_and_leaves_no_process(
+        self, cell: KukaCell, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        cell.in_world(lambda: cell.controller.lose_link(1e6))
+        cell.settings = cell.settings.model_copy(update={"connect_timeout_s": 0.5})
+        started: list[subprocess.Popen[bytes]] = []
+        popen = subprocess.Popen
+
+        def watched(*args: object, **options: object) -> subprocess.Popen[bytes]:
+            started.append(popen(*args, **options))  # type: ignore[call-overload]
+            return started[-1]
+
+        monkeypatch.setattr(subprocess, "Popen", watched)
+        with pytest.raises(DeviceTimeout, match="0 packets|0 came"):
+            cell.open()
+        assert [process.returncode is not None for process in started] == [True]
+
+    def test_a_port_in_use_is_told(self, cell: KukaCell) -> None:
+        cell.open()
+        with pytest.raises(DeviceLost, match="in use"):
+            cell.open()
+
+    def test_closing_twice_or_with_a_dead_process_raises_nothing(self, cell: KukaCell) -> None:
+        robot = cell.open()
+        os.kill(robot._process.pid, signal.SIGKILL)
+        robot._process.wait()
+        with pytest.raises(DeviceLost):
+            robot.measured()
+        robot.close()
+        robot.close()
+
+    def test_a_killed_parent_leaves_no_process_and_the_arm_at_rest(self, cell: KukaCell) -> None:
+        script = (
+            "import sys, time, numpy; from pathlib import Path\n"
+            "from sim.clock import SharedClock; from drivers.kuka_rsi import KukaRsi, Settings\n"
+            "robot = KukaRsi(Settings.model_validate_json(sys.argv[1]), SharedClock(Path(sys.argv[2])))\n"
+            f"robot.move_to(numpy.array({AWAY_DEG.tolist()}))\n"
+            "print(robot._process.pid, flush=True)\n"
+            "time.sleep(60)\n"
+        )
+        arguments = [cell.settings.model_dump_json(), str(cell.clock_path)]
+        with subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE) as parent:
+            assert parent.stdout is not None
+            loop = Path(f"/proc/{int(parent.stdout.readline())}")
+            cell.wait_until_under_way()
+            parent.kill()
+        cell.wait_until(lambda: not loop.exists() or "Z" in (loop / "stat").read_text().split()[2])
+        cell.wait_until(lambda: not cell.controller.moving)
+        cell.assert_stands()
+        cell.assert_smooth()
+        again = cell.open()
+        again.move_to(HOME_DEG)
+        assert np.allclose(again.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
+
+    def test_every_error_is_a_device_error_with_a_remedy(self, cell: KukaCell) -> None:
+        robot = cell.open()
+        robot.close()
+        with pytest.raises(DeviceError) as raised:
+            robot.move_to(HOME_DEG)
+        assert raised.value.remedy

@@ -1,0 +1,112 @@
+# Sourced by the scripts of this folder: finds the project and makes its environment ready.
+#
+# Sets `root`, the project's folder. `prepare` makes sure that `$root/.venv` holds what pyproject.toml asks
+# for: with the uv on PATH, or with one that it installs into `$root/.tools/uv-venv`. When nothing has changed
+# since the last time it only compares a stamp. Everything it says goes to standard error.
+# shellcheck shell=bash
+
+root=$(dirname "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")")
+
+prepare() {
+    is_ready && return 0
+    mkdir -p "$root/.tools"
+    local status=0
+    set +e # not `( ... ) ||`: that would switch `set -e` off inside as well
+    (
+        set -e
+        # Two first starts at once: the second waits here, and then finds everything done.
+        if command -v flock >/dev/null; then flock 9; fi
+        is_ready || set_up
+    ) 9>"$root/.tools/lock" >&2 </dev/null
+    status=$?
+    set -e
+    ((status == 0)) || fail "the set-up failed; see the messages above"
+}
+
+# ---- helpers ----
+
+say() { printf 'coupole: %s\n' "$*" >&2; }
+
+fail() {
+    say "$*"
+    exit 1
+}
+
+# What the environment was made from; virtual environments hold absolute paths, hence the folder.
+stamp_now() {
+    printf '%s\n' "$root"
+    cat "$root/pyproject.toml" "$root/.venv/pyvenv.cfg" | sha256sum
+}
+
+is_ready() {
+    [[ -f "$root/.tools/stamp" && -x "$root/.venv/bin/python" && -x "$root/.venv/bin/coupole" ]] &&
+        [[ "$(<"$root/.tools/stamp")" == "$(stamp_now)" ]]
+}
+
+set_up() {
+    local uv
+    say "setting up the environment in $root/.venv (once; needs the network)"
+    if [[ -f "$root/.tools/stamp" && "$(head -n 1 "$root/.tools/stamp")" != "$root" ]]; then
+        rm -rf "$root/.venv" "$root/.tools/uv-venv" # made for the folder that this one was copied from
+    fi
+    rm -f "$root/.tools/stamp"
+    find_python
+    find_uv
+    cd "$root"
+    unset VIRTUAL_ENV
+    export UV_PROJECT_ENVIRONMENT="$root/.venv"
+    if [[ -n "$python" ]]; then
+        UV_PYTHON_DOWNLOADS=never "$uv" sync --inexact --no-managed-python --python "$python"
+    else
+        "$uv" sync --inexact --python '>=3.11,<3.14'
+    fi
+    stamp_now >"$root/.tools/stamp.new"
+    mv "$root/.tools/stamp.new" "$root/.tools/stamp"
+}
+
+# Sets `python` to the first interpreter that fits, or to nothing.
+find_python() {
+    local name
+    for name in python3.13 python3.12 python3.11 python3; do
+        python=$("$name" -c '
+import sys
+if not (3, 11) <= sys.version_info < (3, 14):
+    sys.exit(1)
+print(sys.executable)' 2>/dev/null) && return 0
+    done
+    python=""
+}
+
+# Sets `uv` to one that runs: from PATH, from an earlier start, or freshly installed.
+find_uv() {
+    local home="$root/.tools/uv-venv"
+    for uv in uv "$home/bin/uv"; do
+        "$uv" --version >/dev/null 2>&1 && return 0
+    done
+    install_uv "${python:-python3}" "$home"
+}
+
+# Debian refuses pip outside a virtual environment, and may lack what makes one.
+install_uv() {
+    local python=$1 home=$2 minor
+    minor=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null) ||
+        fail "no Python found; install Python 3.11, 3.12 or 3.13 (Debian: apt install python3 python3-venv)"
+    if ! "$python" -c 'import ensurepip' 2>/dev/null && [[ $EUID -eq 0 ]] && command -v apt-get >/dev/null; then
+        say "installing python$minor-venv with apt-get"
+        export DEBIAN_FRONTEND=noninteractive
+        { apt-get update -qq && apt-get install -y -qq "python$minor-venv"; } ||
+            apt-get install -y -qq python3-venv || say "apt-get could not install python$minor-venv"
+    fi
+    rm -rf "$home"
+    if "$python" -c 'import ensurepip' 2>/dev/null; then
+        "$python" -m venv "$home"
+        "$home/bin/python" -m pip install --quiet --disable-pip-version-check uv
+    elif "$python" -m pip --version >/dev/null 2>&1; then
+        "$python" -m venv --without-pip "$home"
+        "$python" -m pip --python "$home/bin/python" install --quiet --disable-pip-version-check uv
+    else
+        fail "Python $minor at $python cannot make virtual environments: install python$minor-venv" \
+            "(Debian: sudo apt install python3-venv), or uv, and start again"
+    fi
+    uv="$home/bin/uv"
+}

@@ -24,6 +24,7 @@ from coupole.rig import (
 )
 
 DRY_RUN_WIDTH_PX = 128
+_LONGEST_WATCHDOG_S = 60.0
 DRY_RUN_PICTURES = 48
 """Frames of each burst that a dry run renders, about: the sample that exposure is judged on."""
 
@@ -92,11 +93,11 @@ def open_cell(
         opened: dict[str, Any] = {}
         identities: dict[str, Identity] = {}
         for kind in ("ledbox", "camera", "robot"):
-            opened[kind] = _open_device(cell.rig, kind, clock, endpoints, dry_run=dry_run)
+            opened[kind] = _open_device(cell.rig, kind, clock, endpoints, dry_run=dry_run, speed=speed or 1.0)
             stack.callback(opened[kind].close)
             identities[kind] = opened[kind].identify()
             on_opened(kind, identities[kind])
-        yield_cell = OpenedCell(
+        opened_cell = OpenedCell(
             clock,
             **opened,
             sensor=sensor,
@@ -105,13 +106,18 @@ def open_cell(
             identities=identities,
         )
         try:
-            yield yield_cell
+            yield opened_cell
         finally:
-            yield_cell.make_safe()
+            opened_cell.make_safe()
 
 
-def _open_device(rig: Rig, kind: str, clock: Clock, endpoints: Mapping[str, Any] | None, *, dry_run: bool) -> Any:
+def _open_device(
+    rig: Rig, kind: str, clock: Clock, endpoints: Mapping[str, Any] | None, *, dry_run: bool, speed: float
+) -> Any:
     driver, settings = device_for(rig, kind, dry_run=dry_run)
+    if speed > 1.0 and "watchdog_s" in settings_class(driver).model_fields:
+        # The world's seconds pass faster than the host's: its watchdog must not bite a host that is on time.
+        settings["watchdog_s"] = min(_LONGEST_WATCHDOG_S, settings.get("watchdog_s", 2.0) * speed)
     if endpoints is not None:
         endpoint_key, setting, _ = ENDPOINT_SETTINGS[kind]
         settings[setting] = endpoints[kind][endpoint_key]
@@ -134,7 +140,7 @@ def world_config(
     rig = cell.rig
     settings: dict[str, Any] = dict(rig.world.settings) if rig.world else {}
     if speed is not None:
-        settings["speed"] = speed
+        settings |= {"speed": speed, "hurry_only_when_told": dry_run}
     robot = {"start_joints_deg": list(rig.motion.home_joints_deg), **settings.get("robot", {})}
     robot.setdefault("sends_to", f"127.0.0.1:{_free_udp_port()}")
     robot.setdefault("cycle_ms", rig.robot.settings.get("cycle_ms", 4))

@@ -40,7 +40,7 @@ def main() -> None:
         code = Interrupted.exit_code
     except typer.Abort:
         code = Interrupted.exit_code
-    except Exception as error:  # noqa: BLE001  click's usage errors, which know their own exit code
+    except Exception as error:  # click's usage errors, which know their own exit code
         if not hasattr(error, "exit_code") or not hasattr(error, "show"):
             raise
         error.show()
@@ -80,8 +80,7 @@ def check(
 ) -> None:
     """Say everything that can be known of a plan before a device is touched."""
     from coupole.console import make_console, show_preflight, show_views
-    from coupole.job import read_job
-    from coupole.session import preflight_of
+    from coupole.job import preflight_of, read_job
 
     console = make_console(quiet=as_json)
     try:
@@ -89,7 +88,7 @@ def check(
     except InputError as error:
         _fail(error, as_json=as_json, found={"ok": False, "refusals": []})
         raise
-    report = preflight_of(job, job.cell.storage_folder, measure_disk=True)
+    report = preflight_of(job, job.cell.storage_folder)
     show_preflight(console, report, name=job.plan.name, rig=job.cell.rig.name)
     show_views(console, report)
     if as_json:
@@ -204,7 +203,7 @@ def status(run: RunPath, as_json: JsonOption = False) -> None:
 @app.command()
 def verify(run: RunPath, as_json: JsonOption = False) -> None:
     """Read every frame of a run back: completeness and every checksum."""
-    from rich.progress import track
+    from rich.progress import Progress
 
     from coupole.console import make_console
     from coupole.errors import ChecksumMismatch, UnprovenError
@@ -213,11 +212,9 @@ def verify(run: RunPath, as_json: JsonOption = False) -> None:
 
     console = make_console(quiet=as_json)
     opened = Run(run)
-    total = len(opened.proven())
-    ticks = iter(track(range(total), "verifying", console=console, disable=not console.is_terminal))
-    found = verify_run(opened, lambda done, of: next(ticks, None) and None)
-    for _ in ticks:
-        pass
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        bar = bars.add_task("reading back")
+        found = verify_run(opened, lambda done, total: bars.update(bar, completed=done, total=total))
     for problem in found.bad:
         console.print(f"[red]bad:[/] {problem}")
     if found.missing:

@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from coupole.observer import Observer, Outcome
+from coupole.observer import Progress as RunProgress
 from coupole.preflight import Report
 from coupole.recorder import DryRecorder
 from coupole.run import Status
-from coupole.sequencer import Observer, Outcome
-from coupole.sequencer import Progress as RunProgress
 
 _PLAIN_LINE_EVERY_S = 5.0
 

@@ -67,6 +67,10 @@ class Clock(Protocol):
         """Wait `seconds` on this clock; returns early only if the clock's source is gone."""
         ...
 
+    def hurry(self, until_ns: int) -> None:
+        """Until then the caller only waits: a simulated clock may run fast. A real one cannot."""
+        ...
+
 
 class SystemClock:
     """The clock of a rig of real devices: the machine's monotonic one."""
@@ -76,6 +80,9 @@ class SystemClock:
 
     def sleep(self, seconds: float) -> None:
         time.sleep(seconds)
+
+    def hurry(self, until_ns: int) -> None:
+        """Real time does not hurry."""
 
 
 class Deadline:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole import yamlfile
+from coupole import ledger, yamlfile
 from coupole.dome import LedTable, read_led_table
-from coupole.errors import InputError, Problem
+from coupole.errors import InputError, Problem, StorageError
 from coupole.geometry import apply
 from coupole.plan import MeasuredObject, Plan
+from coupole.preflight import Report, StorageFacts, check
 from coupole.rig import Rig, driver_problems
 from coupole.run import Inputs
 from coupole.shots import Schedule, build_schedule, missing_lights
+from coupole.store import measure_write_speed
 from coupole.yamlfile import Document
 
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
@@ -157,3 +160,29 @@ def bounding_points(mesh_path: Path, measured: MeasuredObject) -> NDArray[np.flo
     box = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     points = np.concatenate([box, [(low + high) / 2]])
     return apply(measured.support_from_object.matrix(), points)
+
+
+def preflight_of(job: Job, folder: Path) -> Report:
+    """Preflight's report on a job whose run would lie in `folder`; the disk there is measured."""
+    existing = folder
+    while not existing.exists():
+        existing = existing.parent
+    try:
+        write_bytes_s = measure_write_speed(existing)
+    except StorageError:
+        write_bytes_s = 0.0
+    return check_job(job, StorageFacts(shutil.disk_usage(existing).free, write_bytes_s))
+
+
+def check_job(job: Job, storage: StorageFacts) -> Report:
+    """Preflight's report on a job, given what is known of the disk."""
+    before = ledger.total_lux_h(job.cell.storage_folder, job.plan.object.id) if job.plan.object else 0.0
+    return check(
+        job.plan,
+        job.cell.rig,
+        job.schedule,
+        job.cell.leds,
+        storage,
+        object_points_support_mm=job.object_points_support_mm,
+        dose_before_lux_h=before,
+    )

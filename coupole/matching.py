@@ -13,7 +13,8 @@ interference). Timestamps deviate from their edges by at most `jitter_us`, clock
 **Proof.** Under that model the true alignment leaves at most `max_surplus` frames unexplained. So it is among
 the hypotheses that do, the *candidates*; and a label on which all candidates agree is true. Frames on which
 they disagree, and steps that two frames claim, are ambiguous and get no label. All alignments are tried: the
-true one fires at least one of the first `max_surplus + 1` frames, so one of these serves as anchor.
+true one fires at least one of the first `max_surplus + 1` frames, so one of these serves as anchor (of fewer
+frames nothing is proven; while the burst runs, of fewer than `in_flight` more).
 
 Everything here is a pure function of its arguments and is simply run again as a burst goes on.
 """
@@ -74,8 +75,8 @@ class Match:
     clocks: ClockFit | None
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _align(  # type: ignore[no-untyped-def]  # noqa: PLR0912
+@numba.njit(cache=True, nogil=True)
+def _align(  # type: ignore[no-untyped-def]
     frame_ns, step_ns, anchor_frame, anchor_step, jitter_ns, drift, max_surplus, in_flight, steps_out
 ):
     """Fill `steps_out` [frames] under one hypothesis; True if it is a candidate."""
@@ -96,8 +97,6 @@ def _align(  # type: ignore[no-untyped-def]  # noqa: PLR0912
             if step >= n_steps and in_flight > 0:
                 pending += 1
                 steps_out[frame] = _PENDING
-                if pending > in_flight:
-                    return False
             elif step < 0 or step >= n_steps or abs(step_ns[step] - predicted) > window:
                 surplus += 1
                 steps_out[frame] = _SURPLUS
@@ -111,13 +110,13 @@ def _align(  # type: ignore[no-untyped-def]  # noqa: PLR0912
                 else:
                     ref_frame, ref_step = frame, step
                 steps_out[frame] = step
-            if surplus > max_surplus:
+            if surplus + max(0, pending - in_flight) > max_surplus:  # surplus frames may be pending, too
                 return False
             frame += way
     return True
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True)
 def _agree(  # type: ignore[no-untyped-def]
     frame_ns, step_ns, jitter_ns, drift, max_surplus, in_flight, agreed, agrees
 ):
@@ -190,6 +189,10 @@ def match(
     if np.any(np.diff(timestamps_ns) <= 0):
         return unproven("the camera's timestamps do not increase")
 
+    in_flight = 0 if complete else model.in_flight
+    if n_frames <= model.max_surplus + in_flight:
+        return unproven("too few frames: all of them may be surplus, or of steps that are not in the log yet")
+
     step_ns = log["t_trigger_ns"][edged].astype(np.int64)
     agreed, agrees = steps.copy(), np.zeros(n_frames, np.bool_)
     candidates = _agree(
@@ -198,7 +201,7 @@ def match(
         model.jitter_us * 1e3,
         model.drift_ppm * 1e-6,
         model.max_surplus,
-        0 if complete else model.in_flight,
+        in_flight,
         agreed,
         agrees,
     )

@@ -6,6 +6,7 @@ refuses keys that it does not know. `coupole.yamlfile` turns what is refused her
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -148,7 +149,7 @@ class BracketExposure(Model):
     @field_validator("exposures_us")
     @classmethod
     def _increasing(cls, exposures_us: tuple[int, ...]) -> tuple[int, ...]:
-        if any(b <= a for a, b in zip(exposures_us, exposures_us[1:], strict=False)):
+        if any(b <= a for a, b in pairwise(exposures_us)):
             raise ValueError("increasing exposures, each longer than the one before")
         return exposures_us
 

@@ -91,7 +91,7 @@ def base_from_flange(view: ViewPose, rig: Rig) -> Transform:
 def joints_for_views(
     views: Sequence[ViewPose], rig: Rig, start_deg: Sequence[float]
 ) -> tuple[list[NDArray[np.float64] | None], list[str]]:
-    """Joint angles [6] for each view, each the nearest to the one before; None and a refusal where there is none."""
+    """Joint angles [6] of each view, the nearest to those before; None and a refusal where there are none."""
     arm = arm_of(rig)
     here = np.asarray(start_deg, dtype=np.float64)
     joints: list[NDArray[np.float64] | None] = []
@@ -343,11 +343,11 @@ def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts
         )
     elif storage.write_bytes_s and report.asked_bytes_s > _DISK_SHARE * storage.write_bytes_s:
         report.warnings.append(
-            f"frames come at {report.asked_bytes_s / 1e6:.0f} MB/s, close to the {storage.write_bytes_s / 1e6:.0f} "
-            "MB/s that the disk takes"
+            f"frames come at {report.asked_bytes_s / 1e6:.0f} MB/s, close to the "
+            f"{storage.write_bytes_s / 1e6:.0f} MB/s that the disk takes"
         )
     if frame_bytes % PAGE_BYTES:
         report.warnings.append(
-            f"a frame of {rig.sensor.width_px} x {rig.sensor.height_px} is no multiple of {PAGE_BYTES} bytes: it is "
-            "written through the page cache, which is slower"
+            f"a frame of {rig.sensor.width_px} x {rig.sensor.height_px} is no multiple of {PAGE_BYTES} bytes: "
+            "it is written through the page cache, which is slower"
         )

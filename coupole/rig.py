@@ -23,14 +23,14 @@ class Twin(Model):
     """The simulated counterpart that `--dry-run` opens in a device's place."""
 
     driver: DriverName
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = Field(default_factory=dict)
 
 
 class Device(Model):
     """A driver and its settings. On a simulated rig the world's endpoint fills in the address."""
 
     driver: DriverName
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = Field(default_factory=dict)
     twin: Twin | None = None
 
 
@@ -53,7 +53,7 @@ class Sensor(Model):
 
     @property
     def white_dn(self) -> int:
-        return 2**self.bit_depth - 1
+        return (1 << self.bit_depth) - 1
 
 
 class Lens(Model):
@@ -143,7 +143,7 @@ class WorldSection(Model):
     join: Path | None = None
     """File with the JSON line of a `coupole sim` that is running already."""
     driver: DriverName = "sim.client:World"
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = Field(default_factory=dict)
 
 
 class Rig(Model):

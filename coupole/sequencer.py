@@ -7,7 +7,6 @@ armed, then lights; and backwards. On the way out, whatever the reason, `coupole
 from __future__ import annotations
 
 import contextlib
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -29,8 +28,9 @@ from coupole.devices import (
 from coupole.errors import CoupoleError, DeviceError, DeviceFault, DeviceTimeout, Interrupted, UnprovenError
 from coupole.intake import Intake
 from coupole.job import Job
-from coupole.matching import UNLABELLED, FaultModel, Match, compile_now, match
 from coupole.kinematics import move_duration_s
+from coupole.matching import UNLABELLED, FaultModel, Match, compile_now, match
+from coupole.observer import Control, Observer, Outcome, Progress
 from coupole.preflight import arm_of, joints_for_views
 from coupole.recorder import Recorder
 from coupole.run import is_shot
@@ -41,60 +41,12 @@ _LAST_FRAMES_S = 1.0
 """How long after a burst's end its last frames may take to reach the host, readout apart."""
 _CLOCK_TOLERANCE, _STALL_S = 1.02, 5.0
 """A burst may take so much longer than its table says, as a factor and in seconds."""
+_LAST_STRETCH_S = 0.2
+"""Of a burst, in which the host has to be on its feet."""
 _BOX_JITTER_US = 20.0
 _BUFFERS = 64
 _PAUSE_NAP_S = 0.1
 _LIT_IN_VAIN = STATUS_LED_OPEN | STATUS_OVER_TEMPERATURE
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where the run is, for whoever watches."""
-
-    view: str
-    view_number: int
-    views: int
-    proven: int
-    """Proven frames of the whole run, darks included."""
-    frames: int
-    light: str
-    dose_lux_h: float
-
-
-class Observer:
-    """Watches a run; override what is of interest. Called on the sequencer's thread, so be brief."""
-
-    def progress(self, progress: Progress) -> None:
-        """Something was proven, or time went by."""
-
-    def note(self, message: str) -> None:
-        """Something that the operator should know."""
-
-
-@dataclass
-class Control:
-    """How the operator reaches into a run: set from signal handlers and other threads."""
-
-    stop: threading.Event = field(default_factory=threading.Event)
-    pause: threading.Event = field(default_factory=threading.Event)
-
-
-@dataclass
-class Outcome:
-    """What came of it."""
-
-    shots: int
-    proven: int = 0
-    reshot: int = 0
-    bad: list[str] = field(default_factory=list)
-    """Shots whose LED drew no current: proven dark, so not kept as shots."""
-    missing: list[str] = field(default_factory=list)
-    duration_s: float = 0.0
-    ideal_s: float = 0.0
-    """Motion and settling at the arm's limits plus the tables' own time, of what this session did."""
-    dose_lux_h: float = 0.0
-    over_triggers: int = 0
-    lost_transfers: int = 0
 
 
 @dataclass
@@ -202,10 +154,12 @@ class Sequencer:
         self._recorder.event("move", view=view.name, joints_deg=[round(float(j), 6) for j in joints_deg])
         motion = self._job.cell.rig.motion
         here_deg = self._cell.robot.measured().joints_deg
-        self.outcome.ideal_s += move_duration_s(self._arm, here_deg, joints_deg) + motion.settle_dwell_s
+        motion_s = move_duration_s(self._arm, here_deg, joints_deg) + motion.settle_dwell_s
+        self.outcome.ideal_s += motion_s
         self.outcome.ideal_s += sum(burst.duration_s for burst in left)
         self._cell.robot.move_to(joints_deg)
         self._cell.ledbox.load(left[0].table)
+        self._hurry(motion_s)
         while self._cell.robot.measured().moving:
             self._raise_if_stopped()
             self._cell.clock.sleep(POLL_S)
@@ -308,6 +262,7 @@ class Sequencer:
             box.start(burst.table)
             if following is not None:
                 box.load(following.table)
+            self._hurry(burst.duration_s - _LAST_STRETCH_S)
             self._follow(firing)
             if burst.panel:
                 box.panel(burst.panel, False)
@@ -480,6 +435,11 @@ class Sequencer:
                 remedy="Check the box, then resume the run.",
             )
         return frame, record, lit_throughout
+
+    def _hurry(self, seconds: float) -> None:
+        """For so long there is nothing to do but to watch: a rehearsal's clock may run fast."""
+        clock = self._cell.clock
+        clock.hurry(clock.now_ns() + int(max(0.0, seconds) * 1e9))
 
     # -- small things -------------------------------------------------------------------------------------
 

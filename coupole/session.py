@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import threading
 import time
@@ -18,44 +17,14 @@ from coupole import ledger, report
 from coupole.cell import OpenedCell, coarse, open_cell
 from coupole.console import RunObserver, show_dry_run, show_preflight
 from coupole.devices import Identity
-from coupole.errors import CoupoleError, Interrupted, PreflightRefused, StorageError
-from coupole.job import Job
-from coupole.preflight import Report, StorageFacts, check
+from coupole.errors import CoupoleError, Interrupted, PreflightRefused
+from coupole.job import Job, check_job, preflight_of
+from coupole.observer import Control, Outcome
+from coupole.preflight import Report, StorageFacts
 from coupole.recorder import DryRecorder, RunRecorder
 from coupole.rig import in_world
 from coupole.run import Run, is_shot
-from coupole.sequencer import Control, Outcome, Sequencer
-from coupole.store import measure_write_speed
-
-UNLIMITED_BYTES = 2**62
-
-
-def preflight_of(job: Job, folder: Path, *, measure_disk: bool) -> Report:
-    """Preflight's report on a job whose run would lie in `folder`."""
-    existing = folder
-    while not existing.exists():
-        existing = existing.parent
-    speed = 0.0
-    if measure_disk:
-        try:
-            speed = measure_write_speed(existing)
-        except StorageError:
-            speed = 0.0
-    storage = StorageFacts(shutil.disk_usage(existing).free, speed)
-    return _check(job, storage)
-
-
-def _check(job: Job, storage: StorageFacts) -> Report:
-    before = ledger.total_lux_h(job.cell.storage_folder, job.plan.object.id) if job.plan.object else 0.0
-    return check(
-        job.plan,
-        job.cell.rig,
-        job.schedule,
-        job.cell.leds,
-        storage,
-        object_points_support_mm=job.object_points_support_mm,
-        dose_before_lux_h=before,
-    )
+from coupole.sequencer import Sequencer
 
 
 def _refuse(found: Report) -> None:
@@ -85,6 +54,10 @@ def _operator(control: Control) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+UNLIMITED_BYTES = 2**62
+"""A rehearsal keeps nothing: the disk does not matter."""
+
+
 # -- the run ----------------------------------------------------------------------------------------------
 
 
@@ -102,7 +75,7 @@ def acquire_plan(
     if run is not None:
         run.refuse_changes(job.inputs)
     folder = (run.folder if run else parent or job.cell.storage_folder).resolve()
-    preflight = preflight_of(job, folder, measure_disk=True)
+    preflight = preflight_of(job, folder)
     if run is not None:
         done_bytes = len(run.proven()) * job.cell.rig.sensor.frame_bytes
         preflight.refusals = [r for r in preflight.refusals if done_bytes == 0 or not r.startswith("storage")]
@@ -239,7 +212,7 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> No
 
 def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any]) -> None:
     """Run a whole plan on the rig's twin, faster than life, and say what preflight could not know."""
-    preflight = _check(job, StorageFacts(UNLIMITED_BYTES))
+    preflight = check_job(job, StorageFacts(UNLIMITED_BYTES))
     show_preflight(console, preflight, name=job.plan.name, rig=f"the twin of {job.cell.rig.name}")
     _refuse(preflight)
     recorder, control = DryRecorder(), Control()

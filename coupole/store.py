@@ -69,7 +69,7 @@ _DATA, _FRAMES, _POSES = (
 
 def checksum(pixels: NDArray[np.uint16]) -> int:
     """xxh3-64 of a frame's bytes."""
-    return xxhash.xxh3_64_intdigest(memoryview(pixels).cast("B"))
+    return xxhash.xxh3_64_intdigest(pixels.data.cast("B"))
 
 
 def _storage_error(path: Path, error: OSError) -> StorageError:
@@ -173,7 +173,8 @@ def read_layout(path: Path) -> Layout:
     try:
         with h5py.File(path, "r") as file:
             data, frames, poses = file[_DATA], file[_FRAMES], file[_POSES]
-            return Layout(*data.shape, data.id.get_offset(), frames.id.get_offset(), poses.id.get_offset())
+            frames_px: tuple[int, int, int] = data.shape
+            return Layout(*frames_px, data.id.get_offset(), frames.id.get_offset(), poses.id.get_offset())
     except (OSError, KeyError) as error:
         raise StorageError(f"{path}: not a view file of a run: {error}") from error
 
@@ -271,7 +272,7 @@ class ViewWriter:
         record["state"], record["frame_id"], record["camera_ns"] = STORED, frame_id, camera_ns
         record["exposure_us"], record["xxh3"] = exposure_us, checksum(pixels)
         offset = self._layout.data_offset + slot * self._layout.frame_bytes
-        self._write(self._fd, memoryview(pixels).cast("B"), offset)
+        self._write(self._fd, pixels.data.cast("B"), offset)
         self._write_record(slot)
         return slot
 

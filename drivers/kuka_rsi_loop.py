@@ -35,8 +35,8 @@ def serve(link: socket.socket, shared: block.Block, parent_pid: int, config: Con
     responder = Responder(config)
     shared.write_state(responder.state(realtime))
     _drop_backlog(link)
-    leaving, idle, orphan_ns, look_ns = False, False, 0, 0
-    while not (leaving and (idle or responder.motion.phase == block.STANDING)):
+    leaving, orphan_ns, look_ns = False, 0, 0
+    while not (leaving and responder.motion.phase == block.STANDING):
         try:
             data, address = link.recvfrom(4096)
             idle = False

@@ -184,11 +184,15 @@ class Responder:
             self.fail(block.LINK_LOST, f"no packet for {silent_s:.2f} s, the delay counter was {self.delay}")
 
     def fail(self, fault: int, text: str) -> None:
-        """Latch the first fault and bring the commanded axes to rest."""
+        """Latch the first fault and bring the commanded axes to rest: along their path if the arm is with them
+        and listens, else where they are, so that nothing pushes on."""
         if self.fault == block.NO_FAULT:
             self.fault, self.fault_text = fault, text.encode()
         self._session_over |= fault == block.LINK_LOST
-        self.motion.stop()
+        if fault in (block.LINK_LOST, block.NOT_FOLLOWING):
+            self.motion.stand_at(self.motion.commanded_deg)
+        else:
+            self.motion.stop()
 
     def state(self, realtime: int) -> block.State:
         return block.State(

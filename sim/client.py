@@ -12,7 +12,7 @@ from typing import IO, Any
 
 from coupole.errors import DeviceError, DeviceLost, DeviceTimeout
 from sim.clock import SharedClock
-from sim.world import Config, Settings
+from sim.config import Config, Settings
 
 __all__ = ["Config", "Settings", "World"]
 
@@ -35,7 +35,7 @@ class World:
         `config` is the JSON form of `Config`. Raises DeviceError if the world does not come up.
         """
         line = Config.model_validate(config).model_dump_json()
-        process = subprocess.Popen(  # noqa: S603
+        process = subprocess.Popen(
             [sys.executable, "-m", "sim.world"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -2,7 +2,10 @@
 
 World time runs `speed` times as fast as the machine's monotonic clock, never past the next event that the
 world has not worked off yet (the *horizon*): a slow or lock-stepped world stretches its time instead of
-letting events happen late. Four numbers in shared memory are all that a reader needs.
+letting events happen late. A few numbers in shared memory are all that a reader needs.
+
+A world that is to *hurry only when told* runs in real time except until a moment that its client names: the
+client's own work then costs as much world time as it would cost in life, and only its waiting is cut short.
 """
 
 from __future__ import annotations
@@ -10,43 +13,78 @@ from __future__ import annotations
 import mmap
 import struct
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
-_BLOCK = struct.Struct("<QqqdqQ")
-"""Sequence (odd while being written), machine ns at the anchor, world ns at the anchor, speed, horizon ns,
-1 while the world lives."""
-BLOCK_BYTES = _BLOCK.size
+_BLOCK = struct.Struct("<QqqdqqQ")
+"""Sequence (odd while being written), machine ns and world ns at the anchor, speed, hurry-until ns, horizon ns,
+1 while the world lives. The client's wish, hurry-until ns, stands behind it."""
+_SEQUENCE, _WISH = struct.Struct("<Q"), struct.Struct("<q")
+BLOCK_BYTES = _BLOCK.size + _WISH.size
 _NAP_S = 0.02
 FOREVER_NS = 2**62
+
+
+@dataclass(frozen=True)
+class Pace:
+    """World time as a function of machine time: `speed` from the anchor until `hurry_until_ns`, then real time
+    (or slower, for a speed below 1)."""
+
+    machine_ns: int
+    world_ns: int
+    speed: float
+    hurry_until_ns: int
+
+    def world_at(self, machine_ns: int) -> int:
+        hurried_ns = self.world_ns + int((machine_ns - self.machine_ns) * self.speed)
+        if hurried_ns <= self.hurry_until_ns:
+            return hurried_ns
+        switch_ns = max(self.world_ns, self.hurry_until_ns)
+        machine_at_switch_ns = self.machine_ns + (switch_ns - self.world_ns) / self.speed
+        return int(switch_ns + (machine_ns - machine_at_switch_ns) * min(1.0, self.speed))
 
 
 class ClockWriter:
     """The world's side: it owns the block and moves anchor and horizon."""
 
-    def __init__(self, path: Path, speed: float) -> None:
+    def __init__(self, path: Path, speed: float, *, hurry_only_when_told: bool = False) -> None:
         self.speed = speed
         self._sequence = 0
-        self._anchor_machine_ns = time.monotonic_ns()
-        self._anchor_world_ns = 0
+        self._told = hurry_only_when_told
         path.write_bytes(bytes(BLOCK_BYTES))
         with path.open("r+b") as file:
             self._memory = mmap.mmap(file.fileno(), BLOCK_BYTES)
+        until_ns = 0 if hurry_only_when_told else FOREVER_NS
+        self._pace = Pace(time.monotonic_ns(), 0, speed, until_ns)
         self.publish(horizon_ns=0)
 
     def paced_ns(self) -> int:
         """World time that the pace alone would give now, events apart."""
-        return self._anchor_world_ns + int((time.monotonic_ns() - self._anchor_machine_ns) * self.speed)
+        now_ns = time.monotonic_ns()
+        world_ns = self._pace.world_at(now_ns)
+        if self._told:
+            (wish_ns,) = _WISH.unpack_from(self._memory, _BLOCK.size)
+            if wish_ns != self._pace.hurry_until_ns:
+                self._pace = Pace(now_ns, world_ns, self.speed, wish_ns)
+        return world_ns
+
+    def machine_s_until(self, world_ns: int) -> float:
+        """Shortest machine time until `world_ns`; the pace may turn out slower."""
+        return (world_ns - self.paced_ns()) / 1e9 / self.speed
 
     def slip_to(self, world_ns: int) -> None:
         """Let it be `world_ns` now: the world fell behind and does not rush to catch up."""
-        self._anchor_machine_ns = time.monotonic_ns()
-        self._anchor_world_ns = world_ns
+        self._pace = Pace(time.monotonic_ns(), world_ns, self.speed, self._pace.hurry_until_ns)
 
     def publish(self, horizon_ns: int, *, alive: bool = True) -> None:
         self._sequence += 2
-        fields = (self._anchor_machine_ns, self._anchor_world_ns, self.speed, horizon_ns, int(alive))
-        _BLOCK.pack_into(self._memory, 0, self._sequence - 1, *fields)
-        _BLOCK.pack_into(self._memory, 0, self._sequence, *fields)
+        pace = self._pace
+        fields = (pace.machine_ns, pace.world_ns, pace.speed, pace.hurry_until_ns, horizon_ns, int(alive))
+        # Whole slices, in this order: `pack_into` would zero the block first, and a reader would see that.
+        block = _BLOCK.pack(self._sequence, *fields)
+        self._memory[:8] = _SEQUENCE.pack(self._sequence - 1)
+        self._memory[8 : _BLOCK.size] = block[8:]
+        self._memory[:8] = block[:8]
 
     def close(self) -> None:
         self.publish(0, alive=False)
@@ -57,33 +95,32 @@ class SharedClock:
     """A reader's side: `coupole.devices.Clock` on the block at `path`."""
 
     def __init__(self, path: Path) -> None:
-        with path.open("rb") as file:
-            self._memory = mmap.mmap(file.fileno(), BLOCK_BYTES, access=mmap.ACCESS_READ)
+        with path.open("r+b") as file:
+            self._memory = mmap.mmap(file.fileno(), BLOCK_BYTES)
         self._last_ns = 0
 
-    def _read(self) -> tuple[int, int, float, int, bool]:
+    def _read(self) -> tuple[Pace, int, bool]:
         while True:
-            sequence, machine_ns, world_ns, speed, horizon_ns, alive = _BLOCK.unpack_from(self._memory)
-            if sequence % 2 == 0 and _BLOCK.unpack_from(self._memory)[0] == sequence:
-                return machine_ns, world_ns, speed, horizon_ns, bool(alive)
+            sequence, *pace, horizon_ns, alive = _BLOCK.unpack_from(self._memory)
+            if sequence % 2 == 0 and _SEQUENCE.unpack_from(self._memory)[0] == sequence:
+                return Pace(*pace), horizon_ns, bool(alive)
 
     @property
     def alive(self) -> bool:
-        return self._read()[4]
-
-    @property
-    def speed(self) -> float:
-        """The pace asked of the world, not what it reaches."""
         return self._read()[2]
 
     def now_ns(self) -> int:
         """World time, never running backwards."""
-        machine_ns, world_ns, speed, horizon_ns, _ = self._read()
-        paced_ns = world_ns + int((time.monotonic_ns() - machine_ns) * speed)
-        self._last_ns = max(self._last_ns, min(paced_ns, horizon_ns))
+        pace, horizon_ns, _ = self._read()
+        self._last_ns = max(self._last_ns, min(pace.world_at(time.monotonic_ns()), horizon_ns))
         return self._last_ns
 
     def sleep(self, seconds: float) -> None:
         end_ns = self.now_ns() + int(seconds * 1e9)
+        speed = self._read()[0].speed
         while self.alive and (left_ns := end_ns - self.now_ns()) > 0:
-            time.sleep(min(_NAP_S, max(left_ns / 1e9 / self.speed, 2e-5)))
+            time.sleep(min(_NAP_S, max(left_ns / 1e9 / speed, 2e-5)))
+
+    def hurry(self, until_ns: int) -> None:
+        """Tell a world that hurries only when told that it may, until then."""
+        self._memory[_BLOCK.size :] = _WISH.pack(until_ns)

@@ -109,9 +109,10 @@ class LateRsi(When):
 
 
 class RsiLinkLoss(When):
-    """The robot's controller sends no more packets."""
+    """The robot's controller sends no packets for `seconds`, then starts its program again."""
 
     kind: Literal["rsi_link_loss"]
+    seconds: Annotated[float, Field(gt=0)] = 10.0
 
 
 class NudgeArm(When):

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
 from coupole.geometry import Transform
 from sim.camera_server import Exposed
+from sim.config import WHITE_SHARE, CameraConfig, SceneConfig
 from sim.scene import (
     Leds,
     Pinhole,
@@ -24,50 +21,8 @@ from sim.scene import (
 )
 from sim.sensor import SensorModel, expose
 
-WHITE_SHARE = 0.6
-"""A white target at the support's centre reaches this share of full scale at the plan's exposure (design)."""
 _POSE_TOLERANCE = 1e-6
 _CACHED_LEDS = 4096
-
-
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class MeshConfig(_Model):
-    """One object: its mesh and where it lies on the support (row-major 4x4)."""
-
-    path: Path
-    unit: Literal["mm", "m", "um"]
-    support_from_object: list[list[float]]
-
-
-class SceneConfig(_Model):
-    """Geometry of the simulated cell; transforms are row-major 4x4."""
-
-    leds: Path
-    emission: Literal["lambertian", "paper"]
-    base_from_support: list[list[float]]
-    support_diameter_mm: float
-    objects: list[MeshConfig]
-
-
-class CameraConfig(_Model):
-    """Sensor and lens of the simulated camera."""
-
-    width_px: int
-    height_px: int
-    pixel_pitch_um: float
-    bit_depth: int
-    bayer_pattern: str
-    black_dn: int
-    max_frames_per_s: float
-    exposure_gap_us: int
-    focal_length_mm: float
-    focus_distance_mm: float
-    flange_from_camera: list[list[float]]
-    nominal_exposure_us: int
-    """The exposure at which white reaches `WHITE_SHARE` of full scale."""
 
 
 class Photographer:

@@ -102,7 +102,7 @@ class Reactor:
         """Work until stopped."""
         while not self._stopped.is_set():
             next_ns = self._next_ns()
-            wait_s = (next_ns - self.clock.paced_ns()) / 1e9 / self.clock.speed
+            wait_s = self.clock.machine_s_until(next_ns)
             for key, _ in self._selector.select(max(0.0, wait_s)):
                 self._now_ns = max(self._now_ns, min(self.clock.paced_ns(), next_ns))
                 key.data()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -59,7 +60,7 @@ def load_mesh(path: Path, unit: str) -> NDArray[np.float64]:
     """Corners [triangles, 3, 3] in mm of any mesh that trimesh reads."""
     import trimesh
 
-    mesh = trimesh.load(path, process=False, force="mesh")
+    mesh: Any = trimesh.load(path, process=False, force="mesh")
     corners: NDArray[np.float64] = np.asarray(mesh.vertices)[np.asarray(mesh.faces)] * _UNIT_MM[unit]
     return corners
 
@@ -98,7 +99,7 @@ class Pinhole:
         return Pinhole(width_px, height_px, image_distance_mm * 1e3 / pixel_pitch_um)
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True)
 def _rasterise(corners, base_to_camera, focal, width, height, near, triangle_of_pixel, depth):  # type: ignore[no-untyped-def]
     half_w, half_h = 0.5 * width - 0.5, 0.5 * height - 0.5
     u, v, w = np.empty(3), np.empty(3), np.empty(3)

@@ -28,7 +28,7 @@ class SensorModel:
 
     @property
     def white_dn(self) -> int:
-        return 2**self.bit_depth - 1
+        return (1 << self.bit_depth) - 1
 
     @property
     def electrons_per_dn(self) -> float:
@@ -40,7 +40,7 @@ class SensorModel:
         return np.array([CHANNEL[c] for c in letters]).reshape(2, 2)
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True)
 def _mix(x):  # type: ignore[no-untyped-def]
     """SplitMix64's finaliser (Steele, Lea, Flood 2014): a bijection of 64 bits that scatters a counter."""
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -48,7 +48,7 @@ def _mix(x):  # type: ignore[no-untyped-def]
     return x ^ (x >> np.uint64(31))
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True)
 def _expose(  # type: ignore[no-untyped-def]
     out, triangle, radiance, falloff, channels, electrons, black, white, e_per_dn, read_noise_e, key
 ):

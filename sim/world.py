@@ -16,43 +16,21 @@ import sys
 import tempfile
 import threading
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel
 
 from sim import camera_server, kuka_controller, ledbox_firmware
 from sim import faults as script
 from sim.camera_server import Exposed
 from sim.clock import ClockWriter
+from sim.config import CameraConfig, Config
 from sim.lighting import Lighting
-from sim.picture import CameraConfig, Photographer, SceneConfig
+from sim.picture import Photographer
 from sim.reactor import Reactor
 
 SCRATCH = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gettempdir())
-
-
-class Settings(BaseModel):
-    """The rig's `world.settings`: the character of the stand-ins, and what goes wrong."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    speed: Annotated[float, Field(gt=0, le=1000)] = 1.0
-    seed: int = 1
-    ledbox: ledbox_firmware.Settings = ledbox_firmware.Settings()
-    robot: kuka_controller.Settings = kuka_controller.Settings()
-    camera: camera_server.Settings = camera_server.Settings()
-    faults: tuple[script.Fault, ...] = ()
-
-
-class Config(BaseModel):
-    """All that a world needs to know."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    settings: Settings
-    scene: SceneConfig
-    camera: CameraConfig
 
 
 class World:
@@ -60,19 +38,12 @@ class World:
 
     def __init__(self, config: Config, folder: Path) -> None:
         settings = config.settings
-        self.clock = ClockWriter(folder / "clock", settings.speed)
+        self.clock = ClockWriter(
+            folder / "clock", settings.speed, hurry_only_when_told=settings.hurry_only_when_told
+        )
         self.reactor = Reactor(self.clock)
         self.lighting = Lighting()
         self._photographer = Photographer(config.scene, config.camera, seed=settings.seed)
-        self.box = ledbox_firmware.LedBoxFirmware(
-            self.reactor,
-            settings.ledbox,
-            on_edge=lambda t_ns: self.camera.edge(t_ns),
-            on_light=self.lighting.light,
-            on_dark=self.lighting.dark,
-            on_panel=self.lighting.panel,
-            ready=lambda: self.camera.ready(),
-        )
         self.robot = kuka_controller.KukaController(self.reactor, settings.robot)
         self.camera = camera_server.CameraServer(
             self.reactor,
@@ -91,6 +62,15 @@ class World:
             lighting=self.lighting,
             pose=self.robot.true_base_from_flange,
             render=self._photographer.render,
+        )
+        self.box = ledbox_firmware.LedBoxFirmware(
+            self.reactor,
+            settings.ledbox,
+            on_edge=self.camera.edge,
+            on_light=self.lighting.light,
+            on_dark=self.lighting.dark,
+            on_panel=self.lighting.panel,
+            ready=self.camera.ready,
         )
         self._control = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.bind(str(folder / "control"))
@@ -161,9 +141,9 @@ class World:
             case script.LateRsi():
                 self.robot.late(fault.cycles)
             case script.RsiLinkLoss():
-                self.robot.lose_link()
+                self.robot.lose_link(fault.seconds)
             case script.NudgeArm():
-                self.robot.nudge(fault.deg)
+                self.robot.nudge([fault.deg] * 6)
 
     # -- control ------------------------------------------------------------------------------------------
 

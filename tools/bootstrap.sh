@@ -56,9 +56,9 @@ set_up() {
     unset VIRTUAL_ENV
     export UV_PROJECT_ENVIRONMENT="$root/.venv"
     if [[ -n "$python" ]]; then
-        UV_PYTHON_DOWNLOADS=never "$uv" sync --inexact --no-managed-python --python "$python"
+        UV_PYTHON_DOWNLOADS=never "$uv" sync --compile-bytecode --inexact --no-managed-python --python "$python"
     else
-        "$uv" sync --inexact --python '>=3.11,<3.14'
+        "$uv" sync --compile-bytecode --inexact --python '>=3.11,<3.14'
     fi
     stamp_now >"$root/.tools/stamp.new"
     mv "$root/.tools/stamp.new" "$root/.tools/stamp"

@@ -247,6 +247,8 @@ class TestKukaRsi(RobotConformance):
         cell.in_world(lambda: cell.controller.late(70))
         with pytest.raises(DeviceFault, match="late answers"):
             robot.wait_settled()
+        robot.stop()
+        cell.clock.sleep(0.1)
         cell.wait_until(lambda: not cell.controller.moving)
         cell.assert_stands()
 

@@ -1,0 +1,75 @@
+"""What a world is told when it starts: the rig's `world.settings`, and the scene of rig and plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from sim import camera_server, kuka_controller, ledbox_firmware
+from sim import faults as script
+
+WHITE_SHARE = 0.6
+"""A white target at the support's centre reaches this share of full scale at the plan's exposure (design)."""
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class MeshConfig(_Model):
+    """One object: its mesh and where it lies on the support (row-major 4x4)."""
+
+    path: Path
+    unit: Literal["mm", "m", "um"]
+    support_from_object: list[list[float]]
+
+
+class SceneConfig(_Model):
+    """Geometry of the simulated cell; transforms are row-major 4x4."""
+
+    leds: Path
+    emission: Literal["lambertian", "paper"]
+    base_from_support: list[list[float]]
+    support_diameter_mm: float
+    objects: list[MeshConfig]
+
+
+class CameraConfig(_Model):
+    """Sensor and lens of the simulated camera."""
+
+    width_px: int
+    height_px: int
+    pixel_pitch_um: float
+    bit_depth: int
+    bayer_pattern: str
+    black_dn: int
+    max_frames_per_s: float
+    exposure_gap_us: int
+    focal_length_mm: float
+    focus_distance_mm: float
+    flange_from_camera: list[list[float]]
+    nominal_exposure_us: int
+    """The exposure at which white reaches `WHITE_SHARE` of full scale."""
+
+
+class Settings(_Model):
+    """The rig's `world.settings`: the character of the stand-ins, and what goes wrong."""
+
+    speed: Annotated[float, Field(gt=0, le=1000)] = 1.0
+    hurry_only_when_told: bool = False
+    """Real time, but `speed` while the controller says that it merely waits (dry runs)."""
+    seed: int = 1
+    ledbox: ledbox_firmware.Settings = ledbox_firmware.Settings()
+    robot: kuka_controller.Settings = kuka_controller.Settings()
+    camera: camera_server.Settings = camera_server.Settings()
+    faults: tuple[script.Fault, ...] = ()
+
+
+class Config(_Model):
+    """All that a world needs to know."""
+
+    settings: Settings
+    scene: SceneConfig
+    camera: CameraConfig

@@ -20,9 +20,9 @@ from coupole.plan import Plan
 from coupole.rig import BoardThermal, KeepOutSphere, LedLimits, Rig
 from coupole.shots import Burst, Schedule, ViewPose
 
-BURST_OVERHEAD_S = 0.06
-"""Arm the camera, read the table's CRC back, start, wait for the last frame (measured on the simulated cell)."""
-SETTLE_CHECK_S = 0.1
+BURST_OVERHEAD_S = 0.17
+"""Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell, 115200 baud)."""
+SETTLE_CHECK_S = 0.2
 """From the end of a motion to 'settled', dwell apart (measured on the simulated cell)."""
 STEP_BYTES, BITS_PER_BYTE = 16, 10
 UPLOAD_OVERHEAD_S = 0.1
@@ -230,7 +230,7 @@ def _time_and_dose(
         if there is not None:
             move_s = kinematics.move_duration_s(arm, here, there)
             here = there
-        move_s += SETTLE_CHECK_S + rig.motion.settle_dwell_s
+        move_s += rig.motion.settle_dwell_s
         burst_s = sum(b.duration_s for b in bursts)
         dose = np.zeros(len(total))
         for burst in bursts:
@@ -244,7 +244,7 @@ def _time_and_dose(
         total += dose
         waiting_s = max(0.0, upload_s(bursts[0], baud) - move_s) if not report.views else 0.0
         report.ideal_s += move_s + burst_s
-        report.duration_s += move_s + waiting_s + burst_s + BURST_OVERHEAD_S * len(bursts)
+        report.duration_s += move_s + SETTLE_CHECK_S + waiting_s + burst_s + BURST_OVERHEAD_S * len(bursts)
         report.views.append(
             ViewReport(
                 view.name, None if there is None else tuple(there.tolist()), move_s, burst_s, float(dose.max())

@@ -105,6 +105,8 @@ class Sequencer:
         self._view_number = 0
         self._view_name = ""
         self._frames_wanted = job.schedule.frames
+        self.burst_times_s: list[float] = []
+        """From start to last proof of each burst, on the rig's clock."""
         self.outcome = Outcome(shots=job.schedule.shots)
         compile_now()
 
@@ -259,11 +261,13 @@ class Sequencer:
             intake.start()
             if burst.panel:
                 box.panel(burst.panel, True)
+            started_ns = self._cell.clock.now_ns()
             box.start(burst.table)
             if following is not None:
                 box.load(following.table)
             self._hurry(burst.duration_s - _LAST_STRETCH_S)
             self._follow(firing)
+            self.burst_times_s.append((self._cell.clock.now_ns() - started_ns) / 1e9)
             if burst.panel:
                 box.panel(burst.panel, False)
         except BaseException:

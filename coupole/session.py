@@ -86,10 +86,10 @@ def acquire_plan(
         raise Interrupted("not started")
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=_teller(console)) as cell:
-        run = run or Run.create(folder, job.plan.name, job.inputs, _about(job, cell, preflight))
+        run = run or Run.create(folder, job.plan.name, job.inputs, about_run(job, cell))
         lock = run.lock()
         console.print(f"run {run.folder}")
-        recorder = RunRecorder(run, _metadata(job, cell))
+        recorder = RunRecorder(run, metadata_of_views(job, cell))
         try:
             _acquire(job, cell, run, recorder, console, resumed=resume is not None, found=found)
         finally:
@@ -106,7 +106,7 @@ def _teller(console: Console) -> Any:
     return tell
 
 
-def _about(job: Job, cell: OpenedCell, preflight: Report) -> dict[str, Any]:
+def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
     """What stands in run.json beside the inputs."""
     return {
         "simulated": cell.simulated,
@@ -116,11 +116,11 @@ def _about(job: Job, cell: OpenedCell, preflight: Report) -> dict[str, Any]:
         "scaling": cell.world_endpoints["camera"]["scaling"] if cell.world_endpoints else None,
         "views": [view.name for view in job.schedule.views],
         "labels": [label for burst in job.schedule.bursts[0] for label in burst.labels],
-        "expected": {"shots": preflight.shots, "frames": preflight.frames, "duration_s": preflight.duration_s},
+        "expected": {"shots": job.schedule.shots, "frames": job.schedule.frames},
     }
 
 
-def _metadata(job: Job, cell: OpenedCell) -> dict[str, Any]:
+def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
     """Attributes of every view's file."""
     rig = job.cell.rig
     return {

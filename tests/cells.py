@@ -29,12 +29,12 @@ from ruamel.yaml import YAML
 
 from coupole import cli, journal
 from coupole.cell import world_config
-from coupole.job import read_cell, read_job
+from coupole.job import read_job
 from sim.client import World
 
 REPO = Path(__file__).resolve().parent.parent
 BLACK_DN = 64
-PIXEL_STEP = 5
+PIXEL_STEP = 4
 """Of the object's pixels every so-manieth is looked at to tell LEDs apart."""
 PATIENCE_S = 60.0
 """How long a test waits for what must come; only a broken program lets it run out."""
@@ -136,15 +136,23 @@ class CellFolder:
         run: Path = found[0].parent
         return run
 
-    @contextmanager
-    def standing_world(self, **config: Any) -> Iterator[World]:
-        """A world that outlives its controllers; the rig is rewritten to join it. It holds the plan's object."""
-        job = read_job(self.plan)
-        world = World.start(world_config(job.cell, job, job.cell.rig.sensor, **config))
-        endpoints = self.folder / "world.json"
-        endpoints.write_text(json.dumps(world.endpoints) + "\n")
-        self.rig_data["world"] = {"join": str(endpoints)}
+    def join(self) -> None:
+        """Have the rig join a world that `world()` keeps, in place of one of its own."""
+        self.rig_data["world"] = {"join": str(self._endpoints)}
         self.write()
+
+    @property
+    def _endpoints(self) -> Path:
+        return self.folder / "world.json"
+
+    @contextmanager
+    def world(self, *faults: dict[str, Any], **settings: Any) -> Iterator[World]:
+        """The world that the rig joins: it outlives its controllers, and holds the plan's object."""
+        job = read_job(self.plan)
+        config = world_config(job.cell, job, job.cell.rig.sensor, speed=self.speed)
+        config["settings"] |= {"seed": 1, "faults": list(faults), **settings}
+        world = World.start(config)
+        self._endpoints.write_text(json.dumps(world.endpoints) + "\n")
         try:
             yield world
         finally:
@@ -303,7 +311,10 @@ class Expectation:
         cos_object = np.einsum("lpk,pk->lp", to_led, normals[seen]) / distance
         cos_led = -np.einsum("lpk,lk->lp", to_led, table[:, 5:8]) / distance
         lit = table[:, 8:9] * np.clip(cos_object, 0, None) * np.clip(cos_led, 0, None) / distance**2
-        self._pictures = self._alike(lit)
+        axis = base_from_camera[:3, 2]
+        from_lens = points[seen] - base_from_camera[:3, 3]
+        cos_lens = from_lens @ axis / np.linalg.norm(from_lens, axis=1)
+        self._pictures = self._alike(lit * cos_lens**4)  # the lens darkens towards the corners
 
     def led_of(self, pixels: NDArray[np.uint16]) -> int:
         """The LED, of all in the dome, whose picture this frame is most like."""
@@ -381,6 +392,23 @@ def project(
     column = in_camera[:, 0] * scale + (sensor["width_px"] - 1) / 2
     row = in_camera[:, 1] * scale + (sensor["height_px"] - 1) / 2
     return column, row, in_camera[:, 2]
+
+
+def safe(world: World) -> bool:
+    """True if nothing shines, the arm stands and the camera is disarmed."""
+    state = world.ask("state")
+    return not (state["shining"] or state["panels"] or state["arm_moving"] or state["camera_armed"])
+
+
+def labels(run: Path) -> list[str]:
+    """What the run's edges are for, one after the other: labels of a view's frames in the order of its burst."""
+    found: list[str] = json.loads((run / "run.json").read_text())["labels"]
+    return found
+
+
+def reshot(run: Path) -> list[str]:
+    """Shots that were taken again, in order."""
+    return [shot for event in events(run, "reshoot") for shot in event["shots"]]
 
 
 def mislabelled(cell: CellFolder, run: Path) -> list[str]:

@@ -7,7 +7,6 @@ timestamps only; the take knows the truth.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -17,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from coupole.devices import NO_LIGHT, STATUS_NO_EDGE, STEP_RECORD_DTYPE
+from coupole.devices import STATUS_NO_EDGE, STEP_RECORD_DTYPE
 from coupole.dome import LedTable
 from coupole.matching import UNLABELLED, FaultModel, Match, match
 from coupole.plan import Plan
@@ -89,13 +88,13 @@ class Take:
         """
         if self.truth[frame] >= 0:
             return {int(self.truth[frame])}
-        fired = np.flatnonzero(self.truth >= 0)
-        gaps_us = [0.0]
-        for side in (fired[fired < frame][-1:], fired[fired > frame][:1]):
-            gaps_us += np.abs(self.frames_us[side] - self.frames_us[frame]).tolist()
-        tolerance_us = 2 * self.jitter_us + 1.01e-6 * MODEL.drift_ppm * max(gaps_us) + 2 * MODEL.jitter_us
-        near = np.flatnonzero(np.abs(self.edges_us - self.frames_us[frame]) <= tolerance_us)
+        near = np.flatnonzero(np.abs(self.edges_us - self.frames_us[frame]) <= reach_us(self.edges_us))
         return set(near.tolist()) - set(self.truth.tolist())
+
+
+def reach_us(edges_us: NDArray[np.float64]) -> float:
+    """How near to an edge a frame must come to be taken for the edge's own, at most."""
+    return 6 * MODEL.jitter_us + MODEL.drift_ppm * 1e-6 * float(edges_us[-1] - edges_us[0])
 
 
 def take(
@@ -109,11 +108,13 @@ def take(
     jitter_us: float = 20.0,
     first_id: int = 1,
     id_modulus: tuple[int, int] = PLAIN,
+    busy: bool = True,
     seed: int = 0,
 ) -> Take:
     """Run a burst: `lost` steps' frames are lost in transfer, `missed` steps' edges are not seen by the camera.
 
-    `surplus_us` are true times, from the first edge on, of frames that no step fired.
+    `surplus_us` are true times, from the first edge on, of frames that no step fired. The camera is busy after
+    each, and misses an edge that follows at once (`busy`).
     """
     rng = np.random.default_rng(seed)
     table = burst.table
@@ -131,6 +132,8 @@ def take(
 
     exposed = np.ones(steps, np.bool_)
     exposed[np.asarray(missed, np.int64)] = False
+    for time_us in surplus_us if busy else ():
+        exposed[(edges_us > time_us) & (edges_us < time_us + reach_us(edges_us))] = False
     arrives = exposed.copy()
     arrives[np.asarray(lost, np.int64)] = False
     fired = np.flatnonzero(exposed)
@@ -180,9 +183,7 @@ def gone(draw: st.DrawFn, steps: int) -> NDArray[np.int64]:
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     gone = np.zeros(steps, np.bool_)
     for pattern in draw(
-        st.lists(
-            st.sampled_from(("few", "run", "first", "last", "start marks", "end marks", "most")), max_size=3
-        )
+        st.lists(st.sampled_from(("few", "run", "first", "last", "start marks", "end marks", "most")), max_size=3)
     ):
         match pattern:
             case "few":
@@ -268,25 +269,319 @@ def test_no_frame_of_a_finished_burst_gets_a_wrong_label(what: Take) -> None:
     assert_no_wrong_label(what, what.verdict())
 
 
-@examples(1000)
-@given(takes(), st.data())
+@examples(1500)
+@given(takes(), st.integers(0, 2**32))
 def test_no_frame_of_a_running_burst_gets_a_wrong_label_and_no_label_is_changed_later(
-    what: Take, data: st.DataObject
+    what: Take, seed: int
 ) -> None:
-    rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
-    given_so_far = np.full(len(what.truth), UNLABELLED)
-    for frames in sorted(set(rng.integers(1, len(what.truth) + 1, 12).tolist())) if len(what.truth) else ():
+    rng = np.random.default_rng(seed)
+    total = len(what.truth)
+    labels = np.full(total, UNLABELLED)
+    for frames in np.unique(rng.integers(1, total + 1, 12)) if total else ():
         fired = what.truth[:frames][what.truth[:frames] >= 0]
-        # The log holds all that has arrived but for the last frames, which may be ahead of it, or more.
-        known = int(fired[-1 - MODEL.in_flight]) + 1 if len(fired) > MODEL.in_flight else 0
-        over = int(np.searchsorted(what.edges_us, what.frames_us[frames - 1], side="right"))
-        steps = int(rng.integers(known, max(known, over) + 1))
+        # The log holds the steps of all frames that are here but for the last ones, or more.
+        least = int(fired[-1 - MODEL.in_flight]) + 1 if len(fired) > MODEL.in_flight else 0
+        most = int(np.searchsorted(what.edges_us, what.frames_us[frames - 1], side="right"))
+        steps = int(rng.integers(least, max(least, most) + 1))
         verdict = what.verdict(complete=False, frames=frames, steps=steps)
         assert_no_wrong_label(what, verdict)
-        early = given_so_far[:frames]
-        both = (early >= 0) & (verdict.step_of_frame >= 0)
-        assert np.array_equal(early[both], verdict.step_of_frame[both])
-        early[~both] = np.maximum(early, verdict.step_of_frame)[~both]
-    last = what.verdict()
-    both = (given_so_far >= 0) & (last.step_of_frame >= 0)
-    assert np.array_equal(given_so_far[both], last.step_of_frame[both])
+        assert_same_where_both(labels[:frames], verdict.step_of_frame)
+        labels[:frames] = np.maximum(labels[:frames], verdict.step_of_frame)
+    assert_same_where_both(labels, what.verdict().step_of_frame)
+
+
+def assert_same_where_both(early: NDArray[np.int64], late: NDArray[np.int64]) -> None:
+    both = (early >= 0) & (late >= 0)
+    assert np.array_equal(early[both], late[both])
+
+
+@examples(800)
+@given(takes())
+def test_a_step_is_called_missing_only_if_no_frame_of_it_is_here(what: Take) -> None:
+    here = np.zeros(len(what.log), np.bool_)
+    here[what.truth[what.truth >= 0]] = True
+    assert not np.any(what.verdict().missing & here)
+
+
+@examples(800)
+@given(takes())
+def test_a_step_is_called_lost_in_transfer_only_if_the_camera_counted_it(what: Take) -> None:
+    verdict = what.verdict()
+    if not np.any((verdict.step_of_frame >= 0) & (what.truth < 0)):
+        assert not np.any(verdict.lost_in_transfer & ~what.exposed)
+
+
+@pytest.mark.xfail(strict=True, reason="the frame before the edge becomes the reference and hides the true one")
+def test_a_surplus_frame_just_before_an_edge_never_takes_the_label_of_the_frame_that_follows() -> None:
+    burst = whole_burst(1, 1_500_000, 0)
+    edge_us = float(np.sum(burst.table["period_us"][:START]))
+    what = take(burst, surplus_us=(edge_us - 250.0,), relative_ppm=0.0, jitter_us=0.0, busy=False)
+    assert_no_wrong_label(what, what.verdict())
+
+
+# ------------------------------------------------------------------------------------------- proves what it can
+
+
+def assert_all_proven(what: Take, verdict: Match) -> None:
+    assert np.array_equal(verdict.step_of_frame, what.truth)
+    assert not verdict.ambiguous
+    assert not verdict.reason
+    assert not verdict.surplus.any()
+
+
+clocks = {
+    "box_ppm": st.floats(-60, 60),
+    "relative_ppm": st.floats(-99, 99),
+    "jitter_us": st.floats(0, MODEL.jitter_us),
+    "seed": st.integers(0, 2**32),
+}
+
+
+@examples(500)
+@given(bursts(), st.fixed_dictionaries(clocks))
+def test_a_clean_burst_is_proven_completely(burst: Burst, clock: dict[str, float]) -> None:
+    what = take(burst, **clock)
+    verdict = what.verdict()
+    assert_all_proven(what, verdict)
+    assert not verdict.missing.any()
+
+
+@examples(500)
+@given(st.integers(1, MAX_LIGHTS), st.sampled_from(EXPOSURES_US), st.fixed_dictionaries(clocks), st.data())
+def test_up_to_five_percent_of_lost_transfers_leave_all_other_frames_proven(
+    lights: int, exposure_us: int, clock: dict[str, float], data: st.DataObject
+) -> None:
+    burst = whole_burst(lights, exposure_us)
+    steps = len(burst.table)
+    most = max(1, steps // 20)
+    lost = data.draw(st.lists(st.integers(START - 1, steps - END), max_size=most, unique=True))
+    what = take(burst, lost=tuple(lost), **clock)
+    verdict = what.verdict()
+    assert_all_proven(what, verdict)
+    assert set(np.flatnonzero(verdict.missing)) == set(np.flatnonzero(verdict.lost_in_transfer)) == set(lost)
+
+
+@examples(300)
+@given(st.integers(1, MAX_LIGHTS), st.fixed_dictionaries(clocks), st.data())
+def test_one_missed_trigger_leaves_exactly_its_step_unproven(
+    lights: int, clock: dict[str, float], data: st.DataObject
+) -> None:
+    burst = whole_burst(lights)
+    step = data.draw(st.integers(0, len(burst.table) - 1))
+    what = take(burst, missed=(step,), **clock)
+    verdict = what.verdict()
+    assert_all_proven(what, verdict)
+    assert np.flatnonzero(verdict.missing).tolist() == [step]
+    assert not verdict.lost_in_transfer.any()
+
+
+@examples(300)
+@given(st.integers(1, MAX_LIGHTS), st.fixed_dictionaries(clocks), st.floats(1, 5_000), st.data())
+def test_one_double_trigger_leaves_at_most_its_step_unproven(
+    lights: int, clock: dict[str, float], after_us: float, data: st.DataObject
+) -> None:
+    burst = whole_burst(lights)
+    step = data.draw(st.integers(0, len(burst.table) - 1))
+    edge_us = float(np.sum(burst.table["period_us"][:step]))
+    what = take(burst, surplus_us=(edge_us + 5.0 + after_us,), **clock)
+    verdict = what.verdict()
+    others = (what.truth >= 0) & (what.truth != step)
+    assert np.array_equal(verdict.step_of_frame[others], what.truth[others])
+    assert not verdict.missing.any()
+    assert_no_wrong_label(what, verdict)
+
+
+# --------------------------------------------------------------------------------------------- one fault at a time
+
+LIGHT = START + 2 + 3  # a step in the middle of the lights, behind two dark frames
+
+
+def edge_us(burst: Burst, step: int) -> float:
+    return float(np.sum(burst.table["period_us"][:step]))
+
+
+def test_a_lost_transfer_leaves_its_step_missing_and_known_as_exposed() -> None:
+    verdict = take(whole_burst(12), lost=(LIGHT,)).verdict()
+    assert np.flatnonzero(verdict.missing).tolist() == [LIGHT]
+    assert np.flatnonzero(verdict.lost_in_transfer).tolist() == [LIGHT]
+
+
+def test_a_missed_trigger_leaves_its_step_missing_and_not_lost_in_transfer() -> None:
+    verdict = take(whole_burst(12), missed=(LIGHT,)).verdict()
+    assert np.flatnonzero(verdict.missing).tolist() == [LIGHT]
+    assert not verdict.lost_in_transfer.any()
+
+
+def test_a_run_of_lost_transfers_is_known_step_by_step() -> None:
+    run = range(LIGHT, LIGHT + 5)
+    verdict = take(whole_burst(12), lost=tuple(run)).verdict()
+    assert np.flatnonzero(verdict.lost_in_transfer).tolist() == list(run)
+
+
+def test_a_gap_of_one_lost_and_one_missed_frame_is_not_called_lost_in_transfer() -> None:
+    verdict = take(whole_burst(12), lost=(LIGHT,), missed=(LIGHT + 1,)).verdict()
+    assert np.flatnonzero(verdict.missing).tolist() == [LIGHT, LIGHT + 1]
+    assert not verdict.lost_in_transfer.any()
+
+
+def test_a_double_trigger_within_the_tolerance_labels_neither_frame_and_proves_all_others() -> None:
+    burst = whole_burst(12)
+    what = take(burst, surplus_us=(edge_us(burst, LIGHT) + 60.0,))
+    verdict = what.verdict()
+    unlabelled = np.flatnonzero(verdict.step_of_frame == UNLABELLED).tolist()
+    assert unlabelled == [LIGHT, LIGHT + 1]
+    assert verdict.ambiguous
+    assert f"steps [{LIGHT}] have more than one frame each" in verdict.reason
+
+
+def test_a_bounce_beyond_the_tolerance_is_surplus_and_the_step_is_proven() -> None:
+    burst = whole_burst(12)
+    what = take(burst, surplus_us=(edge_us(burst, LIGHT) + 3_000.0,))
+    verdict = what.verdict()
+    assert np.array_equal(verdict.step_of_frame, what.truth)
+    assert np.flatnonzero(verdict.surplus).tolist() == [LIGHT + 1]
+    assert not verdict.ambiguous
+
+
+def test_more_surplus_frames_than_the_fault_model_allows_prove_nothing() -> None:
+    burst = whole_burst(12)
+    bounces = tuple(edge_us(burst, step) + 3_000.0 for step in range(LIGHT, LIGHT + MODEL.max_surplus + 1))
+    verdict = take(burst, surplus_us=bounces).verdict()
+    assert np.all(verdict.step_of_frame == UNLABELLED)
+    assert verdict.ambiguous
+    assert "no alignment of box and camera leaves 3 frames or fewer unexplained" in verdict.reason
+
+
+def test_a_lost_first_frame_shifts_no_label() -> None:
+    what = take(whole_burst(12), lost=(0,))
+    assert_all_proven(what, what.verdict())
+
+
+def test_a_lost_first_frame_and_a_surplus_last_one_shift_no_label() -> None:
+    burst = whole_burst(12)
+    last = len(burst.table) - 1
+    what = take(burst, lost=(0,), surplus_us=(edge_us(burst, last) + burst.timing.period_us,))
+    verdict = what.verdict()
+    assert np.array_equal(verdict.step_of_frame, what.truth)
+    assert np.flatnonzero(verdict.surplus).tolist() == [last]
+
+
+def test_frame_ids_may_wrap_within_a_burst() -> None:
+    what = take(whole_burst(12), lost=(LIGHT,), first_id=65535 - LIGHT, id_modulus=GIGE)
+    verdict = what.verdict()
+    assert what.frame_ids.min() == 1
+    assert_all_proven(what, verdict)
+    assert np.flatnonzero(verdict.lost_in_transfer).tolist() == [LIGHT]
+
+
+def test_without_any_mark_equal_periods_are_declared_ambiguous_and_not_guessed() -> None:
+    burst = whole_burst(12)
+    steps = len(burst.table)
+    verdict = take(burst, lost=(*range(START), *range(steps - END, steps))).verdict()
+    assert np.all(verdict.step_of_frame == UNLABELLED)
+    assert verdict.ambiguous
+    assert "alignments of box and camera are possible" in verdict.reason
+
+
+def test_the_start_marks_alone_prove_a_burst() -> None:
+    burst = whole_burst(12)
+    steps = len(burst.table)
+    what = take(burst, lost=tuple(range(steps - END, steps)))
+    assert_all_proven(what, what.verdict())
+
+
+def test_the_end_marks_alone_prove_a_burst() -> None:
+    what = take(whole_burst(12), lost=tuple(range(START)))
+    assert_all_proven(what, what.verdict())
+
+
+def test_frame_ids_that_do_not_increase_prove_nothing() -> None:
+    clean = take(whole_burst(12))
+    ids = clean.frame_ids.copy()
+    ids[LIGHT] = ids[LIGHT - 1]
+    verdict = replace(clean, frame_ids=ids).verdict()
+    assert np.all(verdict.step_of_frame == UNLABELLED)
+    assert verdict.reason == "the camera's frame ids do not increase"
+
+
+def test_timestamps_that_do_not_increase_prove_nothing() -> None:
+    clean = take(whole_burst(12))
+    stamps = clean.timestamps_ns.copy()
+    stamps[LIGHT] = stamps[LIGHT - 1]
+    verdict = replace(clean, timestamps_ns=stamps).verdict()
+    assert np.all(verdict.step_of_frame == UNLABELLED)
+    assert verdict.reason == "the camera's timestamps do not increase"
+
+
+def test_without_frames_all_steps_are_missing_and_nothing_is_ambiguous() -> None:
+    verdict = take(whole_burst(12)).verdict(frames=0)
+    assert verdict.missing.all()
+    assert not verdict.ambiguous
+
+
+def test_frames_without_a_log_prove_nothing() -> None:
+    verdict = take(whole_burst(12)).verdict(steps=0)
+    assert np.all(verdict.step_of_frame == UNLABELLED)
+    assert verdict.ambiguous
+    assert verdict.reason == "frames came before the box sent an edge"
+
+
+def test_a_step_that_sent_no_edge_is_neither_labelled_nor_missing() -> None:
+    what = take(whole_burst(12), missed=(LIGHT,))
+    what.log["status"][LIGHT] = STATUS_NO_EDGE
+    what.log["t_trigger_ns"][LIGHT] = 0
+    verdict = what.verdict()
+    assert_all_proven(what, verdict)
+    assert not verdict.missing.any()
+
+
+def test_the_first_frame_of_a_running_burst_is_not_labelled_before_the_log_can_say_whose_it_is() -> None:
+    what = take(whole_burst(12), lost=(0,))
+    verdict = what.verdict(complete=False, frames=1, steps=1)
+    assert verdict.step_of_frame.tolist() == [UNLABELLED]
+
+
+def test_surplus_frames_ahead_of_the_log_do_not_shift_the_labels_of_a_running_burst() -> None:
+    burst = whole_burst(30)
+    bounces = (edge_us(burst, 6) + 3_000.0, edge_us(burst, 16) + 3_000.0, edge_us(burst, 28) + 3_000.0)
+    what = take(burst, missed=tuple(range(6)), surplus_us=bounces)
+    frames = int(np.flatnonzero(what.truth == 29)[0]) + 1
+    verdict = what.verdict(complete=False, frames=frames, steps=28)
+    assert_no_wrong_label(what, verdict)
+
+
+def test_frames_of_a_running_burst_are_proven_as_they_come() -> None:
+    what = take(whole_burst(30))
+    for frames in range(MODEL.max_surplus + MODEL.in_flight + START, len(what.truth) + 1):
+        verdict = what.verdict(complete=False, frames=frames, steps=frames)
+        assert np.array_equal(verdict.step_of_frame, what.truth[:frames])
+
+
+def test_the_clock_fit_recovers_drift_and_offset() -> None:
+    what = take(whole_burst(40, 1_500_000), relative_ppm=37.0, box_ppm=-20.0, jitter_us=20.0)
+    clocks = what.verdict().clocks
+    assert clocks is not None
+    assert clocks.drift_ppm == pytest.approx(37.0, abs=1.0)
+    box_ns = what.log["t_trigger_ns"].astype(np.float64)
+    told_ns = clocks.offset_ns + (1 + clocks.drift_ppm * 1e-6) * box_ns
+    assert np.allclose(told_ns, what.timestamps_ns, rtol=0, atol=40e3)
+    assert 1.0 < clocks.residual_rms_us < 20.0
+    assert clocks.residual_rms_us <= clocks.residual_max_us <= 40.0
+
+
+# ------------------------------------------------------------------------------------------------ the code of marks
+
+
+@pytest.mark.parametrize("exposure_us", [10, 500, 8_000, 20_000, 300_000])
+def test_every_wrong_alignment_of_a_clean_burst_leaves_too_many_frames_unexplained(exposure_us: int) -> None:
+    """By brute force: lay the burst's edges on themselves, moved so that any frame falls on any wrong step."""
+    tolerance_us = 2 * MODEL.jitter_us
+    for lights in range(1, MAX_LIGHTS + 1):
+        table = whole_burst(lights, exposure_us, lights % 3).table
+        edges = np.concatenate([[0], np.cumsum(table["period_us"][:-1], dtype=np.int64)]).astype(np.float64)
+        for frame, step in np.argwhere(~np.eye(len(edges), dtype=bool)):
+            since = np.abs(edges - edges[frame])
+            moved = edges + edges[step] - edges[frame]
+            nearest = np.abs(moved[:, None] - edges[None, :]).min(axis=1)
+            unexplained = int(np.sum(nearest > tolerance_us + MODEL.drift_ppm * 1e-6 * since))
+            assert unexplained > MODEL.max_surplus, (lights, frame, step)

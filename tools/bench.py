@@ -1,0 +1,221 @@
+"""Figures with their peers, one JSON line each: `python tools/bench.py [check|sequencing|store|matching ...]`.
+
+Each line has `name`, `value`, `unit`, `peer` (what ran beside it in the same run, or the limit it is held
+against) and `ratio` (ours over the peer's; above 1 is better). Medians of interleaved runs: these figures are
+ratios because machines are noisy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import mmap
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+FULL_SIZE = (3072, 4096)
+
+
+def line(name: str, value: float, unit: str, peer: str, ratio: float, **more: Any) -> None:
+    """Print one figure."""
+    figure = {"name": name, "value": round(value, 6), "unit": unit, "peer": peer, "ratio": round(ratio, 4), **more}
+    print(json.dumps(figure), flush=True)
+
+
+def cpu_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+# -- check ------------------------------------------------------------------------------------------------
+
+
+def bench_check(rounds: int) -> None:
+    """`coupole check --no-paths` of 30 views x 1080 LEDs x 3 exposures, against the 3 s it may take and against
+    a Python that only imports numpy, pydantic and h5py."""
+    command = [sys.executable, "-m", "coupole.cli", "check", str(ROOT / "configs/plans/large.yaml"), "--no-paths"]
+    bare = [sys.executable, "-c", "import numpy, pydantic, h5py"]
+    ours, peers = [], []
+    for _ in range(rounds):
+        for argv, times in ((command, ours), (bare, peers)):
+            start = time.perf_counter()
+            subprocess.run(argv, check=True, capture_output=True, cwd=ROOT)
+            times.append(time.perf_counter() - start)
+    value, peer = statistics.median(ours), statistics.median(peers)
+    line("check_large_plan", value, "s", "limit_3_s", 3.0 / value)
+    line("check_large_plan", value, "s", "python_imports", peer / value)
+
+
+# -- sequencing -------------------------------------------------------------------------------------------
+
+
+def bench_sequencing(rounds: int) -> None:
+    """A burst of 1080 LEDs at 100 frames/s, from INITiate to the last proven frame, against the table's own
+    time; on the world's clock and on the machine's."""
+    from coupole.cell import open_cell
+    from coupole.job import read_job
+    from coupole.recorder import RunRecorder
+    from coupole.run import Run
+    from coupole.sequencer import Sequencer
+    from coupole.session import about_run, metadata_of_views
+
+    job = read_job(ROOT / "configs/plans/demo.yaml")
+    table_s = job.schedule.bursts[0][0].duration_s
+    world_s, machine_s, whole, cpu = [], [], [], []
+    for _ in range(rounds):
+        with tempfile.TemporaryDirectory(dir=ROOT) as folder, open_cell(job.cell, job=job) as cell:
+            run = Run.create(Path(folder), "bench", job.inputs, about_run(job, cell))
+            recorder = RunRecorder(run, metadata_of_views(job, cell))
+            sequencer = Sequencer(job, cell, recorder)
+            started_s, used_s = time.perf_counter(), cpu_s()
+            outcome = sequencer.acquire()
+            machine_s.append(time.perf_counter() - started_s)
+            cpu.append((cpu_s() - used_s) / len(recorder.proven()))
+            world_s += sequencer.burst_times_s
+            whole.append(outcome.ideal_s / outcome.duration_s)
+            recorder.close()
+    value = statistics.median(world_s)
+    line("burst_1080_leds", value, "s", "table_time", table_s / value)
+    line("run_of_three_views", statistics.median(whole), "1", "ideal_time", statistics.median(whole))
+    line(
+        "run_of_three_views_machine_time",
+        statistics.median(machine_s),
+        "s",
+        "ideal_time",
+        outcome.ideal_s / statistics.median(machine_s),
+        cpu_ms_per_frame=round(1e3 * statistics.median(cpu), 3),
+    )
+
+
+# -- store ------------------------------------------------------------------------------------------------
+
+
+def bench_store(rounds: int) -> None:
+    """Full-size frames through the view writer (checksum, O_DIRECT, frame table, sync) against a plain
+    O_DIRECT copy of the same bytes to the same disk."""
+    from coupole.devices import FrameFormat
+    from coupole.store import ViewWriter, create
+
+    height, width = FULL_SIZE
+    frames, distinct = 48, 8
+    memory = mmap.mmap(-1, distinct * height * width * 2)
+    pixels = np.frombuffer(memory, np.uint16).reshape(distinct, height, width)
+    pixels[:] = np.random.default_rng(1).integers(64, 4095, pixels.shape, np.uint16)
+    frame_bytes = height * width * 2
+    ours, peers, ours_cpu, peers_cpu = [], [], [], []
+    with tempfile.TemporaryDirectory(dir=ROOT) as folder:
+        view, copy = Path(folder) / "view.h5", Path(folder) / "copy.raw"
+        metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}
+        create(view, frames, FrameFormat(height, width, 12, "GBRG", 64, 4095), metadata)
+        fd = os.open(copy, os.O_WRONLY | os.O_CREAT | os.O_DIRECT)
+        os.posix_fallocate(fd, 0, frames * frame_bytes)
+
+        def store() -> None:
+            writer = ViewWriter(view, {})
+            keep = partial(writer.put, camera_ns=0, exposure_us=8000)
+            with ThreadPoolExecutor(2) as pool:  # as `coupole.intake` does
+                slots = [pool.submit(keep, pixels[k % distinct], frame_id=k) for k in range(frames)]
+                for k, slot in enumerate(slots):
+                    writer.prove(slot.result(), f"view/led{k:04d}/e0", led=k)
+            writer.sync()
+            writer.close()
+
+        def copy_plainly() -> None:
+            for k in range(frames):
+                os.pwrite(fd, pixels[k % distinct].data.cast("B"), k * frame_bytes)
+            os.fdatasync(fd)
+
+        for _ in range(rounds):
+            for work, times, used in ((store, ours, ours_cpu), (copy_plainly, peers, peers_cpu)):
+                started_s, before_s = time.perf_counter(), cpu_s()
+                work()
+                times.append(time.perf_counter() - started_s)
+                used.append((cpu_s() - before_s) / frames * 1e3)
+        os.close(fd)
+    value, peer = frames / statistics.median(ours), frames / statistics.median(peers)
+    line(
+        "store_full_size",
+        value,
+        "frames/s",
+        "o_direct_copy",
+        value / peer,
+        peer_value=round(peer, 2),
+        cpu_ms_per_frame=round(statistics.median(ours_cpu), 2),
+        peer_cpu_ms_per_frame=round(statistics.median(peers_cpu), 2),
+    )
+
+
+# -- matching ---------------------------------------------------------------------------------------------
+
+
+def bench_matching(rounds: int) -> None:
+    """Proof of a whole burst of 1092 frames, 2 % of them lost, against numpy's nearest-neighbour pairing, which
+    is told the clocks' offset and proves nothing; and against the 10 ms that a frame takes at 100 frames/s."""
+    from coupole.devices import STEP_RECORD_DTYPE
+    from coupole.job import read_job
+    from coupole.matching import compile_now, match
+
+    compile_now()
+    table = read_job(ROOT / "configs/plans/demo.yaml").schedule.bursts[0][0].table
+    log = np.zeros(len(table), STEP_RECORD_DTYPE)
+    log["step"], log["led"] = np.arange(len(table)), table["led"]
+    log["t_trigger_ns"] = 1_000_000 + 1000 * np.concatenate([[0], np.cumsum(table["period_us"][:-1])])
+    random = np.random.default_rng(7)
+    here = random.random(len(log)) > 0.02
+    stamps = (log["t_trigger_ns"].astype(np.int64) * (1 + 3e-5) + 5e9).astype(np.int64)
+    frame_ids, stamps = (np.arange(len(log)) + 1)[here], stamps[here]
+    ours, peers = [], []
+
+    def pair() -> None:
+        nearest = np.searchsorted(log["t_trigger_ns"].astype(np.int64), stamps - 5_000_000_000)
+        nearest.clip(0, len(log) - 1)
+
+    def prove() -> None:
+        judged = match(log, frame_ids, stamps, complete=True)
+        assert np.count_nonzero(judged.step_of_frame >= 0) == len(frame_ids)
+
+    for _ in range(max(rounds, 3) * 20):
+        for work, times in ((prove, ours), (pair, peers)):
+            start = time.perf_counter()
+            work()
+            times.append((time.perf_counter() - start) / len(frame_ids) * 1e6)
+    value, peer = statistics.median(ours), statistics.median(peers)
+    line("matching_per_frame", value, "us", "frame_period_at_100_hz", 10_000 / value)
+    line("matching_per_frame", value, "us", "numpy_nearest_pairing", peer / value, peer_value=round(peer, 4))
+
+
+BENCHES: dict[str, Callable[[int], None]] = {
+    "check": bench_check,
+    "sequencing": bench_sequencing,
+    "store": bench_store,
+    "matching": bench_matching,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"which of {', '.join(BENCHES)}; all if none")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--json", action="store_true", help="the lines are JSON anyway")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.names) - set(BENCHES):
+        parser.error(f"expected some of {', '.join(BENCHES)}; found {', '.join(sorted(unknown))}")
+    for name in arguments.names or BENCHES:
+        BENCHES[name](arguments.rounds)
+
+
+if __name__ == "__main__":
+    main()

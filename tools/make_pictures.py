@@ -1,0 +1,134 @@
+"""The pictures of the README: the simulated cell (SVG) and a synthetic frame of the demo plan (PNG).
+
+`python tools/make_pictures.py` writes docs/pictures/cell.svg and docs/pictures/frame.png.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole import kinematics
+from coupole.cell import world_config
+from coupole.geometry import apply, inverse, transform
+from coupole.job import Job, read_job
+from coupole.preflight import joints_for_views
+from coupole.report import develop, png
+from sim.camera_server import Exposed
+from sim.config import Config
+from sim.picture import Photographer
+
+ROOT = Path(__file__).resolve().parent.parent
+PICTURES = ROOT / "docs/pictures"
+SHOWN_VIEW, SHOWN_LED = 1, 640
+_WIDTH, _HEIGHT, _SCALE = 900, 600, 0.26
+_EYE_AZIMUTH_DEG, _EYE_ELEVATION_DEG = -62.0, 16.0
+_LINKS_MM = ((0, 0, 400), (25, 0, 0), (560, 0, 0), (0, 0, 35), (515, 0, 0), (80, 0, 0))
+"""Joint origins of the KR10 R1100 sixx, each in the frame of the joint before (facts/robot)."""
+
+
+def project(points_support_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Support coordinates [n, 3] to picture coordinates [n, 3]: x, y and depth (towards the eye)."""
+    azimuth, elevation = np.radians([_EYE_AZIMUTH_DEG, _EYE_ELEVATION_DEG])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    towards = np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    up = np.cross(towards, right)
+    x, y, depth = (np.atleast_2d(points_support_mm) @ np.stack([right, up, towards], axis=1)).T
+    return np.stack([_WIDTH / 2 + _SCALE * x, _HEIGHT - 90 - _SCALE * y, depth], axis=1)
+
+
+def elbow_points(joints_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Joint origins [8, 3] of the arm in the base frame, mm, from base to flange."""
+    a = [*(-joints_deg[:1]), *joints_deg[1:3], -joints_deg[3], joints_deg[4], -joints_deg[5]]
+    turns = [(a[0], 0, 0), (0, a[1], 0), (0, a[2], 0), (0, 0, a[3]), (0, a[4], 0), (0, 0, a[5])]
+    pose, points = np.eye(4), [np.zeros(3)]
+    for offset, turn in zip(_LINKS_MM, turns, strict=True):
+        pose = pose @ transform(offset, turn)
+        points.append(pose[:3, 3])
+    points.append(kinematics.forward(kinematics.KR10_R1100_SIXX, joints_deg)[:3, 3])
+    return np.array(points)
+
+
+def polyline(points: NDArray[np.float64], style: str) -> str:
+    path = " ".join(f"{x:.1f},{y:.1f}" for x, y, _ in project(points))
+    return f'<polyline points="{path}" {style}/>'
+
+
+def draw_cell(job: Job) -> str:
+    """The dome, the disk, the arm in one view of the plan, and what its camera sees."""
+    rig = job.cell.rig
+    support_from_base = inverse(rig.support.base_from_support.matrix())
+    joints, _ = joints_for_views(job.schedule.views, rig, rig.motion.home_joints_deg)
+    there = joints[SHOWN_VIEW]
+    assert there is not None
+    arm = apply(support_from_base, elbow_points(there))
+    flange = support_from_base @ kinematics.forward(kinematics.KR10_R1100_SIXX, there)
+    camera = flange @ rig.flange_from_camera.matrix()
+    half = rig.lens.focus_distance_mm * rig.sensor.pixel_pitch_um * 1e-3 / rig.lens.focal_length_mm / 2
+    corners = [
+        [sx * rig.sensor.width_px * half, sy * rig.sensor.height_px * half, rig.lens.focus_distance_mm]
+        for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
+    ]
+    field = apply(camera, corners)
+    angle = np.linspace(0, 2 * np.pi, 90)
+    rim = 0.5 * rig.support.diameter_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    leds = project(apply(support_from_base, job.cell.leds.positions_mm))
+    nearest, farthest = leds[:, 2].max(), leds[:, 2].min()
+    box = job.object_points_support_mm[:8]
+    edges = [(0, 1), (0, 2), (0, 4), (1, 3), (1, 5), (2, 3), (2, 6), (3, 7), (4, 5), (4, 6), (5, 7), (6, 7)]
+    parts = [polyline(rim, 'fill="#20242a" stroke="#4a525c"')]
+    for x, y, depth in leds[np.argsort(leds[:, 2])]:
+        near = (depth - farthest) / (nearest - farthest)
+        parts.append(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{1.2 + near:.1f}" fill="#ffd27a" '
+            f'opacity="{0.75 - 0.5 * near:.2f}"/>'
+        )
+    parts += [polyline(box[list(edge)], 'stroke="#d8c8a8" stroke-width="1.5"') for edge in edges]
+    parts += [polyline(np.stack([camera[:3, 3], c]), 'stroke="#6fb7ff" stroke-width="1"') for c in field[:4]]
+    parts.append(polyline(field, 'fill="#6fb7ff" fill-opacity="0.15" stroke="#6fb7ff" stroke-width="1"'))
+    parts.append(
+        polyline(arm, 'fill="none" stroke="#f08a3c" stroke-width="13" stroke-linejoin="round" stroke-linecap="round"')
+    )
+    parts.append(
+        polyline(
+            np.stack([flange[:3, 3], camera[:3, 3]]),
+            'fill="none" stroke="#dfe5ec" stroke-width="15" stroke-linecap="square"',
+        )
+    )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" '
+        f'width="{_WIDTH}" height="{_HEIGHT}"><title>The simulated cell: 1080 LEDs, support disk, arm and '
+        f'camera in one view of the demo plan</title><rect width="{_WIDTH}" height="{_HEIGHT}" fill="#12151a"/>'
+        + "".join(parts)
+        + "</svg>\n"
+    )
+
+
+def synthetic_frame(job: Job) -> bytes:
+    """One frame of the demo at twice its resolution, developed, as PNG."""
+    rig = job.cell.rig
+    fine = {"width_px": 1024, "height_px": 768, "pixel_pitch_um": rig.sensor.pixel_pitch_um / 2}
+    config = Config.model_validate(world_config(job.cell, job, rig.sensor.model_copy(update=fine)))
+    photographer = Photographer(config.scene, config.camera, seed=1)
+    joints, _ = joints_for_views(job.schedule.views, rig, rig.motion.home_joints_deg)
+    flange = kinematics.forward(kinematics.KR10_R1100_SIXX, joints[SHOWN_VIEW])
+    raw = np.zeros((768, 1024), np.uint16)
+    photographer.render(raw, Exposed({SHOWN_LED: 8e-3}, [], 8e-3, 1.0, 0, flange))
+    sensor = photographer.sensor
+    return png(develop(raw, pattern=sensor.bayer_pattern, black_dn=sensor.black_dn, white_dn=sensor.white_dn))
+
+
+def main() -> None:
+    """Write both pictures."""
+    job = read_job(ROOT / "configs/plans/demo.yaml")
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    (PICTURES / "cell.svg").write_text(draw_cell(job), encoding="utf-8")
+    (PICTURES / "frame.png").write_bytes(synthetic_frame(job))
+
+
+if __name__ == "__main__":
+    main()

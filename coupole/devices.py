@@ -145,7 +145,7 @@ class LedBox(Protocol):
         ...
 
     def poll_log(self) -> NDArray[np.void]:
-        """Records (STEP_RECORD_DTYPE [k]) of the steps that finished since the last poll; may be empty.
+        """Records (STEP_RECORD_DTYPE [k]) of all steps that finished since the last poll; may be empty.
 
         Raises DeviceFault if the burst ended by a fault of the box.
         """

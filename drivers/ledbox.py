@@ -114,8 +114,8 @@ class LedBox:
         self._started = np.frombuffer(payload, STEP_DTYPE)
 
     def poll_log(self) -> NDArray[np.void]:
-        """New records, STEP_RECORD_DTYPE [k]. While the burst runs, one bounded round trip (60 ms at 115200
-        baud); after its end, all that is left."""
+        """New records, STEP_RECORD_DTYPE [k]: of every step that had finished when the last round trip of this
+        call began (at 115200 baud one of 60 ms keeps up with 100 steps a second)."""
         more, records = self._poll()
         parts = [records]
         while more:
@@ -220,7 +220,7 @@ class LedBox:
         return int(self._scpi.number(crc))
 
     def _poll(self) -> tuple[bool, NDArray[np.void]]:
-        """Whether the burst has ended with records left to fetch, and the next records."""
+        """Whether there are more records of finished steps to fetch, and the next ones."""
         bytes_wanted = self._scpi.bytes_per_s * _POLL_S - _POLL_OVERHEAD_BYTES
         limit = max(1, min(_MAX_RECORDS_PER_POLL, int(bytes_wanted / STEP_RECORD_DTYPE.itemsize)))
         command = f"SEQ:STAT?;INDex?;LOG? {self._next_record},{limit}"
@@ -238,7 +238,7 @@ class LedBox:
             first = int(np.flatnonzero(wrong)[0])
             self._scpi.unexpected(f"the log's record of step {steps[first]}", f"{records[first]} came")
         self._next_record += len(records)
-        return not running and self._next_record < finished, records
+        return self._next_record < finished, records
 
     def _note_state(self, state: str) -> bool:
         if state not in ("IDLE", "RUN", "ABORTED", "FAULT"):

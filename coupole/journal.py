@@ -45,11 +45,20 @@ class Journal:
         """Note an event; it reaches the disk with the next `commit()`."""
         self._lines.append(json.dumps({"event": event, "t": utc_now(), **fields}, separators=(",", ":")) + "\n")
 
+    def take(self) -> list[str]:
+        """The lines noted since the last time; they are the caller's now, to be handed to `append`."""
+        lines, self._lines = self._lines, []
+        return lines
+
     def commit(self) -> None:
         """Write and sync what was noted. Raises DiskFull or StorageError; then nothing of it counts."""
-        if not self._lines:
+        self.append(self.take())
+
+    def append(self, lines: list[str]) -> None:
+        """Write and sync lines that were taken; may run on another thread than `write` and `take`."""
+        if not lines:
             return
-        data = "".join(self._lines).encode()
+        data = "".join(lines).encode()
         start = os.fstat(self._fd).st_size
         try:
             view = memoryview(data)
@@ -60,11 +69,6 @@ class Journal:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, start)
             raise _storage_error(self._path, error) from error
-        self._lines.clear()
-
-    def discard(self) -> None:
-        """Forget what was noted since the last `commit()`."""
-        self._lines.clear()
 
     def close(self) -> None:
         os.close(self._fd)

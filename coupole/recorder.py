@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -63,6 +64,8 @@ class RunRecorder:
         self._file = ""
         self._pose = 0
         self._committed_s = time.monotonic()
+        self._committer = ThreadPoolExecutor(1, "commit")
+        self._committing: Future[None] | None = None
 
     def proven(self) -> set[str]:
         return set(self._proven)
@@ -113,11 +116,22 @@ class RunRecorder:
         self._journal.write(event, **fields)
 
     def commit(self, *, now: bool) -> None:
-        if now or time.monotonic() - self._committed_s > COMMIT_EVERY_S:
-            if self._writer is not None:
-                self._writer.sync()
-            self._journal.commit()
+        """A disk may take seconds to sync, so this happens on another thread unless it must be `now`: while a
+        burst runs, nobody waits for the disk. What went wrong there is raised by the next call."""
+        if self._committing is not None and (now or self._committing.done()):
+            committing, self._committing = self._committing, None
+            committing.result()
+        if now:
+            self._commit(self._writer, self._journal.take())
+        elif self._committing is None and time.monotonic() - self._committed_s > COMMIT_EVERY_S:
             self._committed_s = time.monotonic()
+            self._committing = self._committer.submit(self._commit, self._writer, self._journal.take())
+
+    def _commit(self, writer: ViewWriter | None, lines: list[str]) -> None:
+        """Frames first, then the lines that speak of them."""
+        if writer is not None:
+            writer.sync()
+        self._journal.append(lines)
 
     def end_view(self) -> None:
         if self._writer is not None:
@@ -134,6 +148,7 @@ class RunRecorder:
 
     def close(self) -> None:
         """Give everything back; what was not committed is not lost, it is unproven."""
+        self._committer.shutdown(wait=True)
         if self._writer is not None:
             self._writer.close()
             self._writer = None

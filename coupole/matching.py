@@ -237,9 +237,10 @@ def match(
 
 def compile_now() -> None:
     """Compile the alignment kernels (seconds on a fresh machine), lest the first burst wait for it."""
-    log = np.zeros(2, STEP_RECORD_DTYPE)
-    log["t_trigger_ns"] = [0, 10_000_000]
-    match(log, np.array([1, 2]), np.array([0, 10_000_000]), complete=True)
+    log = np.zeros(16, STEP_RECORD_DTYPE)
+    log["t_trigger_ns"] = 10_000_000 * np.arange(16)
+    match(log, np.arange(16), 10_000_000 * np.arange(16), complete=True)
+    assert _agree.signatures, "the kernels were not reached"
 
 
 def _lost_in_transfer(

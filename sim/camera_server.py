@@ -7,6 +7,7 @@ Unix socket and hand the slots back. `sim.memory_camera` is the driver at the ot
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import mmap
@@ -78,6 +79,14 @@ class _Shot:
     deliver_ns: int
     rendered: bool
     ready: bool = False
+
+
+def _received(client: socket.socket, size: int) -> bytes:
+    """The next message, empty if the client is gone: killed with messages unread, it resets the connection."""
+    try:
+        return client.recv(size)
+    except ConnectionResetError:
+        return b""
 
 
 class CameraServer:
@@ -237,7 +246,7 @@ class CameraServer:
 
     def _accept(self) -> None:
         client, _ = self._listener.accept()
-        purpose = client.recv(64)
+        purpose = _received(client, 64)
         if purpose == b"control" and self._control is None:
             self._control = client
             self._reactor.add_reader(client, self._on_command)
@@ -246,20 +255,25 @@ class CameraServer:
             self._stream = client
             self._reactor.add_reader(client, self._take_slots_back)
         else:
-            client.send(b'{"error": "the camera is in use by another client"}')
+            with contextlib.suppress(OSError):
+                client.send(b'{"error": "the camera is in use by another client"}')
             client.close()
             return
-        client.send(b"{}")
+        with contextlib.suppress(OSError):
+            client.send(b"{}")
 
     def _on_command(self) -> None:
         assert self._control is not None
-        data = self._control.recv(4096)
+        data = _received(self._control, 4096)
         if not data:
             self._drop_control()
             return
         command = json.loads(data)
-        reply: dict[str, Any] = getattr(self, f"_do_{command.pop('do')}")(**command)
-        self._control.send(json.dumps(reply).encode())
+        try:
+            reply: dict[str, Any] = getattr(self, f"_do_{command.pop('do')}")(**command)
+            self._control.send(json.dumps(reply).encode())
+        except BrokenPipeError:
+            self._drop_control()
 
     def _do_configure(self, exposure_us: int, gain_db: float, hardware_trigger: bool) -> dict[str, Any]:
         self._exposure_ns, self._hardware = exposure_us * 1000, hardware_trigger
@@ -323,7 +337,7 @@ class CameraServer:
     def _take_slots_back(self) -> None:
         while self._stream is not None:
             try:
-                data = self._stream.recv(SLOT_MESSAGE.size)
+                data = _received(self._stream, SLOT_MESSAGE.size)
             except BlockingIOError:
                 return
             if not data:

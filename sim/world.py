@@ -152,13 +152,15 @@ class World:
         self.reactor.add_reader(client, lambda: self._on_command(client))
 
     def _on_command(self, client: socket.socket) -> None:
-        data = client.recv(4096)
-        if not data:
-            self.reactor.remove_reader(client)
-            client.close()
-            return
-        command = json.loads(data)
-        client.send(json.dumps(self._do(command)).encode())
+        try:
+            data = client.recv(4096)
+            if data:
+                client.send(json.dumps(self._do(json.loads(data))).encode())
+                return
+        except (ConnectionResetError, BrokenPipeError):  # killed before it read the answer
+            pass
+        self.reactor.remove_reader(client)
+        client.close()
 
     def _do(self, command: dict[str, Any]) -> dict[str, Any]:
         match command["do"]:

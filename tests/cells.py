@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -21,8 +20,8 @@ from typing import Any
 from unittest import mock
 
 import h5py
-import trimesh
 import numpy as np
+import trimesh
 import xxhash
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
@@ -74,6 +73,7 @@ class CellFolder:
 
     folder: Path
     speed: float = 5.0
+    write_now: bool = True
     rig_data: dict[str, Any] = field(init=False)
     plan_data: dict[str, Any] = field(init=False)
 
@@ -81,6 +81,7 @@ class CellFolder:
         rig = YAML(typ="safe").load(REPO / "configs/rigs/sim.yaml")
         rig["sensor"] |= {"width_px": 128, "height_px": 96, "pixel_pitch_um": 176.0}
         rig["dome"]["leds"] = str(REPO / "configs/domes/coupole.csv")
+        rig["ledbox"]["settings"]["watchdog_s"] = 4 * self.speed  # of the world's time; the machine may be busy
         rig["storage"] = {"folder": str(self.folder / "storage"), "reserve_bytes": 0}
         rig["world"] = {"serves": "always", "settings": {"seed": 1, "speed": self.speed}}
         self.rig_data = rig
@@ -93,7 +94,8 @@ class CellFolder:
             "lights": SOME_LIGHTS,
             "exposure": {"kind": "fixed", "exposure_us": 8000},
         }
-        self.write()
+        if self.write_now:
+            self.write()
 
     @property
     def plan(self) -> Path:
@@ -221,7 +223,11 @@ def alive(pid: int) -> bool:
 
 def children(pid: int) -> list[int]:
     """Processes that a process started and that run still."""
-    return [int(word) for task in Path(f"/proc/{pid}/task").iterdir() for word in (task / "children").read_text().split()]
+    return [
+        int(word)
+        for task in Path(f"/proc/{pid}/task").iterdir()
+        for word in (task / "children").read_text().split()
+    ]
 
 
 # -- what a run left ------------------------------------------------------------------------------------------
@@ -304,7 +310,9 @@ class Expectation:
         self._rows, self._columns = (places[::PIXEL_STEP] for places in np.nonzero(triangle >= 0))
         seen = triangle[self._rows, self._columns]
         self._cell = 2 * (self._rows % 2) + self._columns % 2
-        table = np.loadtxt(cell.rig_data["dome"]["leds"], delimiter=",", comments="#", skiprows=_table_starts(cell))
+        table = np.loadtxt(
+            cell.rig_data["dome"]["leds"], delimiter=",", comments="#", skiprows=_table_starts(cell)
+        )
         self.leds = table[:, 0].astype(int)
         to_led = table[:, None, 2:5] - points[seen]
         distance = np.linalg.norm(to_led, axis=2)

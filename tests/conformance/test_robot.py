@@ -59,7 +59,12 @@ class KukaCell:
     def in_world(self, action: Callable[[], object]) -> None:
         """Do something on the world's thread and wait until it is done."""
         done = threading.Event()
-        self.reactor.call_threadsafe(lambda: (action(), done.set()))
+
+        def act() -> None:
+            action()
+            done.set()
+
+        self.reactor.call_threadsafe(act)
         assert done.wait(30.0)
 
     def joints_deg(self) -> NDArray[np.float64]:
@@ -265,7 +270,7 @@ class TestKukaRsi(RobotConformance):
             return started[-1]
 
         monkeypatch.setattr(subprocess, "Popen", watched)
-        with pytest.raises(DeviceTimeout, match="0 packets|0 came"):
+        with pytest.raises(DeviceTimeout, match="0 came"):
             cell.open()
         assert [process.returncode is not None for process in started] == [True]
 

@@ -7,14 +7,21 @@ by whole periods look alike on the LED steps and differ on the coded dark marks 
 
 **Fault model.** Any number of frames may be missing (lost in transfer, trigger missed, at the start, at the
 end, anywhere). At most `max_surplus` frames of a burst were fired by something other than a step (a bounce, an
-interference). Timestamps deviate from their edges by at most `jitter_us`, clocks from each other by at most
-`drift_ppm`.
+interference); one that starts within twice the jitter of an edge whose own frame is missing is taken for it,
+and shows its light. Timestamps deviate from their edges by at most `jitter_us`, clocks from each other by at
+most `drift_ppm`, and steadily.
 
 **Proof.** Under that model the true alignment leaves at most `max_surplus` frames unexplained. So it is among
 the hypotheses that do, the *candidates*; and a label on which all candidates agree is true. Frames on which
 they disagree, and steps that two frames claim, are ambiguous and get no label. All alignments are tried: the
 true one fires at least one of the first `max_surplus + 1` frames, so one of these serves as anchor (of fewer
 frames nothing is proven; while the burst runs, of fewer than `in_flight` more).
+
+*Explained* means two things. Counted from the anchor, a frame lies within the jitter plus the drift of the time
+between: wide, but the true alignment always passes. And the frames so labelled lie within the jitter of one
+straight line, camera time over box time, save for as many as `max_surplus` still allows. Which ones to leave out
+is tried exhaustively: three points that no line fits hold at least one surplus frame. Labels of frames that some
+way of doing so leaves out are not given.
 
 Everything here is a pure function of its arguments and is simply run again as a burst goes on.
 """
@@ -30,7 +37,7 @@ from numpy.typing import NDArray
 from coupole.devices import STATUS_NO_EDGE, STEP_RECORD_DTYPE
 
 UNLABELLED = -1
-_SURPLUS, _PENDING, _UNDECIDABLE = -1, -2, -3
+_SURPLUS, _PENDING, _UNDECIDABLE, _DOUBTFUL = -1, -2, -3, -4
 
 
 @dataclass(frozen=True)
@@ -79,18 +86,19 @@ class Match:
 def _align(  # type: ignore[no-untyped-def]
     frame_ns, step_ns, anchor_frame, anchor_step, jitter_ns, drift, max_surplus, in_flight, steps_out
 ):
-    """Fill `steps_out` [frames] under one hypothesis; True if it is a candidate."""
-    surplus = 0
-    pending = 0
+    """Fill `steps_out` [frames] under one hypothesis; the number of surplus frames, too many of them if it fails.
+
+    Frames that claim the same step are all but one surplus, whichever.
+    """
+    surplus = pending = 0
     n_frames, n_steps = len(frame_ns), len(step_ns)
     steps_out[anchor_frame] = anchor_step
     for way in (1, -1):
-        ref_frame, ref_step = anchor_frame, anchor_step
-        step = anchor_step
+        last = step = anchor_step
         frame = anchor_frame + way
         while 0 <= frame < n_frames:
-            elapsed = frame_ns[frame] - frame_ns[ref_frame]
-            predicted = step_ns[ref_step] + elapsed
+            elapsed = frame_ns[frame] - frame_ns[anchor_frame]
+            predicted = step_ns[anchor_step] + elapsed
             window = 2 * jitter_ns + drift * abs(elapsed)
             while 0 <= step < n_steps and way * (predicted - step_ns[step]) > window:
                 step += way
@@ -104,16 +112,111 @@ def _align(  # type: ignore[no-untyped-def]
                 beyond = step + way
                 if 0 <= beyond < n_steps and abs(step_ns[beyond] - predicted) <= window:
                     steps_out[0] = _UNDECIDABLE
-                    return True
-                if step == ref_step:
-                    surplus += 1
-                else:
-                    ref_frame, ref_step = frame, step
+                    return 0
+                surplus += step == last
+                last = step
                 steps_out[frame] = step
             if surplus + max(0, pending - in_flight) > max_surplus:  # surplus frames may be pending, too
-                return False
+                return max_surplus + 1
             frame += way
-    return True
+    return surplus
+
+
+@numba.njit(cache=True, nogil=True)
+def _misfit(box_ns, excess_ns, left_out, jitter_ns, triple):  # type: ignore[no-untyped-def]  # noqa: PLR0912
+    """True if no line lies within `jitter_ns` of all points but those left out; `triple` then shows three points
+    that prove it. The exchange algorithm for the best line in the maximum norm, stopped as soon as it is clear.
+    """
+    n = len(box_ns)
+    kept = 0
+    for k in range(n):
+        if not left_out[k]:
+            if kept < 3:
+                triple[kept] = k
+            triple[2] = k
+            kept += 1
+    if kept < 3:
+        return False
+    for _ in range(n):
+        i, j, k = triple
+        slope = (excess_ns[k] - excess_ns[i]) / (box_ns[k] - box_ns[i])
+        height = (excess_ns[j] - excess_ns[i] - slope * (box_ns[j] - box_ns[i])) / 2
+        if abs(height) > jitter_ns:
+            return True
+        worst, worst_residual = -1, jitter_ns
+        for m in range(n):
+            if not left_out[m]:
+                residual = excess_ns[m] - excess_ns[i] - slope * (box_ns[m] - box_ns[i]) - height
+                if abs(residual) > abs(worst_residual):
+                    worst, worst_residual = m, residual
+        if worst < 0:
+            return False
+        like_the_middle = (worst_residual > 0) == (height > 0)
+        if worst < i:
+            if like_the_middle:
+                triple[1], triple[2] = i, j
+            triple[0] = worst
+        elif worst < j:
+            triple[1 if like_the_middle else 0] = worst
+        elif worst < k:
+            triple[1 if like_the_middle else 2] = worst
+        else:
+            if like_the_middle:
+                triple[0], triple[1] = j, k
+            triple[2] = worst
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
+def _leave_out(frame_ns, step_ns, view, may_leave_out, jitter_ns):  # type: ignore[no-untyped-def]  # noqa: PLR0912
+    """Mark in `view` the frames that have to, or may have to, be left out for the rest to fit one line; False if
+    leaving out `may_leave_out` frames is not enough."""
+    n_frames = len(view)
+    frames = np.empty(n_frames, np.int64)
+    n = 0
+    for frame in range(n_frames):
+        alone = view[frame] >= 0
+        if frame > 0 and view[frame - 1] == view[frame]:
+            alone = False
+        if frame + 1 < n_frames and view[frame + 1] == view[frame]:
+            alone = False
+        if alone:
+            frames[n] = frame
+            n += 1
+    box_ns, excess_ns = np.empty(n), np.empty(n)
+    for k in range(n):
+        box_ns[k] = step_ns[view[frames[k]]] - step_ns[view[frames[0]]]
+        excess_ns[k] = frame_ns[frames[k]] - frame_ns[frames[0]] - box_ns[k]
+    left_out, ever_left_out = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    triple = np.empty(3, np.int64)
+    tries = np.empty((may_leave_out + 1, 3), np.int64)  # at each depth, three points of which one must go
+    next_try = np.zeros(may_leave_out + 1, np.int64)
+    depth, fits = 0, False
+    enter = True
+    while depth >= 0:
+        if enter:
+            if not _misfit(box_ns, excess_ns, left_out, jitter_ns, triple):
+                fits = True
+                ever_left_out |= left_out
+                depth, enter = depth - 1, False
+                continue
+            if depth == may_leave_out:
+                depth, enter = depth - 1, False
+                continue
+            tries[depth] = triple
+            next_try[depth] = 0
+        if next_try[depth] > 0:
+            left_out[tries[depth, next_try[depth] - 1]] = False
+        if next_try[depth] == 3:
+            depth, enter = depth - 1, False
+            continue
+        left_out[tries[depth, next_try[depth]]] = True
+        next_try[depth] += 1
+        depth, enter = depth + 1, True
+    for k in range(n):
+        if ever_left_out[k]:
+            view[frames[k]] = _DOUBTFUL
+    return fits
 
 
 @numba.njit(cache=True, nogil=True)
@@ -122,21 +225,25 @@ def _agree(  # type: ignore[no-untyped-def]
 ):
     """Try all hypotheses; `agreed` [frames] is the first candidate's view, `agrees` where all others share it.
 
-    Returns the number of different candidates, or -1 if one of them could not be decided.
+    Returns the number of candidates (the same alignment may count more than once), or -1 if one of them could
+    not be decided.
     """
     n_frames, n_steps = len(frame_ns), len(step_ns)
     candidates = 0
     view = np.empty(n_frames, np.int64)
     for anchor_frame in range(min(max_surplus + 1, n_frames)):
         for anchor_step in range(n_steps):
-            if candidates and agreed[anchor_frame] == anchor_step:
+            if candidates == 1 and agreed[anchor_frame] == anchor_step:
                 continue
-            if not _align(
+            surplus = _align(
                 frame_ns, step_ns, anchor_frame, anchor_step, jitter_ns, drift, max_surplus, in_flight, view
-            ):
+            )
+            if surplus > max_surplus:
                 continue
             if view[0] == _UNDECIDABLE:
                 return -1
+            if not _leave_out(frame_ns, step_ns, view, max_surplus - surplus, jitter_ns):
+                continue
             if candidates == 0:
                 agreed[:] = view
                 agrees[:] = True
@@ -217,11 +324,13 @@ def match(
     surplus = agrees & (agreed == _SURPLUS)
     undecided = ~labelled & ~surplus & ~(agrees & (agreed == _PENDING))
     missing = np.zeros(n_steps, np.bool_)
-    if agrees.all():
+    if agrees.all() and not np.any(agreed == _DOUBTFUL):
         missing[edged[claimed == 0]] = True
     reasons = []
     if not agrees.all():
-        reasons.append(f"{candidates} alignments of box and camera are possible")
+        reasons.append("more than one alignment of box and camera is possible")
+    if np.any(agreed == _DOUBTFUL):
+        reasons.append("some frames do not fit the clocks")
     if np.any(claimed > 1):
         reasons.append(f"steps {edged[claimed > 1].tolist()} have more than one frame each")
     return Match(

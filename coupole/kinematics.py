@@ -110,6 +110,36 @@ def forward(arm: Arm, joints_deg: ArrayLike) -> Transform:
     return base_from_flange
 
 
+def link_frames(arm: Arm, joints_deg: ArrayLike) -> NDArray[np.float64]:
+    """`base_from_link` [..., 8, 4, 4] of joint angles [..., 6]: base, the six links, the flange.
+
+    A link's frame lies in its joint and, with all angles 0 (the arm stretched out along x), parallel to the base;
+    the flange's is that of `forward`. These are the frames of the vendor's link meshes (facts/robot.md).
+    """
+    joints = np.radians(np.where(arm.flip_axes, -1.0, 1.0) * np.asarray(joints_deg, dtype=np.float64))
+    origins_mm = (
+        (0.0, arm.b_mm, arm.c1_mm),
+        (arm.a1_mm, 0.0, 0.0),
+        (arm.c2_mm, 0.0, 0.0),
+        (0.0, 0.0, -arm.a2_mm),
+        (arm.c3_mm, 0.0, 0.0),
+        (arm.c4_mm, 0.0, 0.0),
+    )
+    frames = np.zeros((*joints.shape[:-1], 8, 4, 4))
+    frames[..., 0, :, :] = np.eye(4)
+    for k, (origin_mm, axis) in enumerate(zip(origins_mm, "zyyxyx", strict=True)):
+        step = np.zeros((*joints.shape[:-1], 4, 4))
+        c, s = np.cos(joints[..., k]), np.sin(joints[..., k])
+        i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+        step[..., range(4), range(4)] = 1.0
+        step[..., i, i], step[..., j, j], step[..., i, j], step[..., j, i] = c, c, -s, s
+        step[..., :3, 3] = origin_mm
+        frames[..., k + 1, :, :] = frames[..., k, :, :] @ step
+    link_from_flange = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+    frames[..., 7, :, :] = frames[..., 6, :, :] @ link_from_flange
+    return frames
+
+
 def inverse(arm: Arm, base_from_flange: Transform) -> NDArray[np.float64]:
     """All joint angles [k, 6] within the limits that reach the pose; k is 0 where there are none.
 

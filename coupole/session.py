@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import threading
@@ -17,7 +18,7 @@ from coupole import ledger, report
 from coupole.cell import OpenedCell, coarse, open_cell
 from coupole.console import RunObserver, show_dry_run, show_preflight
 from coupole.devices import Identity
-from coupole.errors import CoupoleError, Interrupted, PreflightRefused
+from coupole.errors import CoupoleError, Interrupted, PreflightRefused, StorageError
 from coupole.job import Job, check_job, preflight_of
 from coupole.observer import Control, Outcome
 from coupole.preflight import Report, StorageFacts
@@ -92,9 +93,14 @@ def acquire_plan(
         recorder = RunRecorder(run, metadata_of_views(job, cell))
         try:
             _acquire(job, cell, run, recorder, console, resumed=resume is not None, found=found)
+        except CoupoleError:
+            with contextlib.suppress(StorageError):  # what ended the run matters more than its report
+                report.write(run)
+            raise
+        else:
+            report.write(run)
         finally:
             recorder.close()
-            report.write(run)
             os.close(lock)
 
 

@@ -370,3 +370,9 @@ class CameraServer:
 
     def close(self) -> None:
         self._workers.shutdown(cancel_futures=True)
+        for link in (self._listener, self._control, self._stream):
+            if link is not None:
+                link.close()
+        if self._memory_fd >= 0:
+            os.close(self._memory_fd)
+            self._memory_fd = -1

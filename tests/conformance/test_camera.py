@@ -1,0 +1,320 @@
+"""What every Camera must do, run on each driver against the other end of its wire."""
+
+from __future__ import annotations
+
+import mmap
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coupole.devices import Camera, Exposure, Frame
+from coupole.errors import DeviceError, DeviceRefused
+from sim.camera_server import CameraServer, Exposed
+from sim.camera_server import Settings as ServerSettings
+from sim.clock import ClockWriter, SharedClock
+from sim.lighting import Lighting
+from sim.memory_camera import MemoryCamera, Settings
+from sim.reactor import Reactor
+
+HEIGHT_PX, WIDTH_PX = 24, 40
+EXPOSURE = Exposure(exposure_us=2_000)
+BY_SOFTWARE = Exposure(exposure_us=2_000, hardware_trigger=False)
+PATIENCE_S = 10.0
+A_MOMENT_S = 0.2
+"""How long a test looks for a frame that must not come."""
+
+
+class CameraWorld:
+    """A camera, its trigger cable and its clock; every frame is filled with the number of its exposure."""
+
+    def __init__(self, folder: Path) -> None:
+        self._address = str(folder / "camera")
+        self.reactor = Reactor(ClockWriter(folder / "clock", speed=1.0))
+        self.clock = SharedClock(folder / "clock")
+        self._server = CameraServer(
+            self.reactor,
+            ServerSettings(),
+            path=Path(self._address),
+            frame_format={
+                "height_px": HEIGHT_PX,
+                "width_px": WIDTH_PX,
+                "bit_depth": 12,
+                "bayer_pattern": "GBRG",
+                "black_dn": 64,
+                "white_dn": 4095,
+            },
+            readout_us=10_000,
+            exposure_gap_us=100,
+            lighting=Lighting(),
+            pose=lambda: np.eye(4),
+            render=_render,
+        )
+        self._thread = threading.Thread(target=self.reactor.run)
+        self._thread.start()
+        self._drivers = ExitStack()
+
+    def open(self) -> Camera:
+        return self._drivers.enter_context(closing(MemoryCamera(Settings(address=self._address), self.clock)))
+
+    def fire(self, *periods_us: int) -> list[int]:
+        """Send an edge, and one more after each of `periods_us`; their times, ns of the world."""
+        at_ns: list[int] = []
+        done = threading.Event()
+
+        def act() -> None:
+            start_ns = self.reactor.now_ns + 5_000_000
+            at_ns.extend(start_ns + int(offset) * 1000 for offset in np.cumsum([0, *periods_us]))
+            for t_ns in at_ns:
+                self.reactor.at(t_ns, lambda t_ns=t_ns: self._server.edge(t_ns))  # type: ignore[misc]
+            self.reactor.at(at_ns[-1] + 1, done.set)
+
+        self.reactor.call_threadsafe(act)
+        assert done.wait(PATIENCE_S)
+        return at_ns
+
+    @property
+    def armed(self) -> bool:
+        return self._server.armed
+
+    def close(self) -> None:
+        self._drivers.close()
+        self.reactor.stop()
+        self._thread.join()
+        self._server.close()
+
+
+def _render(out: NDArray[np.uint16], exposed: Exposed) -> None:
+    out[:] = exposed.number
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[CameraWorld]:
+    world = CameraWorld(tmp_path)
+    yield world
+    world.close()
+
+
+@pytest.fixture
+def camera(world: CameraWorld) -> Camera:
+    """Opened, configured for edges, not armed."""
+    camera = world.open()
+    camera.configure(EXPOSURE)
+    return camera
+
+
+def take(camera: Camera, count: int) -> list[Frame]:
+    """`count` frames, kept."""
+    frames = [camera.next_frame(PATIENCE_S) for _ in range(count)]
+    assert None not in frames
+    return [frame for frame in frames if frame is not None]
+
+
+def take_numbers(camera: Camera, count: int) -> list[int]:
+    """What `count` frames show, each given back at once."""
+    numbers = []
+    for _ in range(count):
+        (frame,) = take(camera, 1)
+        assert (frame.pixels == frame.pixels[0, 0]).all()
+        numbers.append(int(frame.pixels[0, 0]))
+        frame.release()
+    return numbers
+
+
+def _while_taking(camera: Camera, count: int, act: Callable[[], object]) -> list[int]:
+    """What `count` frames show that are taken, and given back, while `act` makes them."""
+    numbers: list[int] = []
+    taker = threading.Thread(target=lambda: numbers.extend(take_numbers(camera, count)))
+    taker.start()
+    act()
+    taker.join()
+    return numbers
+
+
+class TestCamera:
+    """The contract of `coupole.devices.Camera`."""
+
+    def test_it_says_who_it_is(self, camera: Camera) -> None:
+        identity = camera.identify()
+        assert all((identity.vendor, identity.model, identity.serial, identity.firmware))
+        assert camera.self_test()
+
+    def test_configure_says_what_frames_look_like(self, camera: Camera) -> None:
+        frame_format = camera.configure(EXPOSURE)
+        assert (frame_format.height_px, frame_format.width_px) == (HEIGHT_PX, WIDTH_PX)
+        assert frame_format.bayer_pattern == "GBRG"
+        assert (frame_format.black_dn, frame_format.white_dn) == (64, 4095)
+
+    def test_the_least_period_covers_exposure_gap_and_readout(self, camera: Camera) -> None:
+        assert camera.min_period_us(EXPOSURE) == 10_000
+        assert camera.min_period_us(Exposure(30_000)) == 30_100
+
+    def test_each_edge_makes_a_frame_in_order(self, camera: Camera, world: CameraWorld) -> None:
+        camera.arm(8)
+        world.fire(*[camera.min_period_us(EXPOSURE)] * 5)
+        assert take_numbers(camera, 6) == list(range(6))
+
+    def test_frame_ids_count_on_by_one(self, camera: Camera, world: CameraWorld) -> None:
+        camera.arm(8)
+        world.fire(*[12_000] * 3)
+        ids = [frame.frame_id for frame in take(camera, 4)]
+        assert ids == list(range(ids[0], ids[0] + 4))
+
+    def test_timestamps_follow_the_edges(self, camera: Camera, world: CameraWorld) -> None:
+        camera.arm(8)
+        edges_ns = world.fire(11_000, 25_000, 13_000)
+        stamps_ns = [frame.timestamp_ns for frame in take(camera, 4)]
+        allowed_ns = 2e3 * camera.timestamp_jitter_us + 1e-4 * (edges_ns[-1] - edges_ns[0])
+        assert np.diff(stamps_ns) == pytest.approx(np.diff(edges_ns), abs=allowed_ns)
+
+    def test_edges_at_the_least_period_are_all_taken(self, camera: Camera, world: CameraWorld) -> None:
+        camera.arm(8)
+        world.fire(*[camera.min_period_us(EXPOSURE)] * 19)
+        assert take_numbers(camera, 20) == list(range(20))
+        assert camera.statistics().over_triggers == 0
+
+    def test_an_edge_that_comes_too_early_is_counted_and_makes_no_frame(
+        self, camera: Camera, world: CameraWorld
+    ) -> None:
+        camera.arm(8)
+        world.fire(3_000, 12_000)
+        assert len(take(camera, 2)) == 2
+        assert camera.next_frame(A_MOMENT_S) is None
+        statistics = camera.statistics()
+        assert (statistics.exposed, statistics.over_triggers) == (2, 1)
+
+    def test_next_frame_gives_none_when_nothing_comes_in_time(self, camera: Camera) -> None:
+        camera.arm(8)
+        assert camera.next_frame(0.01) is None
+
+    def test_released_buffers_are_used_again(self, camera: Camera, world: CameraWorld) -> None:
+        """Many more frames than buffers, taken as they come."""
+        camera.arm(8)
+        numbers = _while_taking(camera, 150, lambda: world.fire(*[10_000] * 149))
+        assert numbers == list(range(150))
+        statistics = camera.statistics()
+        assert (statistics.overflows, statistics.lost_transfers) == (0, 0)
+
+    def test_a_frame_keeps_its_pixels_until_it_is_released(self, camera: Camera, world: CameraWorld) -> None:
+        camera.arm(8)
+        world.fire()
+        (kept,) = take(camera, 1)
+        world.fire(*[10_000] * 19)
+        take_numbers(camera, 20)
+        assert (kept.pixels == 0).all()
+
+    def test_pixels_begin_on_a_page_and_are_contiguous(self, camera: Camera, world: CameraWorld) -> None:
+        camera.arm(8)
+        world.fire(10_000, 10_000)
+        for frame in take(camera, 3):
+            assert frame.pixels.ctypes.data % mmap.PAGESIZE == 0
+            assert frame.pixels.flags.c_contiguous
+            assert (frame.pixels.dtype, frame.pixels.shape) == (np.uint16, (HEIGHT_PX, WIDTH_PX))
+
+    def test_statistics_add_up(self, camera: Camera, world: CameraWorld) -> None:
+        camera.arm(8)
+        world.fire(10_000, 1_000, 10_000, 10_000)
+        take(camera, 4)
+        found = camera.statistics()
+        assert (found.exposed, found.over_triggers) == (4, 1)
+        assert found.exposed == found.delivered + found.lost_transfers + found.overflows
+
+    def test_a_disarmed_camera_ignores_edges(self, camera: Camera, world: CameraWorld) -> None:
+        camera.arm(8)
+        world.fire()
+        take_numbers(camera, 1)
+        camera.disarm()
+        world.fire(10_000)
+        assert not world.armed
+        assert camera.next_frame(A_MOMENT_S) is None
+
+    def test_disarming_twice_does_no_harm(self, camera: Camera) -> None:
+        camera.arm(8)
+        camera.disarm()
+        camera.disarm()
+
+    def test_arming_anew_forgets_frames_and_counters_of_before(self, camera: Camera, world: CameraWorld) -> None:
+        camera.arm(8)
+        world.fire(10_000, 10_000)
+        taken = take_numbers(camera, 1)
+        camera.disarm()
+        camera.arm(8)
+        assert camera.statistics().exposed == 0
+        world.fire()
+        after = take_numbers(camera, 1)
+        assert taken == [0]
+        assert after[0] >= 2
+        assert camera.statistics().exposed == 1
+
+    def test_a_frame_released_after_its_session_does_not_disturb_the_next(
+        self, camera: Camera, world: CameraWorld
+    ) -> None:
+        camera.arm(8)
+        world.fire()
+        (late,) = take(camera, 1)
+        camera.disarm()
+        camera.arm(8)
+        late.release()
+        world.fire()
+        (kept,) = take(camera, 1)
+        numbers = _while_taking(camera, 60, lambda: world.fire(*[10_000] * 59))
+        assert numbers == list(range(2, 62))
+        assert (kept.pixels == 1).all()
+
+    def test_a_software_trigger_makes_one_frame(self, world: CameraWorld) -> None:
+        camera = world.open()
+        camera.configure(BY_SOFTWARE)
+        camera.arm(8)
+        camera.trigger()
+        assert take_numbers(camera, 1) == [0]
+        assert camera.next_frame(A_MOMENT_S) is None
+
+    def test_edges_make_no_frame_while_the_software_triggers(self, world: CameraWorld) -> None:
+        camera = world.open()
+        camera.configure(BY_SOFTWARE)
+        camera.arm(8)
+        world.fire()
+        assert camera.next_frame(A_MOMENT_S) is None
+
+    def test_a_software_trigger_is_refused_while_edges_trigger(self, camera: Camera) -> None:
+        camera.arm(8)
+        with pytest.raises(DeviceRefused, match="camera: expected"):
+            camera.trigger()
+
+    def test_arming_before_configuring_is_refused(self, world: CameraWorld) -> None:
+        with pytest.raises(DeviceRefused, match="configure"):
+            world.open().arm(8)
+
+    def test_a_second_client_is_refused(self, camera: Camera, world: CameraWorld) -> None:
+        with pytest.raises(DeviceRefused, match="in use"):
+            world.open()
+
+    def test_closing_disarms_and_lets_the_next_client_in(self, world: CameraWorld) -> None:
+        first = world.open()
+        first.configure(EXPOSURE)
+        first.arm(8)
+        first.close()
+        second = _when_free(world.open)
+        assert not world.armed
+        second.configure(EXPOSURE)
+        second.arm(8)
+        world.fire()
+        assert len(take(second, 1)) == 1
+
+    def test_a_camera_that_is_not_there_is_reported(self, world: CameraWorld, tmp_path: Path) -> None:
+        with pytest.raises(DeviceError, match="camera: expected"):
+            MemoryCamera(Settings(address=str(tmp_path / "nothing")), world.clock)
+
+
+def _when_free(open_camera: Callable[[], Camera]) -> Camera:
+    """Open it as soon as the world has noticed that the last client went."""
+    for _ in range(100):
+        try:
+            return open_camera()
+        except DeviceRefused:
+            threading.Event().wait(0.02)
+    return open_camera()

@@ -1,0 +1,87 @@
+"""The rehearsal: a whole plan on the rig's twin, faster than life, with nothing written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cells import LOW, SIDE, TOP, CellFolder, Ended
+
+
+@pytest.fixture(scope="module")
+def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellFolder, Ended]:
+    """Three views under all 1080 LEDs of a rig whose real devices are not there."""
+    cell = CellFolder(tmp_path_factory.mktemp("dry"))
+    cell.rig_data["ledbox"] = {"driver": "drivers.ledbox:LedBox", "settings": {"port": "/dev/ttyNOPE"}}
+    cell.rig_data["camera"]["settings"] = {"address": "/nowhere"}
+    cell.rig_data["robot"] = {"driver": "drivers.kuka_rsi:KukaRsi", "settings": {"listen": "192.0.2.1:49152"}}
+    cell.rig_data["world"] = {"serves": "dry_run"}
+    cell.write(views=[TOP, SIDE, LOW], lights={"kind": "all"})
+    return cell, cell.acquire("--dry-run", "--speed", "10")
+
+
+def test_a_dry_run_needs_no_real_device(rehearsed: tuple[CellFolder, Ended]) -> None:
+    assert rehearsed[1].code == 0, rehearsed[1].err
+
+
+def test_a_dry_run_takes_and_proves_every_shot(rehearsed: tuple[CellFolder, Ended]) -> None:
+    found = rehearsed[1].document
+    assert (found["shots"], found["proven"], found["missing"], found["reshot"]) == (3240, 3240, 0, 0)
+
+
+def test_a_dry_run_takes_the_time_that_preflight_says(rehearsed: tuple[CellFolder, Ended]) -> None:
+    found = rehearsed[1].document
+    assert found["duration_s"] == pytest.approx(found["preflight_s"], rel=0.02)
+
+
+def test_a_dry_run_says_how_fast_it_was(rehearsed: tuple[CellFolder, Ended]) -> None:
+    found = rehearsed[1].document
+    assert found["speed_asked"] == 10
+    assert found["speed"] == pytest.approx(found["duration_s"] / found["machine_s"], rel=0.01)
+
+
+def test_a_dry_run_judges_the_exposure_of_every_view_on_a_sample(rehearsed: tuple[CellFolder, Ended]) -> None:
+    exposure: dict[str, Any] = rehearsed[1].document["exposure"]
+    assert set(exposure) == {"top", "side", "low"}
+    assert all(40 <= seen["pictures"] <= 60 and seen["verdict"] == "well exposed" for seen in exposure.values())
+
+
+def test_a_dry_run_writes_nothing(rehearsed: tuple[CellFolder, Ended]) -> None:
+    left = {path.name for path in rehearsed[0].folder.iterdir()}
+    assert left == {"rig.yaml", "plan.yaml"}
+
+
+def test_a_dry_run_leaves_the_ledger_alone(cell: CellFolder) -> None:
+    ledger = cell.folder / "storage/ledger/relief.jsonl"
+    ledger.parent.mkdir(parents=True)
+    before = '{"run": "earlier", "dose_lux_h": 1.0, "t": "2026-01-01T00:00:00Z"}\n'
+    ledger.write_text(before)
+    assert cell.acquire("--dry-run").code == 0
+    assert ledger.read_text() == before
+    assert [path.name for path in ledger.parent.parent.iterdir()] == ["ledger"]
+
+
+@pytest.mark.parametrize(
+    ("exposures_us", "verdict"),
+    [((1000, 2000, 16000), "over-exposed"), ((1000, 30000, 31000), "well exposed")],
+    ids=["too-long", "right"],
+)
+def test_a_dry_run_tells_an_exposure_that_is_too_long_from_a_right_one(
+    cell: CellFolder, exposures_us: tuple[int, ...], verdict: str
+) -> None:
+    """The world's light is such that the middle exposure of a bracket is right."""
+    cell.write(exposure={"kind": "bracket", "exposures_us": exposures_us})
+    ended = cell.acquire("--dry-run")
+    assert ended.code == 0, ended.err
+    assert ended.document["exposure"]["top"]["verdict"] == verdict
+
+
+def test_a_dry_run_of_a_refused_plan_ends_with_three(cell: CellFolder) -> None:
+    cell.write(views=[{**TOP, "target_mm": [0, 0, 900]}])
+    assert cell.acquire("--dry-run").code == 3
+
+
+@pytest.mark.parametrize("option", ["--resume", "--output"])
+def test_a_dry_run_does_not_go_with_options_that_keep_something(cell: CellFolder, option: str) -> None:
+    assert cell.acquire("--dry-run", option, str(Path("/nowhere"))).code == 2

@@ -1,0 +1,335 @@
+"""Runs that end in the middle, and what `--resume` makes of them: nothing lost, nothing taken twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cells
+import pytest
+from cells import SIDE, TOP, CellFolder, Ended, Stored
+
+from sim.client import World
+
+MANY_LIGHTS = {"kind": "every", "every": 4}
+"""270 LEDs: a burst of 2.8 s."""
+SPEED = 2.0
+
+
+@dataclass(frozen=True)
+class Killed:
+    """A run whose controller was killed in the middle of its first burst."""
+
+    folder: Path
+    run: Path
+    world_pids: list[int]
+
+    def copy(self, folder: Path) -> tuple[CellFolder, Path]:
+        """The cell, its run and its files once more, to go on with."""
+        shutil.copytree(self.folder, folder, dirs_exist_ok=True)
+        return _self_contained_cell(folder, write=False), folder / self.run.relative_to(self.folder)
+
+
+def _self_contained_cell(folder: Path, *, write: bool = True) -> CellFolder:
+    """A cell whose plan, rig, dome and mesh lie beside each other and name each other without a path."""
+    cell = CellFolder(folder, speed=SPEED, write_now=write)
+    cell.rig_data["dome"]["leds"] = "coupole.csv"
+    cell.rig_data["storage"]["folder"] = "storage"
+    cell.plan_data["object"]["mesh"] = "relief.ply"
+    if write:
+        shutil.copy(cells.REPO / "configs/domes/coupole.csv", folder)
+        shutil.copy(cells.REPO / "configs/objects/relief.ply", folder)
+        cell.write(views=[TOP, SIDE], lights=MANY_LIGHTS)
+    return cell
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Killed:
+    folder = tmp_path_factory.mktemp("killed")
+    cell = _self_contained_cell(folder)
+    process = cell.start_acquire()
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 20, "proven frames")
+    worlds = cells.children(process.pid)
+    process.kill()
+    cells.finish(process)
+    return Killed(folder, run, worlds)
+
+
+def _proven(run: Path) -> dict[str, dict[str, Any]]:
+    return {event["shot"]: event for event in cells.events(run, "frame")}
+
+
+def _pixels_of(run: Path, shots: Any) -> dict[str, bytes]:
+    frames: dict[str, Stored] = cells.stored(run)
+    return {shot: frames[shot].pixels.tobytes() for shot in shots}
+
+
+# -- kill -9 --------------------------------------------------------------------------------------------------
+
+
+def test_a_killed_run_has_kept_part_of_a_burst(killed: Killed) -> None:
+    assert 20 < len(_proven(killed.run)) < len(cells.labels(killed.run))
+    assert cells.events(killed.run, "stop") == []
+    assert cells.here("status", killed.run, "--json").document["state"] == "running or interrupted"
+
+
+def test_verify_says_five_of_a_run_that_is_not_complete(killed: Killed) -> None:
+    verified = cells.here("verify", killed.run, "--json")
+    assert verified.code == 5
+    assert verified.document["bad"] == []
+    assert verified.document["ok"] is False
+
+
+def test_the_world_of_a_killed_controller_ends_with_it(killed: Killed) -> None:
+    assert killed.world_pids
+    cells.wait_until(lambda: not any(map(cells.alive, killed.world_pids)), "the world's end")
+
+
+@dataclass(frozen=True)
+class Resumed:
+    """A killed run that was brought to its end, and what it held before that."""
+
+    cell: CellFolder
+    run: Path
+    ended: Ended
+    proven_before: dict[str, dict[str, Any]]
+    bytes_before: dict[str, bytes]
+
+
+@pytest.fixture(scope="module")
+def resumed(killed: Killed, tmp_path_factory: pytest.TempPathFactory) -> Resumed:
+    cell, run = killed.copy(tmp_path_factory.mktemp("resumed"))
+    proven = _proven(run)
+    kept = _pixels_of(run, proven)
+    return Resumed(cell, run, cell.acquire("--resume", run), proven, kept)
+
+
+def test_a_killed_run_is_resumed_to_completeness(resumed: Resumed) -> None:
+    assert resumed.ended.code == 0, resumed.ended.err
+    found = resumed.ended.document
+    assert (found["run"], found["proven"], found["missing"]) == (str(resumed.run), 540, 0)
+    cells.assert_each_shot_proven_once(resumed.run)
+
+
+def test_what_was_proven_before_a_kill_is_not_taken_again(resumed: Resumed) -> None:
+    after = _proven(resumed.run)
+    assert {shot: after[shot] for shot in resumed.proven_before} == resumed.proven_before
+    resumed_burst = cells.events(resumed.run, "burst")[0]
+    marks = 10  # they are fired with every burst
+    assert resumed_burst["steps"] <= len(cells.labels(resumed.run)) - len(resumed.proven_before) + marks
+
+
+def test_bytes_that_were_proven_before_a_kill_stay_as_they_were(resumed: Resumed) -> None:
+    assert _pixels_of(resumed.run, resumed.proven_before) == resumed.bytes_before
+
+
+def test_labels_stay_true_over_a_kill_and_a_resume(resumed: Resumed) -> None:
+    resumed.cell.plan_data["object"]["mesh"] = str(resumed.cell.folder / "relief.ply")
+    resumed.cell.rig_data["dome"]["leds"] = str(resumed.cell.folder / "coupole.csv")
+    assert cells.mislabelled(resumed.cell, resumed.run) == []
+
+
+def test_a_torn_last_line_of_the_journal_does_not_count(killed: Killed, tmp_path: Path) -> None:
+    cell, run = killed.copy(tmp_path)
+    journal = run / "journal.jsonl"
+    whole = journal.read_bytes()
+    last = whole.rstrip(b"\n").rpartition(b"\n")[2]
+    assert b'"frame"' in last
+    journal.write_bytes(whole[: -len(last) // 2])
+    assert cell.acquire("--resume", run).code == 0
+    cells.assert_each_shot_proven_once(run)
+
+
+def test_a_run_without_its_last_line_takes_that_shot_again(killed: Killed, tmp_path: Path) -> None:
+    """Its frame stands in the file as proven, but only the journal's word counts."""
+    cell, run = killed.copy(tmp_path)
+    journal = run / "journal.jsonl"
+    lines = journal.read_bytes().splitlines(keepends=True)
+    lost = json.loads(lines[-1])["shot"]
+    journal.write_bytes(b"".join(lines[:-1]))
+    assert cell.acquire("--resume", run).code == 0
+    cells.assert_each_shot_proven_once(run)
+    assert lost in cells.stored(run)
+
+
+# -- what is resumed must be what was begun -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["plan.yaml", "rig.yaml", "relief.ply", "coupole.csv"])
+def test_a_run_is_not_resumed_with_a_changed_file(killed: Killed, tmp_path: Path, name: str) -> None:
+    cell, run = killed.copy(tmp_path)
+    before = (run / "journal.jsonl").read_bytes()
+    changed = tmp_path / name
+    match changed.suffix:
+        case ".yaml":
+            changed.write_text(changed.read_text() + "\n")
+        case ".csv":
+            changed.write_text("# another dome\n" + changed.read_text())
+        case _:
+            data = bytearray(changed.read_bytes())
+            data[1000] ^= 1
+            changed.write_bytes(data)
+    ended = cell.acquire("--resume", run)
+    assert ended.code == 2
+    assert name in ended.err
+    assert (run / "journal.jsonl").read_bytes() == before
+
+
+def test_a_folder_that_is_no_run_is_not_resumed(cell: CellFolder) -> None:
+    assert cell.acquire("--resume", cell.folder).code == 2
+
+
+def test_a_complete_run_is_resumed_at_once_and_shoots_nothing(cell: CellFolder) -> None:
+    cell.write(lights={"kind": "ids", "ids": [3, 4]})
+    assert cell.acquire().code == 0
+    run = cell.run_folder
+    before = cells.events(run)
+    ended = cell.acquire("--resume", run)
+    assert ended.code == 0
+    assert (ended.document["proven"], ended.document["missing"]) == (2, 0)
+    assert [event["event"] for event in cells.events(run)[len(before) :]] == ["resume", "stop"]
+    cells.assert_each_shot_proven_once(run)
+
+
+# -- the operator stops it ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def standing(tmp_path: Path) -> Iterator[tuple[CellFolder, World]]:
+    """A cell whose world outlives its controllers."""
+    cell = CellFolder(tmp_path, speed=SPEED)
+    cell.join()
+    cell.write(lights=MANY_LIGHTS)
+    with cell.world() as world:
+        yield cell, world
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_ends_with_130_leaves_the_cell_safe_and_is_resumed(
+    standing: tuple[CellFolder, World], number: signal.Signals
+) -> None:
+    cell, world = standing
+    process = cell.start_acquire()
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 20, "proven frames")
+    process.send_signal(number)
+    ended = cells.finish(process)
+    assert cells.safe(world)
+    assert ended.code == 130
+    assert ended.document["exit_code"] == 130
+    assert cells.events(run, "stop")[-1]["outcome"] == "interrupted"
+    assert cells.here("status", run, "--json").document["state"] == "interrupted"
+    assert cell.acquire("--resume", run).code == 0
+    cells.assert_each_shot_proven_once(run)
+
+
+def test_a_run_stopped_while_the_arm_moves_stops_the_arm(standing: tuple[CellFolder, World]) -> None:
+    cell, world = standing
+    process = cell.start_acquire()
+    cells.wait_until(lambda: world.ask("state")["arm_moving"], "the arm's motion")
+    process.send_signal(signal.SIGINT)
+    ended = cells.finish(process)
+    assert cells.safe(world)
+    assert ended.code == 130
+    assert cells.frame_lines(cell.run_folder) == 0
+
+
+def test_a_run_that_is_being_acquired_is_not_resumed_by_another(standing: tuple[CellFolder, World]) -> None:
+    cell, _ = standing
+    process = cell.start_acquire()
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    other = cell.acquire("--resume", run)
+    assert cells.finish(process).code == 0
+    assert other.code in (2, 4), other.err  # the run is locked, or its devices are
+    cells.assert_each_shot_proven_once(run)
+
+
+# -- the controller dies, the cell goes on --------------------------------------------------------------------
+
+
+def test_leds_go_dark_by_the_boxs_watchdog_when_the_controller_is_killed(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path, speed=1.0)
+    cell.rig_data["ledbox"]["settings"]["watchdog_s"] = 2.0
+    cell.join()
+    cell.write(lights={"kind": "every", "every": 2})
+    with cell.world() as world:
+        process = cell.start_acquire()
+        run = cell.run_folder
+        cells.wait_until(lambda: cells.frame_lines(run) > 20, "proven frames")
+        process.kill()
+        cells.finish(process)
+        killed_s = world.ask("state")["t_s"]
+        dark_since_s = _dark_since_s(world)
+        assert dark_since_s < killed_s + 2.5  # the burst would have gone on for 4 s
+        cells.wait_until(lambda: cells.safe(world), "a safe cell")
+
+
+def _dark_since_s(world: World, for_s: float = 0.3) -> float:
+    """World time of the first of many looks in a row in which nothing shone; LEDs flash at 100 Hz."""
+    looks: list[float] = []
+
+    def dark_for_long() -> bool:
+        state = world.ask("state")
+        looks.append(state["t_s"])
+        if state["shining"]:
+            looks.clear()
+        return bool(looks) and looks[-1] - looks[0] > for_s and len(looks) > 10
+
+    cells.wait_until(dark_for_long, "darkness")
+    return looks[0]
+
+
+def test_the_arm_comes_to_rest_when_the_controller_is_killed_in_a_motion(
+    standing: tuple[CellFolder, World],
+) -> None:
+    cell, world = standing
+    process = cell.start_acquire()
+    cells.wait_until(lambda: world.ask("state")["arm_moving"], "the arm's motion")
+    process.kill()
+    cells.finish(process)
+    cells.wait_until(lambda: cells.safe(world), "the arm at rest")
+
+
+# -- the operator pauses it -----------------------------------------------------------------------------------
+
+
+def test_a_run_pauses_between_bursts_and_goes_on(standing: tuple[CellFolder, World]) -> None:
+    cell, world = standing
+    cell.write(lights=cells.SOME_LIGHTS, repeats=4)
+    process = cell.start_acquire()
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    process.send_signal(signal.SIGUSR1)
+    cells.wait_until(lambda: cells.events(run, "pause"), "the pause")
+    assert cells.here("status", run, "--json").document["state"] == "paused"
+    paused_at = cells.frame_lines(run)
+    assert cells.safe(world)
+    time.sleep(0.5)
+    assert cells.frame_lines(run) == paused_at < 4 * 54
+    process.send_signal(signal.SIGUSR1)
+    assert cells.finish(process).code == 0
+    kinds = [event["event"] for event in cells.events(run)]
+    assert kinds.index("pause") < kinds.index("resume") < kinds.index("stop")
+    cells.assert_each_shot_proven_once(run)
+
+
+def test_a_paused_run_can_be_stopped(standing: tuple[CellFolder, World]) -> None:
+    cell, world = standing
+    cell.write(lights=cells.SOME_LIGHTS, repeats=4)
+    process = cell.start_acquire()
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    os.kill(process.pid, signal.SIGUSR1)
+    cells.wait_until(lambda: cells.events(run, "pause"), "the pause")
+    os.kill(process.pid, signal.SIGINT)
+    assert cells.finish(process).code == 130
+    assert cells.safe(world)

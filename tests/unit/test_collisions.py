@@ -1,0 +1,172 @@
+"""Bodies and distances, against shapes that can be reckoned by hand and against an independent checker."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from coupole.collisions import (
+    ARM_CAPSULES,
+    MESH_STEP_MM,
+    Capsule,
+    CellBodies,
+    Clearances,
+    Surroundings,
+    surface_points,
+)
+from coupole.geometry import apply, inverse, transform
+from coupole.kinematics import KR10_R1100_SIXX, forward, link_frames
+
+LINK_MESHES = Path(__file__).parents[3] / "shared/data/robot/kr10r1100sixx"
+BASE_FROM_SUPPORT = transform((200, 0, 1450), (0, 0, 180))
+TOOL = (Capsule("camera", 7, (0, 0, 20), (0, 0, 100), 60),)
+LOW, HIGH = np.array(KR10_R1100_SIXX.limits_deg).T
+STRETCHED = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+ANYWHERE = st.tuples(*(st.floats(low, high) for low, high in KR10_R1100_SIXX.limits_deg)).map(np.array)
+
+
+def cell(object_points_mm: NDArray[np.float64] | None = None, **clearances: float) -> CellBodies:
+    points = np.zeros((0, 3)) if object_points_mm is None else object_points_mm
+    around = Surroundings(BASE_FROM_SUPPORT, 740.0, 1500.0, 74.0, points)
+    return CellBodies(KR10_R1100_SIXX, around, TOOL, Clearances(**clearances))
+
+
+def box_corners(size_mm: tuple[float, float, float]) -> NDArray[np.float64]:
+    """A box on the support, centred, as triangles."""
+    import trimesh
+
+    mesh = trimesh.creation.box(extents=size_mm)
+    return np.asarray(mesh.vertices[mesh.faces]) + [0, 0, size_mm[2] / 2]
+
+
+@given(ANYWHERE)
+def test_the_last_link_frame_is_the_flange(joints: NDArray[np.float64]) -> None:
+    assert np.abs(link_frames(KR10_R1100_SIXX, joints)[7] - forward(KR10_R1100_SIXX, joints)).max() < 1e-9
+
+
+@pytest.mark.skipif(not LINK_MESHES.is_dir(), reason="the vendor's link meshes are not at hand")
+@pytest.mark.parametrize("link", range(7))
+def test_the_capsules_of_a_link_enclose_its_mesh(link: int) -> None:
+    import trimesh
+
+    name = "base_link" if link == 0 else f"link_{link}"
+    mesh = trimesh.load(LINK_MESHES / f"{name}.stl", process=False, force="mesh")
+    points = 1000 * np.concatenate([mesh.vertices, trimesh.sample.sample_surface(mesh, 5000, seed=1)[0]])
+    outside = np.full(len(points), np.inf)
+    for capsule in (c for c in ARM_CAPSULES if c.link == link):
+        start, end = np.array(capsule.start_mm, float), np.array(capsule.end_mm, float)
+        along = end - start
+        share = np.clip((points - start) @ along / max(along @ along, 1e-9), 0, 1)
+        outside = np.minimum(
+            outside, np.linalg.norm(points - start - share[:, None] * along, axis=1) - capsule.radius_mm
+        )
+    assert outside.max() <= 0.5
+
+
+def test_surface_points_lie_dense_on_the_surface() -> None:
+    corners = box_corners((100.0, 60.0, 40.0))
+    points = surface_points(corners)
+    random = np.random.default_rng(1)
+    weights = random.dirichlet((1, 1, 1), 4000)
+    somewhere = np.einsum("nk,nkj->nj", weights, corners[random.integers(0, len(corners), 4000)])
+    nearest = np.min(np.linalg.norm(somewhere[:, None] - points[None], axis=2), axis=1)
+    assert nearest.max() <= MESH_STEP_MM
+
+
+def test_the_camera_above_a_box_is_as_far_as_geometry_says() -> None:
+    bodies = cell(surface_points(box_corners((100.0, 100.0, 50.0))), object_mm=50.0)
+    pose = BASE_FROM_SUPPORT @ transform((0, 0, 420), (0, 0, 180))  # flange 420 mm above the disk, looking down
+    from coupole.kinematics import inverse as solve
+
+    joints = solve(KR10_R1100_SIXX, pose)[0]
+    margin = bodies.margins(joints)[("camera", "the object")][0]
+    true = 420 - 100 - 60 - 50 - 50  # axis end, radius, box height, what must be kept
+    assert true - MESH_STEP_MM - 12 <= margin <= true
+
+
+def test_an_arm_through_the_support_is_named() -> None:
+    contacts = cell().contacts((0.0, -90.0, 0.0, 0.0, 0.0, 0.0))
+    assert any(contact.other == "the support" and contact.distance_mm < 0 for contact in contacts)
+
+
+def test_an_arm_through_the_dome_is_named() -> None:
+    contacts = cell().contacts(STRETCHED)
+    around = apply(inverse(BASE_FROM_SUPPORT), link_frames(KR10_R1100_SIXX, STRETCHED)[7][:3, 3])
+    assert np.linalg.norm(around) > 1300
+    assert any(contact.other == "the dome" for contact in contacts)
+
+
+def test_a_message_names_both_bodies_the_distance_and_what_must_be_kept() -> None:
+    contact = cell().contacts((0.0, -90.0, 0.0, 0.0, 0.0, 0.0))[0]
+    assert str(contact).startswith(f"{contact.body} would be ")
+    assert f"{contact.required_mm:g} mm must be kept" in str(contact)
+
+
+@settings(max_examples=60, deadline=None)
+@given(ANYWHERE, ANYWHERE)
+def test_a_motion_that_is_called_clear_is_clear_at_every_place(
+    start: NDArray[np.float64], end: NDArray[np.float64]
+) -> None:
+    bodies = cell(surface_points(box_corners((300.0, 200.0, 200.0))))
+    end = start + 0.2 * (end - start)
+    if bodies.contact_on_the_way(start, end) is None:
+        places = start + np.linspace(0, 1, 400)[:, None] * (end - start)
+        assert min(margin.min() for margin in bodies.margins(places).values()) >= 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(ANYWHERE, st.integers(0, 5), st.floats(-3, 3))
+def test_no_margin_changes_faster_than_the_arm_can_move(joints: NDArray[np.float64], axis: int, by: float) -> None:
+    from coupole.collisions import _REACH_MM
+
+    bodies = cell(surface_points(box_corners((300.0, 200.0, 200.0))))
+    moved = joints.copy()
+    moved[axis] += by
+    before, after = bodies.margins(joints), bodies.margins(moved)
+    for pair, margin in before.items():
+        both = 2 if pair[1].startswith("the arm's") else 1
+        assert abs(float(after[pair][0] - margin[0])) <= both * np.radians(abs(by)) * _REACH_MM[axis] + 1e-6
+
+
+@pytest.mark.skipif(not LINK_MESHES.is_dir(), reason="the vendor's link meshes are not at hand")
+def test_margins_never_exceed_the_distance_that_an_independent_checker_finds() -> None:
+    import fcl
+    import trimesh
+
+    corners = box_corners((300.0, 200.0, 250.0))
+    bodies = cell(surface_points(corners), object_mm=0.0)
+    box = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners))
+    box_object = fcl.CollisionObject(_fcl_mesh(box.vertices, box.faces))
+    links = {}
+    for link in range(2, 7):
+        mesh = trimesh.load(LINK_MESHES / f"link_{link}.stl", process=False, force="mesh")
+        links[link] = fcl.CollisionObject(_fcl_mesh(1000 * mesh.vertices, mesh.faces))
+    random = np.random.default_rng(4)
+    compared = 0
+    for _ in range(150):
+        joints = random.uniform(LOW, HIGH)
+        frames = inverse(BASE_FROM_SUPPORT) @ link_frames(KR10_R1100_SIXX, joints)
+        margins = bodies.margins(joints)
+        for link, moving in links.items():
+            moving.setTransform(fcl.Transform(frames[link][:3, :3], frames[link][:3, 3]))
+            distance = fcl.distance(moving, box_object, fcl.DistanceRequest(), fcl.DistanceResult())
+            margin = float(margins[(f"link {link}", "the object")][0])
+            if margin > 0:
+                assert distance >= margin
+                compared += 1
+    assert compared > 100
+
+
+def _fcl_mesh(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> object:
+    import fcl
+
+    model = fcl.BVHModel()
+    model.beginModel(len(vertices), len(faces))
+    model.addSubModel(np.ascontiguousarray(vertices), np.ascontiguousarray(faces))
+    model.endModel()
+    return model

@@ -88,7 +88,7 @@ def check(
     except InputError as error:
         _fail(error, as_json=as_json, found={"ok": False, "refusals": []})
         raise
-    report = preflight_of(job, job.cell.storage_folder)
+    report = preflight_of(job, job.cell.storage_folder, paths=not no_paths)
     show_preflight(console, report, name=job.plan.name, rig=job.cell.rig.name)
     show_views(console, report)
     if as_json:
@@ -106,14 +106,14 @@ def check(
                     "ideal_s": report.ideal_s,
                     "dose_lux_h": report.dose_lux_h,
                     "peak_board_c": report.peak_board_c,
-                    "paths_checked": False,
+                    "paths_checked": not no_paths,
                 }
             )
         )
     if report.refusals:
         raise PreflightRefused(report.refusals)
     if not as_json:
-        console.print("the plan can be run" + ("" if no_paths else " (paths between views are not checked yet)"))
+        console.print("the plan can be run" + (" (collisions were not checked)" if no_paths else ""))
 
 
 @app.command()

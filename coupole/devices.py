@@ -278,7 +278,7 @@ class ArmState:
     joints_deg: tuple[float, float, float, float, float, float]
     base_from_flange: Transform
     t_ns: int
-    """On the rig's clock."""
+    """When this was first seen, on the rig's clock: a later time means that the controller was heard since."""
     moving: bool
     fault: str = ""
     """Name and reason of a latched fault; empty when there is none."""

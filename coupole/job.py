@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole import ledger, yamlfile
+from coupole.collisions import CellBodies
 from coupole.dome import LedTable, read_led_table
 from coupole.errors import InputError, Problem, StorageError
 from coupole.geometry import apply
+from coupole.itinerary import bodies_of, plan_itinerary
 from coupole.plan import MeasuredObject, Plan
 from coupole.preflight import Report, StorageFacts, check
 from coupole.rig import Rig, driver_problems
@@ -50,9 +53,16 @@ class Job:
     document: Document
     cell: Cell
     mesh_path: Path | None
+    object_corners_mm: NDArray[np.float64]
+    """The object's mesh [triangles, 3, 3] in the support frame; none of them without a mesh."""
     object_points_support_mm: NDArray[np.float64]
     """[n, 3] corners and centre of the object's bounding box, or the views' targets: where dose is reckoned."""
     schedule: Schedule
+
+    @cached_property
+    def bodies(self) -> CellBodies:
+        """Arm, tool and everything that they must not touch."""
+        return bodies_of(self.cell.rig, self.cell.leds, self.object_corners_mm)
 
     @property
     def inputs(self) -> Inputs:
@@ -99,7 +109,7 @@ def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
 
     problems += [document.problem(key, message) for key, message in missing_lights(plan, cell.leds)]
     mesh_path = document.resolve(plan.object.mesh) if plan.object and plan.object.mesh else None
-    points, mesh_problem = _object_points(plan, mesh_path)
+    corners, mesh_problem = _object_corners(plan, mesh_path)
     if mesh_problem:
         problems.append(document.problem(("object", "mesh"), mesh_problem))
     if isinstance(plan.calibrations, tuple):
@@ -119,7 +129,7 @@ def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
         readout_us=1e6 / cell.rig.sensor.max_frames_per_s,
         exposure_gap_us=cell.rig.sensor.exposure_gap_us,
     )
-    return Job(plan, document, cell, mesh_path, points, schedule)
+    return Job(plan, document, cell, mesh_path, corners, _dose_points(plan, corners), schedule)
 
 
 def _named_rig(document: Document) -> Path | None:
@@ -134,36 +144,48 @@ def _bad_exposures(document: Document, plan: Plan, rig: Rig) -> list[Problem]:
     return []
 
 
-def _object_points(plan: Plan, mesh_path: Path | None) -> tuple[NDArray[np.float64], str]:
-    """Points in the support frame and, if the mesh cannot be read, why."""
-    targets = [view.target_mm for view in plan.views if hasattr(view, "target_mm")]
-    points = np.array(targets or [(0.0, 0.0, 0.0)])
+def _object_corners(plan: Plan, mesh_path: Path | None) -> tuple[NDArray[np.float64], str]:
+    """The object's triangles in the support frame and, if the mesh cannot be read, why."""
+    nothing = np.zeros((0, 3, 3))
     if mesh_path is None:
-        return points, ""
+        return nothing, ""
     assert plan.object is not None
     if not mesh_path.is_file():
-        return points, f"expected a mesh file (PLY, STL, OBJ); there is no {mesh_path}"
+        return nothing, f"expected a mesh file (PLY, STL, OBJ); there is no {mesh_path}"
     try:
-        return bounding_points(mesh_path, plan.object), ""
+        return load_corners(mesh_path, plan.object), ""
     except Exception as error:  # noqa: BLE001  whatever trimesh raises, the file is not a mesh to us
-        return points, f"cannot read the mesh {mesh_path}: {error}"
+        return nothing, f"cannot read the mesh {mesh_path}: {error}"
 
 
-def bounding_points(mesh_path: Path, measured: MeasuredObject) -> NDArray[np.float64]:
-    """Corners and centre [9, 3] of the object's bounding box, in the support frame, mm."""
+def load_corners(mesh_path: Path, measured: MeasuredObject) -> NDArray[np.float64]:
+    """Triangles [n, 3, 3] of a mesh file in the support frame, mm. Raises whatever trimesh raises."""
     import trimesh
 
     loaded: Any = trimesh.load(mesh_path, process=False, force="mesh")
-    if len(loaded.vertices) == 0:
-        raise ValueError("it has no vertices")
-    low, high = np.asarray(loaded.bounds) * MM_PER_UNIT[measured.mesh_unit]
-    box = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    points = np.concatenate([box, [(low + high) / 2]])
-    return apply(measured.support_from_object.matrix(), points)
+    if len(loaded.faces) == 0:
+        raise ValueError("it has no triangles")
+    corners = np.asarray(loaded.vertices)[np.asarray(loaded.faces)] * MM_PER_UNIT[measured.mesh_unit]
+    if not np.isfinite(corners).all():
+        raise ValueError("it has vertices that are no finite numbers")
+    return apply(measured.support_from_object.matrix(), corners)
 
 
-def preflight_of(job: Job, folder: Path) -> Report:
-    """Preflight's report on a job whose run would lie in `folder`; the disk there is measured."""
+def _dose_points(plan: Plan, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Corners and centre [9, 3] of the object's bounding box; the views' targets where there is no mesh."""
+    if len(corners) == 0:
+        targets = [view.target_mm for view in plan.views if hasattr(view, "target_mm")]
+        return np.array(targets or [(0.0, 0.0, 0.0)])
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    box = [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    return np.concatenate([box, [(low + high) / 2]])
+
+
+def preflight_of(job: Job, folder: Path, *, paths: bool = True) -> Report:
+    """Preflight's report on a job whose run would lie in `folder`; the disk there is measured.
+
+    Without `paths` nothing is checked for collisions.
+    """
     existing = folder
     while not existing.exists():
         existing = existing.parent
@@ -171,11 +193,14 @@ def preflight_of(job: Job, folder: Path) -> Report:
         write_bytes_s = measure_write_speed(existing)
     except StorageError:
         write_bytes_s = 0.0
-    return check_job(job, StorageFacts(shutil.disk_usage(existing).free, write_bytes_s))
+    return check_job(job, StorageFacts(shutil.disk_usage(existing).free, write_bytes_s), paths=paths)
 
 
-def check_job(job: Job, storage: StorageFacts) -> Report:
+def check_job(job: Job, storage: StorageFacts, *, paths: bool = True) -> Report:
     """Preflight's report on a job, given what is known of the disk."""
+    rig = job.cell.rig
+    bodies = job.bodies if paths else None
+    itinerary = plan_itinerary(job.schedule.views, rig, bodies, rig.motion.home_joints_deg)
     before = ledger.total_lux_h(job.cell.storage_folder, job.plan.object.id) if job.plan.object else 0.0
     return check(
         job.plan,
@@ -183,6 +208,7 @@ def check_job(job: Job, storage: StorageFacts) -> Report:
         job.schedule,
         job.cell.leds,
         storage,
+        itinerary,
         object_points_support_mm=job.object_points_support_mm,
         dose_before_lux_h=before,
     )

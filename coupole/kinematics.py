@@ -216,20 +216,23 @@ def unreachable_reason(arm: Arm, base_from_flange: Transform) -> str:
 
 
 def move_duration_s(arm: Arm, from_joints_deg: ArrayLike, to_joints_deg: ArrayLike) -> float:
-    """Duration of the jerk-limited motion from rest to rest, all axes in step on a straight line in joint
-    space: the profile that the driver runs (about 10 us a call).
+    """Duration of the jerk-limited motion from rest to rest on a straight line in joint space, as fast as the
+    axis that limits it allows: the profile that the driver runs (some 10 us a call).
     """
-    from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
+    from ruckig import InputParameter, Ruckig, Trajectory
 
-    motion = InputParameter(6)
-    motion.current_position = [float(v) for v in np.asarray(from_joints_deg)]
-    motion.target_position = [float(v) for v in np.asarray(to_joints_deg)]
-    motion.max_velocity = list(arm.velocity_deg_s)
-    motion.max_acceleration = list(arm.acceleration_deg_s2)
-    motion.max_jerk = list(arm.jerk_deg_s3)
-    motion.synchronization = Synchronization.Phase
-    trajectory = Trajectory(6)
-    Ruckig(6).calculate(motion, trajectory)
+    way_deg = np.abs(np.asarray(to_joints_deg, dtype=np.float64) - np.asarray(from_joints_deg))
+    moved = way_deg > 0
+    if not moved.any():
+        return 0.0
+    motion = InputParameter(1)
+    motion.current_position, motion.target_position = [0.0], [1.0]
+    motion.max_velocity, motion.max_acceleration, motion.max_jerk = (
+        [float(np.min(np.array(limits)[moved] / way_deg[moved]))]
+        for limits in (arm.velocity_deg_s, arm.acceleration_deg_s2, arm.jerk_deg_s3)
+    )
+    trajectory = Trajectory(1)
+    Ruckig(1).calculate(motion, trajectory)
     return float(trajectory.duration)
 
 

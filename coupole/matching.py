@@ -233,8 +233,6 @@ def _agree(  # type: ignore[no-untyped-def]
     view = np.empty(n_frames, np.int64)
     for anchor_frame in range(min(max_surplus + 1, n_frames)):
         for anchor_step in range(n_steps):
-            if candidates == 1 and agreed[anchor_frame] == anchor_step:
-                continue
             surplus = _align(
                 frame_ns, step_ns, anchor_frame, anchor_step, jitter_ns, drift, max_surplus, in_flight, view
             )

@@ -12,16 +12,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole import kinematics
 from coupole.devices import NO_LIGHT
 from coupole.dome import LedTable
-from coupole.geometry import Transform, apply, inverse
+from coupole.geometry import apply
+from coupole.itinerary import Itinerary
 from coupole.plan import Plan
-from coupole.rig import BoardThermal, KeepOutSphere, LedLimits, Rig
-from coupole.shots import Burst, Schedule, ViewPose
+from coupole.rig import BoardThermal, LedLimits, Rig
+from coupole.shots import Burst, Schedule
 
 BURST_OVERHEAD_S = 0.17
-"""Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell, 115200 baud)."""
+"""Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""
 SETTLE_CHECK_S = 0.2
 """From the end of a motion to 'settled', dwell apart (measured on the simulated cell)."""
 STEP_BYTES, BITS_PER_BYTE = 16, 10
@@ -70,75 +70,26 @@ class Report:
     warnings: list[str] = field(default_factory=list)
 
 
-def arm_of(rig: Rig) -> kinematics.Arm:
-    """The rig's arm with the speeds that plans are run at."""
-    return kinematics.slowed(
-        kinematics.KR10_R1100_SIXX,
-        speed_fraction=rig.motion.speed_fraction,
-        acceleration_deg_s2=rig.motion.acceleration_deg_s2,
-        jerk_deg_s3=rig.motion.jerk_deg_s3,
-    )
-
-
-def base_from_flange(view: ViewPose, rig: Rig) -> Transform:
-    """Where the flange must be for a view that is given as a camera pose."""
-    assert view.support_from_camera is not None
-    base_from_camera = rig.support.base_from_support.matrix() @ view.support_from_camera
-    flange: Transform = base_from_camera @ inverse(rig.flange_from_camera.matrix())
-    return flange
-
-
-def joints_for_views(
-    views: Sequence[ViewPose], rig: Rig, start_deg: Sequence[float]
-) -> tuple[list[NDArray[np.float64] | None], list[str]]:
-    """Joint angles [6] of each view, the nearest to those before; None and a refusal where there are none."""
-    arm = arm_of(rig)
-    here = np.asarray(start_deg, dtype=np.float64)
-    joints: list[NDArray[np.float64] | None] = []
-    refusals: list[str] = []
-    for view in views:
-        if view.joints_deg is not None:
-            there: NDArray[np.float64] | None = np.asarray(view.joints_deg, dtype=np.float64)
-            if violation := kinematics.limit_violations(arm, view.joints_deg):
-                refusals.append(f"view {view.name}: {violation}")
-                there = None
-        else:
-            pose = base_from_flange(view, rig)
-            solutions = kinematics.inverse(arm, pose)
-            if len(solutions) == 0:
-                refusals.append(f"view {view.name}: {kinematics.unreachable_reason(arm, pose)}")
-                there = None
-            else:
-                there = kinematics.nearest(arm, solutions, here)
-        if there is not None:
-            here = there
-        joints.append(there)
-    return joints, refusals
-
-
 def check(
     plan: Plan,
     rig: Rig,
     schedule: Schedule,
     leds: LedTable,
     storage: StorageFacts,
+    itinerary: Itinerary,
     *,
     object_points_support_mm: NDArray[np.float64],
     dose_before_lux_h: float = 0.0,
-    start_joints_deg: Sequence[float] | None = None,
 ) -> Report:
     """Check a whole plan. `object_points_support_mm` [n, 3] are where the dose is reckoned; the worst counts."""
     report = Report(shots=schedule.shots, frames=schedule.frames)
     report.dose_before_lux_h = dose_before_lux_h
     report.dose_budget_lux_h = plan.object.dose_budget_lux_h if plan.object else None
-    start = start_joints_deg or rig.motion.home_joints_deg
-    joints, unreachable = joints_for_views(schedule.views, rig, start)
-    report.refusals += unreachable
+    report.refusals += itinerary.refusals
     report.refusals += _refuse_names(schedule)
-    report.refusals += _refuse_keep_out(schedule, joints, rig)
     report.refusals += _refuse_optics(plan, rig)
     report.refusals += _refuse_on_times(schedule.bursts[0], rig.led_limits)
-    _time_and_dose(report, plan, rig, schedule, joints, start, leds, object_points_support_mm)
+    _time_and_dose(report, plan, rig, schedule, itinerary, leds, object_points_support_mm)
     _thermal(report, rig.led_limits, schedule, leds)
     _storage(report, rig, schedule, storage)
     return report
@@ -148,32 +99,6 @@ def _refuse_names(schedule: Schedule) -> list[str]:
     names = [view.name for view in schedule.views]
     twice = sorted({name for name in names if names.count(name) > 1})
     return [f"view {name}: expected a name of its own, found it more than once in the plan" for name in twice]
-
-
-def _refuse_keep_out(schedule: Schedule, joints: Sequence[NDArray[np.float64] | None], rig: Rig) -> list[str]:
-    support_from_base = inverse(rig.support.base_from_support.matrix())
-    flange_from_camera = rig.flange_from_camera.matrix()
-    refusals = []
-    for view, there in zip(schedule.views, joints, strict=True):
-        if there is None:
-            continue
-        flange = kinematics.forward(kinematics.KR10_R1100_SIXX, there)
-        points = {"flange": flange[:3, 3], "camera": (flange @ flange_from_camera)[:3, 3]}
-        for part, point_base in points.items():
-            point = apply(support_from_base, point_base)
-            if point[2] <= 0:
-                refusals.append(f"view {view.name}: the {part} would be {-point[2]:.0f} mm below the support")
-            for volume in rig.keep_out:
-                if isinstance(volume, KeepOutSphere):
-                    inside = bool(np.linalg.norm(point - np.array(volume.center_mm)) < volume.radius_mm)
-                else:
-                    inside = bool(np.all(point > volume.min_mm) and np.all(point < volume.max_mm))
-                if inside:
-                    at = ", ".join(f"{v:.0f}" for v in point)
-                    refusals.append(
-                        f"view {view.name}: the {part} at ({at}) mm is inside keep-out `{volume.name}`"
-                    )
-    return refusals
 
 
 def _refuse_optics(plan: Plan, rig: Rig) -> list[str]:
@@ -212,25 +137,18 @@ def _time_and_dose(
     plan: Plan,
     rig: Rig,
     schedule: Schedule,
-    joints: Sequence[NDArray[np.float64] | None],
-    start: Sequence[float],
+    itinerary: Itinerary,
     leds: LedTable,
     points_support_mm: NDArray[np.float64],
 ) -> None:
-    arm = arm_of(rig)
     points_base = apply(rig.support.base_from_support.matrix(), points_support_mm)
     lux = leds.illuminance_lux(points_base, emission=rig.dome.emission)
     row_of_id = {int(led): row for row, led in enumerate(leds.ids)}
     dose_of_table: dict[int, NDArray[np.float64]] = {}
-    here = np.asarray(start, dtype=np.float64)
     total = np.zeros(len(points_support_mm))
     baud = int(rig.ledbox.settings.get("baud", 115_200))
-    for view, there, bursts in zip(schedule.views, joints, schedule.bursts, strict=True):
-        move_s = 0.0
-        if there is not None:
-            move_s = kinematics.move_duration_s(arm, here, there)
-            here = there
-        move_s += rig.motion.settle_dwell_s
+    for view, visit, bursts in zip(schedule.views, itinerary.visits, schedule.bursts, strict=True):
+        move_s = (visit.leg.duration_s if visit and visit.leg.waypoints else 0.0) + rig.motion.settle_dwell_s
         burst_s = sum(b.duration_s for b in bursts)
         dose = np.zeros(len(total))
         for burst in bursts:
@@ -247,7 +165,11 @@ def _time_and_dose(
         report.duration_s += move_s + SETTLE_CHECK_S + waiting_s + burst_s + BURST_OVERHEAD_S * len(bursts)
         report.views.append(
             ViewReport(
-                view.name, None if there is None else tuple(there.tolist()), move_s, burst_s, float(dose.max())
+                view.name,
+                None if visit is None else tuple(visit.joints_deg.tolist()),
+                move_s,
+                burst_s,
+                float(dose.max()),
             )
         )
     report.dose_lux_h = float(total.max())

@@ -100,6 +100,8 @@ class Motion(Model):
     acceleration_deg_s2: Annotated[float, Field(gt=0)] = 300.0
     jerk_deg_s3: Annotated[float, Field(gt=0)] = 3000.0
     settle_dwell_s: Annotated[float, Field(ge=0)] = 0.3
+    still_deg: Annotated[float, Field(gt=0)] = 0.01
+    """An axis that moves farther than this during a burst has moved: what was not proven before is taken again."""
     home_joints_deg: tuple[float, float, float, float, float, float] = (0.0, -170.0, 150.0, 0.0, -70.0, 0.0)
     """Where the arm is taken to be when a plan is checked without it."""
 
@@ -128,6 +130,25 @@ class KeepOutBox(Model):
 
 
 KeepOut = Annotated[KeepOutSphere | KeepOutBox, Field(discriminator="kind")]
+
+
+class ToolBody(Model):
+    """Something that the flange carries: a capsule in the flange's frame."""
+
+    name: Name
+    from_mm: Vector
+    to_mm: Vector
+    radius_mm: Annotated[float, Field(gt=0)]
+
+
+class Keep(Model):
+    """Distances that the arm keeps from what stands round it, mm."""
+
+    object_mm: Annotated[float, Field(ge=0)] = 50.0
+    support_mm: Annotated[float, Field(ge=0)] = 10.0
+    dome_mm: Annotated[float, Field(ge=0)] = 20.0
+    self_mm: Annotated[float, Field(ge=0)] = 0.0
+    keep_out_mm: Annotated[float, Field(ge=0)] = 0.0
 
 
 class Storage(Model):
@@ -159,6 +180,8 @@ class Rig(Model):
     flange_from_camera: Pose
     dome: Dome
     support: Support
+    tool: tuple[ToolBody, ...]
+    clearances: Keep = Keep()
     keep_out: tuple[KeepOut, ...] = ()
     led_limits: LedLimits = LedLimits()
     motion: Motion = Motion()

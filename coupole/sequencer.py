@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +24,24 @@ from coupole.devices import (
     Deadline,
     Exposure,
     Frame,
+    FrameFormat,
 )
-from coupole.errors import CoupoleError, DeviceError, DeviceFault, DeviceTimeout, Interrupted, UnprovenError
+from coupole.errors import (
+    CoupoleError,
+    DeviceError,
+    DeviceFault,
+    DeviceLost,
+    DeviceTimeout,
+    Interrupted,
+    PreflightRefused,
+    UnprovenError,
+)
 from coupole.intake import Intake
+from coupole.itinerary import Visit, arm_of, plan_itinerary
 from coupole.job import Job
 from coupole.kinematics import move_duration_s
 from coupole.matching import UNLABELLED, FaultModel, Match, compile_now, match
 from coupole.observer import Control, Observer, Outcome, Progress
-from coupole.preflight import arm_of, joints_for_views
 from coupole.recorder import Recorder
 from coupole.run import is_shot
 from coupole.shots import Burst, ViewPose
@@ -45,7 +55,8 @@ _LAST_STRETCH_S = 0.2
 """Of a burst, in which the host has to be on its feet."""
 _BOX_JITTER_US = 20.0
 _BUFFERS = 64
-_PAUSE_NAP_S = 0.1
+_PAUSE_NAP_S, _MOTION_POLL_S = 0.1, 0.01
+_ARM_NEWS_S = 1.0
 _LIT_IN_VAIN = STATUS_LED_OPEN | STATUS_OVER_TEMPERATURE
 
 
@@ -59,6 +70,20 @@ class _Firing:
     judged: Match | None = None
     proven: set[int] = field(default_factory=set)
     """Frames that the recorder has been told of."""
+
+
+class _ArmMovedError(Exception):
+    """The arm moved while lights flashed."""
+
+
+@dataclass(frozen=True)
+class _Station:
+    """Where the arm stands for the present view, and what `Recorder.begin_view` was told."""
+
+    view: str
+    arm: ArmState
+    frames: int
+    frame_format: FrameFormat
 
 
 @dataclass(frozen=True)
@@ -116,18 +141,12 @@ class Sequencer:
         """Do all that is not proven yet. Raises UnprovenError if shots stay missing, or a CoupoleError."""
         start_ns = self._cell.clock.now_ns()
         schedule = self._job.schedule
-        here = self._cell.robot.measured()
-        joints, refusals = joints_for_views(schedule.views, self._job.cell.rig, here.joints_deg)
-        assert not refusals, "preflight comes first"
         try:
-            for number, (view, there, bursts) in enumerate(
-                zip(schedule.views, joints, schedule.bursts, strict=True)
-            ):
-                self._view_number, self._view_name = number, view.name
-                left = self._left_of(bursts)
-                if left:
-                    assert there is not None
-                    self._acquire_view(view, there, left, bursts)
+            left = {n: found for n, bursts in enumerate(schedule.bursts) if (found := self._left_of(bursts))}
+            views = [schedule.views[n] for n in left]
+            for (number, bursts), visit in zip(left.items(), self._itinerary(views), strict=True):
+                self._view_number, self._view_name = number, schedule.views[number].name
+                self._acquire_view(schedule.views[number], visit, bursts, schedule.bursts[number])
         finally:
             self.outcome.duration_s = (self._cell.clock.now_ns() - start_ns) / 1e9
             self.outcome.dose_lux_h = float(self._dose_lux_h.max())
@@ -139,6 +158,14 @@ class Sequencer:
             raise UnprovenError(self._say_missing())
         return self.outcome
 
+    def _itinerary(self, views: Sequence[ViewPose]) -> list[Visit]:
+        """Ways to the views that are left, from where the arm really stands."""
+        start_deg = self._cell.robot.measured().joints_deg
+        found = plan_itinerary(views, self._job.cell.rig, self._job.bodies, start_deg)
+        if found.refusals:
+            raise PreflightRefused(found.refusals)
+        return [visit for visit in found.visits if visit is not None]
+
     def _left_of(self, bursts: Sequence[Burst]) -> list[Burst]:
         """Bursts of which something is not proven yet, cut down to that."""
         done = self._recorder.proven()
@@ -149,23 +176,10 @@ class Sequencer:
                 left.append(burst if len(wanted) == len(burst.labels) else burst.only(wanted))
         return left
 
-    def _acquire_view(
-        self, view: ViewPose, joints_deg: NDArray[np.float64], left: list[Burst], all_bursts: Sequence[Burst]
-    ) -> None:
+    def _acquire_view(self, view: ViewPose, visit: Visit, left: list[Burst], all_bursts: Sequence[Burst]) -> None:
         self._recorder.event("view", view=view.name)
-        self._recorder.event("move", view=view.name, joints_deg=[round(float(j), 6) for j in joints_deg])
-        motion = self._job.cell.rig.motion
-        here_deg = self._cell.robot.measured().joints_deg
-        motion_s = move_duration_s(self._arm, here_deg, joints_deg) + motion.settle_dwell_s
-        self.outcome.ideal_s += motion_s
         self.outcome.ideal_s += sum(burst.duration_s for burst in left)
-        self._cell.robot.move_to(joints_deg)
-        self._cell.ledbox.load(left[0].table)
-        self._hurry(motion_s)
-        while self._cell.robot.measured().moving:
-            self._raise_if_stopped()
-            self._cell.clock.sleep(POLL_S)
-        arm = self._cell.robot.wait_settled()
+        arm = self._move(view, visit, left[0])
         base_from_camera = arm.base_from_flange @ self._job.cell.rig.flange_from_camera.matrix()
         self._recorder.event(
             "settled",
@@ -177,6 +191,7 @@ class Sequencer:
         self._check_format(frame_format.height_px, frame_format.width_px)
         frames = sum(len(burst.labels) for burst in all_bursts)
         self._recorder.begin_view(view.name, frames, frame_format, arm, base_from_camera)
+        self._station = _Station(view.name, arm, frames, frame_format)
         try:
             for index, burst in enumerate(left):
                 following = left[index + 1] if index + 1 < len(left) else None
@@ -184,6 +199,25 @@ class Sequencer:
             self._recorder.event("seal", view=view.name)
         finally:
             self._recorder.end_view()
+
+    def _move(self, view: ViewPose, visit: Visit, first: Burst) -> ArmState:
+        """Follow a leg, loading the view's first table meanwhile; the measured state once the arm stands still."""
+        robot, motion = self._cell.robot, self._job.cell.rig.motion
+        whole_s = visit.leg.duration_s + motion.settle_dwell_s
+        self.outcome.ideal_s += whole_s
+        waypoints = [np.round(place, 6).tolist() for place in visit.leg.waypoints]
+        self._recorder.event("move", view=view.name, joints_deg=waypoints)
+        here_deg = np.array(robot.measured().joints_deg)
+        for number, waypoint in enumerate(visit.leg.waypoints):
+            robot.move_to(waypoint)
+            if number == 0:
+                self._cell.ledbox.load(first.table)
+            self._hurry(move_duration_s(self._arm, here_deg, waypoint) + motion.settle_dwell_s)
+            while robot.measured().moving:
+                self._raise_if_stopped()
+                self._cell.clock.sleep(_MOTION_POLL_S)
+            here_deg = waypoint
+        return robot.wait_settled()
 
     def _check_format(self, height_px: int, width_px: int) -> None:
         sensor = self._cell.sensor
@@ -207,7 +241,12 @@ class Sequencer:
                 shots = [s for s in todo.shot_ids if s and is_shot(s)]
                 self.outcome.reshot += len(shots)
                 self._recorder.event("reshoot", view=burst.view, attempt=attempt, shots=shots)
-            verdict = self._fire(todo, following if attempt == 0 else None)
+            try:
+                verdict = self._fire(todo, following if attempt == 0 else None)
+            except _ArmMovedError as moved:
+                self._observer.note(f"{burst.view}: {moved}; back to the view")
+                self._stand_again(str(moved))
+                verdict = _Verdict(_NOTHING_TO_MATCH, [])
             done = self._recorder.proven()
             left = {label for label in todo.labels if label and f"{burst.view}/{label}" not in done}
             if not left:
@@ -215,6 +254,17 @@ class Sequencer:
             self._note_gap(burst, verdict, left)
             self.outcome.bad = sorted(set(self.outcome.bad) | set(verdict.dead))
             todo = burst.only(left)
+
+    def _stand_again(self, why: str) -> None:
+        """Bring the arm back to its view after it was moved, and measure anew where it stands."""
+        self._cell.ledbox.lights_off()
+        station = self._station
+        self._recorder.event("fault", kind="ArmMoved", message=f"{station.view}: {why}")
+        self._cell.robot.move_to(np.array(station.arm.joints_deg))
+        arm = self._cell.robot.wait_settled()
+        base_from_camera = arm.base_from_flange @ self._job.cell.rig.flange_from_camera.matrix()
+        self._recorder.begin_view(station.view, station.frames, station.frame_format, arm, base_from_camera)
+        self._station = replace(station, arm=arm)
 
     def _note_gap(self, burst: Burst, verdict: _Verdict, left: set[str]) -> None:
         judged = verdict.match
@@ -291,8 +341,11 @@ class Sequencer:
         last_frames: Deadline | None = None
         edges = 0
         judged_at = (-1, -1)
+        taken, confirmed, heard_ns = 0, 0, 0
         while True:
             self._raise_if_stopped()
+            if (news_ns := self._heard_of_arm_at_rest()) > heard_ns:
+                heard_ns, confirmed = news_ns, taken  # what had come by the last round was taken at rest
             taken = len(intake)  # before the log is read: the proof needs frames that are older than the log
             firing.log = np.concatenate([firing.log, box.poll_log()])
             if len(firing.log) == len(burst.table) and last_frames is None:
@@ -301,11 +354,12 @@ class Sequencer:
             complete = last_frames is not None and (taken >= edges or last_frames.expired)
             if complete:
                 clock.sleep(readout_s)  # a surplus frame may be on its way still
-                taken = len(intake)
-            if complete or (taken, len(firing.log)) != judged_at:
-                judged_at = (taken, len(firing.log))
+                taken = confirmed = len(intake)
+                self._wait_for_news_of_arm_at_rest()
+            if complete or (confirmed, len(firing.log)) != judged_at:
+                judged_at = (confirmed, len(firing.log))
                 firing.judged = self._match(firing, taken, complete=complete)
-                self._prove(firing, complete=complete)
+                self._prove(firing, confirmed, complete=complete)
                 self._tell(burst, len(firing.log))
             if complete:
                 return
@@ -330,12 +384,12 @@ class Sequencer:
             model=FaultModel(jitter_us=self._cell.camera.timestamp_jitter_us + _BOX_JITTER_US),
         )
 
-    def _prove(self, firing: _Firing, *, complete: bool) -> None:
-        """Hand newly proven frames to the recorder, once their bytes are written."""
+    def _prove(self, firing: _Firing, confirmed: int, *, complete: bool) -> None:
+        """Hand newly proven frames to the recorder, of the first `confirmed`, once their bytes are written."""
         assert firing.judged is not None
         labels, log, intake = firing.burst.labels, firing.log, firing.intake
         for frame in np.flatnonzero(firing.judged.step_of_frame != UNLABELLED).tolist():
-            if frame in firing.proven or not (complete or intake.kept(frame)):
+            if frame in firing.proven or frame >= confirmed or not (complete or intake.kept(frame)):
                 continue
             record = log[firing.judged.step_of_frame[frame]]
             label = labels[int(record["step"])]
@@ -476,6 +530,30 @@ class Sequencer:
             raise Interrupted("stopped by the operator; everything proven so far is kept")
         arm = self._cell.robot.measured()
         self._refuse_faulty(arm)
+
+    def _heard_of_arm_at_rest(self) -> int:
+        """When the arm was last heard of; raises _ArmMovedError if it does not stand where it did."""
+        arm = self._cell.robot.measured()
+        off_deg = float(np.abs(np.subtract(arm.joints_deg, self._station.arm.joints_deg)).max())
+        if off_deg > self._job.cell.rig.motion.still_deg:
+            raise _ArmMovedError(f"the arm moved by {off_deg:.3f} deg during a burst")
+        return arm.t_ns
+
+    def _wait_for_news_of_arm_at_rest(self) -> None:
+        """Hear once more of the arm, lest it fell silent, or worse, while the last frames were taken."""
+        since_ns, clock = self._cell.robot.measured().t_ns, self._cell.clock
+        deadline = Deadline(clock, _ARM_NEWS_S)
+        while self._heard_of_arm_at_rest() <= since_ns:
+            self._raise_if_stopped()
+            if deadline.expired:
+                raise DeviceLost(
+                    "robot",
+                    expected=f"news of the arm within {_ARM_NEWS_S:g} s of the burst's end",
+                    happened="its controller is silent",
+                    remedy="Check the controller and its network, then resume the run.",
+                )
+            clock.sleep(_MOTION_POLL_S)
+        self._raise_if_stopped()
 
     @staticmethod
     def _refuse_faulty(arm: ArmState) -> None:

@@ -99,6 +99,7 @@ class KukaRsi:
         self._clock = clock
         self._command = block.Command()
         self._motion_s = 0.0
+        self._last_packets, self._last_news_ns = -1, 0
         self._process, self._block = _spawn(settings, self.arm)
         try:
             self._wait_for_session()
@@ -151,10 +152,12 @@ class KukaRsi:
     def measured(self) -> ArmState:
         state = self._state()
         joints = state.measured_deg
+        if state.packets != self._last_packets:
+            self._last_packets, self._last_news_ns = state.packets, self._clock.now_ns()
         return ArmState(
             joints_deg=(joints[0], joints[1], joints[2], joints[3], joints[4], joints[5]),
             base_from_flange=forward(self.arm, joints),
-            t_ns=self._clock.now_ns(),
+            t_ns=self._last_news_ns,
             moving=self._moves(state),
             fault=state.fault_text.decode(errors="replace"),
         )
@@ -258,6 +261,8 @@ class KukaRsi:
 
     def _moves(self, state: block.State) -> bool:
         speed_deg_s = max(map(abs, state.velocity_deg_s))
+        if state.command != self._command.number:  # the loop has not taken the last command yet
+            return True
         return state.phase != block.STANDING or speed_deg_s > self.settings.settle_deg_s
 
     def _stop_s(self) -> float:

@@ -225,7 +225,7 @@ class LedBox:
         limit = max(1, min(_MAX_RECORDS_PER_POLL, int(bytes_wanted / STEP_RECORD_DTYPE.itemsize)))
         command = f"SEQ:STAT?;INDex?;LOG? {self._next_record},{limit}"
         state, index, log = self._scpi.ask(command, 3, reply_bytes=limit * STEP_RECORD_DTYPE.itemsize)
-        running = self._note_state(str(state))
+        self._note_state(str(state))
         if not isinstance(log, bytes) or len(log) % STEP_RECORD_DTYPE.itemsize:
             self._scpi.unexpected("a block of whole log records", f"{len(log)} bytes came")
         records = np.frombuffer(log, STEP_RECORD_DTYPE)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from coupole import kinematics
 from coupole.cell import world_config
 from coupole.geometry import apply, inverse, transform
+from coupole.itinerary import plan_itinerary
 from coupole.job import Job, read_job
-from coupole.preflight import joints_for_views
 from coupole.report import develop, png
 from sim.camera_server import Exposed
 from sim.config import Config
@@ -58,13 +58,19 @@ def polyline(points: NDArray[np.float64], style: str) -> str:
     return f'<polyline points="{path}" {style}/>'
 
 
+def joints_of_shown_view(job: Job) -> NDArray[np.float64]:
+    rig = job.cell.rig
+    visits = plan_itinerary(job.schedule.views, rig, job.bodies, rig.motion.home_joints_deg).visits
+    shown = visits[SHOWN_VIEW]
+    assert shown is not None
+    return shown.joints_deg
+
+
 def draw_cell(job: Job) -> str:
     """The dome, the disk, the arm in one view of the plan, and what its camera sees."""
     rig = job.cell.rig
     support_from_base = inverse(rig.support.base_from_support.matrix())
-    joints, _ = joints_for_views(job.schedule.views, rig, rig.motion.home_joints_deg)
-    there = joints[SHOWN_VIEW]
-    assert there is not None
+    there = joints_of_shown_view(job)
     arm = apply(support_from_base, elbow_points(there))
     flange = support_from_base @ kinematics.forward(kinematics.KR10_R1100_SIXX, there)
     camera = flange @ rig.flange_from_camera.matrix()
@@ -91,7 +97,9 @@ def draw_cell(job: Job) -> str:
     parts += [polyline(np.stack([camera[:3, 3], c]), 'stroke="#6fb7ff" stroke-width="1"') for c in field[:4]]
     parts.append(polyline(field, 'fill="#6fb7ff" fill-opacity="0.15" stroke="#6fb7ff" stroke-width="1"'))
     parts.append(
-        polyline(arm, 'fill="none" stroke="#f08a3c" stroke-width="13" stroke-linejoin="round" stroke-linecap="round"')
+        polyline(
+            arm, 'fill="none" stroke="#f08a3c" stroke-width="13" stroke-linejoin="round" stroke-linecap="round"'
+        )
     )
     parts.append(
         polyline(
@@ -114,8 +122,7 @@ def synthetic_frame(job: Job) -> bytes:
     fine = {"width_px": 1024, "height_px": 768, "pixel_pitch_um": rig.sensor.pixel_pitch_um / 2}
     config = Config.model_validate(world_config(job.cell, job, rig.sensor.model_copy(update=fine)))
     photographer = Photographer(config.scene, config.camera, seed=1)
-    joints, _ = joints_for_views(job.schedule.views, rig, rig.motion.home_joints_deg)
-    flange = kinematics.forward(kinematics.KR10_R1100_SIXX, joints[SHOWN_VIEW])
+    flange = kinematics.forward(kinematics.KR10_R1100_SIXX, joints_of_shown_view(job))
     raw = np.zeros((768, 1024), np.uint16)
     photographer.render(raw, Exposed({SHOWN_LED: 8e-3}, [], 8e-3, 1.0, 0, flange))
     sensor = photographer.sensor

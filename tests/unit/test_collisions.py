@@ -41,7 +41,8 @@ def box_corners(size_mm: tuple[float, float, float]) -> NDArray[np.float64]:
     import trimesh
 
     mesh = trimesh.creation.box(extents=size_mm)
-    return np.asarray(mesh.vertices[mesh.faces]) + [0, 0, size_mm[2] / 2]
+    corners: NDArray[np.float64] = mesh.vertices[mesh.faces] + np.array((0, 0, size_mm[2] / 2))
+    return corners
 
 
 @given(ANYWHERE)

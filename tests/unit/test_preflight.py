@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 from coupole import ledger
 from coupole.devices import NO_LIGHT
 from coupole.dome import LedTable, read_led_table
+from coupole.itinerary import bodies_of, plan_itinerary
 from coupole.plan import Plan
 from coupole.preflight import BURST_OVERHEAD_S, SETTLE_CHECK_S, Report, StorageFacts, check, upload_s
 from coupole.rig import Rig
@@ -23,6 +26,7 @@ RIG, _ = read(ROOT / "configs/rigs/sim.yaml").problems(Rig)
 DOME = read_led_table(ROOT / "configs/domes/coupole.csv")
 ROOMY = StorageFacts(free_bytes=10**15, write_bytes_s=10e9)
 CENTRE = np.zeros((1, 3))
+NO_OBJECT = np.zeros((0, 3, 3))
 TOP = {"kind": "look_at", "name": "top", "target_mm": [0, 0, 30], "distance_mm": 335, "azimuth_deg": -90}
 PARK = {"kind": "joints", "name": "park", "joints_deg": [0, -170, 150, 0, -70, 0]}
 
@@ -62,10 +66,14 @@ def checked(
     leds: LedTable = DOME,
     storage: StorageFacts = ROOMY,
     points: np.ndarray[Any, Any] = CENTRE,
+    start_joints_deg: Sequence[float] | None = None,
     **known: Any,
 ) -> Report:
     rig = rig or rig_of()
-    return check(plan, rig, schedule_of(plan, rig, leds), leds, storage, object_points_support_mm=points, **known)
+    schedule = schedule_of(plan, rig, leds)
+    bodies = bodies_of(rig, DOME, NO_OBJECT)
+    itinerary = plan_itinerary(schedule.views, rig, bodies, start_joints_deg or rig.motion.home_joints_deg)
+    return check(plan, rig, schedule, leds, storage, itinerary, object_points_support_mm=points, **known)
 
 
 def only_refusal(report: Report) -> str:
@@ -272,14 +280,37 @@ def test_a_camera_inside_a_keep_out_is_refused_naming_view_part_and_volume() -> 
     ball = {"kind": "sphere", "name": "lamp", "center_mm": (0, 0, 365), "radius_mm": 60}
     view = {**TOP, "name": "over", "target_mm": [0, 0, 30], "elevation_deg": 85}
     report = checked(plan_of(views=[view]), rig_of(keep_out=[ball]))
-    assert only_refusal(report).startswith("view over: the camera at (")
-    assert "is inside keep-out `lamp`" in only_refusal(report)
+    assert only_refusal(report).startswith("view over: camera would be inside keep-out `lamp`")
 
 
-def test_a_camera_below_the_support_is_refused() -> None:
-    low = {**TOP, "name": "low", "target_mm": [200, 0, -20], "distance_mm": 150, "elevation_deg": 5}
-    refusals = checked(plan_of(views=[{**low, "azimuth_deg": 180}]), rig_of(keep_out=[])).refusals
-    assert "view low: the camera would be 7 mm below the support" in refusals
+def test_a_camera_that_grazes_the_support_is_refused_with_the_distance() -> None:
+    low = {**TOP, "name": "low", "target_mm": [200, 0, 40], "distance_mm": 200, "elevation_deg": 10}
+    refusal = only_refusal(checked(plan_of(views=[{**low, "azimuth_deg": 180}]), rig_of(keep_out=[])))
+    assert refusal.startswith("view low: ")
+    assert "the support; 10 mm must be kept" in refusal
+
+
+def test_a_camera_too_near_to_the_object_is_refused_with_the_distance() -> None:
+    near = {**TOP, "name": "near", "distance_mm": 80, "elevation_deg": 80}
+    plan, rig = plan_of(views=[near]), rig_of()
+    schedule = schedule_of(plan, rig, DOME)
+    flat = np.array([[[-50.0, -50, 30], [50, -50, 30], [0, 80, 30]]])
+    itinerary = plan_itinerary(schedule.views, rig, bodies_of(rig, DOME, flat), rig.motion.home_joints_deg)
+    assert len(itinerary.refusals) == 1
+    assert itinerary.refusals[0].startswith("view near: camera would be ")
+    assert itinerary.refusals[0].endswith("mm from the object; 50 mm must be kept")
+
+
+def test_a_motion_that_would_touch_the_support_takes_another_way() -> None:
+    view = {**TOP, "elevation_deg": 45, "azimuth_deg": 0}
+    plan, rig = plan_of(views=[view]), rig_of()
+    schedule = schedule_of(plan, rig, DOME)
+    bodies = bodies_of(rig, DOME, NO_OBJECT)
+    start = np.array([-65.0, -150.0, 140.0, 0.0, -60.0, 0.0])
+    (visit,) = plan_itinerary(schedule.views, rig, bodies, start.tolist()).visits
+    assert visit is not None
+    places = [start, *visit.leg.waypoints]
+    assert all(bodies.contact_on_the_way(a, b) is None for a, b in pairwise(places))
 
 
 def test_a_name_that_stands_twice_is_refused_once() -> None:

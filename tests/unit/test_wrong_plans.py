@@ -109,6 +109,7 @@ robot: {driver: "drivers.kuka_rsi:KukaRsi"}
 sensor: {width_px: 512, height_px: 384, pixel_pitch_um: 3.2}
 lens: {focal_length_mm: 50, f_number: 8, focus_distance_mm: 335}
 flange_from_camera: {translation_mm: [0, 0, 100]}
+tool: [{name: camera, from_mm: [0, 0, 20], to_mm: [0, 0, 100], radius_mm: 60}]
 dome: {leds: ../domes/coupole.csv}
 support: {base_from_support: {translation_mm: [200, 0, 1450], abc_deg: [0, 0, 180]}}
 keep_out:

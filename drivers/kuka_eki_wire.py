@@ -1,0 +1,166 @@
+"""The XML that `KukaEki` and the controller exchange over EthernetKRL (EKI), and how to read it.
+
+Every element has a path, as EKI's configuration names it; `tools/make_kuka_files.py` writes the controller's
+files from the same tables. Each message carries all of its elements: EKI keeps a queue for every one of them,
+and a message without one would leave the queues out of step. Angles are degrees, lengths millimetres.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+Six = tuple[float, float, float, float, float, float]
+
+ROOT = "Coupole"
+STOP, MOVE, ASK = range(3)
+"""What a command asks: come to rest, move to the axes point to point, nothing but that it was taken."""
+
+_AXES = tuple((f"Axes/@A{axis}", "REAL") for axis in range(1, 7))
+COMMAND_ELEMENTS: tuple[tuple[str, str], ...] = (
+    ("Command/@Session", "INT"),
+    ("Command/@Number", "INT"),
+    ("Command/@Verb", "INT"),
+    ("Command/@Velocity", "INT"),
+    ("Command/@Acceleration", "INT"),
+    *_AXES,
+)
+"""From the PC: path below the root and type. Velocity and acceleration are percent of $VEL_AXIS, $ACC_AXIS."""
+STATUS_ELEMENTS: tuple[tuple[str, str], ...] = (
+    ("Status/@Session", "INT"),
+    ("Status/@Taken", "INT"),
+    ("Status/@Done", "INT"),
+    ("Status/@Moving", "INT"),
+    ("Status/@Fault", "INT"),
+    ("Status/@Time", "INT"),
+    ("Status/@Override", "INT"),
+    ("Status/@T1", "INT"),
+    ("Arm/@Model", "STRING"),
+    ("Arm/@Serial", "INT"),
+    *_AXES,
+    ("Pose/@Valid", "INT"),
+    *((f"Pose/@{name}", "REAL") for name in "XYZABC"),
+)
+"""From the controller, at a steady rate; see `Status`."""
+
+NO_FAULT, EMERGENCY_STOP, DRIVES_OFF, STOP_MESSAGE, PROGRAM_ENDED, TARGET_REFUSED = range(6)
+FAULTS = {
+    EMERGENCY_STOP: "emergency stop: the arm does not follow its program",
+    DRIVES_OFF: "the drives are off: enabling switch, safety gate or operating mode",
+    STOP_MESSAGE: "the controller stands at a stop message",
+    PROGRAM_ENDED: "the robot program is not running",
+    TARGET_REFUSED: "target refused: out of the controller's own software limits",
+}
+"""What the controller's fault numbers mean."""
+
+_OPEN, _CLOSE = f"<{ROOT}".encode(), f"</{ROOT}>".encode()
+_LONGEST_BYTES = 16384
+"""EKI's own limit of an uninterpreted message (BUFFSIZE)."""
+
+
+class Command(NamedTuple):
+    """One order. `number` rises with every command of a session, so that its answers can be told apart."""
+
+    session: int
+    number: int
+    verb: int
+    velocity_percent: int
+    acceleration_percent: int
+    joints_deg: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Status:
+    """How the controller stood when it sent this."""
+
+    session: int
+    """Of the last command taken: an echo, so that another session's answers are known."""
+    taken: int
+    """Number of the last command taken."""
+    done: int
+    """Number of the last STOP or MOVE that is finished."""
+    moving: bool
+    fault: int
+    time_ms: int
+    """The controller's own clock ($ROB_TIMER)."""
+    override_percent: int
+    t1: bool
+    """In T1, where the controller slows every motion down."""
+    model: str
+    serial: int
+    joints_deg: Six
+    """Measured axes."""
+    pose: Six | None
+    """Measured flange in base: X, Y, Z mm, A, B, C deg; None where the controller has none."""
+
+
+def command_xml(command: Command) -> bytes:
+    """The message of a command."""
+    axes = " ".join(f'A{axis}="{angle:.6f}"' for axis, angle in enumerate(command.joints_deg, start=1))
+    return (
+        f'<{ROOT}><Command Session="{command.session}" Number="{command.number}" Verb="{command.verb}" '
+        f'Velocity="{command.velocity_percent}" Acceleration="{command.acceleration_percent}"/>'
+        f"<Axes {axes}/></{ROOT}>"
+    ).encode()
+
+
+class StatusReader:
+    """Finds statuses in a stream of bytes that may come in any pieces."""
+
+    def __init__(self) -> None:
+        self.malformed = 0
+        """Messages that were no status; they are left out."""
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[Status]:
+        """The statuses that these bytes complete, in order."""
+        *messages, self._rest = (self._rest + data).split(_CLOSE)
+        if len(self._rest) > _LONGEST_BYTES:
+            self.malformed += 1
+            self._rest = b""
+        statuses = []
+        for message in messages:
+            start = message.rfind(_OPEN)  # what stands before was cut off in its midst
+            status = _read_status(message[start:] + _CLOSE) if start >= 0 else None
+            if status is None:
+                self.malformed += 1
+            else:
+                statuses.append(status)
+        return statuses
+
+
+def _read_status(message: bytes) -> Status | None:
+    """None where the message is no XML, lacks an element or has one that is no number."""
+    try:
+        values = {
+            f"{child.tag}/@{name}": value
+            for child in ElementTree.fromstring(message)
+            for name, value in child.attrib.items()
+        }
+        joints_deg = _six(values, "Axes", [f"A{axis}" for axis in range(1, 7)])
+        pose = _six(values, "Pose", list("XYZABC"))
+        if not math.isfinite(sum(joints_deg)):
+            return None
+        return Status(
+            session=int(values["Status/@Session"]),
+            taken=int(values["Status/@Taken"]),
+            done=int(values["Status/@Done"]),
+            moving=int(values["Status/@Moving"]) != 0,
+            fault=int(values["Status/@Fault"]),
+            time_ms=int(values["Status/@Time"]),
+            override_percent=int(values["Status/@Override"]),
+            t1=int(values["Status/@T1"]) != 0,
+            model=values["Arm/@Model"],
+            serial=int(values["Arm/@Serial"]),
+            joints_deg=joints_deg,
+            pose=pose if int(values["Pose/@Valid"]) else None,
+        )
+    except (ElementTree.ParseError, KeyError, ValueError):
+        return None
+
+
+def _six(values: dict[str, str], tag: str, names: list[str]) -> Six:
+    a, b, c, d, e, f = (float(values[f"{tag}/@{name}"]) for name in names)
+    return a, b, c, d, e, f

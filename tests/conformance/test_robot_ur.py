@@ -1,0 +1,328 @@
+"""What every Robot must do, run on the UR driver against a stand-in for the controller; and the UR's own faults.
+
+Real time: ur-rtde knows no other. Each cell has a loopback address of its own, since UR's ports are fixed.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_robot import AWAY_DEG, HOME_DEG, RobotConformance
+
+from coupole.errors import DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout, InputError
+from drivers.ur import Settings, UrRobot
+from sim.clock import ClockWriter, SharedClock
+from sim.reactor import Reactor
+from sim.ur_arm import flange_pose, rotation_vector
+from sim.ur_controller import Settings as ControllerSettings
+from sim.ur_controller import UrController
+
+pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
+
+_ADDRESSES = (f"127.{1 + os.getpid() // 254 % 253}.{1 + os.getpid() % 254}.{i}" for i in itertools.count(1))
+_CYCLE_S = 0.002
+
+
+class UrCell:
+    """A UR controller in a world of its own, and drivers that talk to it."""
+
+    def __init__(self, folder: Path) -> None:
+        address = next(_ADDRESSES)
+        self.clock_path = folder / "clock"
+        self.reactor = Reactor(ClockWriter(self.clock_path, speed=1.0))
+        self.controller = UrController(self.reactor, ControllerSettings(address=address))
+        self.trace_deg: list[tuple[float, ...]] = []
+        self.settings = Settings.model_validate(
+            {
+                "host": address,
+                "limits_deg": [(-170, 170), (-190, 45), (-120, 156), (-185, 185), (-120, 120), (-350, 350)],
+                "speed_fraction": 0.75,
+                "acceleration_deg_s2": 300.0,
+                "stop_deg_s2": 600.0,
+                "link_timeout_s": 0.8,
+            }
+        )
+        self.reactor.after(0.5 * _CYCLE_S, self._sample)
+        self._thread = threading.Thread(target=self.reactor.run)
+        self._thread.start()
+        self.clock = SharedClock(self.clock_path)
+        self._drivers = ExitStack()
+
+    def open(self) -> UrRobot:
+        return self._drivers.enter_context(closing(UrRobot(self.settings, self.clock)))
+
+    def in_world(self, action: Callable[[], object]) -> None:
+        """Do something on the world's thread and wait until it is done."""
+        done = threading.Event()
+
+        def act() -> None:
+            action()
+            done.set()
+
+        self.reactor.call_threadsafe(act)
+        assert done.wait(30.0)
+
+    def joints_deg(self) -> NDArray[np.float64]:
+        return np.array(self.controller.joints_deg)
+
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        give_up = time.monotonic() + 30.0
+        while not condition():
+            assert time.monotonic() < give_up
+            time.sleep(0.001)
+
+    def wait_until_under_way(self) -> None:
+        self.wait_until(lambda: bool(np.max(np.abs(self.joints_deg() - HOME_DEG)) > 8.0))
+
+    def close(self) -> None:
+        self._drivers.close()
+        self.reactor.stop()
+        self._thread.join()
+        self.controller.close()
+
+    def _sample(self) -> None:
+        self.trace_deg.append(self.controller.joints_deg)
+        self.reactor.after(_CYCLE_S, self._sample)
+
+    def assert_smooth(self) -> None:
+        """Speed and acceleration of all that was sampled are within the driver's limits."""
+        axes_deg = np.array(self.trace_deg)
+        for order, limit in enumerate((self.settings.speed_deg_s, self.settings.stop_deg_s2), start=1):
+            rounding = 2.0**order * 1e-9 / _CYCLE_S**order
+            assert np.all(np.abs(np.diff(axes_deg, order, axis=0)) / _CYCLE_S**order <= limit * 1.001 + rounding)
+
+    def assert_stands(self) -> None:
+        """The arm does not move for half a second."""
+        before = self.joints_deg()
+        self.clock.sleep(0.5)
+        assert not self.controller.moving
+        assert np.array_equal(self.joints_deg(), before)
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Iterator[UrCell]:
+    with closing(UrCell(tmp_path)) as cell:
+        yield cell
+
+
+@pytest.fixture
+def robot(cell: UrCell) -> UrRobot:
+    return cell.open()
+
+
+class TestUrRobot(RobotConformance):
+    @pytest.fixture
+    def cell(self, tmp_path: Path) -> Iterator[UrCell]:
+        with closing(UrCell(tmp_path)) as cell:
+            yield cell
+
+    def test_it_says_who_it_is_and_that_it_is_simulated(self, cell: UrCell, robot: UrRobot) -> None:
+        assert robot.identify().model == "UR10"
+        assert robot.identify().simulated
+        assert robot.self_test()["tool offset"] == "0.00, 0.00, 100.00 mm"
+
+    def test_it_reaches_poses_and_measures_them_right(self, cell: UrCell, robot: UrRobot) -> None:
+        for target_deg in (AWAY_DEG, np.array([-30.0, -80.0, 60.0, -70.0, 80.0, 170.0])):
+            robot.move_to(target_deg)
+            state = robot.wait_settled()
+            assert not state.moving
+            assert np.allclose(state.joints_deg, target_deg, atol=1e-3)
+            assert np.allclose(state.base_from_flange, flange_pose(target_deg.tolist()), atol=1e-6)
+            assert np.allclose(cell.controller.true_base_from_flange(), state.base_from_flange, atol=1e-6)
+
+    def test_an_emergency_stop_is_a_fault_that_only_a_new_driver_leaves_behind(
+        self, cell: UrCell, robot: UrRobot
+    ) -> None:
+        _assert_latched(cell, robot, cell.controller.estop, "emergency stop")
+
+    def test_many_moves_leave_no_queue_behind(self, cell: UrCell, robot: UrRobot) -> None:
+        for _ in range(5):
+            robot.move_to(AWAY_DEG)
+            robot.move_to(HOME_DEG)
+        assert np.allclose(robot.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
+        cell.assert_smooth()
+
+
+def _assert_latched(cell: UrCell, robot: UrRobot, happens: Callable[[], None], name: str) -> None:
+    """What happens in mid-motion is a fault of that name; acknowledged, nothing moves until a new driver does."""
+    robot.move_to(AWAY_DEG)
+    cell.wait_until_under_way()
+    cell.in_world(happens)
+    with pytest.raises(DeviceFault, match=name):
+        robot.wait_settled()
+    cell.wait_until(lambda: not cell.controller.moving)
+    cell.in_world(cell.controller.reset)
+    with pytest.raises(DeviceFault, match=name):
+        robot.move_to(HOME_DEG)
+    assert name in robot.measured().fault
+    assert cell.controller.program_state == "STOPPED"
+    cell.assert_stands()
+    robot.close()
+    again = cell.open()
+    again.move_to(HOME_DEG)
+    assert np.allclose(again.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
+
+
+def test_a_protective_stop_is_a_latched_fault_and_its_paused_program_is_ended(
+    cell: UrCell, robot: UrRobot
+) -> None:
+    _assert_latched(cell, robot, cell.controller.protective_stop, "protective stop")
+
+
+def test_a_program_stopped_at_the_pendant_is_a_latched_fault(cell: UrCell, robot: UrRobot) -> None:
+    _assert_latched(cell, robot, cell.controller.stop_program, "program stopped")
+
+
+def test_an_operator_who_takes_local_control_is_named(cell: UrCell, robot: UrRobot) -> None:
+    def take_control() -> None:
+        cell.controller.remote_control = False
+        cell.controller.stop_program()
+
+    cell.in_world(take_control)
+    cell.wait_until(lambda: bool(robot.measured().fault))
+    with pytest.raises(DeviceFault, match="not in remote control"):
+        robot.move_to(AWAY_DEG)
+    robot.close()
+    with pytest.raises(DeviceFault, match="not in remote control"):
+        cell.open()
+
+
+def test_opening_in_an_emergency_stop_names_it(cell: UrCell) -> None:
+    cell.in_world(cell.controller.estop)
+    with pytest.raises(DeviceFault, match="ROBOT_EMERGENCY_STOP"):
+        cell.open()
+
+
+def test_connections_that_end_are_a_lost_link(cell: UrCell, robot: UrRobot) -> None:
+    robot.move_to(AWAY_DEG)
+    cell.wait_until_under_way()
+    cell.in_world(cell.controller.drop_link)
+    with pytest.raises(DeviceLost, match="the controller closed it"):
+        robot.wait_settled()
+    assert cell.controller.program_state == "STOPPED"
+    cell.assert_stands()
+    robot.close()
+    again = cell.open()
+    again.move_to(HOME_DEG)
+    assert np.allclose(again.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
+
+
+def test_a_lost_link_ends_measuring(cell: UrCell, robot: UrRobot) -> None:
+    def measure_on() -> None:
+        while True:
+            robot.measured()
+            time.sleep(0.01)
+
+    cell.in_world(lambda: cell.controller.lose_link(60.0))
+    with pytest.raises(DeviceLost, match="link lost: no sample for"):
+        measure_on()
+    robot.stop()
+    robot.close()
+
+
+def test_a_running_program_of_somebody_else_is_left_alone(cell: UrCell, robot: UrRobot) -> None:
+    cell.settings = cell.settings.model_copy(update={"connect_timeout_s": 10.0})
+    with pytest.raises(DeviceRefused, match="PLAYING"):
+        cell.open()
+    robot.move_to(AWAY_DEG)
+    assert np.allclose(robot.wait_settled().joints_deg, AWAY_DEG, atol=1e-3)
+
+
+def test_a_silent_controller_ends_opening_in_time_and_leaves_no_process(
+    cell: UrCell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell.in_world(lambda: cell.controller.lose_link(60.0))
+    cell.settings = cell.settings.model_copy(update={"connect_timeout_s": 1.0})
+    started: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def watched(*args: object, **options: object) -> subprocess.Popen[bytes]:
+        started.append(popen(*args, **options))  # type: ignore[call-overload]
+        return started[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", watched)
+    with pytest.raises(DeviceTimeout, match="hung for"):
+        cell.open()
+    assert [process.returncode is not None for process in started] == [True]
+
+
+def test_nobody_at_the_address_is_told(cell: UrCell) -> None:
+    cell.settings = cell.settings.model_copy(update={"host": next(_ADDRESSES)})
+    with pytest.raises(DeviceLost, match="Connection refused"):
+        cell.open()
+
+
+def test_closing_twice_or_with_a_dead_process_raises_nothing(cell: UrCell, robot: UrRobot) -> None:
+    robot.move_to(AWAY_DEG)
+    cell.wait_until_under_way()
+    os.kill(robot._process.pid, signal.SIGKILL)
+    with pytest.raises(DeviceLost) as raised:
+        robot.wait_settled()
+    assert raised.value.remedy
+    robot.stop()
+    robot.close()
+    robot.close()
+    with pytest.raises(DeviceLost, match="robot"):
+        robot.move_to(HOME_DEG)
+    assert cell.controller.fault.startswith("RTDE watchdog")
+    cell.assert_stands()
+
+
+def test_a_killed_parent_leaves_no_process_and_the_arm_at_rest(cell: UrCell) -> None:
+    script = (
+        "import sys, time, numpy; from pathlib import Path\n"
+        "from sim.clock import SharedClock; from drivers.ur import UrRobot, Settings\n"
+        "robot = UrRobot(Settings.model_validate_json(sys.argv[1]), SharedClock(Path(sys.argv[2])))\n"
+        f"robot.move_to(numpy.array({AWAY_DEG.tolist()}))\n"
+        "print(robot._process.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    arguments = [cell.settings.model_dump_json(), str(cell.clock_path)]
+    with subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        owner = Path(f"/proc/{int(parent.stdout.readline())}")
+        cell.wait_until_under_way()
+        parent.kill()
+    cell.wait_until(lambda: not owner.exists() or "Z" in (owner / "stat").read_text().split()[2])
+    assert not cell.controller.moving
+    cell.assert_stands()
+    cell.assert_smooth()
+
+
+def test_statistics_can_be_asked_after_closing(cell: UrCell, robot: UrRobot) -> None:
+    robot.measured()
+    robot.close()
+    assert robot.statistics()["samples"] > 0
+
+
+def test_the_stand_in_refuses_a_world_that_is_not_in_real_time(tmp_path: Path) -> None:
+    reactor = Reactor(ClockWriter(tmp_path / "clock", speed=10.0))
+    with pytest.raises(InputError, match="real time"):
+        UrController(reactor, ControllerSettings())
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 1e-7, 30.0, 180.0])
+def test_rotation_vectors_of_the_stand_in_are_those_of_scipy(turn_deg: float) -> None:
+    from scipy.spatial.transform import Rotation
+
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    rotation = Rotation.from_rotvec(np.radians(turn_deg) * axis).as_matrix()
+    again = Rotation.from_rotvec(rotation_vector(rotation)).as_matrix()
+    assert np.allclose(again, rotation, atol=1e-9)
+
+
+def test_the_stand_in_stands_where_universal_robots_own_figures_say() -> None:
+    # All joints at 0: the arm lies along -x. a2 + a3 = 1184.25 mm; d4 + d6 = 290.7 mm; d1 - d5 = 60.85 mm.
+    assert np.allclose(flange_pose([0.0] * 6)[:3, 3], [-1184.25, -290.7, 60.85], atol=1e-9)

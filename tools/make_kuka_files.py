@@ -1,0 +1,219 @@
+"""Writes what a KUKA controller needs for both of Coupole's drivers: RSI and EthernetKRL.
+
+    python tools/make_kuka_files.py [--output configs/kuka] [--pc-address 192.168.1.10]
+                                    [--rsi JSON] [--eki JSON] [--load 1]
+
+Ports, tags, cycle and rates come from the drivers' own settings: their defaults, or those given as JSON as in
+a rig's `robot: settings:`. KRL is made of the templates in `tools/kuka`. The same options give the same bytes.
+How to install them: docs/how-to/kuka-controller.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from coupole.kinematics import Arm
+from drivers import kuka_eki, kuka_rsi
+from drivers import kuka_eki_wire as wire
+
+ROOT = Path(__file__).resolve().parents[1]
+TEMPLATES = ROOT / "tools" / "kuka"
+
+EKI_NAME, RSI_CONTEXT, RSI_CONFIG = "CoupoleEki", "coupole_rsi", "coupole_rsi_ethernet.xml"
+ALIVE_FLAG, RECEIVED_FLAG, ORDER_FLAG = 501, 502, 503
+"""Elements of $FLAG: connection alive, something received, an order for the robot program."""
+PING_S = 1
+"""EKI's shortest interval for finding out that the PC is gone."""
+
+KRL_COMMAND = {
+    "Command/@Session": "CP_IN_SESSION",
+    "Command/@Number": "CP_IN_NUMBER",
+    "Command/@Verb": "CP_IN_VERB",
+    "Command/@Velocity": "CP_IN_VELOCITY",
+    "Command/@Acceleration": "CP_IN_ACCELERATION",
+} | {f"Axes/@A{axis}": f"CP_IN_AXES.A{axis}" for axis in range(1, 7)}
+"""Variable of coupole_link.dat that takes each element."""
+KRL_STATUS = (
+    {
+        "Status/@Session": "CP_SESSION",
+        "Status/@Taken": "CP_TAKEN",
+        "Status/@Done": "DONE",
+        "Status/@Moving": "MOVING",
+        "Status/@Fault": "FAULT",
+        "Status/@Time": "$ROB_TIMER",
+        "Status/@Override": "$OV_PRO",
+        "Status/@T1": "T1",
+        "Arm/@Model": "$MODEL_NAME[]",
+        "Arm/@Serial": "$KR_SERIALNO",
+        "Pose/@Valid": "POSE_VALID",
+    }
+    | {f"Axes/@A{axis}": f"$AXIS_ACT_MEAS.A{axis}" for axis in range(1, 7)}
+    | {f"Pose/@{name}": f"CP_POSE.{name}" for name in "XYZABC"}
+)
+"""What the controller sends in each element."""
+WIRE_NUMBERS = (
+    *("MOVE", "ASK", "NO_FAULT", "EMERGENCY_STOP", "DRIVES_OFF"),
+    *("STOP_MESSAGE", "PROGRAM_ENDED", "TARGET_REFUSED"),
+)
+"""Numbers of the wire that the programs use."""
+_KRL_TYPE = {"INT": "Int", "REAL": "Real", "STRING": "String"}
+
+
+def rsi_xml(settings: kuka_rsi.Settings, pc_address: str) -> str:
+    """Configuration of the ETHERNET object: what is sent, what is received, to whom."""
+    host, port = settings.listen.rsplit(":", 1)
+    sent = "\n".join(
+        f'      <ELEMENT TAG="DEF_{tag}" TYPE="{kind}" INDX="INTERNAL"/>'
+        for tag, kind in (("RIst", "DOUBLE"), (settings.measured_tag, "DOUBLE"), (settings.delay_tag, "LONG"))
+    )
+    received = "\n".join(
+        f'      <ELEMENT TAG="{settings.correction_tag}.A{axis}" TYPE="DOUBLE" INDX="{axis}" HOLDON="1"/>'
+        for axis in range(1, 7)
+    )
+    return f"""\
+<ROOT>
+  <CONFIG>
+    <IP_NUMBER>{pc_address if host == "0.0.0.0" else host}</IP_NUMBER>
+    <PORT>{port}</PORT>
+    <SENTYPE>{settings.sen_type}</SENTYPE>
+    <ONLYSEND>FALSE</ONLYSEND>
+  </CONFIG>
+  <SEND>
+    <ELEMENTS>
+{sent}
+    </ELEMENTS>
+  </SEND>
+  <RECEIVE>
+    <ELEMENTS>
+      <ELEMENT TAG="DEF_EStr" TYPE="STRING" INDX="INTERNAL"/>
+{received}
+    </ELEMENTS>
+  </RECEIVE>
+</ROOT>
+"""
+
+
+def eki_xml(settings: kuka_eki.Settings) -> str:
+    """Configuration of the EthernetKRL connection. The flag is set when a whole message has come."""
+    host, port = settings.address.rsplit(":", 1)
+    here = f"<IP>{host}</IP>\n      <PORT>{port}</PORT>"
+    if settings.controller_is == "server":
+        external, internal = "<TYPE>Client</TYPE>", f"\n      {here}"
+    else:
+        external, internal = f"<TYPE>Server</TYPE>\n      {here}", ""
+    received = "\n".join(
+        f'      <ELEMENT Tag="{wire.ROOT}/{path}" Type="{kind}"/>' for path, kind in wire.COMMAND_ELEMENTS
+    )
+    sent = "\n".join(f'      <ELEMENT Tag="{wire.ROOT}/{path}"/>' for path, _ in wire.STATUS_ELEMENTS)
+    return f"""\
+<ETHERNETKRL>
+  <CONFIGURATION>
+    <EXTERNAL>
+      {external}
+    </EXTERNAL>
+    <INTERNAL>
+      <ENVIRONMENT>Submit</ENVIRONMENT>
+      <BUFFERING Mode="FIFO" Limit="16"/>
+      <ALIVE Set_Flag="{ALIVE_FLAG}" Ping="{PING_S}"/>{internal}
+      <PROTOCOL>TCP</PROTOCOL>
+    </INTERNAL>
+  </CONFIGURATION>
+  <RECEIVE>
+    <XML>
+{received}
+      <ELEMENT Tag="{wire.ROOT}" Set_Flag="{RECEIVED_FLAG}"/>
+    </XML>
+  </RECEIVE>
+  <SEND>
+    <XML>
+{sent}
+    </XML>
+  </SEND>
+</ETHERNETKRL>
+"""
+
+
+def krl_get() -> str:
+    """The lines that read one command."""
+    return "\n".join(
+        f'  RET=EKI_Get{_KRL_TYPE[kind]}("{EKI_NAME}","{wire.ROOT}/{path}",{KRL_COMMAND[path]})'
+        for path, kind in wire.COMMAND_ELEMENTS
+    )
+
+
+def krl_set() -> str:
+    """The lines that write one status."""
+    return "\n".join(
+        f'RET=EKI_Set{_KRL_TYPE[kind]}("{EKI_NAME}","{wire.ROOT}/{path}",{KRL_STATUS[path]})'
+        for path, kind in wire.STATUS_ELEMENTS
+    )
+
+
+def axis_rows(arm: Arm) -> str:
+    """Rows of the table of correction limits."""
+    return "\n".join(
+        f"| A{axis} | {low:g} to {high:g} | {low - high - 1:g}, {high - low + 1:g} | {high - low:g} |"
+        for axis, (low, high) in enumerate(arm.limits_deg, start=1)
+    )
+
+
+def filled(template: str, values: dict[str, str]) -> str:
+    """The template with each @NAME@ replaced; raises KeyError for one without value."""
+    return re.sub(r"@([A-Z_0-9]+)@", lambda match: values[match[1]], template)
+
+
+def files(rsi: kuka_rsi.Settings, eki: kuka_eki.Settings, pc_address: str, load: int) -> Iterable[tuple[str, str]]:
+    """Path below the output folder, and text, of every file."""
+    lost = "CP_WAS_ALIVE"
+    values = {name: str(getattr(wire, name)) for name in WIRE_NUMBERS} | {
+        "ROOT": wire.ROOT,
+        "EKI_NAME": EKI_NAME,
+        "ALIVE_FLAG": str(ALIVE_FLAG),
+        "RECEIVED_FLAG": str(RECEIVED_FLAG),
+        "ORDER_FLAG": str(ORDER_FLAG),
+        "STATUS_MS": str(eki.status_ms),
+        "OPEN_AGAIN": lost if eki.controller_is == "server" else f"{lost} OR ($ROB_TIMER-CP_SENT_MS>2000)",
+        "GET_COMMAND": krl_get(),
+        "SET_STATUS": krl_set(),
+        "LOAD": str(load),
+        "RSI_CONTEXT": RSI_CONTEXT,
+        "RSI_CONFIG": RSI_CONFIG,
+        "IPO_MODE": {4: "#IPO_FAST", 12: "#IPO"}[rsi.cycle_ms],
+        "DELAY_LIMIT": str(rsi.delay_limit),
+        "AXIS_ROWS": axis_rows(rsi.arm()),
+    }
+    yield f"eki/{EKI_NAME}.xml", eki_xml(eki)
+    yield f"rsi/{RSI_CONFIG}", rsi_xml(rsi, pc_address)
+    for folder, name in (
+        ("eki", "coupole_eki.src"),
+        ("eki", "coupole_eki.dat"),
+        ("eki", "coupole_link.src"),
+        ("eki", "coupole_link.dat"),
+        ("rsi", "coupole_rsi.src"),
+        ("rsi", "coupole_rsi.dat"),
+        ("rsi", "context.md"),
+    ):
+        yield f"{folder}/{name}", filled((TEMPLATES / name).read_text(), values)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=ROOT / "configs" / "kuka")
+    parser.add_argument("--pc-address", default="192.168.1.10", help="the PC's address in the RSI network")
+    parser.add_argument("--rsi", default="{}", help="settings of drivers.kuka_rsi, JSON")
+    parser.add_argument("--eki", default="{}", help="settings of drivers.kuka_eki, JSON")
+    parser.add_argument("--load", type=int, default=1, help="number of the camera's LOAD_DATA")
+    options = parser.parse_args(arguments)
+    rsi = kuka_rsi.Settings.model_validate_json(options.rsi)
+    eki = kuka_eki.Settings.model_validate_json(options.eki)
+    for path, text in files(rsi, eki, options.pc_address, options.load):
+        target = options.output / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(text)
+
+
+if __name__ == "__main__":
+    main()

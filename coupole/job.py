@@ -181,10 +181,13 @@ def _dose_points(plan: Plan, corners: NDArray[np.float64]) -> NDArray[np.float64
     return np.concatenate([box, [(low + high) / 2]])
 
 
-def preflight_of(job: Job, folder: Path, *, paths: bool = True) -> Report:
+def preflight_of(
+    job: Job, folder: Path, *, paths: bool = True, allocated_bytes: int = 0, share_left: float = 1.0
+) -> Report:
     """Preflight's report on a job whose run would lie in `folder`; the disk there is measured.
 
-    Without `paths` nothing is checked for collisions.
+    Without `paths` nothing is checked for collisions. Of a run to be resumed, `allocated_bytes` lie there already
+    and `share_left` of its frames are still to be taken.
     """
     existing = folder
     while not existing.exists():
@@ -193,10 +196,11 @@ def preflight_of(job: Job, folder: Path, *, paths: bool = True) -> Report:
         write_bytes_s = measure_write_speed(existing)
     except StorageError:
         write_bytes_s = 0.0
-    return check_job(job, StorageFacts(shutil.disk_usage(existing).free, write_bytes_s), paths=paths)
+    free_bytes = shutil.disk_usage(existing).free + allocated_bytes
+    return check_job(job, StorageFacts(free_bytes, write_bytes_s), paths=paths, share_left=share_left)
 
 
-def check_job(job: Job, storage: StorageFacts, *, paths: bool = True) -> Report:
+def check_job(job: Job, storage: StorageFacts, *, paths: bool = True, share_left: float = 1.0) -> Report:
     """Preflight's report on a job, given what is known of the disk."""
     rig = job.cell.rig
     bodies = job.bodies if paths else None
@@ -211,4 +215,5 @@ def check_job(job: Job, storage: StorageFacts, *, paths: bool = True) -> Report:
         itinerary,
         object_points_support_mm=job.object_points_support_mm,
         dose_before_lux_h=before,
+        share_left=share_left,
     )

@@ -80,8 +80,12 @@ def check(
     *,
     object_points_support_mm: NDArray[np.float64],
     dose_before_lux_h: float = 0.0,
+    share_left: float = 1.0,
 ) -> Report:
-    """Check a whole plan. `object_points_support_mm` [n, 3] are where the dose is reckoned; the worst counts."""
+    """Check a whole plan. `object_points_support_mm` [n, 3] are where the dose is reckoned; the worst counts.
+
+    Of a plan that is resumed, `share_left` of its light is still to come.
+    """
     report = Report(shots=schedule.shots, frames=schedule.frames)
     report.dose_before_lux_h = dose_before_lux_h
     report.dose_budget_lux_h = plan.object.dose_budget_lux_h if plan.object else None
@@ -89,7 +93,7 @@ def check(
     report.refusals += _refuse_names(schedule)
     report.refusals += _refuse_optics(plan, rig)
     report.refusals += _refuse_on_times(schedule.bursts[0], rig.led_limits)
-    _time_and_dose(report, plan, rig, schedule, itinerary, leds, object_points_support_mm)
+    _time_and_dose(report, plan, rig, schedule, itinerary, leds, object_points_support_mm, share_left)
     _thermal(report, rig.led_limits, schedule, leds)
     _storage(report, rig, schedule, storage)
     return report
@@ -140,6 +144,7 @@ def _time_and_dose(
     itinerary: Itinerary,
     leds: LedTable,
     points_support_mm: NDArray[np.float64],
+    share_left: float,
 ) -> None:
     points_base = apply(rig.support.base_from_support.matrix(), points_support_mm)
     lux = leds.illuminance_lux(points_base, emission=rig.dome.emission)
@@ -172,7 +177,7 @@ def _time_and_dose(
                 float(dose.max()),
             )
         )
-    report.dose_lux_h = float(total.max())
+    report.dose_lux_h = float(total.max()) * share_left
     budget = report.dose_budget_lux_h
     if budget is not None and report.dose_lux_h + report.dose_before_lux_h > budget:
         assert plan.object is not None

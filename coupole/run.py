@@ -113,6 +113,10 @@ class Run:
     def view_path(self, view: str) -> Path:
         return self.folder / "views" / f"{view}.h5"
 
+    def allocated_bytes(self) -> int:
+        """What the run's views take on the disk already: laid out whole before their first frame."""
+        return sum(path.stat().st_blocks * 512 for path in (self.folder / "views").glob("*.h5"))
+
     def expected_shots(self) -> Iterable[str]:
         """Ids of all shots and dark frames of the plan."""
         for view in self.about["views"]:

@@ -72,14 +72,32 @@ def acquire_plan(
     found: dict[str, Any],
 ) -> None:
     """Run a plan into a run folder; `found` is filled with the figures of `--json`, also when this raises."""
-    run = Run(resume) if resume else None
-    if run is not None:
-        run.refuse_changes(job.inputs)
+    with contextlib.ExitStack() as held:
+        run = Run(resume) if resume else None
+        if run is not None:
+            held.callback(os.close, run.lock())
+            run.refuse_changes(job.inputs)
+        _acquire_into(run, job, console, parent=parent, confirm=confirm, found=found, held=held)
+
+
+def _acquire_into(
+    run: Run | None,
+    job: Job,
+    console: Console,
+    *,
+    parent: Path | None,
+    confirm: bool,
+    found: dict[str, Any],
+    held: contextlib.ExitStack,
+) -> None:
+    resumed = run is not None
     folder = (run.folder if run else parent or job.cell.storage_folder).resolve()
-    preflight = preflight_of(job, folder)
-    if run is not None:
-        done_bytes = len(run.proven()) * job.cell.rig.sensor.frame_bytes
-        preflight.refusals = [r for r in preflight.refusals if done_bytes == 0 or not r.startswith("storage")]
+    preflight = preflight_of(
+        job,
+        folder,
+        allocated_bytes=run.allocated_bytes() if run else 0,
+        share_left=1.0 - len(run.proven()) / job.schedule.frames if run else 1.0,
+    )
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     _refuse(preflight)
     real = not in_world(job.cell.rig, dry_run=False)
@@ -87,12 +105,13 @@ def acquire_plan(
         raise Interrupted("not started")
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=_teller(console)) as cell:
-        run = run or Run.create(folder, job.plan.name, job.inputs, about_run(job, cell))
-        lock = run.lock()
+        if run is None:
+            run = Run.create(folder, job.plan.name, job.inputs, about_run(job, cell))
+            held.callback(os.close, run.lock())
         console.print(f"run {run.folder}")
         recorder = RunRecorder(run, metadata_of_views(job, cell))
         try:
-            _acquire(job, cell, run, recorder, console, resumed=resume is not None, found=found)
+            _acquire(job, cell, run, recorder, console, resumed=resumed, found=found)
         except CoupoleError:
             with contextlib.suppress(StorageError):  # what ended the run matters more than its report
                 report.write(run)
@@ -101,7 +120,6 @@ def acquire_plan(
             report.write(run)
         finally:
             recorder.close()
-            os.close(lock)
 
 
 def _teller(console: Console) -> Any:

@@ -244,12 +244,17 @@ def test_a_run_stopped_while_the_arm_moves_stops_the_arm(standing: tuple[CellFol
 
 def test_a_run_that_is_being_acquired_is_not_resumed_by_another(standing: tuple[CellFolder, World]) -> None:
     cell, _ = standing
+    cell.write(lights=cells.SOME_LIGHTS, repeats=4)
     process = cell.start_acquire()
     run = cell.run_folder
     cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    process.send_signal(signal.SIGUSR1)
+    cells.wait_until(lambda: cells.events(run, "pause"), "the pause")
     other = cell.acquire("--resume", run)
+    process.send_signal(signal.SIGUSR1)
     assert cells.finish(process).code == 0
-    assert other.code in (2, 4), other.err  # the run is locked, or its devices are
+    assert other.code == 2
+    assert "another process is acquiring into this run" in other.err
     cells.assert_each_shot_proven_once(run)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,16 @@ from coupole.collisions import CellBodies
 from coupole.dome import LedTable, read_led_table
 from coupole.errors import InputError, Problem, StorageError
 from coupole.geometry import apply
-from coupole.itinerary import bodies_of, plan_itinerary
+from coupole.itinerary import Itinerary, bodies_of, plan_itinerary
 from coupole.plan import MeasuredObject, Plan
 from coupole.preflight import Report, StorageFacts, check
 from coupole.rig import Rig, driver_problems
 from coupole.run import Inputs
-from coupole.shots import Schedule, build_schedule, missing_lights
+from coupole.shots import Schedule, ViewPose, build_schedule, missing_lights
 from coupole.store import measure_write_speed
 from coupole.yamlfile import Document
 
+_SAME_PLACE_DEG = 1e-3
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
 
 
@@ -58,6 +60,18 @@ class Job:
     object_points_support_mm: NDArray[np.float64]
     """[n, 3] corners and centre of the object's bounding box, or the views' targets: where dose is reckoned."""
     schedule: Schedule
+    _planned: list[tuple[tuple[str, ...], Sequence[float], Itinerary]] = field(default_factory=list, repr=False)
+
+    def itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
+        """Ways to views from where the arm stands, clear of everything; remembered, so that what preflight planned
+        from home need not be planned again where the arm does stand there."""
+        names = tuple(view.name for view in views)
+        for planned_names, planned_deg, itinerary in self._planned:
+            if planned_names == names and np.allclose(planned_deg, start_deg, rtol=0, atol=_SAME_PLACE_DEG):
+                return itinerary
+        itinerary = plan_itinerary(views, self.cell.rig, self.bodies, start_deg)
+        self._planned.append((names, tuple(start_deg), itinerary))
+        return itinerary
 
     @cached_property
     def bodies(self) -> CellBodies:
@@ -203,8 +217,11 @@ def preflight_of(
 def check_job(job: Job, storage: StorageFacts, *, paths: bool = True, share_left: float = 1.0) -> Report:
     """Preflight's report on a job, given what is known of the disk."""
     rig = job.cell.rig
-    bodies = job.bodies if paths else None
-    itinerary = plan_itinerary(job.schedule.views, rig, bodies, rig.motion.home_joints_deg)
+    home_deg = rig.motion.home_joints_deg
+    if paths:
+        itinerary = job.itinerary(job.schedule.views, home_deg)
+    else:
+        itinerary = plan_itinerary(job.schedule.views, rig, None, home_deg)
     before = ledger.total_lux_h(job.cell.storage_folder, job.plan.object.id) if job.plan.object else 0.0
     return check(
         job.plan,

@@ -20,9 +20,9 @@ from coupole.plan import Plan
 from coupole.rig import BoardThermal, LedLimits, Rig
 from coupole.shots import Burst, Schedule
 
-BURST_OVERHEAD_S = 0.17
+BURST_OVERHEAD_S = 0.14
 """Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""
-SETTLE_CHECK_S = 0.2
+SETTLE_CHECK_S = 0.1
 """From the end of a motion to 'settled', dwell apart (measured on the simulated cell)."""
 STEP_BYTES, BITS_PER_BYTE = 16, 10
 UPLOAD_OVERHEAD_S = 0.1

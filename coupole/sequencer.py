@@ -37,7 +37,7 @@ from coupole.errors import (
     UnprovenError,
 )
 from coupole.intake import Intake
-from coupole.itinerary import Visit, arm_of, plan_itinerary
+from coupole.itinerary import Visit, arm_of
 from coupole.job import Job
 from coupole.kinematics import move_duration_s
 from coupole.matching import UNLABELLED, FaultModel, Match, compile_now, match
@@ -51,8 +51,8 @@ _LAST_FRAMES_S = 1.0
 """How long after a burst's end its last frames may take to reach the host, readout apart."""
 _CLOCK_TOLERANCE, _STALL_S = 1.02, 5.0
 """A burst may take so much longer than its table says, as a factor and in seconds."""
-_LAST_STRETCH_S = 0.2
-"""Of a burst, in which the host has to be on its feet."""
+_LAST_STRETCH_S = 0.3
+"""Of a burst: time enough for a host that fell behind in a hurry to catch up before the end."""
 _BOX_JITTER_US = 20.0
 _BUFFERS = 64
 _PAUSE_NAP_S, _MOTION_POLL_S = 0.1, 0.01
@@ -139,12 +139,12 @@ class Sequencer:
 
     def acquire(self) -> Outcome:
         """Do all that is not proven yet. Raises UnprovenError if shots stay missing, or a CoupoleError."""
-        start_ns = self._cell.clock.now_ns()
         schedule = self._job.schedule
+        left = {n: found for n, bursts in enumerate(schedule.bursts) if (found := self._left_of(bursts))}
+        visits = self._itinerary([schedule.views[n] for n in left])
+        start_ns = self._cell.clock.now_ns()
         try:
-            left = {n: found for n, bursts in enumerate(schedule.bursts) if (found := self._left_of(bursts))}
-            views = [schedule.views[n] for n in left]
-            for (number, bursts), visit in zip(left.items(), self._itinerary(views), strict=True):
+            for (number, bursts), visit in zip(left.items(), visits, strict=True):
                 self._view_number, self._view_name = number, schedule.views[number].name
                 self._acquire_view(schedule.views[number], visit, bursts, schedule.bursts[number])
         finally:
@@ -161,7 +161,7 @@ class Sequencer:
     def _itinerary(self, views: Sequence[ViewPose]) -> list[Visit]:
         """Ways to the views that are left, from where the arm really stands."""
         start_deg = self._cell.robot.measured().joints_deg
-        found = plan_itinerary(views, self._job.cell.rig, self._job.bodies, start_deg)
+        found = self._job.itinerary(views, start_deg)
         if found.refusals:
             raise PreflightRefused(found.refusals)
         return [visit for visit in found.visits if visit is not None]

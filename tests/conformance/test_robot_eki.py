@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from test_robot import AWAY_DEG, HOME_DEG, KukaCell, RobotConformance
+from robot_conformance import AWAY_DEG, HOME_DEG, KukaCell, RobotConformance
 
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.kuka_eki import KukaEki, Settings

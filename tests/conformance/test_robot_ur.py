@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_robot import AWAY_DEG, HOME_DEG, RobotConformance
+from robot_conformance import AWAY_DEG, HOME_DEG, RobotConformance
 
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout, InputError
 from drivers.ur import Settings, UrRobot

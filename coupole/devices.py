@@ -305,7 +305,15 @@ class Robot(Protocol):
     def measured(self) -> ArmState: ...
 
     def stop(self) -> None:
-        """Bring the arm to rest along its path, as fast as its limits allow. Safe to call at any time."""
+        """Bring the arm to rest along its path, as fast as its limits allow. Safe to call at any time.
+
+        From any motion that `move_to` began, each axis turns by at most `stopping_deg` more.
+        """
+        ...
+
+    def stopping_deg(self) -> NDArray[np.float64]:
+        """Farthest that each axis [6] still turns after `stop` is called: what this driver's speeds,
+        accelerations and delays make of it."""
         ...
 
     def statistics(self) -> Mapping[str, float]:

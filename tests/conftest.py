@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from cells import CellFolder
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--full", action="store_true", help="full scale: minutes to an hour instead of seconds")
+
+
+@pytest.fixture
+def scale(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
+    """`scale(small, full)`: how many of something to test, with `--full` or without."""
+    full = bool(request.config.getoption("--full"))
+    return lambda small, whole: whole if full else small
 
 
 @pytest.fixture

@@ -147,8 +147,7 @@ def acquire(
         if dry_run:
             rehearse(job, console, speed=speed, found=found)
         else:
-            confirm = not yes and not as_json and sys.stdin.isatty()
-            acquire_plan(job, console, parent=output, resume=resume, confirm=confirm, found=found)
+            acquire_plan(job, console, parent=output, resume=resume, confirm=not yes, found=found)
     except CoupoleError as error:
         _fail(error, as_json=as_json, found=found)
         raise

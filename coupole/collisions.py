@@ -113,7 +113,7 @@ _SELF_PAIRS = tuple(
 )
 """Bodies of the arm that can meet; neighbours in the chain are kept apart by the joints' limits."""
 _FIXED_TO_BASE = ("base",)
-_REACH_MM = (1600.0, 1500.0, 1000.0, 420.0, 420.0, 250.0)
+REACH_MM = (1600.0, 1500.0, 1000.0, 420.0, 420.0, 250.0)
 """Farthest that any point of arm and tool can be from axis 1 to 6 (links stretched out, tool of 300 mm)."""
 _RESOLUTION_MM = 2.0
 _FAR_MM = 400.0
@@ -210,7 +210,7 @@ class CellBodies:
         stretch's ends; other stretches are halved. So nothing between samples is missed.
         """
         start, end = np.asarray(from_deg, dtype=np.float64), np.asarray(to_deg, dtype=np.float64)
-        sweep_mm = float(np.radians(np.abs(end - start)) @ np.array(_REACH_MM))
+        sweep_mm = float(np.radians(np.abs(end - start)) @ np.array(REACH_MM))
         middles, half = np.array([0.5]), 0.5
         while len(middles):
             moved_mm = sweep_mm * half

@@ -26,6 +26,15 @@ def make_console(*, quiet: bool) -> Console:
     return Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=not sys.stderr.isatty())
 
 
+def ask(question: str) -> bool:
+    """Put a yes-or-no question on standard error, even where all else is quiet; only a typed yes is one."""
+    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
+    try:
+        return sys.stdin.readline().strip().lower() in {"y", "yes"}
+    except OSError:  # no standard input
+        return False
+
+
 def duration_text(seconds: float) -> str:
     """`2 h 05 min`, `3 min 20 s`, `12.3 s`."""
     if seconds >= 3600:

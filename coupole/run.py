@@ -135,6 +135,17 @@ class Run:
             if event["event"] == "frame"
         }
 
+    def robot_fault(self) -> str:
+        """The fault of the arm that ended the last session, empty if none did."""
+        found = ""
+        for event in journal.read(self.journal_path) if self.journal_path.exists() else ():
+            match event:
+                case {"event": "start"} | {"event": "resume", "simulated": _}:
+                    found = ""
+                case {"event": "fault", "device": "robot", "message": message}:
+                    found = message
+        return found
+
     def lock(self) -> int:
         """Hold the run for this process. Raises InputError if another process acquires into it."""
         fd = os.open(self.folder / "run.json", os.O_RDONLY)

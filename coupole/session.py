@@ -16,9 +16,16 @@ from rich.console import Console
 
 from coupole import ledger, report
 from coupole.cell import OpenedCell, coarse, open_cell
-from coupole.console import RunObserver, show_dry_run, show_preflight
+from coupole.console import RunObserver, ask, show_dry_run, show_preflight
 from coupole.devices import Identity
-from coupole.errors import CoupoleError, Interrupted, PreflightRefused, StorageError
+from coupole.errors import (
+    CoupoleError,
+    DeviceError,
+    DeviceFault,
+    Interrupted,
+    PreflightRefused,
+    StorageError,
+)
 from coupole.job import Job, check_job, preflight_of
 from coupole.observer import Control, Outcome
 from coupole.preflight import Report, StorageFacts
@@ -100,9 +107,10 @@ def _acquire_into(
     )
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     _refuse(preflight)
+    acknowledged = _ask_whether_clear(run.robot_fault()) if run else ""
     real = not in_world(job.cell.rig, dry_run=False)
-    if real and confirm and not console.input("Move the arm and light the object? [y/N] ").lower().startswith("y"):
-        raise Interrupted("not started")
+    if real and confirm and not ask("Move the arm and light the object?"):
+        raise Interrupted("not started: answer the question, or say `--yes`")
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=_teller(console)) as cell:
         if run is None:
@@ -111,7 +119,9 @@ def _acquire_into(
         console.print(f"run {run.folder}")
         recorder = RunRecorder(run, metadata_of_views(job, cell))
         try:
-            _acquire(job, cell, run, recorder, console, resumed=resumed, found=found)
+            how = {"simulated": cell.simulated, **({"acknowledged": acknowledged} if acknowledged else {})}
+            recorder.event("resume" if resumed else "start", **how)
+            _acquire(job, cell, run, recorder, console, found=found)
         except CoupoleError:
             with contextlib.suppress(StorageError):  # what ended the run matters more than its report
                 report.write(run)
@@ -120,6 +130,25 @@ def _acquire_into(
             report.write(run)
         finally:
             recorder.close()
+
+
+def _ask_whether_clear(fault: str) -> str:
+    """After a fault of the arm a person must say that it may move again; `--yes` does not say it.
+
+    Returns the fault that was acknowledged, empty if there was none. Raises DeviceFault without that word.
+    """
+    if not fault:
+        return ""
+    if not ask(
+        f"The arm stopped in a fault: {fault}\nIs the cause found, the cell clear, and may the arm move again?"
+    ):
+        raise DeviceFault(
+            "robot",
+            expected="the word of a person who has been to the cell",
+            happened="nobody said that the arm may move again",
+            remedy="See to the cell, then resume from a terminal and answer the question (`--yes` does not).",
+        )
+    return fault
 
 
 def _teller(console: Console) -> Any:
@@ -168,7 +197,6 @@ def _acquire(
     recorder: RunRecorder,
     console: Console,
     *,
-    resumed: bool,
     found: dict[str, Any],
 ) -> None:
     control = Control()
@@ -176,13 +204,13 @@ def _acquire(
     sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
     outcome = sequencer.outcome
     ended = "done"
-    recorder.event("resume" if resumed else "start", simulated=cell.simulated)
     try:
         with _operator(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
             sequencer.acquire()
     except CoupoleError as error:
         ended = "interrupted" if isinstance(error, Interrupted) else "failed"
-        recorder.event("fault", kind=type(error).__name__, message=str(error))
+        whose = {"device": error.device} if isinstance(error, DeviceError) else {}
+        recorder.event("fault", kind=type(error).__name__, message=str(error), **whose)
         raise
     finally:
         cell.make_safe()

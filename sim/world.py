@@ -171,6 +171,7 @@ class World:
                     "shining": self.lighting.shining(now_ns),
                     "panels": self.lighting.panels(now_ns),
                     "arm_moving": self.robot.moving,
+                    "joints_deg": list(self.robot.joints_deg),
                     "camera_armed": self.camera.armed,
                 }
             case "fault":

@@ -122,9 +122,9 @@ class CellFolder:
         self.world_settings["faults"] = list(faults)
         self.write()
 
-    def acquire(self, *options: str | Path) -> Ended:
+    def acquire(self, *options: str | Path, typed: str = "") -> Ended:
         """`coupole acquire --json` on the plan, in this process: with the command's exit code and words."""
-        return here("acquire", self.plan, "--json", "--yes", *options)
+        return here("acquire", self.plan, "--json", "--yes", *options, typed=typed)
 
     def start_acquire(self, *options: str | Path, **popen: Any) -> subprocess.Popen[str]:
         """The same as a process of its own, still running."""
@@ -161,12 +161,13 @@ class CellFolder:
             world.close()
 
 
-def here(*arguments: str | Path) -> Ended:
-    """Run a command in this process."""
+def here(*arguments: str | Path, typed: str = "") -> Ended:
+    """Run a command in this process; `typed` is what the operator answers."""
     out, err = io.StringIO(), io.StringIO()
     before = signal.getsignal(signal.SIGTERM)
     with (
         mock.patch.object(sys, "argv", ["coupole", *map(str, arguments)]),
+        mock.patch.object(sys, "stdin", io.StringIO(typed)),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):

@@ -8,32 +8,17 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cells
 import pytest
 from cells import SIDE, TOP, CellFolder, Ended
-
-from sim.client import World
+from failures import MORE_LIGHTS, assert_complete_once_mended, assert_told, fail_in_a_burst
 
 FRAMES = 66
 """Of one view: 54 lights, two dark frames, ten marks."""
-MORE_LIGHTS = {"kind": "every", "every": 4}
-"""270 LEDs: a burst of 2.8 s."""
-
-
-@pytest.fixture
-def lifelike(tmp_path: Path) -> CellFolder:
-    """The same at the pace of life, with a burst that is long enough for a silent robot to be given up in it."""
-    cell = CellFolder(tmp_path, speed=1.0)
-    cell.rig_data["robot"]["settings"] = {"link_timeout_s": 1.0}
-    cell.join()
-    cell.write(lights=MORE_LIGHTS)
-    return cell
 
 
 @pytest.fixture
@@ -217,48 +202,10 @@ def test_a_flickering_led_changes_no_label(joining: CellFolder) -> None:
 def test_a_box_or_camera_that_fails_in_a_burst_ends_the_run_with_four_and_a_safe_cell(
     joining: CellFolder, fault: dict[str, Any], device: str, words: str
 ) -> None:
-    ended = _fail_in_a_burst(joining, fault)
-    _assert_told(joining, ended, device)
+    ended = fail_in_a_burst(joining, fault)
+    assert_told(joining, ended, device)
     assert words in ended.err
-    _assert_complete_once_mended(joining)
-
-
-@pytest.mark.parametrize(
-    "fault",
-    [{"kind": "emergency_stop"}, {"kind": "late_rsi"}, {"kind": "rsi_link_loss", "seconds": 60.0}],
-    ids=lambda fault: str(fault["kind"]),
-)
-def test_a_robot_that_fails_in_a_burst_ends_the_run_with_four_and_a_safe_cell(
-    lifelike: CellFolder, fault: dict[str, Any]
-) -> None:
-    ended = _fail_in_a_burst(lifelike, fault)
-    _assert_told(lifelike, ended, "robot")
-    _assert_complete_once_mended(lifelike)
-
-
-def _fail_in_a_burst(cell: CellFolder, fault: dict[str, Any]) -> Ended:
-    with cell.world({**fault, "at_edge": 20}) as world:
-        ended = cell.acquire()
-        cells.wait_until(lambda: cells.safe(world), "a safe cell")
-    return ended
-
-
-def _assert_told(cell: CellFolder, ended: Ended, device: str) -> None:
-    """Exit code, message, JSON and journal name the device that failed."""
-    assert ended.code == 4, ended
-    assert ended.err.partition(": ")[2].startswith(f"{device}: expected ")
-    assert ended.document["error"].startswith(f"{device}: expected ")
-    assert cells.events(cell.run_folder, "stop")[-1]["outcome"] == "failed"
-    assert any(event["message"].startswith(device) for event in cells.events(cell.run_folder, "fault"))
-
-
-def _assert_complete_once_mended(cell: CellFolder) -> None:
-    run = cell.run_folder
-    with cell.world():
-        resumed = cell.acquire("--resume", run)
-    assert resumed.code == 0, resumed.err
-    cells.assert_each_shot_proven_once(run)
-    assert cells.mislabelled(cell, run) == []
+    assert_complete_once_mended(joining)
 
 
 def test_a_mute_box_is_reported_with_what_was_expected_and_what_to_do(joining: CellFolder) -> None:
@@ -290,56 +237,6 @@ def test_a_fault_at_a_time_of_the_world_is_met_whatever_the_run_does_then(joinin
         assert cells.safe(world)
     assert ended.code == 4
     assert "camera: expected" in ended.err
-
-
-@contextmanager
-def _once(world: World, condition: Callable[[dict[str, Any]], bool], fault: dict[str, Any]) -> Iterator[None]:
-    """Let `fault` happen when the world's state first meets `condition`, while the body runs."""
-
-    def watch() -> None:
-        cells.wait_until(lambda: condition(world.ask("state")), "the moment of a fault")
-        world.ask("fault", fault=fault)
-
-    watcher = threading.Thread(target=watch)
-    watcher.start()
-    try:
-        yield
-    finally:
-        watcher.join()
-
-
-@pytest.mark.parametrize(
-    "fault",
-    [
-        {"kind": "emergency_stop"},
-        {"kind": "late_rsi"},
-        {"kind": "rsi_link_loss", "seconds": 5.0},
-    ],
-    ids=lambda fault: str(fault["kind"]),
-)
-def test_a_robot_that_fails_in_a_motion_ends_the_run_with_four_and_is_resumed_after_a_reset(
-    joining: CellFolder, fault: dict[str, Any]
-) -> None:
-    with joining.world() as world:
-        with _once(world, lambda state: state["arm_moving"], fault):
-            ended = joining.acquire()
-        cells.wait_until(lambda: cells.safe(world), "a safe cell")
-        assert ended.code == 4, ended
-        assert "robot: expected" in ended.err
-        assert cells.events(joining.run_folder, "burst") == []
-        world.ask("reset_robot")
-        resumed = joining.acquire("--resume", joining.run_folder)
-    assert resumed.code == 0, resumed.err
-    cells.assert_each_shot_proven_once(joining.run_folder)
-    assert cells.mislabelled(joining, joining.run_folder) == []
-
-
-def test_a_latched_emergency_stop_is_not_run_over_until_it_is_reset(joining: CellFolder) -> None:
-    with joining.world() as world:
-        with _once(world, lambda state: state["arm_moving"], {"kind": "emergency_stop"}):
-            assert joining.acquire().code == 4
-        assert joining.acquire("--resume", joining.run_folder).code == 4
-        assert cells.events(joining.run_folder, "burst") == []
 
 
 # -- the disk -------------------------------------------------------------------------------------------------

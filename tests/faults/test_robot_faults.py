@@ -1,0 +1,167 @@
+"""What can go wrong with the arm in a run: it is noticed and named, and nothing moves until a person says so."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cells
+import pytest
+from cells import SIDE, TOP, CellFolder
+from failures import MORE_LIGHTS, assert_complete_once_mended, assert_told, fail_in_a_burst
+
+from sim.client import World
+
+ROBOT_FAULTS = pytest.mark.parametrize(
+    "fault",
+    [{"kind": "emergency_stop"}, {"kind": "late_rsi"}, {"kind": "rsi_link_loss", "seconds": 60.0}],
+    ids=lambda fault: str(fault["kind"]),
+)
+
+
+@pytest.fixture
+def joining(cell: CellFolder) -> CellFolder:
+    """A cell of one view whose world is kept by the test."""
+    cell.join()
+    return cell
+
+
+@pytest.fixture
+def lifelike(tmp_path: Path) -> CellFolder:
+    """The same at the pace of life, with a burst that is long enough for a silent robot to be given up in it."""
+    cell = CellFolder(tmp_path, speed=1.0)
+    cell.rig_data["robot"]["settings"] = {"link_timeout_s": 1.0}
+    cell.join()
+    cell.write(lights=MORE_LIGHTS)
+    return cell
+
+
+@contextmanager
+def _once(world: World, condition: Callable[[dict[str, Any]], bool], fault: dict[str, Any]) -> Iterator[None]:
+    """Let `fault` happen when the world's state first meets `condition`, while the body runs."""
+
+    def watch() -> None:
+        cells.wait_until(lambda: condition(world.ask("state")), "the moment of a fault")
+        world.ask("fault", fault=fault)
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        yield
+    finally:
+        watcher.join()
+
+
+def _moves(state: dict[str, Any]) -> bool:
+    return bool(state["arm_moving"])
+
+
+@ROBOT_FAULTS
+def test_a_robot_that_fails_in_a_burst_ends_the_run_with_four_and_a_safe_cell(
+    lifelike: CellFolder, fault: dict[str, Any]
+) -> None:
+    ended = fail_in_a_burst(lifelike, fault)
+    assert_told(lifelike, ended, "robot")
+    assert_complete_once_mended(lifelike, typed="y\n")
+
+
+@ROBOT_FAULTS
+def test_a_robot_that_fails_in_a_motion_ends_the_run_with_four_and_is_resumed_after_a_reset(
+    joining: CellFolder, fault: dict[str, Any]
+) -> None:
+    with joining.world() as world:
+        with _once(world, _moves, fault | ({"seconds": 5.0} if "seconds" in fault else {})):
+            ended = joining.acquire()
+        cells.wait_until(lambda: cells.safe(world), "a safe cell")
+        assert_told(joining, ended, "robot")
+        assert cells.events(joining.run_folder, "burst") == []
+        world.ask("reset_robot")
+        resumed = joining.acquire("--resume", joining.run_folder, typed="y\n")
+    assert resumed.code == 0, resumed.err
+    cells.assert_each_shot_proven_once(joining.run_folder)
+    assert cells.mislabelled(joining, joining.run_folder) == []
+
+
+def test_a_latched_emergency_stop_is_not_run_over_until_it_is_reset(joining: CellFolder) -> None:
+    with joining.world() as world:
+        with _once(world, _moves, {"kind": "emergency_stop"}):
+            assert joining.acquire().code == 4
+        assert joining.acquire("--resume", joining.run_folder, typed="y\n").code == 4
+        assert cells.events(joining.run_folder, "burst") == []
+
+
+@pytest.mark.parametrize("typed", ["", "\n", "n\n"], ids=["nobody", "nothing", "no"])
+def test_after_a_fault_of_the_arm_nothing_moves_without_a_persons_word_and_yes_does_not_give_it(
+    joining: CellFolder, typed: str
+) -> None:
+    with joining.world() as world:
+        with _once(world, _moves, {"kind": "emergency_stop"}):
+            joining.acquire()
+        world.ask("reset_robot")
+        before = world.ask("state")["joints_deg"]
+        ended = joining.acquire("--resume", joining.run_folder, "--yes", typed=typed)
+        assert ended.code == 4, ended
+        assert "robot: expected the word of a person" in ended.document["error"]
+        assert "emergency stop" in ended.err
+        assert world.ask("state")["joints_deg"] == before
+        assert cells.events(joining.run_folder, "resume") == []
+
+
+def test_the_word_is_kept_in_the_journal_and_asked_for_once(joining: CellFolder) -> None:
+    joining.write(views=[TOP, SIDE])
+    with joining.world() as world:
+        with _once(world, _moves, {"kind": "emergency_stop"}):
+            joining.acquire()
+        world.ask("reset_robot")
+        run = joining.run_folder
+        with _once(world, lambda state: bool(state["shining"]), {"kind": "unplug_camera"}):
+            assert joining.acquire("--resume", run, typed="y\n").code == 4
+    (resumed,) = cells.events(run, "resume")
+    assert "emergency stop" in resumed["acknowledged"]
+    with joining.world():
+        assert joining.acquire("--resume", run).code == 0
+    assert "acknowledged" not in cells.events(run, "resume")[-1]
+
+
+def test_an_arm_pushed_in_a_burst_has_just_that_burst_taken_again(joining: CellFolder) -> None:
+    """It springs back, or is brought back; the views before and after stay as they were taken."""
+    joining.write(views=[TOP, SIDE], lights=MORE_LIGHTS)
+    first_edge = 270 + 12  # of the second view
+    edge = first_edge + 100
+    with joining.world({"kind": "nudge_arm", "deg": 0.05, "seconds": 0.5, "at_edge": edge}):
+        ended = joining.acquire()
+    run = joining.run_folder
+    assert ended.code == 0, ended.err
+    assert {shot.split("/")[0] for shot in cells.reshot(run)} == {"side"}
+    (moved,) = cells.events(run, "fault")
+    assert moved["kind"] == "ArmMoved"
+    cells.assert_each_shot_proven_once(run)
+    assert cells.mislabelled(joining, run) == []
+    side = [frame.record for shot, frame in cells.stored(run).items() if shot.startswith("side/")]
+    assert max(record["step"] for record in side if record["pose"] == 0) < edge - first_edge
+    assert {int(record["pose"]) for record in side} == {0, 1}
+
+
+def test_where_the_arm_stood_before_and_after_each_burst_is_in_the_journal(joining: CellFolder) -> None:
+    with joining.world() as world:
+        assert joining.acquire().code == 0
+        stands_deg = world.ask("state")["joints_deg"]
+    (burst,) = cells.events(joining.run_folder, "burst")
+    assert burst["joints_before_deg"] == pytest.approx(stands_deg, abs=2e-3)
+    assert burst["joints_after_deg"] == pytest.approx(stands_deg, abs=2e-3)
+    (stop,) = cells.events(joining.run_folder, "stop")
+    assert stop["robot"]["late_answers"] == 0
+
+
+def test_an_arm_that_leaves_its_way_is_stopped(joining: CellFolder) -> None:
+    """Pushed by less than the driver calls not following, but by more than the way was found clear for."""
+    with joining.world() as world:
+        with _once(world, _moves, {"kind": "nudge_arm", "deg": 0.9}):
+            ended = joining.acquire()
+        cells.wait_until(lambda: cells.safe(world), "a safe cell")
+    assert_told(joining, ended, "robot")
+    assert "way that was found clear" in ended.document["error"]
+    assert cells.events(joining.run_folder, "burst") == []

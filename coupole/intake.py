@@ -20,7 +20,7 @@ class Intake:
     `keep(frame)` runs on `writers` threads and returns the slot. Frames are listed in order of arrival.
     """
 
-    def __init__(self, camera: Camera, keep: Callable[[Frame], int], *, writers: int = 2) -> None:
+    def __init__(self, camera: Camera, keep: Callable[[Frame], int], *, writers: int = 3) -> None:
         self._camera, self._keep = camera, keep
         self._pool = ThreadPoolExecutor(writers, "keep")
         self._frame_ids: list[int] = []

@@ -8,6 +8,7 @@ says what the slot holds: nothing, a frame not yet proven, or a proven shot with
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import mmap
 import os
@@ -207,7 +208,8 @@ def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
 
 
 class ViewWriter:
-    """Writes one view's file. `put` may be called from several threads, everything else from one."""
+    """Writes one view's file. `put` may be called from several threads, everything else from one (`sync` from
+    another than the rest)."""
 
     def __init__(self, path: Path, proven_slots: dict[str, int]) -> None:
         """Open a file that `create` made. `proven_slots` (shot id to slot) are kept; all other slots are free."""
@@ -217,6 +219,8 @@ class ViewWriter:
         self._lock = threading.Lock()
         taken = set(proven_slots.values())
         self._free = deque(slot for slot in range(self._layout.frames) if slot not in taken)
+        self._changed: set[int] = set()
+        """Slots whose record in the file is not up to date."""
         self._poses = 0
         self.direct = False
         try:
@@ -268,12 +272,12 @@ class ViewWriter:
                 f"{self.path}: no slot is free: more frames came than the view's bursts can have made. "
                 "Look for a trigger line that bounces."
             ) from None
-        record = self._table[slot : slot + 1]
+        record = np.zeros((), FRAME_DTYPE)
         record["state"], record["frame_id"], record["camera_ns"] = STORED, frame_id, camera_ns
         record["exposure_us"], record["xxh3"] = exposure_us, checksum(pixels)
         offset = self._layout.data_offset + slot * self._layout.frame_bytes
         self._write(self._fd, pixels.data.cast("B"), offset)
-        self._write_record(slot)
+        self._note(slot, record)
         return slot
 
     def frame_id(self, slot: int) -> int:
@@ -282,25 +286,36 @@ class ViewWriter:
 
     def prove(self, slot: int, shot: str, **fields: Any) -> int:
         """Say that a slot holds a proven shot; returns the frame's checksum. It counts after `sync()`."""
-        record = self._table[slot]
+        record = self._table[slot].copy()
         record["shot"] = shot.encode()
         for name, value in fields.items():
             record[name] = value
         record["state"] = PROVEN
-        self._write_record(slot)
+        self._note(slot, record)
         return int(record["xxh3"])
 
     def free(self, slot: int, *, give_back: bool = True) -> None:
         """A slot's frame is not wanted: it may be overwritten."""
-        self._table[slot] = np.zeros((), FRAME_DTYPE)
-        self._write_record(slot)
+        self._note(slot, np.zeros((), FRAME_DTYPE))
         if give_back:
             with self._lock:
                 self._free.append(slot)
 
-    def _write_record(self, slot: int) -> None:
-        data = self._table[slot].tobytes()
-        self._write(self._plain_fd, data, self._layout.table_offset + slot * FRAME_DTYPE.itemsize)
+    def _note(self, slot: int, record: NDArray[np.void] | np.void) -> None:
+        """Change a slot's record. It is written by the next `sync()`, with others: a small write beside each large
+        one would cost a tenth of the disk's speed (they wait for each other in the file system)."""
+        with self._lock:
+            self._table[slot] = record
+            self._changed.add(slot)
+
+    def _write_table(self) -> None:
+        with self._lock:
+            slots = np.array(sorted(self._changed), np.int64)
+            runs = np.split(slots, np.flatnonzero(np.diff(slots) > 1) + 1) if len(slots) else []
+            pieces = [(int(run[0]), self._table[run[0] : run[-1] + 1].tobytes()) for run in runs]
+            self._changed.clear()
+        for first, data in pieces:
+            self._write(self._plain_fd, data, self._layout.table_offset + first * FRAME_DTYPE.itemsize)
 
     def _write(self, fd: int, data: bytes | memoryview, offset: int) -> None:
         view = memoryview(data)
@@ -312,13 +327,17 @@ class ViewWriter:
             raise _storage_error(self.path, error) from error
 
     def sync(self) -> None:
-        """All that was written is on disk when this returns."""
+        """All that was put, proven and freed is on disk when this returns."""
+        self._write_table()
         try:
             os.fdatasync(self._plain_fd)
         except OSError as error:
             raise _storage_error(self.path, error) from error
 
     def close(self) -> None:
+        """Give the file back; what was not synced is written, but need not last."""
+        with contextlib.suppress(StorageError):
+            self._write_table()
         if self._fd != self._plain_fd:
             os.close(self._fd)
         os.close(self._plain_fd)

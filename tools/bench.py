@@ -126,7 +126,7 @@ def bench_store(rounds: int) -> None:
         def store() -> None:
             writer = ViewWriter(view, {})
             keep = partial(writer.put, camera_ns=0, exposure_us=8000)
-            with ThreadPoolExecutor(2) as pool:  # as `coupole.intake` does
+            with ThreadPoolExecutor(3) as pool:  # as `coupole.intake` does
                 slots = [pool.submit(keep, pixels[k % distinct], frame_id=k) for k in range(frames)]
                 for k, slot in enumerate(slots):
                     writer.prove(slot.result(), f"view/led{k:04d}/e0", led=k)

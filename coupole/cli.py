@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -225,6 +226,52 @@ def verify(run: RunPath, as_json: JsonOption = False) -> None:
     if found.missing:
         raise UnprovenError(f"{len(found.missing)} frames of the plan are missing; resume the run")
     console.print(f"ok: {found.frames} frames, each of them once, all checksums right")
+
+
+@app.command()
+def meter(
+    plan: PlanPath,
+    rig: RigOption = None,
+    saturated: Annotated[
+        float, typer.Option("--saturated", min=0, max=0.5, help="Share of a picture's pixels that may saturate.")
+    ] = 1e-3,
+    snr: Annotated[float, typer.Option("--snr", min=1, help="Signal-to-noise ratio to reach.")] = 30.0,
+    share: Annotated[
+        float, typer.Option("--share", min=0.01, max=1, help="Share of the object's pixels that must reach it.")
+    ] = 0.9,
+    write: Annotated[
+        Path | None, typer.Option("--write", help="Write the plan with this exposure, in the plan's folder.")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell moves.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Advise on a plan's exposure: a few pictures of each view, under a few lights, none of them kept."""
+    from coupole.console import make_console, show_advice
+    from coupole.job import read_job
+    from coupole.metering import Wish, write_plan
+    from coupole.session import meter as meter_plan
+
+    console = make_console(quiet=as_json)
+    try:
+        advice = meter_plan(read_job(plan, rig), console, Wish(saturated, snr, share), confirm=not yes)
+        if write is not None:
+            write_plan(plan, write, advice.exposure)
+    except CoupoleError as error:
+        _fail(error, as_json=as_json)
+        raise
+    show_advice(console, advice)
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "exposure": advice.exposure.model_dump(mode="json"),
+                    "remarks": advice.remarks,
+                    "noise": asdict(advice.noise),
+                    "views": {seen.view: asdict(seen) for seen in advice.views},
+                    "plan": str(write) if write else None,
+                }
+            )
+        )
 
 
 @app.command()

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from coupole.metering import Advice
 from coupole.observer import Observer, Outcome
 from coupole.observer import Progress as RunProgress
 from coupole.preflight import Report
@@ -161,3 +162,21 @@ def show_dry_run(console: Console, recorder: DryRecorder, outcome: Outcome, foun
             f"{outcome.reshot} shots re-shot, {outcome.over_triggers} edges came too early for the camera, "
             f"{outcome.lost_transfers} frames lost in transfer"
         )
+
+
+def show_advice(console: Console, advice: Advice) -> None:
+    """What metering learnt."""
+    table = Table("view", "at least", "at most", "object", box=None)
+    for seen in advice.views:
+        table.add_row(
+            seen.view,
+            f"{seen.shortest_us:,.0f} us",
+            f"{seen.longest_us:,.0f} us",
+            f"{seen.object_share:.0%} of the pixels",
+        )
+    console.print(table)
+    console.print(f"noise: {advice.noise.read_dn:.2f} DN read, {advice.noise.gain_dn:.4f} DN per electron")
+    for remark in advice.remarks:
+        console.print(f"[yellow]{remark}[/]")
+    exposures = ", ".join(f"{exposure_us:,}" for exposure_us in advice.exposure.exposures_us)
+    console.print(f"proposed: {advice.exposure.kind} {exposures} us")

@@ -135,7 +135,12 @@ def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
     problems += _bad_exposures(document, plan, cell.rig)
     if problems:
         raise InputError(problems)
-    schedule = build_schedule(
+    return Job(plan, document, cell, mesh_path, corners, _dose_points(plan, corners), schedule_of(plan, cell))
+
+
+def schedule_of(plan: Plan, cell: Cell) -> Schedule:
+    """All bursts of all views of a plan, at the times that the cell's camera and LEDs allow."""
+    return build_schedule(
         plan,
         cell.leds,
         cell.rig.support.base_from_support.matrix(),
@@ -143,7 +148,6 @@ def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
         readout_us=1e6 / cell.rig.sensor.max_frames_per_s,
         exposure_gap_us=cell.rig.sensor.exposure_gap_us,
     )
-    return Job(plan, document, cell, mesh_path, corners, _dose_points(plan, corners), schedule)
 
 
 def _named_rig(document: Document) -> Path | None:

@@ -9,12 +9,13 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from coupole import ledger, report
+from coupole import ledger, metering, report
 from coupole.cell import OpenedCell, coarse, open_cell
 from coupole.console import RunObserver, ask, show_dry_run, show_preflight
 from coupole.devices import Identity
@@ -26,13 +27,14 @@ from coupole.errors import (
     PreflightRefused,
     StorageError,
 )
-from coupole.job import Job, check_job, preflight_of
+from coupole.job import Job, check_job, preflight_of, schedule_of
 from coupole.observer import Control, Outcome
 from coupole.preflight import Report, StorageFacts
 from coupole.recorder import DryRecorder, RunRecorder
 from coupole.rig import in_world
 from coupole.run import Run, is_shot
 from coupole.sequencer import Sequencer
+from coupole.shots import EXPOSURE_MARGIN_US, select_leds
 
 
 def _refuse(found: Report) -> None:
@@ -108,9 +110,7 @@ def _acquire_into(
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     _refuse(preflight)
     acknowledged = _ask_whether_clear(run.robot_fault()) if run else ""
-    real = not in_world(job.cell.rig, dry_run=False)
-    if real and confirm and not ask("Move the arm and light the object?"):
-        raise Interrupted("not started: answer the question, or say `--yes`")
+    _ask_to_begin(job, confirm=confirm)
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=_teller(console)) as cell:
         if run is None:
@@ -130,6 +130,19 @@ def _acquire_into(
             report.write(run)
         finally:
             recorder.close()
+
+
+def _ask_to_begin(job: Job, *, confirm: bool) -> None:
+    """Nothing real moves or shines unasked."""
+    real = not in_world(job.cell.rig, dry_run=False)
+    if real and confirm and not ask("Move the arm and light the object?"):
+        raise Interrupted("not started: answer the question, or say `--yes`")
+
+
+def _enter_dose(job: Job, cell: OpenedCell, outcome: Outcome, what_for: str) -> None:
+    """Light that a real cell gave an object goes into the object's ledger."""
+    if job.plan.object and not cell.simulated:
+        ledger.add(job.cell.storage_folder, job.plan.object.id, run=what_for, dose_lux_h=outcome.dose_lux_h)
 
 
 def _ask_whether_clear(fault: str) -> str:
@@ -219,13 +232,7 @@ def _acquire(
             console.print(f"[red]{trouble}[/]")
         recorder.event("stop", outcome=ended, robot=dict(cell.robot.statistics()))
         recorder.close_quietly()
-        if job.plan.object and not cell.simulated:
-            ledger.add(
-                job.cell.storage_folder,
-                job.plan.object.id,
-                run=run.folder.name,
-                dose_lux_h=outcome.dose_lux_h,
-            )
+        _enter_dose(job, cell, outcome, run.folder.name)
         found.update(_figures(run, job, outcome))
         _say_outcome(console, run, outcome, ended)
 
@@ -257,6 +264,36 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> No
     console.print(f"  frames  {run.folder / 'views'}\n  report  {run.folder / 'report.html'}")
     if ended != "done":
         console.print(f"  go on with --resume {run.folder}")
+
+
+# -- exposure advice --------------------------------------------------------------------------------------
+
+
+def meter(job: Job, console: Console, wish: metering.Wish, *, confirm: bool) -> metering.Advice:
+    """Take a few pictures of each view under lights spread over the dome, keep none, and advise on exposure.
+
+    The light that this gives the object is entered in its ledger. Raises PreflightRefused, DeviceError,
+    Interrupted, and UnprovenError where pictures stay missing.
+    """
+    cell_leds, base_from_support = job.cell.leds, job.cell.rig.support.base_from_support.matrix()
+    few = metering.metering_plan(job.plan, cell_leds, select_leds(job.plan, cell_leds, base_from_support))
+    small = replace(job, plan=few, schedule=schedule_of(few, job.cell))
+    preflight = check_job(small, StorageFacts(UNLIMITED_BYTES))
+    _refuse(preflight)
+    _ask_to_begin(job, confirm=confirm)
+    recorder, control = metering.MeterRecorder(), Control()
+    with open_cell(job.cell, job=small, on_opened=_teller(console)) as cell:
+        observer = RunObserver(console, job.cell.rig.sensor.frame_bytes, 0)
+        sequencer = Sequencer(small, cell, recorder, observer=observer, control=control)
+        try:
+            with _operator(control), observer.showing(small.schedule.frames, len(small.schedule.views)):
+                sequencer.acquire()
+        finally:
+            cell.make_safe()
+            _enter_dose(job, cell, sequencer.outcome, "meter")
+    limits = job.cell.rig.led_limits
+    longest_us = limits.on_us[1] - limits.rise_us - EXPOSURE_MARGIN_US
+    return metering.advise(recorder.views, wish, longest_us=longest_us)
 
 
 # -- the rehearsal ----------------------------------------------------------------------------------------

@@ -275,6 +275,37 @@ def meter(
 
 
 @app.command()
+def live(
+    what: Annotated[Path, typer.Argument(help="A run's folder, a plan, or a rig.", show_default=False)],
+    led: Annotated[int | None, typer.Option("--led", help="The LED to begin with; none is dark.")] = None,
+    exposure_us: Annotated[int, typer.Option("--exposure-us", min=10, help="Exposure to begin with.")] = 8000,
+    frames_per_s: Annotated[
+        float, typer.Option("--fps", min=0.1, max=20, help="Pictures a second, at most.")
+    ] = 5.0,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page; 0: any.")] = 0,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before real light is given.")] = False,
+) -> None:
+    """Look through the camera, or at a run that goes on: figures here, pictures on a page for this machine.
+
+    Of a run the folder alone is read, so it is never slowed. Of a rig or a plan (then its object's light is
+    entered in the ledger) the camera is taken; the arm is held where it stands.
+    """
+    from coupole.console import make_console
+    from coupole.job import read_cell, read_job
+    from coupole.live import Choice
+    from coupole.session import watch_cell, watch_run
+    from coupole.yamlfile import read
+
+    console = make_console(quiet=False)
+    if what.is_dir():
+        watch_run(what, console, port=port)
+        return
+    source = read_job(what) if "views" in read(what).data else read_cell(what)
+    choice = Choice(led, exposure_us)
+    watch_cell(source, console, choice, frames_per_s=frames_per_s, port=port, confirm=not yes)
+
+
+@app.command()
 def sim(
     rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
     plan: Annotated[Path | None, typer.Option("--plan", help="Put this plan's object on the support.")] = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -9,9 +10,11 @@ from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
+from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from coupole.live import Shown
 from coupole.metering import Advice
 from coupole.observer import Observer, Outcome
 from coupole.observer import Progress as RunProgress
@@ -180,3 +183,48 @@ def show_advice(console: Console, advice: Advice) -> None:
         console.print(f"[yellow]{remark}[/]")
     exposures = ", ".join(f"{exposure_us:,}" for exposure_us in advice.exposure.exposures_us)
     console.print(f"proposed: {advice.exposure.kind} {exposures} us")
+
+
+class LiveFigures:
+    """The live view's figures: drawn in place on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._live = Live(console=console, refresh_per_second=5, transient=True) if console.is_terminal else None
+        self._best: dict[str, float] = {}
+        self._said_s, self._number = 0.0, 0
+
+    def __enter__(self) -> LiveFigures:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self, shown: Shown | None) -> None:
+        """Draw what is newest, if it is new."""
+        if shown is None or shown.number == self._number:
+            return
+        self._number = shown.number
+        seen = shown.figures
+        best = self._best[shown.title] = max(self._best.get(shown.title, 0.0), seen.sharpness)
+        saturated = ", ".join(f"{name} {share:.2%}" for name, share in seen.saturated.items())
+        line = (
+            f"{shown.title}, {shown.exposure_us} us: brightest {seen.brightest:.0%}; saturated {saturated}; "
+            f"sharpness {seen.sharpness / best:.0%} of the best; {shown.frames_per_s:.1f} frames/s"
+        )
+        if self._live is not None:
+            self._live.update("\n".join([line, *(_bars(name, bins) for name, bins in seen.histograms.items())]))
+        elif time.monotonic() - self._said_s > _PLAIN_LINE_EVERY_S:
+            self._said_s = time.monotonic()
+            self._console.print(line)
+
+
+def _bars(name: str, bins: list[int]) -> str:
+    """A histogram as one line of blocks, logarithmic."""
+    blocks = " ▁▂▃▄▅▆▇█"
+    top = math.log1p(max(bins)) or 1.0
+    pairs = [max(bins[i : i + 2]) for i in range(0, len(bins), 2)]
+    return f"{name:>2} " + "".join(blocks[round(math.log1p(n) / top * (len(blocks) - 1))] for n in pairs)

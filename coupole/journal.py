@@ -91,3 +91,20 @@ def read(path: Path) -> Iterator[dict[str, Any]]:
                         yield event
     except OSError as error:
         raise StorageError(f"{path}: cannot read the journal: {error.strerror}") from error
+
+
+def tail(path: Path, most_bytes: int) -> list[dict[str, Any]]:
+    """The last events of a journal, as far as they lie in its last `most_bytes`."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - most_bytes))
+            lines = file.read(most_bytes).splitlines()
+    except OSError as error:
+        raise StorageError(f"{path}: cannot read the journal: {error.strerror}") from error
+    found = []
+    for line in lines:
+        with contextlib.suppress(json.JSONDecodeError, UnicodeDecodeError):
+            event = json.loads(line)
+            if isinstance(event, dict) and "event" in event:
+                found.append(event)
+    return found

@@ -4,56 +4,23 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from coupole import journal, store
 from coupole.errors import StorageError
+from coupole.picture import develop, png
 from coupole.run import Run, is_shot, status
 
 PICTURES_PER_VIEW = 12
 THUMBNAIL_WIDTH_PX = 256
-_GAMMA = 1 / 2.2
 _STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left}
 figure{display:inline-block;margin:.3em}figcaption{font-size:12px;color:#666}
 img{display:block;background:#000}.bad{color:#b00}.ok{color:#070}svg{background:#f6f6f6}
 """
-
-
-def develop(raw: NDArray[np.uint16], *, pattern: str, black_dn: int, white_dn: int) -> NDArray[np.uint8]:
-    """A picture to look at [h/2, w/2, 3] from a RAW frame: one pixel for each Bayer cell, plain gamma 2.2."""
-    scaled = np.clip((raw.astype(np.float32) - black_dn) / (white_dn - black_dn), 0, 1)
-    cell = [scaled[0::2, 0::2], scaled[0::2, 1::2], scaled[1::2, 0::2], scaled[1::2, 1::2]]
-    letters = pattern if pattern != "MONO" else "GGGG"
-    planes = []
-    for colour in "RGB":
-        mine = [
-            plane
-            for plane, letter in zip(cell, letters, strict=True)
-            if letter in (colour, "G" * (pattern == "MONO"))
-        ]
-        planes.append(np.mean(mine, axis=0))
-    picture: NDArray[np.uint8] = (255 * np.stack(planes, axis=-1) ** _GAMMA + 0.5).astype(np.uint8)
-    return picture
-
-
-def png(picture: NDArray[np.uint8], width_px: int | None = None) -> bytes:
-    """A picture as PNG, made narrower if asked."""
-    from PIL import Image
-
-    image = Image.fromarray(picture)
-    if width_px and image.width > width_px:
-        image = image.resize((width_px, max(1, image.height * width_px // image.width)))
-    buffer = io.BytesIO()
-    image.save(buffer, "PNG", optimize=True)
-    return buffer.getvalue()
 
 
 def write(run: Run) -> Path:

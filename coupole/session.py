@@ -17,21 +17,25 @@ from rich.console import Console
 
 from coupole import ledger, metering, report
 from coupole.cell import OpenedCell, coarse, open_cell
-from coupole.console import RunObserver, ask, show_dry_run, show_preflight
+from coupole.console import LiveFigures, RunObserver, ask, show_dry_run, show_preflight
 from coupole.devices import Identity
 from coupole.errors import (
     CoupoleError,
     DeviceError,
     DeviceFault,
+    InputError,
     Interrupted,
     PreflightRefused,
     StorageError,
 )
-from coupole.job import Job, check_job, preflight_of, schedule_of
+from coupole.geometry import apply
+from coupole.job import Cell, Job, check_job, preflight_of, schedule_of
+from coupole.live import CellSource, Choice, RunSource, Source, Studio, choice_from, run_source
+from coupole.live_page import serve
 from coupole.observer import Control, Outcome
 from coupole.preflight import Report, StorageFacts
 from coupole.recorder import DryRecorder, RunRecorder
-from coupole.rig import in_world
+from coupole.rig import Rig, in_world
 from coupole.run import Run, is_shot
 from coupole.sequencer import Sequencer
 from coupole.shots import EXPOSURE_MARGIN_US, select_leds
@@ -64,6 +68,7 @@ def _operator(control: Control) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+_FIGURES_EVERY_S = 0.2
 UNLIMITED_BYTES = 2**62
 """A rehearsal keeps nothing: the disk does not matter."""
 
@@ -110,7 +115,7 @@ def _acquire_into(
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     _refuse(preflight)
     acknowledged = _ask_whether_clear(run.robot_fault()) if run else ""
-    _ask_to_begin(job, confirm=confirm)
+    _ask_to_begin(job.cell, confirm=confirm)
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=_teller(console)) as cell:
         if run is None:
@@ -132,17 +137,22 @@ def _acquire_into(
             recorder.close()
 
 
-def _ask_to_begin(job: Job, *, confirm: bool) -> None:
+def _ask_to_begin(cell: Cell, *, confirm: bool) -> None:
     """Nothing real moves or shines unasked."""
-    real = not in_world(job.cell.rig, dry_run=False)
+    real = not in_world(cell.rig, dry_run=False)
     if real and confirm and not ask("Move the arm and light the object?"):
         raise Interrupted("not started: answer the question, or say `--yes`")
 
 
-def _enter_dose(job: Job, cell: OpenedCell, outcome: Outcome, what_for: str) -> None:
+def _longest_exposure_us(rig: Rig) -> int:
+    """What the LEDs' longest on-time leaves for the exposure."""
+    return rig.led_limits.on_us[1] - rig.led_limits.rise_us - EXPOSURE_MARGIN_US
+
+
+def _enter_dose(job: Job, cell: OpenedCell, dose_lux_h: float, what_for: str) -> None:
     """Light that a real cell gave an object goes into the object's ledger."""
     if job.plan.object and not cell.simulated:
-        ledger.add(job.cell.storage_folder, job.plan.object.id, run=what_for, dose_lux_h=outcome.dose_lux_h)
+        ledger.add(job.cell.storage_folder, job.plan.object.id, run=what_for, dose_lux_h=dose_lux_h)
 
 
 def _ask_whether_clear(fault: str) -> str:
@@ -232,7 +242,7 @@ def _acquire(
             console.print(f"[red]{trouble}[/]")
         recorder.event("stop", outcome=ended, robot=dict(cell.robot.statistics()))
         recorder.close_quietly()
-        _enter_dose(job, cell, outcome, run.folder.name)
+        _enter_dose(job, cell, outcome.dose_lux_h, run.folder.name)
         found.update(_figures(run, job, outcome))
         _say_outcome(console, run, outcome, ended)
 
@@ -280,7 +290,7 @@ def meter(job: Job, console: Console, wish: metering.Wish, *, confirm: bool) -> 
     small = replace(job, plan=few, schedule=schedule_of(few, job.cell))
     preflight = check_job(small, StorageFacts(UNLIMITED_BYTES))
     _refuse(preflight)
-    _ask_to_begin(job, confirm=confirm)
+    _ask_to_begin(job.cell, confirm=confirm)
     recorder, control = metering.MeterRecorder(), Control()
     with open_cell(job.cell, job=small, on_opened=_teller(console)) as cell:
         observer = RunObserver(console, job.cell.rig.sensor.frame_bytes, 0)
@@ -290,10 +300,66 @@ def meter(job: Job, console: Console, wish: metering.Wish, *, confirm: bool) -> 
                 sequencer.acquire()
         finally:
             cell.make_safe()
-            _enter_dose(job, cell, sequencer.outcome, "meter")
-    limits = job.cell.rig.led_limits
-    longest_us = limits.on_us[1] - limits.rise_us - EXPOSURE_MARGIN_US
-    return metering.advise(recorder.views, wish, longest_us=longest_us)
+            _enter_dose(job, cell, sequencer.outcome.dose_lux_h, "meter")
+    return metering.advise(recorder.views, wish, longest_us=_longest_exposure_us(job.cell.rig))
+
+
+# -- live view --------------------------------------------------------------------------------------------
+
+
+def watch_cell(
+    job_or_cell: Job | Cell, console: Console, choice: Choice, *, frames_per_s: float, port: int, confirm: bool
+) -> None:
+    """Show a cell's camera until the operator says stop; the arm is held where it stands."""
+    job = job_or_cell if isinstance(job_or_cell, Job) else None
+    rig_cell = job_or_cell.cell if isinstance(job_or_cell, Job) else job_or_cell
+    rig, leds = rig_cell.rig, rig_cell.leds
+    centre = rig.support.base_from_support.matrix()[:3, 3]
+    points = apply(rig.support.base_from_support.matrix(), job.object_points_support_mm) if job else centre[None]
+    lux_of_row = leds.illuminance_lux(points, emission=rig.dome.emission).max(axis=0)
+    lux = dict(zip(leds.ids.tolist(), lux_of_row.tolist(), strict=True))
+    ids = tuple(leds.ids.tolist())
+    studio = Studio(choice_from(vars(choice), choice, ids, _longest_exposure_us(rig)))
+    _ask_to_begin(rig_cell, confirm=confirm)
+    with open_cell(rig_cell, job=job, on_opened=_teller(console)) as cell:
+        source = CellSource(cell, rig, leds, lux.__getitem__, frames_per_s=frames_per_s)
+        try:
+            _show_live(source, studio, console, port, longest_us=_longest_exposure_us(rig))
+        finally:
+            given = studio.shown.dose_lux_h if studio.shown else 0.0
+            if job is not None and given:
+                _enter_dose(job, cell, given, "live")
+
+
+def watch_run(folder: Path, console: Console, *, port: int) -> None:
+    """Show the newest proven frame of a run until the operator says stop."""
+    _show_live(RunSource(folder), Studio(Choice(None, 0)), console, port, longest_us=0)
+
+
+def _show_live(source: Source, studio: Studio, console: Console, port: int, *, longest_us: int) -> None:
+    try:
+        server = serve(studio, source.leds, longest_us, port)
+    except OSError as error:
+        raise InputError(f"--port {port}: cannot serve the page there: {error.strerror}") from error
+    failures: list[Exception] = []
+    control = Control()
+    page = threading.Thread(target=server.serve_forever, name="page", daemon=True)
+    page.start()
+    console.print(f"live at http://127.0.0.1:{server.server_port}/  (Ctrl-C ends it)")
+    with _operator(control):
+        filling = run_source(source, studio, failures.append)
+        try:
+            with LiveFigures(console) as figures:
+                while not studio.closing.is_set() and not control.stop.is_set():
+                    figures.show(studio.shown)
+                    studio.closing.wait(_FIGURES_EVERY_S)
+        finally:
+            studio.closing.set()
+            filling.join()
+            server.shutdown()
+            server.server_close()
+    if failures:
+        raise failures[0]
 
 
 # -- the rehearsal ----------------------------------------------------------------------------------------

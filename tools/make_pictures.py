@@ -15,7 +15,7 @@ from coupole.cell import world_config
 from coupole.geometry import apply, inverse, transform
 from coupole.itinerary import plan_itinerary
 from coupole.job import Job, read_job
-from coupole.report import develop, png
+from coupole.picture import develop, png
 from sim.camera_server import Exposed
 from sim.config import Config
 from sim.picture import Photographer

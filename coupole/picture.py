@@ -1,0 +1,144 @@
+"""Pictures and figures of RAW frames, to look at: none of this is kept or measured with."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+_GAMMA = 1 / 2.2
+BINS = 128
+_SATURATED, _SHARP = (255, 0, 0), (0, 255, 60)
+_SHARP_GRADIENT = 0.25
+"""Of the local brightness, from one cell to the next: an edge in focus."""
+_DARK = 0.02
+"""Share of full scale below which an edge is noise."""
+
+
+@dataclass(frozen=True)
+class Coding:
+    """How a frame's numbers are to be read."""
+
+    pattern: str
+    """2x2 Bayer pattern from the top left, or MONO."""
+    black_dn: int
+    white_dn: int
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a RAW frame is like."""
+
+    histograms: dict[str, list[int]]
+    """By channel (R, G1, G2, B; Y for MONO): pixels in `BINS` equal steps from 0 to full scale."""
+    saturated: dict[str, float]
+    """By channel: share of pixels at full scale."""
+    brightest: float
+    """99.9 % quantile, share of the range above black."""
+    sharpness: float
+    """Mean squared gradient of the green cells over their mean squared (Tenengrad, freed of the light's strength);
+    only figures of the same scene compare."""
+
+
+def develop(raw: NDArray[np.uint16], *, pattern: str, black_dn: int, white_dn: int) -> NDArray[np.uint8]:
+    """A picture to look at [h/2, w/2, 3] from a RAW frame: one pixel for each Bayer cell, plain gamma 2.2."""
+    scaled = np.clip((raw.astype(np.float32) - black_dn) / (white_dn - black_dn), 0, 1)
+    cell = [scaled[0::2, 0::2], scaled[0::2, 1::2], scaled[1::2, 0::2], scaled[1::2, 1::2]]
+    letters = pattern if pattern != "MONO" else "GGGG"
+    planes = []
+    for colour in "RGB":
+        mine = [
+            plane
+            for plane, letter in zip(cell, letters, strict=True)
+            if letter in (colour, "G" * (pattern == "MONO"))
+        ]
+        planes.append(np.mean(mine, axis=0))
+    picture: NDArray[np.uint8] = (255 * np.stack(planes, axis=-1) ** _GAMMA + 0.5).astype(np.uint8)
+    return picture
+
+
+def png(picture: NDArray[np.uint8], width_px: int | None = None) -> bytes:
+    """A picture as PNG, made narrower if asked."""
+    from PIL import Image
+
+    image = Image.fromarray(picture)
+    if width_px and image.width > width_px:
+        image = image.resize((width_px, max(1, image.height * width_px // image.width)))
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def channels(raw: NDArray[np.uint16], pattern: str) -> dict[str, NDArray[np.uint16]]:
+    """Planes [h/2, w/2] of the Bayer cell by name: R, G1, G2, B; the whole frame as Y for MONO."""
+    if pattern == "MONO":
+        return {"Y": raw}
+    planes: dict[str, NDArray[np.uint16]] = {}
+    greens = 0
+    for place, letter in enumerate(pattern):
+        greens += letter == "G"
+        planes[letter if letter != "G" else f"G{greens}"] = raw[place // 2 :: 2, place % 2 :: 2]
+    return dict(sorted(planes.items(), key=lambda item: ("RGB".index(item[0][0]), item[0])))
+
+
+def figures(raw: NDArray[np.uint16], coding: Coding) -> Figures:
+    """Histograms, saturation and sharpness of a RAW frame."""
+    planes = channels(raw, coding.pattern)
+    step = coding.white_dn + 1
+    green = _brightness(raw, coding)
+    energy = float(np.mean(np.diff(green, axis=0) ** 2) + np.mean(np.diff(green, axis=1) ** 2))
+    quantile = float(np.quantile(raw[:: max(1, raw.shape[0] // 512)], 0.999))
+    return Figures(
+        {
+            name: np.bincount(plane.ravel().astype(np.int64) * BINS // step, minlength=BINS).tolist()
+            for name, plane in planes.items()
+        },
+        {name: float(np.mean(plane >= coding.white_dn)) for name, plane in planes.items()},
+        (quantile - coding.black_dn) / (coding.white_dn - coding.black_dn),
+        energy / max(float(np.mean(green**2)), 1e-12),
+    )
+
+
+def look(raw: NDArray[np.uint16], coding: Coding, width_px: int, *, saturation: bool, focus: bool) -> bytes:
+    """A JPEG of a RAW frame, at most `width_px` wide; saturated cells red, edges in focus green, where asked."""
+    from PIL import Image
+
+    stride = max(1, -(-raw.shape[1] // 2 // width_px))
+    height, width = (size // (2 * stride) * 2 * stride for size in raw.shape)
+    cells = raw[:height, :width].reshape(height // (2 * stride), 2 * stride, width // (2 * stride), 2 * stride)
+    few = np.ascontiguousarray(cells[:, :2, :, :2]).reshape(height // stride, width // stride)
+    picture = develop(few, pattern=coding.pattern, black_dn=coding.black_dn, white_dn=coding.white_dn)
+    if focus:
+        picture[_any_of(_in_focus(_brightness(raw[:height, :width], coding)), stride)] = _SHARP
+    if saturation:
+        full = cells.max(axis=(1, 3)) >= coding.white_dn
+        picture[full] = _SATURATED
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, "JPEG", quality=85)
+    return buffer.getvalue()
+
+
+def _brightness(raw: NDArray[np.uint16], coding: Coding) -> NDArray[np.float32]:
+    """[h/2, w/2] first green of each cell above black, share of the range."""
+    planes = channels(raw, coding.pattern)
+    plane = planes["G1"] if "G1" in planes else raw[::2, ::2]
+    return (plane.astype(np.float32) - coding.black_dn) / np.float32(coding.white_dn - coding.black_dn)
+
+
+def _in_focus(green: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """[h, w] True where the brightness changes steeply from one cell to the next."""
+    here = np.zeros(green.shape, bool)
+    for axis in (0, 1):
+        near, far = np.moveaxis(green, axis, 0)[:-1], np.moveaxis(green, axis, 0)[1:]
+        level = np.maximum(near, far)
+        np.moveaxis(here, axis, 0)[:-1] |= (np.abs(far - near) > _SHARP_GRADIENT * level) & (level > _DARK)
+    return here
+
+
+def _any_of(mask: NDArray[np.bool_], stride: int) -> NDArray[np.bool_]:
+    """Blocks of `stride` x `stride` in which any is True."""
+    height, width = (size // stride * stride for size in mask.shape)
+    blocks = mask[:height, :width].reshape(height // stride, stride, width // stride, stride)
+    return np.asarray(blocks.any(axis=(1, 3)))

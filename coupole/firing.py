@@ -23,7 +23,7 @@ from coupole.devices import (
 )
 from coupole.dose import DoseMeter
 from coupole.errors import CoupoleError, DeviceError, DeviceTimeout
-from coupole.intake import Intake
+from coupole.intake import Intake, buffers_for
 from coupole.matching import UNLABELLED, FaultModel, Match, match
 from coupole.observer import Outcome
 from coupole.posing import Posing
@@ -38,7 +38,7 @@ _CLOCK_TOLERANCE, _STALL_S = 1.02, 5.0
 _LAST_STRETCH_S = 0.3
 """Of a burst: time enough for a host that fell behind in a hurry to catch up before the end."""
 _BOX_JITTER_US = 20.0
-_BUFFERS = 64
+_ONE_SHOT_BUFFERS = 8
 _LIT_IN_VAIN = STATUS_LED_OPEN | STATUS_OVER_TEMPERATURE
 
 
@@ -101,17 +101,21 @@ class Firing:
 
         The table of the burst that is `following` is brought into the box meanwhile. Raises ArmMovedError.
         """
-        self._cell.camera.configure(self.exposure(burst))
+        frame_format = self._cell.camera.configure(self.exposure(burst))
         self._cell.ledbox.load(burst.table)
-        return self._by_cable(burst, following) if burst.hardware else self._by_software(burst)
+        if not burst.hardware:
+            return self._by_software(burst)
+        period_s = burst.timing.period_us * 1e-6
+        buffers = buffers_for(len(burst.labels), frame_format.frame_bytes, period_s)
+        return self._by_cable(burst, following, buffers)
 
     # -- the box triggers the camera ----------------------------------------------------------------------
 
-    def _by_cable(self, burst: Burst, following: Burst | None) -> Verdict:
+    def _by_cable(self, burst: Burst, following: Burst | None, buffers: int) -> Verdict:
         box, camera, clock = self._cell.ledbox, self._cell.camera, self._cell.clock
         intake = Intake(camera, lambda frame: self._recorder.put(frame, burst.timing.exposure_us))
         under_way = _UnderWay(burst, intake, self._cell.robot.measured())
-        camera.arm(min(len(burst.labels), _BUFFERS))
+        camera.arm(buffers)
         try:
             intake.start()
             if burst.panel:
@@ -269,7 +273,7 @@ class Firing:
         """Light one step, trigger the camera; the frame, the step's record, and whether the one frame that was
         exposed came while the step was running."""
         box, camera, clock = self._cell.ledbox, self._cell.camera, self._cell.clock
-        camera.arm(_BUFFERS)
+        camera.arm(_ONE_SHOT_BUFFERS)
         try:
             if burst.panel:
                 box.panel(burst.panel, True)

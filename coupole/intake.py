@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,6 +14,18 @@ from numpy.typing import NDArray
 from coupole.devices import Camera, Frame
 
 _TAKE_TIMEOUT_S = 0.05
+_STALL_S = 2.0
+"""A pause of disk or host that the camera's buffers bridge, where memory allows."""
+_FEWEST_BUFFERS = 16
+_MEMORY_SHARE = 0.25
+"""Of the memory that is free now, for buffers."""
+
+
+def buffers_for(frames: int, frame_bytes: int, period_s: float) -> int:
+    """How many buffers to arm a camera with, for a burst of so many frames: enough for a stall, within memory."""
+    free_bytes = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    affordable = int(_MEMORY_SHARE * free_bytes / frame_bytes)
+    return max(_FEWEST_BUFFERS, min(frames, math.ceil(_STALL_S / period_s), affordable))
 
 
 class Intake:

@@ -1,0 +1,17 @@
+"""How heritage materials look, by wavelength: metals, films, paints, gilts, lacquer, and their light.
+
+Plain functions on arrays, from the papers named in each file. Spectra are [..., 81] on the grid of `grid`, 380 to
+780 nm by 5 nm; thicknesses carry their unit; complex indices are n + i k.
+
+====================================  =================================================================
+`fresnel`, `thin_film`, `indices`     one interface, many, and what they are made of
+`kubelka_munk`, `four_flux`           scattering layers under diffuse and under directional light
+`pigments`, `typical`                 mixtures and their fit; typical paints for virtual objects
+`effective_medium`, `gilding`         gold leaf with holes on bole
+`brdf`, `layered`, `tabulated`        reflectance by direction; `hemisphere` adds it up
+`makie`, `nashiji`, `lacquer`         urushi
+`light`, `channels`                   illuminants, observers, camera channels
+`measured`, `resampling`,             spectra from instruments, on the grid, and compared
+`identification`
+====================================  =================================================================
+"""

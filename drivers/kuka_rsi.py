@@ -16,74 +16,25 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
 from coupole.devices import ArmState, Clock, Deadline, Identity
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
-from coupole.kinematics import (
-    KR10_R1100_SIXX,
-    Arm,
-    forward,
-    limit_violations,
-    move_duration_s,
-    slowed,
-)
+from coupole.kinematics import Arm, forward, limit_violations, move_duration_s
 from drivers import kuka_rsi_block as block
+from drivers.kuka_rsi_limits import correction_violations
+from drivers.kuka_rsi_pose import Geometry
 from drivers.kuka_rsi_responder import Config
+from drivers.kuka_rsi_settings import Settings
+
+__all__ = ["KukaRsi", "Settings"]
 
 _SESSION_ANSWERS = 10
 """Answers after which a session counts as established."""
 _POLL_S = 0.004
-_TAG = r"^[A-Za-z_]\w*$"
-
-
-class Settings(BaseModel):
-    """Settings of the driver in the rig file."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    listen: str = Field(default="0.0.0.0:49152", pattern=r"^[^:]+:\d+$")
-    """host:port to bind; the controller's RSI configuration names it (IP_NUMBER, PORT)."""
-    cycle_ms: Literal[4, 12] = 4
-    """4 for #IPO_FAST, 12 for #IPO."""
-    sen_type: str = Field(default="ImFree", pattern=r"^[\w.-]+$")
-    """SENTYPE of the controller's RSI configuration."""
-    measured_tag: str = Field(default="AIPos", pattern=_TAG)
-    delay_tag: str = Field(default="Delay", pattern=_TAG)
-    correction_tag: str = Field(default="AKorr", pattern=_TAG)
-    link_timeout_s: float = Field(default=2.0, gt=0)
-    """Silence after which the link counts as lost, in machine time; longer than any pause of the world."""
-    connect_timeout_s: float = Field(default=10.0, gt=0)
-    """How long to wait for the first packets, in machine time."""
-    delay_limit: int = Field(default=50, ge=1)
-    """Delay counter at which motion ends in a fault; below the controller's own limit (100 as shipped)."""
-    speed_fraction: float = Field(default=0.5, gt=0, le=1)
-    """Of the axes' highest speeds."""
-    acceleration_deg_s2: float = Field(default=300.0, gt=0)
-    jerk_deg_s3: float = Field(default=3000.0, gt=0)
-    settle_deg: float = Field(default=0.003, gt=0)
-    settle_deg_s: float = Field(default=0.1, gt=0)
-    settle_cycles: int = Field(default=10, ge=1)
-    """Settled: within both tolerances for so many cycles, and again after the dwell."""
-    dwell_s: float = Field(default=0.1, ge=0)
-    follow_deg: float = Field(default=1.0, gt=0)
-    follow_lag_s: float = Field(default=0.06, ge=0)
-    follow_cycles: int = Field(default=10, ge=1)
-    """The arm does not follow: farther than `follow_deg` plus `follow_lag_s` times the commanded speed from
-    the commanded axes for so many cycles."""
-
-    def arm(self) -> Arm:
-        """The arm with the speeds that this driver moves it at; preflight computes durations with it."""
-        return slowed(
-            KR10_R1100_SIXX,
-            speed_fraction=self.speed_fraction,
-            acceleration_deg_s2=self.acceleration_deg_s2,
-            jerk_deg_s3=self.jerk_deg_s3,
-        )
 
 
 class KukaRsi:
@@ -99,6 +50,8 @@ class KukaRsi:
         self._clock = clock
         self._command = block.Command()
         self._motion_s = 0.0
+        self._target_deg: block.Six = (0.0,) * 6
+        """Of the last motion."""
         self._last_packets, self._last_news_ns = -1, 0
         self._process, self._block = _spawn(settings, self.arm)
         try:
@@ -135,9 +88,16 @@ class KukaRsi:
             raise self._refused("joint angles within the arm's limits", violations)
         state = self._state()
         self._raise_fault(state)
-        # Retargeted in motion, the arm may first have to brake: as long as from the farthest point, twice.
+        # Retargeted in motion, the arm sets out from anywhere on the rest of its line.
+        on_the_way_deg = [state.commanded_deg] if self._stands(state) else [state.commanded_deg, self._target_deg]
+        if violations := correction_violations(
+            self.settings, self.arm, state.start_deg, on_the_way_deg, target_deg
+        ):
+            raise self._refused("a motion that corrections can bring about", violations)
+        self._target_deg = tuple(float(angle) for angle in target_deg)
+        # It may first have to brake: as long as from the farthest point, twice.
         self._motion_s = move_duration_s(self.arm, state.measured_deg, target_deg) + self._stop_s()
-        self._send(block.MOVE, tuple(float(angle) for angle in target_deg))
+        self._send(block.MOVE, self._target_deg)
 
     def wait_settled(self) -> ArmState:
         command = self._command
@@ -180,6 +140,9 @@ class KukaRsi:
 
         self._wait(stands, deadline, "the arm at rest", faults=False)
 
+    def stopping_deg(self) -> NDArray[np.float64]:
+        return self.settings.stopping_deg()
+
     def statistics(self) -> Mapping[str, float]:
         state = self._block.read_state()
         return {
@@ -187,6 +150,7 @@ class KukaRsi:
             "answers": state.answers,
             "late_answers": state.late,
             "malformed_packets": state.malformed,
+            "foreign_packets": state.foreign,
             "max_gap_ms": state.max_gap_ns / 1e6,
             "delay_counter": state.delay,
             "realtime": state.realtime,
@@ -261,9 +225,11 @@ class KukaRsi:
 
     def _moves(self, state: block.State) -> bool:
         speed_deg_s = max(map(abs, state.velocity_deg_s))
-        if state.command != self._command.number:  # the loop has not taken the last command yet
-            return True
-        return state.phase != block.STANDING or speed_deg_s > self.settings.settle_deg_s
+        # A command that the loop has not taken yet counts as motion.
+        return not self._stands(state) or speed_deg_s > self.settings.settle_deg_s
+
+    def _stands(self, state: block.State) -> bool:
+        return state.phase == block.STANDING and state.command == self._command.number
 
     def _stop_s(self) -> float:
         """Longest time that any axis needs to come to rest: v/a, and twice a/jerk to build it up."""
@@ -288,22 +254,27 @@ class KukaRsi:
 
 def _why_no_session(state: block.State) -> str:
     if state.refused:
-        return f"{state.refused} packets belong to a running RSI session that another program began"
+        return f"{state.refused} packets belong to a running RSI session that another program may have begun"
     if state.malformed:
-        return f"{state.malformed} packets came, but none with an IPOC and six axes"
+        return (
+            f"{state.malformed} packets came, but none with an IPOC and six axes (and, for relative corrections, "
+            "the delay counter)"
+        )
     return f"{state.packets} came"
 
 
 def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], block.Block]:
     """Bind the port and start the loop; raises DeviceLost if the port is not to be had."""
     host, port = settings.listen.rsplit(":", 1)
-    limits = {
+    derived: dict[str, Any] = {
         "cycle_s": settings.cycle_ms / 1e3,
+        "correction_tag": settings.tag,
+        "geometry": Geometry(*(getattr(arm, name) for name in Geometry._fields)),
         "velocity_deg_s": arm.velocity_deg_s,
         "acceleration_deg_s2": arm.acceleration_deg_s2,
         "jerk_deg_s3": arm.jerk_deg_s3,
     }
-    passed_on = {f.name: getattr(settings, f.name) for f in fields(Config) if f.name not in limits}
+    passed_on = {f.name: getattr(settings, f.name) for f in fields(Config) if f.name not in derived}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         try:
             link.bind((host, int(port)))
@@ -323,7 +294,7 @@ def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], block
                     sys.executable,
                     *("-m", "drivers.kuka_rsi_loop"),
                     *map(str, (link.fileno(), memory_fd, os.getpid())),
-                    json.dumps(limits | passed_on),
+                    json.dumps(derived | passed_on),
                 ],
                 pass_fds=(link.fileno(), memory_fd),
                 stdin=subprocess.DEVNULL,

@@ -16,7 +16,7 @@ BLOCK_BYTES = 4096
 _COMMAND_AT, _STATE_AT = 0, 1024
 _SEQUENCE = struct.Struct("=Q")
 _COMMAND = struct.Struct("=QQ6d")
-_STATE = struct.Struct("=12Q18d32s200s")
+_STATE = struct.Struct("=13Q24d32s200s")
 _TORN_S = 1.0
 
 HOLD, MOVE, STOP, LEAVE = range(4)
@@ -39,11 +39,14 @@ class Command(NamedTuple):
 
 class State(NamedTuple):
     packets: int = 0
+    """Of the session, each counted once."""
     answers: int = 0
     malformed: int = 0
     """Packets that could not be read, and so were not answered."""
     refused: int = 0
     """Packets left unanswered because they belong to an RSI session that another program began."""
+    foreign: int = 0
+    """Packets of other senders than the session's, which are not listened to."""
     late: int = 0
     """How far the controller's delay counter rose in all: answers that came too late or not at all."""
     delay: int = 0
@@ -62,6 +65,8 @@ class State(NamedTuple):
     velocity_deg_s: Six = _ZEROS
     """Of the measured axes, over the last cycle."""
     commanded_deg: Six = _ZEROS
+    start_deg: Six = _ZEROS
+    """Where the session began: the axes that correction limits count from."""
     controller: bytes = b""
     """The Type that the controller's packets carry."""
     fault_text: bytes = b""
@@ -89,10 +94,11 @@ class Block:
         self._write(
             _STATE_AT,
             _STATE.pack(
-                *state[:12],
+                *state[:13],
                 *state.measured_deg,
                 *state.velocity_deg_s,
                 *state.commanded_deg,
+                *state.start_deg,
                 state.controller[:32],
                 state.fault_text[:200],
             ),
@@ -100,9 +106,9 @@ class Block:
 
     def read_state(self) -> State:
         fields = self._read(_STATE_AT, _STATE)
-        controller, fault_text = (text.rstrip(b"\0") for text in fields[30:])
-        joints = (fields[12:18], fields[18:24], fields[24:30])
-        return State._make((*fields[:12], *joints, controller, fault_text))
+        controller, fault_text = (text.rstrip(b"\0") for text in fields[37:])
+        joints = (fields[13:19], fields[19:25], fields[25:31], fields[31:37])
+        return State._make((*fields[:13], *joints, controller, fault_text))
 
     def close(self) -> None:
         self._memory.close()

@@ -18,6 +18,7 @@ import sys
 import time
 
 from drivers import kuka_rsi_block as block
+from drivers.kuka_rsi_pose import Geometry
 from drivers.kuka_rsi_responder import Config, Responder
 
 _TICK_S = 0.05
@@ -32,10 +33,11 @@ def serve(link: socket.socket, shared: block.Block, parent_pid: int, config: Con
     # The kernel's own receive time-out costs nothing per packet; Python's is a poll before each call.
     link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@qq", 0, int(_TICK_S * 1e6)))
     realtime = _become_realtime()
-    responder = Responder(config)
+    responder = Responder(config, time.monotonic_ns())
     shared.write_state(responder.state(realtime))
     _drop_backlog(link)
     leaving, orphan_ns, look_ns = False, 0, 0
+    controller = None
     while not (leaving and responder.motion.phase == block.STANDING):
         try:
             data, address = link.recvfrom(4096)
@@ -47,16 +49,19 @@ def serve(link: socket.socket, shared: block.Block, parent_pid: int, config: Con
             command = shared.read_command()
             responder.obey(command)
             leaving |= command.verb == block.LEAVE
-        if idle:
+        late, answer = responder.late, None
+        if not idle and controller not in (None, address):
+            responder.foreign += 1  # somebody else's axes must not be taken for this arm's
+        elif not idle:
+            answer = responder.answer(data, now_ns)
+        if answer is None:
             responder.check_link(now_ns)
         else:
-            late = responder.late
-            answer = responder.answer(data, now_ns)
-            if answer is not None:
-                with contextlib.suppress(OSError):  # a controller that is gone is noticed by its silence
-                    link.sendto(answer, address)
-            if responder.late > late:
-                _drop_backlog(link)  # answers to packets that wait here would be late too
+            controller = address
+            with contextlib.suppress(OSError):  # a controller that is gone is noticed by its silence
+                link.sendto(answer, address)
+        if responder.late > late:
+            _drop_backlog(link)  # answers to packets that wait here would be late too
         shared.write_state(responder.state(realtime))
         if now_ns > look_ns:
             look_ns = now_ns + int(_TICK_S * 1e9)
@@ -84,9 +89,10 @@ def _drop_backlog(link: socket.socket) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C is the operator's word to the program, which then stops us
+    # Ctrl-C is the operator's word to the program, which then stops us.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.disable()
     socket_fd, block_fd, parent_pid = map(int, sys.argv[1:4])
-    serve(socket.socket(fileno=socket_fd), block.Block(block_fd), parent_pid, Config(**json.loads(sys.argv[4])))
+    settings = json.loads(sys.argv[4])
+    settings["geometry"] = Geometry(*settings["geometry"])
+    serve(socket.socket(fileno=socket_fd), block.Block(block_fd), parent_pid, Config(**settings))

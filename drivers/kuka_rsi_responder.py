@@ -3,18 +3,18 @@
 Each packet moves the commanded axes on by one cycle of a jerk-limited trajectory and is answered with their
 corrections, so the arm keeps pace with a real controller as well as with a world that waits or runs fast.
 
-Corrections are absolute: relative to the axes where RSI was started. So only a program that saw the session
+Corrections count from where RSI was started (`kuka_rsi_corrections`). So only a program that saw the session
 begin may answer: to a session in progress a first answer of zero would be a jump back to its start.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
-
-import ruckig
 
 from drivers import kuka_rsi_block as block
+from drivers.kuka_rsi_corrections import NAMES, Corrections
+from drivers.kuka_rsi_motion import Motion
+from drivers.kuka_rsi_pose import Geometry
 from drivers.kuka_rsi_wire import Packet, answer_template, controller_type, packet_parser
 
 _GAP_STEPS = 25
@@ -23,6 +23,8 @@ _LAST_WORDS = 5
 """Packets that are still answered when the commanded axes stand after a fault."""
 _HALTED_PACKETS = 5
 """After so many late answers in a row the arm has come to a halt at the last correction that was in time."""
+_QUIET_NS = 500_000_000
+"""Where packets carry no delay counter, one after so long a silence is taken for the first of a session."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,9 @@ class Config:
     measured_tag: str
     delay_tag: str
     correction_tag: str
+    corrects: str
+    mode: str
+    geometry: Geometry
     velocity_deg_s: tuple[float, ...]
     acceleration_deg_s2: tuple[float, ...]
     jerk_deg_s3: tuple[float, ...]
@@ -46,105 +51,28 @@ class Config:
     follow_cycles: int
 
 
-class Motion:
-    """The commanded axes: standing, moving to a target or coming to rest, always within the limits.
-
-    Motions are straight in joint space: one jerk-limited run along the line, as fast as the axis that limits it
-    allows. (Six axes synchronised by ruckig leave the line by up to 5 degrees in one move of six.) Coming to rest
-    happens on the line, too; a new target given on the way is set out for from there.
-    """
-
-    def __init__(self, config: Config) -> None:
-        self.phase = block.STANDING
-        self.commanded_deg: tuple[float, ...] = (0.0,) * 6
-        self.velocity_deg_s: tuple[float, ...] = (0.0,) * 6
-        self._limits = config.velocity_deg_s, config.acceleration_deg_s2, config.jerk_deg_s3
-        self._run: Any = ruckig.Ruckig(1, config.cycle_s)
-        self._input: Any = ruckig.InputParameter(1)
-        self._output: Any = ruckig.OutputParameter(1)
-        self._start_deg: tuple[float, ...] = (0.0,) * 6
-        self._way_deg: tuple[float, ...] = (0.0,) * 6
-        """From start to target; the run goes from 0 to 1 of it."""
-        self._next_target_deg: tuple[float, ...] | None = None
-
-    def stand_at(self, joints_deg: tuple[float, ...]) -> None:
-        """Take the axes as they are, at rest."""
-        self.phase, self.commanded_deg, self.velocity_deg_s = block.STANDING, joints_deg, (0.0,) * 6
-        self._next_target_deg = None
-
-    def halted(self) -> None:
-        """The arm stood still though the axes were commanded to go on: go on from rest."""
-        self.velocity_deg_s = (0.0,) * 6
-        self._input.current_velocity = self._input.current_acceleration = [0.0]
-
-    def move_to(self, target_deg: tuple[float, ...]) -> None:
-        if self.phase != block.STANDING:
-            self.stop()
-            self._next_target_deg = target_deg
-            return
-        way_deg = tuple(map(float.__sub__, target_deg, self.commanded_deg))
-        if not any(way_deg):
-            return
-        self._start_deg, self._way_deg = self.commanded_deg, way_deg
-        highest = [
-            min(limit / abs(way) for limit, way in zip(limits, way_deg, strict=True) if way)
-            for limits in self._limits
-        ]
-        self._input.max_velocity, self._input.max_acceleration, self._input.max_jerk = ([h] for h in highest)
-        self._input.current_position = self._input.current_velocity = self._input.current_acceleration = [0.0]
-        self._input.target_position = [1.0]
-        self._go(ruckig.ControlInterface.Position, block.MOVING)
-
-    def stop(self) -> None:
-        self._next_target_deg = None
-        if self.phase == block.MOVING:
-            self._go(ruckig.ControlInterface.Velocity, block.STOPPING)
-
-    def _go(self, control: Any, phase: int) -> None:
-        self._input.control_interface = control
-        self._input.target_velocity = self._input.target_acceleration = [0.0]
-        self.phase = phase
-
-    def step(self) -> bool:
-        """One cycle on; False if the trajectory could not be computed, and then the axes stand."""
-        if self.phase == block.STANDING:
-            return True
-        result = self._run.update(self._input, self._output)
-        if result not in (ruckig.Result.Working, ruckig.Result.Finished):
-            self.stand_at(self.commanded_deg)
-            return False
-        self._output.pass_to_input(self._input)
-        share, rate = self._output.new_position[0], self._output.new_velocity[0]
-        self.commanded_deg = tuple(
-            start + share * way for start, way in zip(self._start_deg, self._way_deg, strict=True)
-        )
-        self.velocity_deg_s = tuple(rate * way for way in self._way_deg)
-        if result == ruckig.Result.Finished:
-            following = self._next_target_deg
-            self.stand_at(self.commanded_deg)
-            if following is not None:
-                self.move_to(following)
-        return True
-
-
 class Responder:
     """Makes an answer of every packet, and the state for the driver; touches neither socket nor memory."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, opened_ns: int = 0) -> None:
         self.fault, self.fault_text = block.NO_FAULT, b""
-        self.packets = self.answers = self.malformed = self.refused = 0
+        self.packets = self.answers = self.malformed = self.refused = self.foreign = 0
         self.late = self.delay = self.max_gap_ns = self.command = 0
         self.settled_cycles = self._astray_cycles = self._late_in_row = 0
-        self.motion = Motion(config)
+        limits = config.velocity_deg_s, config.acceleration_deg_s2, config.jerk_deg_s3
+        self.motion = Motion(config.cycle_s, limits)
         self._config = config
         self._parse = packet_parser(config.measured_tag, config.delay_tag)
-        self._template = answer_template(config.sen_type, config.correction_tag)
+        self._template = answer_template(config.sen_type, config.correction_tag, NAMES[config.corrects])
+        self._corrections = Corrections(config.corrects, config.mode, config.geometry)
         self._controller = b""
         self._start_deg: tuple[float, ...] | None = None
         """The measured axes at the start of the session, which corrections refer to; None before it."""
         self._measured_deg: tuple[float, ...] = (0.0,) * 6
         self._velocity_deg_s: tuple[float, ...] = (0.0,) * 6
-        self._ipoc = self._ipoc_step = self._packet_ns = 0
+        self._ipoc = self._ipoc_step = 0
+        self._packet_ns = opened_ns
+        """When the last packet came, that of another program's session included."""
         self._session_over = False
         self._last_words = _LAST_WORDS
         self._last_answer: bytes | None = None
@@ -161,39 +89,44 @@ class Responder:
     def answer(self, data: bytes, now_ns: int) -> bytes | None:
         """What to send back, or None if this packet must not be answered."""
         packet = self._parse(data)
-        if packet is None:
+        if packet is None or (packet.delay is None and self._config.mode == "relative"):
             self.malformed += 1
             return None
-        self.packets += 1
-        rose = max(0, packet.delay - self.delay)
-        advance = int(packet.ipoc) - self._ipoc
-        self.delay = packet.delay
+        advance, rose = int(packet.ipoc) - self._ipoc, 0
         if self._start_deg is None:
-            if packet.delay:
+            if not self._may_begin(packet, now_ns):
                 self.refused += 1
                 return None
             self._controller = controller_type(data)
             self._begin_session(packet)
         else:
-            self.late += rose
             self.max_gap_ns = max(self.max_gap_ns, now_ns - self._packet_ns)
             if not self._in_sequence(packet, advance):
                 return self._last_answer if advance == 0 else None
-        self._ipoc, self._packet_ns = int(packet.ipoc), now_ns
+            rose = max(0, (packet.delay or 0) - self.delay) if advance > 0 else 0
+        self._ipoc, self._packet_ns, self.delay = int(packet.ipoc), now_ns, packet.delay or 0
+        self.packets += 1
+        self.late += rose
+        # Packets lost on the way here count as late, too, but say nothing of the answer before them.
+        applied = rose == 0 or rose < advance // self._ipoc_step
+        if applied:
+            self._corrections.taken()
         self._watch(packet)
         self._late_in_row = self._late_in_row + 1 if rose else 0
-        if rose:  # the last answer was not applied: say it again instead of running ahead of the arm
+        if not applied:  # say the last answer again instead of running ahead of the arm
             if self._late_in_row >= _HALTED_PACKETS:
                 self.motion.halted()
         elif not self.motion.step():
             self.fail(block.NO_TRAJECTORY, "no trajectory within the limits leads to the target")
-        if self._silent():
-            self._last_answer = None
-        else:
-            self.answers += 1
-            corrections = map(float.__sub__, self.motion.commanded_deg, self._start_deg or ())
-            self._last_answer = self._template % (*corrections, packet.ipoc)
+        self._last_answer = None if self._silent() else self._template % (*self._values(), packet.ipoc)
+        self.answers += self._last_answer is not None
         return self._last_answer
+
+    def _values(self) -> block.Six:
+        """The six corrections. When the arm has come to rest after a fault they move it no more."""
+        if self.fault != block.NO_FAULT and self.motion.phase == block.STANDING:
+            return self._corrections.hold()
+        return self._corrections.to(self.motion.commanded_deg)
 
     def _silent(self) -> bool:
         """After a fault the session is ended by silence, so that no old correction can meet a new session: at
@@ -205,7 +138,7 @@ class Responder:
     def check_link(self, now_ns: int) -> None:
         """Latch a fault if packets stayed away for longer than the link's time-out."""
         silent_s = (now_ns - self._packet_ns) / 1e9
-        if self._start_deg and silent_s > self._config.link_timeout_s:
+        if self._start_deg is not None and silent_s > self._config.link_timeout_s:
             self.fail(block.LINK_LOST, f"no packet for {silent_s:.2f} s, the delay counter was {self.delay}")
 
     def fail(self, fault: int, text: str) -> None:
@@ -225,6 +158,7 @@ class Responder:
             answers=self.answers,
             malformed=self.malformed,
             refused=self.refused,
+            foreign=self.foreign,
             late=self.late,
             delay=self.delay,
             max_gap_ns=self.max_gap_ns,
@@ -236,20 +170,27 @@ class Responder:
             measured_deg=self._measured_deg,
             velocity_deg_s=self._velocity_deg_s,
             commanded_deg=self.motion.commanded_deg,
+            start_deg=self._start_deg or (0.0,) * 6,
             controller=self._controller,
             fault_text=self.fault_text,
         )
 
+    def _may_begin(self, packet: Packet, now_ns: int) -> bool:
+        """Whether no other program can have begun this packet's session."""
+        quiet_ns, self._packet_ns = now_ns - self._packet_ns, now_ns
+        return packet.delay == 0 if packet.delay is not None else quiet_ns > _QUIET_NS
+
     def _begin_session(self, packet: Packet) -> None:
         self._start_deg = self._measured_deg = packet.joints_deg
         self._ipoc_step = self._astray_cycles = 0
+        self._corrections.begin(packet.joints_deg)
         self.motion.stand_at(packet.joints_deg)
 
     def _in_sequence(self, packet: Packet, advance: int) -> bool:
         """False for a packet that came twice or out of order. Notices sessions that begin anew."""
         step = self._ipoc_step or 1
-        if advance > 0 and self._ipoc_step == 0:
-            self._ipoc_step = advance
+        if advance > 0 and not 0 < self._ipoc_step <= advance:
+            self._ipoc_step = advance  # the smallest so far: a packet may have been lost on the way
         elif advance > _GAP_STEPS * step:
             self.fail(block.LINK_LOST, f"{advance // step - 1} packets are missing")
         elif advance < -_GAP_STEPS * step:

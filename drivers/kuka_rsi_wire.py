@@ -15,7 +15,8 @@ class Packet(NamedTuple):
     ipoc: bytes
     """As it came, to be sent back unchanged."""
     joints_deg: tuple[float, ...]
-    delay: int
+    delay: int | None
+    """The counter of late answers; None where the controller does not send it."""
 
 
 _ATTRIBUTE = re.compile(rb"""([A-Za-z_]\w*)\s*=\s*["']\s*([^"']*?)\s*["']""")
@@ -25,7 +26,7 @@ _TYPE = re.compile(rb"""<Rob\b[^>]*?\bTYPE\s*=\s*["']([^"']*)["']""", re.IGNOREC
 def packet_parser(measured_tag: str, delay_tag: str) -> Callable[[bytes], Packet | None]:
     """A function that reads a controller's packet: any order of elements and attributes, others ignored.
 
-    It returns None where IPOC or an axis is missing or no number; a missing delay counter counts as 0.
+    It returns None where IPOC or an axis is missing or no number.
     """
     measured, delay = re.escape(measured_tag).encode(), re.escape(delay_tag).encode()
     usual_axes = re.compile(
@@ -54,7 +55,7 @@ def packet_parser(measured_tag: str, delay_tag: str) -> Callable[[bytes], Packet
             return Packet(match[2], joints_deg, int(match[1]))
         ipoc = any_ipoc.search(packet)
         late = any_delay.search(packet)
-        return Packet(ipoc[1], joints_deg, int(late[1]) if late else 0) if ipoc else None
+        return Packet(ipoc[1], joints_deg, int(late[1]) if late else None) if ipoc else None
 
     return parse
 
@@ -65,7 +66,7 @@ def controller_type(packet: bytes) -> bytes:
     return match[1] if match else b""
 
 
-def answer_template(sen_type: str, correction_tag: str) -> bytes:
-    """An answer with places for six corrections in degrees (floats) and the IPOC (bytes), for `%`."""
-    axes = " ".join(f'A{axis}="%.6f"' for axis in range(1, 7))
-    return f'<Sen Type="{sen_type}"><EStr></EStr><{correction_tag} {axes}/><IPOC>%b</IPOC></Sen>'.encode()
+def answer_template(sen_type: str, correction_tag: str, names: tuple[str, ...]) -> bytes:
+    """An answer with places for six corrections (floats) and the IPOC (bytes), for `%`."""
+    values = " ".join(f'{name}="%.6f"' for name in names)
+    return f'<Sen Type="{sen_type}"><EStr></EStr><{correction_tag} {values}/><IPOC>%b</IPOC></Sen>'.encode()

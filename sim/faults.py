@@ -73,6 +73,12 @@ class UnplugCamera(When):
     kind: Literal["unplug_camera"]
 
 
+class CameraControlLoss(When):
+    """The camera forgets who controls it, as after a brown-out, and stops."""
+
+    kind: Literal["camera_control_loss"]
+
+
 class OverTemperature(When):
     """An LED board reports more than its limit."""
 
@@ -116,10 +122,11 @@ class RsiLinkLoss(When):
 
 
 class NudgeArm(When):
-    """Something pushes the arm by `deg` on every axis."""
+    """Something pushes the arm by `deg` on every axis; after `seconds` it springs back (none: it stays there)."""
 
     kind: Literal["nudge_arm"]
     deg: float = 0.05
+    seconds: Annotated[float, Field(gt=0)] | None = None
 
 
 Fault = Annotated[
@@ -129,6 +136,7 @@ Fault = Annotated[
     | MuteBox
     | CutWire
     | UnplugCamera
+    | CameraControlLoss
     | OverTemperature
     | DeadLed
     | FlickeringLed

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from coupole.geometry import Transform, abc_from_rotation
 from sim.kuka_kinematics import AXIS_LIMITS_DEG, AXIS_SPEEDS_DEG_S, PoseErrors, flange_pose
 from sim.kuka_ptp import Motion, braked, point_to_point, standing
+from sim.pushes import Pushes
 from sim.reactor import Reactor, Timer
 
 Six = tuple[float, float, float, float, float, float]
@@ -26,6 +27,8 @@ Six = tuple[float, float, float, float, float, float]
 _STOP, _MOVE, _ASK = range(3)
 _NO_FAULT, _EMERGENCY_STOP, _TARGET_REFUSED = 0, 1, 5
 _TRY_AGAIN_S = 0.1
+_UNSENT_BYTES = 4096
+"""Room for statuses that the client has no room for: the world waits rather than run ahead of its client."""
 _HARD = 100.0
 """An emergency stop does not care for jerk: this many times more of it."""
 
@@ -35,8 +38,9 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    address: str = Field(default="127.0.0.1:54600", pattern=r"^[^:]+:\d+$")
-    """host:port to listen at (port 0: any, see `KukaEkiController.address`), or to connect to."""
+    kind: Literal["eki"] = "eki"
+    address: str = Field(default="127.0.0.1:0", pattern=r"^[^:]+:\d+$")
+    """host:port to listen at, or to connect to; port 0 for one that is free, see `KukaEkiController.address`."""
     controller_is: Literal["server", "client"] = "server"
     status_ms: int = Field(default=20, ge=4)
     ping_s: float = Field(default=0.2, gt=0)
@@ -78,7 +82,7 @@ class KukaEkiController:
         self._motion: Motion = standing(settings.start_joints_deg)
         self._begun_ns = reactor.now_ns
         self._acceleration_deg_s2 = settings.full_acceleration_deg_s2
-        self._pushed_deg: tuple[float, ...] = (0.0,) * 6
+        self._pushes = Pushes(reactor)
         self._stops = 0
         self._end: Timer | None = None
         self._session = self._taken = self._done = self._order = 0
@@ -91,13 +95,12 @@ class KukaEkiController:
         """Nothing passes, by `lose_link`."""
         self._healing: Timer | None = None
         self._listener: socket.socket | None = None
-        host, port = settings.address.rsplit(":", 1)
-        self.address = settings.address
+        self.address = _with_free_port(settings.address)
         """host:port where it listens, or where it connects to."""
         if settings.controller_is == "server":
+            host, port = self.address.rsplit(":", 1)
             self._listener = socket.create_server((host, int(port)))
             self._listener.setblocking(False)
-            self.address = f"{host}:{self._listener.getsockname()[1]}"
         self._open()
         self._timer = reactor.after(settings.status_ms / 1e3, self._cycle)
 
@@ -105,7 +108,7 @@ class KukaEkiController:
     def joints_deg(self) -> tuple[float, ...]:
         """The axes now, as the controller measures and reports them."""
         path_deg = self._motion.joints_deg((self._reactor.now_ns - self._begun_ns) / 1e9)
-        return tuple(map(float.__add__, path_deg, self._pushed_deg))
+        return tuple(map(float.__add__, path_deg, self._pushes.deg))
 
     @property
     def moving(self) -> bool:
@@ -134,9 +137,9 @@ class KukaEkiController:
             self._healing.cancel()
         self._healing = self._reactor.after(seconds, self._heal)
 
-    def nudge(self, joints_deg: Sequence[float]) -> None:
-        """Push the arm off the commanded axes by six angles, for good."""
-        self._pushed_deg = tuple(a + b for a, b in zip(self._pushed_deg, joints_deg, strict=True))
+    def nudge(self, joints_deg: Sequence[float], seconds: float | None = None) -> None:
+        """Push the arm off the commanded axes by six angles; after `seconds` it springs back, if given."""
+        self._pushes.push(joints_deg, seconds)
         self._stops += not self.moving
 
     def close(self) -> None:
@@ -175,7 +178,7 @@ class KukaEkiController:
     def _connect(self) -> None:
         if self._cut:
             return
-        host, port = self._settings.address.rsplit(":", 1)
+        host, port = self.address.rsplit(":", 1)
         try:
             self._welcome(socket.create_connection((host, int(port)), timeout=1.0))
         except OSError:
@@ -184,6 +187,7 @@ class KukaEkiController:
     def _welcome(self, client: socket.socket) -> None:
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNSENT_BYTES)
         self._client, self._parser = client, _new_parser()
         self._reactor.add_reader(client, self._receive)
 
@@ -237,7 +241,8 @@ class KukaEkiController:
         if session != self._session:
             self._session, self._done, self._refused = session, 0, False
             if not self.moving:  # from now on the arm belongs where it stands
-                self._motion, self._pushed_deg = standing(self.joints_deg), (0.0,) * 6
+                self._motion = standing(self.joints_deg)
+                self._pushes.forget()
         self._taken = number
         if verb == _ASK:
             return
@@ -328,6 +333,15 @@ class KukaEkiController:
 
 def _within_limits(joints_deg: Sequence[float]) -> bool:
     return all(low <= angle <= high for angle, (low, high) in zip(joints_deg, AXIS_LIMITS_DEG, strict=True))
+
+
+def _with_free_port(address: str) -> str:
+    """The address, with a port that is free in place of port 0."""
+    host, port = address.rsplit(":", 1)
+    if port != "0":
+        return address
+    with socket.create_server((host, 0)) as probe:
+        return f"{host}:{probe.getsockname()[1]}"
 
 
 def _new_parser() -> Any:

@@ -15,9 +15,9 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from coupole.kinematics import Arm
 from drivers import kuka_eki, kuka_rsi
 from drivers import kuka_eki_wire as wire
+from drivers.kuka_rsi_corrections import NAMES
 
 ROOT = Path(__file__).resolve().parents[1]
 TEMPLATES = ROOT / "tools" / "kuka"
@@ -69,9 +69,11 @@ def rsi_xml(settings: kuka_rsi.Settings, pc_address: str) -> str:
         f'      <ELEMENT TAG="DEF_{tag}" TYPE="{kind}" INDX="INTERNAL"/>'
         for tag, kind in (("RIst", "DOUBLE"), (settings.measured_tag, "DOUBLE"), (settings.delay_tag, "LONG"))
     )
+    # Held, an absolute correction keeps the arm where it is; a relative one would go on moving it.
+    hold_on = {"absolute": 1, "relative": 0}[settings.mode]
     received = "\n".join(
-        f'      <ELEMENT TAG="{settings.correction_tag}.A{axis}" TYPE="DOUBLE" INDX="{axis}" HOLDON="1"/>'
-        for axis in range(1, 7)
+        f'      <ELEMENT TAG="{settings.tag}.{name}" TYPE="DOUBLE" INDX="{index}" HOLDON="{hold_on}"/>'
+        for index, name in enumerate(NAMES[settings.corrects], start=1)
     )
     return f"""\
 <ROOT>
@@ -152,11 +154,27 @@ def krl_set() -> str:
     )
 
 
-def axis_rows(arm: Arm) -> str:
-    """Rows of the table of correction limits."""
-    return "\n".join(
-        f"| A{axis} | {low:g} to {high:g} | {low - high - 1:g}, {high - low + 1:g} | {high - low:g} |"
-        for axis, (low, high) in enumerate(arm.limits_deg, start=1)
+def correction_rows(settings: kuka_rsi.Settings) -> str:
+    """Rows of the table of objects: the correction and its monitor. The monitor stops RSI before the correction
+    is clamped: its limits are the tighter ones, by a degree or a millimetre."""
+    clamp, monitor, inputs = {
+        "axes": ("AXISCORR1", "AXISCORRMON1", "CorrA1 to CorrA6"),
+        "pose": ("POSCORR1", "POSCORRMON1", "CorrX, CorrY, CorrZ, CorrA, CorrB, CorrC"),
+    }[settings.corrects]
+    if settings.corrects == "axes":
+        most = settings.axis_correction_deg
+        clamped = "; ".join(f"A{axis} +-{limit + 1:g}" for axis, limit in enumerate(most, start=1))
+        clamped = f"`LowerLimA1` to `UpperLimA6`, deg: {clamped}"
+        watched = "; ".join(f"`MaxA{axis}` = {limit:g}" for axis, limit in enumerate(most, start=1))
+    else:
+        clamped = (
+            f"`LowerLimX` to `UpperLimZ` = +-{settings.pose_correction_mm + 1:g} mm; "
+            f"`MaxRotAngle` = {min(180.0, settings.pose_correction_deg + 1):g}; `RefCorrSys` = BASE"
+        )
+        watched = f"`MaxTrans` = {settings.pose_correction_mm:g}; `MaxRotAngle` = {settings.pose_correction_deg:g}"
+    return (
+        f"| `{clamp}` | inputs {inputs} from outputs 1 to 6 of `ETHERNET1` | {clamped} |\n"
+        f"| `{monitor}` | - (watches the sum of all corrections) | {watched} |"
     )
 
 
@@ -182,8 +200,12 @@ def files(rsi: kuka_rsi.Settings, eki: kuka_eki.Settings, pc_address: str, load:
         "RSI_CONTEXT": RSI_CONTEXT,
         "RSI_CONFIG": RSI_CONFIG,
         "IPO_MODE": {4: "#IPO_FAST", 12: "#IPO"}[rsi.cycle_ms],
+        "RSI_MODE": {"absolute": "#ABSOLUTE", "relative": "#RELATIVE"}[rsi.mode],
         "DELAY_LIMIT": str(rsi.delay_limit),
-        "AXIS_ROWS": axis_rows(rsi.arm()),
+        "CORRECTION_ROWS": correction_rows(rsi),
+        "NOTES": "".join(
+            (TEMPLATES / f"context-{name}.md").read_text() for name in (rsi.mode, rsi.corrects)
+        ).rstrip(),
     }
     yield f"eki/{EKI_NAME}.xml", eki_xml(eki)
     yield f"rsi/{RSI_CONFIG}", rsi_xml(rsi, pc_address)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +16,10 @@ from numpy.typing import NDArray
 
 from coupole.devices import Robot
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused
-from coupole.kinematics import KR10_R1100_SIXX, forward, inverse, nearest
+from coupole.kinematics import KR10_R1100_SIXX, forward
 from drivers.kuka_rsi import KukaRsi, Settings
 from sim.clock import ClockWriter, SharedClock
-from sim.kuka_controller import KukaController
+from sim.kuka_controller import ALIKE, KukaController
 from sim.kuka_controller import Settings as ControllerSettings
 from sim.reactor import Reactor
 
@@ -29,28 +30,34 @@ AWAY_DEG = np.array([50.0, -50.0, 40.0, 30.0, 60.0, -70.0])
 class KukaCell:
     """A KUKA controller in a world of its own, and drivers that talk to it."""
 
-    def __init__(self, folder: Path, cycle_ms: int) -> None:
+    def __init__(
+        self, folder: Path, cycle_ms: int = 4, *, speed: float = 10.0, lock_step: bool = True, **controller: Any
+    ) -> None:
+        """`controller` are more settings of the stand-in; the driver's are made to fit."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
             self.address = f"127.0.0.1:{probe.getsockname()[1]}"
-        self.cycle_ms = cycle_ms
+        self.cycle_ms, self.lock_step = cycle_ms, lock_step
         self.clock_path = folder / "clock"
-        self.reactor = Reactor(ClockWriter(self.clock_path, speed=10.0))
+        self.reactor = Reactor(ClockWriter(self.clock_path, speed=speed))
+        # In real time a busy machine is late now and then: that is counted, but must not fail a test.
+        delay = {} if lock_step else {"delay_limit": 1_000_000}
+        theirs = {"sends_to": self.address, "cycle_ms": cycle_ms, "lock_step": lock_step, "answer_limit_s": 0.5}
         self.controller = KukaController(
-            self.reactor, ControllerSettings.model_validate({"sends_to": self.address, "cycle_ms": cycle_ms})
+            self.reactor, ControllerSettings.model_validate(theirs | delay | controller)
         )
         self.trace_deg: list[tuple[float, ...]] = []
-        self.settings = Settings.model_validate(
-            {"listen": self.address, "cycle_ms": cycle_ms, "link_timeout_s": 0.5, "connect_timeout_s": 20.0}
-        )
+        ours = {"listen": self.address, "cycle_ms": cycle_ms, "link_timeout_s": 0.5, "connect_timeout_s": 20.0}
+        alike = {name: value for name, value in controller.items() if name in ALIKE}
+        self.settings = Settings.model_validate(ours | delay | alike)
         self.reactor.after(0.5 * cycle_ms / 1e3, self._sample)
         self._thread = threading.Thread(target=self.reactor.run)
         self._thread.start()
         self.clock = SharedClock(self.clock_path)
         self._drivers = ExitStack()
 
-    def open(self) -> KukaRsi:
-        return self._drivers.enter_context(closing(KukaRsi(self.settings, self.clock)))
+    def open(self, **settings: object) -> KukaRsi:
+        return self._drivers.enter_context(closing(KukaRsi(self.settings.model_copy(update=settings), self.clock)))
 
     def in_world(self, action: Callable[[], object]) -> None:
         """Do something on the world's thread and wait until it is done."""
@@ -86,7 +93,10 @@ class KukaCell:
         self.reactor.after(self.cycle_ms / 1e3, self._sample)
 
     def assert_smooth(self) -> None:
-        """Speed, acceleration and jerk of all that was sampled are within the driver's limits."""
+        """Speed, acceleration and jerk of all that was sampled are within the driver's limits. In real time a late
+        answer halts the arm for a cycle, so there nothing is asserted."""
+        if not getattr(self, "lock_step", True):
+            return
         dt_s = self.cycle_ms / 1e3
         axes_deg = np.array(self.trace_deg)
         arm = self.settings.arm()
@@ -107,6 +117,15 @@ class KukaCell:
 class RobotConformance:
     """Any driver passes that satisfies `coupole.devices.Robot`; `cell` is the arm it talks to."""
 
+    def range_deg(self, cell: KukaCell) -> NDArray[np.float64]:
+        """Lowest and highest angles [6, 2] that tests draw targets from."""
+        return 0.6 * np.array(KR10_R1100_SIXX.limits_deg)
+
+    def targets_deg(self, cell: KukaCell, count: int, seed: int) -> NDArray[np.float64]:
+        """Random joint angles [count, 6]."""
+        low, high = self.range_deg(cell).T
+        return np.random.default_rng(seed).uniform(low, high, (count, 6))
+
     @pytest.fixture
     def robot(self, cell: KukaCell) -> Robot:
         return cell.open()
@@ -122,18 +141,22 @@ class RobotConformance:
         assert robot.identify().simulated
         assert robot.self_test()
 
-    def test_it_reaches_poses_and_measures_them_right(self, cell: KukaCell, robot: Robot) -> None:
-        random = np.random.default_rng(5)
-        low, high = np.array(KR10_R1100_SIXX.limits_deg).T
-        for joints_deg in random.uniform(0.6 * low, 0.6 * high, (3, 6)):
-            wanted = forward(KR10_R1100_SIXX, joints_deg)
-            target_deg = nearest(KR10_R1100_SIXX, inverse(KR10_R1100_SIXX, wanted), cell.joints_deg())
+    @pytest.mark.timeout(1800)
+    def test_it_reaches_poses_and_measures_them_right(
+        self, cell: KukaCell, robot: Robot, scale: Callable[[int, int], int]
+    ) -> None:
+        errors = cell.controller.errors
+        for target_deg in self.targets_deg(cell, scale(8, 200), seed=5):
+            wanted = forward(KR10_R1100_SIXX, target_deg)
             robot.move_to(target_deg)
             state = robot.wait_settled()
             assert not state.moving
-            assert np.allclose(state.joints_deg, target_deg, atol=1e-3)
-            assert np.allclose(state.base_from_flange, wanted, atol=0.01)
-            assert np.allclose(cell.controller.true_base_from_flange()[:3, 3], wanted[:3, 3], atol=0.1)
+            assert np.allclose(state.joints_deg, target_deg, atol=5e-3)
+            assert np.allclose(state.base_from_flange, wanted, atol=0.2)
+            settled_mm = np.abs(state.base_from_flange[:3, 3] - wanted[:3, 3])
+            off_mm = np.abs(cell.controller.true_base_from_flange()[:3, 3] - wanted[:3, 3])
+            # what is measured is rounded to 1e-4 deg, some 2 um at the flange
+            assert np.all(off_mm <= 5.0 * errors.repeatability_um / 1e3 + settled_mm + 0.01)
 
     def test_motion_is_jerk_limited(self, cell: KukaCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)
@@ -155,6 +178,19 @@ class RobotConformance:
         cell.assert_stands()
         assert np.max(np.abs(cell.joints_deg() - AWAY_DEG)) > 1.0
         cell.assert_smooth()
+
+    @pytest.mark.timeout(600)
+    def test_after_stop_no_axis_turns_farther_than_it_says(
+        self, cell: KukaCell, robot: Robot, scale: Callable[[int, int], int]
+    ) -> None:
+        random = np.random.default_rng(11)
+        allowed_deg = robot.stopping_deg()
+        assert allowed_deg.shape == (6,)
+        for target_deg in self.targets_deg(cell, scale(4, 40), seed=11):
+            robot.move_to(target_deg)
+            cell.clock.sleep(random.uniform(0.05, 0.9))
+            called_deg = _stop_while_the_world_waits(cell, robot)
+            assert np.all(np.abs(cell.joints_deg() - called_deg) <= allowed_deg + 1e-3)
 
     def test_it_moves_again_after_a_stop(self, cell: KukaCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)
@@ -225,3 +261,18 @@ class RobotConformance:
         cell.in_world(lambda: cell.controller.nudge((0.0, 2.0, 0.0, 0.0, 0.0, 0.0)))
         with pytest.raises(DeviceFault, match="does not follow"):
             robot.wait_settled()
+
+
+def _stop_while_the_world_waits(cell: KukaCell, robot: Robot) -> NDArray[np.float64]:
+    """Where the axes [6] are when `stop` is called: the world stands still until the command has left."""
+    called_deg: list[NDArray[np.float64]] = []
+    stopper = threading.Thread(target=robot.stop)
+
+    def call() -> None:
+        called_deg.append(cell.joints_deg())
+        stopper.start()
+        time.sleep(0.1)
+
+    cell.in_world(call)
+    stopper.join()
+    return called_deg[0]

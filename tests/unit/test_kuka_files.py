@@ -12,7 +12,9 @@ import pytest
 
 from drivers import kuka_eki, kuka_rsi
 from drivers import kuka_eki_wire as wire
+from drivers.kuka_rsi_corrections import NAMES
 from drivers.kuka_rsi_wire import answer_template
+from sim.kuka_settings import Limits
 
 ROOT = Path(__file__).resolve().parents[2]
 KUKA = ROOT / "configs" / "kuka"
@@ -57,16 +59,54 @@ def test_rsi_sends_what_the_driver_reads(rsi: ElementTree.Element) -> None:
     assert {element["INDX"] for element in elements} == {"INTERNAL"}
 
 
-def test_rsi_receives_what_the_driver_sends_and_holds_it(rsi: ElementTree.Element) -> None:
-    settings = kuka_rsi.Settings()
-    sent = ElementTree.fromstring(
-        answer_template(settings.sen_type, settings.correction_tag) % (*(0.0,) * 6, b"1")
-    )
+@pytest.mark.parametrize(("mode", "hold_on"), [("absolute", "1"), ("relative", "0")])
+@pytest.mark.parametrize("corrects", ["axes", "pose"])
+def test_rsi_receives_what_the_driver_sends_and_holds_what_may_be_held(
+    tool: dict[str, Any], corrects: str, mode: str, hold_on: str
+) -> None:
+    settings = kuka_rsi.Settings.model_validate({"corrects": corrects, "mode": mode})
+    template = answer_template(settings.sen_type, settings.tag, NAMES[corrects])
+    sent = ElementTree.fromstring(template % (*(0.0,) * 6, b"1"))
     corrections = [f"{child.tag}.{name}" for child in sent for name in child.attrib]
-    outputs = [e for e in rsi.iterfind("RECEIVE/ELEMENTS/ELEMENT") if e.get("INDX") != "INTERNAL"]
+    configuration = ElementTree.fromstring(tool["rsi_xml"](settings, "192.168.1.10"))
+    outputs = [e for e in configuration.iterfind("RECEIVE/ELEMENTS/ELEMENT") if e.get("INDX") != "INTERNAL"]
     assert [e.get("TAG") for e in outputs] == corrections
     assert [e.get("INDX") for e in outputs] == ["1", "2", "3", "4", "5", "6"]
-    assert {e.get("HOLDON") for e in outputs} == {"1"}
+    assert {e.get("HOLDON") for e in outputs} == {hold_on}
+
+
+@pytest.mark.parametrize(
+    ("settings", "objects"),
+    [
+        ('{"axis_correction_deg": [30, 20, 20, 90, 60, 170]}', "`MaxA1` = 30; `MaxA2` = 20;"),
+        ('{"corrects": "pose", "pose_correction_mm": 400}', "`POSCORRMON1`"),
+        ('{"corrects": "pose", "pose_correction_mm": 400}', "`LowerLimX` to `UpperLimZ` = +-401 mm"),
+        ('{"corrects": "pose"}', "`RefCorrSys` = BASE"),
+        ('{"mode": "relative"}', "HOLDON is 0"),
+    ],
+)
+def test_the_context_says_the_limits_and_the_meaning_of_the_settings(
+    tool: dict[str, Any], tmp_path: Path, settings: str, objects: str
+) -> None:
+    tool["main"](["--output", str(tmp_path), "--rsi", settings])
+    assert objects in (tmp_path / "rsi" / "context.md").read_text()
+
+
+def test_the_monitor_stops_rsi_before_the_correction_is_clamped(tool: dict[str, Any]) -> None:
+    stand_in = Limits()
+    assert kuka_rsi.Settings().axis_correction_deg == stand_in.axis_monitor_deg
+    assert stand_in.axis_clamp_deg == tuple(limit + 1 for limit in stand_in.axis_monitor_deg)
+    for axis, clamp in enumerate(stand_in.axis_clamp_deg, start=1):
+        assert f"A{axis} +-{clamp:g}" in tool["correction_rows"](kuka_rsi.Settings())
+    assert kuka_rsi.Settings().pose_correction_mm == stand_in.pose_monitor_mm < stand_in.pose_clamp_mm
+
+
+@pytest.mark.parametrize(("mode", "word"), [("absolute", "#ABSOLUTE"), ("relative", "#RELATIVE")])
+def test_rsi_is_started_in_the_mode_of_the_settings(
+    tool: dict[str, Any], tmp_path: Path, mode: str, word: str
+) -> None:
+    tool["main"](["--output", str(tmp_path), "--rsi", f'{{"mode": "{mode}"}}'])
+    assert f"RSI_ON({word},#IPO_FAST)" in (tmp_path / "rsi" / "coupole_rsi.src").read_text()
 
 
 @pytest.mark.parametrize(("cycle_ms", "mode"), [(4, "#IPO_FAST"), (12, "#IPO")])

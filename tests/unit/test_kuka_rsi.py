@@ -1,27 +1,23 @@
-"""The RSI packets, the responder without its process, and the stand-in without a driver."""
+"""The RSI packets, and the responder without its process."""
 
 from __future__ import annotations
 
-import select
-import socket
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
+import re
+from dataclasses import replace
 from random import Random
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coupole.kinematics import KR10_R1100_SIXX
 from drivers import kuka_rsi_block as block
+from drivers.kuka_rsi_pose import Geometry
 from drivers.kuka_rsi_responder import Config, Responder
 from drivers.kuka_rsi_wire import controller_type, packet_parser
-from sim.clock import ClockWriter, SharedClock
-from sim.kuka_controller import KukaController, Settings
-from sim.kuka_kinematics import PoseErrors, flange_pose
-from sim.reactor import Reactor
+from sim.kuka_controller import Settings as ControllerSettings
+from sim.kuka_corrections import Corrections
 
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
 CONFIG = Config(
@@ -30,6 +26,9 @@ CONFIG = Config(
     measured_tag="AIPos",
     delay_tag="Delay",
     correction_tag="AKorr",
+    corrects="axes",
+    mode="absolute",
+    geometry=Geometry(*(getattr(KR10_R1100_SIXX, name) for name in Geometry._fields)),
     velocity_deg_s=(100.0,) * 6,
     acceleration_deg_s2=(300.0,) * 6,
     jerk_deg_s3=(3000.0,) * 6,
@@ -44,9 +43,22 @@ CONFIG = Config(
 parse = packet_parser("AIPos", "Delay")
 
 
-def packet(ipoc: int, joints_deg: tuple[float, ...] = HOME_DEG, delay: int = 0) -> bytes:
+def packet(ipoc: int, joints_deg: tuple[float, ...] = HOME_DEG, delay: int | None = 0) -> bytes:
     axes = " ".join(f'A{i}="{angle:.4f}"' for i, angle in enumerate(joints_deg, start=1))
-    return f'<Rob Type="KUKA"><AIPos {axes}/><Delay D="{delay}"/><IPOC>{ipoc}</IPOC></Rob>'.encode()
+    late = "" if delay is None else f'<Delay D="{delay}"/>'
+    return f'<Rob Type="KUKA"><AIPos {axes}/>{late}<IPOC>{ipoc}</IPOC></Rob>'.encode()
+
+
+def values_of(answer: bytes | None) -> tuple[float, ...]:
+    """The six corrections of an answer."""
+    assert answer is not None
+    values = re.findall(rb' (?:[ABCXYZ]|A\d)="([^"]+)"', answer)
+    assert len(values) == 6
+    return tuple(map(float, values))
+
+
+def turn_a1(by_deg: float, number: int = 1) -> block.Command:
+    return block.Command(number, block.MOVE, (by_deg, *HOME_DEG[1:]))
 
 
 @given(
@@ -71,7 +83,7 @@ def test_a_packet_is_read_in_any_order(
     assert read is not None
     assert read.ipoc == str(ipoc).encode()
     assert np.allclose(read.joints_deg, joints_deg, atol=1e-6)
-    assert read.delay == (delay or 0)
+    assert read.delay == delay
     assert controller_type(data) == b"KUKA"
 
 
@@ -160,98 +172,79 @@ def test_a_fault_is_latched_against_new_targets() -> None:
     assert b"no packet for 1.00 s" in responder.fault_text
 
 
-@contextmanager
-def controller_and_client(folder: Path, **settings: object) -> Iterator[tuple[KukaController, socket.socket]]:
-    """A running stand-in, and the socket of a client that has to answer it."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
-        client.bind(("127.0.0.1", 0))
-        client.settimeout(10.0)
-        reactor = Reactor(ClockWriter(folder / "clock", speed=20.0))
-        settings |= {"sends_to": f"127.0.0.1:{client.getsockname()[1]}"}
-        controller = KukaController(reactor, Settings.model_validate(settings))
-        world = threading.Thread(target=reactor.run)
-        world.start()
-        try:
-            yield controller, client
-        finally:
-            reactor.stop()
-            world.join()
-            controller.close()
+def test_without_a_delay_counter_only_a_session_after_silence_is_begun() -> None:
+    responder = Responder(CONFIG, opened_ns=0)
+    assert responder.answer(packet(100, delay=None), 4_000_000) is None
+    assert responder.answer(packet(104, delay=None), 8_000_000) is None
+    assert responder.refused == 2
+    assert responder.answer(packet(5000, delay=None), 1_000_000_000) is not None
 
 
-def answer_with(client: socket.socket, correction_a1_deg: float) -> None:
-    """Answer the newest packet."""
-    data, address = client.recvfrom(4096)
-    while select.select([client], [], [], 0.0)[0]:
-        data = client.recv(4096)
-    read = parse(data)
-    assert read is not None
-    axes = f'A2="0.0" A1="{correction_a1_deg}" A3="0" A4="0" A5="0" A6="0"'
-    client.sendto(b"<Sen><AKorr %b/><IPOC>%b</IPOC></Sen>" % (axes.encode(), read.ipoc), address)
+def test_relative_corrections_need_the_delay_counter() -> None:
+    responder = Responder(replace(CONFIG, mode="relative"))
+    assert responder.answer(packet(100, delay=None), 10**10) is None
+    assert responder.malformed == 1
 
 
-def answer_until_silent(client: socket.socket, correction_a1_deg: float) -> None:
-    client.settimeout(0.3)
-    with suppress(TimeoutError):
-        for _ in range(100):
-            answer_with(client, correction_a1_deg)
-        pytest.fail("the controller goes on sending")
+def test_a_packet_out_of_order_does_not_disturb_the_count_of_late_answers() -> None:
+    responder = Responder(CONFIG)
+    for ipoc, delay in ((100, 0), (104, 1), (108, 2), (104, 1), (112, 2)):
+        responder.answer(packet(ipoc, delay=delay), 0)
+    assert responder.late == 2
 
 
-def test_a_correction_faster_than_an_axis_can_turn_stops_rsi(tmp_path: Path) -> None:
-    with controller_and_client(tmp_path) as (controller, client):
-        for correction_deg in (0.0, 0.0, 0.0):
-            answer_with(client, correction_deg)
-        answer_until_silent(client, 2.0)
-        assert "velocity of A1" in controller.fault
-        assert controller.joints_deg == HOME_DEG
+@pytest.mark.parametrize("mode", ["absolute", "relative"])
+def test_the_answers_after_a_fault_move_nothing(mode: str) -> None:
+    responder = Responder(replace(CONFIG, mode=mode))
+    responder.answer(packet(100), 0)
+    responder.obey(turn_a1(20.0))
+    told_deg, last = 0.0, 0.0
+    answers: list[bytes | None] = []
+    for ipoc in range(104, 900, 4):  # the arm stands: brakes, though answers are taken
+        answers.append(responder.answer(packet(ipoc), 0))
+        if responder.fault == block.NOT_FOLLOWING:
+            break
+        last = values_of(answers[-1])[0]
+        told_deg = last if mode == "absolute" else told_deg + last
+    assert told_deg > 0.5
+    words = [answers[-1], *(responder.answer(packet(ipoc), 0) for ipoc in range(ipoc + 4, ipoc + 40, 4))]
+    expected = 0.0 if mode == "relative" else last
+    assert [values_of(word)[0] for word in words if word is not None] == [expected] * 5
+    assert words[-1] is None
 
 
-def test_a_correction_past_a_software_limit_stops_rsi(tmp_path: Path) -> None:
-    with controller_and_client(tmp_path, start_joints_deg=(169.9, *HOME_DEG[1:])) as (controller, client):
-        for correction_deg in (0.0, 0.0, 0.0, 0.05):
-            answer_with(client, correction_deg)
-        answer_until_silent(client, 0.2)
-        assert "limit switch of A1" in controller.fault
-
-
-def test_late_answers_end_in_the_controllers_own_fault(tmp_path: Path) -> None:
-    settings = {"delay_limit": 5, "restart_s": 1e6}
-    with controller_and_client(tmp_path, **settings) as (controller, client):
-        answer_with(client, 0.0)
-        controller.late(5)
-        answer_until_silent(client, 0.0)
-        assert controller.fault == "KSS29002: 5 late answers"
-
-
-def test_the_world_waits_for_an_outstanding_answer(tmp_path: Path) -> None:
-    with controller_and_client(tmp_path, answer_limit_s=5.0) as (controller, client):
-        for _ in range(5):
-            answer_with(client, 0.0)
-        clock = SharedClock(tmp_path / "clock")
-        held = [client.recv(4096) for _ in range(2)]
-        now_ns = clock.now_ns()
-        held.append(client.recv(4096))
-        assert held[0] == held[1] == held[2]  # sent again, in case it was lost
-        assert clock.now_ns() == now_ns
-        assert controller.delay == 0
-        client.close()
-
-
-def test_the_true_pose_differs_from_stop_to_stop_and_repeats_with_the_seed() -> None:
-    errors = PoseErrors(seed=3, repeatability_um=10.0, repeatability_deg=0.001, absolute_mm=0.0, absolute_deg=0.0)
-    reported = flange_pose(HOME_DEG)
-    first, second = (errors.true_flange_pose(HOME_DEG, stop) for stop in (0, 1))
-    assert np.array_equal(first, errors.true_flange_pose(HOME_DEG, 0))
-    assert 0.0 < np.linalg.norm(first[:3, 3] - second[:3, 3]) < 0.1
-    assert np.linalg.norm(first[:3, 3] - reported[:3, 3]) < 0.1
-
-
-def test_the_absolute_error_varies_over_the_cell_and_is_known() -> None:
-    errors = PoseErrors(seed=3, repeatability_um=0.0, repeatability_deg=0.0, absolute_mm=0.2, absolute_deg=0.02)
-    believed = np.array(HOME_DEG) + errors.axis_zero_error_deg()
-    true_mm = errors.true_flange_pose(HOME_DEG, 7)[:3, 3]
-    assert np.allclose(true_mm, flange_pose(believed.tolist())[:3, 3] + errors.base_error_mm())
-    elsewhere = (60.0, -60.0, 60.0, 0.0, 60.0, 0.0)
-    here, there = (errors.true_flange_pose(q, 0)[:3, 3] - flange_pose(q)[:3, 3] for q in (HOME_DEG, elsewhere))
-    assert np.linalg.norm(here - there) > 1e-3
+@settings(max_examples=30, deadline=None)
+@given(
+    mode=st.sampled_from(["absolute", "relative"]),
+    corrects=st.sampled_from(["axes", "pose"]),
+    counts=st.sampled_from(["cumulative", "consecutive"]),
+    seed=st.integers(0, 2**32),
+    late_share=st.sampled_from([0.0, 0.02, 0.2]),
+    lost_share=st.sampled_from([0.0, 0.02, 0.1]),
+)
+def test_late_answers_and_lost_packets_change_neither_the_way_nor_its_end(
+    mode: str, corrects: str, counts: str, seed: int, late_share: float, lost_share: float
+) -> None:
+    chance = Random(seed)
+    responder = Responder(replace(CONFIG, mode=mode, corrects=corrects, delay_limit=10**6))
+    controller = Corrections(ControllerSettings(mode=mode, corrects=corrects))
+    controller.begin(HOME_DEG)
+    target_deg = (6.0, -88.0, 91.0, -4.0, 85.0, 3.0)
+    arm_deg, delay, answer = HOME_DEG, 0, None
+    share_before = 0.0
+    for number in range(400):
+        if number:
+            in_time = answer is not None and chance.random() >= late_share
+            delay = delay + 1 if not in_time else 0 if counts == "consecutive" else delay
+            arm_deg, fault = controller.take(values_of(answer) if in_time else None)
+            assert fault == ""
+        lost = 1 < number < 300 and chance.random() < lost_share
+        answer = None if lost else responder.answer(packet(1000 + 4 * number, arm_deg, delay), 0)
+        if number == 1:
+            responder.obey(block.Command(1, block.MOVE, target_deg))
+        shares = np.subtract(arm_deg, HOME_DEG) / np.subtract(target_deg, HOME_DEG)
+        assert np.ptp(shares) < 1e-4, "off the line"
+        assert shares[0] >= share_before - 1e-6, "backwards"
+        share_before = float(shares[0])
+    assert responder.fault == block.NO_FAULT
+    assert np.allclose(arm_deg, target_deg, atol=1e-5 if corrects == "axes" else 1e-3)

@@ -1,0 +1,46 @@
+"""Joint angles that bring a stand-in's flange to a pose, for any chain of six turning joints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.geometry import Transform
+from sim.kuka_kinematics import rotation_vector
+
+Chain = Callable[[Sequence[float]], tuple[Transform, NDArray[np.float64], NDArray[np.float64]]]
+"""Of six joint angles in degrees: `base_from_flange`, and in the base frame the joints' origins in mm and their
+axes, each [6, 3]."""
+
+_STEPS = 30
+_REACH_MM = 1000.0
+"""Weighs millimetres against radians."""
+_REACHED = 1e-10
+"""A tenth of a nanometre, or a few billionths of a degree."""
+_DAMPING = 1e-10
+_LONGEST_STEP = 0.2
+
+
+def joints_near(
+    chain: Chain, base_from_flange: Transform, joints_deg: Sequence[float]
+) -> tuple[float, ...] | None:
+    """The joint angles that reach the pose from those given on the shortest way, or None if there is no way.
+
+    Damped Newton steps: Nakamura, Hanafusa, "Inverse Kinematic Solutions with Singularity Robustness" (1986).
+    Limits are not looked at. A controller follows a pose like this: from where the axes are, so near a
+    singularity they may turn fast, or find no way on.
+    """
+    angles = np.radians(np.asarray(joints_deg, dtype=np.float64))
+    for _ in range(_STEPS):
+        here, origins_mm, axes = chain(np.degrees(angles).tolist())
+        away = np.zeros(6)
+        away[:3] = (base_from_flange[:3, 3] - here[:3, 3]) / _REACH_MM
+        away[3:] = rotation_vector(base_from_flange[:3, :3] @ here[:3, :3].T)
+        if float(np.linalg.norm(away)) < _REACHED:
+            return tuple(np.degrees(angles).tolist())
+        jacobian = np.vstack([np.cross(axes, here[:3, 3] - origins_mm).T / _REACH_MM, axes.T])
+        step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + _DAMPING * np.eye(6), away)
+        angles = angles + step * min(1.0, _LONGEST_STEP / float(np.abs(step).max()))
+    return None

@@ -1,0 +1,331 @@
+"""The stand-in for a KUKA controller without a driver: what it makes of corrections, and what it stops for."""
+
+from __future__ import annotations
+
+import select
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coupole.geometry import rotation_from_abc
+from drivers.kuka_rsi_wire import packet_parser
+from sim.clock import ClockWriter, SharedClock
+from sim.kuka_axes import Axes
+from sim.kuka_controller import KukaController, Settings
+from sim.kuka_corrections import Corrections
+from sim.kuka_kinematics import PoseErrors, flange_pose, joints_near
+from sim.reactor import Reactor
+
+HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
+CYCLE_NS = 4_000_000
+parse = packet_parser("AIPos", "Delay")
+
+
+@contextmanager
+def controller_and_client(folder: Path, **settings: object) -> Iterator[tuple[KukaController, socket.socket]]:
+    """A running stand-in, and the socket of a client that has to answer it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.bind(("127.0.0.1", 0))
+        client.settimeout(10.0)
+        reactor = Reactor(ClockWriter(folder / "clock", speed=20.0))
+        settings |= {"sends_to": f"127.0.0.1:{client.getsockname()[1]}"}
+        controller = KukaController(reactor, Settings.model_validate(settings))
+        world = threading.Thread(target=reactor.run)
+        world.start()
+        try:
+            yield controller, client
+        finally:
+            reactor.stop()
+            world.join()
+            controller.close()
+
+
+def answer_with(client: socket.socket, correction_a1_deg: float) -> None:
+    """Answer the newest packet."""
+    data, address = client.recvfrom(4096)
+    while select.select([client], [], [], 0.0)[0]:
+        data = client.recv(4096)
+    read = parse(data)
+    assert read is not None
+    axes = f'A2="0.0" A1="{correction_a1_deg}" A3="0" A4="0" A5="0" A6="0"'
+    client.sendto(b'<Sen Type="ImFree"><AKorr %b/><IPOC>%b</IPOC></Sen>' % (axes.encode(), read.ipoc), address)
+
+
+def answer_until_silent(client: socket.socket, correction_a1_deg: float) -> None:
+    client.settimeout(0.3)
+    with suppress(TimeoutError):
+        for _ in range(100):
+            answer_with(client, correction_a1_deg)
+        pytest.fail("the controller goes on sending")
+
+
+def test_a_correction_faster_than_an_axis_can_turn_stops_rsi(tmp_path: Path) -> None:
+    with controller_and_client(tmp_path) as (controller, client):
+        for correction_deg in (0.0, 0.0, 0.0):
+            answer_with(client, correction_deg)
+        answer_until_silent(client, 2.0)
+        assert "velocity of A1" in controller.fault
+        assert controller.joints_deg == HOME_DEG
+
+
+def test_a_correction_past_a_software_limit_stops_rsi(tmp_path: Path) -> None:
+    with controller_and_client(tmp_path, start_joints_deg=(169.9, *HOME_DEG[1:])) as (controller, client):
+        for correction_deg in (0.0, 0.0, 0.0, 0.05):
+            answer_with(client, correction_deg)
+        answer_until_silent(client, 0.2)
+        assert "limit switch of A1" in controller.fault
+
+
+def test_late_answers_end_in_the_controllers_own_fault(tmp_path: Path) -> None:
+    settings = {"delay_limit": 5, "restart_s": 1e6}
+    with controller_and_client(tmp_path, **settings) as (controller, client):
+        answer_with(client, 0.0)
+        controller.late(5)
+        answer_until_silent(client, 0.0)
+        assert controller.fault == "KSS29002: 5 late answers"
+
+
+def test_the_world_waits_for_an_outstanding_answer(tmp_path: Path) -> None:
+    with controller_and_client(tmp_path, answer_limit_s=5.0) as (controller, client):
+        for _ in range(5):
+            answer_with(client, 0.0)
+        clock = SharedClock(tmp_path / "clock")
+        held = [client.recv(4096) for _ in range(2)]
+        now_ns = clock.now_ns()
+        held.append(client.recv(4096))
+        assert held[0] == held[1] == held[2]  # sent again, in case it was lost
+        assert clock.now_ns() == now_ns
+        assert controller.delay == 0
+        client.close()
+
+
+def test_the_true_pose_differs_from_stop_to_stop_and_repeats_with_the_seed() -> None:
+    errors = PoseErrors(seed=3, repeatability_um=10.0, repeatability_deg=0.001, absolute_mm=0.0, absolute_deg=0.0)
+    reported = flange_pose(HOME_DEG)
+    first, second = (errors.true_flange_pose(HOME_DEG, stop) for stop in (0, 1))
+    assert np.array_equal(first, errors.true_flange_pose(HOME_DEG, 0))
+    assert 0.0 < np.linalg.norm(first[:3, 3] - second[:3, 3]) < 0.1
+    assert np.linalg.norm(first[:3, 3] - reported[:3, 3]) < 0.1
+
+
+def test_the_absolute_error_varies_over_the_cell_and_is_known() -> None:
+    errors = PoseErrors(seed=3, repeatability_um=0.0, repeatability_deg=0.0, absolute_mm=0.2, absolute_deg=0.02)
+    believed = np.array(HOME_DEG) + errors.axis_zero_error_deg()
+    true_mm = errors.true_flange_pose(HOME_DEG, 7)[:3, 3]
+    assert np.allclose(true_mm, flange_pose(believed.tolist())[:3, 3] + errors.base_error_mm())
+    elsewhere = (60.0, -60.0, 60.0, 0.0, 60.0, 0.0)
+    here, there = (errors.true_flange_pose(q, 0)[:3, 3] - flange_pose(q)[:3, 3] for q in (HOME_DEG, elsewhere))
+    assert np.linalg.norm(here - there) > 1e-3
+
+
+# -- corrections, without a wire ------------------------------------------------------------------------------
+
+
+def sum_of(values: tuple[float, ...], **settings: object) -> Corrections:
+    """A session begun at home, with one correction taken."""
+    corrections = Corrections(Settings.model_validate(settings))
+    corrections.begin(HOME_DEG)
+    assert corrections.take(values)[1] == ""
+    return corrections
+
+
+def only(place: int, value: float) -> tuple[float, ...]:
+    return (*(0.0,) * place, value, *(0.0,) * (5 - place))
+
+
+def test_absolute_corrections_replace_each_other_and_relative_ones_add_up() -> None:
+    for mode, a1_deg in (("absolute", 2.0), ("relative", 3.0)):
+        axes_deg, fault = sum_of(only(0, 1.0), mode=mode).take(only(0, 2.0))
+        assert fault == ""
+        assert axes_deg == (a1_deg, *HOME_DEG[1:])
+
+
+@pytest.mark.parametrize(
+    ("mode", "hold_on", "a1_deg"),
+    [
+        ("absolute", None, 1.0),
+        ("absolute", False, 0.0),
+        ("relative", None, 1.0),
+        ("relative", True, 2.0),
+    ],
+)
+def test_holdon_says_what_a_cycle_without_answer_does(mode: str, hold_on: bool | None, a1_deg: float) -> None:
+    axes_deg, _ = sum_of(only(0, 1.0), mode=mode, hold_on=hold_on).take(None)
+    assert axes_deg[0] == a1_deg
+
+
+def test_axiscorr_clamps_without_a_word_and_its_monitor_stops_rsi() -> None:
+    clamps = {"axis_clamp_deg": (5.0,) * 6}
+    axes_deg, fault = sum_of(only(1, 4.0), limits=clamps).take(only(1, 7.0))
+    assert (axes_deg[1], fault) == (-85.0, "")
+    _, fault = sum_of(only(1, 4.0), limits={"axis_monitor_deg": (5.0,) * 6}).take(only(1, 7.0))
+    assert fault == "AXISCORRMON: correction of A2 by 7.000 deg"
+
+
+def test_poscorr_clamps_without_a_word_and_its_monitor_stops_rsi() -> None:
+    clamped, fault = sum_of(only(0, 4.0), corrects="pose", limits={"pose_clamp_mm": 5.0}).take(only(0, 7.0))
+    assert fault == ""
+    assert flange_pose(clamped)[0, 3] == pytest.approx(flange_pose(HOME_DEG)[0, 3] + 5.0)
+    turned, fault = sum_of(only(3, 4.0), corrects="pose", limits={"pose_clamp_deg": 5.0}).take(only(3, 7.0))
+    assert fault == ""
+    assert np.allclose(flange_pose(turned)[:3, :3], rotation_from_abc(5, 0, 0) @ flange_pose(HOME_DEG)[:3, :3])
+    _, fault = sum_of(only(2, 4.0), corrects="pose", limits={"pose_monitor_mm": 5.0}).take(only(2, 7.0))
+    assert fault.startswith("POSCORRMON: correction by [0.0, 0.0, 7.0] mm")
+
+
+@given(moved=st.tuples(*[st.floats(-80.0, 80.0)] * 3), turned=st.tuples(*[st.floats(-30.0, 30.0)] * 3))
+def test_a_correction_of_the_pose_moves_in_base_axes_and_turns_about_them(
+    moved: tuple[float, ...], turned: tuple[float, ...]
+) -> None:
+    here, there = flange_pose(HOME_DEG), flange_pose(sum_of((*moved, *turned), corrects="pose").take(None)[0])
+    assert np.allclose(there[:3, 3], here[:3, 3] + moved, atol=1e-6)
+    assert np.allclose(there[:3, :3], rotation_from_abc(*turned) @ here[:3, :3], atol=1e-9)
+
+
+def test_a_pose_out_of_reach_stops_rsi() -> None:
+    corrections = sum_of((0.0,) * 6, corrects="pose")
+    assert "no solution" in corrections.take(only(0, 900.0))[1]
+
+
+@given(st.tuples(*[st.floats(-20.0, 20.0)] * 6))
+def test_inverse_kinematics_stays_with_the_axes_it_starts_from(away_deg: tuple[float, ...]) -> None:
+    joints_deg = tuple(a + b for a, b in zip(HOME_DEG, away_deg, strict=True))
+    found = joints_near(flange_pose(joints_deg), HOME_DEG)
+    assert found is not None
+    assert np.allclose(found, joints_deg, atol=1e-6)
+
+
+# -- axes, without a wire -------------------------------------------------------------------------------------
+
+
+def axes_at(joints_deg: tuple[float, ...] = HOME_DEG, **settings: object) -> Axes:
+    return Axes(Settings.model_validate({"start_joints_deg": joints_deg, **settings}), 0)
+
+
+def turn_a1(axes: Axes, steps_deg: list[float]) -> str:
+    """Turn axis 1 by one step after the other; the first fault."""
+    for number, step_deg in enumerate(steps_deg):
+        a1_deg = axes.commanded_deg[0] + step_deg
+        if fault := axes.follow((a1_deg, *axes.commanded_deg[1:]), number * CYCLE_NS):
+            return fault
+    return ""
+
+
+def test_a_path_through_the_wrists_singularity_asks_for_too_much_speed() -> None:
+    start_deg = (0.0, -90.0, 90.0, 10.0, 8.0, 0.0)
+    axes = axes_at(start_deg)
+    corrections = Corrections(Settings(corrects="pose"))
+    corrections.begin(start_deg)
+    fault = ""
+    for number in range(200):
+        target_deg, fault = corrections.take(only(4, -0.1 * number))
+        if fault := fault or axes.follow(target_deg, number * CYCLE_NS):
+            break
+    assert "velocity of A4" in fault or "velocity of A6" in fault
+
+
+@pytest.mark.parametrize(
+    ("limit", "steps_deg"),
+    [("acceleration_limit_deg_s2", [0.004, 0.02]), ("jerk_limit_deg_s3", [0.0001, 0.0101])],
+)
+def test_beyond_a_limit_of_acceleration_or_jerk_rsi_stops_or_the_axis_falls_behind(
+    limit: str, steps_deg: list[float]
+) -> None:
+    assert turn_a1(axes_at(), steps_deg) == ""
+    assert limit.split("_", maxsplit=1)[0] in turn_a1(axes_at(**{limit: 300.0}), steps_deg)
+    slow = axes_at(**{limit: 300.0, "on_excess": "clamp"})
+    assert turn_a1(slow, steps_deg) == ""
+    assert 0.0 < slow.commanded_deg[0] < sum(steps_deg)
+
+
+@pytest.mark.parametrize(
+    "workspace",
+    [
+        {"kind": "box", "min_mm": (-2000, 20, -2000), "max_mm": (2000, 2000, 2000), "stops": "inside"},
+        {"kind": "box", "min_mm": (-2000, -2000, -2000), "max_mm": (2000, 20, 2000), "stops": "outside"},
+        {"kind": "sphere", "centre_mm": (540, 0, 915), "radius_mm": 20, "stops": "outside"},
+        {"kind": "sphere", "centre_mm": (540, 120, 915), "radius_mm": 100, "stops": "inside"},
+    ],
+)
+def test_a_workspace_stops_the_arm_where_the_flange_comes_in_or_out(workspace: dict[str, object]) -> None:
+    axes = axes_at(workspaces=(workspace,))
+    assert "workspace 1 violated" in turn_a1(axes, [-0.5] * 10)
+    assert abs(abs(flange_pose(axes.commanded_deg)[1, 3]) - 20.0) < 6.0
+    assert turn_a1(axes_at(workspaces=(workspace,)), [-0.5] * 3) == ""
+
+
+def test_after_a_stop_the_arm_swings_and_then_stands() -> None:
+    axes = axes_at(vibration_deg=0.1, vibration_hz=10.0, vibration_decay_s=0.1)
+    turn_a1(axes, [0.5, 0.5, 0.0])
+    stopped_ns = 2 * CYCLE_NS
+    assert axes.settled_since_ns(stopped_ns) is None
+    quarter_period_ns = stopped_ns + 25_000_000
+    away_deg = np.subtract(axes.measured_deg(quarter_period_ns), axes.commanded_deg)
+    assert away_deg[0] == pytest.approx(0.1 * np.exp(-0.25))
+    assert np.all(away_deg[1:] == 0.0)
+    later_ns = stopped_ns + 2_000_000_000
+    assert axes.measured_deg(later_ns) == axes.commanded_deg
+    assert axes.settled_since_ns(later_ns) is not None
+    assert axes.stops == 1
+
+
+# -- the rest of its life -------------------------------------------------------------------------------------
+
+
+def test_after_an_emergency_stop_the_brakes_hold_the_arm_whatever_corrections_come(tmp_path: Path) -> None:
+    with controller_and_client(tmp_path, packets_after_estop_s=0.2) as (controller, client):
+        for correction_deg in (0.0, 0.05, 0.1):
+            answer_with(client, correction_deg)
+        assert not controller.brakes_closed
+        controller.estop()
+        answer_until_silent(client, 5.0)
+        assert controller.brakes_closed
+        held_deg = controller.joints_deg
+        assert held_deg[0] < 0.3
+        controller.reset()
+        assert not controller.brakes_closed
+        assert controller.joints_deg == held_deg
+
+
+def test_a_nudge_for_a_while_springs_back(tmp_path: Path) -> None:
+    with controller_and_client(tmp_path, answer_limit_s=0.2) as (controller, client):
+        answer_with(client, 0.0)
+        answer_with(client, 0.0)
+        controller.nudge([0.5] * 6, 0.02)
+        pushed = [round(controller.joints_deg[0], 6)]
+        true_mm = controller.true_base_from_flange()[:3, 3]
+        assert np.linalg.norm(true_mm - flange_pose(HOME_DEG)[:3, 3]) > 1.0
+        for _ in range(10):
+            answer_with(client, 0.0)
+            pushed.append(round(controller.joints_deg[0], 6))
+        assert sorted(set(pushed)) == [0.0, 0.5]
+        assert pushed[-1] == 0.0
+
+
+def test_an_answer_of_another_sentype_is_none(tmp_path: Path) -> None:
+    with controller_and_client(tmp_path, sen_type="Dome", restart_s=1e6, answer_limit_s=0.1) as (
+        controller,
+        client,
+    ):
+        answer_with(client, 0.0)
+        answer_with(client, 5.0)
+        assert controller.joints_deg == HOME_DEG
+
+
+def test_consecutive_counting_forgets_late_answers_after_one_in_time(tmp_path: Path) -> None:
+    settings = {"delay_limit": 5, "delay_counts": "consecutive", "answer_limit_s": 0.2}
+    with controller_and_client(tmp_path, **settings) as (controller, client):
+        answer_with(client, 0.0)
+        for _ in range(3):
+            controller.late(4)
+            for _ in range(6):
+                answer_with(client, 0.0)
+        assert controller.fault == ""
+        assert controller.delay == 0

@@ -1,0 +1,93 @@
+"""How long it takes to know what comes too close in one pose of the arm, against python-fcl through trimesh.
+
+Ours gives the distance of every pair of bodies: arm, camera, object, support, dome, keep-out volumes, the arm
+itself. The peer only says whether any of the arm's capsules, as meshes, touches the object's mesh or the support.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_POSES = 100
+
+
+def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+    """Microseconds a pose, of random ones in the demo's cell."""
+    from coupole.job import read_job
+
+    job = read_job(root / "configs/plans/demo.yaml")
+    home_deg = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
+    poses_deg = home_deg + np.random.default_rng(3).uniform(-40.0, 40.0, (_POSES, 6))
+
+    def ours() -> None:
+        for joints_deg in poses_deg:
+            job.bodies.contacts(joints_deg)
+
+    works = list(filter(None, (ours, fcl_check(job, poses_deg))))
+    times_us: list[list[float]] = [[] for _ in works]
+    for _ in range(1 + 5 * rounds):
+        for work, times in zip(works, times_us, strict=True):
+            start_s = time.perf_counter()
+            work()
+            times.append((time.perf_counter() - start_s) / _POSES * 1e6)
+    medians_us = [float(np.median(times[1:])) for times in times_us]  # the first round compiles
+    name, peer_us = ("trimesh_fcl", medians_us[1]) if len(works) > 1 else ("frame_period_at_100_hz", 10_000.0)
+    yield {
+        "name": "collision_check_per_pose",
+        "value": medians_us[0],
+        "unit": "us",
+        "peer": name,
+        "ratio": peer_us / medians_us[0],
+        "peer_value": round(peer_us, 1),
+    }
+
+
+def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | None:
+    """The peer's work on all poses; None where python-fcl is not installed."""
+    try:
+        import fcl  # noqa: F401  what trimesh's manager works with
+    except ImportError:
+        return None
+    import trimesh
+
+    from coupole.collisions import ARM_CAPSULES, Capsule
+    from coupole.kinematics import KR10_R1100_SIXX, link_frames
+
+    rig = job.cell.rig
+    tool = tuple(Capsule(t.name, 7, tuple(t.from_mm), tuple(t.to_mm), t.radius_mm) for t in rig.tool)
+    capsules = [c for c in (*ARM_CAPSULES, *tool) if c.link]
+    arm, around = trimesh.collision.CollisionManager(), trimesh.collision.CollisionManager()
+    base_from_support = rig.support.base_from_support.matrix()
+    corners = job.object_corners_mm.reshape(-1, 3) @ base_from_support[:3, :3].T + base_from_support[:3, 3]
+    around.add_object("object", trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3)))
+    disk = trimesh.creation.cylinder(rig.support.diameter_mm / 2, 50.0, transform=base_from_support)
+    around.add_object("support", disk.apply_translation(-25.0 * base_from_support[:3, 2]))
+    for number, capsule in enumerate(capsules):
+        arm.add_object(str(number), capsule_mesh(capsule))
+    places = link_frames(KR10_R1100_SIXX, poses_deg)
+
+    def check() -> None:
+        for frames in places:
+            for number, capsule in enumerate(capsules):
+                arm.set_transform(str(number), frames[capsule.link])
+            arm.in_collision_other(around)
+
+    return check
+
+
+def capsule_mesh(capsule: Any) -> Any:
+    """A capsule as a mesh, in its link's frame."""
+    import trimesh
+
+    start, end = np.array(capsule.start_mm, dtype=float), np.array(capsule.end_mm, dtype=float)
+    length_mm = float(np.linalg.norm(end - start))
+    mesh = trimesh.creation.capsule(height=length_mm, radius=capsule.radius_mm, count=[16, 16])
+    if length_mm > 0.0:
+        mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], (end - start) / length_mm))
+    return mesh.apply_translation(start)

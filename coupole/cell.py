@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,16 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from coupole.devices import Camera, Clock, Identity, LedBox, Robot, SystemClock
-from coupole.errors import CoupoleError
+from coupole.errors import CoupoleError, InputError
 from coupole.job import Cell, Job
 from coupole.rig import (
-    ENDPOINT_SETTINGS,
+    DEFAULT_WORLD,
     Rig,
     Sensor,
+    camera_kind,
     device_for,
     in_world,
     load_class,
     settings_class,
+    stand_in_for,
+    world_problems,
 )
 
 DRY_RUN_WIDTH_PX = 128
@@ -119,14 +121,14 @@ def _open_device(
         # The world's seconds pass faster than the host's: its watchdog must not bite a host that is on time.
         settings["watchdog_s"] = min(_LONGEST_WATCHDOG_S, settings.get("watchdog_s", 2.0) * speed)
     if endpoints is not None:
-        endpoint_key, setting, _ = ENDPOINT_SETTINGS[kind]
-        settings[setting] = endpoints[kind][endpoint_key]
+        known = settings_class(driver).model_fields
+        settings |= {name: value for name, value in endpoints[kind].items() if name in known}
     return load_class(driver)(settings_class(driver)(**settings), clock)
 
 
 def _get_world(cell: Cell, job: Job | None, sensor: Sensor, *, dry_run: bool, speed: float | None) -> Any:
     section = cell.rig.world
-    driver = section.driver if section else "sim.client:World"
+    driver = section.driver if section else DEFAULT_WORLD
     world_class = load_class(driver)
     if section is not None and section.join is not None and not dry_run:
         return world_class.join(cell.document.resolve(section.join))
@@ -136,18 +138,16 @@ def _get_world(cell: Cell, job: Job | None, sensor: Sensor, *, dry_run: bool, sp
 def world_config(
     cell: Cell, job: Job | None, sensor: Sensor, *, dry_run: bool = False, speed: float | None = None
 ) -> dict[str, Any]:
-    """The world that a rig describes, as `sim.world.Config` in JSON form."""
+    """The world that a rig describes, as `sim.world.Config` in JSON form. Raises InputError where there can be no
+    such world."""
     rig = cell.rig
     settings: dict[str, Any] = dict(rig.world.settings) if rig.world else {}
     if speed is not None:
         settings |= {"speed": speed, "hurry_only_when_told": dry_run}
-    robot = {"start_joints_deg": list(rig.motion.home_joints_deg), **settings.get("robot", {})}
-    robot.setdefault("sends_to", f"127.0.0.1:{_free_udp_port()}")
-    robot.setdefault("cycle_ms", rig.robot.settings.get("cycle_ms", 4))
-    settings["robot"] = robot
-    if dry_run and job is not None:
-        every = max(1, job.schedule.frames // len(job.schedule.views) // DRY_RUN_PICTURES)
-        settings["camera"] = {"render_every": every, **settings.get("camera", {})}
+    settings["robot"] = _robot_config(rig, settings.get("robot", {}), dry_run=dry_run)
+    settings["camera"] = _camera_config(rig, settings.get("camera", {}), job if dry_run else None, dry_run=dry_run)
+    if problems := world_problems(cell.document, rig, settings):
+        raise InputError(problems)
     exposures_us = job.plan.exposure.exposures_us if job else (8000,)
     return {
         "settings": settings,
@@ -179,6 +179,26 @@ def world_config(
     }
 
 
+def _robot_config(rig: Rig, given: Mapping[str, Any], *, dry_run: bool) -> dict[str, Any]:
+    """The robot's stand-in: what the rig says of it, and what follows from the driver at the other end."""
+    _, settings = device_for(rig, "robot", dry_run=dry_run)
+    stand_in = stand_in_for(rig, dry_run=dry_run)
+    alike = {name: settings[name] for name in stand_in.alike if name in settings}
+    start = {"start_joints_deg": list(rig.motion.home_joints_deg)}
+    return {"kind": stand_in.kind, **start, **stand_in.settings, **alike, **given}
+
+
+def _camera_config(rig: Rig, given: Mapping[str, Any], rehearsed: Job | None, *, dry_run: bool) -> dict[str, Any]:
+    """The camera's stand-in, as the rig describes it; not where a rehearsal has another kind of camera."""
+    kind = camera_kind(rig, dry_run=dry_run)
+    if rehearsed is not None:
+        every = max(1, rehearsed.schedule.frames // len(rehearsed.schedule.views) // DRY_RUN_PICTURES)
+        given = {"render_every": every, **given}
+    if kind != camera_kind(rig, dry_run=False):
+        given = {name: value for name, value in given.items() if name == "render_every"}
+    return {"kind": kind, **given}
+
+
 def _objects(job: Job | None) -> list[dict[str, Any]]:
     if job is None or job.mesh_path is None or job.plan.object is None:
         return []
@@ -190,10 +210,3 @@ def _objects(job: Job | None) -> list[dict[str, Any]]:
             "support_from_object": job.plan.object.support_from_object.matrix().tolist(),
         }
     ]
-
-
-def _free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-    return port

@@ -16,17 +16,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from coupole.devices import ArmState, Clock, Identity
-from coupole.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
+from coupole.errors import DeviceError, DeviceLost, DeviceTimeout
 from coupole.geometry import transform
-from coupole.kinematics import (
-    KR10_R1100_SIXX,
-    Arm,
-    forward,
-    limit_violations,
-    move_duration_s,
-    slowed,
-)
+from coupole.kinematics import KR10_R1100_SIXX, Arm, forward, move_duration_s, slowed
 from drivers import kuka_eki_wire as wire
+from drivers.arm_motion import News, checked_target, farthest_stop_deg, longest_stop_s, overtaken, refused
 from drivers.kuka_eki_link import Link, connect
 from drivers.kuka_eki_watch import Tolerances, Watch
 from drivers.kuka_eki_wire import Command, Six, Status
@@ -105,6 +99,7 @@ class KukaEki:
         self.settings = settings
         self.arm = settings.arm()
         self._clock = clock
+        self._news = News(clock)
         self._number = 0
         self._motion_s = 0.0
         self._watch = Watch(
@@ -149,20 +144,15 @@ class KukaEki:
         }
 
     def move_to(self, joints_deg: NDArray[np.float64]) -> None:
-        target_deg = np.asarray(joints_deg, dtype=np.float64)
-        if target_deg.shape != (6,) or not np.all(np.isfinite(target_deg)):
-            raise _refused("six finite joint angles in degrees", f"got {joints_deg!r}")
-        if violations := limit_violations(self.arm, target_deg):
-            raise _refused("joint angles within the arm's limits", violations)
+        target_deg = checked_target(joints_deg, self.arm.limits_deg)
         self._raise_fault()
         status = self._status()
         if status.override_percent <= 0:
-            raise _refused("an override above 0 %", "the controller's program override stands at 0 %")
+            raise refused("an override above 0 %", "the controller's program override stands at 0 %")
         # Retargeted in motion, the arm first has to brake: as long as from the farthest point, twice.
         move_s = move_duration_s(self.arm, status.joints_deg, target_deg) + self._stop_s()
         self._motion_s = move_s * _slower(status)
-        a1, a2, a3, a4, a5, a6 = target_deg.tolist()
-        self._order(wire.MOVE, (a1, a2, a3, a4, a5, a6))
+        self._order(wire.MOVE, target_deg)
 
     def wait_settled(self) -> ArmState:
         settings, watch = self.settings, self._watch
@@ -176,7 +166,7 @@ class KukaEki:
 
         def settled() -> bool:
             if watch.order != order:
-                raise _refused("the arm to go on to its target", "another command ended the motion")
+                raise overtaken()
             return watch.taken_ms is not None and watch.settled_cycles >= settings.settle_cycles
 
         self._wait(settled, limit_s, "the arm at its target and still")
@@ -195,7 +185,7 @@ class KukaEki:
             return ArmState(
                 joints_deg=status.joints_deg,
                 base_from_flange=forward(self.arm, status.joints_deg),
-                t_ns=self._clock.now_ns(),
+                t_ns=self._news.since_ns(self._watch.statuses),
                 moving=self._watch.moving,
                 fault=fault.text if fault else "",
             )
@@ -211,6 +201,13 @@ class KukaEki:
         self._order(wire.STOP, None)
         self._wait_taken()
         self._wait(lambda: not watch.moving, 2.0 * self._stop_s() + 1.0, "the arm at rest", faults=False)
+
+    def stopping_deg(self) -> NDArray[np.float64]:
+        """See `farthest_stop_deg`. The controller's program looks for commands at least as often as it sends
+        statuses; another such time is for the network, and for the robot program to be interrupted."""
+        settings, arm = self.settings, self.arm
+        delay_s = 2.0 * settings.status_ms / 1e3
+        return farthest_stop_deg(arm.velocity_deg_s, arm.acceleration_deg_s2[0], settings.jerk_deg_s3, delay_s)
 
     def statistics(self) -> Mapping[str, float]:
         watch = self._watch
@@ -325,9 +322,8 @@ class KukaEki:
         return f"flange at {x:.2f}, {y:.2f}, {z:.2f} mm, as computed from the axes"
 
     def _stop_s(self) -> float:
-        """Longest time that any axis needs to come to rest: v/a, and twice a/jerk to build it up."""
-        acceleration, jerk = self.arm.acceleration_deg_s2[0], self.settings.jerk_deg_s3
-        return max(self.arm.velocity_deg_s) / acceleration + 2.0 * acceleration / jerk
+        arm = self.arm
+        return longest_stop_s(arm.velocity_deg_s, arm.acceleration_deg_s2[0], self.settings.jerk_deg_s3)
 
     def _raise_fault(self) -> None:
         fault = self._watch.fault
@@ -344,7 +340,3 @@ class KukaEki:
 def _slower(status: Status) -> float:
     """By how much motions are slowed down at the controller."""
     return 100.0 / status.override_percent * (_T1_SLOWER if status.t1 else 1.0)
-
-
-def _refused(expected: str, happened: str) -> DeviceRefused:
-    return DeviceRefused("robot", expected=expected, happened=happened, remedy="Ask for another pose")

@@ -18,6 +18,9 @@ Outcome = TypeVar("Outcome")
 
 _LOOK_S = 0.05
 """How often silence is looked at, and connecting is tried again."""
+_UNREAD_BYTES = 16384
+"""Room for statuses that wait to be read, half a second of them or less: what is read must not be old. A
+controller that is faster than its reader, as in a simulated world that hurries, is held back."""
 
 
 def connect(address: str, controller_is: Literal["server", "client"], timeout_s: float) -> socket.socket:
@@ -26,15 +29,20 @@ def connect(address: str, controller_is: Literal["server", "client"], timeout_s:
     give_up = time.monotonic() + timeout_s
     if controller_is == "client":
         with socket.create_server((host, int(port)), backlog=1) as listener:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNREAD_BYTES)  # handed on to the link
             listener.settimeout(timeout_s)
             link, _ = listener.accept()
     else:
         while True:
+            link = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNREAD_BYTES)  # must be set before connecting
+            link.settimeout(timeout_s)
             try:
-                link = socket.create_connection((host, int(port)), timeout=timeout_s)
+                link.connect((host, int(port)))
                 break
-            except ConnectionRefusedError:
-                if time.monotonic() > give_up:
+            except OSError as error:
+                link.close()
+                if not isinstance(error, ConnectionRefusedError) or time.monotonic() > give_up:
                     raise
                 time.sleep(_LOOK_S)
     link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -23,7 +23,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from coupole import geometry
 from coupole.devices import ArmState, Clock, Deadline, Identity
-from coupole.errors import DeviceLost, DeviceRefused, DeviceTimeout
+from coupole.errors import DeviceLost, DeviceTimeout
+from drivers.arm_motion import News, checked_target, overtaken, refused
 from drivers.ur_messages import Ask, Config, Six, State
 from drivers.ur_process import UrProcess, raise_fault
 
@@ -83,6 +84,7 @@ class UrRobot:
         """
         self.settings = settings
         self._clock = clock
+        self._news = News(clock)
         self._number = 0
         self._motion_s = 0.0
         config = {field.name: getattr(settings, field.name) for field in fields(Config)}
@@ -117,16 +119,12 @@ class UrRobot:
 
     def move_to(self, joints_deg: NDArray[np.float64]) -> None:
         """Start movej; an arm in motion is first brought to rest. Raises DeviceRefused out of limits."""
-        target_deg = np.asarray(joints_deg, dtype=np.float64)
-        if target_deg.shape != (6,) or not np.all(np.isfinite(target_deg)):
-            raise self._refused("six finite joint angles in degrees", f"got {joints_deg!r}")
-        if violations := _limit_violations(self.settings.limits_deg, target_deg):
-            raise self._refused("joint angles within the arm's limits", violations)
-        state = self._command("move", _six(target_deg))
+        target_deg = checked_target(joints_deg, self.settings.limits_deg)
+        state = self._command("move", target_deg)
         raise_fault(state)
         if state.speed_fraction <= 0.0:
-            raise self._refused("a speed slider above 0 %", "it stands at 0 %: the arm will not move")
-        way_deg = float(np.max(np.abs(target_deg - state.joints_deg)))
+            raise refused("a speed slider above 0 %", "it stands at 0 %: the arm will not move")
+        way_deg = float(np.max(np.abs(np.subtract(target_deg, state.joints_deg))))
         # Asked in motion, the arm first brakes, and may have gone on away from the target meanwhile.
         way_deg += self.settings.speed_deg_s * self.settings.stop_s
         self._motion_s = _movej_s(self.settings, way_deg) / state.speed_fraction + self._rest_s()
@@ -147,7 +145,7 @@ class UrRobot:
             joints_deg=state.joints_deg,
             base_from_flange=_transform(state.tcp_pose_m_rad)
             @ geometry.inverse(_transform(state.tcp_offset_m_rad)),
-            t_ns=self._clock.now_ns() - round(state.age_s * 1e9),
+            t_ns=self._news.since_ns(state.samples),
             moving=state.still_samples < self.settings.settle_samples,
             fault=state.fault,
         )
@@ -161,6 +159,15 @@ class UrRobot:
             self._command("stop")
             deadline = Deadline(self._clock, 2.0 * self._rest_s() + 1.0)
             self._wait(self._is_still, deadline, "the arm at rest", faults=False)
+
+    def stopping_deg(self) -> NDArray[np.float64]:
+        """Farthest that each joint [6] turns after a stop: the leading joint's speed, which no joint exceeds, for
+        the time until stopj begins, and half of the time that it takes. A call of the library that is under way
+        comes before, and its commands wait for an answer: three samples each.
+        """
+        settings = self.settings
+        delay_s = 6.0 / settings.frequency_hz
+        return np.full(6, settings.speed_deg_s * (delay_s + 0.5 * settings.stop_s))
 
     def statistics(self) -> Mapping[str, float]:
         """Figures of the process's last word."""
@@ -206,7 +213,7 @@ class UrRobot:
 
     def _settled(self, state: State, number: int) -> bool:
         if self._number != number:
-            raise self._refused("the arm to go on to its target", "another command ended the motion")
+            raise overtaken()
         return state.command == number and self._is_still(state)
 
     def _is_still(self, state: State) -> bool:
@@ -215,10 +222,6 @@ class UrRobot:
     def _rest_s(self) -> float:
         """Time until an arm told to stop counts as standing."""
         return self.settings.stop_s + self.settings.settle_samples / self.settings.frequency_hz
-
-    @staticmethod
-    def _refused(expected: str, happened: str) -> DeviceRefused:
-        return DeviceRefused("robot", expected=expected, happened=happened, remedy="Ask for another pose")
 
 
 def _movej_s(settings: Settings, way_deg: float) -> float:
@@ -229,15 +232,6 @@ def _movej_s(settings: Settings, way_deg: float) -> float:
     return way_deg / speed + speed / acceleration
 
 
-def _limit_violations(limits_deg: tuple[tuple[float, float], ...], joints_deg: NDArray[np.float64]) -> str:
-    """Which joints [6] are out of their limits, as a phrase; empty if none is."""
-    return "; ".join(
-        f"A{joint} would be {angle:.3f} deg, its limits are {low:g} to {high:g} deg"
-        for joint, (angle, (low, high)) in enumerate(zip(joints_deg, limits_deg, strict=True), start=1)
-        if not low <= angle <= high
-    )
-
-
 def _transform(pose_m_rad: Six) -> geometry.Transform:
     """A UR pose (x, y, z in m and a rotation vector in rad) as 4x4 in mm."""
     from scipy.spatial.transform import Rotation
@@ -246,8 +240,3 @@ def _transform(pose_m_rad: Six) -> geometry.Transform:
     result[:3, :3] = Rotation.from_rotvec(pose_m_rad[3:]).as_matrix()
     result[:3, 3] = np.array(pose_m_rad[:3]) * 1e3
     return result
-
-
-def _six(values: NDArray[np.float64]) -> Six:
-    a, b, c, d, e, f = (float(value) for value in values)
-    return a, b, c, d, e, f

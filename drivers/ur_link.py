@@ -90,7 +90,6 @@ class Link:
             speed_fraction=0.0,
             still_samples=0,
             samples=0,
-            age_s=0.0,
             max_gap_s=0.0,
             max_call_s=0.0,
             model=model,
@@ -164,7 +163,6 @@ class Link:
             self._latch("link lost: the controller closed it", lost=True)
             return
         if timestamp_s == self._timestamp_s:
-            self.state = replace(self.state, age_s=age_s)
             if age_s > self.config.link_timeout_s:
                 self._latch(f"link lost: no sample for {age_s:.2f} s", lost=True)
             return
@@ -182,7 +180,6 @@ class Link:
             speed_fraction=self._receive.getTargetSpeedFraction(),
             still_samples=self.state.still_samples + 1 if still else 0,
             samples=self.state.samples + 1,
-            age_s=0.0,
             max_gap_s=max(self.state.max_gap_s, age_s),
         )
         if not self.state.fault:

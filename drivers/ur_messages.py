@@ -61,8 +61,6 @@ class State:
     still_samples: int
     """Samples in a row in which the arm stood still, at its target if it has one."""
     samples: int
-    age_s: float
-    """Time since the controller's timestamp last changed."""
     max_gap_s: float
     max_call_s: float
     """Longest that a call of the library took."""

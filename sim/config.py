@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sim import camera_server, kuka_controller, ledbox_firmware
 from sim import faults as script
+from sim.camera import CameraSettings
+from sim.camera import impossible as impossible_for_camera
+from sim.robot import RobotSettings, impossible
 
 WHITE_SHARE = 0.6
 """A white target at the support's centre reaches this share of full scale at the plan's exposure (design)."""
@@ -62,9 +65,18 @@ class Settings(_Model):
     """Real time, but `speed` while the controller says that it merely waits (dry runs)."""
     seed: int = 1
     ledbox: ledbox_firmware.Settings = ledbox_firmware.Settings()
-    robot: kuka_controller.Settings = kuka_controller.Settings()
-    camera: camera_server.Settings = camera_server.Settings()
+    robot: RobotSettings = kuka_controller.Settings()
+    camera: CameraSettings = camera_server.Settings()
     faults: tuple[script.Fault, ...] = ()
+
+    @model_validator(mode="after")
+    def _possible(self) -> Settings:
+        for fault in self.faults:
+            if why := impossible(fault, self.robot) or impossible_for_camera(fault, self.camera):
+                raise ValueError(why)
+        if self.robot.kind == "ur" and self.speed != 1.0:
+            raise ValueError("a world with a robot of kind `ur` has speed 1: ur-rtde lives in real time")
+        return self
 
 
 class Config(_Model):

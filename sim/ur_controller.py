@@ -10,9 +10,12 @@ stand-in refuses to be built.
 from __future__ import annotations
 
 import math
+import random
 import re
+import socket
 from collections.abc import Sequence
 from enum import IntEnum
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -20,18 +23,23 @@ from pydantic import BaseModel, ConfigDict, Field
 from coupole.errors import InputError
 from coupole.geometry import Transform
 from sim.kuka_kinematics import turn
+from sim.pushes import Pushes
 from sim.reactor import Reactor
-from sim.ur_arm import Motion, Six, brake, flange_pose, movej, rotation_vector
+from sim.ur_arm import Motion, Six, brake, flange_pose, movej, movel, rotation_vector
 from sim.ur_rtde_session import RtdeSession
 from sim.ur_rtde_wire import Value
 from sim.ur_script import ControlScript
 from sim.ur_tcp import Connection, TcpPort
 
+_ANY = "127.0.0.0"
+_DASHBOARD, _SCRIPT, _RTDE = 29999, 30003, 30004
 _CYCLE_NS = 2_000_000
 _END_OF_PROGRAM = re.compile(rb"^end\r?\n", re.MULTILINE)
 _ROBOT_MODE_RUNNING, _ROBOT_MODE_POWER_OFF = 7, 3
-_SAFETY_NORMAL, _SAFETY_PROTECTIVE, _SAFETY_EMERGENCY = 0x001, 0x404, 0x4C0
-"""safety_status_bits: 0 normal, 2 protective stop, 6 robot and 7 any emergency stop, 10 stopped for safety."""
+_SAFETY_NORMAL, _SAFETY_PROTECTIVE, _SAFETY_SAFEGUARD = 0x001, 0x404, 0x410
+_SAFETY_EMERGENCY, _SAFETY_FAULT = 0x4C0, 0x600
+"""safety_status_bits: 0 normal, 2 protective stop, 4 safeguard stop, 6 robot and 7 any emergency stop, 9 fault,
+10 stopped for safety."""
 
 
 class _Runtime(IntEnum):
@@ -47,8 +55,9 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    address: str = Field(default="127.0.0.1", pattern=r"^127\.\d+\.\d+\.\d+$")
-    """Loopback address to listen at."""
+    kind: Literal["ur"] = "ur"
+    address: str = Field(default=_ANY, pattern=r"^127\.\d+\.\d+\.\d+$")
+    """Loopback address to listen at; the default chooses one that is free, see `UrController.address`."""
     start_joints_deg: tuple[float, float, float, float, float, float] = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
     tcp_offset_m_rad: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.5)
     """Flange to tool centre point: x, y, z in m and a rotation vector in rad."""
@@ -77,7 +86,7 @@ class UrController:
         self._motion: Motion | None = None
         self._commanded_deg: Six = settings.start_joints_deg
         self._velocity_deg_s: Six = (0.0,) * 6
-        self._pushed_deg: Six = (0.0,) * 6
+        self._pushes = Pushes(reactor)
         self._script: ControlScript | None = None
         self._runtime = _Runtime.STOPPED
         self._safety_bits, self._robot_mode = _SAFETY_NORMAL, _ROBOT_MODE_RUNNING
@@ -86,18 +95,18 @@ class UrController:
         """World time at which a client last wrote registers, for the watchdog."""
         self._sessions: dict[Connection, RtdeSession] = {}
         self._values: dict[str, Value] | None = None
-        host = settings.address
+        self.address = host = _free_address() if settings.address == _ANY else settings.address
         self._ports = (
-            TcpPort(reactor, (host, 30004), self._open_session, lambda c: self._sessions[c].take()),
-            TcpPort(reactor, (host, 29999), self._greet, self._answer_dashboard),
-            TcpPort(reactor, (host, 30003), lambda _: None, self._take_program),
+            TcpPort(reactor, (host, _RTDE), self._open_session, lambda c: self._sessions[c].take()),
+            TcpPort(reactor, (host, _DASHBOARD), self._greet, self._answer_dashboard),
+            TcpPort(reactor, (host, _SCRIPT), lambda _: None, self._take_program),
         )
         self._timer = reactor.after(0.0, self._cycle)
 
     @property
     def joints_deg(self) -> Six:
         """The axes now, as the controller measures and reports them."""
-        return tuple(map(float.__add__, self._commanded_deg, self._pushed_deg))
+        return tuple(map(float.__add__, self._commanded_deg, self._pushes.deg))
 
     @property
     def moving(self) -> bool:
@@ -122,11 +131,22 @@ class UrController:
         self._safety_bits = _SAFETY_PROTECTIVE
         self._end_program("protective stop", _Runtime.PAUSED if self._script else _Runtime.STOPPED)
 
+    def safeguard_stop(self) -> None:
+        """Somebody opens the cell's door: the arm brakes, the program pauses."""
+        self._safety_bits = _SAFETY_SAFEGUARD
+        self._end_program("safeguard stop", _Runtime.PAUSED if self._script else _Runtime.STOPPED)
+
+    def safety_fault(self) -> None:
+        """The controller's safety system fails: the arm loses power, the program ends."""
+        self._safety_bits, self._robot_mode = _SAFETY_FAULT, _ROBOT_MODE_POWER_OFF
+        self._end_program("safety fault", _Runtime.STOPPED)
+
     def reset(self) -> None:
         """The operator acknowledges all faults, powers the arm and releases its brakes."""
         self.fault = ""
         self._safety_bits, self._robot_mode = _SAFETY_NORMAL, _ROBOT_MODE_RUNNING
-        self._commanded_deg, self._pushed_deg = self.joints_deg, (0.0,) * 6
+        self._commanded_deg = self.joints_deg
+        self._pushes.forget()
 
     def stop_program(self) -> None:
         """The operator presses stop at the pendant."""
@@ -143,9 +163,9 @@ class UrController:
         for port in self._ports:
             port.drop()
 
-    def nudge(self, joints_deg: Sequence[float]) -> None:
-        """Push the arm off the commanded axes by six angles, for good."""
-        self._pushed_deg = tuple(a + b for a, b in zip(self._pushed_deg, joints_deg, strict=True))
+    def nudge(self, joints_deg: Sequence[float], seconds: float | None = None) -> None:
+        """Push the arm off the commanded axes by six angles; after `seconds` it springs back, if given."""
+        self._pushes.push(joints_deg, seconds)
 
     def close(self) -> None:
         self._timer.cancel()
@@ -153,19 +173,28 @@ class UrController:
             port.close()
 
     def start_movej(self, target_deg: Six, speed_deg_s: float, acceleration_deg_s2: float) -> None:
-        """For the program. In motion it ends in a fault: what a real arm does then is not documented."""
-        if self.moving:
-            self._end_program("movej while the arm moved", _Runtime.STOPPED)
-            return
+        """For the program, as are the next two."""
         now_ns = self._reactor.now_ns
-        self._motion = movej(self._commanded_deg, target_deg, speed_deg_s, acceleration_deg_s2, now_ns)
-        self.settled_since_ns = None
+        self._start(movej(self._commanded_deg, target_deg, speed_deg_s, acceleration_deg_s2, now_ns))
+
+    def start_movel(self, tool_pose_m_rad: Six, speed_m_s: float, acceleration_m_s2: float) -> None:
+        tool = _transform(tool_pose_m_rad), _transform(self._settings.tcp_offset_m_rad)
+        now_ns = self._reactor.now_ns
+        self._start(movel(self._commanded_deg, *tool, speed_m_s, acceleration_m_s2, now_ns))
 
     def start_stopj(self, deceleration_deg_s2: float) -> None:
-        """For the program."""
         if self.moving:
             now_ns = self._reactor.now_ns
             self._motion = brake(self._commanded_deg, self._velocity_deg_s, deceleration_deg_s2, now_ns)
+
+    def _start(self, motion: Motion | None) -> None:
+        """In motion the program ends in a fault: what a real arm does then is not documented."""
+        if self.moving:
+            self._end_program("another motion while the arm moved", _Runtime.STOPPED)
+        elif motion is None:
+            self._end_program("no way along that line", _Runtime.STOPPED)
+        else:
+            self._motion, self.settled_since_ns = motion, None
 
     def _cycle(self) -> None:
         """What happens every 2 ms."""
@@ -239,14 +268,20 @@ class UrController:
         if question == "stop":
             self._end_program("stopped over the dashboard", _Runtime.STOPPED)
             return "Stopped"
-        safety = {_SAFETY_NORMAL: "NORMAL", _SAFETY_PROTECTIVE: "PROTECTIVE_STOP"}
+        safety = {
+            _SAFETY_NORMAL: "NORMAL",
+            _SAFETY_PROTECTIVE: "PROTECTIVE_STOP",
+            _SAFETY_SAFEGUARD: "SAFEGUARD_STOP",
+            _SAFETY_EMERGENCY: "ROBOT_EMERGENCY_STOP",
+            _SAFETY_FAULT: "FAULT",
+        }
         answers = {
             "PolyscopeVersion": "URSoftware 5.15.0.126600 (simulated)",
             "get serial number": "20245500001",
             "get robot model": "UR10",
             "is in remote control": str(self.remote_control).lower(),
             "robotmode": f"Robotmode: {'RUNNING' if self._robot_mode == _ROBOT_MODE_RUNNING else 'POWER_OFF'}",
-            "safetystatus": f"Safetystatus: {safety.get(self._safety_bits, 'ROBOT_EMERGENCY_STOP')}",
+            "safetystatus": f"Safetystatus: {safety[self._safety_bits]}",
             "programState": f"{self.program_state} rtde_control.urp",
         }
         return answers.get(question, f"could not understand: '{question}'")
@@ -271,6 +306,18 @@ class UrController:
                 **(self._script.outputs if self._script else {}),
             }
         return self._values
+
+
+def _free_address() -> str:
+    """A loopback address at which nobody listens at UR's ports."""
+    while True:
+        host = f"127.{random.randint(1, 254)}.{random.randint(0, 254)}.{random.randint(1, 254)}"
+        try:
+            for port in (_DASHBOARD, _SCRIPT, _RTDE):
+                socket.create_server((host, port)).close()
+        except OSError:
+            continue
+        return host
 
 
 def _radians(angles_deg: Six) -> Six:

@@ -13,7 +13,7 @@ from typing import Protocol
 from sim.ur_arm import Six
 from sim.ur_rtde_wire import Value
 
-_NONE, _MOVEJ, _STOPJ, _SET_WATCHDOG, _GET_TCP_OFFSET, _END = 0, 1, 34, 35, 40, 255
+_NONE, _MOVEJ, _MOVEL, _STOPJ, _SET_WATCHDOG, _GET_TCP_OFFSET, _END = 0, 1, 3, 34, 35, 40, 255
 _READY, _DONE = 1, 2
 _ASYNC_RUNNING = 0x8000
 
@@ -24,6 +24,7 @@ class Arm(Protocol):
     @property
     def moving(self) -> bool: ...
     def start_movej(self, target_deg: Six, speed_deg_s: float, acceleration_deg_s2: float) -> None: ...
+    def start_movel(self, tool_pose_m_rad: Six, speed_m_s: float, acceleration_m_s2: float) -> None: ...
     def start_stopj(self, deceleration_deg_s2: float) -> None: ...
 
 
@@ -63,6 +64,9 @@ class ControlScript:
             self._arm.start_movej(
                 tuple(map(math.degrees, numbers[:6])), math.degrees(numbers[6]), math.degrees(numbers[7])
             )
+            self._signal_async(running=asynchronous)
+        elif command == _MOVEL:
+            self._arm.start_movel(tuple(numbers[:6]), numbers[6], numbers[7])
             self._signal_async(running=asynchronous)
         elif command == _STOPJ:
             self._arm.start_stopj(math.degrees(numbers[0]))

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from sim import camera_server, kuka_controller, ledbox_firmware
+from sim import camera, gige_camera, kuka_controller, ledbox_firmware, robot
 from sim import faults as script
-from sim.camera_server import Exposed
+from sim.camera_body import Exposed
 from sim.clock import ClockWriter
 from sim.config import CameraConfig, Config
 from sim.lighting import Lighting
@@ -44,11 +44,12 @@ class World:
         self.reactor = Reactor(self.clock)
         self.lighting = Lighting()
         self._photographer = Photographer(config.scene, config.camera, seed=settings.seed)
-        self.robot = kuka_controller.KukaController(self.reactor, settings.robot)
-        self.camera = camera_server.CameraServer(
+        self._robot_settings, self._camera_settings = settings.robot, settings.camera
+        self.robot, robot_endpoint = robot.build(self.reactor, settings.robot)
+        self.camera, camera_endpoint = camera.build(
             self.reactor,
             settings.camera,
-            path=folder / "camera",
+            folder,
             frame_format={
                 "height_px": config.camera.height_px,
                 "width_px": config.camera.width_px,
@@ -83,9 +84,10 @@ class World:
         self._warm_up(config.camera)
         self.endpoints = {
             "ledbox": {"port": self.box.port},
-            "robot": {"sends_to": settings.robot.sends_to, "cycle_ms": settings.robot.cycle_ms},
+            "robot": {"kind": settings.robot.kind, **robot_endpoint},
             "camera": {
-                "address": str(folder / "camera"),
+                "kind": settings.camera.kind,
+                **camera_endpoint,
                 "scaling": f"white at the support's centre reaches 60 % of full scale in "
                 f"{config.camera.nominal_exposure_us} us under the median LED",
             },
@@ -130,6 +132,9 @@ class World:
                 self.box.unplug()
             case script.UnplugCamera():
                 self.camera.unplug()
+            case script.CameraControlLoss():
+                assert isinstance(self.camera, gige_camera.GigeCamera)  # others are refused before
+                self.camera.lose_control()
             case script.OverTemperature():
                 self.box.over_temperature(fault.board)
             case script.DeadLed():
@@ -139,11 +144,12 @@ class World:
             case script.EmergencyStop():
                 self.robot.estop()
             case script.LateRsi():
+                assert isinstance(self.robot, kuka_controller.KukaController)  # others are refused before
                 self.robot.late(fault.cycles)
             case script.RsiLinkLoss():
                 self.robot.lose_link(fault.seconds)
             case script.NudgeArm():
-                self.robot.nudge([fault.deg] * 6)
+                self.robot.nudge([fault.deg] * 6, fault.seconds)
 
     # -- control ------------------------------------------------------------------------------------------
 
@@ -175,7 +181,12 @@ class World:
                     "camera_armed": self.camera.armed,
                 }
             case "fault":
-                self._schedule(OneFault.model_validate({"fault": command["fault"]}).fault)
+                fault = OneFault.model_validate({"fault": command["fault"]}).fault
+                if why := robot.impossible(fault, self._robot_settings) or camera.impossible(
+                    fault, self._camera_settings
+                ):
+                    return {"error": why}
+                self._schedule(fault)
                 return {}
             case "reset_robot":
                 self.robot.reset()

@@ -6,17 +6,20 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from robot_conformance import AWAY_DEG, HOME_DEG, KukaCell, RobotConformance
 
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
+from coupole.kinematics import move_duration_s
 from drivers.kuka_eki import KukaEki, Settings
 from sim.clock import ClockWriter, SharedClock
 from sim.kuka_eki_controller import KukaEkiController
@@ -24,6 +27,29 @@ from sim.kuka_eki_controller import Settings as ControllerSettings
 from sim.reactor import Reactor
 
 SAMPLE_MS = 4
+KINDS: dict[str, dict[str, Any]] = {
+    "fast": {},
+    "client": {"controller_is": "client"},
+    "real-time": {"speed": 1.0},
+    "fastest": {"speed": 200.0},
+}
+"""Worlds and controllers. The whole class is run on the first of them, and with --full on all."""
+_REACHES = "test_it_reaches_poses_and_measures_them_right"
+_STOPS = "test_after_stop_no_axis_turns_farther_than_it_says"
+_STOPS_SMOOTHLY = "test_stop_in_mid_motion_brings_it_to_rest_smoothly"
+_REOPENS = "test_a_driver_opened_after_a_lost_link_starts_where_the_arm_stands"
+_ESTOP = "test_an_emergency_stop_is_a_fault_that_only_a_new_driver_leaves_behind"
+ALSO_ON: dict[str, tuple[str, ...]] = {
+    "client": (_REOPENS, _ESTOP),
+    "real-time": (_STOPS_SMOOTHLY, _ESTOP),
+    "fastest": (_REACHES, _STOPS, _ESTOP),
+}
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "kind" in metafunc.fixturenames:
+        full, name = metafunc.config.getoption("full"), metafunc.function.__name__
+        metafunc.parametrize("kind", [kind for kind in KINDS if full or name in ALSO_ON.get(kind, (name,))])
 
 
 class EkiCell:
@@ -48,7 +74,7 @@ class EkiCell:
             {
                 "address": self.controller.address,
                 "controller_is": controller.get("controller_is", "server"),
-                "link_timeout_s": 1.0,
+                "link_timeout_s": 3.0 if speed == 1.0 else 1.0,
             }
         )
         self.trace_deg: list[tuple[float, ...]] = []
@@ -61,6 +87,19 @@ class EkiCell:
     def open(self, **settings: object) -> KukaEki:
         return self._drivers.enter_context(closing(KukaEki(self.settings.model_copy(update=settings), self.clock)))
 
+    def hold_until_commanded(self, command: Callable[[], None]) -> NDArray[np.float64]:
+        """Where the axes [6] are when `command` is begun; the world stands still until it has come."""
+        called_deg = []
+
+        def hold() -> None:
+            called_deg.append(self.joints_deg())
+            command()
+            assert self.controller._client is not None
+            self.reactor.hold_for(self.controller._client, 20.0)
+
+        self.in_world(hold)
+        return called_deg[0]
+
     def close(self) -> None:
         self._drivers.close()
         self.reactor.stop()
@@ -69,14 +108,24 @@ class EkiCell:
 
 
 class TestKukaEki(RobotConformance):
-    @pytest.fixture(params=["server", "client"])
-    def cell(self, request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[EkiCell]:
-        settings = {}
-        if request.param == "client":
-            with socket.create_server(("127.0.0.1", 0)) as probe:
-                settings["address"] = f"127.0.0.1:{probe.getsockname()[1]}"
-        with closing(EkiCell(tmp_path, controller_is=request.param, **settings)) as cell:
+    @pytest.fixture
+    def cell(self, kind: str, tmp_path: Path) -> Iterator[EkiCell]:
+        with closing(EkiCell(tmp_path, **KINDS[kind])) as cell:
             yield cell
+
+    @pytest.mark.timeout(600)
+    def test_after_stop_no_axis_turns_farther_than_it_says(
+        self, cell: EkiCell, robot: KukaEki, scale: Callable[[int, int], int]
+    ) -> None:
+        """From the call on the world stands still until the command has come, however busy the machine is."""
+        random = np.random.default_rng(11)
+        for target_deg in self.targets_deg(cell, scale(4, 40), seed=11):
+            robot.move_to(target_deg)
+            cell.clock.sleep(random.uniform(0.05, 0.9))
+            stopper = threading.Thread(target=robot.stop)
+            called_deg = cell.hold_until_commanded(stopper.start)
+            stopper.join()
+            assert np.all(np.abs(cell.joints_deg() - called_deg) <= robot.stopping_deg() + 1e-3)
 
 
 @pytest.fixture
@@ -119,6 +168,29 @@ def test_after_an_emergency_stop_the_old_target_is_not_gone_for(cell: EkiCell, r
     cell.assert_stands()
 
 
+def test_news_of_the_arm_is_as_old_as_the_last_status(cell: EkiCell, robot: KukaEki) -> None:
+    before_ns = robot.measured().t_ns
+    cell.wait_until(lambda: robot.measured().t_ns > before_ns)
+    cell.in_world(lambda: cell.controller.lose_link(1e6))
+    cell.wait_until(lambda: robot.measured().t_ns < cell.clock.now_ns() - 1_000_000_000)
+    last_ns = robot.measured().t_ns
+    cell.clock.sleep(0.5)
+    assert robot.measured().t_ns == last_ns
+    cell.wait_until(lambda: robot._watch.link_lost)
+    with pytest.raises(DeviceLost, match="no status for"):
+        robot.measured()
+
+
+def test_a_world_in_a_hurry_does_not_run_ahead_of_its_client(tmp_path: Path) -> None:
+    with closing(EkiCell(tmp_path, speed=1000.0)) as cell:
+        robot = cell.open()
+        for _ in range(50):
+            cell.clock.sleep(0.5)
+            status = robot._watch.status
+            assert status is not None
+            assert cell.clock.now_ns() / 1e6 - status.time_ms < 1000.0
+
+
 def test_a_silent_link_is_a_fault_though_the_connection_stays_open(cell: EkiCell, robot: KukaEki) -> None:
     cell.in_world(lambda: cell.controller.lose_link(1e6))
     with pytest.raises(DeviceLost, match="no status for"):
@@ -146,17 +218,30 @@ def test_a_nudge_after_the_arm_settled_is_told_by_the_next_wait(cell: EkiCell, r
         robot.wait_settled()
 
 
+def test_a_push_for_a_while_springs_back_unless_a_new_driver_takes_the_arm_where_it_stands(
+    cell: EkiCell, robot: KukaEki
+) -> None:
+    push_deg = (0.5, 0.0, 0.0, 0.0, 0.0, 0.0)
+    cell.in_world(lambda: cell.controller.nudge(push_deg, 2.0))
+    assert cell.joints_deg() == pytest.approx(HOME_DEG + push_deg)
+    cell.clock.sleep(3.0)
+    assert cell.joints_deg() == pytest.approx(HOME_DEG)
+    cell.in_world(lambda: cell.controller.nudge(push_deg, 10.0))
+    robot.close()
+    cell.open()
+    cell.clock.sleep(11.0)
+    assert cell.joints_deg() == pytest.approx(HOME_DEG + push_deg)
+
+
 def test_waiting_again_for_an_arm_that_settled_long_ago_works(cell: EkiCell, robot: KukaEki) -> None:
     robot.move_to(AWAY_DEG)
     robot.wait_settled()
-    cell.clock.sleep(20.0)
+    cell.clock.sleep(6.0)
     assert np.allclose(robot.wait_settled().joints_deg, AWAY_DEG, atol=1e-3)
 
 
-def test_a_target_that_the_controller_refuses_is_a_fault(
-    cell: EkiCell, robot: KukaEki, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("drivers.kuka_eki.limit_violations", lambda *_: "")
+def test_a_target_that_the_controller_refuses_is_a_fault(cell: EkiCell, robot: KukaEki) -> None:
+    robot.arm = replace(robot.arm, limits_deg=((-360.0, 360.0),) * 6)
     robot.move_to(np.array([0.0, -90.0, 90.0, 0.0, 121.0, 0.0]))
     with pytest.raises(DeviceRefused, match="software limits"):
         robot.wait_settled()
@@ -222,13 +307,17 @@ def test_a_killed_driver_leaves_the_arm_at_rest_and_another_may_come(cell: EkiCe
     assert np.allclose(again.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
 
 
-@pytest.mark.parametrize("speed", [1.0, 10.0])
-def test_the_world_may_run_faster_than_life(tmp_path: Path, speed: float) -> None:
-    with closing(EkiCell(tmp_path, speed=speed)) as cell:
-        robot = cell.open(dwell_s=0.3)
-        for target_deg in (HOME_DEG + 5.0, HOME_DEG):
-            robot.move_to(target_deg)
-            assert np.allclose(robot.wait_settled().joints_deg, target_deg, atol=1e-3)
+def test_motions_last_as_long_as_preflight_says(cell: EkiCell) -> None:
+    robot = cell.open(speed_fraction=0.295, acceleration_deg_s2=250.0)
+    start_deg = HOME_DEG
+    for target_deg in (HOME_DEG + 0.5, AWAY_DEG, HOME_DEG):
+        before = len(cell.trace_deg)
+        robot.move_to(target_deg)
+        robot.wait_settled()
+        on_the_way = np.any(np.diff(np.array(cell.trace_deg[before - 1 :]), axis=0) != 0.0, axis=1)
+        says_s = move_duration_s(robot.arm, start_deg, target_deg)
+        assert on_the_way.sum() * SAMPLE_MS / 1e3 == pytest.approx(says_s, rel=0.01, abs=2 * SAMPLE_MS / 1e3)
+        start_deg = target_deg
 
 
 def test_an_override_below_100_percent_lengthens_the_time_allowed(tmp_path: Path) -> None:

@@ -5,14 +5,13 @@ Real time: ur-rtde knows no other. Each cell has a loopback address of its own, 
 
 from __future__ import annotations
 
-import itertools
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 
@@ -31,7 +30,6 @@ from sim.ur_controller import UrController
 
 pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
 
-_ADDRESSES = (f"127.{1 + os.getpid() // 254 % 253}.{1 + os.getpid() % 254}.{i}" for i in itertools.count(1))
 _CYCLE_S = 0.002
 
 
@@ -39,19 +37,18 @@ class UrCell:
     """A UR controller in a world of its own, and drivers that talk to it."""
 
     def __init__(self, folder: Path) -> None:
-        address = next(_ADDRESSES)
         self.clock_path = folder / "clock"
         self.reactor = Reactor(ClockWriter(self.clock_path, speed=1.0))
-        self.controller = UrController(self.reactor, ControllerSettings(address=address))
+        self.controller = UrController(self.reactor, ControllerSettings())
         self.trace_deg: list[tuple[float, ...]] = []
         self.settings = Settings.model_validate(
             {
-                "host": address,
+                "host": self.controller.address,
                 "limits_deg": [(-170, 170), (-190, 45), (-120, 156), (-185, 185), (-120, 120), (-350, 350)],
                 "speed_fraction": 0.75,
                 "acceleration_deg_s2": 300.0,
                 "stop_deg_s2": 600.0,
-                "link_timeout_s": 0.8,
+                "link_timeout_s": 1.5,
             }
         )
         self.reactor.after(0.5 * _CYCLE_S, self._sample)
@@ -133,8 +130,10 @@ class TestUrRobot(RobotConformance):
         assert robot.identify().simulated
         assert robot.self_test()["tool offset"] == "0.00, 0.00, 100.00 mm"
 
-    def test_it_reaches_poses_and_measures_them_right(self, cell: UrCell, robot: UrRobot) -> None:
-        for target_deg in (AWAY_DEG, np.array([-30.0, -80.0, 60.0, -70.0, 80.0, 170.0])):
+    def test_it_reaches_poses_and_measures_them_right(
+        self, cell: UrCell, robot: UrRobot, scale: Callable[[int, int], int]
+    ) -> None:
+        for target_deg in self.targets_deg(cell, scale(2, 100), seed=5):
             robot.move_to(target_deg)
             state = robot.wait_settled()
             assert not state.moving
@@ -175,10 +174,19 @@ def _assert_latched(cell: UrCell, robot: UrRobot, happens: Callable[[], None], n
     assert np.allclose(again.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
 
 
-def test_a_protective_stop_is_a_latched_fault_and_its_paused_program_is_ended(
-    cell: UrCell, robot: UrRobot
+@pytest.mark.parametrize(
+    ("stop", "name"),
+    [
+        (UrController.protective_stop, "protective stop"),
+        (UrController.safeguard_stop, "safeguard stop"),
+        (UrController.safety_fault, "safety fault"),
+    ],
+    ids=["protective", "safeguard", "fault"],
+)
+def test_each_stop_for_safety_is_a_latched_fault_by_its_name_and_a_paused_program_is_ended(
+    cell: UrCell, robot: UrRobot, stop: Callable[[UrController], None], name: str
 ) -> None:
-    _assert_latched(cell, robot, cell.controller.protective_stop, "protective stop")
+    _assert_latched(cell, robot, lambda: stop(cell.controller), name)
 
 
 def test_a_program_stopped_at_the_pendant_is_a_latched_fault(cell: UrCell, robot: UrRobot) -> None:
@@ -219,15 +227,23 @@ def test_connections_that_end_are_a_lost_link(cell: UrCell, robot: UrRobot) -> N
     assert np.allclose(again.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
 
 
-def test_a_lost_link_ends_measuring(cell: UrCell, robot: UrRobot) -> None:
+def test_news_of_the_arm_is_as_old_as_the_last_sample_until_the_link_counts_as_lost(
+    cell: UrCell, robot: UrRobot
+) -> None:
+    before_ns = robot.measured().t_ns
+    cell.wait_until(lambda: robot.measured().t_ns > before_ns)
+    cell.in_world(lambda: cell.controller.lose_link(60.0))
+    heard_ns = []
+
     def measure_on() -> None:
         while True:
-            robot.measured()
+            heard_ns.append(robot.measured().t_ns)
             time.sleep(0.01)
 
-    cell.in_world(lambda: cell.controller.lose_link(60.0))
     with pytest.raises(DeviceLost, match="link lost: no sample for"):
         measure_on()
+    assert heard_ns[-1] < cell.clock.now_ns() - 500_000_000
+    assert heard_ns[len(heard_ns) // 2] == heard_ns[-1]
     robot.stop()
     robot.close()
 
@@ -259,7 +275,7 @@ def test_a_silent_controller_ends_opening_in_time_and_leaves_no_process(
 
 
 def test_nobody_at_the_address_is_told(cell: UrCell) -> None:
-    cell.settings = cell.settings.model_copy(update={"host": next(_ADDRESSES)})
+    cell.settings = cell.settings.model_copy(update={"host": "127.255.255.254"})
     with pytest.raises(DeviceLost, match="Connection refused"):
         cell.open()
 
@@ -299,6 +315,50 @@ def test_a_killed_parent_leaves_no_process_and_the_arm_at_rest(cell: UrCell) -> 
     assert not cell.controller.moving
     cell.assert_stands()
     cell.assert_smooth()
+
+
+def test_another_client_moves_the_tool_on_a_straight_line(cell: UrCell) -> None:
+    script = (
+        "import sys; from rtde_control import RTDEControlInterface\n"
+        "control = RTDEControlInterface(sys.argv[1])\n"
+        "assert control.moveL([float(v) for v in sys.argv[2:]], 0.5, 2.0)\n"
+        "control.stopScript()\n"
+    )
+    start, line_mm = _tool_pose(HOME_DEG), np.array([50.0, 150.0, -100.0])
+    goal_m_rad = [*(start[:3, 3] + line_mm) / 1e3, *rotation_vector(start[:3, :3])]
+    words = [cell.settings.host, *map(str, goal_m_rad)]
+    subprocess.run([sys.executable, "-c", script, *words], check=True, capture_output=True, timeout=60)
+    tools = np.array([_tool_pose(joints_deg) for joints_deg in cell.trace_deg[::20]])
+    gone_mm = tools[:, :3, 3] - start[:3, 3]
+    shares = gone_mm @ line_mm / (line_mm @ line_mm)
+    assert np.abs(gone_mm - shares[:, None] * line_mm).max() < 0.01
+    assert np.allclose(tools[:, :3, :3], start[:3, :3], atol=1e-5)
+    assert np.allclose(_tool_pose(cell.controller.joints_deg)[:3, 3], start[:3, 3] + line_mm, atol=1e-3)
+
+
+def _tool_pose(joints_deg: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+    """`base_from_tool` with the stand-in's tool: 100 mm before the flange, turned by 0.5 rad."""
+    from scipy.spatial.transform import Rotation
+
+    flange_from_tool = np.eye(4)
+    flange_from_tool[:3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.5]).as_matrix()
+    flange_from_tool[2, 3] = 100.0
+    base_from_tool: NDArray[np.float64] = flange_pose(list(joints_deg)) @ flange_from_tool
+    return base_from_tool
+
+
+def test_a_line_that_the_arm_cannot_follow_ends_the_program(cell: UrCell) -> None:
+    cell.in_world(lambda: cell.controller.start_movel((5.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.5, 2.0))
+    assert cell.controller.fault == "no way along that line"
+    cell.assert_stands()
+
+
+def test_a_push_for_a_while_springs_back(cell: UrCell, robot: UrRobot) -> None:
+    cell.in_world(lambda: cell.controller.nudge([0.5] * 6, 0.3))
+    assert cell.joints_deg() == pytest.approx(HOME_DEG + 0.5)
+    cell.clock.sleep(0.4)
+    assert cell.joints_deg() == pytest.approx(HOME_DEG)
+    assert robot.measured().fault == ""
 
 
 def test_statistics_can_be_asked_after_closing(cell: UrCell, robot: UrRobot) -> None:

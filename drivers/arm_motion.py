@@ -1,0 +1,80 @@
+"""What the drivers of arms have in common: which targets they refuse, how an arm comes to rest, when it was heard.
+
+Angles are degrees of the arm's six axes; speeds, accelerations and jerks are of the same axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coupole.devices import Clock
+from coupole.errors import DeviceRefused
+
+_LIMIT_TOLERANCE_DEG = 1e-9
+
+
+def refused(expected: str, happened: str) -> DeviceRefused:
+    """The error of a motion that is not begun, or not waited for."""
+    return DeviceRefused("robot", expected=expected, happened=happened, remedy="Ask for another pose")
+
+
+def overtaken() -> DeviceRefused:
+    """The error of a wait for a motion that another command put an end to."""
+    return refused("the arm to go on to its target", "another command ended the motion")
+
+
+def checked_target(
+    joints_deg: ArrayLike, limits_deg: Sequence[tuple[float, float]]
+) -> tuple[float, float, float, float, float, float]:
+    """Six finite angles within lowest and highest of each axis; raises DeviceRefused, which names the axes."""
+    target = np.asarray(joints_deg, dtype=np.float64)
+    if target.shape != (6,) or not np.all(np.isfinite(target)):
+        raise refused("six finite joint angles in degrees", f"got {joints_deg!r}")
+    a1, a2, a3, a4, a5, a6 = target.tolist()
+    outside = [
+        f"A{axis} would be {angle:.3f} deg, its limits are {low:g} to {high:g} deg"
+        for axis, (angle, (low, high)) in enumerate(zip(target, limits_deg, strict=True), start=1)
+        if not low - _LIMIT_TOLERANCE_DEG <= angle <= high + _LIMIT_TOLERANCE_DEG
+    ]
+    if outside:
+        raise refused("joint angles within the arm's limits", "; ".join(outside))
+    return a1, a2, a3, a4, a5, a6
+
+
+def longest_stop_s(velocity_deg_s: Sequence[float], acceleration_deg_s2: float, jerk_deg_s3: float) -> float:
+    """Longest time that any axis needs to come to rest: v/a, and twice a/jerk to build it up."""
+    return max(velocity_deg_s) / acceleration_deg_s2 + 2.0 * acceleration_deg_s2 / jerk_deg_s3
+
+
+def farthest_stop_deg(
+    velocity_deg_s: Sequence[float], acceleration_deg_s2: float, jerk_deg_s3: float, delay_s: float
+) -> NDArray[np.float64]:
+    """Farthest that each axis [6] turns after a stop: its highest speed times the time that it may still last.
+
+    Coming to rest from speed v takes v/a + a/j, at half the speed on average; an axis that still speeds up needs
+    a/j before that. All axes share the time of the one that takes longest. To this comes `delay_s`, from the
+    call until the arm obeys.
+    """
+    speeds_deg_s = np.asarray(velocity_deg_s, dtype=np.float64)
+    rise_s = acceleration_deg_s2 / jerk_deg_s3
+    brake_s = speeds_deg_s.max() / acceleration_deg_s2 + rise_s
+    farthest_deg: NDArray[np.float64] = speeds_deg_s * (rise_s + 0.5 * brake_s + delay_s)
+    return farthest_deg
+
+
+class News:
+    """When the controller was last heard of: silence does not make it later."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._count = -1
+        self._since_ns = 0
+
+    def since_ns(self, count: int) -> int:
+        """Rig time at which this many messages of the controller were first seen to have come."""
+        if count != self._count:
+            self._count, self._since_ns = count, self._clock.now_ns()
+        return self._since_ns

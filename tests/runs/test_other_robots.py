@@ -1,0 +1,155 @@
+"""Runs with the arm on another wire: EthernetKRL is as good as RSI; an arm without a model is not moved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cells
+import pytest
+from cells import SIDE, TOP, CellFolder
+
+from coupole.job import read_cell
+from coupole.rig import planning_arm
+
+EKI = "drivers.kuka_eki:KukaEki"
+UR = "drivers.ur:UrRobot"
+
+
+@pytest.fixture
+def eki(cell: CellFolder) -> CellFolder:
+    """A small cell whose arm hangs on EthernetKRL."""
+    cell.rig_data["robot"] = {"driver": EKI}
+    cell.write(views=[TOP, SIDE])
+    return cell
+
+
+@pytest.mark.parametrize("name", ["sim", "sim-eki", "sim-ur"])
+def test_the_devices_of_each_shipped_rig_open_and_test_themselves(name: str) -> None:
+    if name == "sim-ur":
+        pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
+    ended = cells.command("devices", "--rig", cells.REPO / f"configs/rigs/{name}.yaml")
+    assert ended.code == 0, ended.err
+    assert ended.err.count("simulated") >= 3
+
+
+def test_a_plan_runs_through_ethernetkrl(eki: CellFolder) -> None:
+    ended = eki.acquire()
+    assert ended.code == 0, ended.err
+    run = eki.run_folder
+    cells.assert_each_shot_proven_once(run)
+    assert cells.mislabelled(eki, run) == []
+    (stop,) = cells.events(run, "stop")
+    assert stop["robot"]["statuses"] > 0
+
+
+def test_a_plan_is_rehearsed_through_ethernetkrl_faster_than_life(eki: CellFolder) -> None:
+    """The rig of real devices, none of which is there: the rehearsal brings its own, of the same kind."""
+    eki.rig_data["ledbox"]["settings"]["port"] = "/dev/ttyNOPE"
+    eki.rig_data["camera"]["settings"] = {"address": "/nowhere"}
+    eki.rig_data["robot"]["settings"] = {"address": "192.0.2.1:54600"}
+    eki.rig_data["world"] = {"serves": "dry_run"}
+    eki.write(lights={"kind": "all"})
+    ended = eki.acquire("--dry-run", "--speed", "20")
+    assert ended.code == 0, ended.err
+    found = ended.document
+    assert (found["proven"], found["missing"]) == (2160, 0)
+    assert found["duration_s"] == pytest.approx(found["preflight_s"], rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"kind": "emergency_stop"}, "emergency stop"),
+        ({"kind": "rsi_link_loss", "seconds": 60.0}, "link lost"),
+    ],
+    ids=["emergency-stop", "link-loss"],
+)
+def test_a_fault_of_the_controller_in_a_burst_ends_the_run_with_four_and_a_safe_cell(
+    tmp_path: Path, fault: dict[str, Any], words: str
+) -> None:
+    cell = CellFolder(tmp_path, speed=1.0)
+    cell.rig_data["robot"] = {"driver": EKI, "settings": {"link_timeout_s": 1.0}}
+    cell.join()
+    cell.write(lights={"kind": "every", "every": 4})
+    with cell.world({**fault, "at_edge": 20}) as world:
+        ended = cell.acquire()
+        cells.wait_until(lambda: cells.safe(world), "a safe cell")
+    assert ended.code == 4, ended
+    assert "robot: expected" in ended.err
+    assert words in ended.err
+
+
+def test_an_arm_pushed_in_a_burst_has_it_taken_again(eki: CellFolder) -> None:
+    eki.write(views=[TOP], lights={"kind": "every", "every": 4})
+    eki.faults({"kind": "nudge_arm", "deg": 0.05, "seconds": 0.5, "at_edge": 100})
+    ended = eki.acquire()
+    assert ended.code == 0, ended.err
+    run = eki.run_folder
+    assert cells.reshot(run)
+    assert [event["kind"] for event in cells.events(run, "fault")] == ["ArmMoved"]
+    cells.assert_each_shot_proven_once(run)
+    assert cells.mislabelled(eki, run) == []
+
+
+def test_late_rsi_answers_cannot_happen_without_rsi(eki: CellFolder) -> None:
+    eki.faults({"kind": "late_rsi"})
+    ended = eki.acquire()
+    assert ended.code == 2
+    assert "rig.yaml:" in ended.err
+    assert "no RSI answers" in ended.err
+
+
+def test_nor_can_they_be_asked_of_a_world_that_runs(eki: CellFolder) -> None:
+    with eki.world() as world:
+        assert "has no RSI answers" in world.ask("fault", fault={"kind": "late_rsi"})["error"]
+        assert "t_s" in world.ask("state")
+
+
+@pytest.mark.parametrize(
+    ("robot", "says"),
+    [
+        ({"kind": "rsi"}, "world.settings.robot.kind: expected eki"),
+        ({"cycle_ms": 4}, "world.settings.robot.cycle_ms: unknown key"),
+    ],
+    ids=["kind", "setting"],
+)
+def test_the_stand_in_is_that_of_the_driver(eki: CellFolder, robot: dict[str, Any], says: str) -> None:
+    eki.world_settings["robot"] = robot
+    eki.write()
+    ended = eki.acquire()
+    assert ended.code == 2
+    assert says in ended.err
+
+
+def test_motions_that_the_controller_cannot_be_asked_for_are_found_when_the_rig_is_read(eki: CellFolder) -> None:
+    eki.rig_data["motion"]["acceleration_deg_s2"] = 700
+    eki.write()
+    ended = eki.acquire()
+    assert ended.code == 2
+    assert "acceleration 116 % of the controller's own" in ended.err
+
+
+def test_a_world_with_a_ur_does_not_run_at_another_speed_than_life(cell: CellFolder) -> None:
+    cell.rig_data["robot"] = {"driver": UR}
+    cell.write()
+    ended = cell.acquire()
+    assert ended.code == 2
+    assert "ur-rtde lives in real time" in ended.err
+
+
+def test_a_plan_for_an_arm_without_a_model_is_refused_before_a_device_is_touched(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path, speed=1.0)
+    cell.rig_data["robot"] = {"driver": UR}
+    cell.write()
+    ended = cell.acquire()
+    assert ended.code == 3
+    assert "no model of this arm" in ended.err
+
+
+def test_the_planned_arm_has_the_speeds_of_rig_and_driver() -> None:
+    rig = read_cell(cells.REPO / "configs/rigs/sim-eki.yaml").rig
+    arm = planning_arm(rig)
+    assert arm is not None
+    assert arm.velocity_deg_s[0] == pytest.approx(0.3 * 300)
+    assert planning_arm(read_cell(cells.REPO / "configs/rigs/sim-ur.yaml").rig) is None

@@ -1,9 +1,9 @@
-"""Bodies of the cell and the distances between them: what the arm must not touch, and by how much.
+"""Distances between the bodies of the cell: what the arm must not touch, and by how much.
 
-The arm is a set of capsules (a segment and a radius) that enclose the vendor's link meshes; the camera and an
+The arm is a set of capsules that enclose the vendor's link meshes, or those meshes themselves; the camera and an
 allowance for its cables are capsules too. Around it stand the object (its scanned mesh), the support disk, the
-dome seen from inside, and keep-out volumes. All distances are conservative: what is sampled (capsule axes,
-mesh surfaces, motions) is taken closer by what could lie between the samples.
+dome seen from inside, and keep-out volumes. All distances are conservative: bodies are unions of balls
+(`coupole.balls`) that enclose what they stand for, and of motions nothing between two checked places is missed.
 """
 
 from __future__ import annotations
@@ -11,52 +11,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coupole.geometry import Transform, apply, inverse
-from coupole.kinematics import Arm, link_frames
-
-AXIS_STEP_MM = 20.0
-"""Spacing of the points on a capsule's axis."""
-MESH_STEP_MM = 6.0
-"""Spacing of the points on an object's surface."""
-SWEEP_STEP_MM = 10.0
-"""No point of the arm moves farther than this between two checked places of a motion."""
-
-
-@dataclass(frozen=True)
-class Capsule:
-    """All points within `radius_mm` of a segment, in the frame of one link (0 is the base, 7 the flange)."""
-
-    body: str
-    link: int
-    start_mm: tuple[float, float, float]
-    end_mm: tuple[float, float, float]
-    radius_mm: float
-
-
-ARM_CAPSULES = (
-    Capsule("base", 0, (-93, 1, 133), (-93, 1, 93), 144),
-    Capsule("base", 0, (3, 0, 148), (21, 0, 36), 130),
-    Capsule("link 1", 1, (22, 57, -17), (27, 61, -17), 119),
-    Capsule("link 1", 1, (-10, 4, -124), (15, 1, -132), 127),
-    Capsule("link 1", 1, (18, -60, -14), (24, -63, -20), 119),
-    Capsule("link 2", 2, (-2, -4, -1), (65, -6, 13), 113),
-    Capsule("link 2", 2, (379, -2, 12), (210, -2, 5), 100),
-    Capsule("link 2", 2, (478, 0, 2), (561, -1, -1), 135),
-    Capsule("link 3", 3, (0, 0, -12), (-13, 2, 6), 90),
-    Capsule("link 3", 3, (34, 0, 47), (64, 0, 18), 83),
-    Capsule("link 4", 4, (147, 0, 0), (223, 0, 0), 73),
-    Capsule("link 4", 4, (344, -6, 9), (282, -7, 0), 85),
-    Capsule("link 4", 4, (413, 1, 0), (511, 0, 1), 71),
-    Capsule("link 5", 5, (0, 2, 0), (40, 1, 0), 52),
-    Capsule("link 6", 6, (-7, 0, -1), (-7, 0, -1), 23),
+from coupole.balls import MESH_STEP_MM, Balls, Floats, forest_of
+from coupole.bodies import (
+    ARM_CAPSULES,
+    Body,
+    Capsule,
+    bodies_of_capsules,
+    bodies_of_meshes,
+    part_apart,
+    reach_mm,
 )
-"""KR10 R1100 sixx, mm, in the links' frames: fitted round the collision meshes of kuka_experimental
-(ros-industrial), radii rounded up; a test checks that they enclose every vertex where the meshes are at hand."""
+from coupole.geometry import Transform, inverse
+from coupole.kinematics import JOINT_AXES, Arm, axis_senses, joint_origins_mm
+
+REACH_MM = (1600.0, 1500.0, 1000.0, 420.0, 420.0, 250.0)
+"""Farthest that any point of arm and tool may be from axis 1 to 6 (links stretched out, tool of 300 mm)."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +46,7 @@ class Contact:
 
     def __str__(self) -> str:
         how = f"{self.distance_mm:.0f} mm from" if self.distance_mm > 0 else "inside"
-        return f"{self.body} would be {how} {self.other}; {self.required_mm:g} mm must be kept"
+        return f"{self.body} would be {how} {self.other}; {self.required_mm:.3g} mm must be kept"
 
 
 @dataclass(frozen=True)
@@ -83,6 +58,9 @@ class Clearances:
     dome_mm: float = 20.0
     self_mm: float = 0.0
     keep_out_mm: float = 0.0
+    tube_mm: float = 0.0
+    """How far the arm may be off its way (`coupole.tube`): every pair keeps at least as much as that can bring it
+    together."""
 
 
 @dataclass(frozen=True)
@@ -95,32 +73,54 @@ class Surroundings:
     dome_top_deg: float
     """Elevation above which the dome is open."""
     object_points_mm: NDArray[np.float64]
-    """[n, 3] on the object's surface, none farther than MESH_STEP_MM from what lies between them."""
+    """[n, 3] on the object's surface, of which no point is farther than MESH_STEP_MM from one of them."""
     keep_out_spheres: tuple[tuple[str, tuple[float, float, float], float], ...] = ()
     keep_out_boxes: tuple[tuple[str, tuple[float, float, float], tuple[float, float, float]], ...] = ()
 
 
-_SELF_PAIRS = tuple(
-    (moving, fixed)
-    for moving, against in {
-        "link 3": ("base",),
-        "link 4": ("base", "link 1"),
-        "link 5": ("base", "link 1", "link 2"),
-        "link 6": ("base", "link 1", "link 2"),
-        "tool": ("base", "link 1", "link 2", "link 3"),
-    }.items()
-    for fixed in against
-)
-"""Bodies of the arm that can meet; neighbours in the chain are kept apart by the joints' limits."""
-_FIXED_TO_BASE = ("base",)
-REACH_MM = (1600.0, 1500.0, 1000.0, 420.0, 420.0, 250.0)
-"""Farthest that any point of arm and tool can be from axis 1 to 6 (links stretched out, tool of 300 mm)."""
-_RESOLUTION_MM = 2.0
-_FAR_MM = 400.0
+_SELF_PAIRS = {
+    "link 2": ("base",),
+    "link 3": ("base",),
+    "link 4": ("base", "link 1"),
+    "link 5": ("base", "link 1", "link 2"),
+    "link 6": ("base", "link 1", "link 2"),
+    "tool": ("base", "link 1", "link 2", "link 3", "link 4"),
+}
+"""Bodies of the arm that can meet. The others cannot within the joints' limits, with A3's drawn in as
+`coupole.itinerary` does (seen on the vendor's meshes)."""
+
+
+_EVERYDAY_DEG: dict[tuple[str, str], list[tuple[float, ...]]] = {
+    ("link 2", "base"): [(0, -90, 0, 0, 0, 0)],
+    ("tool", "link 4"): [(0, 0, 0, 0, a5, a6) for a5 in (-90, 0, 90) for a6 in range(0, 360, 15)],
+}
+"""Pairs next to each other: what is near in these postures stays so by the joint between them, or is drawn too
+large (an allowance for a camera reaches back over the wrist). The rest can meet when they bend further."""
+_NEIGHBOURLY_MM = 25.0
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A body and what it is kept from: a solid (`kind`, `figures`) or another body (`SHAPE`)."""
+
+    body: Body
+    other_name: str
+    required_mm: float
+    reach_mm: Floats
+    kind: int
+    figures: tuple[float, ...] = ()
+    other: Body | None = None
+
+    def contact(self, margin_mm: float) -> Contact:
+        return Contact(self.body.name, self.other_name, float(margin_mm + self.required_mm), self.required_mm)
 
 
 class CellBodies:
-    """The arm among its surroundings; `margins` is everything else's foundation."""
+    """The arm among its surroundings.
+
+    `link_meshes` is a folder with the links' meshes (`coupole.bodies.bodies_of_meshes`), which then stand for the
+    arm instead of capsules round them: closer, and slower to check. Raises InputError if they cannot be read.
+    """
 
     def __init__(
         self,
@@ -128,186 +128,138 @@ class CellBodies:
         surroundings: Surroundings,
         tool: Sequence[Capsule],
         clearances: Clearances | None = None,
+        link_meshes: Path | None = None,
     ) -> None:
-        self._arm, self._around = arm, surroundings
-        self._clearances = clearances or Clearances()
-        self._capsules = (*ARM_CAPSULES, *tool)
-        self._points = [_axis_points(c) for c in self._capsules]
-        self._support_from_base = inverse(surroundings.base_from_support)
-        names = {c.body for c in self._capsules}
-        self._tool_names = tuple(c.body for c in tool)
-        self._pairs = [
-            (a, fixed)
-            for moving, fixed in _SELF_PAIRS
-            for a in (dict.fromkeys(self._tool_names) if moving == "tool" else (moving,))
-            if a in names
-        ]
+        self._arm, self._around, self._keep = arm, surroundings, clearances or Clearances()
+        self._has_meshes = link_meshes is not None
+        self._links = bodies_of_meshes(link_meshes) if link_meshes else bodies_of_capsules(ARM_CAPSULES)
+        self._tools = bodies_of_capsules(tool)
+        self._pairs = [*self._pairs_with_surroundings(), *self._pairs_of_the_arm()]
 
     @cached_property
-    def _tree(self) -> Any:
-        from scipy.spatial import cKDTree
+    def reach_mm(self) -> Floats:
+        """[6] farthest that any point of arm and tool can be from each axis."""
+        reach: Floats = np.max([reach_mm(self._arm, body) for body in (*self._links, *self._tools)], axis=0)
+        return reach
 
-        return cKDTree(self._around.object_points_mm) if len(self._around.object_points_mm) else None
-
-    @cached_property
-    def _box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        points = self._around.object_points_mm
-        return points.min(axis=0), points.max(axis=0)
-
-    def _axes_in_base(self, joints_deg: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """For each capsule its axis points [n, m, 3] in the base frame."""
-        frames = link_frames(self._arm, joints_deg)
-        return [
-            points @ frames[:, c.link, :3, :3].swapaxes(-1, -2) + frames[:, c.link, None, :3, 3]
-            for c, points in zip(self._capsules, self._points, strict=True)
-        ]
-
-    def margins(self, joints_deg: ArrayLike) -> dict[tuple[str, str], NDArray[np.float64]]:
+    def margins(self, joints_deg: ArrayLike, far_mm: float = np.inf) -> dict[tuple[str, str], Floats]:
         """For each pair of bodies, distance minus what must be kept [n], of joint angles [n, 6]; mm, never more
-        than the true value."""
-        joints = np.atleast_2d(np.asarray(joints_deg, dtype=np.float64))
-        axes = self._axes_in_base(joints)
-        keep, around = self._clearances, self._around
-        found: dict[tuple[str, str], NDArray[np.float64]] = {}
+        than the true value, and never said to be more than `far_mm` (which saves time)."""
+        margins = self._margins(np.atleast_2d(np.asarray(joints_deg, dtype=np.float64)), far_mm)
+        return {(pair.body.name, pair.other_name): margins[:, n] for n, pair in enumerate(self._pairs)}
 
-        def note(body: str, other: str, margin: NDArray[np.float64]) -> None:
-            key = (body, other)
-            found[key] = np.minimum(found[key], margin) if key in found else margin
-
-        for capsule, axis in zip(self._capsules, axes, strict=True):
-            if capsule.body in _FIXED_TO_BASE:
-                continue
-            slack = capsule.radius_mm + _axis_slack(capsule)
-            points = apply(self._support_from_base, axis)
-            note(capsule.body, "the support", self._to_support(points) - slack - keep.support_mm)
-            note(capsule.body, "the dome", self._to_dome(points) - slack - keep.dome_mm)
-            if self._tree is not None:
-                note(capsule.body, "the object", self._to_object(points) - slack - MESH_STEP_MM - keep.object_mm)
-            for name, center, radius in around.keep_out_spheres:
-                distance = np.linalg.norm(points - np.array(center), axis=-1).min(axis=-1) - radius
-                note(capsule.body, f"keep-out `{name}`", distance - slack - keep.keep_out_mm)
-            for name, low, high in around.keep_out_boxes:
-                distance = _to_box(points, np.array(low), np.array(high)).min(axis=-1)
-                note(capsule.body, f"keep-out `{name}`", distance - slack - keep.keep_out_mm)
-        for body, other in self._pairs:
-            for i, first in enumerate(self._capsules):
-                for j, second in enumerate(self._capsules):
-                    if (first.body, second.body) == (body, other):
-                        apart = np.linalg.norm(axes[i][:, :, None] - axes[j][:, None], axis=-1).min(axis=(1, 2))
-                        slack = first.radius_mm + second.radius_mm + _axis_slack(first) + _axis_slack(second)
-                        note(body, f"the arm's {other}", apart - slack - keep.self_mm)
-        return found
+    def tightest_mm(self, joints_deg: ArrayLike) -> Floats:
+        """[n] the least of all margins where it is negative, else 0; of joint angles [n, 6]."""
+        tightest: Floats = self._margins(np.asarray(joints_deg, dtype=np.float64), 0.0).min(axis=1)
+        return tightest
 
     def contacts(self, joints_deg: ArrayLike) -> list[Contact]:
         """What comes too close in one place [6] of the arm, nearest first."""
-        close = sorted((float(m[0]), pair) for pair, m in self.margins(joints_deg).items() if m[0] < 0)
-        return [self._contact(pair, margin) for margin, pair in close]
+        (margins,) = self._margins(np.asarray(joints_deg, dtype=np.float64)[None], 0.0)
+        order = np.argsort(margins, kind="stable")
+        return [self._pairs[n].contact(margins[n]) for n in order if margins[n] < 0.0]
+
+    def is_clear(self, from_deg: Floats, to_deg: Floats) -> bool:
+        """True if nothing comes too close on a straight motion in joint space."""
+        from coupole.distances import CLEAR, blocked_at
+
+        return bool(blocked_at(self._model, from_deg, to_deg)[0] == CLEAR)
 
     def contact_on_the_way(self, from_deg: ArrayLike, to_deg: ArrayLike) -> Contact | None:
-        """The first contact found on a straight motion in joint space, None if there is none.
+        """The first contact found on a straight motion in joint space, None if there is none."""
+        from coupole.distances import CLEAR, blocked_at
 
-        A stretch is clear if, in its middle, every pair is farther apart than the arm can move from there to the
-        stretch's ends; other stretches are halved. So nothing between samples is missed.
-        """
         start, end = np.asarray(from_deg, dtype=np.float64), np.asarray(to_deg, dtype=np.float64)
-        sweep_mm = float(np.radians(np.abs(end - start)) @ np.array(REACH_MM))
-        middles, half = np.array([0.5]), 0.5
-        while len(middles):
-            moved_mm = sweep_mm * half
-            margins = self.margins(start + middles[:, None] * (end - start))
-            tightest = np.full(len(middles), np.inf)
-            for (body, other), margin in margins.items():
-                both_move = other.startswith("the arm's")
-                limit = margin - (2 if both_move else 1) * moved_mm
-                if np.any(margin < 0) or (moved_mm < _RESOLUTION_MM and np.any(limit < 0)):
-                    return self._contact((body, other), float(margin.min()))
-                tightest = np.minimum(tightest, limit)
-            half /= 2
-            unclear = middles[tightest < 0]
-            middles = np.concatenate([unclear - half, unclear + half])
-        return None
+        pair, share, moved_mm = blocked_at(self._model, start, end)
+        if pair == CLEAR:
+            return None
+        margin_mm = self._margins((start + share * (end - start))[None], np.inf)[0, pair]
+        contact: Contact = self._pairs[pair].contact(margin_mm if margin_mm < 0.0 else margin_mm - moved_mm)
+        return contact
 
-    def _contact(self, pair: tuple[str, str], margin: float) -> Contact:
-        keep = self._clearances
-        required = {
-            "the object": keep.object_mm,
-            "the support": keep.support_mm,
-            "the dome": keep.dome_mm,
-        }.get(pair[1], keep.self_mm if pair[1].startswith("the arm's") else keep.keep_out_mm)
-        return Contact(pair[0], pair[1], margin + required, required)
+    def _margins(self, joints_deg: Floats, far_mm: float) -> Floats:
+        from coupole.distances import margins_at
 
-    def _to_support(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Smallest distance [n] of points [n, m, 3] to the disk; below it counts as inside."""
-        outside = np.linalg.norm(points[..., :2], axis=-1) - self._around.support_radius_mm
-        height = points[..., 2]
-        beside = np.hypot(np.maximum(outside, 0.0), height)
-        distance: NDArray[np.float64] = np.where(outside > 0, beside, height).min(axis=-1)
-        return distance
+        margins: Floats = margins_at(self._model, joints_deg, float(far_mm))
+        return margins
 
-    def _to_dome(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Smallest distance [n] of points [n, m, 3] to the dome, from inside; negative outside."""
-        around = self._around
-        radius = np.linalg.norm(points, axis=-1)
-        out = np.linalg.norm(points[..., :2], axis=-1)
+    # -- what is kept apart -------------------------------------------------------------------------------
+
+    def _pairs_with_surroundings(self) -> list[_Pair]:
+        from coupole.distances import BOX, DISK, DOME, SHAPE, SPHERE, SUPPORT_FRAME
+
+        around, keep = self._around, self._keep
         top = np.radians(around.dome_top_deg)
-        rim = around.dome_radius_mm * np.array([np.cos(top), np.sin(top)])
-        through_the_top = np.hypot(out - rim[0], points[..., 2] - rim[1])
-        open_above = points[..., 2] > np.tan(top) * out
-        distance: NDArray[np.float64] = np.where(open_above, through_the_top, around.dome_radius_mm - radius).min(
-            axis=-1
+        solids: list[tuple[str, float, int, tuple[float, ...]]] = [
+            ("the support", keep.support_mm, DISK, (around.support_radius_mm,)),
+            ("the dome", keep.dome_mm, DOME, (around.dome_radius_mm, float(np.sin(top)), float(np.cos(top)))),
+        ]
+        solids += [
+            (f"keep-out `{name}`", keep.keep_out_mm, SPHERE, (*center, radius))
+            for name, center, radius in around.keep_out_spheres
+        ]
+        solids += [
+            (f"keep-out `{name}`", keep.keep_out_mm, BOX, (*low, *high))
+            for name, low, high in around.keep_out_boxes
+        ]
+        points = around.object_points_mm
+        shape = Body("the object", SUPPORT_FRAME, Balls(points, np.full(len(points), MESH_STEP_MM)))
+        pairs = []
+        for body in (*self._tools, *self._links[:0:-1]):
+            reach = reach_mm(self._arm, body)
+            if len(points):
+                required_mm = self._required_mm(keep.object_mm, reach)
+                pairs.append(_Pair(body, shape.name, required_mm, reach, SHAPE, other=shape))
+            pairs += [
+                _Pair(body, name, self._required_mm(keep_mm, reach), reach, kind, figures)
+                for name, keep_mm, kind, figures in solids
+            ]
+        return pairs
+
+    def _pairs_of_the_arm(self) -> list[_Pair]:
+        from coupole.distances import SHAPE
+
+        pairs = []
+        for body in (*self._tools, *self._links):
+            kind = "tool" if body in self._tools else body.name
+            for other in self._links:
+                if other.name not in _SELF_PAIRS.get(kind, ()):
+                    continue
+                drawn_large = kind == "tool" or not self._has_meshes
+                everyday = _EVERYDAY_DEG.get((kind, other.name)) if drawn_large else None
+                part = part_apart(self._arm, body, other, everyday, _NEIGHBOURLY_MM) if everyday else body
+                if part is not None:
+                    reach = reach_mm(self._arm, part, from_link=other.link)
+                    required_mm = self._required_mm(self._keep.self_mm, reach)
+                    pairs.append(_Pair(part, f"the arm's {other.name}", required_mm, reach, SHAPE, other=other))
+        return pairs
+
+    def _required_mm(self, keep_mm: float, reach: Floats) -> float:
+        """What a pair must keep: the rig's clearance, and in any case what an arm off its way by the tube's width
+        could take from it. `off_the_way_mm` counts each axis' deviation times REACH_MM, the pair feels it times
+        its own reach."""
+        return max(keep_mm, self._keep.tube_mm * float((reach / np.array(REACH_MM)).max()))
+
+    @cached_property
+    def _model(self) -> Any:
+        """All that as the compiled functions want it."""
+        from coupole.distances import SUPPORT_FRAME, Model
+
+        all_bodies = [body for pair in self._pairs for body in (pair.body, pair.other) if body is not None]
+        bodies = list({id(body): body for body in all_bodies}.values())
+        tree_of = {id(body): tree for tree, body in enumerate(bodies)}
+        numbers, figures = [], np.zeros((len(self._pairs), 13))
+        for row, pair in zip(figures, self._pairs, strict=True):
+            other = pair.other or pair.body
+            on_link = pair.other.link if pair.other and pair.other.link != SUPPORT_FRAME else 0
+            trees = tree_of[id(pair.body)], tree_of[id(other)]
+            numbers.append((trees[0], pair.body.link, pair.kind, trees[1], other.link, on_link))
+            row[0], row[1:7] = pair.required_mm, pair.reach_mm
+            row[7 : 7 + len(pair.figures)] = pair.figures
+        return Model(
+            inverse(self._around.base_from_support),
+            np.column_stack([joint_origins_mm(self._arm), axis_senses(self._arm), JOINT_AXES]),
+            *forest_of([body.balls for body in bodies]),
+            np.array(numbers),
+            figures,
         )
-        return distance
-
-    def _to_object(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Smallest distance [n] of points [n, m, 3] to the object's surface points (far away: to its box)."""
-        flat = points.reshape(-1, 3)
-        distance = _to_box(flat, *self._box)
-        near = distance < _FAR_MM
-        if near.any():
-            distance[near] = self._tree.query(flat[near])[0]
-        least: NDArray[np.float64] = distance.reshape(points.shape[:-1]).min(axis=-1)
-        return least
-
-
-def _axis_points(capsule: Capsule) -> NDArray[np.float64]:
-    start, end = np.array(capsule.start_mm, dtype=float), np.array(capsule.end_mm, dtype=float)
-    count = int(np.ceil(np.linalg.norm(end - start) / AXIS_STEP_MM)) + 1
-    points: NDArray[np.float64] = start + np.linspace(0, 1, count)[:, None] * (end - start)
-    return points
-
-
-def _axis_slack(capsule: Capsule) -> float:
-    """How much closer than its axis points a capsule's axis can be, mm."""
-    points = _axis_points(capsule)
-    return float(np.linalg.norm(points[1] - points[0]) / 2) if len(points) > 1 else 0.0
-
-
-def _to_box(
-    points: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Distance [...] of points [..., 3] to an axis-parallel box; negative inside."""
-    beyond = np.maximum(low - points, points - high)
-    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
-    distance: NDArray[np.float64] = np.where(outside > 0, outside, beyond.max(axis=-1))
-    return distance
-
-
-def surface_points(corners_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points [n, 3] on a mesh of corners [triangles, 3, 3], so dense that no point of its surface is farther than
-    MESH_STEP_MM from one of them."""
-    edge_mm, cell_mm = MESH_STEP_MM, MESH_STEP_MM / 3
-    triangles = corners_mm
-    done = []
-    while len(triangles):
-        edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
-        fine = edges <= edge_mm
-        done.append(triangles[fine].reshape(-1, 3))
-        a, b, c = np.moveaxis(triangles[~fine], 1, 0)
-        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-        triangles = np.concatenate(
-            [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-        )
-    points = np.concatenate(done) if done else np.zeros((0, 3))
-    _, first = np.unique(np.floor(points / cell_mm).astype(np.int64), axis=0, return_index=True)
-    kept: NDArray[np.float64] = points[first]
-    return kept

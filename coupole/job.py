@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,9 @@ from coupole.geometry import apply
 from coupole.itinerary import Itinerary, bodies_of, plan_itinerary
 from coupole.plan import MeasuredObject, Plan
 from coupole.preflight import Report, StorageFacts, check
-from coupole.rig import Rig, driver_problems
+from coupole.rig import Rig, driver_problems, planning_arm
 from coupole.run import Inputs
+from coupole.shadow import Shadow, Shadows, shadows_of
 from coupole.shots import Schedule, ViewPose, build_schedule, missing_lights
 from coupole.store import measure_write_speed
 from coupole.yamlfile import Document
@@ -60,6 +61,8 @@ class Job:
     object_points_support_mm: NDArray[np.float64]
     """[n, 3] corners and centre of the object's bounding box, or the views' targets: where dose is reckoned."""
     schedule: Schedule
+    hidden_leds: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    """LEDs that were left out of views, by name of view."""
     _planned: list[tuple[tuple[str, ...], Sequence[float], Itinerary]] = field(default_factory=list, repr=False)
 
     def itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
@@ -69,9 +72,37 @@ class Job:
         for planned_names, planned_deg, itinerary in self._planned:
             if planned_names == names and np.allclose(planned_deg, start_deg, rtol=0, atol=_SAME_PLACE_DEG):
                 return itinerary
-        itinerary = plan_itinerary(views, self.cell.rig, self.bodies, start_deg)
+        itinerary = plan_itinerary(views, self.cell.rig, self.bodies, start_deg, self.plan.order)
         self._planned.append((names, tuple(start_deg), itinerary))
         return itinerary
+
+    def without_hidden(self, known: Mapping[str, Sequence[int]] | None = None) -> Job:
+        """Where the plan wants hidden lights skipped: the same job without the LEDs that reach nothing of what a
+        view sees; those that are `known`, if a run began without them, else as ways from home place the arm."""
+        if self.plan.hidden_lights != "skip":
+            return self
+        hidden = dict(known) if known is not None else self._hidden_from_home()
+        return replace(self, schedule=self.schedule.without(hidden), hidden_leds=hidden)
+
+    def _hidden_from_home(self) -> dict[str, list[int]]:
+        itinerary = self.itinerary(self.schedule.views, self.cell.rig.motion.home_joints_deg)
+        lit = {int(led) for burst in self.schedule.bursts[0] for led in burst.table["led"]}
+        hidden: dict[str, list[int]] = {}
+        for view, visit in zip(self.schedule.views, itinerary.visits, strict=True):
+            useless = self.useless_leds(self.shadows.at(visit.joints_deg)) if visit else []
+            if leds := [led for led in useless if led in lit]:
+                hidden[view.name] = leds
+        return hidden
+
+    def useless_leds(self, shadow: Shadow) -> list[int]:
+        """Ids of the LEDs that reach nothing of what a view sees."""
+        return [int(led) for led in self.cell.leds.ids[shadow.useless()]]
+
+    @cached_property
+    def shadows(self) -> Shadows:
+        """What the object, and in each posture arm and tool, hide of the LEDs."""
+        targets = [view.target_mm for view in self.schedule.views if view.target_mm is not None]
+        return shadows_of(self.cell.rig, self.cell.leds, self.object_corners_mm, targets or [(0.0, 0.0, 0.0)])
 
     @cached_property
     def bodies(self) -> CellBodies:
@@ -225,9 +256,9 @@ def check_job(job: Job, storage: StorageFacts, *, paths: bool = True, share_left
     if paths:
         itinerary = job.itinerary(job.schedule.views, home_deg)
     else:
-        itinerary = plan_itinerary(job.schedule.views, rig, None, home_deg)
+        itinerary = plan_itinerary(job.schedule.views, rig, None, home_deg, job.plan.order)
     before = ledger.total_lux_h(job.cell.storage_folder, job.plan.object.id) if job.plan.object else 0.0
-    return check(
+    report = check(
         job.plan,
         job.cell.rig,
         job.schedule,
@@ -238,3 +269,7 @@ def check_job(job: Job, storage: StorageFacts, *, paths: bool = True, share_left
         dose_before_lux_h=before,
         share_left=share_left,
     )
+    if planning_arm(rig) is None:
+        why = "no model of this arm's links: whether it touches anything cannot be told"
+        report.refusals.insert(0, f"robot {rig.robot.driver}: {why}")
+    return report

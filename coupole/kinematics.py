@@ -110,14 +110,13 @@ def forward(arm: Arm, joints_deg: ArrayLike) -> Transform:
     return base_from_flange
 
 
-def link_frames(arm: Arm, joints_deg: ArrayLike) -> NDArray[np.float64]:
-    """`base_from_link` [..., 8, 4, 4] of joint angles [..., 6]: base, the six links, the flange.
+JOINT_AXES = (2, 1, 1, 0, 1, 0)
+"""About which axis of its link's frame (0 x, 1 y, 2 z) each joint turns."""
 
-    A link's frame lies in its joint and, with all angles 0 (the arm stretched out along x), parallel to the base;
-    the flange's is that of `forward`. These are the frames of the vendor's link meshes (facts/robot.md).
-    """
-    joints = np.radians(np.where(arm.flip_axes, -1.0, 1.0) * np.asarray(joints_deg, dtype=np.float64))
-    origins_mm = (
+
+def joint_origins_mm(arm: Arm) -> tuple[tuple[float, float, float], ...]:
+    """Where each joint lies in the frame of the link before it."""
+    return (
         (0.0, arm.b_mm, arm.c1_mm),
         (arm.a1_mm, 0.0, 0.0),
         (arm.c2_mm, 0.0, 0.0),
@@ -125,12 +124,26 @@ def link_frames(arm: Arm, joints_deg: ArrayLike) -> NDArray[np.float64]:
         (arm.c3_mm, 0.0, 0.0),
         (arm.c4_mm, 0.0, 0.0),
     )
+
+
+def axis_senses(arm: Arm) -> Six:
+    """1 for each axis that turns right-handed about its JOINT_AXES, -1 for the others."""
+    return tuple(-1.0 if flipped else 1.0 for flipped in arm.flip_axes)
+
+
+def link_frames(arm: Arm, joints_deg: ArrayLike) -> NDArray[np.float64]:
+    """`base_from_link` [..., 8, 4, 4] of joint angles [..., 6]: base, the six links, the flange.
+
+    A link's frame lies in its joint and, with all angles 0 (the arm stretched out along x), parallel to the base;
+    the flange's is that of `forward`. These are the frames of the vendor's link meshes (facts/robot.md).
+    """
+    joints = np.radians(np.array(axis_senses(arm)) * np.asarray(joints_deg, dtype=np.float64))
     frames = np.zeros((*joints.shape[:-1], 8, 4, 4))
     frames[..., 0, :, :] = np.eye(4)
-    for k, (origin_mm, axis) in enumerate(zip(origins_mm, "zyyxyx", strict=True)):
+    for k, (origin_mm, axis) in enumerate(zip(joint_origins_mm(arm), JOINT_AXES, strict=True)):
         step = np.zeros((*joints.shape[:-1], 4, 4))
         c, s = np.cos(joints[..., k]), np.sin(joints[..., k])
-        i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+        i, j = (axis + 1) % 3, (axis + 2) % 3
         step[..., range(4), range(4)] = 1.0
         step[..., i, i], step[..., j, j], step[..., i, j], step[..., j, i] = c, c, -s, s
         step[..., :3, 3] = origin_mm
@@ -216,24 +229,35 @@ def unreachable_reason(arm: Arm, base_from_flange: Transform) -> str:
 
 
 def move_duration_s(arm: Arm, from_joints_deg: ArrayLike, to_joints_deg: ArrayLike) -> float:
-    """Duration of the jerk-limited motion from rest to rest on a straight line in joint space, as fast as the
-    axis that limits it allows: the profile that the driver runs (some 10 us a call).
-    """
-    from ruckig import InputParameter, Ruckig, Trajectory
+    """`move_durations_s` of one motion."""
+    return float(move_durations_s(arm, from_joints_deg, to_joints_deg))
 
+
+def move_durations_s(arm: Arm, from_joints_deg: ArrayLike, to_joints_deg: ArrayLike) -> NDArray[np.float64]:
+    """Durations [...] of jerk-limited motions from rest to rest on straight lines in joint space [..., 6], as fast
+    as the axes that limit them allow: the profile that the driver runs.
+
+    The profile is symmetric: speed is gained for `ramp_s`, kept, and lost as it was gained. A distance d at the
+    highest speed v then takes d / v + ramp_s(v), with ramp_s(v) = v / a + a / j where the acceleration a is
+    reached and 2 sqrt(v / j) where it is not (Biagiotti, Melchiorri, "Trajectory Planning for Automatic Machines
+    and Robots", 2008, sec. 3.4). Distances count in whole motions: d is 1.
+    """
     way_deg = np.abs(np.asarray(to_joints_deg, dtype=np.float64) - np.asarray(from_joints_deg))
-    moved = way_deg > 0
-    if not moved.any():
-        return 0.0
-    motion = InputParameter(1)
-    motion.current_position, motion.target_position = [0.0], [1.0]
-    motion.max_velocity, motion.max_acceleration, motion.max_jerk = (
-        [float(np.min(np.array(limits)[moved] / way_deg[moved]))]
+    share_of_deg = 1.0 / np.maximum(way_deg, 1e-9)
+    v_most, a_most, j_most = (
+        np.min(np.array(limits) * share_of_deg, axis=-1)
         for limits in (arm.velocity_deg_s, arm.acceleration_deg_s2, arm.jerk_deg_s3)
     )
-    trajectory = Trajectory(1)
-    Ruckig(1).calculate(motion, trajectory)
-    return float(trajectory.duration)
+    ramp_of_jerk_s = a_most / j_most
+    v_reached = np.where(
+        j_most**2 >= 2.0 * a_most**3,
+        (np.sqrt(ramp_of_jerk_s**2 + 4.0 / a_most) - ramp_of_jerk_s) * a_most / 2.0,
+        np.cbrt(j_most / 4.0),
+    )
+    v = np.minimum(v_most, v_reached)
+    ramp_s = np.where(v >= a_most * ramp_of_jerk_s, v / a_most + ramp_of_jerk_s, 2.0 * np.sqrt(v / j_most))
+    durations_s: NDArray[np.float64] = np.where(way_deg.max(axis=-1) > 0.0, 1.0 / v + ramp_s, 0.0)
+    return durations_s
 
 
 def _stack(rows: tuple[tuple[Any, ...], ...]) -> NDArray[np.float64]:

@@ -1,9 +1,8 @@
-"""Ways of the arm between views that touch nothing, and the postures that make them short.
+"""Ways of the arm between places that touch nothing.
 
 A *leg* brings the arm from one view to the next: straight in joint space where that is clear, else over via
 points, else along a path that RRT-Connect finds (Kuffner, LaValle 2000: two trees that grow towards each
-other), shortened afterwards. Postures (which of the arm's solutions) are chosen for all views together, by
-dynamic programming over the time of the legs.
+other), shortened afterwards. Where even that finds none it goes over a resting place that both ends know a way to.
 """
 
 from __future__ import annotations
@@ -16,15 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.collisions import CellBodies, Contact
-from coupole.kinematics import Arm, move_duration_s
+from coupole.kinematics import Arm, move_durations_s
 
 Joints = NDArray[np.float64]
 
 _RRT_STEP_DEG = 15.0
 _RRT_NODES = 600
 _SHORTCUTS = 40
-_SETTLED_ROUNDS = 12
-_NO_WAY_S = 1e6
+NO_WAY_S = 1e6
 
 
 @dataclass(frozen=True)
@@ -38,60 +36,94 @@ class Leg:
 
 
 class PathPlanner:
-    """Legs among the cell's bodies, remembered; without bodies every straight motion is taken as clear."""
+    """Legs among the cell's bodies, remembered; without bodies every straight motion is taken as clear.
+
+    The way back is the way there reversed, and what is found does not depend on what was asked before.
+    """
 
     def __init__(
         self, arm: Arm, bodies: CellBodies | None, vias_deg: Sequence[Sequence[float]], seed: int = 1
     ) -> None:
-        self._arm, self._bodies = arm, bodies
+        self._arm, self._bodies, self._seed = arm, bodies, seed
         self._vias = [np.asarray(via, dtype=np.float64) for via in vias_deg]
-        self._random = np.random.default_rng(seed)
-        self._legs: dict[tuple[bytes, bytes], Leg] = {}
+        self._straight: dict[tuple[bytes, bytes], bool] = {}
+        self._chains: dict[tuple[bytes, bytes], list[Joints] | Contact] = {}
+        self._from_via: dict[tuple[int, bytes], list[Joints] | None] = {}
 
-    def free(self, joints_deg: Joints) -> bool:
-        """True if the arm touches nothing there."""
-        return self._bodies is None or not self._bodies.contacts(joints_deg)
+    def straight_s(self, places_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Times [n, n] of straight motions between places [n, 6], clear or not; lower bounds of the legs'."""
+        return move_durations_s(self._arm, places_deg[:, None], places_deg)
 
-    def contact(self, joints_deg: Joints) -> Contact | None:
-        """What is nearest of what comes too close there."""
-        contacts = self._bodies.contacts(joints_deg) if self._bodies else []
-        return contacts[0] if contacts else None
-
-    def straight_s(self, start: Joints, goal: Joints) -> float:
-        """Time of the straight motion, clear or not; a lower bound of the leg's."""
-        return move_duration_s(self._arm, start, goal)
+    def is_straight(self, start: Joints, goal: Joints) -> bool:
+        """True if nothing is in the way of the straight motion."""
+        a, b = _sorted(start, goal)
+        key = (a.tobytes(), b.tobytes())
+        if key not in self._straight:
+            self._straight[key] = self._clear(a, b)
+        return self._straight[key]
 
     def leg(self, start: Joints, goal: Joints) -> Leg:
         """The way from one place to another."""
-        key = (start.tobytes(), goal.tobytes())
-        if key not in self._legs:
-            self._legs[key] = self._find(start, goal)
-        return self._legs[key]
+        a, b = _sorted(start, goal)
+        key = (a.tobytes(), b.tobytes())
+        if key not in self._chains:
+            self._chains[key] = self._find(a, b)
+        found = self._chains[key]
+        if isinstance(found, Contact):
+            return Leg((), NO_WAY_S, found)
+        chain = found if a is start else found[::-1]
+        return Leg(tuple(chain[1:]), self._chain_s(chain))
 
-    def _find(self, start: Joints, goal: Joints) -> Leg:
-        contact = self._blocked(start, goal)
-        if contact is None:
-            return Leg((goal,), self.straight_s(start, goal))
+    def _find(self, start: Joints, goal: Joints) -> list[Joints] | Contact:
+        """Places [k] from start to goal, straight motions between which are clear, or what is in the way."""
+        if self.is_straight(start, goal):
+            return [start, goal]
         for place in (start, goal):
-            if (at := self.contact(place)) is not None:
-                return Leg((), _NO_WAY_S, at)
-        best: list[Joints] | None = None
+            if self._bodies is not None and (contacts := self._bodies.contacts(place)):
+                return contacts[0]
+        chain = self._over_vias(start, goal)
+        if chain is None and not (self._is_cut_off(start) or self._is_cut_off(goal)):
+            chain = self._rrt_connect(start, goal) or self._over_resting_place(start, goal)
+        if chain is not None:
+            return self._shortened(chain)
+        assert self._bodies is not None
+        contact = self._bodies.contact_on_the_way(start, goal)
+        assert contact is not None
+        return contact
+
+    def _over_vias(self, start: Joints, goal: Joints) -> list[Joints] | None:
         for vias in self._via_chains(start, goal):
             chain = [start, *vias, goal]
-            if all(self._blocked(a, b) is None for a, b in pairwise(chain)):
-                best = chain
-                break
-        best = best or self._rrt_connect(start, goal)
-        if best is None:
-            return Leg((), _NO_WAY_S, contact)
-        short = self._shortened(best)
-        return Leg(tuple(short[1:]), self._chain_s(short))
+            if all(self._clear(a, b) for a, b in pairwise(chain)):
+                return chain
+        return None
 
-    def _blocked(self, a: Joints, b: Joints) -> Contact | None:
-        return self._bodies.contact_on_the_way(a, b) if self._bodies else None
+    def _over_resting_place(self, start: Joints, goal: Joints) -> list[Joints] | None:
+        for number in range(len(self._vias)):
+            there, on = (self._way_from_via(number, place) for place in (start, goal))
+            if there is not None and on is not None:
+                return there[::-1] + on[1:]
+        return None
+
+    def _is_cut_off(self, place: Joints) -> bool:
+        """True if no way leads there from any resting place, as far as was searched."""
+        found = [self._from_via.get((number, place.tobytes()), [place]) for number in range(len(self._vias))]
+        return bool(found) and all(way is None for way in found)
+
+    def _way_from_via(self, number: int, place: Joints) -> list[Joints] | None:
+        """From a resting place to another place; searched once."""
+        key = (number, place.tobytes())
+        if key not in self._from_via:
+            via = self._vias[number]
+            straight = [via, place] if self._clear(via, place) else None
+            self._from_via[key] = straight or self._rrt_connect(via, place)
+        return self._from_via[key]
+
+    def _clear(self, a: Joints, b: Joints) -> bool:
+        return self._bodies is None or self._bodies.is_clear(a, b)
 
     def _chain_s(self, chain: Sequence[Joints]) -> float:
-        return sum(self.straight_s(a, b) for a, b in pairwise(chain))
+        return float(move_durations_s(self._arm, chain[:-1], chain[1:]).sum())
 
     def _via_chains(self, start: Joints, goal: Joints) -> list[list[Joints]]:
         """Via points to try: a resting place of the arm, reached and left with axis 1 where start and goal have
@@ -106,13 +138,14 @@ class PathPlanner:
     # -- RRT-Connect --------------------------------------------------------------------------------------
 
     def _rrt_connect(self, start: Joints, goal: Joints) -> list[Joints] | None:
+        random = np.random.default_rng([self._seed, *np.frombuffer(np.concatenate([start, goal]), np.uint32)])
         low, high = np.array(self._arm.limits_deg).T
         low, high = np.maximum(low, np.minimum(start, goal) - 120), np.minimum(high, np.maximum(start, goal) + 120)
         trees: tuple[list[Joints], list[Joints]] = ([start], [goal])
         parents: tuple[list[int], list[int]] = ([-1], [-1])
         grow = 0
         while len(trees[0]) + len(trees[1]) < _RRT_NODES:
-            target = self._random.uniform(low, high)
+            target = random.uniform(low, high)
             reached = self._extend(trees[grow], parents[grow], target, greedy=False)
             if reached is not None:
                 place = trees[grow][reached]
@@ -134,7 +167,7 @@ class PathPlanner:
             if distance == 0.0:
                 return node
             there = target if distance <= _RRT_STEP_DEG else tree[node] + away * (_RRT_STEP_DEG / distance)
-            if self._blocked(tree[node], there) is not None:
+            if not self._clear(tree[node], there):
                 return reached
             tree.append(there)
             parents.append(node)
@@ -144,24 +177,30 @@ class PathPlanner:
 
     def _shortened(self, chain: list[Joints]) -> list[Joints]:
         """Leave out via points that are not needed, then cut corners at random."""
+        random = np.random.default_rng(self._seed)
         chain = list(chain)
         i = 0
         while i + 2 < len(chain):
             for j in range(len(chain) - 1, i + 1, -1):
-                if self._blocked(chain[i], chain[j]) is None:
+                if self._clear(chain[i], chain[j]):
                     del chain[i + 1 : j]
                     break
             i += 1
         for _ in range(_SHORTCUTS if len(chain) > 2 else 0):
-            i = int(self._random.integers(1, len(chain) - 1))
+            i = int(random.integers(1, len(chain) - 1))
             before, here, after = chain[i - 1 : i + 2]
-            a, b = self._random.uniform(0.2, 0.9, 2)
+            a, b = random.uniform(0.2, 0.9, 2)
             corner = [before + a * (here - before), here + (1 - b) * (after - here)]
             if self._chain_s([before, *corner, after]) < self._chain_s([before, here, after]) and all(
-                self._blocked(p, q) is None for p, q in pairwise([before, *corner, after])
+                self._clear(p, q) for p, q in pairwise([before, *corner, after])
             ):
                 chain[i : i + 1] = corner
         return chain
+
+
+def _sorted(a: Joints, b: Joints) -> tuple[Joints, Joints]:
+    """The two places in an order that does not depend on which comes first."""
+    return (b, a) if a.tobytes() > b.tobytes() else (a, b)
 
 
 def _branch(tree: list[Joints], parents: list[int], node: int) -> list[Joints]:
@@ -171,67 +210,3 @@ def _branch(tree: list[Joints], parents: list[int], node: int) -> list[Joints]:
         places.append(tree[node])
         node = parents[node]
     return places[::-1]
-
-
-# -- postures and order -----------------------------------------------------------------------------------
-
-
-def choose_postures(
-    planner: PathPlanner, start: Joints, choices: Sequence[NDArray[np.float64]]
-) -> list[tuple[Joints, Leg]]:
-    """One posture for each view (from `choices` [k, 6] each) and the legs between, shortest in all.
-
-    Legs are taken as straight until one is used; then its true time counts, and the choice is made again, until
-    nothing changes. Where no way is found the leg says so.
-    """
-    if not choices:
-        return []
-    true_s: dict[tuple[int, int, int], float] = {}
-    straight = _straight_times(planner, start, choices)
-    picked: list[int] = []
-    for _ in range(_SETTLED_ROUNDS):
-        picked = _shortest_chain(straight, true_s, choices)
-        places = [start] + [choices[v][k] for v, k in enumerate(picked)]
-        news = False
-        for view, (a, b) in enumerate(pairwise(places)):
-            key = (view, picked[view - 1] if view else 0, picked[view])
-            leg = planner.leg(a, b)
-            news |= key not in true_s and leg.duration_s > straight[view][key[1], key[2]] + 1e-9
-            true_s[key] = leg.duration_s
-        if not news:
-            break
-    places = [start] + [choices[v][k] for v, k in enumerate(picked)]
-    return [(b, planner.leg(a, b)) for a, b in pairwise(places)]
-
-
-def _straight_times(
-    planner: PathPlanner, start: Joints, choices: Sequence[NDArray[np.float64]]
-) -> list[NDArray[np.float64]]:
-    """For each view times [postures before, postures] of straight motions."""
-    before: NDArray[np.float64] = start[None]
-    times = []
-    for postures in choices:
-        times.append(np.array([[planner.straight_s(a, b) for b in postures] for a in before]))
-        before = postures
-    return times
-
-
-def _shortest_chain(
-    straight: Sequence[NDArray[np.float64]],
-    true_s: dict[tuple[int, int, int], float],
-    choices: Sequence[NDArray[np.float64]],
-) -> list[int]:
-    total = np.zeros(1)
-    came_from: list[NDArray[np.int64]] = []
-    for view, straight_s in enumerate(straight):
-        times = straight_s.copy()
-        for (v, a, b), seconds in true_s.items():
-            if v == view:
-                times[a, b] = seconds
-        costs = total[:, None] + times
-        came_from.append(np.argmin(costs, axis=0))
-        total = costs.min(axis=0)
-    picked = [int(np.argmin(total))]
-    for back in came_from[:0:-1]:
-        picked.append(int(back[picked[-1]]))
-    return picked[::-1]

@@ -184,8 +184,13 @@ class Plan(Model):
     optics: Optics = Optics()
     calibrations: Literal["none"] | tuple[Path, ...] = "none"
     views: Annotated[tuple[View, ...], Field(min_length=1)]
+    order: Literal["fastest", "as_written"] = "fastest"
+    """In which order the views are visited: on the shortest way, or as they stand here."""
     lights: Lights
     repeats: Annotated[int, Field(ge=1, le=1000)] = 1
+    hidden_lights: Literal["mark", "skip"] = "mark"
+    """What becomes of LEDs that arm, camera or object hide from all that a view sees: taken and marked, or left
+    out."""
     exposure: Exposures
     gain_db: Annotated[float, Field(ge=0, le=42)] = 0.0
     darks_per_view: Annotated[int, Field(ge=0, le=1000)] = 2

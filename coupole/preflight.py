@@ -54,6 +54,7 @@ class Report:
     """What will happen, and why it must not, if it must not."""
 
     views: list[ViewReport] = field(default_factory=list)
+    """In the order in which they are visited; those that cannot be come last."""
     shots: int = 0
     frames: int = 0
     bytes: int = 0
@@ -94,7 +95,7 @@ def check(
     report.refusals += _refuse_optics(plan, rig)
     report.refusals += _refuse_on_times(schedule.bursts[0], rig.led_limits)
     _time_and_dose(report, plan, rig, schedule, itinerary, leds, object_points_support_mm, share_left)
-    _thermal(report, rig.led_limits, schedule, leds)
+    _thermal(report, rig.led_limits, [schedule.bursts[index] for index in _order(itinerary)], leds)
     _storage(report, rig, schedule, storage)
     return report
 
@@ -131,6 +132,11 @@ def _refuse_on_times(bursts: Sequence[Burst], limits: LedLimits) -> list[str]:
     return refusals
 
 
+def _order(itinerary: Itinerary) -> list[int]:
+    """Views as they are visited, then those that cannot be."""
+    return [*itinerary.order, *sorted(set(range(len(itinerary.visits))) - set(itinerary.order))]
+
+
 def upload_s(burst: Burst, baud: int) -> float:
     """Time to bring a burst's table into the box over a serial line."""
     return STEP_BYTES * len(burst.table) * BITS_PER_BYTE / baud + UPLOAD_OVERHEAD_S if baud else 0.0
@@ -152,7 +158,8 @@ def _time_and_dose(
     dose_of_table: dict[int, NDArray[np.float64]] = {}
     total = np.zeros(len(points_support_mm))
     baud = int(rig.ledbox.settings.get("baud", 115_200))
-    for view, visit, bursts in zip(schedule.views, itinerary.visits, schedule.bursts, strict=True):
+    for index in _order(itinerary):
+        view, visit, bursts = schedule.views[index], itinerary.visits[index], schedule.bursts[index]
         move_s = (visit.leg.duration_s if visit and visit.leg.waypoints else 0.0) + rig.motion.settle_dwell_s
         burst_s = sum(b.duration_s for b in bursts)
         dose = np.zeros(len(total))
@@ -187,8 +194,10 @@ def _time_and_dose(
         )
 
 
-def _thermal(report: Report, limits: LedLimits, schedule: Schedule, leds: LedTable) -> None:
-    """Board temperatures (first order) and rest of each LED, over all bursts, moves left out (they only cool)."""
+def _thermal(
+    report: Report, limits: LedLimits, bursts_of_views: Sequence[Sequence[Burst]], leds: LedTable
+) -> None:
+    """Board temperatures (first order) and rest of each LED, over the bursts of the report's views."""
     model = limits.board
     board_of_led = dict(zip(leds.ids.tolist(), leds.boards.tolist(), strict=True))
     n_boards = int(leds.boards.max()) + 1
@@ -197,7 +206,7 @@ def _thermal(report: Report, limits: LedLimits, schedule: Schedule, leds: LedTab
     peak = 0.0
     rest_refused = False
     t_s = 0.0
-    for bursts, view in zip(schedule.bursts, report.views, strict=True):
+    for bursts, view in zip(bursts_of_views, report.views, strict=True):
         rise *= np.exp(-view.move_s / model.time_constant_s)
         t_s += view.move_s
         for burst in bursts:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from coupole.geometry import abc_from_rotation, transform
@@ -14,11 +16,13 @@ from coupole.kinematics import (
     limit_margin_deg,
     limit_violations,
     move_duration_s,
+    move_durations_s,
     nearest,
     slowed,
     unreachable_reason,
     within_limits,
 )
+from coupole.singularities import distances, margin, reason, unease
 from sim.kuka_kinematics import flange_pose
 
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
@@ -124,3 +128,76 @@ def test_a_long_motion_takes_as_long_as_its_slowest_axis() -> None:
 
 def test_a_motion_to_where_the_arm_is_takes_no_time() -> None:
     assert move_duration_s(KR10_R1100_SIXX, HOME_DEG, HOME_DEG) == 0.0
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_motion_takes_as_long_as_ruckigs(seed: int) -> None:
+    from ruckig import InputParameter, Ruckig, Trajectory
+
+    random = np.random.default_rng(seed)
+    arm = slowed(
+        KR10_R1100_SIXX,
+        speed_fraction=random.uniform(0.01, 1.0),
+        acceleration_deg_s2=10 ** random.uniform(1, 4),
+        jerk_deg_s3=10 ** random.uniform(1.5, 5),
+    )
+    way_deg = random.uniform(-1, 1, 6) * 10 ** random.uniform(-3, 2.2)
+    motion = InputParameter(1)
+    motion.current_position, motion.target_position = [0.0], [1.0]
+    motion.max_velocity, motion.max_acceleration, motion.max_jerk = (
+        [float(np.min(np.array(limits) / np.abs(way_deg)))]
+        for limits in (arm.velocity_deg_s, arm.acceleration_deg_s2, arm.jerk_deg_s3)
+    )
+    trajectory = Trajectory(1)
+    Ruckig(1).calculate(motion, trajectory)
+    assert move_duration_s(arm, np.array(HOME_DEG), HOME_DEG + way_deg) == pytest.approx(
+        trajectory.duration, rel=1e-9
+    )
+
+
+def test_durations_of_many_motions_are_those_of_each() -> None:
+    places = random_joints_deg(5, seed=8)
+    table_s = move_durations_s(KR10_R1100_SIXX, places[:, None], places)
+    assert table_s.shape == (5, 5)
+    assert table_s[1, 3] == move_duration_s(KR10_R1100_SIXX, places[1], places[3])
+    assert np.array_equal(np.diag(table_s), np.zeros(5))
+
+
+# ------------------------------------------------------------------------------------------- singularities
+
+
+def jacobian(joints_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[6, 6] of the flange's position (m) and orientation by the axes (rad), by differences."""
+    columns = []
+    for axis in range(6):
+        step = np.zeros(6)
+        step[axis] = 1e-5
+        before, after = (forward(KR10_R1100_SIXX, joints_deg + way * np.degrees(step)) for way in (-1, 1))
+        turn = after[:3, :3] @ before[:3, :3].T
+        spin = np.array((turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])) / 2
+        columns.append(np.concatenate([(after - before)[:3, 3] / 1000, spin]) / 2e-5)
+    return np.array(columns).T
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_jacobians_determinant_is_the_product_of_the_distances_from_singularities(seed: int) -> None:
+    joints_deg = random_joints_deg(1, seed)[0]
+    wrist_deg, elbow_deg, shoulder_mm = distances(KR10_R1100_SIXX, joints_deg)
+    upper_m, fore_m = 0.560, np.hypot(0.515, 0.035)
+    product = (
+        upper_m * fore_m * abs(np.sin(np.radians(wrist_deg)) * np.sin(np.radians(elbow_deg)) * shoulder_mm / 1000)
+    )
+    assert abs(np.linalg.det(jacobian(joints_deg))) == pytest.approx(product, abs=1e-6)
+
+
+def test_a_posture_well_away_from_singularities_has_no_reason_against_it() -> None:
+    assert reason(KR10_R1100_SIXX, HOME_DEG) == ""
+    assert margin(KR10_R1100_SIXX, HOME_DEG) > 1.0
+
+
+def test_a_posture_is_the_less_easy_the_nearer_it_is_to_a_singularity_or_a_limit() -> None:
+    postures = np.array([HOME_DEG, (0, -90, 90, 0, 8, 0), (0, -90, 90, 0, 5, 0), (0, -90, 90, 0, 118, 0)])
+    easy, near, nearest_, limited = unease(KR10_R1100_SIXX, postures)
+    assert easy == 0.0
+    assert 0.0 < near < nearest_ == 1.0
+    assert limited == pytest.approx(0.8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -72,7 +73,8 @@ def checked(
     rig = rig or rig_of()
     schedule = schedule_of(plan, rig, leds)
     bodies = bodies_of(rig, DOME, NO_OBJECT)
-    itinerary = plan_itinerary(schedule.views, rig, bodies, start_joints_deg or rig.motion.home_joints_deg)
+    start_deg = start_joints_deg or rig.motion.home_joints_deg
+    itinerary = plan_itinerary(schedule.views, rig, bodies, start_deg, plan.order)
     return check(plan, rig, schedule, leds, storage, itinerary, object_points_support_mm=points, **known)
 
 
@@ -284,10 +286,9 @@ def test_a_camera_inside_a_keep_out_is_refused_naming_view_part_and_volume() -> 
 
 
 def test_a_camera_that_grazes_the_support_is_refused_with_the_distance() -> None:
-    low = {**TOP, "name": "low", "target_mm": [200, 0, 40], "distance_mm": 200, "elevation_deg": 10}
+    low = {**TOP, "name": "low", "target_mm": [200, 0, 32], "distance_mm": 200, "elevation_deg": 9}
     refusal = only_refusal(checked(plan_of(views=[{**low, "azimuth_deg": 180}]), rig_of(keep_out=[])))
-    assert refusal.startswith("view low: ")
-    assert "the support; 10 mm must be kept" in refusal
+    assert re.fullmatch(r"view low: camera would be \d mm from the support; 10 mm must be kept", refusal)
 
 
 def test_a_camera_too_near_to_the_object_is_refused_with_the_distance() -> None:
@@ -311,6 +312,35 @@ def test_a_motion_that_would_touch_the_support_takes_another_way() -> None:
     assert visit is not None
     places = [start, *visit.leg.waypoints]
     assert all(bodies.contact_on_the_way(a, b) is None for a, b in pairwise(places))
+
+
+def three_views(order: str) -> Plan:
+    """From near to home, far away and back again."""
+    places = {"near": -60, "far": 60, "between": 0}
+    views = [{**TOP, "name": n, "azimuth_deg": azimuth, "elevation_deg": 45} for n, azimuth in places.items()]
+    return plan_of(views=views, order=order)
+
+
+def test_views_are_reported_in_the_order_in_which_they_are_visited() -> None:
+    as_written, fastest = (checked(three_views(order)) for order in ("as_written", "fastest"))
+    assert [view.name for view in as_written.views] == ["near", "far", "between"]
+    assert [view.name for view in fastest.views][1] == "between"
+    assert sum(view.move_s for view in fastest.views) < sum(view.move_s for view in as_written.views)
+
+
+def test_views_that_are_refused_are_reported_last() -> None:
+    far = {**TOP, "name": "far", "target_mm": [3000, 0, 0], "elevation_deg": 45}
+    report = checked(plan_of(views=[far, {**TOP, "elevation_deg": 80}]))
+    assert [view.name for view in report.views] == ["top", "far"]
+
+
+def test_an_led_rests_in_the_order_of_the_visits() -> None:
+    same = [{**PARK, "name": name} for name in ("first", "second")]
+    away = {**TOP, "name": "away", "azimuth_deg": 60, "elevation_deg": 45}
+    rig = rig_of(led_limits=limits(cooldown_ratio=100.0))
+    few = {"lights": {"kind": "ids", "ids": [5]}, "darks_per_view": 0, "views": [same[0], away, same[1]]}
+    assert checked(plan_of(order="as_written", **few), rig).refusals == []
+    assert "led0005/e0: LED 5 rests " in only_refusal(checked(plan_of(order="fastest", **few), rig))
 
 
 def test_a_name_that_stands_twice_is_refused_once() -> None:

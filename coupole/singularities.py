@@ -1,0 +1,84 @@
+"""Postures in which an axis would have to race for a small motion of the camera, and how far others are from them.
+
+An arm of this kind has three (Siciliano et al., "Robotics", 2009, sec. 3.3): the wrist stretched, so that axes 4
+and 6 turn about one line; the elbow stretched or folded, so that the arm cannot reach farther or nearer; and the
+wrist's centre on axis 1, which then may stand anyhow. Motions run straight in joint space and cross such places
+unharmed; views do not stay there, because what is corrected, or measured from the joints, loses its footing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coupole.kinematics import Arm, axis_senses, limit_margin_deg
+
+
+@dataclass(frozen=True)
+class KeptFrom:
+    """How far a view's posture stays from singularities."""
+
+    wrist_deg: float = 5.0
+    """Least angle of A5."""
+    elbow_deg: float = 5.0
+    """Least angle between upper arm and forearm, from stretched and from folded."""
+    shoulder_mm: float = 20.0
+    """Least distance of the wrist's centre from axis 1."""
+
+
+KEPT_FROM = KeptFrom()
+_AT_EASE = 3.0
+"""So many times the least distance from a singularity, a posture has no more to gain."""
+_AT_EASE_LIMIT_DEG = 10.0
+
+
+def distances(arm: Arm, joints_deg: ArrayLike) -> tuple[NDArray[np.float64], ...]:
+    """How far joint angles [..., 6] are from the wrist's (deg), the elbow's (deg) and the shoulder's (mm)
+    singularity, [...] each."""
+    joints = np.asarray(joints_deg, dtype=np.float64)
+    theta = np.radians(np.array(axis_senses(arm)) * joints - np.asarray(arm.offsets_deg))
+    wrist_deg = np.abs(joints[..., 4])
+    bend_deg = np.degrees(theta[..., 2] + np.arctan2(arm.a2_mm, arm.c3_mm))
+    elbow_deg = np.abs((bend_deg + 90.0) % 180.0 - 90.0)
+    s23, c23 = np.sin(theta[..., 1] + theta[..., 2]), np.cos(theta[..., 1] + theta[..., 2])
+    out_mm = arm.c2_mm * np.sin(theta[..., 1]) + arm.c3_mm * s23 + arm.a2_mm * c23 + arm.a1_mm
+    return wrist_deg, elbow_deg, np.hypot(out_mm, arm.b_mm)
+
+
+def margin(arm: Arm, joints_deg: ArrayLike, kept: KeptFrom = KEPT_FROM) -> NDArray[np.float64]:
+    """[...] how many times as far as it must be a posture [..., 6] is from the nearest singularity."""
+    wrist_deg, elbow_deg, shoulder_mm = distances(arm, joints_deg)
+    shares = (wrist_deg / kept.wrist_deg, elbow_deg / kept.elbow_deg, shoulder_mm / kept.shoulder_mm)
+    least: NDArray[np.float64] = np.minimum.reduce(shares)
+    return least
+
+
+def reason(arm: Arm, joints_deg: ArrayLike, kept: KeptFrom = KEPT_FROM) -> str:
+    """Which singularity a posture [6] is too near to, as a phrase for messages; empty if it is not."""
+    wrist_deg, elbow_deg, shoulder_mm = (float(distance) for distance in distances(arm, joints_deg))
+    if wrist_deg < kept.wrist_deg:
+        return (
+            f"the wrist would be stretched, with A5 {wrist_deg:.1f} deg from its singularity; "
+            f"{kept.wrist_deg:g} deg must be kept"
+        )
+    if elbow_deg < kept.elbow_deg:
+        return (
+            f"the elbow would be stretched or folded, with A3 {elbow_deg:.1f} deg from its singularity; "
+            f"{kept.elbow_deg:g} deg must be kept"
+        )
+    if shoulder_mm < kept.shoulder_mm:
+        return (
+            f"the wrist's centre would be {shoulder_mm:.1f} mm from axis 1, the shoulder's singularity; "
+            f"{kept.shoulder_mm:g} mm must be kept"
+        )
+    return ""
+
+
+def unease(arm: Arm, postures_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[k] 0 for postures [k, 6] well away from singularities and limits, up to 1 for those just allowed."""
+    from_singular = (_AT_EASE - margin(arm, postures_deg)) / (_AT_EASE - 1.0)
+    from_limit = 1.0 - limit_margin_deg(arm, postures_deg) / _AT_EASE_LIMIT_DEG
+    uneasy: NDArray[np.float64] = np.clip(np.maximum(from_singular, from_limit), 0.0, 1.0)
+    return uneasy

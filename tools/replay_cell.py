@@ -1,0 +1,180 @@
+"""The cell as python-fcl sees it: an independent check of motions that Coupole's own checker has called clear.
+
+Nothing of `coupole.kinematics`, `coupole.collisions` or `coupole.paths` is used (but the sizes of the arm's
+capsules, where its meshes are not at hand): the chain of joints is the data sheet's, profiles are ruckig's, bodies
+are triangle meshes and fcl's own shapes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import fcl
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from ruckig import InputParameter, Ruckig, Trajectory
+
+from coupole.bodies import ARM_CAPSULES, Capsule
+from coupole.job import Job
+from coupole.rig import KeepOutSphere
+
+STEP_S = 0.004
+JOINTS_MM = ((0, 0, 400), (25, 0, 0), (560, 0, 0), (0, 0, 35), (515, 0, 0), (80, 0, 0))
+AXES = ((0, 0, -1), (0, 1, 0), (0, 1, 0), (-1, 0, 0), (0, 1, 0), (-1, 0, 0))
+"""KR10 R1100 sixx: origins and axes of the joints with all angles 0."""
+_DISK_MM, _SHELL_MM = 50.0, 4
+FLANGE = 7
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Two bodies that overlap."""
+
+    body: str
+    other: str
+    joints_deg: tuple[float, ...]
+
+
+def link_poses(joints_deg: Floats) -> Floats:
+    """[n, 8, 4, 4] poses of the base, the six links and the flange, in the base's frame."""
+    poses = np.tile(np.eye(4), (len(joints_deg), 8, 1, 1))
+    for k, (origin_mm, axis) in enumerate(zip(JOINTS_MM, AXES, strict=True)):
+        step = np.tile(np.eye(4), (len(joints_deg), 1, 1))
+        step[:, :3, :3] = _rotations(np.array(axis, dtype=float), np.radians(joints_deg[:, k]))
+        step[:, :3, 3] = origin_mm
+        poses[:, k + 1] = poses[:, k] @ step
+    poses[:, FLANGE] = poses[:, 6]
+    poses[:, FLANGE, :3, :3] = (
+        poses[:, 6, :3, :3] @ _rotations(np.array((0.0, 1.0, 0.0)), np.array([np.pi / 2]))[0]
+    )
+    return poses
+
+
+def _rotations(axis: Floats, angles: Floats) -> Floats:
+    """[n, 3, 3] by Rodrigues' formula."""
+    cross = np.cross(np.eye(3), axis)
+    sines, cosines = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
+    rotations: Floats = np.eye(3) + sines * cross + (1.0 - cosines) * (cross @ cross)
+    return rotations
+
+
+def motion(job: Job, start_deg: Floats, goal_deg: Floats) -> Floats:
+    """[n, 6] the straight motion from rest to rest in steps of 4 ms, by ruckig."""
+    way_deg = goal_deg - start_deg
+    moved = np.abs(way_deg) > 0
+    if not moved.any():
+        return goal_deg[None]
+    asked = job.cell.rig.motion
+    top_deg_s = asked.speed_fraction * np.array((300, 225, 225, 381, 311, 492))
+    profile = InputParameter(1)
+    profile.current_position, profile.target_position = [0.0], [1.0]
+    profile.max_velocity = [float(np.min(top_deg_s[moved] / np.abs(way_deg[moved])))]
+    profile.max_acceleration = [asked.acceleration_deg_s2 / float(np.abs(way_deg).max())]
+    profile.max_jerk = [asked.jerk_deg_s3 / float(np.abs(way_deg).max())]
+    course = Trajectory(1)
+    Ruckig(1).calculate(profile, course)
+    times = np.append(np.arange(0.0, course.duration, STEP_S), course.duration)
+    shares = np.array([course.at_time(float(t))[0][0] for t in times])
+    return start_deg + shares[:, None] * way_deg
+
+
+class ReplayCell:
+    """A job's cell in fcl; `touches` says what overlaps."""
+
+    def __init__(self, job: Job, meshes: Path | None) -> None:
+        rig = job.cell.rig
+        self._support_from_base = np.linalg.inv(rig.support.base_from_support.matrix())
+        tool = [Capsule(body.name, FLANGE, body.from_mm, body.to_mm, body.radius_mm) for body in rig.tool]
+        links = _links_of_meshes(meshes) if meshes else _solids(ARM_CAPSULES)
+        self._moving = [*links, *_solids(tool)]
+        self._around = self._surroundings(job)
+        least_apart = 2 if meshes else 3  # fat capsules of next neighbours but one overlap by their making
+        self._own = [
+            (i, j)
+            for i, (_, link, _) in enumerate(self._moving)
+            for j, (_, other, _) in enumerate(self._moving[:i])
+            if abs(min(link, 6) - min(other, 6)) >= (least_apart if max(link, other) < FLANGE else 3)
+        ]
+
+    @staticmethod
+    def _surroundings(job: Job) -> list[tuple[str, Any]]:
+        rig = job.cell.rig
+        base_from_support = rig.support.base_from_support.matrix()
+        leds_mm = trimesh.transform_points(job.cell.leds.positions_mm, np.linalg.inv(base_from_support))
+        radius_mm = float(np.linalg.norm(leds_mm, axis=1).min())
+        top = float((leds_mm[:, 2] / np.linalg.norm(leds_mm, axis=1)).max())
+        shell = trimesh.creation.icosphere(subdivisions=_SHELL_MM, radius=radius_mm)
+        shell.update_faces((shell.vertices[shell.faces][..., 2] <= top * radius_mm).all(axis=1))
+        disk = fcl.Cylinder(rig.support.diameter_mm / 2, _DISK_MM)
+        around = [
+            ("the dome", fcl.CollisionObject(_bvh(shell.vertices, shell.faces))),
+            ("the support", fcl.CollisionObject(disk, fcl.Transform(np.array((0.0, 0.0, -_DISK_MM / 2))))),
+        ]
+        for keep_out in rig.keep_out:
+            if isinstance(keep_out, KeepOutSphere):
+                shape, center = fcl.Sphere(keep_out.radius_mm), np.array(keep_out.center_mm)
+            else:
+                low, high = np.array(keep_out.min_mm), np.array(keep_out.max_mm)
+                shape, center = fcl.Box(*(high - low)), (low + high) / 2
+            around.append((f"keep-out `{keep_out.name}`", fcl.CollisionObject(shape, fcl.Transform(center))))
+        if len(corners := job.object_corners_mm):
+            around.append(("the object", fcl.CollisionObject(_bvh(*_shared(corners)))))
+        return around
+
+    def touches(self, joints_deg: Floats) -> list[Touch]:
+        """What overlaps anywhere on [n, 6]; each pair once, where it does first."""
+        found: dict[tuple[str, str], Touch] = {}
+        for joints, links in zip(joints_deg, self._support_from_base @ link_poses(joints_deg), strict=True):
+            for _, link, solid in self._moving:
+                solid.setTransform(fcl.Transform(links[link][:3, :3], links[link][:3, 3]))
+            pairs = [
+                *((name, other, a, b) for name, link, a in self._moving if link for other, b in self._around),
+                *(
+                    (self._moving[i][0], self._moving[j][0], self._moving[i][2], self._moving[j][2])
+                    for i, j in self._own
+                ),
+            ]
+            for name, other, a, b in pairs:
+                if (name, other) not in found and fcl.collide(a, b, fcl.CollisionRequest(), fcl.CollisionResult()):
+                    found[name, other] = Touch(name, other, tuple(joints.tolist()))
+        return list(found.values())
+
+
+def _links_of_meshes(folder: Path) -> list[tuple[str, int, Any]]:
+    links = []
+    for link in range(7):
+        mesh: Any = trimesh.load(folder / (f"link_{link}.stl" if link else "base_link.stl"), force="mesh")
+        scale = 1000.0 if mesh.extents.max() < 10.0 else 1.0
+        solid = fcl.CollisionObject(_bvh(mesh.vertices * scale, mesh.faces))
+        links.append((f"link {link}" if link else "base", link, solid))
+    return links
+
+
+def _solids(capsules: Sequence[Capsule]) -> list[tuple[str, int, Any]]:
+    """Capsules as meshes."""
+    solids = []
+    for capsule in capsules:
+        start, end = np.array(capsule.start_mm, dtype=float), np.array(capsule.end_mm, dtype=float)
+        length = float(np.linalg.norm(end - start))
+        mesh = trimesh.creation.capsule(height=length, radius=capsule.radius_mm, count=[24, 24])
+        if length > 0:
+            mesh.apply_transform(trimesh.geometry.align_vectors((0, 0, 1), (end - start) / length))
+        solids.append((capsule.body, capsule.link, fcl.CollisionObject(_bvh(mesh.vertices + start, mesh.faces))))
+    return solids
+
+
+def _shared(corners: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    return corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+
+
+def _bvh(vertices: Floats, faces: NDArray[np.int64]) -> Any:
+    model = fcl.BVHModel()
+    model.beginModel(len(vertices), len(faces))
+    model.addSubModel(np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces))
+    model.endModel()
+    return model

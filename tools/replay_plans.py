@@ -1,0 +1,188 @@
+"""Random plans, checked by preflight; each that passes is replayed every 4 ms by an independent checker.
+
+    python tools/replay_plans.py [--plans 500] [--seed 1] [--meshes DIR] [--check-meshes]
+
+`--meshes` is a folder with the links' meshes (base_link.stl, link_1.stl to link_6.stl); without it the replay has
+meshes made of the arm's capsules. With `--check-meshes` preflight uses those meshes too. Prints one JSON line: how
+many plans passed, why the others were refused, how many places were looked at, and what touched what. Exits with 1
+if anything did.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from replay_cell import ReplayCell, Touch, motion
+
+from coupole.itinerary import Itinerary, bodies_of, plan_itinerary
+from coupole.job import Job, read_job
+from coupole.kinematics import KR10_R1100_SIXX
+
+ROOT = Path(__file__).resolve().parents[1]
+RELIEF = ROOT / "configs/objects/relief.ply"
+Plan = dict[str, Any]
+REASONS = {
+    "touches the object": "the object;",
+    "touches the dome": "the dome;",
+    "touches the support": "the support;",
+    "touches a keep-out volume": "keep-out",
+    "touches itself": "the arm's",
+    "beyond a limit": "its limits are",
+    "out of reach": "out of reach",
+    "near a singularity": "singularity",
+}
+"""What a refusal is counted as, by a phrase of it."""
+
+
+def random_object(random: np.random.Generator, folder: Path) -> Plan:
+    """A mesh of one of four kinds, somewhere on the support, as the plan's `object`."""
+    kind = random.choice(["relief", "box", "sphere", "bunny"])
+    path = RELIEF if kind == "relief" else folder / "object.ply"
+    lift_mm = 0.0
+    if kind == "box":
+        size_mm = random.uniform(40, 350, 3)
+        trimesh.creation.box(extents=size_mm).export(path)
+        lift_mm = size_mm[2] / 2
+    elif kind == "sphere":
+        lift_mm = random.uniform(30, 200)
+        trimesh.creation.icosphere(subdivisions=3, radius=lift_mm).export(path)
+    elif kind == "bunny":
+        body_mm = random.uniform(40, 90)
+        lift_mm = body_mm
+        body = trimesh.creation.icosphere(subdivisions=3, radius=body_mm)
+        body.vertices *= 1.0 + 0.1 * np.sin(body.vertices @ random.normal(size=(3, 1)) * 0.1)
+        head = trimesh.creation.icosphere(subdivisions=3, radius=0.6 * body_mm)
+        head.apply_translation((0.8 * body_mm, 0, 1.2 * body_mm))
+        ears = [trimesh.creation.capsule(height=body_mm, radius=0.15 * body_mm) for _ in range(2)]
+        for side, ear in zip((-1, 1), ears, strict=True):
+            ear.apply_translation((0.7 * body_mm, side * 0.3 * body_mm, 1.6 * body_mm))
+        trimesh.util.concatenate([body, head, *ears]).export(path)
+    at_mm = [*random.uniform(-150, 150, 2).tolist(), lift_mm]
+    pose = {"translation_mm": at_mm, "abc_deg": [float(random.uniform(-180, 180)), 0, 0]}
+    return {"id": "something", "mesh": str(path), "support_from_object": pose}
+
+
+def random_view(random: np.random.Generator, name: str, target_mm: list[float]) -> Plan:
+    """A view of any kind: mostly of the object, sometimes of another place, or given by joints."""
+    kind = random.choice(["look_at", "grid", "joints"], p=[0.6, 0.25, 0.15])
+    if kind == "joints":
+        around_deg = np.array((0.0, -120.0, 110.0, 0.0, -60.0, 0.0))
+        low, high = np.array(KR10_R1100_SIXX.limits_deg).T
+        joints_deg = np.clip(around_deg + random.uniform(-70, 70, 6), low - 1, high + 1)
+        return {"kind": "joints", "name": name, "joints_deg": joints_deg.tolist()}
+    looks = {
+        "kind": str(kind),
+        "name": name,
+        "target_mm": (np.array(target_mm) + random.uniform(-40, 40, 3)).tolist(),
+        "distance_mm": float(random.uniform(220, 450)),
+        "roll_deg": float(random.choice([0.0, random.uniform(-180, 180)])),
+    }
+    azimuth_deg, elevation_deg = float(random.uniform(-180, 180)), float(random.uniform(25, 89))
+    if kind == "look_at":
+        return {**looks, "azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
+    azimuths_deg = [azimuth_deg, azimuth_deg + float(random.uniform(10, 60))]
+    return {**looks, "azimuths_deg": azimuths_deg, "elevations_deg": [elevation_deg]}
+
+
+def random_plan(random: np.random.Generator, folder: Path, rig: Path) -> Path:
+    """A plan of 3 to 6 views, or a few more where one is a grid, written into a folder."""
+    seen = random_object(random, folder)
+    x_mm, y_mm, _ = seen["support_from_object"]["translation_mm"]
+    views = [random_view(random, f"v{k}", [x_mm, y_mm, 40.0]) for k in range(random.integers(3, 7))]
+    plan = {
+        "schema_version": 1,
+        "name": "replay",
+        "rig": str(rig),
+        "object": seen,
+        "views": views,
+        "order": str(random.choice(["fastest", "as_written"])),
+        "lights": {"kind": "none"},
+        "exposure": {"kind": "fixed", "exposure_us": 8000},
+    }
+    path = folder / "plan.yaml"
+    path.write_text(json.dumps(plan), encoding="utf-8")
+    return path
+
+
+def planned(job: Job, meshes: Path | None) -> Itinerary:
+    """The ways that preflight looks at: from home."""
+    bodies = bodies_of(job.cell.rig, job.cell.leds, job.object_corners_mm, meshes) if meshes else job.bodies
+    home_deg = job.cell.rig.motion.home_joints_deg
+    return plan_itinerary(job.schedule.views, job.cell.rig, bodies, home_deg, job.plan.order)
+
+
+def replayed(job: Job, itinerary: Itinerary, cell: ReplayCell) -> tuple[int, list[Touch]]:
+    """How many places were looked at, and what touched there."""
+    here_deg = np.array(job.cell.rig.motion.home_joints_deg)
+    places, touches = 0, []
+    for index in itinerary.order:
+        visit = itinerary.visits[index]
+        assert visit is not None
+        for start_deg, goal_deg in pairwise([here_deg, *visit.leg.waypoints]):
+            course_deg = motion(job, start_deg, goal_deg)
+            places += len(course_deg)
+            touches += cell.touches(course_deg)
+        here_deg = visit.joints_deg
+    return places, touches
+
+
+def reason(refusal: str) -> str:
+    """What a refusal is counted as."""
+    what = next((name for name, phrase in REASONS.items() if phrase in refusal), "something else")
+    return f"no way: {what}" if "no way to it" in refusal else what
+
+
+def run(
+    plans: int, seed: int, meshes: Path | None, rig: Path, *, check_meshes: bool = False, tell: bool = False
+) -> dict[str, Any]:
+    """Figures of a whole replay; `touches` lists plan, bodies and joint angles of each collision found."""
+    passed, places = 0, 0
+    refused: Counter[str] = Counter()
+    touches: list[dict[str, Any]] = []
+    for number in range(plans):
+        with tempfile.TemporaryDirectory() as folder:
+            job = read_job(random_plan(np.random.default_rng([seed, number]), Path(folder), rig))
+        itinerary = planned(job, meshes if check_meshes else None)
+        if itinerary.refusals:
+            refused[reason(itinerary.refusals[0])] += 1
+            continue
+        passed += 1
+        looked_at, found = replayed(job, itinerary, ReplayCell(job, meshes))
+        places += looked_at
+        touches += [{"plan": number, **vars(touch)} for touch in found]
+        if tell:
+            print(f"plan {number}: {passed} passed, {len(touches)} touches", file=sys.stderr, flush=True)
+    return {
+        "plans": plans,
+        "passed": passed,
+        "refused": dict(refused.most_common()),
+        "places": places,
+        "meshes": "links" if meshes else "capsules",
+        "touches": touches,
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--plans", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--meshes", type=Path)
+    parser.add_argument("--check-meshes", action="store_true", help="preflight has the links' meshes as well")
+    parser.add_argument("--rig", type=Path, default=ROOT / "configs/rigs/sim.yaml")
+    asked = parser.parse_args()
+    found = run(asked.plans, asked.seed, asked.meshes, asked.rig, check_meshes=asked.check_meshes, tell=True)
+    print(json.dumps(found))
+    return 1 if found["touches"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -7,20 +7,22 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from coupole.live import Shown
-from coupole.metering import Advice
 from coupole.observer import Observer, Outcome
 from coupole.observer import Progress as RunProgress
 from coupole.preflight import Report
 from coupole.recorder import DryRecorder
 from coupole.run import Status
+
+if TYPE_CHECKING:
+    from coupole.live import Shown
+    from coupole.metering import Advice
 
 _PLAIN_LINE_EVERY_S = 5.0
 

@@ -24,6 +24,7 @@ from coupole.errors import InputError
 from coupole.geometry import Transform
 from coupole.plan import BracketExposure, FixedExposure, LightIds, Plan
 from coupole.run import is_shot
+from coupole.store import Collections
 
 METERING_LIGHTS = 12
 SHORTER = (16, 4, 1)
@@ -145,7 +146,13 @@ class MeterRecorder:
         return self._proven
 
     def begin_view(
-        self, view: str, frames: int, frame_format: FrameFormat, arm: ArmState, base_from_camera: Transform
+        self,
+        view: str,
+        frames: int,
+        frame_format: FrameFormat,
+        arm: ArmState,
+        base_from_camera: Transform,
+        collections: Collections,
     ) -> None:
         self._view = view
         self.views.setdefault(view, Metered(frame_format))

@@ -16,7 +16,7 @@ from coupole.errors import StorageError
 from coupole.geometry import Transform
 from coupole.journal import Journal
 from coupole.run import Run
-from coupole.store import ViewWriter, create
+from coupole.store import Collections, ViewWriter, create
 
 COMMIT_EVERY_S = 0.5
 SPARE_SLOTS = 32
@@ -31,9 +31,18 @@ class Recorder(Protocol):
         ...
 
     def begin_view(
-        self, view: str, frames: int, frame_format: FrameFormat, arm: ArmState, base_from_camera: Transform
+        self,
+        view: str,
+        frames: int,
+        frame_format: FrameFormat,
+        arm: ArmState,
+        base_from_camera: Transform,
+        collections: Collections,
     ) -> None:
-        """Frames of this view come next; may be called again when the pose was measured anew."""
+        """Frames of this view come next; may be called again when the pose was measured anew.
+
+        `collections` are arrays by name that stand beside the frames, by name of their group.
+        """
         ...
 
     def put(self, frame: Frame, exposure_us: int) -> int:
@@ -71,7 +80,13 @@ class RunRecorder:
         return set(self._proven)
 
     def begin_view(
-        self, view: str, frames: int, frame_format: FrameFormat, arm: ArmState, base_from_camera: Transform
+        self,
+        view: str,
+        frames: int,
+        frame_format: FrameFormat,
+        arm: ArmState,
+        base_from_camera: Transform,
+        collections: Collections,
     ) -> None:
         path = self._run.view_path(view)
         self._file = str(path.relative_to(self._run.folder))
@@ -80,7 +95,8 @@ class RunRecorder:
             if not path.exists():
                 if mine:
                     raise StorageError(f"{path}: the journal knows proven frames of it, but it is gone")
-                create(path, frames + SPARE_SLOTS, frame_format, {**self._metadata, "title": view})
+                metadata = {**self._metadata, "title": view}
+                create(path, frames + SPARE_SLOTS, frame_format, metadata, collections)
             self._writer = ViewWriter(path, mine)
         self._pose = self._writer.add_pose(arm, base_from_camera)
 
@@ -190,7 +206,13 @@ class DryRecorder:
         return self._proven
 
     def begin_view(
-        self, view: str, frames: int, frame_format: FrameFormat, arm: ArmState, base_from_camera: Transform
+        self,
+        view: str,
+        frames: int,
+        frame_format: FrameFormat,
+        arm: ArmState,
+        base_from_camera: Transform,
+        collections: Collections,
     ) -> None:
         self._view, self._format = view, frame_format
 

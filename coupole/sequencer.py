@@ -75,7 +75,7 @@ class Sequencer:
         itinerary = self._posing.itinerary([schedule.views[n] for n in numbers])
         start_ns = self._cell.clock.now_ns()
         try:
-            for count, index in enumerate(range(len(numbers))):
+            for count, index in enumerate(itinerary.order):
                 number, visit = numbers[index], itinerary.visits[index]
                 assert visit is not None
                 view = schedule.views[number]
@@ -103,7 +103,9 @@ class Sequencer:
         return left
 
     def _acquire_view(self, view: ViewPose, visit: Visit, left: list[Burst], all_bursts: Sequence[Burst]) -> None:
-        self._recorder.event("view", view=view.name)
+        shadow = self._job.shadows.at(visit.joints_deg)
+        self._recorder.event("view", view=view.name, hidden_leds=self._job.useless_leds(shadow))
+        collections = {"shadow": {**shadow.arrays(self._job.shadows.patches), "leds": self._job.cell.leds.ids}}
         motion_s = visit.leg.duration_s + self._job.cell.rig.motion.settle_dwell_s
         self.outcome.ideal_s += motion_s + sum(burst.duration_s for burst in left)
         waypoints_deg = [np.round(place, 6).tolist() for place in visit.leg.waypoints]
@@ -120,7 +122,9 @@ class Sequencer:
                 joints_deg=[round(j, 6) for j in stand.arm.joints_deg],
                 base_from_camera=np.round(stand.base_from_camera, 6).tolist(),
             )
-            self._recorder.begin_view(view.name, frames, frame_format, stand.arm, stand.base_from_camera)
+            self._recorder.begin_view(
+                view.name, frames, frame_format, stand.arm, stand.base_from_camera, collections
+            )
 
         begin(stand)
         try:

@@ -91,6 +91,7 @@ def acquire_plan(
         if run is not None:
             held.callback(os.close, run.lock())
             run.refuse_changes(job.inputs)
+        job = job.without_hidden(run.hidden_leds if run else None)
         _acquire_into(run, job, console, parent=parent, confirm=confirm, found=found, held=held)
 
 
@@ -191,7 +192,8 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
         "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
         "scaling": cell.world_endpoints["camera"]["scaling"] if cell.world_endpoints else None,
         "views": [view.name for view in job.schedule.views],
-        "labels": [label for burst in job.schedule.bursts[0] for label in burst.labels],
+        "labels": job.schedule.labels,
+        "hidden_leds": job.hidden_leds,
         "expected": {"shots": job.schedule.shots, "frames": job.schedule.frames},
     }
 
@@ -367,6 +369,7 @@ def _show_live(source: Source, studio: Studio, console: Console, port: int, *, l
 
 def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any]) -> None:
     """Run a whole plan on the rig's twin, faster than life, and say what preflight could not know."""
+    job = job.without_hidden()
     preflight = check_job(job, StorageFacts(UNLIMITED_BYTES))
     show_preflight(console, preflight, name=job.plan.name, rig=f"the twin of {job.cell.rig.name}")
     _refuse(preflight)

@@ -7,6 +7,7 @@ the first with `/r<repeat>` behind: `top/led0417/e0`, `top/dark0/e0`, `top/panel
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -98,6 +99,11 @@ class Burst:
         """[steps] True for shots, False for marks and dark frames."""
         return np.array(["dark" not in label and "mark" not in label and label != "" for label in self.labels])
 
+    def without(self, leds: Collection[int]) -> Burst:
+        """The same burst without the shots under these LEDs."""
+        dropped = np.isin(self.table["led"], list(leds)) & (self.table["led"] != NO_LIGHT)
+        return self.only({label for label, drop in zip(self.labels, dropped, strict=True) if not drop})
+
     def only(self, wanted: set[str]) -> Burst:
         """The same burst with those shots only (ids without view), and marks anew."""
         marked = self.hardware
@@ -121,15 +127,28 @@ class Schedule:
     views: tuple[ViewPose, ...]
     bursts: tuple[tuple[Burst, ...], ...]
     """Bursts of each view."""
+    labels: tuple[str, ...]
+    """Of all frames that a view can have, before any was left out, in the order of its bursts."""
 
     @property
     def shots(self) -> int:
         """Frames under a light, darks and marks apart."""
-        return sum(int(b.is_light().sum()) for b in self.bursts[0]) * len(self.views)
+        return sum(int(b.is_light().sum()) for bursts in self.bursts for b in bursts)
 
     @property
     def frames(self) -> int:
-        return sum(len(b.labels) for b in self.bursts[0]) * len(self.views)
+        return sum(len(b.labels) for bursts in self.bursts for b in bursts)
+
+    def without(self, hidden: Mapping[str, Collection[int]]) -> Schedule:
+        """The same without some LEDs in some views (LED ids by name of view)."""
+        return Schedule(
+            self.views,
+            tuple(
+                tuple(b.without(hidden[view.name]) for b in bursts) if hidden.get(view.name) else bursts
+                for view, bursts in zip(self.views, self.bursts, strict=True)
+            ),
+            self.labels,
+        )
 
 
 def expand_views(plan: Plan) -> list[ViewPose]:
@@ -259,7 +278,8 @@ def build_schedule(
                 )
                 darks = 0
     views = tuple(expand_views(plan))
-    return Schedule(views, tuple(tuple(replace(b, view=view.name) for b in templates) for view in views))
+    bursts = tuple(tuple(replace(b, view=view.name) for b in templates) for view in views)
+    return Schedule(views, bursts, tuple(label for b in templates for label in b.labels))
 
 
 def _steps(plan: Plan, lights: list[tuple[int, str]]) -> list[tuple[int, list[tuple[int, str]]]]:

@@ -409,6 +409,12 @@ def safe(world: World) -> bool:
     return not (state["shining"] or state["panels"] or state["arm_moving"] or state["camera_armed"])
 
 
+def about(run: Path) -> dict[str, Any]:
+    """The run's run.json."""
+    found: dict[str, Any] = json.loads((run / "run.json").read_text())
+    return found
+
+
 def labels(run: Path) -> list[str]:
     """What the run's edges are for, one after the other: labels of a view's frames in the order of its burst."""
     found: list[str] = json.loads((run / "run.json").read_text())["labels"]

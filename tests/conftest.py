@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 from cells import CellFolder
+from hypothesis import settings
+
+settings.register_profile("coupole", deadline=None)  # no test asserts wall-clock speed
+settings.load_profile("coupole")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

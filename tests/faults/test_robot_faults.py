@@ -128,7 +128,7 @@ def test_the_word_is_kept_in_the_journal_and_asked_for_once(joining: CellFolder)
 
 def test_an_arm_pushed_in_a_burst_has_just_that_burst_taken_again(joining: CellFolder) -> None:
     """It springs back, or is brought back; the views before and after stay as they were taken."""
-    joining.write(views=[TOP, SIDE], lights=MORE_LIGHTS)
+    joining.write(views=[TOP, SIDE], lights=MORE_LIGHTS, order="as_written")
     first_edge = 270 + 12  # of the second view
     edge = first_edge + 100
     with joining.world({"kind": "nudge_arm", "deg": 0.05, "seconds": 0.5, "at_edge": edge}):

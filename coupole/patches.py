@@ -1,0 +1,120 @@
+"""Patches: an object's surface divided into parts of about the same area, each with a point that stands for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+PATCHES = 400
+_PIECE_EDGE, _LEAST_EDGE = 0.5, 1e-3
+"""Longest edge of the pieces that patches are made of, as a share of a patch's width, but not shorter than that
+share of the object's size (or slivers of a mesh would be cut without end)."""
+_TURN_WIDTHS = 2.0
+"""Surfaces that differ by a unit in their normals are kept apart like those so many patch widths away."""
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Parts of an object's surface, each of about the same area, in the support frame."""
+
+    points_mm: NDArray[np.float64]
+    """[n, 3] a point on the surface that stands for the patch."""
+    normals: NDArray[np.float64]
+    """[n, 3] unit, outwards: the mean over the patch."""
+    areas_mm2: NDArray[np.float64]
+    """[n]; 1 each where there is no mesh."""
+    piece_patch: NDArray[np.int64]
+    """[pieces] the patch that each piece of a triangle belongs to."""
+    piece_triangle: NDArray[np.int64]
+    """[pieces] the mesh's triangle that it is a piece of."""
+
+    def of_triangles(self, triangles: int) -> NDArray[np.int64]:
+        """A patch for each of a mesh's triangles [triangles]: that of one of its pieces, -1 without area."""
+        found = np.full(triangles, -1)
+        found[self.piece_triangle] = self.piece_patch
+        return found
+
+
+def patches_of(corners_mm: NDArray[np.float64], count: int = PATCHES) -> Patches:
+    """Divide a mesh [triangles, 3, 3], corners counter-clockwise seen from outside, into about `count` patches.
+
+    Triangles are cut into pieces smaller than a patch; these are halved by area, again and again, across the
+    direction of place and normal in which they differ most. The same mesh gives the same patches, one without area
+    none.
+    """
+    width_mm = float(np.sqrt(_areas_and_normals(corners_mm)[0].sum() / count))
+    if width_mm == 0.0:
+        return patches_at([])
+    size_mm = float(np.ptp(corners_mm, axis=(0, 1)).max())
+    pieces_mm, triangle = _cut(corners_mm, max(_PIECE_EDGE * width_mm, _LEAST_EDGE * size_mm))
+    areas_mm2, normals = _areas_and_normals(pieces_mm)
+    real = areas_mm2 > 0
+    pieces_mm, triangle, areas_mm2, normals = pieces_mm[real], triangle[real], areas_mm2[real], normals[real]
+    centers_mm = pieces_mm.mean(axis=1)
+    traits = np.hstack([centers_mm, _TURN_WIDTHS * width_mm * normals])
+    patch = np.zeros(len(pieces_mm), np.int64)
+    chosen = []
+    for number, members in enumerate(_halved(traits, areas_mm2, min(count, len(pieces_mm)))):
+        patch[members] = number
+        mean = np.average(traits[members], axis=0, weights=areas_mm2[members])
+        chosen.append(members[np.argmin(np.linalg.norm(traits[members] - mean, axis=1))])
+    total_mm2 = np.bincount(patch, areas_mm2).astype(np.float64)
+    mean_normals = np.stack([np.bincount(patch, areas_mm2 * component) for component in normals.T], axis=1)
+    length = np.linalg.norm(mean_normals, axis=1, keepdims=True)
+    # A patch round a thin edge may have normals that cancel out: then the one of its point must do.
+    unit = np.where(length > 1e-6 * total_mm2[:, None], mean_normals / np.maximum(length, 1e-300), normals[chosen])
+    return Patches(centers_mm[chosen], unit, total_mm2, patch, triangle)
+
+
+def patches_at(points_mm: ArrayLike) -> Patches:
+    """Points [n, 3] that stand for an object without a mesh: patches of equal weight that face up."""
+    points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 3)
+    nothing = np.zeros(0, np.int64)
+    return Patches(points, np.tile((0.0, 0.0, 1.0), (len(points), 1)), np.ones(len(points)), nothing, nothing)
+
+
+def _areas_and_normals(corners_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Areas [n] and unit normals [n, 3] of triangles [n, 3, 3]; zeros for those without area."""
+    across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    length = np.linalg.norm(across, axis=1)
+    return length / 2, across / np.where(length > 0, length, 1.0)[:, None]
+
+
+def _cut(corners_mm: NDArray[np.float64], edge_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Triangles halved across their longest edge until none has an edge longer than `edge_mm`, and for each piece
+    the triangle that it comes from."""
+    done_mm, done_of = [], []
+    pieces_mm, of = corners_mm, np.arange(len(corners_mm))
+    while len(pieces_mm):
+        edges = np.linalg.norm(pieces_mm - np.roll(pieces_mm, -1, axis=1), axis=2)
+        fine = edges.max(axis=1) <= edge_mm
+        done_mm.append(pieces_mm[fine])
+        done_of.append(of[fine])
+        rest = np.flatnonzero(~fine)
+        turn = (edges[rest].argmax(axis=1)[:, None] + np.arange(3)) % 3  # the longest edge first
+        a, b, c = np.moveaxis(np.take_along_axis(pieces_mm[rest], turn[:, :, None], axis=1), 1, 0)
+        middle = (a + b) / 2
+        pieces_mm = np.concatenate([np.stack((a, middle, c), axis=1), np.stack((middle, b, c), axis=1)])
+        of = np.tile(of[rest], 2)
+    return np.concatenate(done_mm or [corners_mm]), np.concatenate(done_of or [of])
+
+
+def _halved(traits: NDArray[np.float64], weights: NDArray[np.float64], count: int) -> list[NDArray[np.int64]]:
+    """Divide items with traits [n, k] into `count` groups of about equal weight whose members are alike."""
+    groups, open_groups = [], [(np.arange(len(traits)), count)]
+    while open_groups:
+        members, parts = open_groups.pop()
+        if parts <= 1:
+            groups += [members] * parts
+            continue
+        spread = traits[members] - np.average(traits[members], axis=0, weights=weights[members])
+        widest = int(np.argmax(weights[members] @ spread**2))
+        members = members[np.argsort(traits[members, widest], kind="stable")]
+        first_parts = parts // 2
+        reached = np.cumsum(weights[members])
+        cut = int(np.searchsorted(reached, reached[-1] * first_parts / parts))
+        cut = min(max(cut, first_parts), len(members) - (parts - first_parts))
+        open_groups += [(members[cut:], parts - first_parts), (members[:cut], first_parts)]
+    return groups

@@ -1,0 +1,37 @@
+"""Colours of pictures and pages. Red is for what must not be, and for nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Colour = tuple[float, float, float]
+"""Red, green and blue from 0 to 1."""
+
+RED: Colour = (0.86, 0.08, 0.10)
+HOME: Colour = (0.93, 0.62, 0.25)
+ARM: Colour = (0.42, 0.58, 0.78)
+TOOL: Colour = (0.16, 0.30, 0.50)
+SUPPORT: Colour = (0.90, 0.91, 0.92)
+OBJECT: Colour = (0.83, 0.78, 0.68)
+KEEP_OUT: Colour = (0.55, 0.40, 0.62)
+CAMERA_WAY: Colour = (0.05, 0.45, 0.42)
+FLANGE_WAY: Colour = (0.62, 0.66, 0.70)
+SIGHT: Colour = (0.10, 0.25, 0.50)
+UNUSED: Colour = (0.80, 0.80, 0.80)
+INK: Colour = (0.13, 0.15, 0.18)
+
+_SHARE = np.array([(0.16, 0.16, 0.32), (0.20, 0.42, 0.55), (0.35, 0.68, 0.55), (0.95, 0.85, 0.30)])
+"""From none to all: dark, without red, and lighter all the way, so that it reads in grey, too."""
+
+
+def of_share(share: ArrayLike) -> NDArray[np.float64]:
+    """Colours [..., 3] of shares [...] from 0 to 1."""
+    at = np.clip(np.asarray(share, np.float64), 0, 1) * (len(_SHARE) - 1)
+    return np.stack([np.interp(at, np.arange(len(_SHARE)), column) for column in _SHARE.T], axis=-1)
+
+
+def css(colour: ArrayLike) -> str:
+    """`rgb(12,34,56)`."""
+    red, green, blue = (round(255 * float(part)) for part in np.asarray(colour, np.float64))
+    return f"rgb({red},{green},{blue})"

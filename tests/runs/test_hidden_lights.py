@@ -1,0 +1,80 @@
+"""LEDs that arm, camera or object hide from all that a view sees: marked in the run, or left out of it."""
+
+from __future__ import annotations
+
+import cells
+import h5py
+import numpy as np
+import pytest
+from cells import LOW, TOP, CellFolder
+
+from coupole.shadow import REACHED
+
+STEEP = {**TOP, "name": "steep", "elevation_deg": 88}
+
+
+@pytest.fixture
+def hidden(cell: CellFolder) -> CellFolder:
+    """A cell with views in which some LEDs reach nothing: the camera hangs between them and the object."""
+    cell.write(views=[STEEP, LOW], lights={"kind": "every", "every": 5})
+    return cell
+
+
+def test_each_views_file_says_which_leds_reach_which_part_of_the_object(hidden: CellFolder) -> None:
+    assert hidden.acquire().code == 0
+    with h5py.File(hidden.run_folder / "views" / "steep.h5") as file:
+        shadow = file["entry/shadow"]
+        assert shadow.attrs["NX_class"] == "NXcollection"
+        codes, seen, leds = shadow["codes"][()], shadow["seen"][()], shadow["leds"][()]
+        assert codes.shape == (len(shadow["points_mm"]), 1080) == (len(seen), len(leds))
+        assert shadow["normals"].shape == shadow["points_mm"].shape
+    assert 0.2 < np.mean(codes[seen] == REACHED) < 1.0
+
+
+def test_hidden_leds_are_taken_and_marked_where_the_plan_does_not_say_otherwise(hidden: CellFolder) -> None:
+    ended = hidden.acquire()
+    assert ended.code == 0
+    assert ended.document["shots"] == 2 * 216
+    views = {event["view"]: event["hidden_leds"] for event in cells.events(hidden.run_folder, "view")}
+    with h5py.File(hidden.run_folder / "views" / "steep.h5") as file:
+        shadow = file["entry/shadow"]
+        reached = (shadow["codes"][()][shadow["seen"][()]] == REACHED).any(axis=0)
+        assert views["steep"] == shadow["leds"][()][~reached].tolist()
+
+
+def test_hidden_leds_are_left_out_where_the_plan_says_so(hidden: CellFolder) -> None:
+    hidden.write(hidden_lights="skip")
+    ended = hidden.acquire()
+    assert ended.code == 0, ended.err
+    run = hidden.run_folder
+    skipped = {(view, led) for view, leds in cells.about(run)["hidden_leds"].items() for led in leds}
+    asked = {(view, led) for view in ("steep", "low") for led in range(0, 1080, 5)}
+    taken = {
+        (shot.split("/")[0], int(frame.record["led"]))
+        for shot, frame in cells.stored(run).items()
+        if cells.is_light(shot)
+    }
+    assert skipped & asked
+    assert taken == asked - skipped
+    assert ended.document["shots"] == len(taken)
+    assert cells.here("verify", run).code == 0
+    assert cells.mislabelled(hidden, run) == []
+
+
+def test_what_preflight_says_will_be_left_out_is_left_out(hidden: CellFolder) -> None:
+    hidden.write(hidden_lights="skip")
+    checked = cells.here("check", hidden.plan, "--json").document
+    assert checked["shots"] + checked["hidden_lights"] == 2 * 216
+    assert hidden.acquire().document["shots"] == checked["shots"]
+
+
+def test_a_run_is_resumed_without_what_it_began_without(hidden: CellFolder) -> None:
+    hidden.write(hidden_lights="skip")
+    hidden.faults({"kind": "unplug_camera", "at_edge": 250})
+    assert hidden.acquire().code == 4
+    run = hidden.run_folder
+    before = cells.about(run)["hidden_leds"]
+    resumed = hidden.acquire("--resume", run)  # the rest has fewer edges than 250
+    assert resumed.code == 0, resumed.err
+    assert cells.about(run)["hidden_leds"] == before
+    assert cells.here("verify", run).code == 0

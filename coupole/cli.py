@@ -89,6 +89,8 @@ def check(
     except InputError as error:
         _fail(error, as_json=as_json, found={"ok": False, "refusals": []})
         raise
+    if not no_paths:
+        job = job.without_hidden()
     report = preflight_of(job, job.cell.storage_folder, paths=not no_paths)
     show_preflight(console, report, name=job.plan.name, rig=job.cell.rig.name)
     show_views(console, report)
@@ -107,6 +109,7 @@ def check(
                     "ideal_s": report.ideal_s,
                     "dose_lux_h": report.dose_lux_h,
                     "peak_board_c": report.peak_board_c,
+                    "hidden_lights": sum(map(len, job.hidden_leds.values())),
                     "paths_checked": not no_paths,
                 }
             )
@@ -115,6 +118,33 @@ def check(
         raise PreflightRefused(report.refusals)
     if not as_json:
         console.print("the plan can be run" + (" (collisions were not checked)" if no_paths else ""))
+
+
+@app.command()
+def view(
+    plan: PlanPath,
+    rig: RigOption = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder for both files.")] = Path(),
+    no_paths: Annotated[
+        bool, typer.Option("--no-paths", help="Leave out path planning and swept collisions.")
+    ] = False,
+    show: Annotated[bool, typer.Option("--show", help="Open the page in a browser.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw a plan, refused or not: a picture (PNG) and a page to turn round (HTML)."""
+    from coupole.console import make_console
+    from coupole.job import read_job
+    from coupole.view import look_at_plan
+
+    try:
+        png, html = look_at_plan(read_job(plan, rig), out, make_console(quiet=as_json), paths=not no_paths)
+    except InputError as error:
+        _fail(error, as_json=as_json)
+        raise
+    if show:
+        typer.launch(str(html.resolve()))
+    if as_json:
+        print(json.dumps({"png": str(png), "html": str(html)}))
 
 
 @app.command()
@@ -226,6 +256,95 @@ def verify(run: RunPath, as_json: JsonOption = False) -> None:
     if found.missing:
         raise UnprovenError(f"{len(found.missing)} frames of the plan are missing; resume the run")
     console.print(f"ok: {found.frames} frames, each of them once, all checksums right")
+
+
+@app.command()
+def archive(
+    run: RunPath,
+    codec: Annotated[str, typer.Option("--codec", help="lz4 (fast) or zstd (a little smaller).")] = "lz4",
+    keep: Annotated[bool, typer.Option("--keep", help="Keep the files as they were, in RUN/unarchived.")] = False,
+    partial: Annotated[
+        bool, typer.Option("--partial", help="Of a run that is not complete, archive the complete views.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compress a run's frames, bit for bit; a view is read back and compared before it replaces the old file."""
+    from rich.progress import Progress
+
+    from coupole.archive import archive_run
+    from coupole.bitshuffle import codec_of
+    from coupole.console import bytes_text, make_console
+    from coupole.run import Run
+
+    console = make_console(quiet=as_json)
+    try:
+        with Progress(console=console, disable=not console.is_terminal) as bars:
+            bar = bars.add_task("archive")
+            found = archive_run(
+                Run(run),
+                codec_of(codec),
+                keep=keep,
+                partial=partial,
+                progress=lambda what, done, total: bars.update(bar, description=what, completed=done, total=total),
+                on_view=lambda view: console.print(
+                    f"{view.view}: {view.frames} frames {view.ratio:.2f} times smaller, "
+                    f"{bytes_text(view.freed_bytes)} freed"
+                ),
+            )
+    except CoupoleError as error:
+        _fail(error, as_json=as_json)
+        raise
+    total = found.figures()
+    if found.views:
+        console.print(f"ratio {total['ratio']:.2f} at {total['mb_s']:.0f} MB/s, reading back included")
+    for views, how in ((found.already, "archived already"), (found.incomplete, "not complete, left as it is")):
+        for view in views:
+            console.print(f"{view}: {how}")
+    if as_json:
+        print(json.dumps({"run": str(run.resolve()), "codec": codec, **total}))
+
+
+@app.command()
+def export(
+    run: RunPath,
+    to: Annotated[str, typer.Option("--to", help="dng or tiff.", show_default=False)],
+    views: Annotated[
+        list[str] | None, typer.Option("--views", help="Names, with * and ?; again for more.")
+    ] = None,
+    shots: Annotated[
+        list[str] | None, typer.Option("--shots", help="Labels, as `led04*/e0`; again for more.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder; RUN/export if not given.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over files that stand there.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write proven frames as files of another format, one for each, named after its shot."""
+    from rich.progress import Progress
+
+    from coupole.console import bytes_text, make_console
+    from coupole.export import export_run
+    from coupole.run import Run
+
+    console = make_console(quiet=as_json)
+    folder = out or run / "export"
+    try:
+        with Progress(console=console, disable=not console.is_terminal) as bars:
+            bar = bars.add_task("export")
+            found = export_run(
+                Run(run),
+                to,
+                folder,
+                views=views or [],
+                shots=shots or [],
+                overwrite=overwrite,
+                progress=lambda done, total: bars.update(bar, completed=done, total=total),
+            )
+    except CoupoleError as error:
+        _fail(error, as_json=as_json)
+        raise
+    console.print(f"{found.files} files, {bytes_text(found.bytes)}, in {folder}")
+    if as_json:
+        print(json.dumps({"out": str(folder.resolve()), "files": found.files, "bytes": found.bytes}))
 
 
 @app.command()

@@ -114,14 +114,22 @@ class Run:
         return self.folder / "views" / f"{view}.h5"
 
     def allocated_bytes(self) -> int:
-        """What the run's views take on the disk already: laid out whole before their first frame."""
-        return sum(path.stat().st_blocks * 512 for path in (self.folder / "views").glob("*.h5"))
+        """What the run's views need no more of the disk: laid out whole before their first frame, or archived."""
+        return sum(map(_settled_bytes, (self.folder / "views").glob("*.h5")))
 
     def expected_shots(self) -> Iterable[str]:
-        """Ids of all shots and dark frames of the plan."""
+        """Ids of all shots and dark frames of the plan, those apart that were left out as hidden in their view."""
         for view in self.about["views"]:
+            hidden = {f"led{led:04d}" for led in self.hidden_leds.get(view, ())}
             for label in self.about["labels"]:
-                yield f"{view}/{label}"
+                if label.partition("/")[0] not in hidden:
+                    yield f"{view}/{label}"
+
+    @property
+    def hidden_leds(self) -> dict[str, list[int]]:
+        """LEDs that were left out of views, by name of view: arm, camera or object hide them there."""
+        found: dict[str, list[int]] = self.about.get("hidden_leds", {})
+        return found
 
     def proven(self) -> dict[str, ProvenFrame]:
         """Proven shots by id, as the journal says."""
@@ -188,6 +196,11 @@ def _new_folder(parent: Path, name: str) -> Path:
             continue
         return folder
     raise StorageError(f"{parent}: a thousand runs named {name} stand here already")
+
+
+def _settled_bytes(view_file: Path) -> int:
+    layout = store.read_layout(view_file)
+    return layout.frames * layout.frame_bytes if layout.archived else view_file.stat().st_blocks * 512
 
 
 def _user() -> str:
@@ -300,7 +313,10 @@ def _frame_problem(path: Path, layout: store.Layout, table: Any, frame: ProvenFr
     record = table[frame.index]
     if record["state"] != store.PROVEN or record["shot"].decode() != frame.shot:
         return f"{frame.shot}: slot {frame.index} of {path.name} is recorded as `{record['shot'].decode()}`"
-    found = store.checksum(store.read_frame(path, layout, frame.index))
+    try:
+        found = store.checksum(store.read_frame(path, layout, frame.index))
+    except StorageError as error:
+        return f"{frame.shot}: {error}"
     if not f"{found:016x}" == f"{int(record['xxh3']):016x}" == frame.xxh3:
         return f"{frame.shot}: slot {frame.index} of {path.name} has checksum {found:016x}, not {frame.xxh3}"
     return ""

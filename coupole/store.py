@@ -14,6 +14,7 @@ import mmap
 import os
 import threading
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,7 @@ POSE_DTYPE = np.dtype(
 
 PAGE = mmap.PAGESIZE
 MAX_POSES = 256
-_DATA, _FRAMES, _POSES = (
+DATA, FRAMES, POSES = (
     "entry/instrument/detector/data",
     "entry/instrument/detector/frames",
     "entry/instrument/robot/poses",
@@ -87,15 +88,28 @@ class Layout:
     height_px: int
     width_px: int
     data_offset: int
+    """0 if the file is archived."""
     table_offset: int
     poses_offset: int
+    archived: bool
+    """True if the frames are compressed, as `coupole.archive` leaves them; then the file is only read."""
 
     @property
     def frame_bytes(self) -> int:
         return self.height_px * self.width_px * 2
 
 
-def create(path: Path, slots: int, frame_format: FrameFormat, metadata: dict[str, Any]) -> None:
+Collections = Mapping[str, Mapping[str, NDArray[np.generic]]]
+"""Arrays by name, by name of the group in the entry that holds them (NXcollection)."""
+
+
+def create(
+    path: Path,
+    slots: int,
+    frame_format: FrameFormat,
+    metadata: dict[str, Any],
+    collections: Collections | None = None,
+) -> None:
     """Lay out a view's file with `slots` slots, all free, and its space allocated.
 
     `metadata`: `title`, `sample`, `simulated`, `pixel_pitch_um` and whatever else is to stand in the entry's
@@ -107,6 +121,10 @@ def create(path: Path, slots: int, frame_format: FrameFormat, metadata: dict[str
             partial, "w", alignment_threshold=PAGE, alignment_interval=PAGE, libver=("v108", "v110")
         ) as file:
             _describe(file, slots, frame_format, metadata)
+            for name, arrays in (collections or {}).items():
+                collection = _group(file["entry"], name, "NXcollection")
+                for key, values in arrays.items():
+                    collection[key] = values
         with partial.open("r+b") as file_on_disk:
             os.posix_fallocate(file_on_disk.fileno(), 0, partial.stat().st_size)
             os.fsync(file_on_disk.fileno())
@@ -145,7 +163,7 @@ def _describe(file: h5py.File, slots: int, frame_format: FrameFormat, metadata: 
     sample = _group(entry, "sample", "NXsample")
     sample["name"] = metadata["sample"]
     shown = _group(entry, "data", "NXdata", signal="data")
-    shown["data"] = h5py.SoftLink(f"/{_DATA}")
+    shown["data"] = h5py.SoftLink(f"/{DATA}")
 
 
 def _group(parent: h5py.Group, name: str, nx_class: str, **attributes: str) -> h5py.Group:
@@ -173,9 +191,10 @@ def read_layout(path: Path) -> Layout:
     """Where frames and tables lie in a view's file. Raises StorageError if it is not such a file."""
     try:
         with h5py.File(path, "r") as file:
-            data, frames, poses = file[_DATA], file[_FRAMES], file[_POSES]
+            data, frames, poses = file[DATA], file[FRAMES], file[POSES]
             frames_px: tuple[int, int, int] = data.shape
-            return Layout(*frames_px, data.id.get_offset(), frames.id.get_offset(), poses.id.get_offset())
+            tables = frames.id.get_offset(), poses.id.get_offset()
+            return Layout(*frames_px, data.id.get_offset() or 0, *tables, archived=data.chunks is not None)
     except (OSError, KeyError) as error:
         raise StorageError(f"{path}: not a view file of a run: {error}") from error
 
@@ -200,11 +219,24 @@ def read_frames(path: Path) -> NDArray[np.void]:
 
 
 def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
-    """Pixels [H, W] of one slot, DN."""
+    """Pixels [H, W] of one slot, DN. Raises StorageError if an archived frame cannot be read."""
+    if layout.archived:
+        return _read_archived_frame(path, slot)
     with path.open("rb") as file:
         file.seek(layout.data_offset + slot * layout.frame_bytes)
         pixels = np.frombuffer(file.read(layout.frame_bytes), np.uint16)
     return pixels.reshape(layout.height_px, layout.width_px)
+
+
+def _read_archived_frame(path: Path, slot: int) -> NDArray[np.uint16]:
+    import hdf5plugin  # noqa: F401  # registers the filter
+
+    try:
+        with h5py.File(path, "r") as file:
+            pixels: NDArray[np.uint16] = file[DATA][slot]
+            return pixels
+    except OSError as error:
+        raise StorageError(f"{path}: slot {slot} cannot be read: {error}") from error
 
 
 class ViewWriter:
@@ -212,9 +244,15 @@ class ViewWriter:
     another than the rest)."""
 
     def __init__(self, path: Path, proven_slots: dict[str, int]) -> None:
-        """Open a file that `create` made. `proven_slots` (shot id to slot) are kept; all other slots are free."""
+        """Open a file that `create` made. `proven_slots` (shot id to slot) are kept; all other slots are free.
+        Raises StorageError if the file was archived."""
         self.path = path
         self._layout = read_layout(path)
+        if self._layout.archived:
+            raise StorageError(
+                f"{path}: is archived, so nothing is written into it any more. Only complete views are archived: "
+                "see with `coupole verify` whether the journal lost lines."
+            )
         self._table = read_frames(path)
         self._lock = threading.Lock()
         taken = set(proven_slots.values())

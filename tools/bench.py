@@ -1,4 +1,4 @@
-"""Figures with their peers, one JSON line each: `python tools/bench.py [check|sequencing|store|matching ...]`.
+"""Figures with their peers, one JSON line each: `python tools/bench.py [check|sequencing|store|matching|rsi ...]`.
 
 Each line has `name`, `value`, `unit`, `peer` (what ran beside it in the same run, or the limit it is held
 against) and `ratio` (ours over the peer's; above 1 is better). Medians of interleaved runs: these figures are
@@ -197,11 +197,41 @@ def bench_matching(rounds: int) -> None:
     line("matching_per_frame", value, "us", "numpy_nearest_pairing", peer / value, peer_value=round(peer, 4))
 
 
+# -- robot and collisions: in files of their own beside this one ---------------------------------------------
+
+
+def bench_rsi(rounds: int) -> None:
+    """Latency of answers to a KUKA controller at 4 ms, against a minimal program in C."""
+    from bench_rsi import figures
+
+    for figure in figures(rounds):
+        line(**figure)
+
+
+def bench_collisions(rounds: int) -> None:
+    """Collision check of one pose of the arm, against python-fcl."""
+    from bench_collisions import figures
+
+    for figure in figures(ROOT, rounds):
+        line(**figure)
+
+
+def bench_archive(rounds: int) -> None:
+    """Ratio and speed of archiving a view, reading from it, against plain h5py and the file before."""
+    from bench_archive import figures
+
+    for figure in figures(ROOT, rounds):
+        line(**figure)
+
+
 BENCHES: dict[str, Callable[[int], None]] = {
     "check": bench_check,
     "sequencing": bench_sequencing,
     "store": bench_store,
     "matching": bench_matching,
+    "rsi": bench_rsi,
+    "collisions": bench_collisions,
+    "archive": bench_archive,
 }
 
 

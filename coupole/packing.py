@@ -1,0 +1,80 @@
+"""Two 12-bit pixels in three bytes, in both orders that are in use.
+
+=====  ========  ==================  =======
+order  byte 0    byte 1              byte 2
+=====  ========  ==================  =======
+lsb    a[7:0]    b[3:0] and a[11:8]  b[11:4]
+msb    a[11:4]   a[3:0] and b[11:8]  b[7:0]
+=====  ========  ==================  =======
+
+(The middle byte's high half is named first.) `lsb` is GenICam's `Mono12p` and `BayerGB12p` (PFNC: least
+significant bit first, no gaps), `msb` is TIFF's and DNG's (FillOrder 1). GigE Vision's older `Mono12Packed` is
+neither. Rows follow each other without a gap, which for an even width is also what TIFF asks for.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Order = Literal["lsb", "msb"]
+
+
+def pack12(pixels: NDArray[np.uint16], order: Order = "lsb") -> NDArray[np.uint8]:
+    """Bytes [3 n / 2] of n pixels (any shape, C order, n even) below 4096.
+
+    Raises ValueError for an odd number of pixels, and for one that has more than 12 bits.
+    """
+    if pixels.size % 2:
+        raise ValueError(f"expected an even number of pixels, found {pixels.size}")
+    packed = np.empty(pixels.size // 2 * 3, np.uint8)
+    highest = _pack(np.ascontiguousarray(pixels).reshape(-1), packed, order == "msb")
+    if highest > 0x0FFF:
+        raise ValueError(f"expected pixels of 12 bits, found a bit above them in {int(pixels.max())}")
+    return packed
+
+
+def unpack12(packed: NDArray[np.uint8], order: Order = "lsb") -> NDArray[np.uint16]:
+    """Pixels [2 n / 3] of n bytes that `pack12` or a camera made. Raises ValueError unless 3 divides n."""
+    if packed.size % 3:
+        raise ValueError(f"expected a multiple of 3 bytes, found {packed.size}")
+    pixels = np.empty(packed.size // 3 * 2, np.uint16)
+    _unpack(np.ascontiguousarray(packed).reshape(-1), pixels, order == "msb")
+    return pixels
+
+
+@numba.njit(cache=True, nogil=True)
+def _pack(pixels, packed, msb_first):  # type: ignore[no-untyped-def]
+    """Returns the bits that any pixel has."""
+    seen = np.uint16(0)
+    for pair in range(len(packed) // 3):
+        a, b = pixels[2 * pair], pixels[2 * pair + 1]
+        seen |= a | b
+        if msb_first:
+            packed[3 * pair] = a >> 4
+            packed[3 * pair + 1] = (a & 0xF) << 4 | b >> 8
+            packed[3 * pair + 2] = b & 0xFF
+        else:
+            packed[3 * pair] = a & 0xFF
+            packed[3 * pair + 1] = (b & 0xF) << 4 | a >> 8
+            packed[3 * pair + 2] = b >> 4
+    return seen
+
+
+@numba.njit(cache=True, nogil=True)
+def _unpack(packed, pixels, msb_first):  # type: ignore[no-untyped-def]
+    for pair in range(len(packed) // 3):
+        first, middle, last = (
+            np.uint16(packed[3 * pair]),
+            np.uint16(packed[3 * pair + 1]),
+            np.uint16(packed[3 * pair + 2]),
+        )
+        if msb_first:
+            pixels[2 * pair] = first << 4 | middle >> 4
+            pixels[2 * pair + 1] = (middle & 0xF) << 8 | last
+        else:
+            pixels[2 * pair] = (middle & 0xF) << 8 | first
+            pixels[2 * pair + 1] = last << 4 | middle >> 4

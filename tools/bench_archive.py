@@ -1,0 +1,180 @@
+"""What archiving a view costs and brings: ratio, speed, and reading from the archive against the file before.
+
+Full-size frames of a dim object on a dark ground, with the shot and read noise of the simulated sensor, drawn anew
+for each of eight frames that then repeat. Speed is taken of a view of 40 frames, reading of one with as many of
+1080 as the disk has room for, cold: the page cache is emptied of the file before.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import resource
+import shutil
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+HEIGHT_PX, WIDTH_PX = 3072, 4096
+FRAME_BYTES = HEIGHT_PX * WIDTH_PX * 2
+FRAMES, FEW_FRAMES, DISTINCT = 1080, 40, 8
+_DATA = "entry/instrument/detector/data"
+TILE = np.s_[1100:1356, 1900:2156]
+"""A window of 256 x 256 that is in line with no tile's edge."""
+
+
+def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+    """For each codec ratio, speed, and two readings; peers: plain h5py, and the file before."""
+    import hdf5plugin  # noqa: F401  # registers the filter
+
+    from coupole.bitshuffle import CODECS
+
+    frames = min(FRAMES, int(shutil.disk_usage(root).free * 0.4 / FRAME_BYTES))
+    pictures = _pictures()
+    with tempfile.TemporaryDirectory(dir=root) as folder:
+        for name, codec in CODECS.items():
+            yield from _speeds(Path(folder) / "small.h5", pictures, name, codec, rounds)
+        path, kept = Path(folder) / "view.h5", Path(folder) / "kept"
+        proven = _write_view(path, pictures, frames)
+        for name, codec in CODECS.items():
+            _archive(path, proven, codec, kept)
+            for what, read in (("tile_through_all_frames", _read_tile), ("one_frame", _read_frame)):
+                ours_s, before_s = _interleaved(rounds, read, path, kept / path.name)
+                figure = _figure(f"archive_{name}_{what}", ours_s, "s", "contiguous", before_s / ours_s)
+                yield {**figure, "peer_value": round(before_s, 4), "frames": frames}
+            (kept / path.name).replace(path)
+
+
+def _speeds(
+    path: Path, pictures: NDArray[np.uint16], name: str, codec: Any, rounds: int
+) -> Iterator[dict[str, Any]]:
+    """Ratio and speed of a small view, time and again, with plain h5py in between."""
+    proven, kept = _write_view(path, pictures, FEW_FRAMES), path.parent / "kept_small"
+    compress, read_back, plain, cpu_ms = [], [], [], []
+    for _ in range(rounds):
+        _forget(path)
+        used_s = _cpu_s()
+        done = _archive(path, proven, codec, kept)
+        cpu_ms.append(1e3 * (_cpu_s() - used_s) / FEW_FRAMES)
+        compress.append(done.pixel_bytes / done.compress_s / 1e6)
+        read_back.append(done.pixel_bytes / done.read_back_s / 1e6)
+        (kept / path.name).replace(path)
+        plain.append(_plain_h5py_mb_s(path.with_name("plain.h5"), path, codec))
+    ours, peer, cost_ms = statistics.median(compress), statistics.median(plain), statistics.median(cpu_ms)
+    yield _figure(f"archive_{name}_ratio", done.ratio, "1", "uncompressed", done.ratio)
+    yield {
+        **_figure(f"archive_{name}_compress", ours, "MB/s", "plain_h5py", ours / peer),
+        "peer_value": round(peer, 1),
+        "both_passes_cpu_ms_per_frame": round(cost_ms, 1),
+        "both_passes_mb_s_per_core": round(FRAME_BYTES / cost_ms / 1e3, 1),
+    }
+    back = statistics.median(read_back)
+    yield _figure(f"archive_{name}_read_back", back, "MB/s", "compress", back / ours)
+
+
+def _archive(path: Path, proven: list[Any], codec: Any, kept: Path) -> Any:
+    from coupole.archive_view import archive_view
+
+    return archive_view(path, proven, codec, lambda what, done, total: None, keep_in=kept)
+
+
+def _figure(name: str, value: float, unit: str, peer: str, ratio: float, **more: Any) -> dict[str, Any]:
+    return {"name": name, "value": value, "unit": unit, "peer": peer, "ratio": ratio, **more}
+
+
+def _cpu_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def _pictures() -> NDArray[np.uint16]:
+    """Frames [DISTINCT, H, W] in page-aligned memory: photons and 13 electrons of read noise at 3.35 electrons a
+    DN, 64 DN black; the light comes from another side in each."""
+    memory = mmap.mmap(-1, DISTINCT * FRAME_BYTES)
+    pictures = np.frombuffer(memory, np.uint16).reshape(DISTINCT, HEIGHT_PX, WIDTH_PX)
+    y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX].astype(np.float32)
+    object_here = np.hypot(x - WIDTH_PX / 2, y - HEIGHT_PX / 2) < 1300
+    relief = (0.6 + 0.4 * np.sin(x / 37) * np.sin(y / 53)) * object_here
+    relief[::2, ::2] *= 0.8
+    relief[1::2, ::2] *= 0.6
+    random = np.random.default_rng(1)
+    for number, picture in enumerate(pictures):
+        angle = 2 * np.pi * number / DISTINCT
+        away = np.hypot(x - WIDTH_PX * (0.5 + 0.2 * np.cos(angle)), y - HEIGHT_PX * (0.5 + 0.2 * np.sin(angle)))
+        electrons = 3.35 * 700 * relief * np.exp(-0.5 * (away / 900) ** 2)
+        noise = random.standard_normal((HEIGHT_PX, WIDTH_PX), np.float32) * np.sqrt(electrons + 13**2)
+        picture[:] = np.clip(np.rint((electrons + noise) / 3.35 + 64), 0, 4095)
+    return pictures
+
+
+def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[Any]:
+    """A view whose frames are all proven; returns what its journal would say of them."""
+    from coupole.devices import FrameFormat
+    from coupole.run import ProvenFrame
+    from coupole.store import ViewWriter, create
+
+    metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}
+    create(path, frames, FrameFormat(HEIGHT_PX, WIDTH_PX, 12, "GBRG", 64, 4095), metadata)
+    writer, proven = ViewWriter(path, {}), []
+    for number in range(frames):
+        slot = writer.put(pictures[number % DISTINCT], frame_id=number, camera_ns=0, exposure_us=8000)
+        shot = f"view/led{number:04d}/e0"
+        proven.append(ProvenFrame(shot, path.name, slot, number, f"{writer.prove(slot, shot, led=number):016x}"))
+    writer.sync()
+    writer.close()
+    return proven
+
+
+def _plain_h5py_mb_s(path: Path, before: Path, codec: Any) -> float:
+    """Speed of plain h5py: one frame after the other read and assigned to a dataset of the same chunks and filter,
+    then synced. Nothing is compared."""
+    from coupole.bitshuffle import tile_shape
+
+    chunks = (1, *tile_shape(HEIGHT_PX, WIDTH_PX))
+    _forget(before)
+    start_s = time.perf_counter()
+    with h5py.File(before) as source, h5py.File(path, "w") as file:
+        pixels = source[_DATA]
+        data = file.create_dataset("d", pixels.shape, np.uint16, chunks=chunks, **codec.filter)
+        for number in range(len(pixels)):
+            data[number] = pixels[number]
+    with path.open("r+b") as written:
+        os.fsync(written.fileno())
+    return FEW_FRAMES * FRAME_BYTES / (time.perf_counter() - start_s) / 1e6
+
+
+def _forget(path: Path) -> None:
+    """Empty the page cache of a file."""
+    with path.open("rb") as file:
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def _interleaved(
+    rounds: int, read: Callable[[h5py.Dataset], None], ours: Path, before: Path
+) -> tuple[float, float]:
+    """Median seconds of a reading from either file."""
+    times: dict[Path, list[float]] = {ours: [], before: []}
+    for _ in range(rounds):
+        for path, found in times.items():
+            _forget(path)
+            with h5py.File(path) as file:
+                start_s = time.perf_counter()
+                read(file[_DATA])
+                found.append(time.perf_counter() - start_s)
+    return statistics.median(times[ours]), statistics.median(times[before])
+
+
+def _read_tile(data: h5py.Dataset) -> None:
+    for number in range(len(data)):
+        data[(number, *TILE)]
+
+
+def _read_frame(data: h5py.Dataset) -> None:
+    data[len(data) // 2]

@@ -1,8 +1,7 @@
-"""The simulated camera, inside the world: edges make exposures, exposures make frames in shared memory.
+"""The simulated camera without a network: its frames lie in a ring of page-aligned slots, shared with the host.
 
-It keeps the sensor's rules (an edge that comes before the sensor is ready is counted and ignored), its own
-clock and its own frame counter. Frames lie in a ring of page-aligned slots; clients are told of them over a
-Unix socket and hand the slots back. `sim.memory_camera` is the driver at the other end.
+Clients are told of frames over a Unix socket and hand the slots back. `sim.memory_camera` is the driver at the
+other end; what the camera does with its edges is in `sim.camera_body`.
 """
 
 from __future__ import annotations
@@ -12,22 +11,21 @@ import json
 import math
 import mmap
 import os
-import random
 import socket
 import struct
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from coupole.geometry import Transform
+from sim import camera_body
+from sim.camera_body import CameraBody, Render, Shot
 from sim.lighting import Lighting
 from sim.reactor import Reactor
 
@@ -37,48 +35,11 @@ SLOT_MESSAGE = struct.Struct("<I")
 _HOST_PATIENCE_S, _HOST_NAP_S = 30.0, 0.005
 
 
-@dataclass(frozen=True)
-class Exposed:
-    """What one exposure saw, for the renderer."""
-
-    seconds_of_led: dict[int, float]
-    panels: list[int]
-    exposure_s: float
-    gain: float
-    number: int
-    """Counts exposures from power-on."""
-    base_from_flange: Transform
-
-
-Render = Callable[[NDArray[np.uint16], Exposed], None]
-"""Fill a frame [h, w] with what an exposure saw."""
-
-
-class Settings(BaseModel):
+class Settings(camera_body.Settings):
     """Character of the simulated camera."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
+    kind: Literal["memory"] = "memory"
     slots: Annotated[int, Field(ge=8)] = 48
-    render_every: Annotated[int, Field(ge=0)] = 1
-    """Every n-th frame holds a picture, the others none; 0 for none at all (dry runs)."""
-    clock_offset_ns: int = 7_777_000_000
-    clock_ppm: float = -23.0
-    timestamp_jitter_us: float = 2.0
-    first_frame_id: Annotated[int, Field(ge=1, le=65535)] = 1
-    id_modulus: Annotated[int, Field(ge=0)] = 65535
-    """Last frame id; after it comes 1 (GigE Vision 1)."""
-    seed: int = 11
-
-
-@dataclass
-class _Shot:
-    slot: int
-    frame_id: int
-    timestamp_ns: int
-    deliver_ns: int
-    rendered: bool
-    ready: bool = False
 
 
 def _received(client: socket.socket, size: int) -> bytes:
@@ -105,13 +66,20 @@ class CameraServer:
         pose: Callable[[], Transform],
         render: Render,
     ) -> None:
-        self._reactor, self._settings, self._lighting = reactor, settings, lighting
-        self._pose, self._render = pose, render
-        self._format = frame_format
+        self._reactor, self._settings, self._format = reactor, settings, frame_format
+        self._body = CameraBody(
+            reactor,
+            settings,
+            self,
+            readout_us=readout_us,
+            exposure_gap_us=exposure_gap_us,
+            lighting=lighting,
+            pose=pose,
+            render=render,
+        )
+        self.edge, self.ready = self._body.edge, self._body.ready
+        self.lose_frames, self.ignore_edges = self._body.lose_frames, self._body.ignore_edges
         self._shape = (frame_format["height_px"], frame_format["width_px"])
-        self._readout_ns, self._gap_ns = round(readout_us * 1e3), round(exposure_gap_us * 1e3)
-        self._random = random.Random(settings.seed)
-        self._workers = ThreadPoolExecutor(1, "render")
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(str(path))
         self._listener.listen(4)
@@ -119,128 +87,43 @@ class CameraServer:
         self._stream: socket.socket | None = None
         self._memory: mmap.mmap | None = None
         self._memory_fd = -1
-        self._generation = 0
+        self._generation = self._session = 0
         self._frames: list[NDArray[np.uint16]] = []
         self._free: deque[int] = deque()
-        self._pending: deque[_Shot] = deque()
-        self._armed = self._hardware = False
-        self._gain = 1.0
-        self._session = 0
-        self._exposure_ns = 8_000_000
-        self._ready_ns = self._readout_until_ns = 0
-        self._frame_id = settings.first_frame_id
-        self._number = 0
-        self._counters = dict.fromkeys(("exposed", "delivered", "lost_transfers", "over_triggers", "overflows"), 0)
-        self.lose_frames: set[int] = set()
-        """Numbers of frames (counted from power-on) whose transfer gets lost."""
-        self.ignore_edges: set[int] = set()
-        """Numbers of edges (counted from power-on) that the camera does not see."""
-        self._edge_number = 0
+        self._counted_before = dict(self._body.counters)
         reactor.add_reader(self._listener, self._accept)
-
-    # -- the cable ----------------------------------------------------------------------------------------
-
-    def edge(self, t_ns: int) -> None:
-        """A rising edge on the trigger line at world time `t_ns`."""
-        number, self._edge_number = self._edge_number, self._edge_number + 1
-        if self._armed and self._hardware and number not in self.ignore_edges:
-            self._start_exposure(t_ns)
-
-    def ready(self) -> bool:
-        """The exposure-ready line: an edge now would make a frame."""
-        return self._armed and self._reactor.now_ns >= self._next_start_ns()
 
     @property
     def armed(self) -> bool:
-        return self._armed
+        return self._body.armed
 
-    def _next_start_ns(self) -> int:
-        """The next exposure must not end before the last frame is read out (facts/genicam)."""
-        return max(self._ready_ns, self._readout_until_ns - self._exposure_ns)
+    # -- the wire (see sim.camera_body.Wire) --------------------------------------------------------------
 
-    def _start_exposure(self, t_ns: int) -> None:
-        if t_ns < self._next_start_ns():
-            self._counters["over_triggers"] += 1
-            return
-        end_ns = t_ns + self._exposure_ns
-        self._ready_ns = end_ns + self._gap_ns
-        self._readout_until_ns = end_ns + self._readout_ns
-        self._counters["exposed"] += 1
-        frame_id = self._frame_id
-        self._frame_id = self._frame_id + 1 if self._frame_id != self._settings.id_modulus else 1
-        number, self._number = self._number, self._number + 1
-        jitter_ns = self._random.gauss(0.0, self._settings.timestamp_jitter_us * 1e3)
-        stamp_ns = self._settings.clock_offset_ns + t_ns * (1 + self._settings.clock_ppm * 1e-6) + jitter_ns
-        session = self._session
-        self._reactor.at(
-            end_ns, lambda: self._end_exposure(session, t_ns, end_ns, frame_id, number, int(stamp_ns))
-        )
-
-    def _end_exposure(
-        self, session: int, start_ns: int, end_ns: int, frame_id: int, number: int, stamp_ns: int
-    ) -> None:
-        if session != self._session or not self._armed:
-            return
-        if number in self.lose_frames:
-            self._counters["lost_transfers"] += 1
-            return
-        if not self._free and not self._wait_for_a_slot():
-            self._counters["overflows"] += 1
-            return
-        every = self._settings.render_every
-        shot = _Shot(
-            self._free.popleft(),
-            frame_id,
-            stamp_ns,
-            end_ns + self._readout_ns,
-            every > 0 and number % every == 0,
-        )
-        self._pending.append(shot)
-        if not shot.rendered:
-            shot.ready = True
-            self._reactor.at(shot.deliver_ns, self._deliver)
-            return
-        exposed = Exposed(
-            self._lighting.exposure_s(start_ns, end_ns),
-            self._lighting.panels(start_ns),
-            (end_ns - start_ns) / 1e9,
-            self._gain,
-            number,
-            self._pose(),
-        )
-        self._workers.submit(self._work, shot, exposed)
-
-    def _wait_for_a_slot(self) -> bool:
-        """Let the world stand still until the host hands a slot back: its load is no fault of the camera."""
+    def claim(self) -> int | None:
+        """A slot; without one the world stands still until the host hands one back: its load is no fault of the
+        camera."""
         patience_end = time.monotonic() + _HOST_PATIENCE_S
         while not self._free and self._stream is not None and time.monotonic() < patience_end:
-            self._deliver()
+            self._body.deliver()
             if self._stream is not None and self._reactor.hold_for(self._stream, _HOST_NAP_S):
                 self._take_slots_back()
-        return bool(self._free)
+        return self._free.popleft() if self._free else None
 
-    def _work(self, shot: _Shot, exposed: Exposed) -> None:
-        self._render(self._frames[shot.slot], exposed)
-        shot.ready = True
-        self._reactor.call_threadsafe(self._deliver)
+    def pixels(self, slot: int) -> NDArray[np.uint16]:
+        return self._frames[slot]
 
-    def _deliver(self) -> None:
-        """Tell the client of finished frames, in order, not before their readout has ended."""
-        while self._pending and self._pending[0].ready and self._stream is not None:
-            shot = self._pending[0]
-            if shot.deliver_ns > self._reactor.now_ns:
-                self._reactor.at(shot.deliver_ns, self._deliver)
-                return
-            try:
-                self._stream.send(FRAME_MESSAGE.pack(shot.slot, shot.frame_id, shot.timestamp_ns, shot.rendered))
-            except BlockingIOError:
-                self._reactor.after(1e-3, self._deliver)
-                return
-            except OSError:
-                self._drop_stream()
-                return
-            self._pending.popleft()
-            self._counters["delivered"] += 1
+    def send(self, shot: Shot) -> bool:
+        if self._stream is None:
+            return False
+        try:
+            self._stream.send(FRAME_MESSAGE.pack(shot.slot, shot.frame_id, shot.timestamp_ns, shot.rendered))
+        except BlockingIOError:
+            self._reactor.after(1e-3, self._body.deliver)
+            return False
+        except OSError:
+            self._drop_stream()
+            return False
+        return True
 
     # -- the client ---------------------------------------------------------------------------------------
 
@@ -276,19 +159,18 @@ class CameraServer:
             self._drop_control()
 
     def _do_configure(self, exposure_us: int, gain_db: float, hardware_trigger: bool) -> dict[str, Any]:
-        self._exposure_ns, self._hardware = exposure_us * 1000, hardware_trigger
-        self._gain = 10.0 ** (gain_db / 20.0)
+        self._body.exposure_ns, self._body.hardware = exposure_us * 1000, hardware_trigger
+        self._body.gain = 10.0 ** (gain_db / 20.0)
         return self._format
 
     def _do_limits(self) -> dict[str, Any]:
-        return {"readout_us": math.ceil(self._readout_ns / 1e3), "exposure_gap_us": self._gap_ns // 1000}
+        return {"readout_us": math.ceil(self._body.readout_ns / 1e3), "exposure_gap_us": self._body.gap_ns // 1000}
 
     def _do_arm(self, buffers: int) -> dict[str, Any]:
         self._end_session()
         self._allocate(max(buffers, self._settings.slots))
-        self._counters = dict.fromkeys(self._counters, 0)
-        self._ready_ns = self._readout_until_ns = 0
-        self._armed = True
+        self._counted_before = dict(self._body.counters)
+        self._body.arm()
         return {"slots": len(self._frames), "session": self._session % 65536, "memory": self._generation}
 
     def _do_memory(self) -> dict[str, Any]:
@@ -298,23 +180,22 @@ class CameraServer:
         return {}
 
     def _do_trigger(self) -> dict[str, Any]:
-        if not self._armed or self._hardware:
+        if not self._body.armed or self._body.hardware:
             return {"error": "software trigger on a camera that is not armed for it"}
-        self._start_exposure(self._reactor.now_ns)
+        self._body.expose(self._reactor.now_ns)
         return {}
 
     def _do_statistics(self) -> dict[str, Any]:
-        return dict(self._counters)
+        """Since the camera was armed."""
+        return {name: count - self._counted_before[name] for name, count in self._body.counters.items()}
 
     def _do_disarm(self) -> dict[str, Any]:
         self._end_session()
         return {}
 
     def _end_session(self) -> None:
-        self._armed = False
+        self._body.disarm()
         self._session += 1
-        self._workers.submit(lambda: None).result()
-        self._pending.clear()
         self._free = deque(range(len(self._frames)))
 
     def _allocate(self, slots: int) -> None:
@@ -369,7 +250,7 @@ class CameraServer:
         self._listener.close()
 
     def close(self) -> None:
-        self._workers.shutdown(cancel_futures=True)
+        self._body.close()
         for link in (self._listener, self._control, self._stream):
             if link is not None:
                 link.close()

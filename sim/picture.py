@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform
-from sim.camera_server import Exposed
+from sim.camera_body import Exposed
 from sim.config import WHITE_SHARE, CameraConfig, SceneConfig
 from sim.scene import (
     Leds,

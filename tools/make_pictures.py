@@ -16,7 +16,7 @@ from coupole.geometry import apply, inverse, transform
 from coupole.itinerary import plan_itinerary
 from coupole.job import Job, read_job
 from coupole.picture import develop, png
-from sim.camera_server import Exposed
+from sim.camera_body import Exposed
 from sim.config import Config
 from sim.picture import Photographer
 

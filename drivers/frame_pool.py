@@ -1,0 +1,62 @@
+"""Page-aligned memory for the frames of cameras whose library hands images out one by one.
+
+A slot is free until it is taken for a frame, and again when that frame is released. Frames of an acquisition that
+is over may be released late: that does no harm to the slots of the next one.
+"""
+
+from __future__ import annotations
+
+import mmap
+import threading
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class FramePool:
+    """`slots` pieces of memory of `slot_bytes` each. May be used from several threads."""
+
+    def __init__(self, slots: int, slot_bytes: int) -> None:
+        self.slots, self.slot_bytes = slots, slot_bytes
+        self._pitch = -(-slot_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
+        # Populated: a burst's first frames must not wait for pages.
+        flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | mmap.MAP_POPULATE
+        self._memory = np.frombuffer(mmap.mmap(-1, slots * self._pitch, flags), np.uint8)
+        self._acquisition = 0
+        self._free = list(range(slots))
+        self._freed = threading.Condition()
+
+    def begin(self) -> None:
+        """A new acquisition begins: all slots are free, whoever still looks at one."""
+        with self._freed:
+            self._acquisition += 1
+            self._free = list(range(self.slots))
+
+    def take(self, timeout_s: float) -> Slot | None:
+        """A free slot, or None if none was given back in time."""
+        with self._freed:
+            if not self._freed.wait_for(lambda: self._free, timeout_s):
+                return None
+            index = self._free.pop()
+            start = index * self._pitch
+            return Slot(self, index, self._acquisition, self._memory[start : start + self.slot_bytes])
+
+    def give_back(self, index: int, acquisition: int) -> None:
+        """What `Slot.release` calls."""
+        with self._freed:
+            if acquisition == self._acquisition and index not in self._free:
+                self._free.append(index)
+                self._freed.notify()
+
+
+class Slot:
+    """One piece of the pool, taken."""
+
+    def __init__(self, pool: FramePool, index: int, acquisition: int, memory: NDArray[np.uint8]) -> None:
+        self._pool, self._index, self._acquisition = pool, index, acquisition
+        self.memory = memory
+        """[slot_bytes], begins on a page."""
+
+    def release(self) -> None:
+        """Give it back; a second time does nothing."""
+        self._pool.give_back(self._index, self._acquisition)

@@ -1,0 +1,68 @@
+"""A world with nothing but the GigE Vision camera in it, for tests."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+from camera_conformance import fire, in_world, sensor
+from gige import gige_port
+
+from drivers.aravis import AravisCamera, Settings
+from sim import gige_camera
+from sim.clock import ClockWriter, SharedClock
+from sim.reactor import Reactor
+
+SETTINGS: dict[str, Any] = {
+    "address": "127.0.0.1",
+    "packet_size": 32_000,
+    "exposed_counter": {"select": {"CounterSelector": "Counter0"}},
+    "over_trigger_counter": {"select": {"CounterSelector": "Counter1"}},
+}
+
+
+class GigeWorld:
+    """See `CameraWorld`."""
+
+    def __init__(self, folder: Path, *, height_px: int = 24, width_px: int = 40, **settings: Any) -> None:
+        self.reactor = Reactor(ClockWriter(folder / "clock", speed=1.0))
+        self.clock = SharedClock(folder / "clock")
+        self.camera = gige_camera.GigeCamera(
+            self.reactor, gige_camera.Settings(**settings), **sensor(height_px, width_px)
+        )
+        self._thread = threading.Thread(target=self.reactor.run)
+        self._thread.start()
+        self._drivers = ExitStack()
+
+    def open(self, **settings: Any) -> AravisCamera:
+        checked = Settings.model_validate({**SETTINGS, **settings})
+        return self._drivers.enter_context(closing(AravisCamera(checked, self.clock)))
+
+    def open_nothing(self) -> AravisCamera:
+        return self.open(address="127.0.0.77")
+
+    def fire(self, *periods_us: int) -> list[int]:
+        return fire(self.reactor, self.camera.edge, periods_us)
+
+    def unplug(self) -> None:
+        in_world(self.reactor, self.camera.unplug)
+
+    @property
+    def armed(self) -> bool:
+        return self.camera.armed
+
+    def close(self) -> None:
+        self._drivers.close()
+        self.reactor.stop()
+        self._thread.join()
+        self.camera.close()
+
+
+@contextmanager
+def gige_world(folder: Path, **settings: Any) -> Iterator[GigeWorld]:
+    """A running world with the port for itself."""
+    with gige_port(), closing(GigeWorld(folder, **settings)) as world:
+        yield world

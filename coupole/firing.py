@@ -105,6 +105,14 @@ class Firing:
         self._cell.ledbox.load(burst.table)
         if not burst.hardware:
             return self._by_software(burst)
+        needed_us = self._cell.camera.min_period_us(self.exposure(burst))
+        if burst.timing.period_us < needed_us:
+            raise DeviceError(
+                "camera",
+                expected=f"to be triggered every {needed_us} us at the most",
+                happened=f"the rig's `sensor:` has it triggered every {burst.timing.period_us} us",
+                remedy="Lower `max_frames_per_s`, or raise `exposure_gap_us`, in the rig.",
+            )
         period_s = burst.timing.period_us * 1e-6
         buffers = buffers_for(len(burst.labels), frame_format.frame_bytes, period_s)
         return self._by_cable(burst, following, buffers)

@@ -221,6 +221,19 @@ def test_a_mute_box_is_reported_with_what_was_expected_and_what_to_do(joining: C
     assert remedy
 
 
+def test_a_camera_slower_than_the_rig_says_is_told_before_any_light(cell: CellFolder) -> None:
+    """The world is made of what the rig said first; then the rig claims more."""
+    cell.join()
+    with cell.world() as world:
+        cell.rig_data["sensor"]["max_frames_per_s"] = 150
+        cell.write()
+        ended = cell.acquire()
+        assert cells.safe(world)
+    assert ended.code == 4
+    assert "camera: expected to be triggered every 10000 us at the most" in ended.err
+    assert cells.events(cell.run_folder, "burst") == []
+
+
 def test_a_box_that_is_mute_from_the_start_is_reported_before_anything_moves(joining: CellFolder) -> None:
     with joining.world({"kind": "mute_box"}) as world:
         ended = joining.acquire()

@@ -91,7 +91,7 @@ _SELF_PAIRS = {
 
 
 _EVERYDAY_DEG: dict[tuple[str, str], list[tuple[float, ...]]] = {
-    ("link 2", "base"): [(0, -90, 0, 0, 0, 0)],
+    ("link 2", "base"): [(0, -170, 0, 0, 0, 0), (0, 20, 0, 0, 0, 0)],
     ("tool", "link 4"): [(0, 0, 0, 0, a5, a6) for a5 in (-90, 0, 90) for a6 in range(0, 360, 15)],
 }
 """Pairs next to each other: what is near in these postures stays so by the joint between them, or is drawn too

@@ -119,21 +119,22 @@ def plan_itinerary(
             refusals.append(f"view {view.name}: {why_not}")
         else:
             choices[index] = postures
-    visits: list[Visit | None] = [None] * len(views)
     start = np.asarray(start_deg, dtype=np.float64)
-    unease_s = [UNEASE_S * singularities.unease(arm, postures) for postures in choices.values()]
-    tour = shortest_tour(planner, start, list(choices.values()), unease_s, as_written=order == "as_written")
-    numbers = list(choices)
-    visited: list[int] = []
-    before = "where the arm stands"
-    for group, joints, leg in zip(tour.order, tour.places, tour.legs, strict=True):
-        index = numbers[group]
-        if leg.contact is not None:
-            refusals.append(f"view {views[index].name}: no way to it was found from {before}: {leg.contact}")
-        else:
-            visits[index] = Visit(joints, leg)
-            visited.append(index)
-        before = f"view {views[index].name}"
+    while True:
+        unease_s = [UNEASE_S * singularities.unease(arm, postures) for postures in choices.values()]
+        tour = shortest_tour(planner, start, list(choices.values()), unease_s, as_written=order == "as_written")
+        visited = [list(choices)[group] for group in tour.order]
+        contacts = [leg.contact for leg in tour.legs]
+        cut_off = next((k for k, contact in enumerate(contacts) if contact is not None), None)
+        if cut_off is None:
+            break
+        before = f"view {views[visited[cut_off - 1]].name}" if cut_off else "where the arm stands"
+        name = views[visited[cut_off]].name
+        refusals.append(f"view {name}: no way to it was found from {before}: {contacts[cut_off]}")
+        del choices[visited[cut_off]]  # what comes after it may be reached without it
+    visits: list[Visit | None] = [None] * len(views)
+    for index, joints, leg in zip(visited, tour.places, tour.legs, strict=True):
+        visits[index] = Visit(joints, leg)
     return Itinerary(tuple(visits), tuple(refusals), tuple(visited))
 
 

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 _RESTARTS, _ROUNDS = 3, 200
 _CHANGES_PER_PLACE, _MOST_CHANGES = 2_000, 600_000
-_AGAIN = 0.1
+_AGAIN = 0.03
 """Share of the changes, and of the first temperature, when a way is sought again after some legs were learnt."""
 _COLDEST_S = 1e-3
 _DETOUR_S = 0.5
@@ -88,7 +88,7 @@ def _settled(
     """An order and the places picked in it that are still best when all legs of the way are known."""
     picked = _best_places(times.seconds, groups, order)
     for count in range(_ROUNDS):
-        if not as_written:
+        if not as_written and len(order) > 1:
             order, picked = _best_order(times.seconds, groups, order, picked, seed, again=count > 0)
         picked = _best_places(times.seconds, groups, order)
         news = False
@@ -143,18 +143,17 @@ def _way_s(seconds: Floats, groups: _Groups, picked: NDArray[np.int64]) -> float
 
 def _best_places(seconds: Floats, groups: _Groups, order: NDArray[np.int64]) -> NDArray[np.int64]:
     """The place of each group that makes the way in a given order shortest, by dynamic programming."""
-    before, total_s = np.zeros(1, dtype=np.int64), np.zeros(1)
-    came_from, rows = [], []
+    before, total_s = slice(0, 1), np.zeros(1)
+    came_from = []
     for group in order:
-        here = np.arange(groups.first[group], groups.first[group + 1])
-        costs_s = total_s[:, None] + seconds[np.ix_(before, here)] + groups.unease_s[here]
-        came_from.append(np.argmin(costs_s, axis=0))
-        rows.append(here)
-        before, total_s = here, costs_s.min(axis=0)
-    k = int(np.argmin(total_s))
+        here = slice(groups.first[group], groups.first[group + 1])
+        costs_s = total_s[:, None] + seconds[before, here]
+        came_from.append(costs_s.argmin(axis=0))
+        before, total_s = here, costs_s.min(axis=0) + groups.unease_s[here]
+    k = int(total_s.argmin())
     picked = []
-    for here, back in zip(rows[::-1], came_from[::-1], strict=True):
-        picked.append(here[k])
+    for group, back in zip(order[::-1], came_from[::-1], strict=True):
+        picked.append(groups.first[group] + k)
         k = int(back[k])
     return np.array(picked[::-1])
 

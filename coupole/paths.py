@@ -1,8 +1,8 @@
 """Ways of the arm between places that touch nothing.
 
 A *leg* brings the arm from one view to the next: straight in joint space where that is clear, else over via
-points, else along a path that RRT-Connect finds (Kuffner, LaValle 2000: two trees that grow towards each
-other), shortened afterwards. Where even that finds none it goes over a resting place that both ends know a way to.
+points, else along paths that RRT-Connect finds (Kuffner, LaValle 2000: two trees that grow towards each other) to
+and from a resting place, shortened afterwards.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from coupole.kinematics import Arm, move_durations_s
 Joints = NDArray[np.float64]
 
 _RRT_STEP_DEG = 15.0
-_RRT_NODES = 600
+_RRT_TRIES = 300
 _SHORTCUTS = 40
 NO_WAY_S = 1e6
 
@@ -81,9 +81,9 @@ class PathPlanner:
         for place in (start, goal):
             if self._bodies is not None and (contacts := self._bodies.contacts(place)):
                 return contacts[0]
-        chain = self._over_vias(start, goal)
-        if chain is None and not (self._is_cut_off(start) or self._is_cut_off(goal)):
-            chain = self._rrt_connect(start, goal) or self._over_resting_place(start, goal)
+        chain = self._over_vias(start, goal) or self._over_resting_place(start, goal)
+        if chain is None and self._is_cut_off(start) == self._is_cut_off(goal):
+            chain = self._rrt_connect(start, goal)
         if chain is not None:
             return self._shortened(chain)
         assert self._bodies is not None
@@ -106,9 +106,8 @@ class PathPlanner:
         return None
 
     def _is_cut_off(self, place: Joints) -> bool:
-        """True if no way leads there from any resting place, as far as was searched."""
-        found = [self._from_via.get((number, place.tobytes()), [place]) for number in range(len(self._vias))]
-        return bool(found) and all(way is None for way in found)
+        """True if no way was found there from any resting place."""
+        return all(self._way_from_via(number, place) is None for number in range(len(self._vias)))
 
     def _way_from_via(self, number: int, place: Joints) -> list[Joints] | None:
         """From a resting place to another place; searched once."""
@@ -144,7 +143,7 @@ class PathPlanner:
         trees: tuple[list[Joints], list[Joints]] = ([start], [goal])
         parents: tuple[list[int], list[int]] = ([-1], [-1])
         grow = 0
-        while len(trees[0]) + len(trees[1]) < _RRT_NODES:
+        for _ in range(_RRT_TRIES):
             target = random.uniform(low, high)
             reached = self._extend(trees[grow], parents[grow], target, greedy=False)
             if reached is not None:

@@ -2,8 +2,8 @@
 
 The camera is found by its address, serial number or Aravis id; the rig's `features` are checked, written and
 read back at opening, in their order. Frames are views of our own page-aligned buffers, not copied (packed and
-8-bit formats are widened once). What a camera cannot tell is -1, never guessed. `docs/reference/cameras.md` lists
-the settings.
+8-bit formats are widened once). What a camera cannot tell is -1, never guessed. The settings are listed in
+`docs/reference/camera-aravis.md`.
 """
 
 from __future__ import annotations

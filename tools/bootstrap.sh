@@ -2,7 +2,8 @@
 #
 # Sets `root`, the project's folder. `prepare` makes sure that `$root/.venv` holds what pyproject.toml asks
 # for: with the uv on PATH, or with one that it installs into `$root/.tools/uv-venv`. When nothing has changed
-# since the last time it only compares a stamp. Everything it says goes to standard error.
+# since the last time it only compares a stamp. `prepare_tests` adds what only the tests need of the system.
+# Everything they say goes to standard error.
 # shellcheck shell=bash
 
 root=$(dirname "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")")
@@ -23,6 +24,21 @@ prepare() {
     ((status == 0)) || fail "the set-up failed; see the messages above"
 }
 
+# libaravis and its command line, for the tests of the GigE Vision camera: installed by root where there is
+# apt-get, tried once. Where it is missing, the wheel `aravis-python` may serve; without either they are skipped.
+prepare_tests() {
+    local tried="$root/.tools/tried-libaravis"
+    if has_aravis || [[ -e $tried || $EUID -ne 0 ]] || ! command -v apt-get >/dev/null; then
+        return 0
+    fi
+    say "installing libaravis with apt-get, for the tests (once; needs the network)"
+    (
+        if command -v flock >/dev/null; then flock 9; fi
+        has_aravis || install_aravis || : >"$tried"
+    ) 9>"$root/.tools/lock" >&2 </dev/null
+    has_aravis || say "apt-get could not install libaravis; remove $tried to try again"
+}
+
 # ---- helpers ----
 
 say() { printf 'coupole: %s\n' "$*" >&2; }
@@ -30,6 +46,17 @@ say() { printf 'coupole: %s\n' "$*" >&2; }
 fail() {
     say "$*"
     exit 1
+}
+
+has_aravis() {
+    command -v arv-tool-0.8 >/dev/null && [[ "$(ldconfig -p 2>/dev/null)" == *libaravis-0.8.so.0* ]]
+}
+
+install_aravis() {
+    local packages=(libaravis-0.8-0 aravis-tools-cli) options=(-y -qq --no-install-recommends)
+    export DEBIAN_FRONTEND=noninteractive
+    apt-get install "${options[@]}" "${packages[@]}" ||
+        { apt-get update -qq && apt-get install "${options[@]}" "${packages[@]}"; }
 }
 
 # What the environment was made from; virtual environments hold absolute paths, hence the folder.

@@ -13,23 +13,25 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import tempfile
 from collections import Counter
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from replay_cell import ReplayCell, Touch, motion
 
 from coupole.itinerary import Itinerary, bodies_of, plan_itinerary
-from coupole.job import Job, read_job
+from coupole.job import Job, read_job, schedule_of
 from coupole.kinematics import KR10_R1100_SIXX
+from coupole.plan import Plan
 
 ROOT = Path(__file__).resolve().parents[1]
+DEMO = ROOT / "configs/plans/demo.yaml"
 RELIEF = ROOT / "configs/objects/relief.ply"
-Plan = dict[str, Any]
 REASONS = {
     "touches the object": "the object;",
     "touches the dome": "the dome;",
@@ -43,35 +45,36 @@ REASONS = {
 """What a refusal is counted as, by a phrase of it."""
 
 
-def random_object(random: np.random.Generator, folder: Path) -> Plan:
-    """A mesh of one of four kinds, somewhere on the support, as the plan's `object`."""
+def random_object(random: np.random.Generator) -> tuple[NDArray[np.float64], list[float]]:
+    """Triangles [n, 3, 3] of one of four kinds of objects, somewhere on the support, and where it stands, mm."""
     kind = random.choice(["relief", "box", "sphere", "bunny"])
-    path = RELIEF if kind == "relief" else folder / "object.ply"
-    lift_mm = 0.0
-    if kind == "box":
-        size_mm = random.uniform(40, 350, 3)
-        trimesh.creation.box(extents=size_mm).export(path)
-        lift_mm = size_mm[2] / 2
+    if kind == "relief":
+        mesh: Any = trimesh.load(RELIEF, process=False, force="mesh")
+    elif kind == "box":
+        mesh = trimesh.creation.box(extents=random.uniform(40, 300, 3))
     elif kind == "sphere":
-        lift_mm = random.uniform(30, 200)
-        trimesh.creation.icosphere(subdivisions=3, radius=lift_mm).export(path)
-    elif kind == "bunny":
-        body_mm = random.uniform(40, 90)
-        lift_mm = body_mm
-        body = trimesh.creation.icosphere(subdivisions=3, radius=body_mm)
-        body.vertices *= 1.0 + 0.1 * np.sin(body.vertices @ random.normal(size=(3, 1)) * 0.1)
-        head = trimesh.creation.icosphere(subdivisions=3, radius=0.6 * body_mm)
-        head.apply_translation((0.8 * body_mm, 0, 1.2 * body_mm))
-        ears = [trimesh.creation.capsule(height=body_mm, radius=0.15 * body_mm) for _ in range(2)]
-        for side, ear in zip((-1, 1), ears, strict=True):
-            ear.apply_translation((0.7 * body_mm, side * 0.3 * body_mm, 1.6 * body_mm))
-        trimesh.util.concatenate([body, head, *ears]).export(path)
-    at_mm = [*random.uniform(-150, 150, 2).tolist(), lift_mm]
-    pose = {"translation_mm": at_mm, "abc_deg": [float(random.uniform(-180, 180)), 0, 0]}
-    return {"id": "something", "mesh": str(path), "support_from_object": pose}
+        mesh = trimesh.creation.icosphere(subdivisions=3, radius=random.uniform(30, 150))
+    else:
+        mesh = bunny(random, float(random.uniform(40, 90)))
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(random.uniform(-np.pi, np.pi), (0, 0, 1)))
+    at_mm = [*random.uniform(-150, 150, 2).tolist(), float(mesh.extents[2] / 2)]
+    mesh.apply_translation(np.array((*at_mm[:2], 0.0)) - (0.0, 0.0, mesh.bounds[0][2]))
+    return np.asarray(mesh.vertices)[np.asarray(mesh.faces)], at_mm
 
 
-def random_view(random: np.random.Generator, name: str, target_mm: list[float]) -> Plan:
+def bunny(random: np.random.Generator, body_mm: float) -> Any:
+    """A dented body, a head, two ears."""
+    body = trimesh.creation.icosphere(subdivisions=3, radius=body_mm)
+    body.vertices *= 1.0 + 0.1 * np.sin(body.vertices @ random.normal(size=(3, 1)) * 0.1)
+    head = trimesh.creation.icosphere(subdivisions=3, radius=0.6 * body_mm)
+    head.apply_translation((0.8 * body_mm, 0, 1.2 * body_mm))
+    ears = [trimesh.creation.capsule(height=body_mm, radius=0.15 * body_mm) for _ in range(2)]
+    for side, ear in zip((-1, 1), ears, strict=True):
+        ear.apply_translation((0.7 * body_mm, side * 0.3 * body_mm, 1.6 * body_mm))
+    return trimesh.util.concatenate([body, head, *ears])
+
+
+def random_view(random: np.random.Generator, name: str, target_mm: list[float]) -> dict[str, Any]:
     """A view of any kind: mostly of the object, sometimes of another place, or given by joints."""
     kind = random.choice(["look_at", "grid", "joints"], p=[0.6, 0.25, 0.15])
     if kind == "joints":
@@ -93,24 +96,23 @@ def random_view(random: np.random.Generator, name: str, target_mm: list[float]) 
     return {**looks, "azimuths_deg": azimuths_deg, "elevations_deg": [elevation_deg]}
 
 
-def random_plan(random: np.random.Generator, folder: Path, rig: Path) -> Path:
-    """A plan of 3 to 6 views, or a few more where one is a grid, written into a folder."""
-    seen = random_object(random, folder)
-    x_mm, y_mm, _ = seen["support_from_object"]["translation_mm"]
-    views = [random_view(random, f"v{k}", [x_mm, y_mm, 40.0]) for k in range(random.integers(3, 7))]
-    plan = {
-        "schema_version": 1,
-        "name": "replay",
-        "rig": str(rig),
-        "object": seen,
-        "views": views,
-        "order": str(random.choice(["fastest", "as_written"])),
-        "lights": {"kind": "none"},
-        "exposure": {"kind": "fixed", "exposure_us": 8000},
-    }
-    path = folder / "plan.yaml"
-    path.write_text(json.dumps(plan), encoding="utf-8")
-    return path
+def random_job(random: np.random.Generator, demo: Job) -> Job:
+    """3 to 6 views, or a few more where one is a grid, of an object in the demo's cell."""
+    corners_mm, at_mm = random_object(random)
+    plan = Plan.model_validate(
+        {
+            "schema_version": 1,
+            "name": "replay",
+            "rig": demo.plan.rig,
+            "views": [random_view(random, f"v{k}", at_mm) for k in range(random.integers(3, 7))],
+            "order": str(random.choice(["fastest", "as_written"])),
+            "lights": {"kind": "none"},
+            "exposure": {"kind": "fixed", "exposure_us": 8000},
+        }
+    )
+    return replace(
+        demo, plan=plan, object_corners_mm=corners_mm, schedule=schedule_of(plan, demo.cell), _planned=[]
+    )
 
 
 def planned(job: Job, meshes: Path | None) -> Itinerary:
@@ -142,15 +144,21 @@ def reason(refusal: str) -> str:
 
 
 def run(
-    plans: int, seed: int, meshes: Path | None, rig: Path, *, check_meshes: bool = False, tell: bool = False
+    plans: int,
+    seed: int,
+    meshes: Path | None,
+    rig: Path | None = None,
+    *,
+    check_meshes: bool = False,
+    tell: bool = False,
 ) -> dict[str, Any]:
     """Figures of a whole replay; `touches` lists plan, bodies and joint angles of each collision found."""
+    demo = read_job(DEMO, rig)
     passed, places = 0, 0
     refused: Counter[str] = Counter()
     touches: list[dict[str, Any]] = []
     for number in range(plans):
-        with tempfile.TemporaryDirectory() as folder:
-            job = read_job(random_plan(np.random.default_rng([seed, number]), Path(folder), rig))
+        job = random_job(np.random.default_rng([seed, number]), demo)
         itinerary = planned(job, meshes if check_meshes else None)
         if itinerary.refusals:
             refused[reason(itinerary.refusals[0])] += 1
@@ -177,7 +185,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--meshes", type=Path)
     parser.add_argument("--check-meshes", action="store_true", help="preflight has the links' meshes as well")
-    parser.add_argument("--rig", type=Path, default=ROOT / "configs/rigs/sim.yaml")
+    parser.add_argument("--rig", type=Path, help="another than the demo's")
     asked = parser.parse_args()
     found = run(asked.plans, asked.seed, asked.meshes, asked.rig, check_meshes=asked.check_meshes, tell=True)
     print(json.dumps(found))

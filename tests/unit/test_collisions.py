@@ -82,8 +82,8 @@ def test_surface_points_lie_dense_on_the_surface() -> None:
     corners = box_corners((100.0, 60.0, 40.0))
     points = surface_points(corners)
     random = np.random.default_rng(1)
-    weights = random.dirichlet((1, 1, 1), 4000)
-    somewhere = np.einsum("nk,nkj->nj", weights, corners[random.integers(0, len(corners), 4000)])
+    weights = random.dirichlet((1, 1, 1), 1500)
+    somewhere = np.einsum("nk,nkj->nj", weights, corners[random.integers(0, len(corners), 1500)])
     nearest = np.min(np.linalg.norm(somewhere[:, None] - points[None], axis=2), axis=1)
     assert nearest.max() <= MESH_STEP_MM
 
@@ -126,7 +126,7 @@ def test_a_motion_that_is_called_clear_is_clear_at_every_place(
     end = start + 0.2 * (end - start)
     if bodies.contact_on_the_way(start, end) is None:
         places = start + np.linspace(0, 1, 400)[:, None] * (end - start)
-        assert min(margin.min() for margin in bodies.margins(places).values()) >= 0
+        assert bodies.tightest_mm(places).min() >= 0
 
 
 @settings(max_examples=60, deadline=None)
@@ -156,7 +156,7 @@ def test_margins_never_exceed_the_distance_that_an_independent_checker_finds(mes
         mesh = trimesh.load(LINK_MESHES / f"link_{link}.stl", process=False, force="mesh")
         links[link] = fcl.CollisionObject(_fcl_mesh(1000 * mesh.vertices, mesh.faces))
     random = np.random.default_rng(4)
-    for _ in range(150):
+    for _ in range(60):
         joints = random.uniform(LOW, HIGH)
         frames = inverse(BASE_FROM_SUPPORT) @ link_frames(KR10_R1100_SIXX, joints)
         margins = bodies.margins(joints)
@@ -167,7 +167,7 @@ def test_margins_never_exceed_the_distance_that_an_independent_checker_finds(mes
             if margin > 0:
                 assert distance >= margin
                 taken_closer_mm.append(distance - margin)
-    assert len(taken_closer_mm) > 100
+    assert len(taken_closer_mm) > 50
     assert np.median(taken_closer_mm) < (20.0 if meshes else 60.0)
 
 

@@ -112,6 +112,27 @@ def test_refused_views_are_left_out_of_the_order_and_the_others_chained() -> Non
     assert [visit is None for visit in itinerary.visits] == [False, True, False]
 
 
+@pytest.mark.parametrize("order", ["fastest", "as_written"])
+def test_a_view_that_is_hemmed_in_is_refused_alone_and_says_by_what(order: str) -> None:
+    plates = [
+        {"kind": "box", "name": name, "min_mm": (540, y, 590), "max_mm": (940, y + 20, 810)}
+        for name, y in (("left", -140), ("right", 120))
+    ]
+    rig = rig_of(keep_out=plates)
+    itinerary = planned(
+        looking("a", 335, -90, 60),
+        standing("hemmed", 0, -60, 60, 0, 60, 0),
+        looking("b", 335, -60, 50),
+        rig=rig,
+        order=order,
+    )
+    assert sorted(itinerary.order) == [0, 2]
+    (said,) = itinerary.refusals
+    assert re.match(
+        r"view hemmed: no way to it was found from [\w ]+: \w+ would be .* keep-out `(left|right)`;", said
+    )
+
+
 def test_each_leg_begins_where_the_one_before_it_in_the_order_ends() -> None:
     views = [looking(f"v{k}", 335, azimuth, 50) for k, azimuth in enumerate((-60, 60, -30, 30))]
     itinerary = planned(*views)

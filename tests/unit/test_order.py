@@ -71,15 +71,21 @@ class Search:
 
     def settle(self, best: Callable[[], list[int]]) -> float:
         """The time of the way that `best` still names when all of its legs are known."""
-        while True:
-            way = [0, *best()]
-            unknown = [(a, b) for a, b in pairwise(way) if not self.known[a, b]]
-            if not unknown:
-                return float(self.seconds[way[:-1], way[1:]].sum())
-            for a, b in unknown:
-                duration_s = self.planner.leg(self.places[a], self.places[b]).duration_s
-                self.seconds[a, b] = self.seconds[b, a] = duration_s
-                self.known[a, b] = self.known[b, a] = True
+        while self.learn(way := best()):
+            pass
+        return self.seconds_along(way)
+
+    def learn(self, way: list[int]) -> bool:
+        """Find the legs of a way that are not known; True if there were any."""
+        unknown = [(a, b) for a, b in pairwise([0, *way]) if not self.known[a, b]]
+        for a, b in unknown:
+            duration_s = self.planner.leg(self.places[a], self.places[b]).duration_s
+            self.seconds[a, b] = self.seconds[b, a] = duration_s
+            self.known[a, b] = self.known[b, a] = True
+        return bool(unknown)
+
+    def seconds_along(self, way: list[int]) -> float:
+        return float(self.seconds[[0, *way[:-1]], way].sum())
 
     def exact(self) -> list[int]:
         """The best way of all: dynamic programming over which views were visited and where the last visit was
@@ -98,24 +104,31 @@ class Search:
         assert all(done == everything for done, _ in best)
         return min(best.values())[1]
 
-    def restarted(self, restarts: int, seed: int) -> list[int]:
-        """Best of many random orders, each improved by exchanging stretches and moving visits until nothing helps,
-        with the places chosen anew by dynamic programming for each order that is tried."""
+    def restarted(self, restarts: int, seed: int) -> float:
+        """The least time found from many random orders, each improved by exchanging stretches and moving visits
+        until nothing helps, with the places chosen anew by dynamic programming for each order that is tried."""
         random = np.random.default_rng(seed)
-        found: tuple[float, list[int]] = (np.inf, [])
-        for _ in range(restarts):
-            order = random.permutation(len(self.groups)).tolist()
-            best = self.along(order)
-            improved = True
-            while improved:
-                improved = False
-                for candidate in neighbours(order, random):
-                    trial = self.along(candidate)
-                    if trial[0] < best[0] - 1e-9:
-                        order, best, improved = candidate, trial, True
-                        break
-            found = min(found, best)
-        return found[1]
+        orders = [self.improved(random.permutation(len(self.groups)).tolist(), random) for _ in range(restarts)]
+        while True:
+            k = int(np.argmin([self.along(order)[0] for order in orders]))
+            if self.learn(self.along(orders[k])[1]):
+                continue
+            before_s = self.along(orders[k])[0]
+            orders[k] = self.improved(orders[k], random)
+            if self.along(orders[k])[0] == before_s:
+                return before_s
+
+    def improved(self, order: list[int], random: np.random.Generator) -> list[int]:
+        """The order after all exchanges that help."""
+        best_s = self.along(order)[0]
+        while True:
+            for candidate in neighbours(order, random):
+                trial_s = self.along(candidate)[0]
+                if trial_s < best_s - 1e-9:
+                    order, best_s = candidate, trial_s
+                    break
+            else:
+                return order
 
     def along(self, order: list[int]) -> tuple[float, list[int]]:
         """Time and places of the best way in one order."""
@@ -143,7 +156,7 @@ def neighbours(order: list[int], random: np.random.Generator) -> list[list[int]]
     return found
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_few_views_are_visited_on_the_best_way_there_is(seed: int) -> None:
     views = [view[:4] for view in random_views(6, seed)]
     search = Search(views)
@@ -153,8 +166,7 @@ def test_few_views_are_visited_on_the_best_way_there_is(seed: int) -> None:
 def test_dynamic_programming_agrees_with_trying_all_orders() -> None:
     search = Search([view[:2] for view in random_views(5, 7)])
     tried = min(search.along(list(order)) for order in permutations(range(5)))
-    way = [0, *search.exact()]
-    assert search.seconds[way[:-1], way[1:]].sum() == pytest.approx(tried[0])
+    assert search.seconds_along(search.exact()) == pytest.approx(tried[0])
 
 
 def test_many_views_take_at_most_a_quarter_more_than_a_long_search_finds(
@@ -163,8 +175,7 @@ def test_many_views_take_at_most_a_quarter_more_than_a_long_search_finds(
     for seed in range(100, 100 + scale(1, 10)):
         views = random_views(scale(12, 30), seed)
         search = Search(views)
-        found_s = seconds_of(search.planner, views)
-        assert found_s <= 1.25 * search.settle(lambda s=search, n=seed: s.restarted(scale(3, 10), n))  # type: ignore[misc]
+        assert seconds_of(search.planner, views) <= 1.25 * search.restarted(scale(2, 8), seed)
 
 
 def test_the_same_views_give_the_same_tour() -> None:

@@ -13,7 +13,6 @@ from coupole.kinematics import KR10_R1100_SIXX, link_frames
 
 ROOT = Path(__file__).parents[2]
 LINK_MESHES = ROOT.parent / "shared/data/robot/kr10r1100sixx"
-RIG = ROOT / "configs/rigs/sim.yaml"
 
 
 @pytest.fixture(autouse=True)
@@ -27,7 +26,7 @@ def tools(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_random_plans_that_pass_touch_nothing(scale: Callable[[int, int], int]) -> None:
     import replay_plans
 
-    found = replay_plans.run(scale(20, 500), 1, LINK_MESHES if LINK_MESHES.is_dir() else None, RIG)
+    found = replay_plans.run(scale(20, 500), 1, LINK_MESHES if LINK_MESHES.is_dir() else None)
     assert found["touches"] == []
     assert found["passed"] >= 3
     assert sum(found["refused"].values()) == found["plans"] - found["passed"]

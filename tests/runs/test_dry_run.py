@@ -32,7 +32,7 @@ def test_a_dry_run_takes_and_proves_every_shot(rehearsed: tuple[CellFolder, Ende
 
 def test_a_dry_run_takes_the_time_that_preflight_says(rehearsed: tuple[CellFolder, Ended]) -> None:
     found = rehearsed[1].document
-    assert found["duration_s"] == pytest.approx(found["preflight_s"], rel=0.02)
+    assert found["duration_s"] == pytest.approx(found["preflight_s"], rel=0.1)
 
 
 def test_a_dry_run_says_how_fast_it_was(rehearsed: tuple[CellFolder, Ended]) -> None:

@@ -87,7 +87,7 @@ def link_corners(folder: Path, link: int) -> Floats:
     """Triangles [n, 3, 3] of a link's mesh, mm. Raises InputError."""
     import trimesh
 
-    path = folder / (f"link_{link}.stl" if link else "base_link.stl")
+    path = _mesh_path(folder, link)
     try:
         mesh: Any = trimesh.load(path, process=False, force="mesh")
     except Exception as error:  # whatever trimesh raises, the file is not a mesh to us
@@ -96,6 +96,15 @@ def link_corners(folder: Path, link: int) -> Floats:
     if len(corners) == 0 or not np.isfinite(corners).all():
         raise InputError(f"{path}: expected the mesh of link {link}; it has no triangles, or no finite ones")
     return corners * (1000.0 if np.ptp(corners) < _METRES_BELOW else 1.0)
+
+
+def missing_link_meshes(folder: Path) -> list[Path]:
+    """What `bodies_of_meshes` would not find in a folder."""
+    return [path for link in range(7) if not (path := _mesh_path(folder, link)).is_file()]
+
+
+def _mesh_path(folder: Path, link: int) -> Path:
+    return folder / (f"link_{link}.stl" if link else "base_link.stl")
 
 
 def reach_mm(arm: Arm, body: Body, from_link: int = 0) -> Floats:

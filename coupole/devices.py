@@ -207,7 +207,7 @@ class Frame:
     """Counts frames that the camera exposed, modulo the transport's range (see `Camera.id_modulus`)."""
     timestamp_ns: int
     """Start of exposure on the camera's clock."""
-    pixels: NDArray[np.uint16]
+    pixels: NDArray[np.uint16] = field(repr=False)
     """[height_px, width_px], DN; page-aligned memory of the driver, not copied."""
     release: Any = field(default=lambda: None, repr=False)
     """Call once, when the bytes are needed no more: the buffer goes back to the camera."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole import ledger, yamlfile
+from coupole.bodies import missing_link_meshes
 from coupole.collisions import CellBodies
 from coupole.dome import LedTable, read_led_table
 from coupole.errors import InputError, Problem, StorageError
@@ -107,7 +108,9 @@ class Job:
     @cached_property
     def bodies(self) -> CellBodies:
         """Arm, tool and everything that they must not touch."""
-        return bodies_of(self.cell.rig, self.cell.leds, self.object_corners_mm)
+        meshes = self.cell.rig.link_meshes
+        folder = self.cell.document.resolve(meshes) if meshes else None
+        return bodies_of(self.cell.rig, self.cell.leds, self.object_corners_mm, folder)
 
     @property
     def inputs(self) -> Inputs:
@@ -131,6 +134,10 @@ def read_cell(path: Path) -> Cell:
             leds = read_led_table(leds_path)
         except InputError as error:
             problems += error.problems
+    if rig.link_meshes is not None and (missing := missing_link_meshes(document.resolve(rig.link_meshes))):
+        problems.append(
+            document.problem(("link_meshes",), f"expected the links' meshes; there is no {missing[0]}")
+        )
     if problems or leds is None:
         raise InputError(problems)
     return Cell(rig, document, leds)

@@ -184,6 +184,9 @@ class Rig(Model):
     dome: Dome
     support: Support
     tool: tuple[ToolBody, ...]
+    link_meshes: Path | None = None
+    """Folder of meshes (`base_link.stl`, `link_1.stl` to `link_6.stl`) that stand for the arm's links, in place of
+    capsules round them."""
     clearances: Keep = Keep()
     keep_out: tuple[KeepOut, ...] = ()
     led_limits: LedLimits = LedLimits()

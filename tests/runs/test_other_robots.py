@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import cells
 import pytest
 from cells import SIDE, TOP, CellFolder
+from gige import gige_port, needs_aravis
 
 from coupole.job import read_cell
 from coupole.rig import planning_arm
@@ -24,11 +26,12 @@ def eki(cell: CellFolder) -> CellFolder:
     return cell
 
 
-@pytest.mark.parametrize("name", ["sim", "sim-eki", "sim-ur"])
+@pytest.mark.parametrize("name", ["sim", pytest.param("sim-gige", marks=needs_aravis), "sim-eki", "sim-ur"])
 def test_the_devices_of_each_shipped_rig_open_and_test_themselves(name: str) -> None:
     if name == "sim-ur":
         pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
-    ended = cells.command("devices", "--rig", cells.REPO / f"configs/rigs/{name}.yaml")
+    with gige_port() if name == "sim-gige" else nullcontext():
+        ended = cells.command("devices", "--rig", cells.REPO / f"configs/rigs/{name}.yaml")
     assert ended.code == 0, ended.err
     assert ended.err.count("simulated") >= 3
 

@@ -15,6 +15,7 @@ from coupole.dome import read_led_table
 from coupole.errors import InputError
 from coupole.geometry import look_at
 from coupole.itinerary import ELBOW_LIMITS_DEG, Itinerary, arm_of, bodies_of, plan_itinerary
+from coupole.job import read_job
 from coupole.rig import Rig
 from coupole.shots import ViewPose
 from coupole.singularities import KEPT_FROM
@@ -196,3 +197,22 @@ def test_meshes_of_the_links_let_a_view_pass_that_the_capsules_round_them_refuse
     for link_meshes, refused in ((None, True), (LINK_MESHES, False)):
         cell = bodies_of(tight, DOME, no_object, link_meshes)
         assert bool(plan_itinerary([beside_a_lamp], tight, cell, HOME_DEG).refusals) is refused
+
+
+@pytest.mark.skipif(not LINK_MESHES.is_dir(), reason="the vendor's link meshes are not at hand")
+def test_the_rig_names_the_folder_of_link_meshes(tmp_path: Path) -> None:
+    shipped = (ROOT / "configs/rigs/sim.yaml").read_text().replace("../", f"{ROOT}/configs/")
+    (tmp_path / "rig.yaml").write_text(f"link_meshes: {LINK_MESHES}\n{shipped}")
+    home = np.array([HOME_DEG])
+    with_meshes = read_job(ROOT / "configs/plans/demo.yaml", tmp_path / "rig.yaml").bodies
+    with_capsules = read_job(ROOT / "configs/plans/demo.yaml").bodies
+    assert with_meshes.tightest_mm(home) > with_capsules.tightest_mm(home)
+
+
+def test_a_rig_that_names_a_folder_without_link_meshes_is_refused_at_that_line(tmp_path: Path) -> None:
+    shipped = (ROOT / "configs/rigs/sim.yaml").read_text().replace("../", f"{ROOT}/configs/")
+    (tmp_path / "rig.yaml").write_text(f"link_meshes: {tmp_path}\n{shipped}")
+    with pytest.raises(
+        InputError, match=r"rig\.yaml:1:\d+: link_meshes: expected the links' meshes.*base_link\.stl"
+    ):
+        read_job(ROOT / "configs/plans/demo.yaml", tmp_path / "rig.yaml")

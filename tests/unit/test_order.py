@@ -169,6 +169,7 @@ def test_dynamic_programming_agrees_with_trying_all_orders() -> None:
     assert search.seconds_along(search.exact()) == pytest.approx(tried[0])
 
 
+@pytest.mark.timeout(3600)
 def test_many_views_take_at_most_a_quarter_more_than_a_long_search_finds(
     scale: Callable[[int, int], int],
 ) -> None:

@@ -203,6 +203,7 @@ class CameraServer:
         pitch = -(-frame_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
         if self._memory is None or len(self._frames) < slots:
             self._frames = []
+            self._body.pictured.clear()
             if self._memory_fd >= 0:
                 os.close(self._memory_fd)
             self._generation += 1

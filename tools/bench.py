@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import mmap
-import os
 import resource
 import statistics
 import subprocess
@@ -18,8 +16,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -104,58 +100,11 @@ def bench_sequencing(rounds: int) -> None:
 
 
 def bench_store(rounds: int) -> None:
-    """Full-size frames through the view writer (checksum, O_DIRECT, frame table, sync) against a plain
-    O_DIRECT copy of the same bytes to the same disk."""
-    from coupole.devices import FrameFormat
-    from coupole.store import ViewWriter, create
+    """Full-size frames to disk: the view writer and others, and the whole stream of a run."""
+    from bench_store import figures
 
-    height, width = FULL_SIZE
-    frames, distinct = 48, 8
-    memory = mmap.mmap(-1, distinct * height * width * 2)
-    pixels = np.frombuffer(memory, np.uint16).reshape(distinct, height, width)
-    pixels[:] = np.random.default_rng(1).integers(64, 4095, pixels.shape, np.uint16)
-    frame_bytes = height * width * 2
-    ours, peers, ours_cpu, peers_cpu = [], [], [], []
-    with tempfile.TemporaryDirectory(dir=ROOT) as folder:
-        view, copy = Path(folder) / "view.h5", Path(folder) / "copy.raw"
-        metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}
-        create(view, frames, FrameFormat(height, width, 12, "GBRG", 64, 4095), metadata)
-        fd = os.open(copy, os.O_WRONLY | os.O_CREAT | os.O_DIRECT)
-        os.posix_fallocate(fd, 0, frames * frame_bytes)
-
-        def store() -> None:
-            writer = ViewWriter(view, {})
-            keep = partial(writer.put, camera_ns=0, exposure_us=8000)
-            with ThreadPoolExecutor(3) as pool:  # as `coupole.intake` does
-                slots = [pool.submit(keep, pixels[k % distinct], frame_id=k) for k in range(frames)]
-                for k, slot in enumerate(slots):
-                    writer.prove(slot.result(), f"view/led{k:04d}/e0", led=k)
-            writer.sync()
-            writer.close()
-
-        def copy_plainly() -> None:
-            for k in range(frames):
-                os.pwrite(fd, pixels[k % distinct].data.cast("B"), k * frame_bytes)
-            os.fdatasync(fd)
-
-        for _ in range(rounds):
-            for work, times, used in ((store, ours, ours_cpu), (copy_plainly, peers, peers_cpu)):
-                started_s, before_s = time.perf_counter(), cpu_s()
-                work()
-                times.append(time.perf_counter() - started_s)
-                used.append((cpu_s() - before_s) / frames * 1e3)
-        os.close(fd)
-    value, peer = frames / statistics.median(ours), frames / statistics.median(peers)
-    line(
-        "store_full_size",
-        value,
-        "frames/s",
-        "o_direct_copy",
-        value / peer,
-        peer_value=round(peer, 2),
-        cpu_ms_per_frame=round(statistics.median(ours_cpu), 2),
-        peer_cpu_ms_per_frame=round(statistics.median(peers_cpu), 2),
-    )
+    for figure in figures(ROOT, rounds):
+        line(**figure)
 
 
 # -- matching ---------------------------------------------------------------------------------------------

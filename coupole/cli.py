@@ -91,7 +91,7 @@ def check(
         raise
     if not no_paths:
         job = job.without_hidden()
-    report = preflight_of(job, job.cell.storage_folder, paths=not no_paths)
+    job, report = preflight_of(job, job.cell.storage_folder, paths=not no_paths)
     show_preflight(console, report, name=job.plan.name, rig=job.cell.rig.name)
     show_views(console, report)
     if as_json:
@@ -109,6 +109,7 @@ def check(
                     "ideal_s": report.ideal_s,
                     "dose_lux_h": report.dose_lux_h,
                     "peak_board_c": report.peak_board_c,
+                    "exposures": [asdict(timing) for timing in report.timings],
                     "hidden_lights": sum(map(len, job.hidden_leds.values())),
                     "paths_checked": not no_paths,
                 }

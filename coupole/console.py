@@ -19,6 +19,7 @@ from coupole.observer import Progress as RunProgress
 from coupole.preflight import Report
 from coupole.recorder import DryRecorder
 from coupole.run import Status
+from coupole.shots import BurstTiming
 
 if TYPE_CHECKING:
     from coupole.live import Shown
@@ -115,6 +116,7 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
     table = Table(title=f"{name} on {rig}", title_justify="left", box=None, show_header=False)
     table.add_row("views, shots, frames", f"{len(report.views)}, {report.shots}, {report.frames}")
     table.add_row("on disk", f"{bytes_text(report.bytes)} at {bytes_text(report.asked_bytes_s)}/s" + _disk(report))
+    table.add_row("a frame every", "; ".join(map(_pace, report.timings)))
     table.add_row("duration", f"{duration_text(report.duration_s)} (at best {duration_text(report.ideal_s)})")
     budget = "" if report.dose_budget_lux_h is None else f" of {report.dose_budget_lux_h:g} allowed"
     before = f" after {report.dose_before_lux_h:.3f} before" if report.dose_before_lux_h else ""
@@ -123,6 +125,13 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
     console.print(table)
     for warning in report.warnings:
         console.print(f"[yellow]note:[/] {warning}")
+
+
+def _pace(timing: BurstTiming) -> str:
+    bounds = {"LED": "the LED's time alight", "heat": "the LEDs' heat", "disk": "the disk", "camera": "the camera"}
+    return (
+        f"{timing.period_us / 1e3:g} ms, as {bounds[timing.bound]} asks ({timing.exposure_us / 1e3:g} ms exposed)"
+    )
 
 
 def _disk(report: Report) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.devices import Camera, Frame
+from coupole.store import WRITERS
 
 _TAKE_TIMEOUT_S = 0.05
 _STALL_S = 2.0
@@ -34,7 +35,7 @@ class Intake:
     `keep(frame)` runs on `writers` threads and returns the slot. Frames are listed in order of arrival.
     """
 
-    def __init__(self, camera: Camera, keep: Callable[[Frame], int], *, writers: int = 3) -> None:
+    def __init__(self, camera: Camera, keep: Callable[[Frame], int], *, writers: int = WRITERS) -> None:
         self._camera, self._keep = camera, keep
         self._pool = ThreadPoolExecutor(writers, "keep")
         self._frame_ids: list[int] = []

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import shutil
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,15 +22,18 @@ from coupole.errors import InputError, Problem, StorageError
 from coupole.geometry import apply
 from coupole.itinerary import Itinerary, bodies_of, plan_itinerary
 from coupole.plan import MeasuredObject, Plan
-from coupole.preflight import Report, StorageFacts, check
+from coupole.preflight import DISK_SHARE, Report, StorageFacts, check
 from coupole.rig import Rig, driver_problems, planning_arm
 from coupole.run import Inputs
 from coupole.shadow import Shadow, Shadows, shadows_of
-from coupole.shots import Schedule, ViewPose, build_schedule, missing_lights
+from coupole.shots import FASTEST, Pace, Schedule, ViewPose, build_schedule, missing_lights
 from coupole.store import measure_write_speed
 from coupole.yamlfile import Document
 
 _SAME_PLACE_DEG = 1e-3
+_DISK_GRAIN_US = 100
+_LED_DUTIES = tuple(0.9**k for k in range(1, 33))
+"""Tried in turn where LEDs get too hot: down to a thirtieth of the time alight."""
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
 
 
@@ -64,6 +69,8 @@ class Job:
     schedule: Schedule
     hidden_leds: Mapping[str, Sequence[int]] = field(default_factory=dict)
     """LEDs that were left out of views, by name of view."""
+    pace: Pace = FASTEST
+    """What holds the schedule's steps apart beside camera and LEDs."""
     _planned: list[tuple[tuple[str, ...], Sequence[float], Itinerary]] = field(default_factory=list, repr=False)
 
     def itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
@@ -84,6 +91,13 @@ class Job:
             return self
         hidden = dict(known) if known is not None else self._hidden_from_home()
         return replace(self, schedule=self.schedule.without(hidden), hidden_leds=hidden)
+
+    def at(self, pace: Pace) -> Job:
+        """The same job at another pace."""
+        if pace == self.pace:
+            return self
+        schedule = schedule_of(self.plan, self.cell, pace).without(self.hidden_leds)
+        return replace(self, schedule=schedule, pace=pace)
 
     def _hidden_from_home(self) -> dict[str, list[int]]:
         itinerary = self.itinerary(self.schedule.views, self.cell.rig.motion.home_joints_deg)
@@ -176,8 +190,8 @@ def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
     return Job(plan, document, cell, mesh_path, corners, _dose_points(plan, corners), schedule_of(plan, cell))
 
 
-def schedule_of(plan: Plan, cell: Cell) -> Schedule:
-    """All bursts of all views of a plan, at the times that the cell's camera and LEDs allow."""
+def schedule_of(plan: Plan, cell: Cell, pace: Pace = FASTEST) -> Schedule:
+    """All bursts of all views of a plan, at the times that the cell's camera and LEDs and the pace allow."""
     return build_schedule(
         plan,
         cell.leds,
@@ -185,6 +199,7 @@ def schedule_of(plan: Plan, cell: Cell) -> Schedule:
         rise_us=cell.rig.led_limits.rise_us,
         readout_us=1e6 / cell.rig.sensor.max_frames_per_s,
         exposure_gap_us=cell.rig.sensor.exposure_gap_us,
+        pace=pace,
     )
 
 
@@ -239,8 +254,9 @@ def _dose_points(plan: Plan, corners: NDArray[np.float64]) -> NDArray[np.float64
 
 def preflight_of(
     job: Job, folder: Path, *, paths: bool = True, allocated_bytes: int = 0, share_left: float = 1.0
-) -> Report:
-    """Preflight's report on a job whose run would lie in `folder`; the disk there is measured.
+) -> tuple[Job, Report]:
+    """Preflight's report on a job whose run would lie in `folder`, and the job at the pace that LEDs and the disk
+    there, which is measured, allow.
 
     Without `paths` nothing is checked for collisions. Of a run to be resumed, `allocated_bytes` lie there already
     and `share_left` of its frames are still to be taken.
@@ -249,15 +265,17 @@ def preflight_of(
     while not existing.exists():
         existing = existing.parent
     try:
-        write_bytes_s = measure_write_speed(existing)
+        write_bytes_s = measure_write_speed(existing, frame_bytes=job.cell.rig.sensor.frame_bytes)
     except StorageError:
         write_bytes_s = 0.0
     free_bytes = shutil.disk_usage(existing).free + allocated_bytes
     return check_job(job, StorageFacts(free_bytes, write_bytes_s), paths=paths, share_left=share_left)
 
 
-def check_job(job: Job, storage: StorageFacts, *, paths: bool = True, share_left: float = 1.0) -> Report:
-    """Preflight's report on a job, given what is known of the disk."""
+def check_job(
+    job: Job, storage: StorageFacts, *, paths: bool = True, share_left: float = 1.0
+) -> tuple[Job, Report]:
+    """Preflight's report on a job, given what is known of the disk; and the job at the pace that both allow."""
     rig = job.cell.rig
     home_deg = rig.motion.home_joints_deg
     if paths:
@@ -265,18 +283,41 @@ def check_job(job: Job, storage: StorageFacts, *, paths: bool = True, share_left
     else:
         itinerary = plan_itinerary(job.schedule.views, rig, None, home_deg, job.plan.order)
     before = ledger.total_lux_h(job.cell.storage_folder, job.plan.object.id) if job.plan.object else 0.0
-    report = check(
-        job.plan,
-        job.cell.rig,
-        job.schedule,
-        job.cell.leds,
-        storage,
-        itinerary,
-        object_points_support_mm=job.object_points_support_mm,
-        dose_before_lux_h=before,
-        share_left=share_left,
-    )
+
+    def checked(pace: Pace) -> tuple[Job, Report]:
+        paced = job.at(pace)
+        report = check(
+            job.plan,
+            rig,
+            paced.schedule,
+            job.cell.leds,
+            storage,
+            itinerary,
+            object_points_support_mm=job.object_points_support_mm,
+            dose_before_lux_h=before,
+            share_left=share_left,
+        )
+        return paced, report
+
+    job, report = _cooled(*checked(Pace(disk_us=_disk_us(rig, storage))), checked)
     if planning_arm(rig) is None:
         why = "no model of this arm's links: whether it touches anything cannot be told"
         report.refusals.insert(0, f"robot {rig.robot.driver}: {why}")
-    return report
+    return job, report
+
+
+def _disk_us(rig: Rig, storage: StorageFacts) -> int:
+    """Time in which the disk takes a frame, rounded up so that its moods do not show; 0 if unknown."""
+    if not storage.write_bytes_s:
+        return 0
+    seconds = rig.sensor.frame_bytes / (DISK_SHARE * storage.write_bytes_s)
+    return math.ceil(seconds * 1e6 / _DISK_GRAIN_US) * _DISK_GRAIN_US
+
+
+def _cooled(job: Job, report: Report, checked: Callable[[Pace], tuple[Job, Report]]) -> tuple[Job, Report]:
+    """Where LEDs get too hot: the fastest pace at which they do not; as it was if none of those tried will do."""
+    if not report.too_hot:
+        return job, report
+    paces = [replace(job.pace, led_duty=duty) for duty in _LED_DUTIES]
+    first = bisect_left(paces, True, key=lambda pace: not checked(pace)[1].too_hot)
+    return checked(paces[first]) if first < len(paces) else (job, report)

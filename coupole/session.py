@@ -107,7 +107,7 @@ def _acquire_into(
 ) -> None:
     resumed = run is not None
     folder = (run.folder if run else parent or job.cell.storage_folder).resolve()
-    preflight = preflight_of(
+    job, preflight = preflight_of(
         job,
         folder,
         allocated_bytes=run.allocated_bytes() if run else 0,
@@ -290,7 +290,7 @@ def meter(job: Job, console: Console, wish: metering.Wish, *, confirm: bool) -> 
     cell_leds, base_from_support = job.cell.leds, job.cell.rig.support.base_from_support.matrix()
     few = metering.metering_plan(job.plan, cell_leds, select_leds(job.plan, cell_leds, base_from_support))
     small = replace(job, plan=few, schedule=schedule_of(few, job.cell))
-    preflight = check_job(small, StorageFacts(UNLIMITED_BYTES))
+    small, preflight = check_job(small, StorageFacts(UNLIMITED_BYTES))
     _refuse(preflight)
     _ask_to_begin(job.cell, confirm=confirm)
     recorder, control = metering.MeterRecorder(), Control()
@@ -370,7 +370,7 @@ def _show_live(source: Source, studio: Studio, console: Console, port: int, *, l
 def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any]) -> None:
     """Run a whole plan on the rig's twin, faster than life, and say what preflight could not know."""
     job = job.without_hidden()
-    preflight = check_job(job, StorageFacts(UNLIMITED_BYTES))
+    job, preflight = check_job(job, StorageFacts(UNLIMITED_BYTES))
     show_preflight(console, preflight, name=job.plan.name, rig=f"the twin of {job.cell.rig.name}")
     _refuse(preflight)
     recorder, control = DryRecorder(), Control()

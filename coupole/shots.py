@@ -59,6 +59,19 @@ class ViewPose:
 
 
 @dataclass(frozen=True)
+class Pace:
+    """What holds the steps of a burst farther apart than camera and LED ask for."""
+
+    disk_us: int = 0
+    """The disk takes a frame in this time."""
+    led_duty: float = 1.0
+    """Largest share of its step that an LED shines, for the heat."""
+
+
+FASTEST = Pace()
+
+
+@dataclass(frozen=True)
 class BurstTiming:
     """Times of a burst's ordinary steps, in us."""
 
@@ -66,6 +79,8 @@ class BurstTiming:
     on_us: int
     trigger_delay_us: int
     period_us: int
+    bound: str
+    """What decides the period: `camera`, `LED`, `disk` or `heat`."""
 
 
 @dataclass(frozen=True)
@@ -230,20 +245,32 @@ def interleave(boards: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def burst_timing(
-    exposure_us: int, *, rise_us: int, readout_us: float, exposure_gap_us: int, hardware: bool
+    exposure_us: int,
+    *,
+    rise_us: int,
+    readout_us: float,
+    exposure_gap_us: int,
+    hardware: bool,
+    pace: Pace = FASTEST,
 ) -> BurstTiming:
-    """Shortest times of a step that camera and LEDs allow.
+    """Shortest times of a step that camera, LEDs and the given pace allow.
 
     The LED is on for its rise, the exposure and a margin; the period is the longest of the camera's readout,
-    the exposure plus the sensor's gap, and the LED's on-time plus a dark gap.
+    the exposure plus the sensor's gap, the LED's on-time plus a dark gap, and what disk and heat ask for.
     """
     on_us = rise_us + exposure_us + EXPOSURE_MARGIN_US
     if not hardware:
         on_us += SOFTWARE_LATENCY_US
     camera_us = max(readout_us, exposure_us + exposure_gap_us)
     camera_us += PERIOD_MARGIN_US + PERIOD_MARGIN_PPM * 1e-6 * camera_us
-    period_us = max(int(np.ceil(camera_us)), on_us + LED_GAP_US)
-    return BurstTiming(exposure_us, on_us, rise_us, period_us)
+    periods_us = {
+        "camera": int(np.ceil(camera_us)),
+        "LED": on_us + LED_GAP_US,
+        "disk": pace.disk_us,
+        "heat": int(np.ceil(on_us / pace.led_duty)),
+    }
+    bound = max(periods_us, key=lambda name: periods_us[name])
+    return BurstTiming(exposure_us, on_us, rise_us, periods_us[bound], bound)
 
 
 def build_schedule(
@@ -254,6 +281,7 @@ def build_schedule(
     rise_us: int,
     readout_us: float,
     exposure_gap_us: int,
+    pace: Pace = FASTEST,
 ) -> Schedule:
     """All bursts of all views. Tables are shared between views: the box need not be loaded anew."""
     rows = select_leds(plan, leds, base_from_support)
@@ -269,6 +297,7 @@ def build_schedule(
                 readout_us=readout_us,
                 exposure_gap_us=exposure_gap_us,
                 hardware=hardware,
+                pace=pace,
             )
             ending = f"/e{index}" + (f"/r{repeat}" if repeat else "")
             darks = plan.darks_per_view if repeat == 0 else 0

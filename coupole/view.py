@@ -44,7 +44,7 @@ def look(job: Job, console: Console, *, paths: bool) -> Scene:
     rig, views = job.cell.rig, job.schedule.views
     with _doing(console, f"planning the ways to {len(views)} views" if paths else "finding postures"):
         job = job.without_hidden() if paths else job
-        report = check_job(job, StorageFacts(free_bytes=sys.maxsize), paths=paths)
+        job, report = check_job(job, StorageFacts(free_bytes=sys.maxsize), paths=paths)
         home_deg = rig.motion.home_joints_deg
         if paths:
             itinerary = job.itinerary(views, home_deg)

@@ -365,17 +365,6 @@ def test_a_run_that_does_not_fit_on_the_disk_is_refused() -> None:
     assert "must stay free" in refusal
 
 
-def test_a_disk_slower_than_the_frames_is_refused() -> None:
-    refusal = only_refusal(checked(plan_of(), storage=StorageFacts(10**15, write_bytes_s=30e6)))
-    assert "frames come at 39 MB/s, the disk takes 30 MB/s" in refusal
-
-
-def test_a_disk_hardly_faster_than_the_frames_is_warned_of() -> None:
-    report = checked(plan_of(), storage=StorageFacts(10**15, write_bytes_s=40e6))
-    assert report.refusals == []
-    assert "close to the 40 MB/s" in report.warnings[0]
-
-
 def test_a_frame_that_is_no_multiple_of_a_page_is_warned_of() -> None:
     assert RIG is not None
     rig = rig_of(sensor={**RIG.sensor.model_dump(), "width_px": 500})

@@ -97,7 +97,7 @@ def archive_view(
     return ArchivedView(
         view=path.stem,
         frames=len(frames),
-        pixel_bytes=len(frames) * layout.frame_bytes,
+        pixel_bytes=len(frames) * layout.height_px * layout.width_px * 2,
         stored_bytes=stored_bytes,
         freed_bytes=(0 if keep_in else before_bytes) - _bytes_on_disk(path),
         compress_s=written_s - started_s,
@@ -149,7 +149,8 @@ def _write(path: Path, partial: Path, frames: list[ProvenFrame], codec: Codec, p
         ThreadPoolExecutor(workers, "archive") as pool,
     ):
         _reserve(on_disk.fileno(), after, path.stat().st_size - layout.frames * layout.frame_bytes)
-        data = _copy_all_but_frames(before, after, tile, codec, {frame.index for frame in frames})
+        shape = (layout.frames, layout.height_px, layout.width_px)
+        data = _copy_all_but_frames(before, after, shape, tile, codec, {frame.index for frame in frames})
 
         def compress(frame: ProvenFrame) -> Tiles:
             with source.frame(frame) as pixels:
@@ -176,7 +177,12 @@ def _reserve(fd: int, file: h5py.File, more_bytes: int) -> None:
 
 
 def _copy_all_but_frames(
-    before: h5py.File, after: h5py.File, tile: tuple[int, int], codec: Codec, kept: set[int]
+    before: h5py.File,
+    after: h5py.File,
+    shape: tuple[int, int, int],
+    tile: tuple[int, int],
+    codec: Codec,
+    kept: set[int],
 ) -> h5py.Dataset:
     """Copy groups, tables, values, links and attributes as they are; returns the frames' dataset, still empty."""
     frames = before[store.DATA]
@@ -193,9 +199,10 @@ def _copy_all_but_frames(
             elif old[name].name != frames.name:
                 old.copy(name, new)
     data = after.create_dataset(
-        store.DATA, frames.shape, frames.dtype, chunks=(1, *tile), fillvalue=bitshuffle.FILL_DN, **codec.filter
+        store.DATA, shape, "<u2", chunks=(1, *tile), fillvalue=bitshuffle.FILL_DN, **codec.filter
     )
     _copy_attributes(frames, data)
+    data.attrs.pop("packing", None)
     data.attrs["archived"] = f"{journal.utc_now()} by coupole {coupole.__version__}, bitshuffle and {codec.name}"
     data.attrs["not_stored"] = f"slots without a proven frame have no pixels and read as {bitshuffle.FILL_DN}"
     table = after[store.FRAMES]
@@ -243,7 +250,7 @@ class _Source:
         try:
             offset = self._layout.data_offset + frame.index * self._layout.frame_bytes
             read = os.preadv(self._fd, [memory], offset)
-            pixels = np.frombuffer(memory, np.uint16).reshape(self._layout.height_px, self._layout.width_px)
+            pixels = store.pixels_of(memory, self._layout)
             if read != self._layout.frame_bytes or f"{store.checksum(pixels):016x}" != frame.xxh3:
                 raise ChecksumMismatch(
                     f"{self._path}: {frame.shot} is not what was proven. `coupole verify` lists all that is "

@@ -148,6 +148,9 @@ def read_cell(path: Path) -> Cell:
             leds = read_led_table(leds_path)
         except InputError as error:
             problems += error.problems
+    if rig.storage.pixels == "packed12" and (rig.sensor.bit_depth > 12 or rig.sensor.width_px % 2):
+        why = f"expected an even width and 12 bits at most, found {rig.sensor.width_px} and {rig.sensor.bit_depth}"
+        problems.append(document.problem(("storage", "pixels"), f"frames cannot be packed: {why}"))
     if rig.link_meshes is not None and (missing := missing_link_meshes(document.resolve(rig.link_meshes))):
         problems.append(
             document.problem(("link_meshes",), f"expected the links' meshes; there is no {missing[0]}")
@@ -265,7 +268,7 @@ def preflight_of(
     while not existing.exists():
         existing = existing.parent
     try:
-        write_bytes_s = measure_write_speed(existing, frame_bytes=job.cell.rig.sensor.frame_bytes)
+        write_bytes_s = measure_write_speed(existing, frame_bytes=job.cell.rig.frame_bytes)
     except StorageError:
         write_bytes_s = 0.0
     free_bytes = shutil.disk_usage(existing).free + allocated_bytes
@@ -310,7 +313,7 @@ def _disk_us(rig: Rig, storage: StorageFacts) -> int:
     """Time in which the disk takes a frame, rounded up so that its moods do not show; 0 if unknown."""
     if not storage.write_bytes_s:
         return 0
-    seconds = rig.sensor.frame_bytes / (DISK_SHARE * storage.write_bytes_s)
+    seconds = rig.frame_bytes / (DISK_SHARE * storage.write_bytes_s)
     return math.ceil(seconds * 1e6 / _DISK_GRAIN_US) * _DISK_GRAIN_US
 
 

@@ -23,14 +23,16 @@ from numpy.typing import NDArray
 Order = Literal["lsb", "msb"]
 
 
-def pack12(pixels: NDArray[np.uint16], order: Order = "lsb") -> NDArray[np.uint8]:
-    """Bytes [3 n / 2] of n pixels (any shape, C order, n even) below 4096.
+def pack12(
+    pixels: NDArray[np.uint16], order: Order = "lsb", *, out: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """Bytes [3 n / 2] of n pixels (any shape, C order, n even) below 4096, in `out` if given.
 
     Raises ValueError for an odd number of pixels, and for one that has more than 12 bits.
     """
     if pixels.size % 2:
         raise ValueError(f"expected an even number of pixels, found {pixels.size}")
-    packed = np.empty(pixels.size // 2 * 3, np.uint8)
+    packed = np.empty(pixels.size // 2 * 3, np.uint8) if out is None else out
     highest = _pack(np.ascontiguousarray(pixels).reshape(-1), packed, order == "msb")
     if highest > 0x0FFF:
         raise ValueError(f"expected pixels of 12 bits, found a bit above them in {int(pixels.max())}")

@@ -268,7 +268,7 @@ def _heat(
 
 
 def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts) -> None:
-    frame_bytes = rig.sensor.frame_bytes
+    frame_bytes = rig.frame_bytes
     report.bytes = report.frames * frame_bytes
     shortest_us = min(int(b.table["period_us"].min()) for b in schedule.bursts[0])
     report.asked_bytes_s = frame_bytes / (shortest_us * 1e-6)

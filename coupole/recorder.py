@@ -65,8 +65,9 @@ class Recorder(Protocol):
 class RunRecorder:
     """Into a run folder."""
 
-    def __init__(self, run: Run, metadata: Mapping[str, Any]) -> None:
-        self._run, self._metadata = run, dict(metadata)
+    def __init__(self, run: Run, metadata: Mapping[str, Any], *, packed: bool = False) -> None:
+        """Frames may be stored `packed`, two pixels in three bytes."""
+        self._run, self._metadata, self._packed = run, dict(metadata), packed
         self._journal = Journal(run.journal_path)
         self._proven = {shot: frame.index for shot, frame in run.proven().items()}
         self._writer: ViewWriter | None = None
@@ -96,7 +97,7 @@ class RunRecorder:
                 if mine:
                     raise StorageError(f"{path}: the journal knows proven frames of it, but it is gone")
                 metadata = {**self._metadata, "title": view}
-                create(path, frames + SPARE_SLOTS, frame_format, metadata, collections)
+                create(path, frames + SPARE_SLOTS, frame_format, metadata, collections, packed=self._packed)
             self._writer = ViewWriter(path, mine)
         self._pose = self._writer.add_pose(arm, base_from_camera)
 

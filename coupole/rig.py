@@ -51,10 +51,6 @@ class Sensor(Model):
     """Least time between the end of one exposure and the start of the next."""
 
     @property
-    def frame_bytes(self) -> int:
-        return self.width_px * self.height_px * 2
-
-    @property
     def white_dn(self) -> int:
         return (1 << self.bit_depth) - 1
 
@@ -158,6 +154,8 @@ class Storage(Model):
     folder: Path
     reserve_bytes: Annotated[int, Field(ge=0)] = 256 * 1024**2
     """Free space that a run must leave on the disk."""
+    pixels: Literal["uint16", "packed12"] = "uint16"
+    """How frames lie on the disk: two bytes a pixel, or two pixels of at most 12 bits in three bytes."""
 
 
 class WorldSection(Model):
@@ -193,6 +191,12 @@ class Rig(Model):
     motion: Motion = Motion()
     storage: Storage
     world: WorldSection | None = None
+
+    @property
+    def frame_bytes(self) -> int:
+        """Of a frame on the disk."""
+        pixels = self.sensor.width_px * self.sensor.height_px
+        return pixels * 3 // 2 if self.storage.pixels == "packed12" else pixels * 2
 
 
 DEVICES = ("ledbox", "camera", "robot")

@@ -16,7 +16,7 @@ from typing import Any
 from rich.console import Console
 
 from coupole import ledger, metering, report
-from coupole.cell import OpenedCell, coarse, open_cell
+from coupole.cell import OpenedCell, open_cell
 from coupole.console import LiveFigures, RunObserver, ask, show_dry_run, show_preflight
 from coupole.devices import Identity
 from coupole.errors import (
@@ -123,7 +123,8 @@ def _acquire_into(
             run = Run.create(folder, job.plan.name, job.inputs, about_run(job, cell))
             held.callback(os.close, run.lock())
         console.print(f"run {run.folder}")
-        recorder = RunRecorder(run, metadata_of_views(job, cell))
+        packed = job.cell.rig.storage.pixels == "packed12"
+        recorder = RunRecorder(run, metadata_of_views(job, cell), packed=packed)
         try:
             how = {"simulated": cell.simulated, **({"acknowledged": acknowledged} if acknowledged else {})}
             recorder.event("resume" if resumed else "start", **how)
@@ -225,7 +226,7 @@ def _acquire(
     found: dict[str, Any],
 ) -> None:
     control = Control()
-    observer = RunObserver(console, job.cell.rig.sensor.frame_bytes, len(recorder.proven()))
+    observer = RunObserver(console, job.cell.rig.frame_bytes, len(recorder.proven()))
     sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
     outcome = sequencer.outcome
     ended = "done"
@@ -260,7 +261,7 @@ def _figures(run: Run, job: Job, outcome: Outcome) -> dict[str, Any]:
         "reshot": outcome.reshot,
         "bad": len(outcome.bad),
         "frames": frames,
-        "bytes": frames * job.cell.rig.sensor.frame_bytes,
+        "bytes": frames * job.cell.rig.frame_bytes,
         "duration_s": round(outcome.duration_s, 3),
         "ideal_s": round(outcome.ideal_s, 3),
         "efficiency": round(outcome.ideal_s / outcome.duration_s, 4) if outcome.duration_s else 1.0,
@@ -295,7 +296,7 @@ def meter(job: Job, console: Console, wish: metering.Wish, *, confirm: bool) -> 
     _ask_to_begin(job.cell, confirm=confirm)
     recorder, control = metering.MeterRecorder(), Control()
     with open_cell(job.cell, job=small, on_opened=_teller(console)) as cell:
-        observer = RunObserver(console, job.cell.rig.sensor.frame_bytes, 0)
+        observer = RunObserver(console, job.cell.rig.frame_bytes, 0)
         sequencer = Sequencer(small, cell, recorder, observer=observer, control=control)
         try:
             with _operator(control), observer.showing(small.schedule.frames, len(small.schedule.views)):
@@ -375,7 +376,7 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
     _refuse(preflight)
     recorder, control = DryRecorder(), Control()
     with open_cell(job.cell, job=job, dry_run=True, speed=speed, on_opened=_teller(console)) as cell:
-        observer = RunObserver(console, coarse(job.cell.rig.sensor).frame_bytes, 0)
+        observer = RunObserver(console, cell.sensor.width_px * cell.sensor.height_px * 2, 0)
         sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
         outcome = sequencer.outcome
         started_s = time.monotonic()

@@ -12,10 +12,11 @@ import contextlib
 import errno
 import mmap
 import os
+import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,10 +100,14 @@ class Layout:
     poses_offset: int
     archived: bool
     """True if the frames are compressed, as `coupole.archive` leaves them; then the file is only read."""
+    packed: bool
+    """True if two pixels lie in three bytes (`coupole.packing`, `lsb`)."""
 
     @property
     def frame_bytes(self) -> int:
-        return self.height_px * self.width_px * 2
+        """Of a frame in the file."""
+        pixels = self.height_px * self.width_px
+        return pixels * 3 // 2 if self.packed else pixels * 2
 
 
 Collections = Mapping[str, Mapping[str, NDArray[np.generic]]]
@@ -115,8 +120,11 @@ def create(
     frame_format: FrameFormat,
     metadata: dict[str, Any],
     collections: Collections | None = None,
+    *,
+    packed: bool = False,
 ) -> None:
-    """Lay out a view's file with `slots` slots, all free, and its space allocated.
+    """Lay out a view's file with `slots` slots, all free, and its space allocated; frames of up to 12 bits may be
+    `packed`.
 
     `metadata`: `title`, `sample`, `simulated`, `pixel_pitch_um` and whatever else is to stand in the entry's
     attributes. Raises DiskFull if there is no room for all of it.
@@ -126,7 +134,7 @@ def create(
         with h5py.File(
             partial, "w", alignment_threshold=PAGE, alignment_interval=PAGE, libver=("v108", "v110")
         ) as file:
-            _describe(file, slots, frame_format, metadata)
+            _describe(file, slots, frame_format, metadata, packed=packed)
             for name, arrays in (collections or {}).items():
                 collection = _group(file["entry"], name, "NXcollection")
                 for key, values in arrays.items():
@@ -143,7 +151,9 @@ def create(
         raise _storage_error(path, error) from error
 
 
-def _describe(file: h5py.File, slots: int, frame_format: FrameFormat, metadata: dict[str, Any]) -> None:
+def _describe(
+    file: h5py.File, slots: int, frame_format: FrameFormat, metadata: dict[str, Any], *, packed: bool
+) -> None:
     file.attrs["default"] = "entry"
     entry = _group(file, "entry", "NXentry", default="data")
     entry["title"] = metadata["title"]
@@ -152,8 +162,11 @@ def _describe(file: h5py.File, slots: int, frame_format: FrameFormat, metadata: 
     instrument = _group(entry, "instrument", "NXinstrument")
     instrument["name"] = "La Coupole"
     detector = _group(instrument, "detector", "NXdetector")
-    shape = (slots, frame_format.height_px, frame_format.width_px)
-    data = _contiguous(detector, "data", shape, np.dtype("<u2"), fill=False)
+    columns, dtype = (frame_format.width_px * 3 // 2, "u1") if packed else (frame_format.width_px, "<u2")
+    shape = (slots, frame_format.height_px, columns)
+    data = _contiguous(detector, "data", shape, np.dtype(dtype), fill=False)
+    if packed:
+        data.attrs["packing"] = "three bytes hold two pixels a, b: a[7:0], b[3:0] a[11:8], b[11:4] (GenICam 12p)"
     data.attrs["units"] = "DN"
     data.attrs["long_name"] = "raw frames, one a slot; `frames` says what each slot holds"
     _contiguous(detector, "frames", (slots,), FRAME_DTYPE, fill=True)
@@ -198,9 +211,18 @@ def read_layout(path: Path) -> Layout:
     try:
         with h5py.File(path, "r") as file:
             data, frames, poses = file[DATA], file[FRAMES], file[POSES]
-            frames_px: tuple[int, int, int] = data.shape
-            tables = frames.id.get_offset(), poses.id.get_offset()
-            return Layout(*frames_px, data.id.get_offset() or 0, *tables, archived=data.chunks is not None)
+            packed = data.dtype == np.uint8
+            slots, height_px, columns = data.shape
+            return Layout(
+                slots,
+                height_px,
+                columns * 2 // 3 if packed else columns,
+                data.id.get_offset() or 0,
+                frames.id.get_offset(),
+                poses.id.get_offset(),
+                archived=data.chunks is not None,
+                packed=packed,
+            )
     except (OSError, KeyError) as error:
         raise StorageError(f"{path}: not a view file of a run: {error}") from error
 
@@ -230,7 +252,17 @@ def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
         return _read_archived_frame(path, slot)
     with path.open("rb") as file:
         file.seek(layout.data_offset + slot * layout.frame_bytes)
-        pixels = np.frombuffer(file.read(layout.frame_bytes), np.uint16)
+        return pixels_of(file.read(layout.frame_bytes), layout)
+
+
+def pixels_of(stored: bytes | mmap.mmap, layout: Layout) -> NDArray[np.uint16]:
+    """Pixels [H, W] of a frame as it lies in a file that is not archived, DN; not copied unless it is packed."""
+    if layout.packed:
+        from coupole.packing import unpack12
+
+        pixels = unpack12(np.frombuffer(stored, np.uint8))
+    else:
+        pixels = np.frombuffer(stored, np.uint16)
     return pixels.reshape(layout.height_px, layout.width_px)
 
 
@@ -263,6 +295,13 @@ class ViewWriter:
         self._lock = threading.Lock()
         taken = set(proven_slots.values())
         self._free = deque(slot for slot in range(self._layout.frames) if slot not in taken)
+        self._packed: queue.SimpleQueue[mmap.mmap] = queue.SimpleQueue()
+        """Memory to pack frames in, page-aligned as direct writing asks."""
+        if self._layout.packed:
+            from coupole.packing import pack12
+
+            self._pack12 = pack12
+            pack12(np.zeros(2, np.uint16))  # compiled now, not in the first burst
         self._changed: set[int] = set()
         """Slots whose record in the file is not up to date."""
         self._poses = 0
@@ -320,9 +359,29 @@ class ViewWriter:
         record["state"], record["frame_id"], record["camera_ns"] = STORED, frame_id, camera_ns
         record["exposure_us"], record["xxh3"] = exposure_us, checksum(pixels)
         offset = self._layout.data_offset + slot * self._layout.frame_bytes
-        self._write(self._fd, pixels.data.cast("B"), offset)
+        with self._as_stored(pixels) as data:
+            self._write(self._fd, data, offset)
         self._note(slot, record)
         return slot
+
+    @contextlib.contextmanager
+    def _as_stored(self, pixels: NDArray[np.uint16]) -> Iterator[memoryview]:
+        """A frame's bytes as they are to lie in the file, while the context lasts."""
+        if not self._layout.packed:
+            yield pixels.data.cast("B")
+            return
+        try:
+            memory = self._packed.get_nowait()
+        except queue.Empty:
+            memory = mmap.mmap(-1, self._layout.frame_bytes)
+        try:
+            yield self._pack12(pixels, out=np.frombuffer(memory, np.uint8)).data
+        except ValueError as error:
+            raise StorageError(
+                f"{self.path}: a frame cannot be packed: {error}. Store `uint16` in the rig."
+            ) from None
+        finally:
+            self._packed.put(memory)
 
     def frame_id(self, slot: int) -> int:
         """The camera's id of the frame in a slot."""

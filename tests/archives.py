@@ -56,9 +56,10 @@ def make_run(
     shots: int = 4,
     of: FrameFormat = FORMAT,
     missing: tuple[str, ...] = (),
+    packed: bool = False,
 ) -> MadeRun:
     """A run of some views with `shots` proven frames each, but for those `missing`; every view has one frame that
-    was stored and never proven, and two slots that are free."""
+    was stored and never proven, and two slots that are free. Frames are stored `packed` if so wanted."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("plan.yaml", "rig.yaml"):
         (folder / name).write_text(f"# {name}\n")
@@ -69,7 +70,7 @@ def make_run(
     diary.write("start")
     for place, view in enumerate(views):
         path = run.view_path(view)
-        store.create(path, shots + 3, of, {**METADATA, "title": view})
+        store.create(path, shots + 3, of, {**METADATA, "title": view}, packed=packed)
         writer = ViewWriter(path, {})
         pose = writer.add_pose(ArmState((1, 2, 3, 4, 5, 6), np.eye(4), 7, moving=False), 2 * np.eye(4))
         writer.put(noisy_frame(999, of), frame_id=999, camera_ns=999, exposure_us=8000)

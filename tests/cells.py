@@ -265,12 +265,18 @@ def stored(run: Path) -> dict[str, Stored]:
             data, table = file["entry/instrument/detector/data"][()], file["entry/instrument/detector/frames"][()]
             poses = file["entry/instrument/robot/poses"][()]
         for slot in np.flatnonzero(table["state"] == 2):
-            record, pixels = table[slot], data[slot]
+            record, pixels = table[slot], data[slot] if data.dtype == np.uint16 else unpacked(data[slot])
             shot = record["shot"].decode()
             assert shot not in found, f"{shot} is stored twice"
             assert xxhash.xxh3_64_intdigest(pixels.tobytes()) == record["xxh3"], shot
             found[shot] = Stored(shot, record, pixels, poses[record["pose"]]["base_from_camera"])
     return found
+
+
+def unpacked(three: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """Pixels [H, W] of a packed frame [H, 3 W / 2], as its file explains them."""
+    a, middle, b = three.reshape(len(three), -1, 3).astype(np.uint16).transpose(2, 0, 1)
+    return np.stack([a | (middle & 15) << 8, middle >> 4 | b << 4], axis=2).reshape(len(three), -1)
 
 
 def is_light(shot: str) -> bool:

@@ -44,6 +44,7 @@ def writers(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
     """Frames per second and CPU time a frame of each writer, in turn."""
     known: dict[str, Writer] = {
         "coupole": _coupole,
+        "coupole_packed12": partial(_coupole, packed=True),
         "o_direct_copy": _o_direct_copy,
         "h5py": _h5py,
         "zarr": _zarr,
@@ -80,7 +81,7 @@ def writers(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def _installed(name: str) -> bool:
-    return name in ("coupole", "o_direct_copy") or importlib.util.find_spec(name) is not None
+    return name.startswith("coupole") or name == "o_direct_copy" or importlib.util.find_spec(name) is not None
 
 
 def _pictures() -> NDArray[np.uint16]:
@@ -99,13 +100,13 @@ def _cpu_s() -> float:
 # -- the writers ------------------------------------------------------------------------------------------
 
 
-def _coupole(folder: Path, pixels: NDArray[np.uint16], frames: int) -> None:
+def _coupole(folder: Path, pixels: NDArray[np.uint16], frames: int, *, packed: bool = False) -> None:
     from coupole.devices import FrameFormat
     from coupole.store import ViewWriter, create
 
     view = folder / "view.h5"
     metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}
-    create(view, frames, FrameFormat(HEIGHT_PX, WIDTH_PX, 12, "GBRG", 64, 4095), metadata)
+    create(view, frames, FrameFormat(HEIGHT_PX, WIDTH_PX, 12, "GBRG", 64, 4095), metadata, packed=packed)
     writer = ViewWriter(view, {})
     keep = partial(writer.put, camera_ns=0, exposure_us=8000)
     with ThreadPoolExecutor(3) as pool:  # as `coupole.intake` does

@@ -359,7 +359,7 @@ def test_a_lens_that_is_set_otherwise_than_the_plan_believes_is_refused() -> Non
 
 def test_a_run_that_does_not_fit_on_the_disk_is_refused() -> None:
     assert RIG is not None
-    need = (1080 + 2 + MARKS) * RIG.sensor.frame_bytes + RIG.storage.reserve_bytes
+    need = (1080 + 2 + MARKS) * RIG.frame_bytes + RIG.storage.reserve_bytes
     assert checked(plan_of(), storage=StorageFacts(free_bytes=need)).refusals == []
     refusal = only_refusal(checked(plan_of(), storage=StorageFacts(free_bytes=need - 1)))
     assert "must stay free" in refusal

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import PlanError
+from coupole.errors import InputError
 
 _NEWTON_STEPS = 30
 _CONVERGED = 1e-13
@@ -69,7 +69,7 @@ def rays(lens: Lens) -> NDArray[np.float32]:
     """[h, w, 2] direction (x, y) of each pixel's centre: the distortion inverted by Newton's method.
 
     Raises:
-        PlanError: The distortion folds inside the image.
+        InputError: The distortion folds inside the image.
     """
     return _rays(lens)
 
@@ -78,7 +78,7 @@ def rays(lens: Lens) -> NDArray[np.float32]:
 def _rays(lens: Lens) -> NDArray[np.float32]:
     out = np.empty((lens.height_px, lens.width_px, 2), np.float32)
     if not _undistort(out, lens.numbers()):
-        raise PlanError(
+        raise InputError(
             f"lens: the distortion {lens.distortion} folds inside the image of {lens.width_px} x {lens.height_px} "
             f"pixels at a focal length of {lens.focal_px:.0f} pixels; expected a distortion that can be inverted "
             "everywhere; check the order k1 k2 p1 p2 k3 and the signs"

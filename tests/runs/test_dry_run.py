@@ -85,3 +85,19 @@ def test_a_dry_run_of_a_refused_plan_ends_with_three(cell: CellFolder) -> None:
 @pytest.mark.parametrize("option", ["--resume", "--output"])
 def test_a_dry_run_does_not_go_with_options_that_keep_something(cell: CellFolder, option: str) -> None:
     assert cell.acquire("--dry-run", option, str(Path("/nowhere"))).code == 2
+
+
+def test_the_real_cells_rig_is_rehearsed_without_its_devices(cell: CellFolder) -> None:
+    rig = cells.REPO / "configs/rigs/la-coupole.yaml"
+    ended = cells.here("acquire", cell.plan, "--rig", rig, "--dry-run", "--speed", "20", "--json")
+    assert ended.code == 0, ended.err
+    assert ended.document["missing"] == 0
+
+
+def test_a_box_that_waits_for_the_cameras_ready_line_loses_nothing(cell: CellFolder) -> None:
+    cell.rig_data["ledbox"]["settings"]["wait_for_ready"] = True
+    cell.write()
+    ended = cell.acquire()
+    assert ended.code == 0, ended.err
+    assert ended.document["reshot"] == 0
+    cells.assert_each_shot_proven_once(cell.run_folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cells
 import pytest
 from cells import LOW, SIDE, TOP, CellFolder, Ended
 

@@ -49,11 +49,12 @@ fail() {
 }
 
 has_aravis() {
-    command -v arv-tool-0.8 >/dev/null && [[ "$(ldconfig -p 2>/dev/null)" == *libaravis-0.8.so.0* ]]
+    command -v arv-tool-0.8 >/dev/null && command -v arv-camera-test-0.8 >/dev/null &&
+        [[ "$(ldconfig -p 2>/dev/null)" == *libaravis-0.8.so.0* ]]
 }
 
 install_aravis() {
-    local packages=(libaravis-0.8-0 aravis-tools-cli) options=(-y -qq --no-install-recommends)
+    local packages=(libaravis-0.8-0 aravis-tools-cli aravis-tools) options=(-y -qq --no-install-recommends)
     export DEBIAN_FRONTEND=noninteractive
     apt-get install "${options[@]}" "${packages[@]}" ||
         { apt-get update -qq && apt-get install "${options[@]}" "${packages[@]}"; }

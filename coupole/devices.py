@@ -237,6 +237,8 @@ class Camera(Protocol):
     """First and last frame id of the transport: (1, 65535) on GigE Vision 1; after last comes first."""
     timestamp_jitter_us: float
     """Largest deviation of a timestamp from its edge, clock drift apart."""
+    delivery_s: float
+    """Longest time from the end of a readout until the frame has reached the host."""
 
     def identify(self) -> Identity: ...
 

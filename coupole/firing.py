@@ -31,14 +31,14 @@ from coupole.recorder import Recorder
 from coupole.shots import Burst
 
 _POLL_S = 0.05
-_LAST_FRAMES_S = 1.0
-"""How long after a burst's end its last frames may take to reach the host, readout apart."""
 _CLOCK_TOLERANCE, _STALL_S = 1.02, 5.0
 """A burst may take so much longer than its table says, as a factor and in seconds."""
 _LAST_STRETCH_S = 0.3
 """Of a burst: time enough for a host that fell behind in a hurry to catch up before the end."""
 _BOX_JITTER_US = 20.0
 _ONE_SHOT_BUFFERS = 8
+_UNCOUNTED = -1
+"""A camera that does not count its exposures: one frame came while the light shone, which must do."""
 _LIT_IN_VAIN = STATUS_LED_OPEN | STATUS_OVER_TEMPERATURE
 
 
@@ -166,7 +166,7 @@ class Firing:
             taken = len(intake)  # before the log is read: the proof needs frames that are older than the log
             under_way.log = np.concatenate([under_way.log, box.poll_log()])
             if len(under_way.log) == len(burst.table) and last_frames is None:
-                last_frames = Deadline(clock, readout_s + _LAST_FRAMES_S)
+                last_frames = Deadline(clock, readout_s + self._cell.camera.delivery_s)
                 edges = box.edges()
             complete = last_frames is not None and (taken >= edges or last_frames.expired)
             if complete:
@@ -289,8 +289,8 @@ class Firing:
             box.start(single)
             clock.sleep(burst.timing.trigger_delay_us * 1e-6)
             camera.trigger()
-            frame = camera.next_frame(burst.timing.on_us * 1e-6 + _LAST_FRAMES_S)
-            lit_throughout = box.running() and camera.statistics().exposed == 1
+            frame = camera.next_frame(burst.timing.on_us * 1e-6 + camera.delivery_s)
+            lit_throughout = box.running() and camera.statistics().exposed in (1, _UNCOUNTED)
             end = Deadline(clock, burst.timing.period_us * 1e-6 + _STALL_S)
             while box.running():
                 if end.expired:

@@ -37,6 +37,8 @@ _LAST_WIDE_ID = 2**62
 class AravisCamera:
     """`coupole.devices.Camera`; see the module's text."""
 
+    delivery_s = 1.0
+
     def __init__(self, settings: Settings, clock: Clock) -> None:
         self._settings, self._name = settings, settings.device
         self.timestamp_jitter_us = settings.timestamp_jitter_us

@@ -42,6 +42,8 @@ _PLAIN_IMAGE = 1
 class GenTLCamera:
     """`coupole.devices.Camera`; see the module's text."""
 
+    delivery_s = 1.0
+
     def __init__(self, settings: Settings, clock: Clock) -> None:
         self._settings, self._name, self._clock = settings, settings.device, clock
         self.timestamp_jitter_us = settings.timestamp_jitter_us

@@ -92,6 +92,7 @@ class RawFiles:
         self._last_taken: Exif | None = None
         self.id_modulus = (1, settings.last_number)
         # a stamp is the middle of what it may stand for
+        self.delivery_s = settings.patience_s
         self.timestamp_jitter_us = self._sample.exif.resolution_us / 2 + settings.shutter_jitter_us
 
     def _newest(self) -> Path:

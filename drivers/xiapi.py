@@ -66,6 +66,7 @@ class XiCamera:
     """`coupole.devices.Camera`; see the module's text."""
 
     id_modulus = (0, 2**32 - 1)
+    delivery_s = 1.0
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
         self._settings, self._name = settings, settings.device

@@ -41,6 +41,7 @@ class MemoryCamera:
 
     id_modulus = (1, 65535)
     timestamp_jitter_us = 20.0
+    delivery_s = 1.0
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
         self._name = settings.device

@@ -349,6 +349,49 @@ def export(
 
 
 @app.command()
+def scan(
+    mesh: Annotated[Path, typer.Argument(help="The scanner's mesh: PLY, STL or OBJ.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="A new folder for what was read.", show_default=False)],
+    targets: Annotated[Path | None, typer.Option("--targets", help="Table of the scanner's targets.")] = None,
+    unit: Annotated[str, typer.Option("--unit", help="The mesh's unit: mm, cm, m, um or in.")] = "mm",
+    targets_unit: Annotated[
+        str | None, typer.Option("--targets-unit", help="The table's, if it is another.")
+    ] = None,
+    accept_defects: Annotated[
+        bool, typer.Option("--accept-defects", help="Take a mesh that is no clean surface.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Take a scanned mesh and its targets in: check them, bring them to mm, draw them."""
+    from coupole.console import make_console
+    from coupole.scan import UNITS, import_scan
+
+    for option, given in (("--unit", unit), ("--targets-unit", targets_unit)):
+        if given is not None and given not in UNITS:
+            raise InputError(f"{option} {given}: expected one of {', '.join(UNITS)}")
+    console = make_console(quiet=as_json)
+    with console.status("reading the mesh") as status:
+        found = import_scan(
+            mesh,
+            targets,
+            out,
+            unit=unit,
+            targets_unit=targets_unit,
+            accept_defects=accept_defects,
+            progress=status.update,
+        )
+    if as_json:
+        print(json.dumps(found))
+        return
+    size_mm = " x ".join(f"{value:.1f}" for value in found["size_mm"])
+    console.print(f"{found['triangles']:,} triangles, {found['vertices']:,} vertices, {size_mm} mm")
+    console.print(f"median edge {found['median_edge_mm']} mm, {found['open_edges']:,} open edges")
+    if targets:
+        console.print(f"{found['targets']} targets")
+    console.print(f"[bold]{out}[/]: mesh.ply, scan.json, scan.png" + (", targets.csv" if targets else ""))
+
+
+@app.command()
 def meter(
     plan: PlanPath,
     rig: RigOption = None,

@@ -173,6 +173,14 @@ def bench_archive(rounds: int) -> None:
         line(**figure)
 
 
+def bench_mesh(rounds: int) -> None:
+    """Reading a scan of 10 million triangles against numpy and trimesh; memory for 40 million."""
+    from bench_mesh import figures
+
+    for figure in figures(ROOT, rounds):
+        line(**figure)
+
+
 BENCHES: dict[str, Callable[[int], None]] = {
     "check": bench_check,
     "sequencing": bench_sequencing,
@@ -181,6 +189,7 @@ BENCHES: dict[str, Callable[[int], None]] = {
     "rsi": bench_rsi,
     "collisions": bench_collisions,
     "archive": bench_archive,
+    "mesh": bench_mesh,
 }
 
 

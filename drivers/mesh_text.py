@@ -1,0 +1,94 @@
+"""Numbers in text files of gigabytes: lines, tokens and decimal numbers of a byte array, in compiled code.
+
+A file is mapped, never loaded; it is gone through once to count and once to fill arrays of the right size.
+"""
+
+from __future__ import annotations
+
+import mmap
+from pathlib import Path
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+OK, NOT_A_NUMBER, TOO_FEW, BAD_CORNER = 0, 1, 2, 3
+_NEWLINE, _SPACE, _TAB, _RETURN = 10, 32, 9, 13
+_DIGITS = 18
+"""More of them do not fit a 64-bit integer; what comes after them is below a float64's resolution."""
+
+
+def mapped(path: Path) -> NDArray[np.uint8]:
+    """A file's bytes, read as they are used."""
+    if path.stat().st_size == 0:
+        return np.zeros(0, np.uint8)
+    with path.open("rb") as file:
+        return np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), np.uint8)
+
+
+@numba.njit(cache=True, nogil=True)
+def line_end(data, at):  # type: ignore[no-untyped-def]
+    """Place of the newline that ends the line at `at`, or the end of the data."""
+    while at < len(data) and data[at] != _NEWLINE:
+        at += 1
+    return at
+
+
+@numba.njit(cache=True, nogil=True)
+def skip_blanks(data, at, end):  # type: ignore[no-untyped-def]
+    while at < end and (data[at] == _SPACE or data[at] == _TAB or data[at] == _RETURN):
+        at += 1
+    return at
+
+
+@numba.njit(cache=True, nogil=True)
+def token_end(data, at, end):  # type: ignore[no-untyped-def]
+    while at < end and data[at] != _SPACE and data[at] != _TAB and data[at] != _RETURN:
+        at += 1
+    return at
+
+
+@numba.njit(cache=True, nogil=True)
+def whole(data, at, end):  # type: ignore[no-untyped-def]
+    """The whole number at `at`, the place after it, and whether there was one."""
+    negative = at < end and data[at] == 45
+    if at < end and (data[at] == 45 or data[at] == 43):
+        at += 1
+    value, first = np.int64(0), at
+    while at < end and 48 <= data[at] <= 57 and at - first < _DIGITS:
+        value = value * 10 + np.int64(data[at] - 48)
+        at += 1
+    return (-value if negative else value), at, at > first
+
+
+@numba.njit(cache=True, nogil=True)
+def decimal(data, at, end):  # type: ignore[no-untyped-def]
+    """The decimal number at `at` (also nan and inf, as NaN), the place after it, and whether there was one."""
+    stop = token_end(data, at, end)
+    negative = at < stop and data[at] == 45
+    if at < stop and (data[at] == 45 or data[at] == 43):
+        at += 1
+    if at < stop and (data[at] | 32) in (110, 105):  # n of nan, i of inf
+        return np.nan, stop, True
+    mantissa, digits, exponent, any_digit, after_point = np.int64(0), 0, 0, False, False
+    while at < stop:
+        c = data[at]
+        if 48 <= c <= 57:
+            any_digit = True
+            if digits < _DIGITS:
+                mantissa = mantissa * 10 + np.int64(c - 48)
+                digits += 1 if mantissa else 0
+                exponent -= 1 if after_point else 0
+            else:
+                exponent += 0 if after_point else 1
+        elif c == 46 and not after_point:
+            after_point = True
+        else:
+            break
+        at += 1
+    if at < stop and (data[at] | 32) == 101:
+        power, at, found = whole(data, at + 1, stop)
+        any_digit = any_digit and found
+        exponent += power
+    value = np.float64(mantissa) * 10.0**exponent if exponent >= 0 else np.float64(mantissa) / 10.0**-exponent
+    return (-value if negative else value), at, any_digit and at == stop

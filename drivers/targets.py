@@ -1,0 +1,121 @@
+"""Tables of positioning targets (retro-reflective stickers) as text: what VXelements and spreadsheets write.
+
+No real file of the scanner could be examined, so more is understood than may be needed: remarks, tabs, commas,
+semicolons or blanks between columns, decimal commas, a line of headings, a name in front, normals behind.
+What could be read in two ways is refused with its line.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+
+_REMARK = re.compile(r"^\s*(#|//|;|%)")
+_NUMBER = re.compile(r"^[+-]?(\d+([.]\d*)?|[.]\d+)([eE][+-]?\d+)?$")
+_UNIT = re.compile(r"[\[(](?:mm|cm|m|um|µm|in)[\])]|\b(?:mm|cm|um|µm|inch|inches)\b|\bunits?\W+(?:m|in)\b", re.I)
+"""`m` and `in` are words too: they count in brackets, or after `unit`."""
+_COLUMNS = {3: "x y z", 4: "name x y z", 6: "x y z nx ny nz", 7: "name x y z nx ny nz"}
+_UNIT_NORMAL_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Centres [n, 3] in the file's unit; `normals` [n, 3] of length 1 where the file has them."""
+
+    names: tuple[str, ...]
+    centers: NDArray[np.float64]
+    normals: NDArray[np.float64] | None
+    unit: str
+    """What the file itself says; empty if it says nothing."""
+
+
+def read_targets(path: Path) -> Targets:
+    """Read a table of targets. Raises InputError with the line of what is wrong or could be read in two ways."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a table of targets; there is no such file") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected text (UTF-8); byte {error.start} is none") from None
+    rows: list[tuple[int, list[str]]] = []
+    units: dict[str, int] = {}
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        words = _words(line, path, number)
+        if _REMARK.match(line) or (not rows and not any(_NUMBER.match(word) for word in words[-3:])):
+            for found in _UNIT.findall(line):
+                units.setdefault(_unit(found), number)
+            continue
+        rows.append((number, words))
+    if not rows:
+        raise InputError(f"{path}: expected a line for each target; there is none")
+    if len(units) > 1:
+        raise InputError(f"{path}:{max(units.values())}: mixed units: {' and '.join(sorted(units))}")
+    return _targets(path, rows, next(iter(units), ""))
+
+
+def _unit(found: str) -> str:
+    name = re.split(r"\W+", found.strip("[]()").lower())[-1]
+    return {"µm": "um", "inch": "in", "inches": "in"}.get(name, name)
+
+
+def _words(line: str, path: Path, number: int) -> list[str]:
+    """A line's columns. A comma is a decimal comma where other separators part the columns."""
+    text = line.strip()
+    if ";" in text or "\t" in text:
+        words = [word.strip().replace(",", ".") for word in re.split(r"[;\t]+", text.rstrip(";\t"))]
+    elif re.search(r"\d,\s", text) or ("," in text and " " not in text):
+        words = [word.strip() for word in text.rstrip(",").split(",")]
+        decimals = "." in text
+        if not decimals and len(words) in (6, 8, 12, 14) and all(re.fullmatch(r"[+-]?\d+", w) for w in words[-6:]):
+            raise InputError(
+                f"{path}:{number}: `{text[:60]}` could be {len(words)} whole numbers or {len(words) // 2} with "
+                "decimal commas; part the columns with semicolons or tabs, or write decimal points"
+            )
+    else:
+        words = [word.replace(",", ".") for word in text.split()]
+    return words
+
+
+def _targets(path: Path, rows: list[tuple[int, list[str]]], unit: str) -> Targets:
+    first, columns = rows[0][0], len(rows[0][1])
+    if columns not in _COLUMNS:
+        wanted = "; ".join(f"{n} ({what})" for n, what in _COLUMNS.items())
+        raise InputError(f"{path}:{first}: expected columns {wanted}; found {columns}")
+    named = columns in (4, 7)
+    names, numbers = [], np.empty((len(rows), columns - named))
+    for row, (line, words) in enumerate(rows):
+        if len(words) != columns:
+            raise InputError(f"{path}:{line}: expected {columns} columns as in line {first}, found {len(words)}")
+        names.append(words[0] if named else str(row + 1))
+        for column, word in enumerate(words[named:]):
+            if not _NUMBER.match(word):
+                raise InputError(
+                    f"{path}:{line}: expected a number in column {column + named + 1}, found `{word[:40]}`"
+                )
+            numbers[row, column] = float(word)
+    if len(set(names)) < len(names):
+        again = next(name for name in names if names.count(name) > 1)
+        lines = [str(line) for (line, _), name in zip(rows, names, strict=True) if name == again]
+        raise InputError(f"{path}:{lines[1]}: target `{again}` stands in lines {' and '.join(lines)}")
+    normals = _normals(path, rows, numbers[:, 3:]) if numbers.shape[1] == 6 else None
+    return Targets(tuple(names), numbers[:, :3].copy(), normals, unit)
+
+
+def _normals(path: Path, rows: list[tuple[int, list[str]]], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    wrong = np.flatnonzero(np.abs(lengths[:, 0] - 1.0) > _UNIT_NORMAL_TOLERANCE)
+    if wrong.size:
+        line, length = rows[wrong[0]][0], float(lengths[wrong[0], 0])
+        raise InputError(
+            f"{path}:{line}: expected a normal of length 1 in the last three columns, found {length:.4g}"
+        )
+    unit_normals: NDArray[np.float64] = normals / lengths
+    return unit_normals

@@ -1,0 +1,150 @@
+"""How fast a scanner's mesh is read, and in how much memory; a wavy sheet of many triangles stands for a scan."""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TRIANGLES, MOST_TRIANGLES = 10_000_000, 40_000_000
+MOST_MEMORY_GB = 8.0
+_FACE = np.dtype([("corners", "u1"), ("indices", "<i4", (3,))])
+
+
+def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+    from drivers.mesh_files import read_mesh
+    from drivers.vxelements import read_scan
+
+    with tempfile.TemporaryDirectory(dir=root) as folder:
+        path = Path(folder) / "sheet.ply"
+        vertices = _write_sheet(path, TRIANGLES)
+        read_mesh(path)  # compiles
+        works: dict[str, Callable[[], Any]] = {
+            "coupole": lambda: read_mesh(path),
+            "numpy": lambda: _plain_numpy(path, vertices),
+            "trimesh": lambda: _trimesh(path),
+            "with_checks": lambda: read_scan(path),
+        }
+        seconds: dict[str, list[float]] = {name: [] for name in works}
+        for _ in range(rounds):
+            for name, work in works.items():
+                started_s = time.perf_counter()
+                work()
+                seconds[name].append(time.perf_counter() - started_s)
+        medians = {name: statistics.median(times) for name, times in seconds.items()}
+        for peer in ("numpy", "trimesh"):
+            yield _figure("mesh_ply_10m_triangles", medians["coupole"], peer, medians[peer])
+        yield _figure(
+            "mesh_ply_10m_triangles_with_all_checks", medians["with_checks"], "trimesh", medians["trimesh"]
+        )
+        path.unlink()
+        for ending in (".ply", ".stl"):
+            path = Path(folder) / f"large{ending}"
+            (_write_sheet if ending == ".ply" else _write_stl)(path, MOST_TRIANGLES)
+            took_s, peak_gb = _in_a_process(path)
+            path.unlink()
+            yield {
+                "name": f"mesh{ending.replace('.', '_')}_40m_triangles_peak_memory",
+                "value": peak_gb,
+                "unit": "GB",
+                "peer": "limit_8_gb",
+                "ratio": MOST_MEMORY_GB / peak_gb,
+                "seconds": round(took_s, 1),
+            }
+
+
+def _figure(name: str, ours_s: float, peer: str, peer_s: float) -> dict[str, Any]:
+    ratio = peer_s / ours_s
+    return {
+        "name": name,
+        "value": ours_s,
+        "unit": "s",
+        "peer": peer,
+        "ratio": ratio,
+        "peer_value": round(peer_s, 3),
+    }
+
+
+def _sheet(triangles: int) -> tuple[int, Any, Any]:
+    """Vertices in a row; functions of the first and last row that give vertices, and triangles of a strip."""
+    side = int(np.sqrt(triangles / 2)) + 1
+
+    def rows(first: int, last: int) -> Any:
+        y, x = np.mgrid[first:last, 0:side].astype(np.float32) * np.float32(0.2)
+        z = 5 * np.sin(x / 7) * np.cos(y / 11)
+        return np.stack([x, y, z], axis=2).reshape(-1, 3).astype("<f4")
+
+    def strip(first: int, last: int) -> Any:
+        a = (np.arange(first, last)[:, None] * side + np.arange(side - 1)).reshape(-1)
+        quads = np.stack([a, a + 1, a + side, a + 1, a + side + 1, a + side], axis=1)
+        return quads.reshape(-1, 3).astype("<i4")
+
+    return side, rows, strip
+
+
+def _write_sheet(path: Path, triangles: int) -> int:
+    side, rows, strip = _sheet(triangles)
+    count = 2 * (side - 1) ** 2
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {side * side}\nproperty float x\nproperty float y\n"
+        f"property float z\nelement face {count}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    with path.open("wb") as file:
+        file.write(header.encode())
+        for first in range(0, side, 200):
+            rows(first, min(side, first + 200)).tofile(file)
+        for first in range(0, side - 1, 200):
+            indices = strip(first, min(side - 1, first + 200))
+            faces = np.empty(len(indices), _FACE)
+            faces["corners"], faces["indices"] = 3, indices
+            faces.tofile(file)
+    return side * side
+
+
+def _write_stl(path: Path, triangles: int) -> None:
+    side, rows, strip = _sheet(triangles)
+    record = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    with path.open("wb") as file:
+        file.write(b"VXelements".ljust(80) + (2 * (side - 1) ** 2).to_bytes(4, "little"))
+        for first in range(0, side - 1, 200):
+            last = min(side - 1, first + 200)
+            some = np.zeros(2 * (side - 1) * (last - first), record)
+            some["corners"] = rows(first, last + 1)[strip(first, last) - first * side]
+            some.tofile(file)
+
+
+def _plain_numpy(path: Path, vertices: int) -> Any:
+    with path.open("rb") as file:
+        while file.readline() != b"end_header\n":
+            pass
+        points = np.fromfile(file, "<f4", 3 * vertices).reshape(-1, 3)
+        return points, np.ascontiguousarray(np.fromfile(file, _FACE)["indices"])
+
+
+def _trimesh(path: Path) -> Any:
+    import trimesh
+
+    return trimesh.load(path, process=False)
+
+
+def _in_a_process(path: Path) -> tuple[float, float]:
+    """Seconds and peak memory (GB) of reading and checking a scan in a process of its own."""
+    code = (
+        "import json, resource, sys, time; from pathlib import Path; from drivers.vxelements import read_scan; "
+        "start = time.perf_counter(); read_scan(Path(sys.argv[1])); seconds = time.perf_counter() - start; "
+        "peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; print(json.dumps([seconds, peak * 1024 / 1e9]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path)], check=True, capture_output=True, text=True, env=os.environ
+    )
+    seconds, peak_gb = json.loads(done.stdout)
+    return seconds, peak_gb

@@ -140,8 +140,8 @@ def _in_a_process(path: Path) -> tuple[float, float]:
     """Seconds and peak memory (GB) of reading and checking a scan in a process of its own."""
     code = (
         "import json, resource, sys, time; from pathlib import Path; from drivers.vxelements import read_scan; "
-        "start = time.perf_counter(); read_scan(Path(sys.argv[1])); seconds = time.perf_counter() - start; "
-        "peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; print(json.dumps([seconds, peak * 1024 / 1e9]))"
+        "start = time.perf_counter(); read_scan(Path(sys.argv[1])); took = time.perf_counter() - start; "
+        "peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; print(json.dumps([took, peak * 1024 / 1e9]))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(path)], check=True, capture_output=True, text=True, env=os.environ

@@ -149,6 +149,48 @@ def view(
 
 
 @app.command()
+def simulate(
+    plan: PlanPath,
+    rig: RigOption = None,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="How many shots, over all views.")] = 12,
+    out: Annotated[Path, typer.Option("--out", help="Folder for the pictures.")] = Path("simulated"),
+    width: Annotated[
+        int | None, typer.Option("--width", min=16, help="Of the frames, if less than the rig's.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Render some frames of a plan, without devices, for a look: a PNG each, and all on one sheet."""
+    from rich.progress import Progress
+
+    from coupole.console import make_console
+    from coupole.job import read_job
+    from coupole.simulate import simulate as render
+
+    try:
+        job = read_job(plan, rig)
+    except InputError as error:
+        _fail(error, as_json=as_json)
+        raise
+    console = make_console(quiet=as_json)
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        bar = bars.add_task("rendering")
+        made = render(
+            job,
+            out,
+            frames,
+            width_px=width,
+            progress=lambda done, total: bars.update(bar, completed=done, total=total),
+        )
+    if as_json:
+        print(json.dumps({"folder": str(out), "sheet": "sheet.png", "frames": [asdict(still) for still in made]}))
+        return
+    for still in made:
+        over = f", [red]{still.saturated:.2%} saturated[/]" if still.saturated > 1e-3 else ""
+        console.print(f"{still.file}: brightest {still.brightest:.0%}{over}")
+    console.print(f"[bold]{out / 'sheet.png'}[/]")
+
+
+@app.command()
 def acquire(
     plan: PlanPath,
     rig: RigOption = None,

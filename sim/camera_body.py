@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Annotated, Protocol
 
@@ -35,6 +35,8 @@ class Exposed:
     """Counts exposures from power-on."""
     base_from_flange: Transform
 
+
+_RENDER_PATIENCE_S = 30.0
 
 Render = Callable[[NDArray[np.uint16], Exposed], None]
 """Fill a frame [h, w] with what an exposure saw."""
@@ -193,7 +195,15 @@ class CameraBody:
             number,
             self._pose(),
         )
-        self._workers.submit(self._work, shot, exposed)
+        working = self._workers.submit(self._work, shot, exposed)
+        self._reactor.at(shot.deliver_ns, lambda: self._wait_for(working, session))
+
+    def _wait_for(self, working: Future[None], session: int) -> None:
+        """World time stands still until a picture that is due is there: how fast this machine renders is no fault
+        of the camera."""
+        if session == self._session:
+            wait([working], _RENDER_PATIENCE_S)
+            self.deliver()
 
     def _work(self, shot: Shot, exposed: Exposed) -> None:
         self._render(self._wire.pixels(shot.slot), exposed)

@@ -12,13 +12,25 @@ from sim import faults as script
 from sim.camera import CameraSettings
 from sim.camera import impossible as impossible_for_camera
 from sim.robot import RobotSettings, impossible
+from sim.things import Thing
 
 WHITE_SHARE = 0.6
 """A white target at the support's centre reaches this share of full scale at the plan's exposure (design)."""
 
 
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
 class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class MaterialConfig(_Model):
+    """As `sim.surface.Material`: Lambert and GGX per channel."""
+
+    diffuse: tuple[Share, Share, Share]
+    f0: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
+    roughness: Share = 0.0
 
 
 class MeshConfig(_Model):
@@ -27,6 +39,8 @@ class MeshConfig(_Model):
     path: Path
     unit: Literal["mm", "m", "um"]
     support_from_object: list[list[float]]
+    material: MaterialConfig | None = None
+    """Times the mesh's own colours; without it these alone, or a warm stone where there are none."""
 
 
 class SceneConfig(_Model):
@@ -52,6 +66,10 @@ class CameraConfig(_Model):
     exposure_gap_us: int
     focal_length_mm: float
     focus_distance_mm: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 of Brown and Conrady, as OpenCV orders and signs them."""
+    samples_per_side: Annotated[int, Field(ge=1, le=8)] = 1
+    """Rays through each pixel, k x k: for targets whose corners are measured to a fraction of a pixel."""
     flange_from_camera: list[list[float]]
     nominal_exposure_us: int
     """The exposure at which white reaches `WHITE_SHARE` of full scale."""
@@ -68,6 +86,8 @@ class Settings(_Model):
     robot: RobotSettings = kuka_controller.Settings()
     camera: CameraSettings = camera_server.Settings()
     faults: tuple[script.Fault, ...] = ()
+    things: tuple[Thing, ...] = ()
+    """What stands on the support beside the plan's object."""
 
     @model_validator(mode="after")
     def _possible(self) -> Settings:

@@ -1,29 +1,31 @@
-"""What the simulated camera sees: a mesh on the support, lit by one LED or panel at a time.
+"""What stands in the simulated dome: the support disk and the objects on it, their materials, and the LEDs.
 
-Geometry is exact (pinhole projection, z-buffer, the world's true camera pose), shading is simple: Lambert
-with one flat normal per triangle, point emitters with a cosine lobe, no cast shadows. Everything is in the
-robot's base frame, in mm; fluxes in lm, irradiances in lux.
+Everything is in the robot's base frame, in mm; fluxes in lm.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.geometry import Transform, apply, inverse
+from coupole.errors import InputError
+from coupole.geometry import Transform
+from sim.surface import Material, Surface
 
-OBJECT_ALBEDO = (0.62, 0.55, 0.42)
-"""Red, green, blue reflectance of the object: warm stone (assumed)."""
-SUPPORT_ALBEDO = (0.04, 0.04, 0.045)
-"""Black anodised Dibond (facts/instrument: 'more absorbing'; the value is assumed)."""
+STONE = Material("warm stone", (0.62, 0.55, 0.42))
+"""Of what an object is made that says nothing of itself (assumed)."""
+PAINTED = Material("as coloured in its file", (1.0, 1.0, 1.0))
+DIBOND = Material("black anodised Dibond", (0.04, 0.04, 0.045))
+"""The support (facts/instrument: 'more absorbing'; the value is assumed)."""
 _UNIT_MM = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
-_SUPPORT_SEGMENTS = 96
-_NEAR_MM = 1.0
+SUPPORT_CELL_MM = 5.0
+"""Edges of the support's triangles: shadows on it are so fine."""
+_CHUNK = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -46,149 +48,120 @@ def read_leds(path: Path) -> Leds:
 
 @dataclass(frozen=True)
 class Scene:
-    """Triangles in the base frame with their normals and albedos."""
+    """All triangles in the base frame, and of what they are; 40 bytes a triangle at least."""
 
     corners_mm: NDArray[np.float32]
-    """[triangles, 3, 3]."""
-    centroids_mm: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    albedo: NDArray[np.float64]
-    """[triangles, 3], red green blue."""
+    """[triangles, 3, 3]; at least 4 bytes follow in memory, which Embree may read."""
+    material: NDArray[np.int32]
+    """[triangles] row of `materials`."""
+    materials: NDArray[np.float64]
+    """[materials, 7] red, green, blue diffuse reflectance; red, green, blue f0; roughness."""
+    tint: NDArray[np.float32] | None
+    """[triangles, 3] factor of the diffuse reflectance."""
+    normals: NDArray[np.float32] | None
+    """[triangles, 3] unit normals for shading, where they are not the flat ones."""
 
 
-def load_mesh(path: Path, unit: str) -> NDArray[np.float64]:
-    """Corners [triangles, 3, 3] in mm of any mesh that trimesh reads."""
+def load_surface(path: Path, unit: str, material: Material | None = None) -> Surface:
+    """Any mesh that trimesh reads (PLY, STL, OBJ, ...), in mm, as it is: no vertex is merged or dropped.
+
+    Colours of vertices or faces, or a texture (at triangles' centroids), become the tint; they are sRGB. Without
+    `material` a coloured mesh reflects diffusely what its colours say, any other is of `STONE`. Raises InputError.
+    """
     import trimesh
 
-    mesh: Any = trimesh.load(path, process=False, force="mesh")
-    corners: NDArray[np.float64] = np.asarray(mesh.vertices)[np.asarray(mesh.faces)] * _UNIT_MM[unit]
-    return corners
+    try:
+        mesh: Any = trimesh.load(path, process=False, force="mesh")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: expected a mesh of triangles (PLY, STL, OBJ); {error}") from error
+    faces = np.asarray(mesh.faces)
+    if len(faces) == 0:
+        raise InputError(f"{path}: expected a mesh of triangles; found none")
+    tint = _tint(mesh)
+    plain = PAINTED if tint is not None else STONE
+    corners = np.asarray(mesh.vertices)[faces]
+    corners *= _UNIT_MM[unit]
+    return Surface(corners, (material or plain,), np.zeros(len(faces), np.int32), tint)
 
 
-def build_scene(
-    base_from_support: Transform, support_diameter_mm: float, objects_support: list[NDArray[np.float64]]
-) -> Scene:
-    """Scene of the support disk and of objects, given as corners [n, 3, 3] in the support frame."""
-    angle = np.linspace(0.0, 2 * np.pi, _SUPPORT_SEGMENTS + 1)
-    rim = 0.5 * support_diameter_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    disk = np.stack([np.zeros_like(rim[:-1]), rim[:-1], rim[1:]], axis=1)
-    corners = apply(base_from_support, np.concatenate([disk, *objects_support]))
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+def _tint(mesh: Any) -> NDArray[np.float32] | None:
+    """[triangles, 3] linear colours of a mesh; None if it has none."""
+    kind, faces = mesh.visual.kind, np.asarray(mesh.faces)
+    if kind == "face":
+        srgb = np.asarray(mesh.visual.face_colors)[:, :3] / 255.0
+    elif kind == "vertex":
+        srgb = np.asarray(mesh.visual.vertex_colors)[faces][:, :, :3].mean(axis=1) / 255.0
+    elif kind == "texture" and mesh.visual.uv is not None and _picture(mesh) is not None:
+        picture = np.asarray(_picture(mesh).convert("RGB"))
+        u, v = (np.asarray(mesh.visual.uv)[faces].mean(axis=1) % 1.0).T
+        rows = ((1.0 - v) * len(picture)).astype(int).clip(0, len(picture) - 1)
+        columns = (u * picture.shape[1]).astype(int).clip(0, picture.shape[1] - 1)
+        srgb = picture[rows, columns] / 255.0
+    else:
+        return None
+    # IEC 61966-2-1
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)
+
+
+def _picture(mesh: Any) -> Any:
+    material = mesh.visual.material
+    return getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+
+
+def support_disk(diameter_mm: float, cell_mm: float = SUPPORT_CELL_MM) -> Surface:
+    """The support in its own frame, z up: rings of nearly equilateral triangles, 6 i points on ring i."""
+    rings = max(1, round(0.5 * diameter_mm / cell_mm))
+    parts = []
+    inner = np.zeros((1, 3))
+    for ring in range(1, rings + 1):
+        angle = 2 * np.pi * np.arange(6 * ring) / (6 * ring)
+        outer = 0.5 * diameter_mm * ring / rings * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+        sector, step = np.divmod(np.arange(6 * ring), ring)
+        within = sector * (ring - 1) + step
+        next_out = np.roll(outer, -1, axis=0)
+        parts.append(np.stack([inner[within % len(inner)], outer, next_out], axis=1))
+        gap = step < ring - 1
+        ends = inner[(within[gap] + 1) % len(inner)]
+        parts.append(np.stack([inner[within[gap]], next_out[gap], ends], axis=1))
+        inner = outer
+    corners = np.concatenate(parts)
+    return Surface(corners, (DIBOND,), np.zeros(len(corners), np.int32))
+
+
+def build_scene(things: Sequence[tuple[Surface, Transform]]) -> Scene:
+    """Scene of surfaces, each with its `base_from_surface`."""
+    counts = [len(surface.corners_mm) for surface, _ in things]
+    total = sum(counts)
+    # Embree reads vertices by 16 bytes: one float more than the last corner's three.
+    corners = np.zeros(9 * total + 1, np.float32)[:-1].reshape(total, 3, 3)
+    material = np.empty(total, np.int32)
+    tint = np.ones((total, 3), np.float32) if any(s.tint is not None for s, _ in things) else None
+    detailed = any(surface.normals is not None for surface, _ in things)
+    normals = np.empty((total, 3), np.float32) if detailed else None
+    materials: list[Material] = []
+    first = 0
+    for (surface, base_from_surface), count in zip(things, counts, strict=True):
+        part = slice(first, first + count)
+        # In chunks: a scan of 40 million triangles must not stand in memory twice in float64.
+        for start in range(0, count, _CHUNK):
+            piece = surface.corners_mm[start : start + _CHUNK]
+            placed = piece.reshape(-1, 3) @ base_from_surface[:3, :3].T + base_from_surface[:3, 3]
+            corners[first + start : first + start + len(piece)] = placed.reshape(-1, 3, 3)
+        material[part] = surface.material + len(materials)
+        materials += surface.materials
+        if tint is not None and surface.tint is not None:
+            tint[part] = surface.tint
+        if normals is not None:
+            own = surface.normals if surface.normals is not None else _flat_normals(surface.corners_mm)
+            normals[part] = own @ base_from_surface[:3, :3].T
+        first += count
+    table = np.array([[*m.diffuse, *m.f0, m.roughness] for m in materials], np.float64).reshape(-1, 7)
+    return Scene(corners, material, table, tint, normals)
+
+
+def _flat_normals(corners_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    cross = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     length = np.linalg.norm(cross, axis=1, keepdims=True)
-    albedo = np.empty((len(corners), 3))
-    albedo[: len(disk)] = SUPPORT_ALBEDO
-    albedo[len(disk) :] = OBJECT_ALBEDO
-    normals = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0)
-    return Scene(corners.astype(np.float32), corners.mean(axis=1), normals, albedo)
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """The simulated camera's optics: focal length in pixels, principal point at the image's centre."""
-
-    width_px: int
-    height_px: int
-    focal_px: float
-
-    @staticmethod
-    def from_lens(
-        width_px: int, height_px: int, pixel_pitch_um: float, focal_length_mm: float, focus_distance_mm: float
-    ) -> Pinhole:
-        """Focused at `focus_distance_mm` the image stands at 1/(1/f - 1/focus) behind the lens."""
-        image_distance_mm = 1.0 / (1.0 / focal_length_mm - 1.0 / focus_distance_mm)
-        return Pinhole(width_px, height_px, image_distance_mm * 1e3 / pixel_pitch_um)
-
-
-@numba.njit(cache=True, nogil=True)
-def _rasterise(corners, base_to_camera, focal, width, height, near, triangle_of_pixel, depth):  # type: ignore[no-untyped-def]
-    half_w, half_h = 0.5 * width - 0.5, 0.5 * height - 0.5
-    u, v, w = np.empty(3), np.empty(3), np.empty(3)
-    for t in range(len(corners)):
-        behind = False
-        for k in range(3):
-            x, y, z = corners[t, k, 0], corners[t, k, 1], corners[t, k, 2]
-            m = base_to_camera
-            cz = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-            if cz < near:
-                behind = True
-                break
-            w[k] = 1.0 / cz
-            u[k] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * w[k] * focal + half_w
-            v[k] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * w[k] * focal + half_h
-        if behind:
-            continue
-        area = (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0])
-        if area == 0.0:
-            continue
-        first_col = max(0, int(np.ceil(min(u[0], u[1], u[2]))))
-        last_col = min(width - 1, int(np.floor(max(u[0], u[1], u[2]))))
-        first_row = max(0, int(np.ceil(min(v[0], v[1], v[2]))))
-        last_row = min(height - 1, int(np.floor(max(v[0], v[1], v[2]))))
-        for row in range(first_row, last_row + 1):
-            for col in range(first_col, last_col + 1):
-                b0 = ((u[1] - col) * (v[2] - row) - (u[2] - col) * (v[1] - row)) / area
-                b1 = ((u[2] - col) * (v[0] - row) - (u[0] - col) * (v[2] - row)) / area
-                b2 = 1.0 - b0 - b1
-                if b0 < 0 or b1 < 0 or b2 < 0:
-                    continue
-                inverse_z = b0 * w[0] + b1 * w[1] + b2 * w[2]
-                if inverse_z > depth[row, col]:
-                    depth[row, col] = inverse_z
-                    triangle_of_pixel[row, col] = t
-
-
-@dataclass(frozen=True)
-class View:
-    """What one camera pose sees: `triangle` [h, w], index into `seen` or -1; `seen` are scene triangles."""
-
-    triangle: NDArray[np.int32]
-    seen: NDArray[np.int64]
-    towards_camera: NDArray[np.float64]
-    """[seen] cosine of the angle between normal and direction to the camera; its sign picks the side lit."""
-    falloff: NDArray[np.float32]
-    """[h, w] natural vignetting, cos^4."""
-
-
-def rasterise(scene: Scene, pinhole: Pinhole, base_from_camera: Transform) -> View:
-    """Z-buffer the scene from a camera pose."""
-    shape = (pinhole.height_px, pinhole.width_px)
-    triangle, depth = np.full(shape, -1, np.int32), np.zeros(shape, np.float32)
-    to_camera = inverse(base_from_camera)
-    _rasterise(scene.corners_mm, to_camera, pinhole.focal_px, *shape[::-1], _NEAR_MM, triangle, depth)
-    seen, compact = np.unique(triangle, return_inverse=True)
-    first = int(seen[0] == -1)
-    towards = base_from_camera[:3, 3] - scene.centroids_mm[seen[first:]]
-    cosine = np.einsum("ij,ij->i", scene.normals[seen[first:]], towards) / np.linalg.norm(towards, axis=1)
-    rows, cols = np.mgrid[: shape[0], : shape[1]]
-    tangent2 = (cols - shape[1] / 2 + 0.5) ** 2 + (rows - shape[0] / 2 + 0.5) ** 2
-    falloff = (1.0 + tangent2 / pinhole.focal_px**2) ** -2
-    return View(
-        (compact.reshape(shape) - first).astype(np.int32),
-        seen[first:].astype(np.int64),
-        cosine,
-        falloff.astype(np.float32),
-    )
-
-
-def led_radiance(scene: Scene, view: View, leds: Leds, led: int, emission: str) -> NDArray[np.float32]:
-    """Radiance [seen, 3] in lm/(m^2 sr) that triangles send to the camera when one LED is lit.
-
-    E = Phi/(pi d^2) cos_emitter cos_receiver for a Lambertian emitter; `paper` takes the emitter's cosine
-    twice (seed 003, Eq. 2; facts/instrument). L = albedo E / pi.
-    """
-    to_light = leds.positions_mm[led] - scene.centroids_mm[view.seen]
-    distance_mm = np.linalg.norm(to_light, axis=1)
-    cos_emitter = np.maximum(0.0, -(to_light @ leds.normals[led]) / distance_mm)
-    side = np.where(view.towards_camera >= 0, 1.0, -1.0)
-    cos_receiver = np.einsum("ij,ij->i", scene.normals[view.seen], to_light) / distance_mm * side
-    power = 2 if emission == "paper" else 1
-    lux = leds.flux_lm[led] / np.pi / (distance_mm * 1e-3) ** 2 * cos_emitter**power
-    lux *= np.maximum(0.0, cos_receiver)
-    radiance: NDArray[np.float32] = (lux[:, None] * scene.albedo[view.seen] / np.pi).astype(np.float32)
-    return radiance
-
-
-def panel_radiance(scene: Scene, view: View, panel_lux: float) -> NDArray[np.float32]:
-    """Radiance [seen, 3] under a panel: the same irradiance everywhere (a flat white panel is meant so)."""
-    radiance: NDArray[np.float32] = (panel_lux * scene.albedo[view.seen] / np.pi).astype(np.float32)
-    return radiance
+    flat: NDArray[np.float64] = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0)
+    return flat

@@ -19,7 +19,9 @@ class Stills:
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         checked = Config.model_validate(config)
-        self._photographer = Photographer(checked.scene, checked.camera, seed=checked.settings.seed)
+        self._photographer = Photographer(
+            checked.scene, checked.camera, seed=checked.settings.seed, things=checked.settings.things
+        )
         self._shape = (checked.camera.height_px, checked.camera.width_px)
         self._taken = 0
 

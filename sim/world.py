@@ -43,7 +43,7 @@ class World:
         )
         self.reactor = Reactor(self.clock)
         self.lighting = Lighting()
-        self._photographer = Photographer(config.scene, config.camera, seed=settings.seed)
+        self._photographer = Photographer(config.scene, config.camera, seed=settings.seed, things=settings.things)
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
         self.robot, robot_endpoint = robot.build(self.reactor, settings.robot)
         self.camera, camera_endpoint = camera.build(
@@ -97,9 +97,10 @@ class World:
         }
 
     def _warm_up(self, camera: CameraConfig) -> None:
-        """Compile the renderer before anybody waits for a frame."""
-        nothing = Exposed({}, [], 0.0, 1.0, 0, self.robot.true_base_from_flange())
-        self._photographer.render(np.zeros((camera.height_px, camera.width_px), np.uint16), nothing)
+        """Compile the renderer, and lay out what it keeps, before anybody waits for a frame."""
+        led = int(self._photographer.leds.ids[0])
+        lit = Exposed({led: 1e-3}, [1], 1e-3, 1.0, 0, self.robot.true_base_from_flange())
+        self._photographer.render(np.zeros((camera.height_px, camera.width_px), np.uint16), lit)
 
     # -- the cables ---------------------------------------------------------------------------------------
 

@@ -25,6 +25,7 @@ import trimesh
 import xxhash
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
+from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from coupole import cli, journal
 from coupole.cell import world_config
@@ -33,7 +34,7 @@ from sim.client import World
 
 REPO = Path(__file__).resolve().parent.parent
 BLACK_DN = 64
-PIXEL_STEP = 4
+PIXEL_STEP = 3
 """Of the object's pixels every so-manieth is looked at to tell LEDs apart."""
 PATIENCE_S = 60.0
 """How long a test waits for what must come; only a broken program lets it run out."""
@@ -300,7 +301,8 @@ def assert_each_shot_proven_once(run: Path) -> None:
 
 
 class Expectation:
-    """What each LED of the dome must make of one view, reckoned here: Lambert's law on the object's triangles.
+    """What each LED of the dome must make of one view, reckoned here: Lambert's law on the object's triangles that
+    see the LED.
 
     Nothing of the simulator's is used; the pose is the measured one, the lens a pinhole.
     """
@@ -326,6 +328,11 @@ class Expectation:
         cos_object = np.einsum("lpk,pk->lp", to_led, normals[seen]) / distance
         cos_led = -np.einsum("lpk,lk->lp", to_led, table[:, 5:8]) / distance
         lit = table[:, 8:9] * np.clip(cos_object, 0, None) * np.clip(cos_led, 0, None) / distance**2
+        rays = RayMeshIntersector(
+            trimesh.Trimesh(corners.reshape(-1, 3), np.arange(corners.size // 3).reshape(-1, 3), process=False)
+        )
+        origins = np.broadcast_to(points[seen] + 1e-3 * normals[seen], to_led.shape)
+        lit[rays.intersects_any(origins.reshape(-1, 3), to_led.reshape(-1, 3)).reshape(lit.shape)] = 0.0
         axis = base_from_camera[:3, 2]
         from_lens = points[seen] - base_from_camera[:3, 3]
         cos_lens = from_lens @ axis / np.linalg.norm(from_lens, axis=1)
@@ -340,9 +347,9 @@ class Expectation:
         """Pictures [n, pixels] without the colours of the Bayer filter, of unit norm."""
         for place in range(4):
             mine = self._cell == place
-            pictures[:, mine] /= pictures[:, mine].mean(axis=1, keepdims=True)
+            pictures[:, mine] /= np.maximum(pictures[:, mine].mean(axis=1, keepdims=True), 1e-9)
         pictures = pictures - pictures.mean(axis=1, keepdims=True)
-        return pictures / np.linalg.norm(pictures, axis=1, keepdims=True)
+        return pictures / np.maximum(np.linalg.norm(pictures, axis=1, keepdims=True), 1e-9)
 
 
 def _triangle_of_pixel(

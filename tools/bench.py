@@ -181,6 +181,14 @@ def bench_mesh(rounds: int) -> None:
         line(**figure)
 
 
+def bench_render(rounds: int) -> None:
+    """Pictures of the simulated dome, against Open3D, Embree and Mitsuba, and memory for a large scan."""
+    from bench_render import figures
+
+    for figure in figures(ROOT, rounds):
+        line(**figure)
+
+
 BENCHES: dict[str, Callable[[int], None]] = {
     "check": bench_check,
     "sequencing": bench_sequencing,
@@ -189,6 +197,7 @@ BENCHES: dict[str, Callable[[int], None]] = {
     "rsi": bench_rsi,
     "collisions": bench_collisions,
     "archive": bench_archive,
+    "render": bench_render,
     "mesh": bench_mesh,
 }
 

@@ -1,6 +1,6 @@
-"""The simulated camera's optics: what a pose sees, which lights reach it, and what it sends back.
+"""From a scene, a camera pose and the lights that shone to the radiance of every visible triangle.
 
-In order: `lens` (where a pixel looks), `raster` (which triangle it sees), `view` (those triangles, ready for
-shading), `leds` (the square emitters), `embree` and `shadows` (which light reaches which triangle), `radiance`
-(irradiance and reflection). Nothing here is shared with processing: the two check each other.
+`lens` says where a pixel looks, `raster` which triangle it sees, `shadows` which LEDs reach that triangle,
+`emitter` how much light arrives, `radiance` how much of it goes on to the camera. None of this is shared with the
+processing of real frames: the two check each other.
 """

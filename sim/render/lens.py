@@ -1,13 +1,17 @@
-"""Where a pixel looks: a pinhole with the distortion of Brown and Conrady.
+"""Where the pixels of the simulated camera look: a pinhole behind a lens that distorts.
 
-Camera frame: x to the right, y down, z along the optical axis. A direction is written (x, y) for (x, y, 1).
-Pixel centres have integer coordinates; (0, 0) is the centre of the first one.
+Distortion is Brown and Conrady's in OpenCV's order and sign (k1, k2, p1, p2, k3): x = X/Z and y = Y/Z go to
+
+    x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
+    y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+The renderer needs the inverse, once per lens and for every pixel: it then tests triangles where the pixel really
+looks, so that long triangles have bent edges in the picture, as they must.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -15,20 +19,22 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 
-_NEWTON_STEPS = 30
-_CONVERGED = 1e-13
+Distortion = tuple[float, float, float, float, float]
+NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+_PROBES = 65
+_MARGIN = 1.25
+"""The steepest slope found between probes is taken this much steeper."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Focal length and principal point in pixels, distortion k1 k2 p1 p2 k3 (OpenCV's order and meaning)."""
+    """Focal length in pixels, and distortion; the principal point is the image's centre, pixels' centres are
+    whole numbers."""
 
     width_px: int
     height_px: int
     focal_px: float
-    centre_px: tuple[float, float]
-    """Column and row of the principal point."""
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Distortion = NO_DISTORTION
 
     @staticmethod
     def focused(
@@ -38,106 +44,117 @@ class Lens:
         pixel_pitch_um: float,
         focal_length_mm: float,
         focus_distance_mm: float,
-        distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0),
+        distortion: Distortion = NO_DISTORTION,
     ) -> Lens:
-        """Focused at `focus_distance_mm` the image stands at 1/(1/f - 1/focus) behind the lens; the principal
-        point is the image's centre."""
+        """Focused at `focus_distance_mm` the image stands at 1/(1/f - 1/focus) behind the lens."""
         image_distance_mm = 1.0 / (1.0 / focal_length_mm - 1.0 / focus_distance_mm)
-        focal_px = image_distance_mm * 1e3 / pixel_pitch_um
-        return Lens(width_px, height_px, focal_px, ((width_px - 1) / 2, (height_px - 1) / 2), distortion)
+        return Lens(width_px, height_px, image_distance_mm * 1e3 / pixel_pitch_um, distortion)
 
-    def finer(self, k: int) -> Lens:
-        """The same lens on pixels divided into k x k."""
-        column, row = ((c + 0.5) * k - 0.5 for c in self.centre_px)
-        return Lens(self.width_px * k, self.height_px * k, self.focal_px * k, (column, row), self.distortion)
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        return 0.5 * self.width_px - 0.5, 0.5 * self.height_px - 0.5
 
-    def numbers(self) -> NDArray[np.float64]:
-        """[8] focal length, principal point, distortion: the form that the kernels take."""
-        return np.array([self.focal_px, *self.centre_px, *self.distortion])
-
-    def curvature_px(self, radius: float) -> float:
-        """Upper bound of the distortion's second derivative, pixels per squared tangent, out to `radius`.
-
-        x r^(2n) has a second derivative of at most 2n (2n + 1) r^(2n - 1), the tangential terms one of 9 (p1 + p2).
-        """
-        k1, k2, p1, p2, k3 = map(abs, self.distortion)
-        radial = 6 * k1 * radius + 20 * k2 * radius**3 + 42 * k3 * radius**5
-        return self.focal_px * (radial + 9 * (p1 + p2))
-
-
-def rays(lens: Lens) -> NDArray[np.float32]:
-    """[h, w, 2] direction (x, y) of each pixel's centre: the distortion inverted by Newton's method.
-
-    Raises:
-        InputError: The distortion folds inside the image.
-    """
-    return _rays(lens)
-
-
-@lru_cache(maxsize=2)
-def _rays(lens: Lens) -> NDArray[np.float32]:
-    out = np.empty((lens.height_px, lens.width_px, 2), np.float32)
-    if not _undistort(out, lens.numbers()):
-        raise InputError(
-            f"lens: the distortion {lens.distortion} folds inside the image of {lens.width_px} x {lens.height_px} "
-            f"pixels at a focal length of {lens.focal_px:.0f} pixels; expected a distortion that can be inverted "
-            "everywhere; check the order k1 k2 p1 p2 k3 and the signs"
+    def supersampled(self, factor: int) -> Lens:
+        """The lens of a sensor whose pixels are divided into `factor` x `factor`."""
+        return replace(
+            self,
+            width_px=self.width_px * factor,
+            height_px=self.height_px * factor,
+            focal_px=self.focal_px * factor,
         )
-    out.flags.writeable = False
-    return out
 
 
-def falloff(lens: Lens) -> NDArray[np.float32]:
-    """[h, w] natural vignetting, cos^4 of the angle to the optical axis."""
-    x, y = np.moveaxis(rays(lens), 2, 0)
-    share: NDArray[np.float32] = (1.0 + x * x + y * y) ** -2
-    return share
+@dataclass(frozen=True)
+class Sight:
+    """A lens with its inverse, ready to rasterise through."""
+
+    lens: Lens
+    shift: NDArray[np.float32] | None
+    """[h, w, 2] what to add to a pixel's place in the image to undo distortion, in units of the focal length; None
+    where there is none."""
+    shift_slope: float
+    """Largest change of a component of `shift` from one pixel to the next one in its row."""
+    reach: tuple[float, float]
+    """No pixel looks farther from the axis than this, in x and y, in units of the focal length."""
+    bend_slope: float
+    """Bound of the change of distortion over a change of position, in any direction within the image."""
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def project(x, y, lens):  # type: ignore[no-untyped-def]
-    """Column and row at which a direction (x, y) is seen."""
+def sight(lens: Lens) -> Sight:
+    """The inverse of a lens. Raises InputError where distortion folds the image."""
+    half_x, half_y = ((centre + 1.0) / lens.focal_px for centre in lens.centre_px)
+    if lens.distortion == NO_DISTORTION:
+        return Sight(lens, None, 0.0, (half_x, half_y), 0.0)
+    shift = np.empty((lens.height_px, lens.width_px, 2), np.float32)
+    terms = np.array(lens.distortion)
+    if not _undistort(lens.focal_px, *lens.centre_px, terms, shift):
+        raise InputError(
+            f"simulated lens: distortion {lens.distortion} folds the image of {lens.width_px} x {lens.height_px} "
+            f"pixels at a focal length of {lens.focal_px:.0f} pixels, so that a pixel would look two ways; "
+            "expected coefficients (k1, k2, p1, p2, k3) of a calibrated lens"
+        )
+    most = float(np.abs(shift).max())
+    reach = half_x + most, half_y + most
+    return Sight(lens, shift, float(np.abs(np.diff(shift, axis=1)).max()), reach, _bend_slope(lens, reach))
+
+
+def _bend_slope(lens: Lens, reach: tuple[float, float]) -> float:
+    """Bound of |d(a) - d(b)| / |a - b| of the displacement d by distortion, over all that the image sees."""
+    grid = np.stack(np.meshgrid(*(np.linspace(-far, far, _PROBES) for far in reach)), axis=-1)
+    step = 1e-6
+    columns = [
+        (distorted(grid + np.array(way) * step, lens.distortion) - distorted(grid, lens.distortion)) / step
+        for way in ((1, 0), (0, 1))
+    ]
+    jacobian = np.stack(columns, axis=-1) - np.eye(2)
+    return float(np.linalg.norm(jacobian, ord=2, axis=(-2, -1)).max()) * _MARGIN
+
+
+def distorted(xy: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64]:
+    """Brown and Conrady's model on normalised image coordinates [..., 2]."""
+    k1, k2, p1, p2, k3 = distortion
+    x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
-    radial = 1.0 + r2 * (lens[3] + r2 * (lens[4] + r2 * lens[7]))
-    u = x * radial + 2.0 * lens[5] * x * y + lens[6] * (r2 + 2.0 * x * x)
-    v = y * radial + lens[5] * (r2 + 2.0 * y * y) + 2.0 * lens[6] * x * y
-    return lens[1] + lens[0] * u, lens[2] + lens[0] * v
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def bend(x, y, terms):  # type: ignore[no-untyped-def]
+    """What distortion adds to a normalised position (x, y)."""
+    r2 = x * x + y * y
+    radial = r2 * (terms[0] + r2 * (terms[1] + r2 * terms[4]))
+    return (
+        x * radial + 2.0 * terms[2] * x * y + terms[3] * (r2 + 2.0 * x * x),
+        y * radial + terms[2] * (r2 + 2.0 * y * y) + 2.0 * terms[3] * x * y,
+    )
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _undistort(out, lens):  # type: ignore[no-untyped-def]
-    """Fill `out`; false if some pixel has no direction. Each row begins at its first pixel, whatever the threads."""
-    height, width, _ = out.shape
-    k1, k2, p1, p2, k3 = lens[3], lens[4], lens[5], lens[6], lens[7]
-    failed = np.zeros(height, np.uint8)
+def _undistort(focal, centre_x, centre_y, terms, shift):  # type: ignore[no-untyped-def]
+    """Fill `shift` [h, w, 2] by fixed-point iteration, to 1e-7 pixel; False where it does not settle."""
+    height, width = shift.shape[:2]
+    settled = np.ones(height, np.bool_)
     for row in numba.prange(height):
-        v = (row - lens[2]) / lens[0]
-        x, y = -lens[1] / lens[0], v
+        goal_y = (row - centre_y) / focal
         for col in range(width):
-            u = (col - lens[1]) / lens[0]
-            converged = False
-            for _ in range(_NEWTON_STEPS):
-                r2 = x * x + y * y
-                radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-                slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
-                fx = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - u
-                fy = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - v
-                xx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
-                xy = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
-                yy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
-                determinant = xx * yy - xy * xy
-                if determinant <= 0.0 or xx <= 0.0:
+            goal_x = (col - centre_x) / focal
+            x, y = goal_x, goal_y
+            change = 1.0
+            for _ in range(60):
+                bend_x, bend_y = bend(x, y, terms)
+                change = abs(goal_x - bend_x - x) + abs(goal_y - bend_y - y)
+                x, y = goal_x - bend_x, goal_y - bend_y
+                if change * focal < 1e-7:
                     break
-                dx = (yy * fx - xy * fy) / determinant
-                dy = (xx * fy - xy * fx) / determinant
-                x -= dx
-                y -= dy
-                if abs(dx) + abs(dy) < _CONVERGED:
-                    converged = True
-                    break
-            if not converged:
-                failed[row] = 1
-                x, y = u, v
-            out[row, col, 0] = x
-            out[row, col, 1] = y
-    return not failed.any()
+            if not change * focal < 1e-7:
+                settled[row] = False
+            shift[row, col, 0] = x - goal_x
+            shift[row, col, 1] = y - goal_y
+    return settled.all()

@@ -121,7 +121,7 @@ def test_a_trigger_that_is_lost_again_when_shot_again_is_tried_once_more(joining
 
 
 def test_a_fault_in_the_second_view_is_made_good_there(joining: CellFolder) -> None:
-    joining.write(views=[TOP, SIDE])
+    joining.write(views=[TOP, SIDE], order="as_written")
     ended = _acquire_with(joining, {"kind": "drop_trigger", "edge": FRAMES + 20})
     assert ended.code == 0, ended.err
     run = joining.run_folder

@@ -93,7 +93,7 @@ def test_a_viewer_sees_the_object_and_its_histograms(viewer: Viewer) -> None:
     assert shown["dose_lux_h"] > 0
     picture = viewer.picture()
     assert picture.shape == (48, 64, 3)
-    assert picture.std() > 5
+    assert picture.std() > 2  # the dark support, lit from one side
 
 
 def test_saturated_pixels_are_shown_in_red(viewer: Viewer) -> None:

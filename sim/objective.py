@@ -1,0 +1,101 @@
+"""What the simulated lens does to light, beside where it sends it (`sim.render.lens`): loss, vignetting, blur.
+
+A thin lens of focal length f and f-number N, focused at s from its principal plane: the image stands at
+f s/(s - f), magnified by m = f/(s - f).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coupole.errors import InputError
+
+Array = NDArray[np.float64]
+
+CHANNEL_UM = (0.60, 0.54, 0.46)
+"""Wavelengths that stand for red, green and blue."""
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The lens as glass. Defaults are the instrument's 35 mm at f/8; what is marked "assumed" has its order."""
+
+    focal_length_mm: float = 35.0
+    focus_distance_mm: float = 334.0
+    """From the lens's principal plane to what is sharp."""
+    f_number: float = 8.0
+    transmission: float = 0.90
+    """Of the glass, the same for all channels (assumed)."""
+    rim_radius: float = 3.0
+    """Radius of the front rim over that of the pupil: stopped down to f/8 the rim is far outside (assumed)."""
+    rim_shift: float = 4.0
+    """By how many radii of the pupil the rim moves across it, for a tangent of 1 (assumed)."""
+    lateral_colour: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Relative change of magnification of red, green and blue: 1e-4 is 0.2 pixel in a corner at full size."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.focal_length_mm < self.focus_distance_mm or self.f_number <= 0.0:
+            raise InputError(
+                f"simulated lens: expected a focus beyond the focal length of {self.focal_length_mm} mm and an "
+                f"f-number above 0; found {self.focus_distance_mm} mm and f/{self.f_number}; "
+                "set the camera's lens right"
+            )
+
+    @property
+    def magnification(self) -> float:
+        return self.focal_length_mm / (self.focus_distance_mm - self.focal_length_mm)
+
+    @property
+    def working_f_number(self) -> float:
+        """N (1 + m): the cone of light that reaches the sensor is the narrower the farther the lens stands off."""
+        return self.f_number * (1.0 + self.magnification)
+
+
+def illuminance_per_radiance(objective: Objective) -> float:
+    """Illuminance on the sensor's centre, lx, for a luminance of 1 lm/(m^2 sr): pi T/(4 N_w^2), N_w the working
+    f-number."""
+    return float(np.pi * objective.transmission / (4.0 * objective.working_f_number**2))
+
+
+def vignetting(objective: Objective, tangent: ArrayLike) -> Array:
+    """Share of the centre's light at a tangent of the angle to the axis: cos^4 and what the rim leaves."""
+    t = np.asarray(tangent, dtype=float)
+    return np.asarray((1.0 + t * t) ** -2.0 * _overlap(objective.rim_radius, objective.rim_shift * t))
+
+
+def defocus_px(objective: Objective, depth_mm: ArrayLike, pixel_pitch_um: float) -> Array:
+    """Diameter of the circle of confusion, pixels, of points at a depth: f m/N |z - s|/z."""
+    z = np.asarray(depth_mm, dtype=float)
+    opening_mm = objective.focal_length_mm / objective.f_number
+    circle_mm = opening_mm * objective.magnification * np.abs(z - objective.focus_distance_mm) / z
+    return np.asarray(circle_mm * 1e3 / pixel_pitch_um)
+
+
+def diffraction_px(objective: Objective, wavelength_um: ArrayLike, pixel_pitch_um: float) -> Array:
+    """Standard deviation, pixels, of the normal curve nearest to Airy's disk: 0.42 lambda N_w.
+
+    Zhang, Zerubia, Olivo-Marin, Appl. Opt. 46, 1819 (2007): 0.21 lambda/NA, with NA = 1/(2 N_w).
+    """
+    return np.asarray(0.42 * np.asarray(wavelength_um) * objective.working_f_number / pixel_pitch_um)
+
+
+def blur_px(objective: Objective, depth_mm: ArrayLike, channel: int, pixel_pitch_um: float) -> Array:
+    """Standard deviation of the blur per axis, pixels, of points at a depth in one channel (0 red to 2 blue).
+
+    A disk of diameter c has c/4; variances of defocus and diffraction add.
+    """
+    disk = 0.25 * defocus_px(objective, depth_mm, pixel_pitch_um)
+    return np.hypot(disk, diffraction_px(objective, CHANNEL_UM[channel], pixel_pitch_um))
+
+
+def _overlap(rim: float, shift: Array) -> Array:
+    """Share of a unit disk that a disk of radius `rim` covers whose centre is `shift` away."""
+    d = np.clip(shift, abs(1.0 - rim) + 1e-12, 1.0 + rim - 1e-12)
+    in_unit = np.arccos(np.clip((d * d + 1.0 - rim * rim) / (2.0 * d), -1.0, 1.0))
+    in_rim = np.arccos(np.clip((d * d + rim * rim - 1.0) / (2.0 * d * rim), -1.0, 1.0))
+    kite = 0.5 * np.sqrt(np.maximum(0.0, (1.0 + rim - d) * (d + 1.0 - rim) * (d - 1.0 + rim) * (d + 1.0 + rim)))
+    lens = (in_unit + rim * rim * in_rim - kite) / np.pi
+    return np.where(shift <= abs(1.0 - rim), min(1.0, rim * rim), np.where(shift >= 1.0 + rim, 0.0, lens))

@@ -1,0 +1,71 @@
+"""Urushi: a makie tile and a nashiji slab (seed 002), as virtual objects."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim.materials import indices, nashiji
+from sim.objects import appearance
+from sim.objects.mesh import Array, cells_for, joined, of_material, rectangle, skirt, slab
+from sim.surface import Surface
+
+_BODY_MM = 6.0
+_LEVELS = 6
+"""Depths of flakes that have a metal of their own: gold looks redder the deeper it lies."""
+
+
+def makie_tile(side_mm: float = 60.0, *, triangles: int = 60_000, petals: int = 8, seed: int = 1) -> Surface:
+    """A tile of polished black urushi that stands on z = 0, with a flower of sprinkled gold on its face.
+
+    The share of gold falls from 95 % inside the drawing to none over its edge, as powder does: each triangle of
+    the face is gold with that probability, lacquer otherwise.
+    """
+    columns, rows = cells_for(triangles, side_mm, side_mm)
+    face = rectangle(side_mm, side_mm, columns, rows, z_mm=_BODY_MM)
+    share = _drawing(face.mean(axis=1)[:, :2] / (0.5 * side_mm), petals)
+    gold = np.random.default_rng(seed).random(len(face)) < share
+    powder = appearance.metal("makie gold", indices.gold(), 0.25)
+    black = appearance.black_lacquer()
+    return joined(
+        [
+            of_material(face[gold], powder),
+            of_material(face[~gold], black),
+            of_material(skirt(face), black),
+        ]
+    )
+
+
+def nashiji_slab(slab_of: nashiji.Slab | None = None) -> Surface:
+    """Gold flakes on a body of dark lacquer that stands on z = 0; x and y go from 0 to the slab's size.
+
+    The clear lacquer above the flakes is no surface of its own: its absorption along the normal, and what its face
+    lets through, are in the flakes' reflectance by depth (`appearance.metal_in_lacquer`). Refraction, and the
+    gloss of that face, are left away: they need paths to be traced. Flakes at the rim reach over it.
+    """
+    found = nashiji.flakes(slab_of or nashiji.Slab())
+    size_x, size_y = found.slab.size_mm
+    body = slab(size_x, size_y, _BODY_MM) + np.array([0.5 * size_x, 0.5 * size_y, 0.0])
+    parts = [of_material(body, appearance.black_lacquer())]
+    points, faces = nashiji.triangulate(found, around=12, along=4)
+    lift_mm = np.array([0.0, 0.0, _BODY_MM + found.slab.depth_mm])
+    corners = (points + lift_mm)[faces].reshape(len(found.centres_mm), -1, 3, 3)
+    depth_mm = -found.centres_mm[:, 2]
+    level = np.minimum((depth_mm / found.slab.depth_mm * _LEVELS).astype(int), _LEVELS - 1)
+    for k in np.unique(level):
+        middle_mm = (k + 0.5) / _LEVELS * found.slab.depth_mm
+        metal = appearance.metal_in_lacquer(
+            f"gold flakes, {middle_mm:.2f} mm deep", indices.gold(), middle_mm, roughness=0.08
+        )
+        parts.append(of_material(corners[level == k].reshape(-1, 3, 3), metal))
+    return joined(parts)
+
+
+def _drawing(place: Array, petals: int) -> Array:
+    """Share of gold [n] at places [n, 2] of the face, -1 to 1: a flower, its heart and a rim."""
+    r, phi = np.hypot(*place.T), np.arctan2(*place.T[::-1])
+    edge = 0.45 + 0.25 * np.abs(np.cos(0.5 * petals * phi))
+    flower = (r > 0.16) & (r < edge) | (r < 0.10)
+    outside = np.where(flower, 0.0, np.maximum(r - edge, 0.0))
+    powder = 0.95 * np.exp(-((outside / 0.06) ** 2)) * (flower | (r > edge))
+    rim = np.abs(place).max(axis=1) > 0.94
+    return np.where(rim, 0.95, powder)

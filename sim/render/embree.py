@@ -1,0 +1,181 @@
+"""Embree's shadow rays, called from compiled code.
+
+embreex carries the Embree 4 library but traces rays one at a time in the direction of numpy arrays; its C
+functions, found through the extension module that is linked to it, take packets of 16 rays from numba threads.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass, field
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from coupole.errors import CoupoleError
+
+_TRIANGLES, _INDEX, _VERTEX, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
+_COMPACT, _ROBUST = 1 << 1, 1 << 2
+_PACKET = 16
+_CHUNK = 4096
+OFFSET_MM = 2e-3
+"""A shadow ray starts so far above its triangle, on the light's side: ten times the rounding of float32
+coordinates of 2 m, and a hundredth of a scanned triangle."""
+
+
+class _Library:
+    """The C functions with their types, bound once."""
+
+    def __init__(self) -> None:
+        import embreex.rtcore_scene as linked_to_embree
+
+        self._library = ctypes.CDLL(linked_to_embree.__file__)
+        pointer, number, size = ctypes.c_void_p, ctypes.c_uint, ctypes.c_size_t
+        self.new_device = self._bind("rtcNewDevice", pointer, ctypes.c_char_p)
+        self.device_error = self._bind("rtcGetDeviceError", number, pointer)
+        self.new_scene = self._bind("rtcNewScene", pointer, pointer)
+        self.set_scene_flags = self._bind("rtcSetSceneFlags", None, pointer, number)
+        self.new_geometry = self._bind("rtcNewGeometry", pointer, pointer, number)
+        self.set_buffer = self._bind(
+            "rtcSetSharedGeometryBuffer", None, pointer, number, number, number, pointer, size, size, size
+        )
+        self.commit_geometry = self._bind("rtcCommitGeometry", None, pointer)
+        self.attach = self._bind("rtcAttachGeometry", number, pointer, pointer)
+        self.release_geometry = self._bind("rtcReleaseGeometry", None, pointer)
+        self.commit_scene = self._bind("rtcCommitScene", None, pointer)
+        self.release_scene = self._bind("rtcReleaseScene", None, pointer)
+        self.release_device = self._bind("rtcReleaseDevice", None, pointer)
+        self.occluded = np.uint64(ctypes.cast(self._library.rtcOccluded16, pointer).value or 0)
+
+    def _bind(self, name: str, result: Any, *arguments: Any) -> Any:
+        function = getattr(self._library, name)
+        function.restype, function.argtypes = result, arguments
+        return function
+
+
+@dataclass
+class Obstacles:
+    """Triangles that cast shadows, in Embree's tree; `corners_mm` [n, 3, 3] float32 are shared, not copied."""
+
+    corners_mm: NDArray[np.float32]
+    _library: _Library = field(default_factory=_Library, repr=False)
+    _indices: NDArray[np.uint32] = field(init=False, repr=False)
+    _device: int = field(init=False, repr=False)
+    _scene: int = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Build the tree. `corners_mm` must have 4 bytes to spare behind its end (`sim.scene.spacious`)."""
+        call, count = self._library, len(self.corners_mm)
+        self._indices = np.arange(3 * count, dtype=np.uint32)
+        self._device = call.new_device(b"")
+        self._scene = call.new_scene(self._device)
+        # Compact: a tenth slower, but 40 million triangles fit; robust: no ray slips through a common edge.
+        call.set_scene_flags(self._scene, _COMPACT | _ROBUST)
+        geometry = call.new_geometry(self._device, _TRIANGLES)
+        call.set_buffer(geometry, _VERTEX, 0, _FLOAT3, self.corners_mm.ctypes.data, 0, 12, 3 * count)
+        call.set_buffer(geometry, _INDEX, 0, _UINT3, self._indices.ctypes.data, 0, 12, count)
+        call.commit_geometry(geometry)
+        call.attach(self._scene, geometry)
+        call.release_geometry(geometry)
+        call.commit_scene(self._scene)
+        if error := call.device_error(self._device):
+            raise CoupoleError(
+                f"simulated scene: expected Embree to build its tree of {count} triangles; rtcGetDeviceError says "
+                f"{error}. If memory is short, simulate a coarser mesh"
+            )
+
+    def trace(
+        self, sides: NDArray[np.int64], light_mm: NDArray[np.float64], first: int, bits: NDArray[np.uint8]
+    ) -> None:
+        """Set, from place `first` on, the bits of those sides of triangles that a light's centre [3] reaches.
+
+        A side is 2 t for the front of triangle t (seen counter-clockwise), 2 t + 1 for its back. `bits` holds a
+        zero for every place before; sides that face away from the light keep it.
+        """
+        address, scene = self._library.occluded, np.uint64(self._scene)
+        _trace(address, scene, self.corners_mm, sides, light_mm, first, bits)
+
+    def __del__(self) -> None:
+        if hasattr(self, "_scene"):
+            self._library.release_scene(self._scene)
+            self._library.release_device(self._device)
+
+
+def _occluded16(_context, _address, _valid, _scene, _rays):  # type: ignore[no-untyped-def]
+    """`rtcOccluded16(valid, scene, rays, NULL)` at an address that is an argument, so that code can be cached."""
+
+    def generate(context, builder, _signature, values):  # type: ignore[no-untyped-def]
+        word = ir.IntType(64)
+        kind = ir.FunctionType(ir.VoidType(), [word] * 4)
+        function = builder.inttoptr(values[0], kind.as_pointer())
+        builder.call(function, [values[1], values[2], values[3], word(0)])
+        return context.get_dummy_value()
+
+    return types.void(types.uint64, types.uint64, types.uint64, types.uint64), generate
+
+
+_call_occluded16: Any = intrinsic(_occluded16)
+
+
+@numba.njit(cache=True, nogil=True)
+def centroid_and_normal(corners, t, centroid, normal):  # type: ignore[no-untyped-def]
+    """Fill a triangle's centroid [3] and flat unit normal [3]; no normal, all zeros, where it has no area."""
+    for k in range(3):
+        a, b, c = np.float64(corners[t, 0, k]), np.float64(corners[t, 1, k]), np.float64(corners[t, 2, k])
+        centroid[k] = (a + b + c) / 3.0
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        normal[k] = np.float64(corners[t, 1, i] - corners[t, 0, i]) * np.float64(
+            corners[t, 2, j] - corners[t, 0, j]
+        ) - np.float64(corners[t, 1, j] - corners[t, 0, j]) * np.float64(corners[t, 2, i] - corners[t, 0, i])
+    length = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
+    for k in range(3):
+        normal[k] = normal[k] / length if length > 0.0 else 0.0
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _trace(occluded, scene, corners, sides, light, first, bits):  # type: ignore[no-untyped-def]
+    chunks = -(-len(sides) // _CHUNK)
+    start = first // _CHUNK
+    for chunk in numba.prange(start, chunks):
+        rays, words, valid = _packet()
+        place_of_lane = np.empty(_PACKET, np.int64)
+        centroid, normal = np.empty(3), np.empty(3)
+        lane = 0
+        last = min(len(sides), (chunk + 1) * _CHUNK)
+        for place in range(max(first, chunk * _CHUNK), last):
+            centroid_and_normal(corners, sides[place] >> 1, centroid, normal)
+            lift = -OFFSET_MM if sides[place] & 1 else OFFSET_MM
+            facing = 0.0
+            for k in range(3):
+                origin = np.float32(centroid[k] + lift * normal[k])
+                rays[k, lane], rays[4 + k, lane] = origin, np.float32(light[k] - origin)
+                facing += lift * normal[k] * (light[k] - centroid[k])
+            if facing > 0.0:
+                rays[3, lane], rays[8, lane] = 0.0, 1.0
+                words[9, lane], words[11, lane] = np.uint32(0xFFFFFFFF), np.uint32(0)
+                valid[lane], place_of_lane[lane] = -1, place
+                lane += 1
+            if lane == _PACKET or (place == last - 1 and lane > 0):
+                valid[lane:] = 0
+                _call_occluded16(occluded, np.uint64(valid.ctypes.data), scene, np.uint64(rays.ctypes.data))
+                for k in range(lane):
+                    if rays[8, k] >= 0.0:  # Embree sets tfar of a ray that hit something to minus infinity
+                        bits[place_of_lane[k] >> 3] |= np.uint8(1 << (place_of_lane[k] & 7))
+                lane = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _packet():  # type: ignore[no-untyped-def]
+    """Memory of one RTCRay16, aligned to 64 bytes: 12 rows of 16 (org xyz, tnear, dir xyz, time, tfar, mask, id,
+    flags) as float32 and as uint32, and the 16 lanes' valid mask."""
+    memory = np.zeros(13 * _PACKET + 16, np.float32)
+    skip = np.int64((-np.int64(memory.ctypes.data) // 4) % 16)
+    rays = memory[skip : skip + 12 * _PACKET].reshape(12, _PACKET)
+    valid = memory[skip + 12 * _PACKET : skip + 13 * _PACKET].view(np.int32)
+    return rays, rays.view(np.uint32), valid

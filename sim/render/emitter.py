@@ -1,0 +1,141 @@
+"""Light of a square Lambertian emitter at a point.
+
+E = Phi / (2 pi A) sum over the edges of the part above the receiver's horizon of angle_i (edge_i's normal . n)
+(Lambert 1760; seed 003, Eq. 2, where `paper` multiplies by the emitter's cosine once more). Lengths are in mm but
+for E / Phi, which is per m^2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+LED_SIDE_MM = 7.0
+FAR_SIDES = 30.0
+"""From so many sides on, 2 x 2 Gauss points differ from the polygon by less than 1e-6 where the emitter is wholly
+above the horizon by a tenth of its distance (measured in tests/unit/render/test_emitter.py)."""
+_GAUSS = 1.0 / np.sqrt(3.0)
+
+
+@dataclass(frozen=True)
+class Emitter:
+    """A square in the base frame."""
+
+    centre_mm: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    """Unit; light leaves on this side."""
+    half_u_mm: NDArray[np.float64]
+    """From the centre to the middle of one side."""
+    half_v_mm: NDArray[np.float64]
+    """From the centre to the middle of the next side: u x v points along the normal."""
+    flux_lm: float
+
+
+def square(centre_mm: ArrayLike, normal: ArrayLike, *, side_mm: float, flux_lm: float) -> Emitter:
+    """Emitter with two sides horizontal (perpendicular to z; along x where it looks straight up or down).
+
+    The LED table does not say how squares lie; at 1 m that is worth 1e-5 of the irradiance at most.
+    """
+    n = np.asarray(normal, dtype=np.float64)
+    n = n / np.linalg.norm(n)
+    u = np.cross([0.0, 0.0, 1.0], n)
+    u = u / np.linalg.norm(u) if np.linalg.norm(u) > 1e-9 else np.array([1.0, 0.0, 0.0])
+    half = 0.5 * side_mm
+    return Emitter(np.asarray(centre_mm, dtype=np.float64), n, half * u, half * np.cross(n, u), flux_lm)
+
+
+def irradiance(
+    emitter: Emitter, points_mm: ArrayLike, normals: ArrayLike, emission: str = "lambertian"
+) -> NDArray[np.float64]:
+    """[n] lux at points [n, 3] with unit normals [n, 3], nothing in between."""
+    points, facing = (
+        np.atleast_2d(np.asarray(points_mm, np.float64)),
+        np.atleast_2d(np.asarray(normals, np.float64)),
+    )
+    out = np.empty(len(points))
+    _irradiance(points, facing, packed(emitter), out)
+    if emission == "paper":
+        to_light = emitter.centre_mm - points
+        out *= np.maximum(0.0, -(to_light @ emitter.normal) / np.linalg.norm(to_light, axis=1))
+    return out
+
+
+def packed(emitter: Emitter) -> NDArray[np.float64]:
+    """[13] centre, normal, half_u, half_v in mm, and flux in lm, for compiled code."""
+    return np.array([*emitter.centre_mm, *emitter.normal, *emitter.half_u_mm, *emitter.half_v_mm, emitter.flux_lm])
+
+
+@numba.njit(cache=True, nogil=True)
+def _irradiance(points, normals, led, out):  # type: ignore[no-untyped-def]
+    shares = np.empty(4)
+    work = np.empty((2, 8, 3))
+    for i in range(len(points)):
+        p, n = points[i], normals[i]
+        out[i] = led[12] * per_lumen(p[0], p[1], p[2], n[0], n[1], n[2], led, shares, work)
+
+
+@numba.njit(cache=True, nogil=True)
+def per_lumen(px, py, pz, nx, ny, nz, led, shares, work):  # type: ignore[no-untyped-def]
+    """E / Phi in 1/m^2 at p with unit normal n; fills `shares` [4] with what the four Gauss points add to it.
+
+    `work` [2, 8, 3] is memory for the polygon. Without light the shares are 0.
+    """
+    tx, ty, tz = led[0] - px, led[1] - py, led[2] - pz
+    shares[:] = 0.0
+    if tx * led[3] + ty * led[4] + tz * led[5] >= 0.0:
+        return 0.0
+    total = 0.0
+    for k in range(4):
+        u, v = (_GAUSS, -_GAUSS)[k & 1], (_GAUSS, -_GAUSS)[k >> 1]
+        x, y, z = tx + u * led[6] + v * led[9], ty + u * led[7] + v * led[10], tz + u * led[8] + v * led[11]
+        distance2 = x * x + y * y + z * z
+        cosines = -(x * led[3] + y * led[4] + z * led[5]) * max(0.0, x * nx + y * ny + z * nz)
+        shares[k] = 0.25e6 / np.pi * cosines / (distance2 * distance2)
+        total += shares[k]
+    half2 = led[6] * led[6] + led[7] * led[7] + led[8] * led[8]
+    distance2 = tx * tx + ty * ty + tz * tz
+    height = tx * nx + ty * ny + tz * nz
+    if distance2 < 4.0 * half2 * FAR_SIDES * FAR_SIDES or height * height < 0.01 * distance2:
+        exact = _polygon(tx, ty, tz, nx, ny, nz, led, work) / (8.0 * np.pi * half2) * 1e6
+        if total > 0.0:
+            for k in range(4):
+                shares[k] *= exact / total
+        return exact
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _polygon(tx, ty, tz, nx, ny, nz, led, work):  # type: ignore[no-untyped-def]
+    """Lambert's sum over the edges of the square, clipped at the horizon; (tx, ty, tz) leads to its centre."""
+    whole, above = work[0], work[1]
+    for k in range(4):
+        u = 1.0 if k in (0, 3) else -1.0
+        v = 1.0 if k < 2 else -1.0
+        whole[k, 0] = tx + u * led[6] + v * led[9]
+        whole[k, 1] = ty + u * led[7] + v * led[10]
+        whole[k, 2] = tz + u * led[8] + v * led[11]
+    count = 0
+    for k in range(4):
+        a, b = whole[k], whole[(k + 1) % 4]
+        height_a = a[0] * nx + a[1] * ny + a[2] * nz
+        height_b = b[0] * nx + b[1] * ny + b[2] * nz
+        if height_a >= 0.0:
+            above[count] = a
+            count += 1
+        if (height_a >= 0.0) != (height_b >= 0.0):
+            share = height_a / (height_a - height_b)
+            for i in range(3):
+                above[count, i] = a[i] + share * (b[i] - a[i])
+            count += 1
+    total = 0.0
+    for k in range(count):
+        a, b = above[k], above[(k + 1) % count]
+        cx, cy, cz = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        length = np.sqrt(cx * cx + cy * cy + cz * cz)
+        if length > 0.0:
+            angle = np.arctan2(length, a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+            total += angle / length * (cx * nx + cy * ny + cz * nz)
+    return abs(total)

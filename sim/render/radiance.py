@@ -1,0 +1,151 @@
+"""Radiance that visible triangles send to the camera under one LED, or under a panel.
+
+L = f E with f = diffuse / pi + D G F / (4 n.l n.v): Lambert and GGX with Smith's separable G (Walter et al. 2007,
+Eqs. 33 and 34) and Schlick's F, as `sim.surface.Material` says. E comes from the whole square emitter; f is taken
+towards its centre where the lobe is wide, towards four Gauss points of it, weighted by their light, where the
+roughness is below `FINE_ROUGHNESS`. Below 0.01 or so, where the lobe is as narrow as the emitter looks (0.4 deg
+at 1 m), four points are too few. A side whose plane has the emitter's centre behind it is dark.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.render.emitter import Emitter, packed, per_lumen
+from sim.render.view import View
+
+FINE_ROUGHNESS = 0.3
+_CHUNK = 2048
+_GAUSS = 1.0 / np.sqrt(3.0)
+
+
+def led_radiance(
+    view: View,
+    materials: NDArray[np.float64],
+    emitter: Emitter,
+    emission: str,
+    places: NDArray[np.int32],
+    reached: NDArray[np.uint8],
+) -> NDArray[np.float32]:
+    """[seen, 3] lm/(m^2 sr), red green blue. `reached` are `Shadows.reached`'s bits, `places` where to look there.
+
+    `paper` takes the emitter's cosine, towards the triangle, twice (seed 003, Eq. 2; facts/instrument).
+    """
+    radiance = np.empty((len(view.sides), 3), np.float32)
+    _shade(
+        view.centroids_mm,
+        view.normals,
+        view.shading_normals,
+        view.towards_camera,
+        view.diffuse,
+        view.material,
+        materials,
+        packed(emitter),
+        emission == "paper",
+        places,
+        reached,
+        radiance,
+    )
+    return radiance
+
+
+def panel_radiance(view: View, materials: NDArray[np.float64], panel_lux: float) -> NDArray[np.float32]:
+    """[seen, 3] under a panel: the same irradiance everywhere, from all around, as a flat white panel is meant."""
+    albedo = view.diffuse + materials[view.material, 3:6]
+    radiance: NDArray[np.float32] = (panel_lux / np.pi * albedo).astype(np.float32)
+    return radiance
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _shade(  # type: ignore[no-untyped-def]
+    centroids,
+    normals,
+    shading_normals,
+    towards_camera,
+    diffuse,
+    material,
+    materials,
+    led,
+    paper,
+    places,
+    reached,
+    out,
+):
+    count = len(out)
+    for chunk in numba.prange(-(-count // _CHUNK)):
+        shares, work = np.empty(4), np.empty((2, 8, 3))
+        for i in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
+            out[i, 0], out[i, 1], out[i, 2] = 0.0, 0.0, 0.0
+            place = places[i]
+            if not (reached[place >> 3] >> (place & 7)) & 1:
+                continue
+            px, py, pz = np.float64(centroids[i, 0]), np.float64(centroids[i, 1]), np.float64(centroids[i, 2])
+            tx, ty, tz = led[0] - px, led[1] - py, led[2] - pz
+            nx, ny, nz = (
+                np.float64(shading_normals[i, 0]),
+                np.float64(shading_normals[i, 1]),
+                np.float64(shading_normals[i, 2]),
+            )
+            if tx * normals[i, 0] + ty * normals[i, 1] + tz * normals[i, 2] <= 0.0:
+                continue
+            if tx * nx + ty * ny + tz * nz <= 0.0:
+                continue
+            lux = led[12] * per_lumen(px, py, pz, nx, ny, nz, led, shares, work)
+            if paper:
+                lux *= -(tx * led[3] + ty * led[4] + tz * led[5]) / np.sqrt(tx * tx + ty * ty + tz * tz)
+            for k in range(3):
+                out[i, k] = lux * diffuse[i, k] / np.pi
+            m = material[i]
+            alpha = materials[m, 6]
+            vx, vy, vz = towards_camera[i, 0], towards_camera[i, 1], towards_camera[i, 2]
+            if alpha == 0.0 or lux == 0.0 or vx * nx + vy * ny + vz * nz <= 0.0:
+                continue
+            if alpha >= FINE_ROUGHNESS:
+                fixed, grazing = _lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha)
+            else:
+                fixed, grazing = _mean_lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha, led, shares)
+            for k in range(3):
+                f0 = materials[m, 3 + k]
+                out[i, k] += lux * (f0 * fixed + (1.0 - f0) * grazing)
+
+
+@numba.njit(cache=True, nogil=True)
+def _mean_lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha, led, shares):  # type: ignore[no-untyped-def]
+    """`_lobe` towards the Gauss points of an emitter centred at (tx, ty, tz), weighted by `shares` [4]."""
+    fixed, grazing = 0.0, 0.0
+    total = shares[0] + shares[1] + shares[2] + shares[3]
+    for k in range(4):
+        if shares[k] > 0.0:
+            u, v = (_GAUSS, -_GAUSS)[k & 1], (_GAUSS, -_GAUSS)[k >> 1]
+            x, y, z = tx + u * led[6] + v * led[9], ty + u * led[7] + v * led[10], tz + u * led[8] + v * led[11]
+            one, other = _lobe(x, y, z, nx, ny, nz, vx, vy, vz, alpha)
+            fixed += one * shares[k] / total
+            grazing += other * shares[k] / total
+    return fixed, grazing
+
+
+@numba.njit(cache=True, nogil=True)
+def _lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha):  # type: ignore[no-untyped-def]
+    """D G / (4 n.l n.v) towards a light at (tx, ty, tz), and that times Schlick's (1 - h.v)^5."""
+    distance = np.sqrt(tx * tx + ty * ty + tz * tz)
+    lx, ly, lz = tx / distance, ty / distance, tz / distance
+    hx, hy, hz = lx + vx, ly + vy, lz + vz
+    length = np.sqrt(hx * hx + hy * hy + hz * hz)
+    cos_l, cos_v = nx * lx + ny * ly + nz * lz, nx * vx + ny * vy + nz * vz
+    if cos_l <= 0.0 or length == 0.0:
+        return 0.0, 0.0
+    cos_h = (nx * hx + ny * hy + nz * hz) / length
+    cos_hv = (vx * hx + vy * hy + vz * hz) / length
+    alpha2 = alpha * alpha
+    # sin^2 from the cross product: 1 - cos^2 in rounded numbers would shape the peak of a smooth surface.
+    cx, cy, cz = ny * hz - nz * hy, nz * hx - nx * hz, nx * hy - ny * hx
+    spread = cos_h * cos_h * alpha2 + (cx * cx + cy * cy + cz * cz) / (length * length)
+    d = alpha2 / (np.pi * spread * spread)
+    # G1 / (2 n.l) = 1 / (n.l + sqrt(alpha^2 + (1 - alpha^2) n.l^2)), and the same for v.
+    masked_l = 1.0 / (cos_l + np.sqrt(alpha2 + (1.0 - alpha2) * cos_l * cos_l))
+    masked_v = 1.0 / (cos_v + np.sqrt(alpha2 + (1.0 - alpha2) * cos_v * cos_v))
+    value = d * masked_l * masked_v
+    far = 1.0 - cos_hv
+    return value, value * far * far * far * far * far

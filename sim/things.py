@@ -1,0 +1,100 @@
+"""Things that a world puts into its scene beside the plan's object: targets of calibration, samples.
+
+Listed in the rig under `world: settings: things:`, each with its kind, its measures and where it stands on the
+support. The controller knows nothing of them: keep views clear of what is tall.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from coupole.geometry import Transform, transform
+from sim.surface import Surface
+
+_Length = Annotated[float, Field(gt=0)]
+_Vector = tuple[float, float, float]
+
+
+class _Thing(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    translation_mm: _Vector = (0.0, 0.0, 0.0)
+    abc_deg: _Vector = (0.0, 0.0, 0.0)
+    """Where it stands, in the support frame, as in a plan's poses."""
+
+    def support_from_thing(self) -> Transform:
+        return transform(self.translation_mm, self.abc_deg)
+
+
+class CharucoBoard(_Thing):
+    """Defaults are those of `sim.objects.board.Charuco`."""
+
+    kind: Literal["charuco_board"]
+    squares_x: Annotated[int, Field(ge=3)] = 12
+    squares_y: Annotated[int, Field(ge=3)] = 9
+    square_mm: _Length = 16.0
+    marker_mm: _Length = 12.0
+    dictionary: str = "DICT_5X5_250"
+    thickness_mm: _Length = 4.0
+    margin_mm: _Length = 5.0
+
+    def surface(self) -> Surface:
+        from sim.objects.board import Charuco, charuco_board
+
+        measures = {field.name: getattr(self, field.name) for field in dataclasses.fields(Charuco)}
+        return charuco_board(Charuco(**measures))
+
+
+class Sphere(_Thing):
+    kind: Literal["chrome_ball", "glossy_sphere"]
+    diameter_mm: _Length = 30.0
+
+    def surface(self) -> Surface:
+        from sim.objects import shapes, targets
+
+        if self.kind == "chrome_ball":
+            return targets.chrome_ball(self.diameter_mm)
+        return shapes.glossy_sphere(self.diameter_mm / 2)
+
+
+class Sample(_Thing):
+    """A sample of a material, at the measures of its generator."""
+
+    kind: Literal[
+        "spectralon_tile",
+        "grey_card",
+        "gilt_step_wedge",
+        "paint_wedge",
+        "makie_tile",
+        "nashiji_slab",
+        "fabric",
+        "sculpted_relief",
+    ]
+
+    def surface(self) -> Surface:
+        from sim.objects import fabric, shapes, targets, urushi, wedges
+
+        generators: dict[str, Callable[[], Surface]] = {
+            "spectralon_tile": targets.spectralon_tile,
+            "grey_card": targets.grey_card,
+            "gilt_step_wedge": wedges.gilt_step_wedge,
+            "paint_wedge": wedges.paint_wedge,
+            "makie_tile": urushi.makie_tile,
+            "nashiji_slab": urushi.nashiji_slab,
+            "fabric": fabric.fabric,
+            "sculpted_relief": shapes.sculpted_relief,
+        }
+        return generators[self.kind]()
+
+
+Thing = Annotated[CharucoBoard | Sphere | Sample, Field(discriminator="kind")]
+
+
+def placed(things: tuple[Thing, ...], base_from_support: Transform) -> list[tuple[Surface, Transform]]:
+    """Surfaces and where they are in the base frame."""
+    return [(thing.surface(), np.asarray(base_from_support @ thing.support_from_thing())) for thing in things]

@@ -1,0 +1,93 @@
+"""The board through the whole simulated camera: its corners are found where OpenCV projects them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coupole.geometry import inverse
+from sim import blur
+from sim.objective import Objective
+from sim.objects.board import Charuco, charuco_board, inner_corners_mm, opencv_board
+from sim.render.lens import Lens
+from sim.render.view import View, Viewer
+from sim.scene import build_scene
+from sim.sensor import SensorModel, electrons, expose, expose_electrons, mosaic
+
+cv2 = pytest.importorskip("cv2")
+pytest.importorskip("colour")
+
+BOARD = Charuco(7, 5)
+PITCH_UM = 22.0
+LENS = Lens.focused(
+    1024,
+    768,
+    pixel_pitch_um=PITCH_UM,
+    focal_length_mm=35.0,
+    focus_distance_mm=334.0,
+    distortion=(-0.08, 0.02, 5e-4, -3e-4, 0.0),
+)
+MONO = SensorModel(bayer_pattern="MONO", seed=3)
+WHITE_E = 8_000.0
+
+
+@pytest.fixture(scope="module")
+def base_from_camera() -> NDArray[np.float64]:
+    """Looks down at the board from 330 mm, tilted by 15 degrees."""
+    tilt = np.radians(15.0)
+    pose = np.eye(4)
+    z = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
+    pose[:3, :3] = np.stack([np.cross([0.0, -1.0, 0.0], z), [0.0, -1.0, 0.0], z], axis=1)
+    pose[:3, 3] = -330.0 * z
+    return pose
+
+
+def view_of_board(base_from_camera: NDArray[np.float64], samples: int) -> tuple[Viewer, View]:
+    viewer = Viewer(build_scene([(charuco_board(BOARD), np.eye(4))]), LENS, samples)
+    return viewer, viewer.look(base_from_camera)
+
+
+def misses_px(frame: NDArray[np.uint16], base_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[corners, 2] what OpenCV finds less where OpenCV projects the truth."""
+    picture = np.clip(frame.astype(float) / 16.0, 0, 255).astype(np.uint8)
+    found, ids, _, _ = cv2.aruco.CharucoDetector(opencv_board(BOARD)).detectBoard(picture)
+    assert len(ids) == (BOARD.squares_x - 1) * (BOARD.squares_y - 1)
+    camera_from_base = inverse(base_from_camera)
+    matrix = np.diag([LENS.focal_px, LENS.focal_px, 1.0])
+    matrix[:2, 2] = LENS.centre_px
+    true, _ = cv2.projectPoints(
+        inner_corners_mm(BOARD)[ids.ravel()],
+        cv2.Rodrigues(camera_from_base[:3, :3])[0],
+        camera_from_base[:3, 3],
+        matrix,
+        np.array(LENS.distortion),
+    )
+    return np.asarray(found[:, 0] - true[:, 0])
+
+
+def test_corners_of_a_supersampled_frame_are_found_to_a_tenth_of_a_pixel(
+    base_from_camera: NDArray[np.float64],
+) -> None:
+    viewer, view = view_of_board(base_from_camera, 4)
+    frame = np.empty((768, 1024), np.uint16)
+    light = (view.triangle, view.diffuse, viewer.falloff)
+    expose(frame, *light, model=MONO, electrons_per_radiance=WHITE_E, frame=1)
+    misses = misses_px(frame, base_from_camera)
+    assert np.sqrt(np.mean(misses**2)) < 0.14
+    assert np.abs(misses.mean(axis=0)).max() < 0.06
+
+
+def test_blur_leaves_the_corners_in_place(base_from_camera: NDArray[np.float64]) -> None:
+    viewer, view = view_of_board(base_from_camera, 1)
+    image = electrons(view.triangle, view.diffuse, viewer.falloff, electrons_per_radiance=WHITE_E)
+    depth_mm = np.full(view.triangle.shape, 380.0, np.float32)
+    soft = blur.through(Objective(f_number=4.0), image, depth_mm, pixel_pitch_um=PITCH_UM)
+    misses = []
+    for each in (image, soft):
+        frame = np.empty((768, 1024), np.uint16)
+        expose_electrons(frame, mosaic(each, MONO), model=MONO, frame=1)
+        misses.append(misses_px(frame, base_from_camera))
+    moved = misses[1] - misses[0]
+    assert np.sqrt(np.mean(moved**2)) < 0.15
+    assert np.abs(moved.mean(axis=0)).max() < 0.03

@@ -1,0 +1,285 @@
+"""How fast the simulated dome makes pictures, and in how much memory, beside Open3D, Embree and Mitsuba.
+
+Scenes are reliefs that fill the frame, under the demo's dome. Peers that are not installed are left out:
+`pip install open3d mitsuba`.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FULL, SMALL = (4096, 3072), (1024, 768)
+SENSOR_WIDTH_MM = 22.528
+WORKING_DISTANCE_MM = 334.0
+SIMULATED_CAMERA_PER_S = 25.0
+_LEDS_OF_A_ROUND = 12
+
+
+def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+    """All figures of the renderer."""
+    yield from gbuffer_figures(rounds)
+    yield from frame_figures(root, rounds)
+    yield memory_figure(root)
+
+
+def relief(triangles: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Vertices and faces of a bumpy rectangle, z up, in mm: 3:4, of a scan's 0.2 mm cells from 1.4 million
+    triangles on, and never smaller than the field of view."""
+    down = round((triangles / 2 * 3 / 4) ** 0.5)
+    across, half_y = down * 4 // 3, max(75.0, 0.1 * down)
+    x, y = np.meshgrid(
+        np.linspace(-half_y * 4 / 3, half_y * 4 / 3, across + 1), np.linspace(-half_y, half_y, down + 1)
+    )
+    z = 4.0 * np.sin(x / 6.0) * np.cos(y / 5.0) + 0.5 * np.sin(x * 1.7 + y)
+    number = np.arange(x.size, dtype=np.int32).reshape(x.shape)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+    return np.stack([x, y, z], axis=-1).astype(np.float32).reshape(-1, 3), faces
+
+
+def corners_of_relief(triangles: int) -> NDArray[np.float32]:
+    """[about `triangles`, 3, 3]."""
+    vertices, faces = relief(triangles)
+    return vertices[faces]
+
+
+def write_relief(path: Path, triangles: int) -> None:
+    """As binary PLY."""
+    import trimesh
+
+    trimesh.Trimesh(*relief(triangles), process=False).export(path)
+
+
+def camera_pose() -> NDArray[np.float64]:
+    """Looking straight down from the working distance."""
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = WORKING_DISTANCE_MM
+    return pose
+
+
+def times_s(works: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
+    """Median times of interleaved works; the first round, which compiles, does not count."""
+    times: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(1 + rounds):
+        for name, work in works.items():
+            start_s = time.perf_counter()
+            work()
+            times[name].append(time.perf_counter() - start_s)
+    return {name: statistics.median(each[1:]) for name, each in times.items()}
+
+
+# -- which triangle each pixel sees -----------------------------------------------------------------------
+
+
+def gbuffer_figures(rounds: int) -> Iterator[dict[str, Any]]:
+    """Seconds for the triangles of 12.6 Mpixel, with and without a distorting lens, against ray tracers."""
+    from sim.render.lens import Lens, sight
+    from sim.render.raster import visible_triangles
+
+    pose = camera_pose()
+    focal_px = 1.0 / (1.0 / 35.0 - 1.0 / WORKING_DISTANCE_MM) / SENSOR_WIDTH_MM * FULL[0]
+    straight = sight(Lens(*FULL, focal_px))
+    bent = sight(Lens(*FULL, focal_px, (-0.05, 0.02, 1e-4, -2e-4, 0.01)))
+    for millions in (1.4, 10.0):
+        corners = corners_of_relief(int(millions * 1e6))
+        works: dict[str, Callable[[], Any]] = {
+            "straight": lambda corners=corners: visible_triangles(corners, straight, pose),
+            "bent": lambda corners=corners: visible_triangles(corners, bent, pose),
+        }
+        works |= ray_tracers(corners, straight.lens, pose)
+        medians = times_s(works, max(rounds, 3))
+        for lens in ("straight", "bent"):
+            for peer in [name for name in works if name not in ("straight", "bent")]:
+                yield {
+                    "name": f"gbuffer_{millions:g}_M_triangles_{lens}_lens",
+                    "value": medians[lens],
+                    "unit": "s",
+                    "peer": peer,
+                    "ratio": medians[peer] / medians[lens],
+                    "peer_value": round(medians[peer], 4),
+                }
+
+
+def ray_tracers(
+    corners: NDArray[np.float32], lens: Any, pose: NDArray[np.float64]
+) -> dict[str, Callable[[], Any]]:
+    """Primary rays of an undistorted camera through other programs; trees and rays are made before."""
+    columns, rows = np.meshgrid(np.arange(lens.width_px), np.arange(lens.height_px))
+    x, y = (columns - lens.centre_px[0]) / lens.focal_px, (rows - lens.centre_px[1]) / lens.focal_px
+    ways = (np.stack([x, y, np.ones_like(x)], axis=-1) @ pose[:3, :3].T).astype(np.float32).reshape(-1, 3)
+    origins = np.broadcast_to(pose[:3, 3].astype(np.float32), ways.shape).copy()
+    peers: dict[str, Callable[[], Any]] = {}
+    from embreex import rtcore_scene
+    from embreex.mesh_construction import TriangleMesh
+
+    tree = rtcore_scene.EmbreeScene()
+    TriangleMesh(tree, corners)
+    peers["embreex"] = lambda: tree.run(origins, ways)
+    try:
+        import open3d
+    except ImportError:
+        return peers
+    scene = open3d.t.geometry.RaycastingScene()
+    indices = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
+    scene.add_triangles(open3d.core.Tensor(corners.reshape(-1, 3)), open3d.core.Tensor(indices))
+    rays = open3d.core.Tensor(np.concatenate([origins, ways], axis=1))
+    peers["open3d"] = lambda: scene.cast_rays(rays)
+    return peers
+
+
+# -- frames -----------------------------------------------------------------------------------------------
+
+
+def photographer(root: Path, mesh: Path, size: tuple[int, int]) -> Any:
+    """The demo's dome around one mesh, and the flange pose that looks straight down at it."""
+    from coupole.cell import world_config
+    from coupole.job import read_job
+    from sim.config import Config
+    from sim.picture import Photographer
+
+    job = read_job(root / "configs/plans/demo.yaml")
+    told = world_config(job.cell, job, job.cell.rig.sensor)
+    told["scene"]["objects"] = [{"path": mesh, "unit": "mm", "support_from_object": np.eye(4).tolist()}]
+    told["camera"] |= {
+        "width_px": size[0],
+        "height_px": size[1],
+        "pixel_pitch_um": SENSOR_WIDTH_MM / size[0] * 1e3,
+        "focus_distance_mm": WORKING_DISTANCE_MM,
+        "flange_from_camera": np.eye(4).tolist(),
+    }
+    config = Config.model_validate(told)
+    pose = np.array(config.scene.base_from_support) @ camera_pose()
+    return Photographer(config.scene, config.camera, seed=1), pose
+
+
+def render_leds(by: Any, pose: NDArray[np.float64], out: NDArray[np.uint16], leds: range) -> None:
+    from sim.camera_body import Exposed
+
+    for led in leds:
+        by.render(out, Exposed({led: 0.008}, [], 0.008, 1.0, led, pose))
+
+
+def frame_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+    """Frames per second: each LED's first frame, with its shadow rays; again, shadows kept, in another view of the
+    same triangles; again from the same pose, radiance kept where it has room."""
+    for size, millions in ((FULL, 1.4), (SMALL, 0.1)):
+        label = f"{size[0]}x{size[1]}_{millions:g}_M_triangles"
+        with tempfile.TemporaryDirectory() as folder:
+            mesh = Path(folder) / "mesh.ply"
+            write_relief(mesh, int(millions * 1e6))
+            by, pose = photographer(root, mesh, size)
+            peer = mitsuba_frame(mesh, by) if size == FULL else None
+        nudged = pose.copy()
+        nudged[0, 3] += 0.01
+        out = np.zeros((size[1], size[0]), np.uint16)
+        render_leds(by, nudged, out, range(1))
+        render_leds(by, pose, out, range(1))
+        first, kept, again, peers = [], [], [], []
+        for turn in range(rounds):
+            if peer is not None:
+                start_s = time.perf_counter()
+                peer(turn)
+                peers.append(time.perf_counter() - start_s)
+            leds = range(1 + turn * _LEDS_OF_A_ROUND, 1 + (turn + 1) * _LEDS_OF_A_ROUND)
+            for times, place in ((first, pose), (kept, nudged), (again, nudged)):
+                render_leds(by, place, out, range(1))  # a new pose is rasterised here, apart
+                start_s = time.perf_counter()
+                render_leds(by, place, out, leds)
+                times.append((time.perf_counter() - start_s) / len(leds))
+        per_frame = {"shadow_rays": first, "shadows_kept": kept, "radiance_kept": again}
+        peer_s = statistics.median(peers) if peers else None
+        for name, each in per_frame.items():
+            value = 1.0 / statistics.median(each)
+            yield {
+                "name": f"frames_{label}_{name}",
+                "value": value,
+                "unit": "1/s",
+                "peer": "simulated_camera_at_25_hz" if peer_s is None else "mitsuba_scalar_rgb_1_sample",
+                "ratio": value / SIMULATED_CAMERA_PER_S if peer_s is None else value * peer_s,
+                "peer_value": round(SIMULATED_CAMERA_PER_S if peer_s is None else 1.0 / peer_s, 4),
+            }
+
+
+def mitsuba_frame(mesh: Path, by: Any) -> Callable[[int], None] | None:
+    """Moves Mitsuba's LED and renders a frame; None where Mitsuba is not installed."""
+    try:
+        import mitsuba
+    except ImportError:
+        return None
+    mitsuba.set_variant("scalar_rgb")
+    transform = mitsuba.ScalarTransform4f
+    scene = mitsuba.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0},
+            "mesh": {"type": "ply", "filename": str(mesh), "face_normals": True},
+            "led": {
+                "type": "rectangle",
+                "to_world": transform().scale(3.5),
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [1e7] * 3}},
+            },
+            "camera": {
+                "type": "perspective",
+                "fov": 2 * np.degrees(np.arctan(SENSOR_WIDTH_MM / 2 * (1 / 35.0 - 1 / WORKING_DISTANCE_MM))),
+                "to_world": transform().look_at([0, 0, WORKING_DISTANCE_MM], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": FULL[0], "height": FULL[1], "rfilter": {"type": "box"}},
+                "sampler": {"type": "independent", "sample_count": 1},
+            },
+        }
+    )
+    parameters = mitsuba.traverse(scene)
+
+    def move_and_render(led: int) -> None:
+        position = by.leds.positions_mm[led]
+        parameters["led.to_world"] = transform().look_at(position, [0, 0, 0], [0, 0, 1]) @ transform().scale(3.5)
+        parameters.update()
+        mitsuba.render(scene, spp=1)
+
+    return move_and_render
+
+
+# -- memory -----------------------------------------------------------------------------------------------
+
+_ALONE = """
+import json, sys, time
+from pathlib import Path
+import numpy as np
+sys.path[:0] = [{tools!r}, {root!r}]
+from bench_render import FULL, photographer, render_leds
+started = time.perf_counter()
+by, pose = photographer(Path({root!r}), Path({mesh!r}), FULL)
+read_s = time.perf_counter() - started
+render_leds(by, pose, np.zeros(FULL[::-1], np.uint16), range(1))
+peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+print(json.dumps([int(peak.split()[1]) / 2**20, read_s]))
+"""
+
+
+def memory_figure(root: Path) -> dict[str, Any]:
+    """Peak of a process that reads a binary PLY of 10 million triangles and renders one LED at full size, against
+    the 16 GiB of a laboratory's computer."""
+    with tempfile.TemporaryDirectory() as folder:
+        mesh = Path(folder) / "mesh.ply"
+        write_relief(mesh, 10_000_000)
+        script = _ALONE.format(tools=str(root / "tools"), root=str(root), mesh=str(mesh))
+        done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    peak, read_s = json.loads(done.stdout)
+    return {
+        "name": "peak_memory_10_M_triangles",
+        "value": peak,
+        "unit": "GiB",
+        "peer": "memory_of_16_GiB",
+        "ratio": 16.0 / peak,
+        "read_s": round(read_s, 2),
+    }

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from coupole.calibrate_cli import calibrate_app
 from coupole.errors import CoupoleError, InputError, Interrupted, PreflightRefused
 
 app = typer.Typer(
@@ -21,6 +22,7 @@ app = typer.Typer(
 )
 plan_app = typer.Typer(help="Plan templates.", no_args_is_help=True)
 app.add_typer(plan_app, name="plan")
+app.add_typer(calibrate_app, name="calibrate")
 
 PlanPath = Annotated[Path, typer.Argument(help="The plan (YAML).", show_default=False)]
 RigOption = Annotated[Path | None, typer.Option("--rig", help="Another rig than the plan names.")]

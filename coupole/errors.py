@@ -5,6 +5,7 @@
     CoupoleError
     ├── InputError            2    plan, rig or arguments are wrong
     ├── PreflightRefused      3    the plan is well formed but must not be run
+    ├── CalibrationRefused    3    the calibration misses its limits: written, but not to be used
     ├── DeviceError           4    a device failed
     │   ├── DeviceTimeout     4    ... did not answer in time
     │   ├── DeviceLost        4    ... its link is gone
@@ -61,6 +62,16 @@ class InputError(CoupoleError):
 
 class PreflightRefused(CoupoleError):
     """Preflight found reasons not to run; `refusals` holds all of them."""
+
+    exit_code = 3
+
+    def __init__(self, refusals: Sequence[str]) -> None:
+        self.refusals = tuple(refusals)
+        super().__init__("\n".join(refusals))
+
+
+class CalibrationRefused(CoupoleError):
+    """A calibration misses its acceptance limits; `refusals` holds all of them."""
 
     exit_code = 3
 

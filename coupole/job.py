@@ -7,9 +7,10 @@ import shutil
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +24,15 @@ from coupole.geometry import apply
 from coupole.itinerary import Itinerary, bodies_of, plan_itinerary
 from coupole.plan import MeasuredObject, Plan
 from coupole.preflight import DISK_SHARE, Report, StorageFacts, check
-from coupole.rig import Rig, driver_problems, planning_arm
+from coupole.rig import Rig, driver_problems, in_world, planning_arm
 from coupole.run import Inputs
 from coupole.shadow import Shadow, Shadows, shadows_of
 from coupole.shots import FASTEST, Pace, Schedule, ViewPose, build_schedule, missing_lights
 from coupole.store import measure_write_speed
 from coupole.yamlfile import Document
+
+if TYPE_CHECKING:
+    from coupole.calibration.in_force import InForce
 
 _SAME_PLACE_DEG = 1e-3
 _DISK_GRAIN_US = 100
@@ -67,6 +71,8 @@ class Job:
     object_points_support_mm: NDArray[np.float64]
     """[n, 3] corners and centre of the object's bounding box, or the views' targets: where dose is reckoned."""
     schedule: Schedule
+    calibrations: tuple[InForce, ...] = ()
+    """The records that the plan names."""
     hidden_leds: Mapping[str, Sequence[int]] = field(default_factory=dict)
     """LEDs that were left out of views, by name of view."""
     pace: Pace = FASTEST
@@ -129,6 +135,7 @@ class Job:
     @property
     def inputs(self) -> Inputs:
         others = [self.cell.leds_path] + ([self.mesh_path] if self.mesh_path else [])
+        others += [item.path for item in self.calibrations]
         return Inputs(self.document.path, self.cell.document.path, tuple(others))
 
 
@@ -190,7 +197,25 @@ def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
     problems += _bad_exposures(document, plan, cell.rig)
     if problems:
         raise InputError(problems)
-    return Job(plan, document, cell, mesh_path, corners, _dose_points(plan, corners), schedule_of(plan, cell))
+    return Job(
+        plan,
+        document,
+        cell,
+        mesh_path,
+        corners,
+        _dose_points(plan, corners),
+        schedule_of(plan, cell),
+        calibrations=_calibrations(document, plan),
+    )
+
+
+def _calibrations(document: Document, plan: Plan) -> tuple[InForce, ...]:
+    """The records that a plan names. Raises InputError."""
+    if plan.calibrations == "none":
+        return ()
+    from coupole.calibration.in_force import read_in_force
+
+    return read_in_force([document.resolve(path) for path in plan.calibrations])
 
 
 def schedule_of(plan: Plan, cell: Cell, pace: Pace = FASTEST) -> Schedule:
@@ -303,10 +328,29 @@ def check_job(
         return paced, report
 
     job, report = _cooled(*checked(Pace(disk_us=_disk_us(rig, storage))), checked)
+    report.refusals += _calibration_refusals(job)
     if planning_arm(rig) is None:
         why = "no model of this arm's links: whether it touches anything cannot be told"
         report.refusals.insert(0, f"robot {rig.robot.driver}: {why}")
     return job, report
+
+
+def _calibration_refusals(job: Job) -> list[str]:
+    """Why the records that the plan names do not hold here."""
+    if job.plan.calibrations == "none":
+        return []
+    from coupole.calibration.in_force import Situation, refusals
+
+    rig = job.cell.rig
+    here = Situation(
+        now=datetime.now(UTC),
+        simulated=in_world(rig, dry_run=False),
+        size_px=(rig.sensor.width_px, rig.sensor.height_px),
+        focal_length_mm=rig.lens.focal_length_mm,
+        focus_distance_mm=rig.lens.focus_distance_mm,
+        f_number=rig.lens.f_number,
+    )
+    return refusals(job.calibrations, here)
 
 
 def _disk_us(rig: Rig, storage: StorageFacts) -> int:

@@ -189,7 +189,7 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
     return {
         "simulated": cell.simulated,
         "object": job.plan.object.id if job.plan.object else None,
-        "calibrations": "none" if job.plan.calibrations == "none" else [str(p) for p in job.plan.calibrations],
+        "calibrations": {item.record.kind: item.record.sha256 for item in job.calibrations} or "none",
         "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
         "scaling": cell.world_endpoints["camera"]["scaling"] if cell.world_endpoints else None,
         "views": [view.name for view in job.schedule.views],

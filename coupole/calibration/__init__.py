@@ -1,0 +1,19 @@
+"""One file per calibration, each: observations in, result with uncertainty out.
+
+::
+
+    board.py        a ChArUco or chess board, and its corners in an image
+    sources.py      runs and folders of pictures, as images to look for a board in
+    poses.py        robot poses as files give them, and what their numbers may mean
+    optics.py       projection with Brown-Conrady distortion, and its derivatives
+    adjustment.py   least squares with variance components: values, covariance, and what dominates it
+    camera.py       intrinsics and distortion from images of a board
+    chromatic.py    a lens for each colour channel: lateral chromatic aberration
+    hand_eye.py     A X = X B in closed form: Park, Tsai, Daniilidis
+    bundle.py       camera, hand-eye, board and errors of the robot in one adjustment
+    diagnosis.py    why robot and camera contradict each other
+    workflow.py     images to record and report, with acceptance limits
+    record.py       the result on disk, sealed by its checksum
+    in_force.py     which records a plan may be acquired with
+    report.py       the result as a page and a picture
+"""

@@ -1,0 +1,341 @@
+"""Least squares with variance components: values, covariance, and what dominates it.
+
+Observations come in blocks: each has its residuals over their stated noise, the derivatives for the few parameters
+that it depends on, and belongs to one group (corners, robot's positions, robot's orientations, ...). The normal
+matrix is added up block by block, so no Jacobian of the whole is ever built. After convergence each group's noise
+is estimated from its own residuals and its redundancy (Foerstner, Photogrammetric Engineering 1979; the iterated
+estimate is REML), and the adjustment repeated, until stated and seen noise agree.
+
+Two more things are read off the normal matrix: how much each group contributes to each parameter's variance (from
+C = C N C with N the sum over the groups), and the degrees of freedom that stand behind each standard uncertainty
+(Welch-Satterthwaite, GUM annex G.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.stats import t as student
+
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+
+S = TypeVar("S")
+
+HUBER = 2.0
+REJECT_SIGMA = 5.0
+"""An image point with normal noise lies farther off once in 270,000."""
+_MAX_STEPS = 60
+_MAX_ROUNDS = 30
+_SETTLED = 1e-3
+"""Noise factors are estimated no finer than to a thousandth."""
+_SINGULAR = 1e-6
+"""Share of a parameter's own precision that may be left of it after all others are known."""
+_LEAST_REDUNDANCY = 3.0
+"""With less the residuals say nothing of the noise."""
+_LEAST_FACTOR = 1e-4
+"""Of the stated noise; a group without any would outweigh all others by no right."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Observations that share one noise."""
+
+    name: str
+    estimated: bool
+    """False if the stated noise is to be believed; else it is where the observations are too few to tell."""
+    rejects: int = 0
+    """Residuals of one observation (2 for an image point), if single observations may be rejected; else 0."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some observations: residuals [m] (observed minus computed, over the stated noise), derivatives of what was
+    computed [m, k], the k parameters that they are for, and the group's number."""
+
+    residuals: Floats
+    jacobian: Floats
+    columns: np.ndarray[tuple[int], np.dtype[np.intp]]
+    group: int
+
+
+@dataclass(frozen=True)
+class Component:
+    """What the residuals say of one group's noise."""
+
+    name: str
+    factor: float
+    """Noise seen over noise stated; 1 where it was not to be estimated."""
+    observations: int
+    rejected: int
+    redundancy: float
+    chi2: float
+    """Sum of squared residuals over the stated noise."""
+
+
+@dataclass(frozen=True)
+class Adjusted(Generic[S]):
+    """The result: state, covariance [p, p] of the steps in its parameters, and what is known of the noise."""
+
+    state: S
+    covariance: Floats
+    components: tuple[Component, ...]
+    contributions: Floats
+    """Share [groups, p] of each parameter's variance."""
+    degrees: Floats
+    """Effective degrees of freedom [p]."""
+    residuals: tuple[Floats, ...]
+    """Of each block, over the stated noise."""
+    kept: tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], ...]
+    """Of each block, which residuals were not rejected."""
+    steps: int
+
+    def factor(self, name: str) -> float:
+        return next(component.factor for component in self.components if component.name == name)
+
+    @property
+    def chi2_per_degree(self) -> float:
+        """Over all groups, with the stated noise."""
+        return sum(c.chi2 for c in self.components) / max(sum(c.redundancy for c in self.components), 1e-9)
+
+
+def coverage_factor(degrees: Floats | float, coverage: float = 0.95) -> Floats:
+    """k for a two-sided interval, from Student's distribution."""
+    return np.asarray(student.ppf(0.5 + coverage / 2, np.maximum(degrees, 1.0)))
+
+
+def adjust(
+    state: S,
+    evaluate: Callable[[S], list[Block]],
+    move: Callable[[S, Floats], S],
+    groups: Sequence[Group],
+    parameters: int,
+    *,
+    what: str,
+) -> Adjusted[S]:
+    """Minimise the sum of squared residuals from a start on (Levenberg-Marquardt), estimate the noise, reject.
+
+    First Huber's weights hold gross errors off; then what exceeds `REJECT_SIGMA` is left out, and the rest is
+    weighted by its noise alone. `what` names the calibration in errors. Raises InputError if the observations do
+    not determine all parameters.
+    """
+    factors = np.ones(len(groups))
+    blocks = evaluate(state)
+    kept = [np.ones(len(block.residuals), dtype=np.bool_) for block in blocks]
+    weights = [k.astype(np.float64) for k in kept]
+    rejecting = any(group.rejects for group in groups)
+    taken = 0
+    for robust in (True, False) if rejecting else (False,):
+        for _ in range(_MAX_ROUNDS):
+            if robust:
+                weights = [_huber(b, groups[b.group].rejects, factors[b.group]) for b in blocks]
+            state, blocks, steps = _descend(state, blocks, evaluate, move, weights, factors, parameters, what)
+            taken += steps
+            if robust:
+                seen = _robust_factors(blocks, groups, factors)
+            else:
+                seen = _seen_factors(blocks, groups, kept, weights, factors, parameters, what)
+            settled = bool(np.all(np.abs(seen / factors - 1) < _SETTLED))
+            factors = seen
+            if not robust and (rejected := _reject(blocks, groups, kept, factors)):
+                kept, settled = rejected, False
+                weights = [k.astype(np.float64) for k in kept]
+            if settled:
+                break
+        if robust:
+            kept = _reject(blocks, groups, kept, factors) or kept
+            weights = [k.astype(np.float64) for k in kept]
+    return _summary(state, blocks, groups, kept, weights, factors, parameters, what, taken)
+
+
+def _normals(
+    blocks: Sequence[Block], weights: Sequence[Floats], groups: int, parameters: int
+) -> tuple[Floats, Floats]:
+    """Normal matrices [groups, p, p] and right-hand sides [groups, p], with the stated noise."""
+    matrices, sides = np.zeros((groups, parameters, parameters)), np.zeros((groups, parameters))
+    for block, weight in zip(blocks, weights, strict=True):
+        weighted = block.jacobian * weight[:, None]
+        matrices[block.group][np.ix_(block.columns, block.columns)] += weighted.T @ block.jacobian
+        sides[block.group][block.columns] += weighted.T @ block.residuals
+    return matrices, sides
+
+
+def _cost(blocks: Sequence[Block], weights: Sequence[Floats], factors: Floats) -> float:
+    return sum(
+        float(weight @ block.residuals**2) / float(factors[block.group]) ** 2
+        for block, weight in zip(blocks, weights, strict=True)
+    )
+
+
+def _descend(
+    state: S,
+    blocks: list[Block],
+    evaluate: Callable[[S], list[Block]],
+    move: Callable[[S, Floats], S],
+    weights: Sequence[Floats],
+    factors: Floats,
+    parameters: int,
+    what: str,
+) -> tuple[S, list[Block], int]:
+    """Levenberg-Marquardt with fixed weights, until a step gains nothing."""
+    damping, cost = 1e-6, _cost(blocks, weights, factors)
+    for step in range(1, _MAX_STEPS + 1):
+        matrices, sides = _normals(blocks, weights, len(factors), parameters)
+        normal = np.einsum("g,gij->ij", factors**-2.0, matrices)
+        side = factors**-2.0 @ sides
+        while True:
+            damped = normal + damping * np.diag(np.diag(normal))
+            change = cho_solve(_factored(damped, what), side)
+            tried = move(state, change)
+            tried_blocks = evaluate(tried)
+            tried_cost = _cost(tried_blocks, weights, factors)
+            if tried_cost <= cost or damping > 1e8:
+                break
+            damping *= 10
+        if not tried_cost <= cost:
+            return state, blocks, step
+        gain, predicted = cost - tried_cost, float(change @ side)
+        state, blocks, cost, damping = tried, tried_blocks, tried_cost, max(damping / 10, 1e-12)
+        if predicted < 1e-7 or gain < 1e-12 * cost:  # a step of 3e-4 of the uncertainty
+            return state, blocks, step
+    raise InputError(
+        f"{what}: no convergence in {_MAX_STEPS} steps. Look for views of another board or camera, and take views "
+        "that differ more in tilt, roll and distance."
+    )
+
+
+def _factored(normal: Floats, what: str) -> tuple[Floats, bool]:
+    """Cholesky factor of the normal matrix, scaled to units of its diagonal for the test of rank."""
+    diagonal = np.diag(normal)
+    if (diagonal > 0).all():
+        scale = diagonal**-0.5
+        try:
+            factor, lower = cho_factor(normal * np.outer(scale, scale), lower=True)
+        except LinAlgError:
+            pass
+        else:
+            if np.diag(factor).min() > _SINGULAR:
+                return np.asarray(factor / scale[:, None]), lower
+    raise InputError(
+        f"{what}: the observations do not determine all parameters. Take views that differ more in tilt, roll and "
+        "distance, or leave fewer parameters free."
+    )
+
+
+def _observations(values: Floats, size: int) -> Floats:
+    """Norms of observations of `size` residuals each, scaled to the share of one residual."""
+    return np.asarray(np.sqrt(np.mean(values.reshape(-1, size) ** 2, axis=1)))
+
+
+def _huber(block: Block, size: int, factor: float) -> Floats:
+    if not size:
+        return np.ones(len(block.residuals))
+    far = _observations(block.residuals, size) / factor
+    return np.asarray(np.repeat(np.minimum(1.0, HUBER / np.maximum(far, 1e-12)), size))
+
+
+def _robust_factors(blocks: Sequence[Block], groups: Sequence[Group], factors: Floats) -> Floats:
+    """Noise from the median of absolute residuals, for groups with gross errors; others wait."""
+    seen = factors.copy()
+    for number, group in enumerate(groups):
+        if group.rejects and group.estimated:
+            residuals = np.concatenate([b.residuals for b in blocks if b.group == number])
+            seen[number] = max(1.4826 * float(np.median(np.abs(residuals))), _LEAST_FACTOR)
+    return seen
+
+
+def _seen_factors(
+    blocks: Sequence[Block],
+    groups: Sequence[Group],
+    kept: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]],
+    weights: Sequence[Floats],
+    factors: Floats,
+    parameters: int,
+    what: str,
+) -> Floats:
+    """Noise of each group from its squared residuals over its redundancy."""
+    matrices, _ = _normals(blocks, weights, len(groups), parameters)
+    covariance = _covariance(matrices, factors, what)
+    seen = factors.copy()
+    for number, group in enumerate(groups):
+        if not group.estimated:
+            continue
+        chi2, count = _chi2(blocks, kept, number)
+        redundancy = count - float(np.sum(covariance * matrices[number])) / factors[number] ** 2
+        if redundancy >= _LEAST_REDUNDANCY:
+            seen[number] = max(np.sqrt(chi2 / redundancy), _LEAST_FACTOR)
+    return seen
+
+
+def _covariance(matrices: Floats, factors: Floats, what: str) -> Floats:
+    normal = np.einsum("g,gij->ij", factors**-2.0, matrices)
+    return np.asarray(cho_solve(_factored(normal, what), np.eye(len(normal))))
+
+
+def _chi2(
+    blocks: Sequence[Block], kept: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]], group: int
+) -> tuple[float, int]:
+    pairs = [(b.residuals[k], int(k.sum())) for b, k in zip(blocks, kept, strict=True) if b.group == group]
+    return sum(float(r @ r) for r, _ in pairs), sum(count for _, count in pairs)
+
+
+def _reject(
+    blocks: Sequence[Block],
+    groups: Sequence[Group],
+    kept: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]],
+    factors: Floats,
+) -> list[np.ndarray[tuple[int], np.dtype[np.bool_]]] | None:
+    """Which residuals are within `REJECT_SIGMA`, None if none is out that was not before."""
+    result = []
+    for block, before in zip(blocks, kept, strict=True):
+        size = groups[block.group].rejects
+        limit = REJECT_SIGMA * factors[block.group] / np.sqrt(size or 1)
+        good = np.repeat(_observations(block.residuals, size) <= limit, size) if size else before
+        result.append(before & good)
+    unchanged = all((a == b).all() for a, b in zip(result, kept, strict=True))
+    return None if unchanged else result
+
+
+def _summary(
+    state: S,
+    blocks: list[Block],
+    groups: Sequence[Group],
+    kept: list[np.ndarray[tuple[int], np.dtype[np.bool_]]],
+    weights: Sequence[Floats],
+    factors: Floats,
+    parameters: int,
+    what: str,
+    steps: int,
+) -> Adjusted[S]:
+    matrices, _ = _normals(blocks, weights, len(groups), parameters)
+    covariance = _covariance(matrices, factors, what)
+    components, contributions, redundancies = [], [], []
+    for number, group in enumerate(groups):
+        information = matrices[number] / factors[number] ** 2
+        contributions.append(np.einsum("ij,jk,ki->i", covariance, information, covariance, optimize=True))
+        chi2, count = _chi2(blocks, kept, number)
+        whole = sum(len(block.residuals) for block in blocks if block.group == number)
+        redundancy = count - float(np.sum(covariance * information))
+        told = group.estimated and redundancy >= _LEAST_REDUNDANCY
+        redundancies.append(redundancy if told else np.inf)
+        size = group.rejects or 1
+        components.append(
+            Component(group.name, float(factors[number]), count // size, (whole - count) // size, redundancy, chi2)
+        )
+    shares = np.asarray(contributions) / np.diag(covariance)
+    freedom = np.maximum(np.asarray(redundancies), 1e-9)[:, None]
+    degrees = 1.0 / np.maximum(np.sum(shares**2 / freedom, axis=0), 1e-12)
+    return Adjusted(
+        state,
+        covariance,
+        tuple(components),
+        shares,
+        degrees,
+        tuple(block.residuals for block in blocks),
+        tuple(kept),
+        steps,
+    )

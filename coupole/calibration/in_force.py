@@ -1,0 +1,119 @@
+"""Which calibrations a plan may be acquired with: pure functions, and every reason why not."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from coupole.calibration.record import Record, read_record
+from coupole.errors import InputError, Problem
+
+NEEDED = ("camera", "hand-eye")
+"""Kinds that a pixel needs to become a ray in the robot's base."""
+_SAME = 1e-3
+"""Relative difference of figures that people write down."""
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What is there to be photographed with. What is None is not known, and not checked."""
+
+    now: datetime
+    """With a time zone."""
+    simulated: bool
+    size_px: tuple[int, int]
+    """Width and height of the camera's frames."""
+    focal_length_mm: float
+    focus_distance_mm: float
+    f_number: float
+    camera: str | None = None
+    """Model and serial number, once the camera is open."""
+    temperature_c: float | None = None
+
+
+@dataclass(frozen=True)
+class InForce:
+    """A record and the file that it was read from."""
+
+    path: Path
+    record: Record
+
+
+def read_in_force(paths: Sequence[Path]) -> tuple[InForce, ...]:
+    """The records that a plan names. Raises InputError with the problems of all files."""
+    found: list[InForce] = []
+    problems: list[Problem] = []
+    others: list[str] = []
+    for path in paths:
+        try:
+            found.append(InForce(path, read_record(path)))
+        except InputError as error:
+            problems += error.problems
+            others += [] if error.problems else [str(error)]
+    if others:
+        raise InputError("\n".join([*others, *map(str, problems)]))
+    if problems:
+        raise InputError(problems)
+    return tuple(found)
+
+
+def refusals(named: Sequence[InForce], here: Situation, needed: Sequence[str] = NEEDED) -> list[str]:
+    """Why a plan that names these records must not be acquired here; empty if it may."""
+    counts = Counter[str](item.record.kind for item in named)
+    reasons = [f"calibrations: no record of the kind `{kind}` is named" for kind in needed if not counts[kind]]
+    reasons += [f"calibrations: {n} records of the kind `{kind}` are named" for kind, n in counts.items() if n > 1]
+    for item in named:
+        reasons += [f"{item.path}: {reason}" for reason in _record_refusals(item.record, here)]
+    return reasons
+
+
+def hashes(named: Sequence[InForce]) -> dict[str, str]:
+    """SHA-256 of the records in force by kind, to be stamped into a run."""
+    return {item.record.kind: item.record.sha256 for item in named}
+
+
+def _record_refusals(record: Record, here: Situation) -> list[str]:
+    holds, reasons = record.validity, []
+    if here.now >= holds.expires:
+        reasons.append(f"expired on {holds.expires:%Y-%m-%d %H:%M} UTC. Calibrate anew")
+    if here.now < record.created:
+        reasons.append(
+            f"made on {record.created:%Y-%m-%d %H:%M} UTC, which is yet to come. Set this machine's clock"
+        )
+    if record.simulated and not here.simulated:
+        reasons.append("made with a simulated camera; this cell is real")
+    if here.simulated and not record.simulated:
+        reasons.append("made in a real cell; this one is simulated")
+    reasons += [
+        f"not accepted: {limit.what} is {limit.found:.4g} {limit.unit}, at most {limit.limit:.4g} is allowed"
+        for limit in record.limits
+        if not limit.passed
+    ]
+    if holds.focus_distance_mm is not None:
+        off_mm = abs(holds.focus_distance_mm - here.focus_distance_mm)
+        if off_mm > holds.focus_tolerance_mm:
+            reasons.append(
+                f"holds for a focus of {holds.focus_distance_mm:g} mm (within {holds.focus_tolerance_mm:g}); the "
+                f"rig is focused at {here.focus_distance_mm:g} mm. Calibrate at this focus, or turn the ring back"
+            )
+    for what, unit, valid, found in (
+        ("focal length", " mm", holds.focal_length_mm, here.focal_length_mm),
+        ("aperture", "", holds.f_number, here.f_number),
+    ):
+        if valid is not None and abs(valid - found) > _SAME * valid:
+            reasons.append(f"holds for {what} {valid:g}{unit}; the rig has {found:g}{unit}")
+    if holds.size_px is not None and holds.size_px != here.size_px:
+        reasons.append(
+            f"holds for frames of {holds.size_px[0]} x {holds.size_px[1]} pixels; the camera gives "
+            f"{here.size_px[0]} x {here.size_px[1]}"
+        )
+    if holds.camera is not None and here.camera is not None and holds.camera != here.camera:
+        reasons.append(f"holds for the camera {holds.camera}; this one is {here.camera}")
+    if holds.temperature_c is not None and here.temperature_c is not None:
+        low, high = holds.temperature_c
+        if not low <= here.temperature_c <= high:
+            reasons.append(f"holds from {low:g} to {high:g} C; the cell has {here.temperature_c:g} C")
+    return reasons

@@ -1,0 +1,187 @@
+"""Where a scanned mesh lies in the robot's base, from its stickers in pictures of known pose.
+
+The scanner's table says where the stickers are in the mesh's frame, to its own accuracy; pictures say where they
+are in the base, to that of camera, hand-eye and robot. Points are found in space, matched with the table by the
+triangles they form, and then everything is adjusted at once:
+
+    pixel = project((base_from_camera_i . E_i)^-1 . base_from_mesh . (q_j + d_j))
+
+with q_j the table's target, d_j what it is off, E_i what the arm is off in view i. (Seed 003, section 4, "mesh to
+robot", which has no uncertainty of target or arm in it.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from coupole.calibration import optics
+from coupole.calibration.adjustment import Adjusted, Block, Group, adjust
+from coupole.calibration.multi_view import CameraView, SeenPoint, seen_points
+from coupole.calibration.optics import Intrinsics
+from coupole.calibration.point_sets import match_points
+from coupole.calibration.rotations import Floats, between, inverses, moved, skew
+
+STICKERS, SCANNER, POSITION, ORIENTATION = "stickers", "scanner", "robot position", "robot orientation"
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What is known of the noise beforehand, standard deviations of each coordinate."""
+
+    sticker_px: float = 0.1
+    scanner_mm: float = 0.03
+    """Accuracy of the scanner (seed 003: 30 um)."""
+    robot_mm: float = 0.3
+    robot_deg: float = 0.02
+    """What camera poses are off: robot and hand-eye together."""
+
+
+@dataclass(frozen=True)
+class MeshPose:
+    """The result; the covariance [6, 6] is that of a step of `rotations.moved`: mm, then degrees."""
+
+    base_from_mesh: Floats
+    covariance: Floats
+    matched: tuple[str, ...]
+    """Names of the targets that were recognised."""
+    missing: tuple[str, ...]
+    false_points: int
+    """Points found in space that are none of the table's."""
+    views_of: dict[str, int]
+    residual_px: float
+    point_rms_mm: float
+    """Of the points found in space, before the adjustment, from the table's."""
+    noise: dict[str, float]
+    """Seen over stated, by group."""
+
+    def uncertainty_at(self, mesh_mm: Floats) -> float:
+        """Standard uncertainty of a mesh point's place in the base, mm: root of the sum of its variances."""
+        turn = self.base_from_mesh[:3, :3]
+        by_step = np.concatenate([np.eye(3), -turn @ skew(mesh_mm) * np.pi / 180], axis=1)
+        return float(np.sqrt(np.trace(by_step @ self.covariance @ by_step.T)))
+
+
+@dataclass(frozen=True)
+class _State:
+    base_from_mesh: Floats
+    base_from_camera: Floats
+    """[views, 4, 4]."""
+    targets_mm: Floats
+    """[matched, 3] in the mesh's frame."""
+
+
+def mesh_to_robot(
+    views: Sequence[CameraView],
+    intrinsics: Intrinsics,
+    targets_mm: Floats,
+    names: Sequence[str],
+    *,
+    stated: Stated = Stated(),
+    depth_mm: tuple[float, float] = (200.0, 900.0),
+) -> MeshPose:
+    """Find a mesh by its targets [n, 3] (mesh frame) in views in which things like stickers were seen.
+
+    Raises InputError if too few stickers are seen in three views, or if their layout fits nowhere or twice.
+    """
+    pose_px = intrinsics.fx * (stated.robot_mm / np.mean(depth_mm) + np.radians(stated.robot_deg))
+    tolerance_px = 4.0 * float(np.hypot(stated.sticker_px, pose_px))
+    tolerance_mm = 4.0 * float(
+        np.sqrt(stated.scanner_mm**2 + stated.robot_mm**2 + (0.5 * depth_mm[0] * 1e-4) ** 2)
+    )
+    points = seen_points(views, intrinsics, tolerance_px=tolerance_px, depth_mm=depth_mm)
+    found_mm = np.array([point.base_mm for point in points]).reshape(-1, 3)
+    match = match_points(found_mm, targets_mm, tolerance_mm)
+    seen = [points[row] for row in match.found]
+    adjusted = _adjust(views, intrinsics, seen, targets_mm[match.known], match.found_from_known, stated)
+    recognised = [names[row] for row in match.known.tolist()]
+    to_degrees = np.diag([1.0, 1.0, 1.0, *np.degrees([1.0, 1.0, 1.0])])
+    sightings = sum(len(point.views) for point in seen)
+    residuals = np.concatenate(
+        [r[k] for r, k in zip(adjusted.residuals[:sightings], adjusted.kept[:sightings], strict=True)]
+    )
+    return MeshPose(
+        adjusted.state.base_from_mesh,
+        to_degrees @ adjusted.covariance[:6, :6] @ to_degrees,
+        tuple(recognised),
+        tuple(name for name in names if name not in set(recognised)),
+        len(points) - len(seen),
+        {name: len(point.views) for name, point in zip(recognised, seen, strict=True)},
+        float(np.sqrt(np.mean(residuals**2)) * stated.sticker_px),
+        match.rms_mm,
+        {component.name: component.factor for component in adjusted.components},
+    )
+
+
+def _adjust(
+    views: Sequence[CameraView],
+    intrinsics: Intrinsics,
+    seen: Sequence[SeenPoint],
+    targets_mm: Floats,
+    start: Floats,
+    stated: Stated,
+) -> Adjusted[_State]:
+    """Unknowns: the mesh's step [6], a step [6] for each view, an offset [3] for each target."""
+    reported = np.array([view.base_from_camera for view in views])
+    first_target = 6 + 6 * len(views)
+    pose_sigma = np.array([stated.robot_mm] * 3 + [np.radians(stated.robot_deg)] * 3)
+    groups = (
+        Group(STICKERS, estimated=True, rejects=2),
+        Group(SCANNER, estimated=False),
+        Group(POSITION, estimated=True),
+        Group(ORIENTATION, estimated=True),
+    )
+
+    row_of = np.concatenate([np.full(len(point.views), row) for row, point in enumerate(seen)])
+    view_of = np.concatenate([point.views for point in seen])
+    observed = np.array(
+        [views[v].pixels[p] for point in seen for v, p in zip(point.views, point.places, strict=True)]
+    )
+    own = np.arange(6)
+    columns = np.concatenate(
+        [
+            np.tile(own, (len(row_of), 1)),
+            first_target + 3 * row_of[:, None] + own[:3],
+            6 + 6 * view_of[:, None] + own,
+        ],
+        axis=1,
+    )
+
+    def evaluate(state: _State) -> list[Block]:
+        turn, places = state.base_from_mesh[:3, :3], state.targets_mm[row_of]
+        camera_from_base = inverses(state.base_from_camera)[view_of]
+        in_base = places @ turn.T + state.base_from_mesh[:3, 3]
+        in_camera = np.einsum("nij,nj->ni", camera_from_base[:, :3, :3], in_base) + camera_from_base[:, :3, 3]
+        projected = optics.project(in_camera, intrinsics.vector())
+        by_base = projected.by_point @ camera_from_base[:, :3, :3]
+        by_turn = by_base @ (-turn @ skew(places))
+        by_view = projected.by_point @ skew(in_camera)
+        jacobian = (
+            np.concatenate([by_base, by_turn, by_base @ turn, -by_base, by_view], axis=2) / stated.sticker_px
+        )
+        residuals = (observed - projected.pixels) / stated.sticker_px
+        blocks = [Block(residuals[k], jacobian[k], columns[k], 0) for k in range(len(row_of))]
+        for row in range(len(seen)):
+            off = (targets_mm[row] - state.targets_mm[row]) / stated.scanner_mm
+            columns_of = np.arange(first_target + 3 * row, first_target + 3 * row + 3)
+            blocks.append(Block(off, np.eye(3) / stated.scanner_mm, columns_of, 1))
+        off_by = between(state.base_from_camera, reported)
+        for view in range(len(views)):
+            for group, part in ((2, slice(0, 3)), (3, slice(3, 6))):
+                columns_of = 6 + 6 * view + np.arange(6)[part]
+                weight = np.diag(1.0 / pose_sigma[part])
+                blocks.append(Block(off_by[view, part] / pose_sigma[part], weight, columns_of, group))
+        return blocks
+
+    def move(state: _State, step: Floats) -> _State:
+        return _State(
+            moved(state.base_from_mesh, step[:6]),
+            moved(state.base_from_camera, step[6:first_target].reshape(-1, 6)),
+            state.targets_mm + step[first_target:].reshape(-1, 3),
+        )
+
+    begin = _State(start, reported, targets_mm)
+    parameters = first_target + 3 * len(seen)
+    return adjust(begin, evaluate, move, groups, parameters, what="mesh to robot")

@@ -1,0 +1,181 @@
+"""Points in space from what several cameras of known pose saw, without being told what belongs together.
+
+Rays of two views that pass each other closely make a candidate; it stands if enough other views saw something
+where it would appear. Each thing seen is used once, by the candidate that most views agree on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from coupole.calibration import optics
+from coupole.calibration.optics import Intrinsics
+from coupole.calibration.rotations import Floats, inverses
+from coupole.errors import InputError
+
+LEAST_VIEWS = 3
+_NEWTON_STEPS = 12
+_REFINEMENTS = 4
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """One picture: where the camera stood, and the pixels [n, 2] at which something was seen."""
+
+    name: str
+    base_from_camera: Floats
+    pixels: Floats
+
+
+@dataclass(frozen=True)
+class SeenPoint:
+    """One point and where it was seen: numbers of views, and of pixels in them."""
+
+    base_mm: Floats
+    views: tuple[int, ...]
+    places: tuple[int, ...]
+    rms_px: float
+
+
+def unproject(pixels: Floats, intrinsics: Intrinsics) -> Floats:
+    """Unit directions [n, 3] in the camera frame that project to pixels [n, 2] (Newton's method).
+
+    Raises InputError where the distortion cannot be undone.
+    """
+    vector = intrinsics.vector()
+    rays = np.concatenate([(pixels - vector[2:4]) / vector[:2], np.ones((len(pixels), 1))], axis=1)
+    for _ in range(_NEWTON_STEPS):
+        seen = optics.project(rays, vector)
+        rays[:, :2] += np.linalg.solve(seen.by_point[:, :, :2], (pixels - seen.pixels)[:, :, None])[:, :, 0]
+    if len(pixels) and not np.abs(optics.project(rays, vector).pixels - pixels).max() < 1e-6:
+        raise InputError("camera record: its distortion cannot be undone at the border of the image")
+    directions: Floats = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return directions
+
+
+def seen_points(
+    views: Sequence[CameraView],
+    intrinsics: Intrinsics,
+    *,
+    tolerance_px: float,
+    depth_mm: tuple[float, float],
+    least_views: int = LEAST_VIEWS,
+) -> list[SeenPoint]:
+    """Points [base frame] that at least `least_views` views agree on within a tolerance, best supported first.
+
+    `depth_mm`: nearest and farthest that things stand in front of a camera.
+    """
+    vector, focal_px = intrinsics.vector(), float(intrinsics.fx)
+    camera_from_base = inverses(np.array([view.base_from_camera for view in views]))
+    rays = [
+        unproject(view.pixels, intrinsics) @ view.base_from_camera[:3, :3].T
+        if len(view.pixels)
+        else np.zeros((0, 3))
+        for view in views
+    ]
+    candidates = [
+        _crossings(views[a], rays[a], views[b], rays[b], depth_mm, tolerance_px / focal_px)
+        for a, b in combinations(range(len(views)), 2)
+    ]
+    points = np.concatenate(candidates) if candidates else np.zeros((0, 3))
+    for _ in range(_REFINEMENTS):
+        if not len(points):
+            return []
+        nearest, off_px = _nearest(points, views, camera_from_base, vector, depth_mm)
+        agreeing = off_px <= tolerance_px
+        points = _refined(points, nearest, agreeing, rays, views)
+        enough = agreeing.sum(axis=1) >= least_views
+        points = points[enough]
+    nearest, off_px = _nearest(points, views, camera_from_base, vector, depth_mm)
+    return _chosen(points, nearest, off_px, tolerance_px, least_views)
+
+
+def _crossings(
+    a: CameraView, rays_a: Floats, b: CameraView, rays_b: Floats, depth_mm: tuple[float, float], spread: float
+) -> Floats:
+    """Midpoints [n, 3] of all pairs of rays that pass each other as closely as pixels tell, at allowed depths."""
+    apart = b.base_from_camera[:3, 3] - a.base_from_camera[:3, 3]
+    cosine = rays_a @ rays_b.T
+    along_a, along_b = (rays_a @ apart)[:, None], (rays_b @ apart)[None]
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    s, t = (along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2
+    on_a = a.base_from_camera[:3, 3] + s[..., None] * rays_a[:, None]
+    on_b = b.base_from_camera[:3, 3] + t[..., None] * rays_b[None]
+    gap_mm = np.linalg.norm(on_a - on_b, axis=2)
+    near, far = depth_mm
+    good = (s > near) & (s < far) & (t > near) & (t < far) & (gap_mm < spread * (s + t)) & (sine2 > 1e-4)
+    return np.asarray((on_a[good] + on_b[good]) / 2)
+
+
+def _nearest(
+    points: Floats,
+    views: Sequence[CameraView],
+    camera_from_base: Floats,
+    vector: Floats,
+    depth_mm: tuple[float, float],
+) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.intp]], Floats]:
+    """For each point and view the place nearest to where the point appears [n, views], and how far that is, px."""
+    nearest = np.zeros((len(points), len(views)), np.intp)
+    off_px = np.full((len(points), len(views)), np.inf)
+    for number, view in enumerate(views):
+        if not len(view.pixels):
+            continue
+        in_camera = points @ camera_from_base[number, :3, :3].T + camera_from_base[number, :3, 3]
+        visible = (in_camera[:, 2] > depth_mm[0] / 2) & (in_camera[:, 2] < 2 * depth_mm[1])
+        if not visible.any():
+            continue
+        pixels = optics.project(in_camera[visible], vector).pixels
+        distances = np.linalg.norm(pixels[:, None] - view.pixels[None], axis=2)
+        nearest[visible, number] = distances.argmin(axis=1)
+        off_px[visible, number] = distances.min(axis=1)
+    return nearest, off_px
+
+
+def _refined(
+    points: Floats,
+    nearest: np.ndarray[tuple[int, int], np.dtype[np.intp]],
+    agreeing: np.ndarray[tuple[int, int], np.dtype[np.bool_]],
+    rays: Sequence[Floats],
+    views: Sequence[CameraView],
+) -> Floats:
+    """Points moved to where they are nearest to all the rays that agree (least squares of distances)."""
+    normal, side = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+    for number, view in enumerate(views):
+        rows = np.flatnonzero(agreeing[:, number])
+        if not len(rows):
+            continue
+        ray = rays[number][nearest[rows, number]]
+        across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+        normal[rows] += across
+        side[rows] += across @ view.base_from_camera[:3, 3]
+    solvable = agreeing.sum(axis=1) >= 2
+    moved = points.copy()
+    moved[solvable] = np.linalg.solve(normal[solvable], side[solvable][:, :, None])[:, :, 0]
+    return moved
+
+
+def _chosen(
+    points: Floats,
+    nearest: np.ndarray[tuple[int, int], np.dtype[np.intp]],
+    off_px: Floats,
+    tolerance_px: float,
+    least_views: int,
+) -> list[SeenPoint]:
+    """Candidates by support, then by residual, each with places that none before it took."""
+    agreeing = off_px <= tolerance_px
+    rms_px = np.sqrt(np.where(agreeing, off_px, 0.0) ** 2).mean(axis=1)
+    taken: set[tuple[int, int]] = set()
+    chosen = []
+    for row in np.lexsort((rms_px, -agreeing.sum(axis=1))):
+        seen = [(int(v), int(nearest[row, v])) for v in np.flatnonzero(agreeing[row])]
+        free = [pair for pair in seen if pair not in taken]
+        if len(free) < least_views or 2 * len(free) < len(seen):
+            continue
+        taken.update(free)
+        residual_px = float(np.sqrt(np.mean([off_px[row, v] ** 2 for v, _ in free])))
+        chosen.append(SeenPoint(points[row], tuple(v for v, _ in free), tuple(p for _, p in free), residual_px))
+    return chosen

@@ -1,0 +1,126 @@
+"""The camera of the processing: pinhole with Brown-Conrady distortion, and its derivatives.
+
+The camera frame has z forward, x to the right and y down; the centre of the first pixel is (0, 0) (OpenCV's
+convention). The simulator has optics of its own, so that the two check each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coupole.calibration.rotations import Floats
+
+NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+UNITS = ("px", "px", "px", "px", "", "", "", "", "")
+MODELS = {
+    "pinhole": ("fx", "fy", "cx", "cy"),
+    "radial": ("fx", "fy", "cx", "cy", "k1"),
+    "brown4": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "brown5": NAMES,
+}
+"""Parameters that a calibration leaves free; all others are 0."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Focal lengths and principal point in px, distortion as factors of normalised coordinates."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    def vector(self) -> Floats:
+        """All nine [9], in the order of `NAMES`."""
+        return np.array([getattr(self, name) for name in NAMES])
+
+    def matrix(self) -> Floats:
+        """The camera matrix [3, 3], px."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def distortion(self) -> Floats:
+        """k1, k2, p1, p2, k3 [5], OpenCV's order."""
+        return self.vector()[4:]
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Pixels [n, 2] of points, and their derivatives."""
+
+    pixels: Floats
+    by_intrinsics: Floats
+    """[n, 2, 9], in the order of `NAMES`."""
+    by_point: Floats
+    """[n, 2, 3], px per mm in the camera frame."""
+
+
+def project(points_camera_mm: ArrayLike, intrinsics: ArrayLike) -> Projected:
+    """Project points [n, 3] of the camera frame with intrinsics [9].
+
+    Brown, Close-range camera calibration, Photogrammetric Engineering 37(8), 1971; with x = X/Z, y = Y/Z,
+    r^2 = x^2 + y^2 and g = 1 + k1 r^2 + k2 r^4 + k3 r^6:
+    u = fx (x g + 2 p1 x y + p2 (r^2 + 2 x^2)) + cx, v = fy (y g + p1 (r^2 + 2 y^2) + 2 p2 x y) + cy.
+    """
+    points = np.asarray(points_camera_mm, dtype=np.float64)
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = np.asarray(intrinsics, dtype=np.float64)
+    depth = points[:, 2]
+    x, y = points[:, 0] / depth, points[:, 1] / depth
+    r2 = x * x + y * y
+    g = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)  # dg / d(r^2)
+    xd = x * g + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * g + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    one, nought = np.ones_like(x), np.zeros_like(x)
+    by_intrinsics = np.empty((len(points), 2, 9))
+    by_intrinsics[:, 0] = np.stack(
+        [
+            xd,
+            nought,
+            one,
+            nought,
+            fx * x * r2,
+            fx * x * r2**2,
+            fx * 2 * x * y,
+            fx * (r2 + 2 * x * x),
+            fx * x * r2**3,
+        ],
+        axis=-1,
+    )
+    by_intrinsics[:, 1] = np.stack(
+        [
+            nought,
+            yd,
+            nought,
+            one,
+            fy * y * r2,
+            fy * y * r2**2,
+            fy * (r2 + 2 * y * y),
+            fy * 2 * x * y,
+            fy * y * r2**3,
+        ],
+        axis=-1,
+    )
+    crossed = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y  # dxd/dy = dyd/dx
+    by_x = np.stack([fx * (g + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x), fy * crossed], axis=-1)
+    by_y = np.stack([fx * crossed, fy * (g + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x)], axis=-1)
+    by_point = np.stack([by_x, by_y, -(by_x * x[:, None] + by_y * y[:, None])], axis=-1) / depth[:, None, None]
+    return Projected(np.stack([fx * xd + cx, fy * yd + cy], axis=-1), by_intrinsics, by_point)
+
+
+def field_monotone(intrinsics: Intrinsics, width_px: int, height_px: int) -> bool:
+    """True if radial distortion never folds back within the image: dr_d/dr > 0 out to its farthest corner."""
+    corners = [(u, v) for u in (0, width_px - 1) for v in (0, height_px - 1)]
+    reach = max(
+        np.hypot((u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy) for u, v in corners
+    )
+    r2 = np.linspace(0.0, 1.1 * reach, 100) ** 2
+    grows = 1 + r2 * (3 * intrinsics.k1 + r2 * (5 * intrinsics.k2 + r2 * 7 * intrinsics.k3))
+    return bool((grows > 0).all())

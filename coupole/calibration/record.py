@@ -1,0 +1,230 @@
+"""The record of a calibration: what was found, how well, from what, and where it holds.
+
+A YAML file that people read and programs trust: it carries a SHA-256 of its own content, so that a record which
+was edited by hand is refused. Values of a rigid transform are given as people write them (mm, KUKA's A B C); their
+uncertainty is that of a small step: `x_mm y_mm z_mm` along the axes of the frame on the left of the transform's
+name, `rx_deg ry_deg rz_deg` about those of the frame on the right.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AwareDatetime, Field
+
+from coupole import yamlfile
+from coupole.calibration.optics import NAMES, Intrinsics
+from coupole.errors import InputError, StorageError
+from coupole.plan import Model, Name, Pose
+
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=0)]
+Kind = Literal["camera", "hand-eye"]
+_STEPS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
+_MOST_ASYMMETRY = 1e-9
+
+
+class Parameter(Model):
+    """One estimated figure."""
+
+    name: Annotated[str, Field(min_length=1)]
+    """With its unit: `fx_px`, `flange_from_camera.x_mm`."""
+    value: float | None
+    """None for small turns: the transform itself has the angles."""
+    u: NotNegative
+    """Standard uncertainty, in the name's unit."""
+    degrees_of_freedom: Positive
+    """Behind that uncertainty; intervals follow Student's distribution."""
+    dominated_by: str
+    """What causes most of its variance."""
+
+
+class Noise(Model):
+    """What the residuals say of one kind of observation."""
+
+    name: str
+    unit: str
+    stated: NotNegative
+    found: NotNegative
+    redundancy: float
+
+
+class ImageResidual(Model):
+    """How one image fits."""
+
+    name: str
+    corners: Count
+    rejected: Count
+    rms_px: NotNegative
+
+
+class Limit(Model):
+    """One acceptance limit and how the calibration stands against it."""
+
+    what: str
+    found: float
+    limit: float
+    unit: str
+
+    @property
+    def passed(self) -> bool:
+        return self.found <= self.limit
+
+
+class Input(Model):
+    """A file that the calibration was made from."""
+
+    name: str
+    """Below the run's or the images' folder, that folder's own name included."""
+    sha256: Sha256
+
+
+class Validity(Model):
+    """Where a record may be used. What is None was not known and is not checked."""
+
+    expires: AwareDatetime
+    camera: str | None = None
+    """Model and serial number."""
+    lens: str | None = None
+    size_px: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] | None = None
+    """Width and height of frames."""
+    focal_length_mm: Positive | None = None
+    focus_distance_mm: Positive | None = None
+    focus_tolerance_mm: Positive = 2.0
+    f_number: Positive | None = None
+    temperature_c: tuple[float, float] | None = None
+    """Of the room, from and to."""
+
+
+class Record(Model):
+    """One calibration."""
+
+    schema_version: Literal[1]
+    kind: Kind
+    name: Name
+    created: AwareDatetime
+    software: str
+    simulated: bool
+    """True if any image comes from a simulated camera."""
+    validity: Validity
+    transforms: dict[str, Pose]
+    """`flange_from_camera` and the like; none for a camera."""
+    parameters: Annotated[tuple[Parameter, ...], Field(min_length=1)]
+    fixed: dict[str, float]
+    """Figures that were held, by name."""
+    covariance: tuple[tuple[float, ...], ...]
+    """[parameters, parameters], in the units of their names."""
+    noise: tuple[Noise, ...]
+    images: tuple[ImageResidual, ...]
+    limits: tuple[Limit, ...]
+    """Acceptance limits; all must be met."""
+    remarks: tuple[str, ...]
+    """What a person should know: methods that disagree, corners that were left out."""
+    inputs: Annotated[tuple[Input, ...], Field(min_length=1)]
+    sha256: Sha256
+
+    @property
+    def passed(self) -> bool:
+        return all(limit.passed for limit in self.limits)
+
+    @property
+    def covariance_matrix(self) -> NDArray[np.float64]:
+        return np.array(self.covariance)
+
+    def value(self, name: str) -> float:
+        """A figure that was estimated or held. Raises KeyError if there is none."""
+        found = {p.name: p.value for p in self.parameters if p.value is not None} | self.fixed
+        return found[name]
+
+
+def sealed(**content: Any) -> Record:
+    """A record of this content, with its hash. Raises pydantic's ValidationError for content that is none."""
+    unsealed = Record.model_construct(**content, schema_version=1, sha256="")
+    plain = json.loads(unsealed.model_dump_json(exclude={"sha256"}))
+    return Record.model_validate_json(json.dumps({**plain, "sha256": content_sha256(plain)}))
+
+
+def content_sha256(plain: dict[str, Any]) -> str:
+    """Of a record's content as JSON has it, without its own hash: keys sorted, no spaces."""
+    rest = {key: value for key, value in plain.items() if key != "sha256"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def write_record(path: Path, record: Record) -> None:
+    """Write a record; a file that is there is whole. Raises StorageError."""
+    plain = json.loads(record.model_dump_json())
+    text = "# A calibration of Coupole. It carries its own checksum: do not edit it, calibrate anew.\n"
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(text + "".join(_lines(plain)), encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise StorageError(
+            f"{path}: cannot write the record: {error.strerror}. Free or mount its folder."
+        ) from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_record(path: Path) -> Record:
+    """Read a record back. Raises InputError with all problems: wrong keys, an edited record, a covariance that is
+    none."""
+    document = yamlfile.read(path)
+    record = document.validate(Record)
+    plain = json.loads(record.model_dump_json())
+    if content_sha256(plain) != record.sha256:
+        message = "the record was edited after it was made: its content has another checksum. Calibrate anew."
+        raise InputError([document.problem(("sha256",), message)])
+    problems = [document.problem(("covariance",), message) for message in _covariance_problems(record)]
+    if problems:
+        raise InputError(problems)
+    return record
+
+
+def step_names(transform: str) -> tuple[str, ...]:
+    """Names of the six parameters of a transform's small step."""
+    return tuple(f"{transform}.{step}" for step in _STEPS)
+
+
+def _covariance_problems(record: Record) -> Iterator[str]:
+    count = len(record.parameters)
+    if [len(row) for row in record.covariance] != [count] * count:
+        yield f"expected {count} rows of {count} numbers, as there are parameters"
+        return
+    covariance = record.covariance_matrix
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    if not np.allclose(scale, [p.u for p in record.parameters], rtol=1e-6, atol=1e-150):
+        yield "its diagonal is not the square of the parameters' `u`"
+    correlation = covariance / scale / scale[:, None]
+    if np.abs(correlation - correlation.T).max() > _MOST_ASYMMETRY:
+        yield "expected a symmetric matrix"
+    elif np.linalg.eigvalsh(correlation)[0] < -_MOST_ASYMMETRY * count:
+        yield "expected a matrix without negative eigenvalues"
+
+
+def _lines(plain: dict[str, Any]) -> Iterator[str]:
+    """YAML of a record: one line for each parameter, image, row; inside a line it is JSON, which YAML includes."""
+    for key, value in plain.items():
+        if isinstance(value, list) and value and isinstance(value[0], dict | list):
+            yield f"{key}:\n" + "".join(f"  - {json.dumps(item, ensure_ascii=False)}\n" for item in value)
+        elif isinstance(value, dict) and value:
+            yield f"{key}:\n" + "".join(f"  {k}: {json.dumps(v, ensure_ascii=False)}\n" for k, v in value.items())
+        else:
+            yield f"{key}: {json.dumps(value, ensure_ascii=False)}\n"
+
+
+def intrinsics_of(record: Record) -> tuple[Intrinsics, tuple[str, ...]]:
+    """The lens of a record, and which of its parameters are estimated, in the covariance's order."""
+    values = {p.name: p.value for p in record.parameters} | dict(record.fixed)
+    named = {name.removesuffix("_px"): value for name, value in values.items()}
+    lens = Intrinsics(**{name: float(named.get(name) or 0.0) for name in NAMES})
+    return lens, tuple(n for p in record.parameters if (n := p.name.removesuffix("_px")) in NAMES)

@@ -1,0 +1,284 @@
+"""Where calibrations get their images: a run, or a folder of pictures with a file of poses.
+
+Of a run each view gives one image: the mean of its frames under panels or LEDs, at the longest exposure that clips
+little; dark frames are subtracted where there are some. Frames of one view are taken at one pose, so their mean
+has less noise and its corners no other place.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole import store
+from coupole.calibration.board import Board, Sighting, detect, plane
+from coupole.calibration.poses import PoseFile, ReportedPoses, read_poses, reported
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError, StorageError
+from coupole.run import ProvenFrame, Run, is_shot, sha256
+
+SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
+POSES_NAME, BOARD_NAME = "poses.yaml", "board.yaml"
+_MOST_FRAMES = 64
+"""Of one view: more make no corner better."""
+_CLIPPED = 0.02
+
+
+@dataclass(frozen=True)
+class About:
+    """What is known of the camera that took the images. None: not said."""
+
+    simulated: bool
+    camera: str | None = None
+    focal_length_mm: float | None = None
+    focus_distance_mm: float | None = None
+    f_number: float | None = None
+    temperature_c: tuple[float, float] | None = None
+    """Lowest and highest temperature of the LED boards, the only ones that a run knows."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One image to look for the board in, read when it is asked for."""
+
+    name: str
+    read: Callable[[], tuple[NDArray[Any], float]]
+    """Grey image [H, W], and its value of saturation."""
+    joints_deg: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Sources:
+    """All images of a calibration."""
+
+    images: tuple[Source, ...]
+    poses: ReportedPoses | None
+    """One for each image, None if there are none."""
+    about: About
+    inputs: tuple[tuple[str, str], ...]
+    """Name and SHA-256 of every file that was or will be read."""
+
+    def with_file(self, path: Path | None) -> Sources:
+        """The same, made with one more file."""
+        return self if path is None else replace(self, inputs=(*self.inputs, (path.name, sha256(path))))
+
+
+@dataclass(frozen=True)
+class Found:
+    """The board in the images, and what became of the others."""
+
+    sightings: tuple[Sighting, ...]
+    chosen: NDArray[np.intp]
+    """[sightings] which of the images they are."""
+    size_px: tuple[int, int]
+    """Width and height."""
+    left_out: tuple[str, ...]
+    """One line for each image that cannot be used."""
+
+
+def open_sources(paths: Sequence[Path], poses: Path | None) -> Sources:
+    """Runs, or one folder of pictures with poses in `poses` or its own `poses.yaml`.
+
+    Raises InputError: nothing there, poses without their image, pictures of runs and folders mixed.
+    """
+    runs = [path for path in paths if (path / "run.json").is_file()]
+    if runs and len(runs) == len(paths) and poses is None:
+        return _joined([_of_run(Run(path)) for path in runs])
+    if runs:
+        raise InputError(f"{runs[0]}: a run, which has its own poses: give runs only, or one folder of pictures")
+    if len(paths) != 1:
+        raise InputError(f"expected runs, or one folder of pictures; found {len(paths)} paths")
+    return _of_folder(paths[0], poses)
+
+
+def find_board(
+    board: Board, sources: Sources, progress: Callable[[int, int], None] = lambda done, total: None
+) -> Found:
+    """Look for the board in all images. Raises InputError if they differ in size, or none shows it."""
+    sightings, chosen, left_out = [], [], []
+    size_px: tuple[int, int] | None = None
+    for number, source in enumerate(sources.images):
+        image, white = source.read()
+        size = (image.shape[1], image.shape[0])
+        if size_px is not None and size != size_px:
+            raise InputError(f"{source.name}: {size[0]} x {size[1]} pixels, the images before it {size_px}")
+        size_px = size
+        seen = detect(board, image, source.name, white=white)
+        if isinstance(seen, str):
+            left_out.append(f"{source.name}: {seen}")
+        else:
+            sightings.append(seen)
+            chosen.append(number)
+        progress(number + 1, len(sources.images))
+    if not sightings or size_px is None:
+        why = f"; {left_out[0]}" if left_out else ""
+        raise InputError(f"the board is in none of {len(sources.images)} images{why}. Is it the one described?")
+    return Found(tuple(sightings), np.array(chosen, dtype=np.intp), size_px, tuple(left_out))
+
+
+# -- folders ----------------------------------------------------------------------------------------------
+
+
+def _of_folder(folder: Path, poses: Path | None) -> Sources:
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a run, or a folder of pictures; there is none")
+    path = poses or folder / POSES_NAME
+    file: PoseFile | None = None
+    numbers: ReportedPoses | None = None
+    if path.is_file() or poses is not None:
+        file, numbers = read_poses(path)
+        pictures = [folder / name for name in file.poses]
+        missing = [picture for picture in pictures if not picture.is_file()]
+        if missing:
+            raise InputError(f"{path}: expected a picture for each pose; there is no {missing[0]}")
+    else:
+        pictures = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    if not pictures:
+        raise InputError(f"{folder}: no pictures ({', '.join(SUFFIXES)}) in this folder")
+    files = [*pictures, *([path] if file else [])]
+    inputs = tuple((f"{folder.resolve().name}/{file_.name}", sha256(file_)) for file_ in files)
+    images = tuple(Source(picture.name, partial(_picture, picture)) for picture in pictures)
+    return Sources(images, numbers, About(simulated=False), inputs)
+
+
+def _picture(path: Path) -> tuple[NDArray[Any], float]:
+    """Grey, in the bits that the file has. Raises InputError if it is no picture."""
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise InputError(f"{path}: not a picture that OpenCV can read")
+    whites = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
+    return image, whites.get(image.dtype, float("inf"))
+
+
+# -- runs -------------------------------------------------------------------------------------------------
+
+
+def _of_run(run: Run) -> Sources:
+    """One image and pose for each view that has frames with light."""
+    by_view: dict[str, list[ProvenFrame]] = {}
+    for shot, frame in run.proven().items():
+        by_view.setdefault(shot.split("/")[0], []).append(frame)
+    images, flanges, inputs = [], [], [(f"{run.folder.name}/run.json", sha256(run.folder / "run.json"))]
+    about = About(simulated=bool(run.about["simulated"]))
+    temperatures: list[float] = []
+    for view, frames in by_view.items():
+        path = run.view_path(view)
+        table = store.read_frames(path)
+        poses, attributes = _poses_and_attributes(path)
+        lit = _at_one_pose([frame for frame in frames if is_shot(frame.shot)], table)
+        if not lit:
+            continue
+        dark = [frame for frame in frames if frame.shot.split("/")[1].startswith("dark")]
+        records = table[[frame.index for frame in lit]]
+        pose = poses[int(records["pose"][0])]
+        temperatures += (records["board_temperature_dc"] / 10.0).tolist()
+        read = partial(_mean_image, path, lit, dark, table)
+        images.append(Source(view, read, tuple(map(float, pose["joints_deg"]))))
+        flanges.append(np.array(pose["base_from_flange"], dtype=np.float64))
+        inputs.append((f"{run.folder.name}/views/{path.name}", _frames_sha256([*lit, *dark])))
+        about = _about(run, attributes)
+    if not images:
+        raise InputError(f"{run.folder}: no proven frame under light; acquire the plan first")
+    low_high = (min(temperatures), max(temperatures))
+    return Sources(
+        tuple(images), reported(np.stack(flanges)), replace(about, temperature_c=low_high), tuple(inputs)
+    )
+
+
+def _at_one_pose(frames: Sequence[ProvenFrame], table: NDArray[np.void]) -> list[ProvenFrame]:
+    """The frames of the pose that most were taken at: an arm that was pushed aside has two in a view."""
+    taken = Counter(int(table[frame.index]["pose"]) for frame in frames)
+    return [frame for frame in frames if int(table[frame.index]["pose"]) == taken.most_common(1)[0][0]]
+
+
+def _mean_image(
+    path: Path, lit: Sequence[ProvenFrame], dark: Sequence[ProvenFrame], table: NDArray[np.void]
+) -> tuple[NDArray[Any], float]:
+    """Mean of the frames at the longest exposure that clips little, green, dark frames subtracted."""
+    layout, facts = store.read_layout(path), store.read_facts(path)
+    exposures = {frame.shot: int(table[frame.index]["exposure_us"]) for frame in (*lit, *dark)}
+    for exposure_us in sorted({exposures[frame.shot] for frame in lit}, reverse=True):
+        mine = [frame for frame in lit if exposures[frame.shot] == exposure_us]
+        frames = [store.read_frame(path, layout, frame.index) for frame in _spread(mine)]
+        clipped = np.mean([np.mean(frame >= facts["white_dn"]) for frame in frames])
+        if clipped < _CLIPPED:
+            break
+    mean = _mean(frames)
+    darks = [frame for frame in dark if exposures[frame.shot] == exposure_us]
+    if darks:
+        black = np.mean(
+            [store.read_frame(path, layout, f.index) for f in _spread(darks)], axis=0, dtype=np.float64
+        )
+    else:
+        black = np.full(mean.shape, float(facts["black_dn"]))
+    white = facts["white_dn"] - float(black.mean())
+    return plane(mean - black, facts["pattern"]), white
+
+
+def _mean(frames: Sequence[NDArray[np.uint16]]) -> Floats:
+    """[H, W], DN."""
+    total = np.zeros(frames[0].shape)
+    for frame in frames:
+        total += frame
+    return total / len(frames)
+
+
+def _spread(frames: Sequence[ProvenFrame]) -> Iterator[ProvenFrame]:
+    """At most `_MOST_FRAMES`, evenly over the list."""
+    step = max(1, -(-len(frames) // _MOST_FRAMES))
+    return iter(frames[::step])
+
+
+def _frames_sha256(frames: Sequence[ProvenFrame]) -> str:
+    """Of the frames' proven checksums: the same however the file is packed or archived."""
+    lines = sorted(f"{frame.shot} {frame.xxh3}" for frame in frames)
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def _poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
+    try:
+        with h5py.File(path, "r") as file:
+            return file[store.POSES][:], dict(file["entry"].attrs)
+    except (OSError, KeyError) as error:
+        raise StorageError(f"{path}: not a view file of a run: {error}") from error
+
+
+def _about(run: Run, attributes: dict[str, Any]) -> About:
+    def number(key: str) -> float | None:
+        return float(attributes[key]) if key in attributes else None
+
+    camera = attributes.get("camera")
+    return About(
+        simulated=bool(run.about["simulated"]),
+        camera=str(camera) if camera is not None else None,
+        focal_length_mm=number("focal_length_mm"),
+        focus_distance_mm=number("focus_distance_mm"),
+        f_number=number("f_number"),
+    )
+
+
+def _joined(parts: Sequence[Sources]) -> Sources:
+    """Several runs as one. Raises InputError if they were taken with different lenses or cameras."""
+    first = parts[0]
+    for part in parts[1:]:
+        if replace(part.about, temperature_c=None) != replace(first.about, temperature_c=None):
+            raise InputError(f"runs with different cameras, lenses or focus: {part.about} and {first.about}")
+    warm = [t for part in parts if part.about.temperature_c for t in part.about.temperature_c]
+    flanges: list[Floats] = [part.poses.base_from_flange for part in parts if part.poses is not None]
+    return Sources(
+        tuple(image for part in parts for image in part.images),
+        reported(np.concatenate(flanges)),
+        replace(first.about, temperature_c=(min(warm), max(warm)) if warm else None),
+        tuple(line for part in parts for line in part.inputs),
+    )

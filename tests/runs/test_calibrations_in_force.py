@@ -1,0 +1,96 @@
+"""Plans that name calibrations: stamped into the run where they hold, refused with the reason where not."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import cells
+import pytest
+from cells import CellFolder
+
+from coupole.calibration.record import Input, Limit, Parameter, Record, Validity, sealed, write_record
+
+
+def record(kind: str, *, focus_distance_mm: float = 335.0, days: float = 30.0) -> Record:
+    now = datetime.now(UTC)
+    return sealed(
+        kind=kind,
+        name=f"{kind}-1",
+        created=now - timedelta(days=60),
+        software="coupole 0.1.0",
+        simulated=True,
+        validity=Validity(
+            expires=now + timedelta(days=days),
+            camera=None,
+            size_px=(128, 96),
+            focal_length_mm=35.0,
+            focus_distance_mm=focus_distance_mm,
+            f_number=8.0,
+            temperature_c=None,
+        ),
+        transforms={},
+        parameters=(
+            Parameter(name="fx_px", value=400.0, u=0.1, degrees_of_freedom=100.0, dominated_by="corners"),
+        ),
+        fixed={},
+        covariance=((0.01,),),
+        noise=(),
+        images=(),
+        limits=(Limit(what="noise of corners", found=0.1, limit=0.3, unit="px"),),
+        remarks=(),
+        inputs=(Input(name="run/run.json", sha256="0" * 64),),
+    )
+
+
+@pytest.fixture
+def calibrated(cell: CellFolder) -> CellFolder:
+    for kind in ("camera", "hand-eye"):
+        write_record(cell.folder / f"{kind}.yaml", record(kind))
+    cell.write(calibrations=["camera.yaml", "hand-eye.yaml"])
+    return cell
+
+
+def refused(cell: CellFolder) -> str:
+    ended = cells.here("check", cell.plan, "--no-paths", "--json")
+    assert ended.code == 3, ended
+    return " ".join(ended.document["refusals"])
+
+
+def test_records_in_force_are_stamped_into_the_run(calibrated: CellFolder) -> None:
+    assert calibrated.acquire().code == 0
+    stamped = cells.about(calibrated.run_folder)["calibrations"]
+    assert set(stamped) == {"camera", "hand-eye"}
+    text = (calibrated.folder / "camera.yaml").read_text()
+    assert stamped["camera"] in text
+
+
+def test_a_run_is_not_resumed_with_another_calibration(calibrated: CellFolder) -> None:
+    assert calibrated.acquire().code == 0
+    write_record(calibrated.folder / "camera.yaml", record("camera", days=31.0))
+    ended = calibrated.acquire("--resume", calibrated.run_folder)
+    assert ended.code == 2
+    assert "camera.yaml" in ended.err
+
+
+def test_a_record_of_another_focus_is_refused(calibrated: CellFolder) -> None:
+    write_record(calibrated.folder / "camera.yaml", record("camera", focus_distance_mm=400.0))
+    assert "holds for a focus of 400 mm" in refused(calibrated)
+
+
+def test_an_expired_record_is_refused(calibrated: CellFolder) -> None:
+    write_record(calibrated.folder / "hand-eye.yaml", record("hand-eye", days=-1.0))
+    assert "hand-eye.yaml: expired on" in refused(calibrated)
+
+
+def test_a_kind_that_the_plan_does_not_name_is_missed(calibrated: CellFolder) -> None:
+    calibrated.write(calibrations=["camera.yaml"])
+    assert "no record of the kind `hand-eye` is named" in refused(calibrated)
+
+
+def test_a_record_that_was_edited_by_hand_is_an_input_error(calibrated: CellFolder) -> None:
+    path: Path = calibrated.folder / "camera.yaml"
+    path.write_text(path.read_text().replace("400.0", "401.0"))
+    ended = cells.here("check", calibrated.plan)
+    assert ended.code == 2
+    assert "camera.yaml" in ended.err

@@ -1,0 +1,53 @@
+"""Lenses of several colours from the same images: their difference is known better than each of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthesis import Cell, make_cell
+
+from coupole.calibration.board import Sighting
+from coupole.calibration.chromatic import calibrate_channels
+from coupole.errors import InputError
+
+MAGNIFIED = 1.0004
+FIELD = np.array([[x, y] for x in (20.0, 500.0, 1000.0) for y in (20.0, 380.0, 750.0)])
+
+
+def in_red(cell: Cell, seed: int) -> list[Sighting]:
+    """The cell's images as red sees them: magnified about the principal point, with noise of its own."""
+    random = np.random.default_rng(seed)
+    centre = np.array(cell.lens.centre_px)
+    return [
+        replace(
+            seen, pixels=centre + MAGNIFIED * (seen.pixels - centre) + random.normal(0, 0.15, seen.pixels.shape)
+        )
+        for seen in cell.sightings
+    ]
+
+
+def test_lateral_colour_is_found_to_a_tenth_of_a_pixel_with_an_interval_that_holds() -> None:
+    cell = make_cell(31, images=20, pixel_px=0.0)
+    random = np.random.default_rng(1)
+    green = [replace(s, pixels=s.pixels + random.normal(0, 0.1, s.pixels.shape)) for s in cell.sightings]
+    found = calibrate_channels({"green": green, "red": in_red(cell, 2)}, cell.size_px)
+    shift, covariance = found.shift("red", "green", FIELD)
+    lens = found.intrinsics["green"]
+    directions = np.c_[(FIELD - (lens.cx, lens.cy)) / (lens.fx, lens.fy), np.ones(len(FIELD))]
+    true = (MAGNIFIED - 1) * (cell.lens.see(directions) - np.array(cell.lens.centre_px))
+    u = np.sqrt(np.einsum("kii->ki", covariance))
+    assert np.abs(shift - true).max() < 0.1
+    assert np.abs((shift - true) / u).max() < 4.0
+    assert found.sigma_px["green"] == pytest.approx(0.1, rel=0.1)
+    assert found.sigma_px["red"] == pytest.approx(0.15, rel=0.1)
+    red, green_fx = (found.names.index(f"{channel}.fx") for channel in ("red", "green"))
+    apart = found.covariance[red, red] + found.covariance[green_fx, green_fx] - 2 * found.covariance[red, green_fx]
+    assert apart < 0.5 * found.covariance[red, red]
+
+
+def test_channels_with_different_images_are_refused() -> None:
+    cell = make_cell(32, images=8)
+    with pytest.raises(InputError, match="every channel needs the same images"):
+        calibrate_channels({"green": cell.sightings, "red": cell.sightings[:7]}, cell.size_px)

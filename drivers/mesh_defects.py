@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.mesh_files import Mesh
+from drivers.mesh import Mesh
 
 OUT_OF_PROPORTION = 200.0
 """An edge so many times longer or shorter than the median is of another scale: mm and m differ by 1000."""

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from drivers import mesh_defects, mesh_files, targets
+from drivers.mesh import Mesh
 from drivers.mesh_defects import Defects
-from drivers.mesh_files import Mesh
 from drivers.targets import Targets
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "in": 25.4}

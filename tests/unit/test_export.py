@@ -21,7 +21,7 @@ from coupole.errors import ChecksumMismatch, InputError
 from coupole.export import Picture, dng, export_run, tiff
 
 PATTERNS = ("GBRG", "GRBG", "RGGB", "BGGR")
-REFERENCE = Path("/work/shared/data/raw/colorchart.dng")
+REFERENCE = Path(__file__).parents[3] / "shared/data/raw/colorchart.dng"
 
 
 def picture(pixels: Frame, *, pattern: str = "GBRG", black_dn: int = 64, white_dn: int = 4095) -> Picture:

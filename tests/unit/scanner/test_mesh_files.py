@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 
 from coupole.errors import InputError
 from drivers import mesh_text
+from drivers.mesh import Mesh
 from drivers.mesh_defects import find_defects
-from drivers.mesh_files import Mesh, read_mesh
+from drivers.mesh_files import read_mesh
 from drivers.vxelements import read_scan
 
 BUNNY = Path(__file__).parents[3].parent / "shared/data/bunny/bun_zipper.ply"

@@ -549,12 +549,15 @@ def schema(what: Annotated[str, typer.Argument(help="plan or rig")]) -> None:
 @plan_app.command("new")
 def plan_new(
     name: Annotated[str, typer.Argument(help="Name of the plan; the file is NAME.yaml.", show_default=False)],
-    template: Annotated[str, typer.Option("--template", help="Which template.")] = "views",
+    template: Annotated[
+        str | None, typer.Option("--template", help="Which template; the one called NAME, else `views`.")
+    ] = None,
     rig: Annotated[str, typer.Option("--rig", help="Path of the rig, relative to the plan.")] = "../rigs/sim.yaml",
 ) -> None:
     """Write a plan to start from."""
     from coupole.templates import TEMPLATES
 
+    template = template or (name if name in TEMPLATES else "views")
     if template not in TEMPLATES:
         raise typer.BadParameter(f"expected one of {', '.join(sorted(TEMPLATES))}; found {template}")
     path = Path(f"{name}.yaml")

@@ -1,5 +1,26 @@
 """Plans to start from: `coupole plan new NAME`."""
 
+
+def _board_views(count: int = 40) -> str:
+    """Views of a board at the support's centre, near the focus: tilted, rolled and shifted evenly (additive
+    recurrence with the root of x^7 = x + 1; Roberts 2018)."""
+    root = 1.0
+    for _ in range(60):
+        root = (1.0 + root) ** (1.0 / 7.0)
+    lines = []
+    for number in range(1, count + 1):
+        share = [(0.5 + number / root**k) % 1.0 for k in range(1, 7)]
+        x_mm, y_mm = 70.0 * (share[0] - 0.5), 70.0 * (share[1] - 0.5)
+        distance_mm, azimuth_deg = 335.0 + 40.0 * (share[2] - 0.25), 360.0 * share[3] - 180.0
+        elevation_deg, roll_deg = 54.0 + 26.0 * share[4], 120.0 * (share[5] - 0.5)
+        lines.append(
+            f"  - {{{{kind: look_at, name: b{number:02d}, target_mm: [{x_mm:.1f}, {y_mm:.1f}, 5], "
+            f"distance_mm: {distance_mm:.1f},\n     azimuth_deg: {azimuth_deg:.1f}, "
+            f"elevation_deg: {elevation_deg:.1f}, roll_deg: {roll_deg:.1f}}}}}"
+        )
+    return "\n".join(lines)
+
+
 TEMPLATES = {
     "views": """\
 # yaml-language-server: $schema=plan.schema.json   (made by `coupole schema plan > plan.schema.json`)
@@ -31,5 +52,16 @@ views:
 lights: {{kind: none}}
 exposure: {{kind: bracket, exposures_us: [2000, 8000, 32000, 128000]}}
 darks_per_view: 20
+""",
+    "charuco": f"""\
+# A ChArUco board on the support, for `coupole calibrate camera` and `hand-eye` (docs/how-to/calibrate.md).
+schema_version: 1
+name: {{name}}
+rig: {{rig}}
+views:
+{_board_views()}
+lights: {{{{kind: panels, panels: [1]}}}}
+exposure: {{{{kind: fixed, exposure_us: 8000}}}}
+darks_per_view: 0
 """,
 }

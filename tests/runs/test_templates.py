@@ -1,0 +1,30 @@
+"""`coupole plan new`: every template is a plan that can be run on the simulated cell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cells
+import pytest
+
+from coupole.templates import TEMPLATES
+
+RIG = cells.REPO / "configs/rigs/sim.yaml"
+
+
+@pytest.mark.parametrize("template", sorted(TEMPLATES))
+def test_a_new_plan_passes_preflight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, template: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cells.here("plan", "new", "mine", "--template", template, "--rig", RIG).code == 0
+    ended = cells.here("check", tmp_path / "mine.yaml", "--json")
+    assert ended.document["refusals"] == []
+    assert ended.document["paths_checked"]
+
+
+def test_a_plan_with_the_name_of_a_template_is_made_from_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cells.here("plan", "new", "charuco", "--rig", RIG).code == 0
+    assert (tmp_path / "charuco.yaml").read_text().count("look_at") == 40
+    assert cells.here("plan", "new", "charuco", "--rig", RIG).code == 2

@@ -51,6 +51,10 @@ class Settings(BaseModel):
     """Every n-th frame holds a picture, the others none; 0 for none at all (dry runs)."""
     render_once: bool = False
     """Each frame memory gets a picture when it is first used, and shows it ever after: for tests of speed."""
+    samples_per_side: Annotated[int, Field(ge=1, le=8)] = 1
+    """Rays through each pixel, k x k: for targets whose corners are measured to a fraction of a pixel."""
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 of the true lens (Brown and Conrady, OpenCV's order), which calibration must find."""
     clock_offset_ns: int = 7_777_000_000
     clock_ppm: float = -23.0
     timestamp_jitter_us: float = 2.0

@@ -105,3 +105,9 @@ class Config(_Model):
     settings: Settings
     scene: SceneConfig
     camera: CameraConfig
+
+    @property
+    def photographed(self) -> CameraConfig:
+        """The camera as the renderer needs it: with the true lens, and as many rays as are wanted."""
+        true = {name: getattr(self.settings.camera, name) for name in ("samples_per_side", "distortion")}
+        return self.camera.model_copy(update=true)

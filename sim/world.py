@@ -43,7 +43,9 @@ class World:
         )
         self.reactor = Reactor(self.clock)
         self.lighting = Lighting()
-        self._photographer = Photographer(config.scene, config.camera, seed=settings.seed, things=settings.things)
+        self._photographer = Photographer(
+            config.scene, config.photographed, seed=settings.seed, things=settings.things
+        )
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
         self.robot, robot_endpoint = robot.build(self.reactor, settings.robot)
         self.camera, camera_endpoint = camera.build(

@@ -44,6 +44,7 @@ def test_the_hand_eye_of_the_simulated_cell_is_found_within_its_interval(
         "height_px": width_px * 3 // 4,
         "pixel_pitch_um": 5.5 * 4096 / width_px,
     }
+    cell.world_settings["camera"] = {"samples_per_side": 3, "distortion": [-0.03, 0.0, 0.0, 0.0, 0.0]}
     cell.world_settings["things"] = [{"kind": "charuco_board", "marker_mm": 9.6}]
     del cell.plan_data["object"]
     cell.write(views=board_views(scale(14, 40)), lights={"kind": "ids", "ids": [700]}, darks_per_view=0)
@@ -58,12 +59,14 @@ def test_the_hand_eye_of_the_simulated_cell_is_found_within_its_interval(
         "--name",
         "found",
         "--model",
-        "pinhole",
+        "radial",
     ]
     calibrated = cells.here("calibrate", "hand-eye", cell.run_folder, *where, "--json")
     assert calibrated.code in (0, 3), calibrated.err  # small frames may miss the limits, not the truth
     record = YAML(typ="safe").load(tmp_path / "records/found.yaml")
     u = {parameter["name"]: parameter["u"] for parameter in record["parameters"]}
+    (bend,) = (parameter["value"] for parameter in record["parameters"] if parameter["name"] == "k1")
+    assert abs(bend - -0.03) < 4 * u["k1"]
     found = record["transforms"]["flange_from_camera"]["translation_mm"]
     for axis, value, true in zip("xyz", found, (0.0, 0.0, 120.0), strict=True):
         assert abs(value - true) < 4 * u[f"flange_from_camera.{axis}_mm"]

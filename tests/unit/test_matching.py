@@ -102,11 +102,13 @@ def take(
     jitter_us: float = 20.0,
     first_id: int = 1,
     id_modulus: tuple[int, int] = PLAIN,
+    dead_us: float = 0.0,
     seed: int = 0,
 ) -> Take:
     """Run a burst: `lost` steps' frames are lost in transfer, `missed` steps' edges are not seen by the camera.
 
-    `surplus_us` are true times, from the first edge on, of frames that no step fired.
+    `surplus_us` are true times, from the first edge on, of frames that no step fired. An edge is ignored that comes
+    within `dead_us` of the last one that made a frame.
     """
     rng = np.random.default_rng(seed)
     table = burst.table
@@ -124,14 +126,21 @@ def take(
 
     exposed = np.ones(steps, np.bool_)
     exposed[np.asarray(missed, np.int64)] = False
-    arrives = exposed.copy()
-    arrives[np.asarray(lost, np.int64)] = False
     fired = np.flatnonzero(exposed)
     times_us = np.concatenate([edges_us[fired], np.asarray(surplus_us, np.float64)])
     origin = np.concatenate([fired, np.full(len(surplus_us), -1)])
-    here = np.concatenate([arrives[fired], np.ones(len(surplus_us), np.bool_)])
     order = np.argsort(times_us, kind="stable")
-    times_us, origin, here = times_us[order], origin[order], here[order]
+    times_us, origin = times_us[order], origin[order]
+    ready_us = -np.inf
+    heard = np.ones(len(times_us), np.bool_)
+    for event, time_us in enumerate(times_us):
+        heard[event] = time_us >= ready_us
+        ready_us = time_us + dead_us if heard[event] else ready_us
+    exposed[origin[~heard & (origin >= 0)]] = False
+    times_us, origin = times_us[heard], origin[heard]
+    arrives = np.concatenate([exposed, [True]])  # surplus frames, at -1, arrive
+    arrives[np.asarray(lost, np.int64)] = False
+    here = arrives[origin]
     first, last = id_modulus
     ids = first + (first_id - first + np.arange(len(times_us))) % (last - first + 1)
     stamps = 3_600e9 + times_us * 1e3 * camera_rate + rng.uniform(-1, 1, len(times_us)) * jitter_us * 1e3
@@ -238,6 +247,7 @@ def takes(draw: st.DrawFn) -> Take:
         jitter_us=draw(st.floats(0, MODEL.jitter_us)),
         first_id=draw(st.one_of(st.integers(1, 5), st.integers(65_480, 65_535), st.integers(1, 65_535))),
         id_modulus=draw(st.sampled_from((PLAIN, GIGE))),
+        dead_us=burst.timing.exposure_us,
         seed=draw(st.integers(0, 2**32)),
     )
 

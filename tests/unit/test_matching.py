@@ -107,8 +107,8 @@ def take(
 ) -> Take:
     """Run a burst: `lost` steps' frames are lost in transfer, `missed` steps' edges are not seen by the camera.
 
-    `surplus_us` are true times, from the first edge on, of frames that no step fired. An edge is ignored that comes
-    within `dead_us` of the last one that made a frame.
+    `surplus_us` are true times, from the first edge on, of frames that no step fired. An edge that comes within
+    `dead_us` of the last one that made a frame is ignored.
     """
     rng = np.random.default_rng(seed)
     table = burst.table

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform, rotation_from_abc
-from sim.kuka_kinematics import flange_pose, joints_near, rotation_vector, turn
+from sim.kuka_kinematics import flange_pose, joints_near, turn
 from sim.kuka_settings import Limits, Settings
+from sim.newton import rotation_vector
 
 Axes6 = tuple[float, ...]
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform
+from sim import newton
 
 _CHAIN = (
     ((0.0, 0.0, 400.0), (0.0, 0.0, -1.0)),
@@ -33,15 +34,6 @@ AXIS_LIMITS_DEG = (
 )
 AXIS_SPEEDS_DEG_S = (300.0, 225.0, 225.0, 381.0, 311.0, 492.0)
 
-_REACH_MM = 1000.0
-"""Weighs millimetres against radians."""
-_REACHED = 1e-10
-"""A tenth of a nanometre, or a few billionths of a degree."""
-_NEWTON_STEPS = 30
-_DAMPING = 1e-10
-_LONGEST_STEP = 0.2
-_TINY = 1e-12
-
 
 def flange_pose(joints_deg: Sequence[float]) -> Transform:
     """`base_from_flange` of six joint angles."""
@@ -61,33 +53,8 @@ def _chain(joints_deg: Sequence[float]) -> tuple[Transform, NDArray[np.float64],
 
 
 def joints_near(base_from_flange: Transform, joints_deg: Sequence[float]) -> tuple[float, ...] | None:
-    """The joint angles that reach the pose from those given on the shortest way, or None if there is no way.
-
-    Damped Newton steps (Nakamura, Hanafusa 1986); limits are not looked at. A controller follows a corrected pose
-    like this: from where the axes are, so near a singularity they may turn fast, or find no way on.
-    """
-    angles = np.radians(np.asarray(joints_deg, dtype=np.float64))
-    for _ in range(_NEWTON_STEPS):
-        here, origins_mm, axes = _chain(np.degrees(angles).tolist())
-        away = np.zeros(6)
-        away[:3] = (base_from_flange[:3, 3] - here[:3, 3]) / _REACH_MM
-        away[3:] = rotation_vector(base_from_flange[:3, :3] @ here[:3, :3].T)
-        if float(np.linalg.norm(away)) < _REACHED:
-            return tuple(np.degrees(angles).tolist())
-        jacobian = np.vstack([np.cross(axes, here[:3, 3] - origins_mm).T / _REACH_MM, axes.T])
-        step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + _DAMPING * np.eye(6), away)
-        angles = angles + step * min(1.0, _LONGEST_STEP / float(np.abs(step).max()))
-    return None
-
-
-def rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3]: axis times angle in radians of a 3x3 rotation by less than half a turn."""
-    sines = 0.5 * (rotation - rotation.T)[[2, 0, 1], [1, 2, 0]]
-    sine = float(np.linalg.norm(sines))
-    if sine < _TINY:
-        return sines
-    turned: NDArray[np.float64] = sines / sine * math.atan2(sine, (float(np.trace(rotation)) - 1.0) / 2.0)
-    return turned
+    """`sim.newton.joints_near` for this arm."""
+    return newton.joints_near(_chain, base_from_flange, joints_deg)
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform
-from sim.kuka_kinematics import rotation_vector
 
 Chain = Callable[[Sequence[float]], tuple[Transform, NDArray[np.float64], NDArray[np.float64]]]
 """Of six joint angles in degrees: `base_from_flange`, and in the base frame the joints' origins in mm and their
@@ -21,6 +21,7 @@ _REACHED = 1e-10
 """A tenth of a nanometre, or a few billionths of a degree."""
 _DAMPING = 1e-10
 _LONGEST_STEP = 0.2
+_TINY = 1e-12
 
 
 def joints_near(
@@ -44,3 +45,13 @@ def joints_near(
         step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + _DAMPING * np.eye(6), away)
         angles = angles + step * min(1.0, _LONGEST_STEP / float(np.abs(step).max()))
     return None
+
+
+def rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3]: axis times angle in radians of a 3x3 rotation by less than half a turn."""
+    sines = 0.5 * (rotation - rotation.T)[[2, 0, 1], [1, 2, 0]]
+    sine = float(np.linalg.norm(sines))
+    if sine < _TINY:
+        return sines
+    turned: NDArray[np.float64] = sines / sine * math.atan2(sine, (float(np.trace(rotation)) - 1.0) / 2.0)
+    return turned

@@ -85,7 +85,7 @@ def test_the_page_asks_for_nothing_elsewhere(viewer: Viewer) -> None:
     assert not re.search(r"""(src|href)\s*=\s*["']?(https?:)?//""", page)
 
 
-def test_a_viewer_sees_the_object_and_its_histograms(viewer: Viewer) -> None:
+def test_a_viewer_sees_the_picture_and_its_histograms(viewer: Viewer) -> None:
     shown = viewer.figures()["shown"]
     assert shown["led"] == 500
     assert set(shown["histograms"]) == {"R", "G1", "G2", "B"}

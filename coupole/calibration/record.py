@@ -27,7 +27,7 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0)]
-Kind = Literal["camera", "hand-eye"]
+Kind = Literal["camera", "hand-eye", "leds", "mesh", "flat-field", "dark", "response", "led-power"]
 _STEPS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
 _MOST_ASYMMETRY = 1e-9
 
@@ -122,6 +122,8 @@ class Record(Model):
     """Figures that were held, by name."""
     covariance: tuple[tuple[float, ...], ...]
     """[parameters, parameters], in the units of their names."""
+    files: tuple[Input, ...] = ()
+    """Tables and maps beside the record, too large for it; with their covariances where they have some."""
     noise: tuple[Noise, ...]
     images: tuple[ImageResidual, ...]
     limits: tuple[Limit, ...]
@@ -185,6 +187,7 @@ def read_record(path: Path) -> Record:
         message = "the record was edited after it was made: its content has another checksum. Calibrate anew."
         raise InputError([document.problem(("sha256",), message)])
     problems = [document.problem(("covariance",), message) for message in _covariance_problems(record)]
+    problems += [document.problem(("files",), message) for message in _file_problems(record, path.parent)]
     if problems:
         raise InputError(problems)
     return record
@@ -209,6 +212,17 @@ def _covariance_problems(record: Record) -> Iterator[str]:
         yield "expected a symmetric matrix"
     elif np.linalg.eigvalsh(correlation)[0] < -_MOST_ASYMMETRY * count:
         yield "expected a matrix without negative eigenvalues"
+
+
+def _file_problems(record: Record, folder: Path) -> Iterator[str]:
+    for file in record.files:
+        try:
+            found = hashlib.sha256((folder / file.name).read_bytes()).hexdigest()
+        except OSError as error:
+            yield f"expected {file.name} beside the record: {error.strerror}"
+            continue
+        if found != file.sha256:
+            yield f"{file.name} beside the record was changed after it was made: it has another checksum"
 
 
 def _lines(plain: dict[str, Any]) -> Iterator[str]:

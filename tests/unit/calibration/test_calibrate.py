@@ -12,7 +12,7 @@ from photographed import BOARD_YAML, FLANGE_FROM_CAMERA, LENS, SIZE_PX, shoot, w
 from synthesis import Array
 from typer.testing import CliRunner, Result
 
-from coupole.calibrate_cli import calibrate_app
+from coupole.commands.calibrate import calibrate_app
 from coupole.calibration.arm_errors import axis_sensitivity
 from coupole.calibration.board import Board
 from coupole.calibration.poses import Convention, read_poses

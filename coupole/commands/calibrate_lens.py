@@ -1,0 +1,160 @@
+"""`coupole calibrate camera` and `hand-eye`."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from coupole.commands.calibrating import (
+    DaysOption,
+    LensOption,
+    NameOption,
+    OutOption,
+    Paths,
+    bar,
+    calibrate,
+)
+from coupole.commands.common import JsonOption
+from coupole.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.calibration.board import Board
+    from coupole.calibration.bundle import EarlierLens
+    from coupole.calibration.report import Outcome
+    from coupole.calibration.sources import Found, Sources
+    from coupole.calibration.workflow import Shown, Wish
+    from coupole.kinematics import Arm
+
+BoardOption = Annotated[
+    Path | None, typer.Option("--board", help="The board's description (YAML); FOLDER/board.yaml if not given.")
+]
+PosesOption = Annotated[
+    Path | None, typer.Option("--poses", help="Robot poses of pictures (YAML); FOLDER/poses.yaml if not given.")
+]
+ModelOption = Annotated[str, typer.Option("--model", help="pinhole, radial (k1), brown4 or brown5 (with k3).")]
+
+
+def camera(
+    paths: Paths,
+    board: BoardOption = None,
+    model: ModelOption = "brown5",
+    out: OutOption = Path("calibrations"),
+    name: NameOption = None,
+    lens: LensOption = None,
+    valid_days: DaysOption = 180,
+    as_json: JsonOption = False,
+) -> None:
+    """Lens and distortion from 8 to 60 images of a board, tilted to all sides, corners over the whole field."""
+    from coupole.calibration.workflow import camera_from
+
+    def work(console: Console, wish: Wish) -> Outcome:
+        _refuse_unknown_model(model)
+        sources, _, found = _look(paths, board, None, console)
+        return _drawn(camera_from(found, sources, model, wish)[1])
+
+    calibrate("camera", work, out=out, name=name, lens=lens, valid_days=valid_days, as_json=as_json)
+
+
+def hand_eye(
+    paths: Paths,
+    board: BoardOption = None,
+    poses: PosesOption = None,
+    camera_record: Annotated[
+        Path | None,
+        typer.Option("--camera", help="A camera's record, which counts as an observation of the lens."),
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="The rig, whose arm's axes may have zero errors (for runs).")
+    ] = None,
+    repeatability_mm: Annotated[float, typer.Option(min=1e-4, help="Of the robot, as stated.")] = 0.03,
+    repeatability_deg: Annotated[float, typer.Option(min=1e-5, help="Of the robot, as stated.")] = 0.003,
+    absolute_mm: Annotated[float, typer.Option(min=0.0, help="The robot's absolute error, as stated.")] = 0.3,
+    absolute_deg: Annotated[float, typer.Option(min=1e-5, help="Of orientation, or of each axis' zero.")] = 0.02,
+    model: ModelOption = "brown5",
+    out: OutOption = Path("calibrations"),
+    name: NameOption = None,
+    lens: LensOption = None,
+    valid_days: DaysOption = 180,
+    as_json: JsonOption = False,
+) -> None:
+    """Where the camera sits on the flange, from 10 to 60 images of a board that stands still."""
+    from coupole.calibration.bundle import RobotNoise
+    from coupole.calibration.workflow import hand_eye_from
+
+    def work(console: Console, wish: Wish) -> Outcome:
+        _refuse_unknown_model(model)
+        earlier, arm = _earlier_lens(camera_record), _arm(rig)
+        sources, described, found = _look(paths, board, poses, console)
+        sources = sources.with_file(camera_record).with_file(rig)
+        robot = RobotNoise(repeatability_mm, repeatability_deg, absolute_mm, absolute_deg)
+        with console.status("adjusting lens, hand-eye, board and the robot's errors"):
+            shown = hand_eye_from(found, sources, described, model, wish, robot=robot, arm=arm, lens=earlier)[2]
+        return _drawn(shown)
+
+    calibrate("hand-eye", work, out=out, name=name, lens=lens, valid_days=valid_days, as_json=as_json)
+
+
+def _drawn(shown: Shown) -> Outcome:
+    from coupole.calibration.lens_picture import draw_lens
+    from coupole.calibration.report import Outcome
+
+    return Outcome(shown.record, partial(draw_lens, shown))
+
+
+def _refuse_unknown_model(model: str) -> None:
+    from coupole.calibration.optics import MODELS
+
+    if model not in MODELS:
+        raise InputError(f"--model: expected one of {', '.join(MODELS)}; found {model}")
+
+
+def _look(
+    paths: list[Path], board: Path | None, poses: Path | None, console: Console
+) -> tuple[Sources, Board, Found]:
+    """Open the images and find the board in them."""
+    from coupole.calibration.board import read_board
+    from coupole.calibration.sources import BOARD_NAME, find_board, open_sources
+
+    beside = paths[0] / BOARD_NAME
+    if board is None and not beside.is_file():
+        raise InputError(f"expected the board's description: give --board, or put it at {beside}")
+    described = read_board(board or beside)
+    sources = open_sources(paths, poses).with_file(board or beside)
+    with bar(console, "looking for the board") as progress:
+        found = find_board(described, sources, progress)
+    for line in found.left_out:
+        console.print(f"[yellow]left out:[/] {line}")
+    corners = sum(len(seen.ids) for seen in found.sightings)
+    console.print(f"{corners} corners in {len(found.sightings)} of {len(sources.images)} images")
+    return sources, described, found
+
+
+def _earlier_lens(path: Path | None) -> EarlierLens | None:
+    """The lens of a camera's record, with its covariance."""
+    from coupole.calibration.bundle import EarlierLens
+    from coupole.calibration.record import intrinsics_of, read_record
+
+    if path is None:
+        return None
+    record = read_record(path)
+    if record.kind != "camera":
+        raise InputError(f"{path}: expected a camera's record, found one of the kind `{record.kind}`")
+    intrinsics, free = intrinsics_of(record)
+    return EarlierLens(intrinsics, free, record.covariance_matrix)
+
+
+def _arm(rig: Path | None) -> Arm | None:
+    from coupole.job import read_cell
+    from coupole.rig import planning_arm
+
+    if rig is None:
+        return None
+    arm = planning_arm(read_cell(rig).rig)
+    if arm is None:
+        raise InputError(f"{rig}: its robot's driver knows no model of the arm; leave --rig out")
+    return arm

@@ -1,0 +1,126 @@
+"""What all `coupole calibrate` commands share: options, and how a record is written, said and refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coupole.commands.common import fail
+from coupole.errors import CalibrationRefused, CoupoleError, InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.calibration.record import Record
+    from coupole.calibration.report import Outcome
+    from coupole.calibration.workflow import Wish
+
+Paths = Annotated[
+    list[Path],
+    typer.Argument(help="Runs, or one folder of pictures.", show_default=False, metavar="RUN_OR_FOLDER..."),
+]
+OutOption = Annotated[Path, typer.Option("--out", help="Folder for the record, its page and its picture.")]
+NameOption = Annotated[str | None, typer.Option("--name", help="Of the record; kind and date if not given.")]
+LensOption = Annotated[str | None, typer.Option("--lens", help="Which lens it is, in words.")]
+DaysOption = Annotated[int, typer.Option("--valid-days", min=1, max=3650, help="When the record expires.")]
+
+
+def calibrate(
+    kind: str,
+    work: Callable[[Console, Wish], Outcome],
+    *,
+    out: Path,
+    name: str | None,
+    lens: str | None,
+    valid_days: int,
+    as_json: bool,
+) -> None:
+    """Do the work, write record, files and report, say what was found, refuse what misses its limits."""
+    from coupole.calibration.report import write_outcome
+    from coupole.calibration.workflow import Wish
+    from coupole.console import make_console
+
+    console = make_console(quiet=as_json)
+    now = datetime.now(UTC)
+    try:
+        wish = Wish(name or f"{kind}-{now:%Y%m%d}", now, valid_days, lens)
+        record_path = out / f"{wish.name}.yaml"
+        if record_path.exists():
+            raise InputError(f"{record_path}: a record stands here already. Choose another --name or --out.")
+        outcome = work(console, wish)
+        page, picture = write_outcome(record_path, outcome)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    record = outcome.record
+    _show(console, record)
+    console.print(f"record {record_path}, report {page}")
+    if as_json:
+        files = {
+            "record": str(record_path.resolve()),
+            "report": str(page.resolve()),
+            "picture": str(picture.resolve()),
+        }
+        print(json.dumps(files | _figures(record)))
+    if not record.passed:
+        raise CalibrationRefused(
+            [
+                f"{record_path}: not accepted: {limit.what} is {limit.found:.3g} {limit.unit}, at most "
+                f"{limit.limit:.3g} is allowed"
+                for limit in record.limits
+                if not limit.passed
+            ]
+        )
+
+
+@contextmanager
+def bar(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar; yields how to move it: done, total."""
+    from rich.progress import Progress
+
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        task = bars.add_task(what)
+        yield lambda done, total: bars.update(task, completed=done, total=total)
+
+
+def _show(console: Console, record: Record) -> None:
+    """The figures, for people."""
+    from rich.table import Table
+
+    for name, pose in record.transforms.items():
+        shift = " ".join(f"{v:.4f}" for v in pose.translation_mm)
+        console.print(f"{name}: {shift} mm, A B C {' '.join(f'{v:.5f}' for v in pose.abc_deg)} deg")
+    table = Table("parameter", "value", "u", "most of it from", box=None)
+    for p in record.parameters:
+        table.add_row(p.name, "" if p.value is None else f"{p.value:.6g}", f"{p.u:.2g}", p.dominated_by)
+    console.print(table)
+    for remark in record.remarks:
+        console.print(f"[yellow]{remark}[/]")
+    for limit in record.limits:
+        colour, how = ("green", "met") if limit.passed else ("red", "missed")
+        console.print(
+            f"[{colour}]{how}[/] {limit.what}: {limit.found:.3g} {limit.unit} (at most {limit.limit:.3g})"
+        )
+
+
+def _figures(record: Record) -> dict[str, Any]:
+    """The figures, for programs."""
+    return {
+        "kind": record.kind,
+        "accepted": record.passed,
+        "sha256": record.sha256,
+        "images": len(record.images),
+        "corners": sum(image.corners for image in record.images),
+        "rejected": sum(image.rejected for image in record.images),
+        "parameters": {p.name: {"value": p.value, "u": p.u} for p in record.parameters},
+        "transforms": {name: pose.model_dump() for name, pose in record.transforms.items()},
+        "noise": {n.name: {"found": n.found, "stated": n.stated, "unit": n.unit} for n in record.noise},
+        "limits": [{**limit.model_dump(), "passed": limit.passed} for limit in record.limits],
+        "remarks": list(record.remarks),
+    }

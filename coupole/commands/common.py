@@ -1,0 +1,28 @@
+"""What the commands share: arguments and options that many of them have, and errors in JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from coupole.errors import CoupoleError
+
+PlanPath = Annotated[Path, typer.Argument(help="The plan (YAML).", show_default=False)]
+RigOption = Annotated[Path | None, typer.Option("--rig", help="Another rig than the plan names.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
+RunPath = Annotated[Path, typer.Argument(help="The run's folder.", show_default=False)]
+
+
+def fail(error: CoupoleError, *, as_json: bool, found: dict[str, Any] | None = None) -> None:
+    """Put an error into the JSON document, if that was asked for; the caller raises it on."""
+    if as_json:
+        document = {
+            **(found or {}),
+            "error": str(error),
+            "kind": type(error).__name__,
+            "exit_code": error.exit_code,
+        }
+        print(json.dumps(document))

@@ -1,0 +1,163 @@
+"""Commands about a plan, without any device: check, view, simulate, schema, plan new."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coupole.commands.common import JsonOption, PlanPath, RigOption, fail
+from coupole.errors import InputError, PreflightRefused
+
+
+def check(
+    plan: PlanPath,
+    rig: RigOption = None,
+    no_paths: Annotated[
+        bool, typer.Option("--no-paths", help="Leave out path planning and swept collisions.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Say everything that can be known of a plan before a device is touched."""
+    from coupole.console import make_console, show_preflight, show_views
+    from coupole.job import preflight_of, read_job
+
+    console = make_console(quiet=as_json)
+    try:
+        job = read_job(plan, rig)
+    except InputError as error:
+        fail(error, as_json=as_json, found={"ok": False, "refusals": []})
+        raise
+    if not no_paths:
+        job = job.without_hidden()
+    job, report = preflight_of(job, job.cell.storage_folder, paths=not no_paths)
+    show_preflight(console, report, name=job.plan.name, rig=job.cell.rig.name)
+    show_views(console, report)
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "ok": not report.refusals,
+                    "refusals": report.refusals,
+                    "warnings": report.warnings,
+                    "views": len(report.views),
+                    "shots": report.shots,
+                    "frames": report.frames,
+                    "bytes": report.bytes,
+                    "duration_s": report.duration_s,
+                    "ideal_s": report.ideal_s,
+                    "dose_lux_h": report.dose_lux_h,
+                    "peak_board_c": report.peak_board_c,
+                    "exposures": [asdict(timing) for timing in report.timings],
+                    "hidden_lights": sum(map(len, job.hidden_leds.values())),
+                    "paths_checked": not no_paths,
+                }
+            )
+        )
+    if report.refusals:
+        raise PreflightRefused(report.refusals)
+    if not as_json:
+        console.print("the plan can be run" + (" (collisions were not checked)" if no_paths else ""))
+
+
+def view(
+    plan: PlanPath,
+    rig: RigOption = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder for both files.")] = Path(),
+    no_paths: Annotated[
+        bool, typer.Option("--no-paths", help="Leave out path planning and swept collisions.")
+    ] = False,
+    show: Annotated[bool, typer.Option("--show", help="Open the page in a browser.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw a plan, refused or not: a picture (PNG) and a page to turn round (HTML)."""
+    from coupole.console import make_console
+    from coupole.job import read_job
+    from coupole.view import look_at_plan
+
+    try:
+        png, html = look_at_plan(read_job(plan, rig), out, make_console(quiet=as_json), paths=not no_paths)
+    except InputError as error:
+        fail(error, as_json=as_json)
+        raise
+    if show:
+        typer.launch(str(html.resolve()))
+    if as_json:
+        print(json.dumps({"png": str(png), "html": str(html)}))
+
+
+def simulate(
+    plan: PlanPath,
+    rig: RigOption = None,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="How many shots, over all views.")] = 12,
+    out: Annotated[Path, typer.Option("--out", help="Folder for the pictures.")] = Path("simulated"),
+    width: Annotated[
+        int | None, typer.Option("--width", min=16, help="Of the frames, if less than the rig's.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Render some frames of a plan, without devices, for a look: a PNG each, and all on one sheet."""
+    from rich.progress import Progress
+
+    from coupole.console import make_console
+    from coupole.job import read_job
+    from coupole.simulate import simulate as render
+
+    try:
+        job = read_job(plan, rig)
+    except InputError as error:
+        fail(error, as_json=as_json)
+        raise
+    console = make_console(quiet=as_json)
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        bar = bars.add_task("rendering")
+        made = render(
+            job,
+            out,
+            frames,
+            width_px=width,
+            progress=lambda done, total: bars.update(bar, completed=done, total=total),
+        )
+    if as_json:
+        print(json.dumps({"folder": str(out), "sheet": "sheet.png", "frames": [asdict(still) for still in made]}))
+        return
+    for still in made:
+        over = f", [red]{still.saturated:.2%} saturated[/]" if still.saturated > 1e-3 else ""
+        console.print(f"{still.file}: brightest {still.brightest:.0%}{over}")
+    console.print(f"[bold]{out / 'sheet.png'}[/]")
+
+
+def schema(what: Annotated[str, typer.Argument(help="plan or rig")]) -> None:
+    """JSON schema of plans or rigs, for editors."""
+    from coupole.plan import Plan
+    from coupole.rig import Rig
+
+    models: dict[str, type[Plan] | type[Rig]] = {"plan": Plan, "rig": Rig}
+    if what not in models:
+        raise typer.BadParameter(f"expected plan or rig, found {what}")
+    print(json.dumps(models[what].model_json_schema(), indent=2))
+
+
+def plan_new(
+    name: Annotated[str, typer.Argument(help="Name of the plan; the file is NAME.yaml.", show_default=False)],
+    template: Annotated[
+        str | None, typer.Option("--template", help="Which template; the one called NAME, else `views`.")
+    ] = None,
+    rig: Annotated[str, typer.Option("--rig", help="Path of the rig, relative to the plan.")] = "../rigs/sim.yaml",
+) -> None:
+    """Write a plan to start from."""
+    from coupole.templates import TEMPLATES
+
+    template = template or (name if name in TEMPLATES else "views")
+    if template not in TEMPLATES:
+        raise typer.BadParameter(f"expected one of {', '.join(sorted(TEMPLATES))}; found {template}")
+    path = Path(f"{name}.yaml")
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(TEMPLATES[template].format(name=name, rig=rig))
+    except FileExistsError as error:
+        raise InputError(f"{path}: stands here already; choose another name") from error
+    print(path)

@@ -1,0 +1,177 @@
+"""Commands that open devices, real or simulated: acquire, devices, meter, live, sim."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from coupole.commands.common import JsonOption, PlanPath, RigOption, fail
+from coupole.errors import CoupoleError
+
+
+def acquire(
+    plan: PlanPath,
+    rig: RigOption = None,
+    output: Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")] = None,
+    resume: Annotated[Path | None, typer.Option("--resume", help="Go on with this run.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Rehearse on the rig's twin.")] = False,
+    speed: Annotated[float, typer.Option("--speed", min=0.1, max=1000, help="Pace of a dry run.")] = 20.0,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell moves.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a plan: check it, move, fire, prove, store.
+
+    Ctrl-C stops safely (lights off, arm still) and the run can be resumed. SIGUSR1 pauses between bursts, and
+    goes on when sent again.
+    """
+    from coupole.console import make_console
+    from coupole.job import read_job
+    from coupole.session import acquire_plan, rehearse
+
+    if dry_run and (resume or output):
+        raise typer.BadParameter("a dry run keeps nothing: --resume and --output do not go with --dry-run")
+    if resume and output:
+        raise typer.BadParameter("a resumed run stays where it is: --output does not go with --resume")
+    console = make_console(quiet=as_json)
+    found: dict[str, Any] = {}
+    try:
+        job = read_job(plan, rig)
+        if dry_run:
+            rehearse(job, console, speed=speed, found=found)
+        else:
+            acquire_plan(job, console, parent=output, resume=resume, confirm=not yes, found=found)
+    except CoupoleError as error:
+        fail(error, as_json=as_json, found=found)
+        raise
+    if as_json:
+        print(json.dumps(found))
+
+
+def devices(
+    rig: Annotated[Path, typer.Option("--rig", help="The rig (YAML).")] = Path("configs/rigs/sim.yaml"),
+    as_json: JsonOption = False,
+) -> None:
+    """Open each device of a rig, let it say who it is and test itself, close it."""
+    from rich.table import Table
+
+    from coupole.cell import open_cell
+    from coupole.console import make_console
+    from coupole.job import read_cell
+
+    console = make_console(quiet=as_json)
+    cell = read_cell(rig)
+    found: dict[str, Any] = {}
+    table = Table("device", "identity", "self-test", box=None)
+    with open_cell(cell) as opened:
+        for kind in ("ledbox", "camera", "robot"):
+            identity, tested = opened.identities[kind], getattr(opened, kind).self_test()
+            found[kind] = {**vars(identity), "self_test": dict(tested)}
+            who = f"{identity.vendor} {identity.model} {identity.serial} ({identity.firmware})"
+            table.add_row(
+                kind,
+                who + (" [dim]simulated[/]" if identity.simulated else ""),
+                ", ".join(f"{key} {value}" for key, value in tested.items()),
+            )
+    console.print(table)
+    if as_json:
+        print(json.dumps(found))
+
+
+def meter(
+    plan: PlanPath,
+    rig: RigOption = None,
+    saturated: Annotated[
+        float, typer.Option("--saturated", min=0, max=0.5, help="Share of a picture's pixels that may saturate.")
+    ] = 1e-3,
+    snr: Annotated[float, typer.Option("--snr", min=1, help="Signal-to-noise ratio to reach.")] = 30.0,
+    share: Annotated[
+        float, typer.Option("--share", min=0.01, max=1, help="Share of the object's pixels that must reach it.")
+    ] = 0.9,
+    write: Annotated[
+        Path | None, typer.Option("--write", help="Write the plan with this exposure, in the plan's folder.")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell moves.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Advise on a plan's exposure: a few pictures of each view, under a few lights, none of them kept."""
+    from coupole.console import make_console, show_advice
+    from coupole.job import read_job
+    from coupole.metering import Wish, write_plan
+    from coupole.session import meter as meter_plan
+
+    console = make_console(quiet=as_json)
+    try:
+        advice = meter_plan(read_job(plan, rig), console, Wish(saturated, snr, share), confirm=not yes)
+        if write is not None:
+            write_plan(plan, write, advice.exposure)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    show_advice(console, advice)
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "exposure": advice.exposure.model_dump(mode="json"),
+                    "remarks": advice.remarks,
+                    "noise": asdict(advice.noise),
+                    "views": {seen.view: asdict(seen) for seen in advice.views},
+                    "plan": str(write) if write else None,
+                }
+            )
+        )
+
+
+def live(
+    what: Annotated[Path, typer.Argument(help="A run's folder, a plan, or a rig.", show_default=False)],
+    led: Annotated[int | None, typer.Option("--led", help="The LED to begin with; none is dark.")] = None,
+    exposure_us: Annotated[int, typer.Option("--exposure-us", min=10, help="Exposure to begin with.")] = 8000,
+    frames_per_s: Annotated[
+        float, typer.Option("--fps", min=0.1, max=20, help="Pictures a second, at most.")
+    ] = 5.0,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page; 0: any.")] = 0,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before real light is given.")] = False,
+) -> None:
+    """Look through the camera, or at a run that goes on: figures here, pictures on a page for this machine.
+
+    Of a run the folder alone is read, so it is never slowed. Of a rig or a plan (then its object's light is
+    entered in the ledger) the camera is taken; the arm is held where it stands.
+    """
+    from coupole.console import make_console
+    from coupole.job import read_cell, read_job
+    from coupole.live import Choice
+    from coupole.session import watch_cell, watch_run
+    from coupole.yamlfile import read
+
+    console = make_console(quiet=False)
+    if what.is_dir():
+        watch_run(what, console, port=port)
+        return
+    source = read_job(what) if "views" in read(what).data else read_cell(what)
+    choice = Choice(led, exposure_us)
+    watch_cell(source, console, choice, frames_per_s=frames_per_s, port=port, confirm=not yes)
+
+
+def sim(
+    rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
+    plan: Annotated[Path | None, typer.Option("--plan", help="Put this plan's object on the support.")] = None,
+    speed: Annotated[float | None, typer.Option("--speed", min=0.01, help="Pace of the world.")] = None,
+) -> None:
+    """Serve a rig's stand-ins for other clients; prints one JSON line with their endpoints, until Ctrl-C."""
+    from coupole.cell import world_config
+    from coupole.job import read_cell, read_job
+    from coupole.rig import load_class
+
+    job = read_job(plan, rig) if plan else None
+    cell = job.cell if job else read_cell(rig)
+    driver = cell.rig.world.driver if cell.rig.world else "sim.client:World"
+    world = load_class(driver).start(world_config(cell, job, cell.rig.sensor, speed=speed))
+    try:
+        print(json.dumps(world.endpoints), flush=True)
+        world.wait()
+    finally:
+        world.close()

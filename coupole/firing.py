@@ -23,7 +23,7 @@ from coupole.devices import (
 )
 from coupole.dose import DoseMeter
 from coupole.errors import CoupoleError, DeviceError, DeviceTimeout
-from coupole.intake import Intake, buffers_for
+from coupole.intake import Intake, buffers_for, memory_for_buffers
 from coupole.matching import UNLABELLED, FaultModel, Match, match
 from coupole.observer import Outcome
 from coupole.posing import Posing
@@ -89,6 +89,9 @@ class Firing:
         self._cell, self._recorder, self._posing, self._dose = cell, recorder, posing, dose
         self._outcome, self._gain_db, self._max_frames_per_s = outcome, gain_db, max_frames_per_s
         self._tell, self._wait_while_paused = tell, wait_while_paused
+        self._buffer_memory_bytes = memory_for_buffers()
+        self._buffers = 0
+        """Never fewer than the burst before had: a ring that changes its size is memory to be touched anew."""
         self.times_s: list[float] = []
         """From start to last proof of each burst, on the rig's clock."""
 
@@ -114,8 +117,9 @@ class Firing:
                 remedy="Lower `max_frames_per_s`, or raise `exposure_gap_us`, in the rig.",
             )
         period_s = burst.timing.period_us * 1e-6
-        buffers = buffers_for(len(burst.labels), frame_format.frame_bytes, period_s)
-        return self._by_cable(burst, following, buffers)
+        wanted = buffers_for(len(burst.labels), frame_format.frame_bytes, period_s, self._buffer_memory_bytes)
+        self._buffers = max(self._buffers, wanted)
+        return self._by_cable(burst, following, self._buffers)
 
     # -- the box triggers the camera ----------------------------------------------------------------------
 

@@ -19,14 +19,17 @@ _STALL_S = 2.0
 """A pause of disk or host that the camera's buffers bridge, where memory allows."""
 _FEWEST_BUFFERS = 16
 _MEMORY_SHARE = 0.25
-"""Of the memory that is free now, for buffers."""
+"""Of the memory that is free when a run begins, for buffers."""
 
 
-def buffers_for(frames: int, frame_bytes: int, period_s: float) -> int:
+def memory_for_buffers() -> int:
+    """Bytes that a camera's buffers may take on this machine, as it is now."""
+    return int(_MEMORY_SHARE * os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+
+
+def buffers_for(frames: int, frame_bytes: int, period_s: float, memory_bytes: int) -> int:
     """How many buffers to arm a camera with, for a burst of so many frames: enough for a stall, within memory."""
-    free_bytes = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    affordable = int(_MEMORY_SHARE * free_bytes / frame_bytes)
-    return max(_FEWEST_BUFFERS, min(frames, math.ceil(_STALL_S / period_s), affordable))
+    return max(_FEWEST_BUFFERS, min(frames, math.ceil(_STALL_S / period_s), memory_bytes // frame_bytes))
 
 
 class Intake:

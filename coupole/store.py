@@ -102,6 +102,8 @@ class Layout:
     """True if the frames are compressed, as `coupole.archive` leaves them; then the file is only read."""
     packed: bool
     """True if two pixels lie in three bytes (`coupole.packing`, `lsb`)."""
+    inode: int
+    """Of the file: another one has come to its place if it was archived since."""
 
     @property
     def frame_bytes(self) -> int:
@@ -209,6 +211,7 @@ def _contiguous(
 def read_layout(path: Path) -> Layout:
     """Where frames and tables lie in a view's file. Raises StorageError if it is not such a file."""
     try:
+        inode = path.stat().st_ino  # before the file is opened: if it is replaced now, `read_frame` sees it
         with h5py.File(path, "r") as file:
             data, frames, poses = file[DATA], file[FRAMES], file[POSES]
             packed = data.dtype == np.uint8
@@ -222,6 +225,7 @@ def read_layout(path: Path) -> Layout:
                 poses.id.get_offset(),
                 archived=data.chunks is not None,
                 packed=packed,
+                inode=inode,
             )
     except (OSError, KeyError) as error:
         raise StorageError(f"{path}: not a view file of a run: {error}") from error
@@ -247,12 +251,17 @@ def read_frames(path: Path) -> NDArray[np.void]:
 
 
 def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
-    """Pixels [H, W] of one slot, DN. Raises StorageError if an archived frame cannot be read."""
+    """Pixels [H, W] of one slot, DN, also if the file was archived since its layout was read.
+
+    Raises StorageError if an archived frame cannot be read.
+    """
     if layout.archived:
         return _read_archived_frame(path, slot)
     with path.open("rb") as file:
-        file.seek(layout.data_offset + slot * layout.frame_bytes)
-        return pixels_of(file.read(layout.frame_bytes), layout)
+        if os.fstat(file.fileno()).st_ino == layout.inode:
+            file.seek(layout.data_offset + slot * layout.frame_bytes)
+            return pixels_of(file.read(layout.frame_bytes), layout)
+    return read_frame(path, read_layout(path), slot)
 
 
 def pixels_of(stored: bytes | mmap.mmap, layout: Layout) -> NDArray[np.uint16]:

@@ -137,6 +137,16 @@ def contents(path: Path) -> dict[str, Any]:
     return found
 
 
+def test_frames_are_read_right_while_the_run_is_being_archived(made: MadeRun) -> None:
+    """A reader knows a view's layout when another file comes to its place."""
+    proven = made.run.proven()
+    layouts = {frame.file: store.read_layout(made.run.folder / frame.file) for frame in proven.values()}
+    archive_run(made.run, LZ4)
+    for shot, frame in proven.items():
+        pixels = store.read_frame(made.run.folder / frame.file, layouts[frame.file], frame.index)
+        assert np.array_equal(pixels, made.frames[shot])
+
+
 def test_all_but_the_frames_is_kept_as_it_was(made: MadeRun) -> None:
     before = contents(made.run.view_path("top"))
     archive_run(made.run, LZ4)

@@ -173,6 +173,7 @@ def world_config(
             ),
             "focal_length_mm": rig.lens.focal_length_mm,
             "focus_distance_mm": rig.lens.focus_distance_mm,
+            "f_number": rig.lens.f_number,
             "flange_from_camera": rig.flange_from_camera.matrix().tolist(),
             "nominal_exposure_us": exposures_us[len(exposures_us) // 2],
         },

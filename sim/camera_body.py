@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from coupole.geometry import Transform
 from sim.lighting import Lighting
 from sim.reactor import Reactor
+from sim.sensor_model import SensorModel
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class Exposed:
     """What one exposure saw, for the renderer."""
 
     seconds_of_led: dict[int, float]
+    """At tabulated flux: an LED that gives a tenth more shines a tenth longer."""
     panels: list[int]
     exposure_s: float
     gain: float
@@ -55,6 +57,16 @@ class Settings(BaseModel):
     """Rays through each pixel, k x k: for targets whose corners are measured to a fraction of a pixel."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 of the true lens (Brown and Conrady, OpenCV's order), which calibration must find."""
+    blur: bool = False
+    """Defocus and diffraction blur pictures; seconds a frame at full size."""
+    rim_radius: Annotated[float, Field(gt=0)] = 3.0
+    rim_shift: Annotated[float, Field(ge=0)] = 4.0
+    """Mechanical vignetting, as `sim.objective.Objective` has it."""
+    lateral_colour: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Relative change of magnification of red, green and blue; with `blur` alone."""
+    sensor: SensorModel = SensorModel()
+    """What the sensor is; Bayer pattern, bits and black level are the rig's."""
+    sensor_temperature_c: float = 25.0
     clock_offset_ns: int = 7_777_000_000
     clock_ppm: float = -23.0
     timestamp_jitter_us: float = 2.0

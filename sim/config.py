@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,13 +12,28 @@ from sim import camera_server, kuka_controller, ledbox_firmware
 from sim import faults as script
 from sim.camera import CameraSettings
 from sim.camera import impossible as impossible_for_camera
+from sim.dome import DomeErrors
+from sim.led_light import STEADY, LedModel
+from sim.panels import Panel
 from sim.robot import RobotSettings, impossible
-from sim.things import Thing
+from sim.sensor_model import SensorModel
+from sim.things import Stickers, Thing
 
 WHITE_SHARE = 0.6
 """A white target at the support's centre reaches this share of full scale at the plan's exposure (design)."""
 
 
+_OF_THE_TRUE_CAMERA = (
+    "samples_per_side",
+    "distortion",
+    "blur",
+    "rim_radius",
+    "rim_shift",
+    "lateral_colour",
+    "sensor",
+    "sensor_temperature_c",
+)
+"""What the rig's `world.settings.camera` says of the picture that it takes."""
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -68,11 +84,29 @@ class CameraConfig(_Model):
     focus_distance_mm: float
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 of Brown and Conrady, as OpenCV orders and signs them."""
+    f_number: Annotated[float, Field(gt=0)] = 8.0
     samples_per_side: Annotated[int, Field(ge=1, le=8)] = 1
     """Rays through each pixel, k x k: for targets whose corners are measured to a fraction of a pixel."""
+    blur: bool = False
+    rim_radius: float = 3.0
+    rim_shift: float = 4.0
+    lateral_colour: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sensor: SensorModel = SensorModel()
+    sensor_temperature_c: float = 25.0
+    """These as in `sim.camera_body.Settings`."""
     flange_from_camera: list[list[float]]
     nominal_exposure_us: int
     """The exposure at which white reaches `WHITE_SHARE` of full scale."""
+
+    def true_sensor(self, seed: int) -> SensorModel:
+        """The sensor with the rig's pattern, bits and black level; the world's seed makes it another one."""
+        return dataclasses.replace(
+            self.sensor,
+            bayer_pattern=self.bayer_pattern,
+            bit_depth=self.bit_depth,
+            black_dn=self.black_dn,
+            seed=self.sensor.seed + seed - 1,
+        )
 
 
 class Settings(_Model):
@@ -88,6 +122,14 @@ class Settings(_Model):
     faults: tuple[script.Fault, ...] = ()
     things: tuple[Thing, ...] = ()
     """What stands on the support beside the plan's object."""
+    stickers: Stickers | None = None
+    """On the plan's object."""
+    leds: LedModel = STEADY
+    """`{}` is LEDs as they are made: each has its own flux and colour, warms up, flickers."""
+    dome: DomeErrors = DomeErrors()
+    """How the dome differs from its table."""
+    panels: tuple[Panel, ...] = ()
+    """The flat white panels 1 to 4, for the camera to see; without them a panel is light from all around."""
 
     @model_validator(mode="after")
     def _possible(self) -> Settings:
@@ -109,5 +151,5 @@ class Config(_Model):
     @property
     def photographed(self) -> CameraConfig:
         """The camera as the renderer needs it: with the true lens, and as many rays as are wanted."""
-        true = {name: getattr(self.settings.camera, name) for name in ("samples_per_side", "distortion")}
+        true = {name: getattr(self.settings.camera, name) for name in _OF_THE_TRUE_CAMERA}
         return self.camera.model_copy(update=true)

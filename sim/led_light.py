@@ -7,14 +7,16 @@ against.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import ConfigDict
 
 from sim.materials import channels
 from sim.materials.grid import WAVELENGTHS_NM, Array
 
-_OWN_FLUX, _OWN_PUMP, _FLASH = 1, 2, 3
+_OWN_FLUX, _OWN_PUMP, _FLASH, _LOOSE = 1, 2, 3, 4
 """Purposes of the seed's streams."""
 
 
@@ -35,6 +37,8 @@ class LedSpectrum:
 class LedModel:
     """How a dome's LEDs differ from their table; all figures are assumed, of the order of white power LEDs."""
 
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
     seed: int = 1
     flux_spread: float = 0.04
     """Standard deviation of the logarithm of an LED's flux over its tabulated one: bins are some 10 % wide."""
@@ -46,11 +50,17 @@ class LedModel:
     """Board temperature at which the table holds."""
     hours_to_70_percent: float = 50_000.0
     """Time of light after which 70 % of the flux is left (L70), on an exponential."""
+    hours_shone: float = 0.0
+    """How old the LEDs are."""
     flicker: float = 5e-4
     """Relative standard deviation from flash to flash."""
     dead: tuple[int, ...] = ()
     """LEDs that give no light."""
     spectrum: LedSpectrum = LedSpectrum()
+
+
+STEADY = LedModel(flux_spread=0.0, pump_spread_nm=0.0, flux_per_k=0.0, flicker=0.0, hours_to_70_percent=np.inf)
+"""LEDs that give what their table says, always."""
 
 
 def spectral_power(spectrum: LedSpectrum) -> Array:
@@ -76,6 +86,23 @@ def led_flux_factor(model: LedModel, led: int, flash: int, temperature_c: float,
     age = 0.7 ** (hours / model.hours_to_70_percent)
     flicker = 1.0 + model.flicker * _normal(model.seed, _FLASH, led, flash)
     return max(0.0, float(own_flux_factor(model, led) * warmth * age * flicker))
+
+
+class Flashes:
+    """A world's flashes, one after the other."""
+
+    def __init__(self, model: LedModel) -> None:
+        self._model = model
+        self._count = 0
+        self.unsteady: dict[int, float] = {}
+        """LEDs with a loose contact: relative standard deviation from flash to flash, beside the model's."""
+
+    def flux(self, led: int, temperature_c: float) -> float:
+        """Flux of the LED's next flash over its tabulated flux."""
+        self._count += 1
+        loose = self.unsteady.get(led, 0.0) * _normal(self._model.seed, _LOOSE, led, self._count)
+        flux = led_flux_factor(self._model, led, self._count, temperature_c, hours=self._model.hours_shone)
+        return max(0.0, flux * (1.0 + loose))
 
 
 def led_power(model: LedModel, led: int) -> Array:

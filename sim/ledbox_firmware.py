@@ -145,6 +145,10 @@ class LedBoxFirmware:
         """From its next step on, the LED draws no current and gives no light."""
         self._dead_leds.add(led)
 
+    def temperature_of_led_c(self, led: int) -> float:
+        """Of the LED's board, now."""
+        return self._boards.temperature_of_led_c(led, self._reactor.now_ns)
+
     def over_temperature(self, board: int) -> None:
         """The board is over its limit from now on, until it has cooled."""
         self._boards.set_temperature(board, self._boards.limit_c + _OVER_LIMIT_K, self._reactor.now_ns)

@@ -13,20 +13,21 @@ class Lighting:
     """Intervals of world time in which LEDs and panels shone."""
 
     def __init__(self) -> None:
-        self._lit: deque[tuple[int, int, int]] = deque()
+        self._lit: deque[tuple[int, int, int, float]] = deque()
         self._panels_since_ns: dict[int, int] = {}
 
-    def light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
-        """LED `led` is switched on at `t_on_ns` and will go off at `t_off_ns` unless `dark` comes first."""
+    def light(self, led: int, t_on_ns: int, t_off_ns: int, flux: float = 1.0) -> None:
+        """LED `led` is switched on at `t_on_ns` and will go off at `t_off_ns` unless `dark` comes first; it gives
+        `flux` times what its table says."""
         if led == NO_LIGHT:
             return
         while self._lit and self._lit[0][2] < t_on_ns - _KEEP_NS:
             self._lit.popleft()
-        self._lit.append((led, t_on_ns, t_off_ns))
+        self._lit.append((led, t_on_ns, t_off_ns, flux))
 
     def dark(self, t_ns: int) -> None:
         """All LEDs go off now."""
-        self._lit = deque((led, on, min(off, t_ns)) for led, on, off in self._lit if on < t_ns)
+        self._lit = deque((led, on, min(off, t_ns), flux) for led, on, off, flux in self._lit if on < t_ns)
 
     def panel(self, panel: int, on: bool, t_ns: int) -> None:
         if on:
@@ -36,17 +37,17 @@ class Lighting:
 
     def shining(self, t_ns: int) -> list[int]:
         """LEDs that shine at `t_ns`."""
-        return [led for led, on, off in self._lit if on <= t_ns < off]
+        return [led for led, on, off, _ in self._lit if on <= t_ns < off]
 
     def panels(self, t_ns: int) -> list[int]:
         """Panels that shine at `t_ns`."""
         return [panel for panel, since in self._panels_since_ns.items() if since <= t_ns]
 
     def exposure_s(self, start_ns: int, end_ns: int) -> dict[int, float]:
-        """Seconds that each LED shone between two times; LEDs that did not are left out."""
+        """Seconds that each LED shone between two times, at its tabulated flux; LEDs that did not are left out."""
         seconds: dict[int, float] = {}
-        for led, on, off in reversed(self._lit):
+        for led, on, off, flux in reversed(self._lit):
             overlap_ns = min(off, end_ns) - max(on, start_ns)
             if overlap_ns > 0:
-                seconds[led] = seconds.get(led, 0.0) + overlap_ns / 1e9
+                seconds[led] = seconds.get(led, 0.0) + flux * overlap_ns / 1e9
         return seconds

@@ -2,51 +2,69 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform, inverse
+from sim import panels
+from sim.blur import through
 from sim.camera_body import Exposed
-from sim.config import WHITE_SHARE, CameraConfig, MeshConfig, SceneConfig
+from sim.config import WHITE_SHARE, CameraConfig, MeshConfig, SceneConfig, Settings
+from sim.dome import as_built
+from sim.glow import Glow, glow
+from sim.led_light import channel_factors
+from sim.materials import light
+from sim.objective import Objective, vignetting
 from sim.render.embree import Obstacles
-from sim.render.emitter import LED_SIDE_MM, irradiance, square
-from sim.render.lens import Lens
+from sim.render.emitter import LED_SIDE_MM, Emitter, irradiance, square
+from sim.render.lens import Lens, sight
 from sim.render.radiance import led_radiance, panel_radiance
 from sim.render.shadows import Shadows
-from sim.render.view import View, Viewer
+from sim.render.view import View, Viewer, tangents
 from sim.scene import Leds, build_scene, load_surface, read_leds, support_disk
-from sim.sensor import SensorModel, expose
+from sim.sensor import electrons, expose, expose_electrons, mosaic
 from sim.surface import Material, Surface
-from sim.things import Thing, placed
+from sim.things import Stickers, placed
 
 _POSE_TOLERANCE = 1e-6
 _SHADOW_BYTES = 512 << 20
 _RADIANCE_BYTES = 256 << 20
 _WARM_UP_HEIGHT_MM = 1000.0
 
+Radiance = NDArray[np.float32]
+
 
 class Photographer:
     """Holds the scene, its shadows and the last pose's view; `render` is called from one worker thread."""
 
-    def __init__(
-        self, scene: SceneConfig, camera: CameraConfig, *, seed: int, things: tuple[Thing, ...] = ()
-    ) -> None:
+    def __init__(self, scene: SceneConfig, camera: CameraConfig, settings: Settings) -> None:
         base_from_support = np.array(scene.base_from_support)
         surfaces = [(support_disk(scene.support_diameter_mm), base_from_support)]
         surfaces += [
-            (_surface(mesh), base_from_support @ np.array(mesh.support_from_object)) for mesh in scene.objects
+            (_surface(mesh, settings.stickers), base_from_support @ np.array(mesh.support_from_object))
+            for mesh in scene.objects
         ]
-        surfaces += placed(things, base_from_support)
+        surfaces += placed(settings.things, base_from_support)
         self._scene = build_scene(surfaces)
-        self.leds: Leds = read_leds(scene.leds)
         self._emission = scene.emission
-        self._emitters = [
-            square(position, normal, side_mm=LED_SIDE_MM, flux_lm=float(flux))
-            for position, normal, flux in zip(
-                self.leds.positions_mm, self.leds.normals, self.leds.flux_lm, strict=True
-            )
-        ]
+        table = read_leds(scene.leds)
+        self.leds: Leds = as_built(table, settings.dome)
+        """Where they are; the controller has the table's."""
+        self._led_model = settings.leds
+        self._emitters = _emitters(self.leds)
         self._row_of_led = {int(led): row for row, led in enumerate(self.leds.ids)}
+        self._objective = Objective(
+            camera.focal_length_mm,
+            camera.focus_distance_mm,
+            camera.f_number,
+            rim_radius=camera.rim_radius,
+            rim_shift=camera.rim_shift,
+            lateral_colour=camera.lateral_colour,
+        )
+        self._camera = camera
         lens = Lens.focused(
             camera.width_px,
             camera.height_px,
@@ -55,20 +73,28 @@ class Photographer:
             focus_distance_mm=camera.focus_distance_mm,
             distortion=camera.distortion,
         )
+        self._sight = sight(lens)
+        self._falloff = vignetting(self._objective, tangents(self._sight)).astype(np.float32)
         self._viewer = Viewer(self._scene, lens, camera.samples_per_side)
-        self._shadows = Shadows(Obstacles(self._scene.corners_mm), self.leds.positions_mm, _SHADOW_BYTES)
-        self.sensor = SensorModel(camera.bayer_pattern, camera.bit_depth, camera.black_dn, seed=seed)
+        self.sensor = camera.true_sensor(settings.seed)
         self.flange_from_camera: Transform = np.array(camera.flange_from_camera)
-        self.reference_lux = self._reference_lux(base_from_support)
+        self.reference_lux = _reference_lux(_emitters(table), base_from_support)
         white_e = WHITE_SHARE * self.sensor.full_scale_e
         self._electrons = white_e * np.pi / (self.reference_lux * camera.nominal_exposure_us * 1e-6)
+        self._panels = [
+            (panels.whole(panel, base_from_support, self.reference_lux), panel.unevenness)
+            for panel in settings.panels
+        ]
+        pieces = [piece for panel, unevenness in self._panels for piece in panels.pieces(panel, unevenness)]
+        self._pieces = pieces
+        places_mm = np.array([*self.leds.positions_mm, *(piece.centre_mm for piece in pieces)])
+        self._shadows = Shadows(Obstacles(self._scene.corners_mm), places_mm, _SHADOW_BYTES)
         self._view: View | None = None
         self._places = np.empty(0, np.int32)
+        self._empty: NDArray[np.float32] | None = None
         self._base_from_camera: Transform = np.zeros((4, 4))
-        self._radiance: dict[int, NDArray[np.float32]] = {}
-        self.flicker: dict[int, float] = {}
-        """Relative rms of LEDs whose flux varies from flash to flash."""
-        self._random = np.random.default_rng(seed)
+        self._radiance: dict[int, Radiance] = {}
+        self._colour: dict[int, NDArray[np.float32]] = {}
         self._warm_up(base_from_support)
 
     def _warm_up(self, base_from_support: Transform) -> None:
@@ -78,40 +104,49 @@ class Photographer:
         view = self._look_from(base_from_support @ support_from_camera @ inverse(self.flange_from_camera))
         self._led(view, int(self.leds.ids[0]))
 
-    def _reference_lux(self, base_from_support: Transform) -> float:
-        """Median over the LEDs of the irradiance on a horizontal white target at the support's centre."""
-        centre, up = base_from_support[:3, 3], base_from_support[:3, 2]
-        return float(np.median([irradiance(emitter, centre, up)[0] for emitter in self._emitters]))
-
     def render(self, out: NDArray[np.uint16], exposed: Exposed) -> None:
         """Fill `out` [h, w] with the frame of one exposure, DN."""
         view = self._look_from(exposed.base_from_flange)
-        lights = [
-            (self._led(view, led), self._seconds(led, lit_s)) for led, lit_s in exposed.seconds_of_led.items()
-        ]
-        lit = panel_radiance(view, self._scene.materials, self.reference_lux) if exposed.panels else None
-        lights += [(lit, exposed.exposure_s) for _ in exposed.panels if lit is not None]
-        if len(lights) == 1:
-            ((radiance, seconds),) = lights
+        radiance, seconds = self._lit(view, exposed)
+        sensed: dict[str, Any] = {
+            "model": self.sensor,
+            "frame": exposed.number,
+            "exposure_s": exposed.exposure_s,
+            "gain": exposed.gain,
+            "temperature_c": self._camera.sensor_temperature_c,
+        }
+        glows = self._glows(view, exposed)
+        scale = self._electrons * seconds
+        if self._camera.blur:
+            sharp = electrons(view.triangle, radiance, self._falloff, electrons_per_radiance=scale)
+            k = self._camera.samples_per_side
+            depth_mm = view.depth_mm(self._base_from_camera)[k // 2 :: k, k // 2 :: k]
+            image = through(self._objective, sharp, depth_mm, pixel_pitch_um=self._camera.pixel_pitch_um)
+            mean_e = mosaic(image, self.sensor)
+            if glows is not None:
+                mean_e += glows
+            expose_electrons(out, mean_e, **sensed)
         else:
-            radiance, seconds = np.zeros((max(1, len(view.sides)), 3), np.float32), 1.0
-            for each, lit_s in lights:
-                radiance[: len(view.sides)] += each * np.float32(lit_s)
-        expose(
-            out,
-            view.triangle,
-            radiance,
-            self._viewer.falloff,
-            model=self.sensor,
-            electrons_per_radiance=self._electrons * seconds,
-            frame=exposed.number,
-            exposure_s=exposed.exposure_s,
-            gain=exposed.gain,
-        )
+            expose(
+                out,
+                view.triangle,
+                radiance,
+                self._falloff,
+                electrons_per_radiance=scale,
+                more_e=glows,
+                **sensed,
+            )
 
-    def _seconds(self, led: int, lit_s: float) -> float:
-        """How long an LED shone, weighted by its flicker."""
-        return lit_s * (1.0 + self.flicker.get(led, 0.0) * float(self._random.standard_normal()))
+    def _lit(self, view: View, exposed: Exposed) -> tuple[Radiance, float]:
+        """Radiance of what is seen, and for how many seconds."""
+        lights = [(self._led(view, led), lit_s) for led, lit_s in exposed.seconds_of_led.items()]
+        lights += [(self._panel(view, panel), exposed.exposure_s) for panel in exposed.panels]
+        if len(lights) == 1:
+            return lights[0]
+        radiance = np.zeros((max(1, len(view.sides)), 3), np.float32)
+        for each, lit_s in lights:
+            radiance[: len(view.sides)] += each * np.float32(lit_s)
+        return radiance, 1.0
 
     def _look_from(self, base_from_flange: Transform) -> View:
         """Rasterise from a flange pose, unless it is the last one still."""
@@ -119,29 +154,104 @@ class Photographer:
         if self._view is None or np.abs(base_from_camera - self._base_from_camera).max() > _POSE_TOLERANCE:
             self._view = self._viewer.look(base_from_camera)
             self._places = self._shadows.places(self._view.sides)
+            self._empty = None
             self._base_from_camera = base_from_camera
             self._radiance.clear()
         return self._view
 
-    def _led(self, view: View, led: int) -> NDArray[np.float32]:
-        """Radiance of the view's triangles under one LED; what fits into memory is computed once per pose."""
-        if led in self._radiance:
-            return self._radiance[led]
+    # -- what lights things -------------------------------------------------------------------------------
+
+    def _led(self, view: View, led: int) -> Radiance:
+        """Radiance of the view's triangles under one LED at its tabulated flux."""
         row = self._row_of_led[led]
-        radiance = led_radiance(
+        return self._remembered(led, lambda: self._shaded(view, self._emitters[row], row) * self._colour_of(led))
+
+    def _panel(self, view: View, panel: int) -> Radiance:
+        """Radiance of the view's triangles under panel 1 to 4."""
+        if not self._panels:
+            return panel_radiance(view, self._scene.materials, self.reference_lux)
+        if panel > len(self._panels):
+            return np.zeros((len(view.sides), 3), np.float32)
+        return self._remembered(-panel, lambda: self._lit_by_panel(view, panel))
+
+    def _lit_by_panel(self, view: View, panel: int) -> Radiance:
+        count = panels.PARTS**2
+        radiance = np.zeros((len(view.sides), 3), np.float32)
+        for piece in range((panel - 1) * count, panel * count):
+            radiance += self._shaded(view, self._pieces[piece], len(self._emitters) + piece, "lambertian")
+        return radiance
+
+    def _shaded(self, view: View, emitter: Emitter, row: int, emission: str = "") -> Radiance:
+        return led_radiance(
             view,
             self._scene.materials,
-            self._emitters[row],
-            self._emission,
+            emitter,
+            emission or self._emission,
             self._places,
             self._shadows.reached(row),
         )
+
+    def _remembered(self, light: int, compute: Callable[[], Radiance]) -> Radiance:
+        """What fits into memory is computed once per pose."""
+        if light in self._radiance:
+            return self._radiance[light]
+        radiance = compute()
         if (len(self._radiance) + 1) * radiance.nbytes <= _RADIANCE_BYTES:
-            self._radiance[led] = radiance
+            self._radiance[light] = radiance
         return radiance
 
+    def _colour_of(self, led: int) -> NDArray[np.float32]:
+        """[3] signal of white under this LED over that under the median one, at equal flux."""
+        if self._led_model.pump_spread_nm == 0.0:
+            return np.ones(3, np.float32)
+        if led not in self._colour:
+            self._colour[led] = channel_factors(self._led_model, led, light.camera()).astype(np.float32)
+        return self._colour[led]
 
-def _surface(mesh: MeshConfig) -> Surface:
+    # -- lamps in the picture -----------------------------------------------------------------------------
+
+    def _glows(self, view: View, exposed: Exposed) -> NDArray[np.float32] | None:
+        """[h, w] mean electrons of lamps that the camera looks at, or None if it sees none."""
+        seen: list[tuple[Glow, NDArray[np.float32]]] = []
+        for led, lit_s in exposed.seconds_of_led.items():
+            if spot := self._glow(view, self._emitters[self._row_of_led[led]], self._emission):
+                seen.append((spot, self._colour_of(led) * np.float32(lit_s)))
+        for panel in exposed.panels:
+            if panel <= len(self._panels):
+                whole, unevenness = self._panels[panel - 1]
+                if area := self._glow(view, whole, "lambertian", unevenness):
+                    seen.append((area, np.full(3, exposed.exposure_s, np.float32)))
+        if not seen:
+            return None
+        mean_e = np.zeros(self._falloff.shape, np.float32)
+        for lamp, seconds in seen:
+            of_row, of_column = np.ogrid[lamp.rows, lamp.columns]
+            weights = seconds[self.sensor.channels()[of_row & 1, of_column & 1]]
+            mean_e[lamp.rows, lamp.columns] += lamp.radiance * weights
+        return mean_e * self._falloff * np.float32(self._electrons)
+
+    def _glow(self, view: View, lamp: Emitter, emission: str, unevenness: float = 0.0) -> Glow | None:
+        if self._empty is None:
+            self._empty = view.empty(self._camera.samples_per_side)
+        blur = (self._objective, self._camera.pixel_pitch_um) if self._camera.blur else None
+        return glow(lamp, emission, self._sight, self._base_from_camera, self._empty, blur, unevenness)
+
+
+def _emitters(leds: Leds) -> list[Emitter]:
+    return [
+        square(position, normal, side_mm=LED_SIDE_MM, flux_lm=float(flux))
+        for position, normal, flux in zip(leds.positions_mm, leds.normals, leds.flux_lm, strict=True)
+    ]
+
+
+def _reference_lux(emitters: list[Emitter], base_from_support: Transform) -> float:
+    """Median over the LEDs of the irradiance on a horizontal white target at the support's centre."""
+    centre, up = base_from_support[:3, 3], base_from_support[:3, 2]
+    return float(np.median([irradiance(emitter, centre, up)[0] for emitter in emitters]))
+
+
+def _surface(mesh: MeshConfig, stickers: Stickers | None) -> Surface:
     given = mesh.material
     material = Material(mesh.path.stem, given.diffuse, given.f0, given.roughness) if given else None
-    return load_surface(mesh.path, mesh.unit, material)
+    surface = load_surface(mesh.path, mesh.unit, material)
+    return stickers.on(surface) if stickers else surface

@@ -20,68 +20,10 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from sim import noise
+from sim.sensor_model import SensorModel
 
-CHANNEL = {"R": 0, "G": 1, "B": 2}
 _RESPONSE, _DARK, _PIXELS, _ROWS = range(4)
 """Kinds of noise that one seed feeds."""
-
-
-@dataclass(frozen=True)
-class SensorModel:
-    """The simulated sensor; full well and range are those of the CMV12000 (facts/instrument), the rest is
-    assumed."""
-
-    bayer_pattern: str = "GBRG"
-    bit_depth: int = 12
-    black_dn: int = 64
-    full_well_e: float = 13_500.0
-    read_noise_e: float = 13.0
-    """Standard deviation of one pixel's readout."""
-    seed: int = 1
-    adc_share: float = 0.96
-    """Share of the full well that fills the ADC at gain 1. Below 1 the ADC clips first, as makers set it: at 1,
-    read noise would leave half of all saturated pixels under `white_dn`."""
-    row_noise_e: float = 1.0
-    """Standard deviation of what all pixels of a row share in one frame."""
-    prnu: float = 0.01
-    """Relative standard deviation of the pixels' responses."""
-    dsnu_e: float = 3.0
-    """Standard deviation of the pixels' offsets, the same in every frame."""
-    dark_e_per_s: float = 100.0
-    """Median dark current at `dark_reference_c`."""
-    dark_spread: float = 0.3
-    """Standard deviation of the natural logarithm of the pixels' dark currents."""
-    dark_reference_c: float = 25.0
-    dark_doubling_k: float = 6.5
-    """Warming that doubles the dark current."""
-    hot_share: float = 1e-4
-    """Share of pixels whose dark current is greater by the factor `hot_factor`."""
-    hot_factor: float = 100.0
-    ambient_e_per_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Red, green, blue: light of the room, the same on every pixel."""
-
-    @property
-    def white_dn(self) -> int:
-        return (1 << self.bit_depth) - 1
-
-    @property
-    def full_scale_e(self) -> float:
-        """Electrons that fill the ADC at gain 1; a gain divides them."""
-        return self.full_well_e * self.adc_share
-
-    @property
-    def electrons_per_dn(self) -> float:
-        """At gain 1; a gain divides it."""
-        return self.full_scale_e / (self.white_dn - self.black_dn)
-
-    def dark_factor(self, temperature_c: float) -> float:
-        """Dark current at a temperature over that at `dark_reference_c`."""
-        return float(2.0 ** ((temperature_c - self.dark_reference_c) / self.dark_doubling_k))
-
-    def channels(self) -> NDArray[np.int64]:
-        """[2, 2] channel (0 red, 1 green, 2 blue) of each place in the Bayer cell; MONO is all green."""
-        letters = self.bayer_pattern if self.bayer_pattern != "MONO" else "GGGG"
-        return np.array([CHANNEL[c] for c in letters]).reshape(2, 2)
 
 
 @dataclass(frozen=True)
@@ -125,13 +67,15 @@ def expose(
     exposure_s: float = 0.0,
     gain: float = 1.0,
     temperature_c: float = 25.0,
+    more_e: NDArray[np.float32] | None = None,
 ) -> None:
     """Fill `out` [h, w] with one frame, DN.
 
     `triangle` [h k, w k] names what k x k parts of each pixel see, a row of `radiance` [seen, 3] or -1 for
     nothing; the pixel takes their mean. Radiance times `falloff` [h, w] times `electrons_per_radiance` is the mean
     number of electrons of a pixel with response 1. `exposure_s` and `temperature_c` set dark current and ambient
-    light, `gain` divides the electrons per DN.
+    light, `gain` divides the electrons per DN. `more_e` [h, w] are mean electrons of other light, such as that of
+    lamps in the picture.
 
     Raises:
         InputError: The shapes do not fit together.
@@ -145,6 +89,8 @@ def expose(
         )
     mean_e = np.empty(out.shape, np.float32)
     _collect(mean_e, triangle, radiance, falloff, model.channels(), electrons_per_radiance)
+    if more_e is not None:
+        mean_e += more_e
     _develop(out, mean_e, *_settings(model, out.shape, frame, exposure_s, gain, temperature_c))
 
 
@@ -156,9 +102,13 @@ def electrons(
     electrons_per_radiance: float,
 ) -> NDArray[np.float32]:
     """[h, w, 3] mean electrons in all three channels at every pixel: what a stage before the Bayer filter, such as
-    the lens's blur, works on. `triangle` is [h, w]; the rest as in `expose`."""
+    the lens's blur, works on. Arguments as in `expose`."""
     seen = np.vstack([radiance, np.zeros((1, 3), np.float32)])  # the last row is nothing, which index -1 means
-    mean_e: NDArray[np.float32] = seen[triangle] * (falloff * np.float32(electrons_per_radiance))[..., None]
+    k = len(triangle) // len(falloff)
+    mean_e = np.zeros((*falloff.shape, 3), np.float32)
+    for part in range(k * k):
+        mean_e += seen[triangle[part // k :: k, part % k :: k]]
+    mean_e *= (falloff * np.float32(electrons_per_radiance / (k * k)))[..., None]
     return mean_e
 
 

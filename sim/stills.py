@@ -19,9 +19,7 @@ class Stills:
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         checked = Config.model_validate(config)
-        self._photographer = Photographer(
-            checked.scene, checked.photographed, seed=checked.settings.seed, things=checked.settings.things
-        )
+        self._photographer = Photographer(checked.scene, checked.photographed, checked.settings)
         self._shape = (checked.camera.height_px, checked.camera.width_px)
         self._taken = 0
 

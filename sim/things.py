@@ -92,6 +92,24 @@ class Sample(_Thing):
         return generators[self.kind]()
 
 
+class Stickers(BaseModel):
+    """The scanner's retro-reflective targets, stuck where the surface is flat enough."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    count: Annotated[int, Field(ge=1)]
+    seed: int = 1
+    diameter_mm: _Length = 6.0
+    gap_mm: _Length = 0.8
+    """As in `sim.objects.targets.sticker_poses`, which tells where they are."""
+
+    def on(self, surface: Surface) -> Surface:
+        """The surface with its stickers. Raises InputError if it has no room for so many."""
+        from sim.objects.targets import with_stickers
+
+        return with_stickers(surface, self.count, self.seed, diameter_mm=self.diameter_mm, gap_mm=self.gap_mm)
+
+
 Thing = Annotated[CharucoBoard | Sphere | Sample, Field(discriminator="kind")]
 
 

@@ -21,11 +21,13 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
+from coupole.devices import NO_LIGHT
 from sim import camera, gige_camera, kuka_controller, ledbox_firmware, robot
 from sim import faults as script
 from sim.camera_body import Exposed
 from sim.clock import ClockWriter
 from sim.config import CameraConfig, Config
+from sim.led_light import Flashes
 from sim.lighting import Lighting
 from sim.picture import Photographer
 from sim.reactor import Reactor
@@ -43,9 +45,8 @@ class World:
         )
         self.reactor = Reactor(self.clock)
         self.lighting = Lighting()
-        self._photographer = Photographer(
-            config.scene, config.photographed, seed=settings.seed, things=settings.things
-        )
+        self._photographer = Photographer(config.scene, config.photographed, settings)
+        self._flashes = Flashes(settings.leds)
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
         self.robot, robot_endpoint = robot.build(self.reactor, settings.robot)
         self.camera, camera_endpoint = camera.build(
@@ -70,7 +71,7 @@ class World:
             self.reactor,
             settings.ledbox,
             on_edge=self.camera.edge,
-            on_light=self.lighting.light,
+            on_light=self._light,
             on_dark=self.lighting.dark,
             on_panel=self.lighting.panel,
             ready=self.camera.ready,
@@ -105,6 +106,12 @@ class World:
         self._photographer.render(np.zeros((camera.height_px, camera.width_px), np.uint16), lit)
 
     # -- the cables ---------------------------------------------------------------------------------------
+
+    def _light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
+        """The box drives an LED, which shines as bright as it can now."""
+        if led != NO_LIGHT:
+            flux = self._flashes.flux(led, self.box.temperature_of_led_c(led))
+            self.lighting.light(led, t_on_ns, t_off_ns, flux)
 
     def _edge_counted(self, number: int) -> None:
         """The box sent, or should have sent, edge `number`: faults that wait for it happen."""
@@ -143,7 +150,7 @@ class World:
             case script.DeadLed():
                 self.box.kill_led(fault.led)
             case script.FlickeringLed():
-                self._photographer.flicker[fault.led] = fault.rms
+                self._flashes.unsteady[fault.led] = fault.rms
             case script.EmergencyStop():
                 self.robot.estop()
             case script.LateRsi():

@@ -35,6 +35,22 @@ class View:
     material: NDArray[np.int32]
     """[seen] row of the scene's materials."""
 
+    def depth_mm(self, base_from_camera: Transform) -> NDArray[np.float32]:
+        """[h k, w k] of what each pixel sees, along the optical axis; infinite where it sees nothing."""
+        axis, eye = base_from_camera[:3, 2], base_from_camera[:3, 3]
+        depths = np.append(self.centroids_mm @ axis - eye @ axis, np.inf).astype(np.float32)
+        of_pixel: NDArray[np.float32] = depths[self.triangle]
+        return of_pixel
+
+    def empty(self, samples: int) -> NDArray[np.float32]:
+        """[h, w] share of each pixel's `samples` x `samples` that sees nothing."""
+        nothing = self.triangle < 0
+        if samples > 1:
+            height, width = nothing.shape
+            nothing = nothing.reshape(height // samples, samples, width // samples, samples)
+            return np.asarray(nothing.mean(axis=(1, 3)), np.float32)
+        return nothing.astype(np.float32)
+
 
 class Viewer:
     """Looks at one scene through one lens, from any pose; `samples` k divides pixels into k x k."""
@@ -42,7 +58,6 @@ class Viewer:
     def __init__(self, scene: Scene, lens: Lens, samples: int = 1) -> None:
         self._scene = scene
         self._sight: Sight = sight(lens.supersampled(samples))
-        self.falloff = falloff(self._sight if samples == 1 else sight(lens))
 
     def look(self, base_from_camera: Transform) -> View:
         """Rasterise from a pose."""
@@ -61,14 +76,14 @@ class Viewer:
         return View(triangle, sides, centroids, normals, shading, towards, diffuse, material)
 
 
-def falloff(through: Sight) -> NDArray[np.float32]:
-    """[h, w] natural vignetting, cos^4 of the angle between a pixel's ray and the axis."""
+def tangents(through: Sight) -> NDArray[np.float64]:
+    """[h, w] tangent of the angle between a pixel's ray and the optical axis."""
     lens = through.lens
     x = (np.arange(lens.width_px)[None, :] - lens.centre_px[0]) / lens.focal_px
     y = (np.arange(lens.height_px)[:, None] - lens.centre_px[1]) / lens.focal_px
     if through.shift is not None:
         x, y = x + through.shift[..., 0], y + through.shift[..., 1]
-    return ((1.0 + x**2 + y**2) ** -2).astype(np.float32)
+    return np.asarray(np.hypot(x, y))
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)

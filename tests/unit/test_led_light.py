@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sim.led_light import (
+    STEADY,
+    Flashes,
     LedModel,
     LedSpectrum,
     camera_weights,
@@ -88,3 +92,14 @@ def test_white_stays_white_in_every_channel() -> None:
     weights = camera_weights(MODEL, light.camera())
     assert weights.shape == (3, 81)
     assert np.allclose(weights.sum(axis=1), 1.0)
+
+
+def test_an_led_with_a_loose_contact_changes_from_flash_to_flash_and_its_neighbours_do_not() -> None:
+    flashes = Flashes(STEADY)
+    flashes.unsteady[7] = 0.2
+    assert {flashes.flux(8, 40.0) for _ in range(8)} == {1.0}
+    assert np.std([flashes.flux(7, 40.0) for _ in range(2000)]) == pytest.approx(0.2, rel=0.08)
+
+
+def test_old_leds_have_lost_light() -> None:
+    assert Flashes(replace(STEADY, hours_to_70_percent=50_000.0, hours_shone=50_000.0)).flux(3, 25.0) == 0.7

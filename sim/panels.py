@@ -1,0 +1,75 @@
+"""The dome's flat white panels: they light what stands in the dome, and the camera may look at them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from coupole.geometry import Transform
+from sim.render.emitter import Emitter, irradiance
+
+PARTS = 4
+"""A panel lights in PARTS x PARTS pieces, each with a shadow of its own: together they are soft."""
+_Vector = tuple[float, float, float]
+_Length = Annotated[float, Field(gt=0)]
+
+
+class Panel(BaseModel):
+    """One square panel, in the support frame. Its upper edge is level."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    centre_mm: _Vector
+    towards_mm: _Vector = (0.0, 0.0, 0.0)
+    """A point that it faces."""
+    side_mm: _Length = 600.0
+    unevenness: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """By how much the middle of its edges is darker than its centre, which falls off as a paraboloid."""
+
+
+def whole(panel: Panel, base_from_support: Transform, lux: float) -> Emitter:
+    """The panel in the base frame, as if it were even: the flux is its centre's luminance times pi times its area.
+    It gives `lux` on a level surface at the support's centre."""
+    one = _one_lumen(panel, base_from_support)
+    given = sum(
+        float(irradiance(piece, base_from_support[:3, 3], base_from_support[:3, 2])[0])
+        for piece in pieces(one, panel.unevenness)
+    )
+    return replace(one, flux_lm=lux / given if given > 0.0 else 0.0)
+
+
+def pieces(panel: Emitter, unevenness: float) -> list[Emitter]:
+    """PARTS x PARTS squares that make up a panel."""
+    places = (2.0 * np.arange(PARTS) + 1.0) / PARTS - 1.0
+    return [
+        Emitter(
+            panel.centre_mm + u * panel.half_u_mm + v * panel.half_v_mm,
+            panel.normal,
+            panel.half_u_mm / PARTS,
+            panel.half_v_mm / PARTS,
+            panel.flux_lm / PARTS**2 * (1.0 - unevenness * (u * u + v * v)),
+        )
+        for u in places
+        for v in places
+    ]
+
+
+def _one_lumen(panel: Panel, base_from_support: Transform) -> Emitter:
+    centre = np.array(panel.centre_mm)
+    normal = np.array(panel.towards_mm) - centre
+    normal /= np.linalg.norm(normal)
+    rotation = base_from_support[:3, :3]
+    level = np.cross((0.0, 0.0, 1.0), normal)
+    length = np.linalg.norm(level)
+    level = level / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])  # it faces straight up or down
+    half_mm = 0.5 * panel.side_mm
+    return Emitter(
+        rotation @ centre + base_from_support[:3, 3],
+        rotation @ normal,
+        half_mm * (rotation @ level),
+        half_mm * (rotation @ np.cross(normal, level)),
+        1.0,
+    )

@@ -157,6 +157,7 @@ def world_config(
             "base_from_support": rig.support.base_from_support.matrix().tolist(),
             "support_diameter_mm": rig.support.diameter_mm,
             "objects": _objects(job),
+            "tool": [body.model_dump() for body in rig.tool],
         },
         "camera": {
             **sensor.model_dump(

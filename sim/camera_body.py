@@ -11,7 +11,7 @@ import random
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Protocol
 
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from coupole.geometry import Transform
+from sim.arm_bodies import NONE, Capsules
 from sim.lighting import Lighting
 from sim.reactor import Reactor
 from sim.sensor_model import SensorModel
@@ -36,6 +37,8 @@ class Exposed:
     number: int
     """Counts exposures from power-on."""
     base_from_flange: Transform
+    arm_mm: Capsules = field(default_factory=lambda: NONE)
+    """What of arm and tool stands in the light, in the base frame."""
 
 
 _RENDER_PATIENCE_S = 30.0
@@ -120,9 +123,10 @@ class CameraBody:
         lighting: Lighting,
         pose: Callable[[], Transform],
         render: Render,
+        arm: Callable[[], Capsules] = lambda: NONE,
     ) -> None:
         self._reactor, self._settings, self._wire = reactor, settings, wire
-        self._lighting, self._pose, self._render = lighting, pose, render
+        self._lighting, self._pose, self._render, self._arm = lighting, pose, render, arm
         self.readout_ns, self.gap_ns = round(readout_us * 1e3), round(exposure_gap_us * 1e3)
         self._random = random.Random(settings.seed)
         self._workers = ThreadPoolExecutor(1, "render")
@@ -210,6 +214,7 @@ class CameraBody:
             self.gain,
             number,
             self._pose(),
+            self._arm(),
         )
         working = self._workers.submit(self._work, shot, exposed)
         self._reactor.at(shot.deliver_ns, lambda: self._wait_for(working, session))

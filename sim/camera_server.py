@@ -25,6 +25,7 @@ from pydantic import Field
 
 from coupole.geometry import Transform
 from sim import camera_body
+from sim.arm_bodies import NONE, Capsules
 from sim.camera_body import CameraBody, Render, Shot
 from sim.lighting import Lighting
 from sim.reactor import Reactor
@@ -65,6 +66,7 @@ class CameraServer:
         lighting: Lighting,
         pose: Callable[[], Transform],
         render: Render,
+        arm: Callable[[], Capsules] = lambda: NONE,
     ) -> None:
         self._reactor, self._settings, self._format = reactor, settings, frame_format
         self._body = CameraBody(
@@ -76,6 +78,7 @@ class CameraServer:
             lighting=lighting,
             pose=pose,
             render=render,
+            arm=arm,
         )
         self.edge, self.ready = self._body.edge, self._body.ready
         self.lose_frames, self.ignore_edges = self._body.lose_frames, self._body.ignore_edges

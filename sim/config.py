@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sim import camera_server, kuka_controller, ledbox_firmware
 from sim import faults as script
+from sim.arm_bodies import ToolBody
 from sim.camera import CameraSettings
 from sim.camera import impossible as impossible_for_camera
 from sim.dome import DomeErrors
@@ -67,6 +68,8 @@ class SceneConfig(_Model):
     base_from_support: list[list[float]]
     support_diameter_mm: float
     objects: list[MeshConfig]
+    tool: list[ToolBody] = []
+    """What the flange carries, which stands in the light."""
 
 
 class CameraConfig(_Model):

@@ -23,6 +23,7 @@ from coupole.errors import DeviceRefused, DeviceTimeout
 from coupole.geometry import Transform
 from sim import camera_body
 from sim import gige_registers as reg
+from sim.arm_bodies import NONE, Capsules
 from sim.camera_body import CameraBody, Render, Shot
 from sim.gige_pixels import LAYOUTS, encode
 from sim.lighting import Lighting
@@ -67,6 +68,7 @@ class GigeCamera:
         lighting: Lighting,
         pose: Callable[[], Transform],
         render: Render,
+        arm: Callable[[], Capsules] = lambda: NONE,
     ) -> None:
         self._reactor, self._settings, self._bit_depth = reactor, settings, frame_format["bit_depth"]
         self._body = CameraBody(
@@ -78,6 +80,7 @@ class GigeCamera:
             lighting=lighting,
             pose=pose,
             render=render,
+            arm=arm,
         )
         self.lose_frames, self.ignore_edges = self._body.lose_frames, self._body.ignore_edges
         shape = (frame_format["height_px"], frame_format["width_px"])

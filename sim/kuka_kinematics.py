@@ -40,6 +40,11 @@ def flange_pose(joints_deg: Sequence[float]) -> Transform:
     return _chain(joints_deg)[0]
 
 
+def joint_origins_mm(joints_deg: Sequence[float]) -> NDArray[np.float64]:
+    """[6, 3] the joints' origins in the base frame."""
+    return _chain(joints_deg)[1]
+
+
 def _chain(joints_deg: Sequence[float]) -> tuple[Transform, NDArray[np.float64], NDArray[np.float64]]:
     """`base_from_flange`, and in the base frame the joints' origins in mm and their axes, each [6, 3]."""
     origins_mm, axes = np.zeros((6, 3)), np.zeros((6, 3))

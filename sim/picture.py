@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from coupole.geometry import Transform, inverse
 from sim import panels
+from sim.arm_bodies import NONE, Capsules
 from sim.blur import through
 from sim.camera_body import Exposed
 from sim.config import WHITE_SHARE, CameraConfig, MeshConfig, SceneConfig, Settings
@@ -18,6 +19,7 @@ from sim.glow import Glow, glow
 from sim.led_light import channel_factors
 from sim.materials import light
 from sim.objective import Objective, vignetting
+from sim.render.arm_shadow import cast
 from sim.render.embree import Obstacles
 from sim.render.emitter import LED_SIDE_MM, Emitter, irradiance, square
 from sim.render.lens import Lens, sight
@@ -29,7 +31,7 @@ from sim.sensor import electrons, expose, expose_electrons, mosaic
 from sim.surface import Material, Surface
 from sim.things import Stickers, placed
 
-_POSE_TOLERANCE = 1e-6
+_POSE_TOLERANCE, _ARM_TOLERANCE_MM = 1e-6, 1e-3
 _SHADOW_BYTES = 512 << 20
 _RADIANCE_BYTES = 256 << 20
 _WARM_UP_HEIGHT_MM = 1000.0
@@ -93,6 +95,7 @@ class Photographer:
         self._places = np.empty(0, np.int32)
         self._empty: NDArray[np.float32] | None = None
         self._base_from_camera: Transform = np.zeros((4, 4))
+        self._arm_mm = NONE
         self._radiance: dict[int, Radiance] = {}
         self._colour: dict[int, NDArray[np.float32]] = {}
         self._warm_up(base_from_support)
@@ -106,7 +109,7 @@ class Photographer:
 
     def render(self, out: NDArray[np.uint16], exposed: Exposed) -> None:
         """Fill `out` [h, w] with the frame of one exposure, DN."""
-        view = self._look_from(exposed.base_from_flange)
+        view = self._look_from(exposed.base_from_flange, exposed.arm_mm)
         radiance, seconds = self._lit(view, exposed)
         sensed: dict[str, Any] = {
             "model": self.sensor,
@@ -148,8 +151,14 @@ class Photographer:
             radiance[: len(view.sides)] += each * np.float32(lit_s)
         return radiance, 1.0
 
-    def _look_from(self, base_from_flange: Transform) -> View:
+    def _look_from(self, base_from_flange: Transform, arm_mm: Capsules = NONE) -> View:
         """Rasterise from a flange pose, unless it is the last one still."""
+        if (
+            arm_mm.shape != self._arm_mm.shape
+            or np.abs(arm_mm - self._arm_mm).max(initial=0.0) > _ARM_TOLERANCE_MM
+        ):
+            self._radiance.clear()
+            self._arm_mm = arm_mm
         base_from_camera = base_from_flange @ self.flange_from_camera
         if self._view is None or np.abs(base_from_camera - self._base_from_camera).max() > _POSE_TOLERANCE:
             self._view = self._viewer.look(base_from_camera)
@@ -182,7 +191,7 @@ class Photographer:
         return radiance
 
     def _shaded(self, view: View, emitter: Emitter, row: int, emission: str = "") -> Radiance:
-        return led_radiance(
+        radiance = led_radiance(
             view,
             self._scene.materials,
             emitter,
@@ -190,6 +199,8 @@ class Photographer:
             self._places,
             self._shadows.reached(row),
         )
+        cast(radiance, view.centroids_mm, self._arm_mm, emitter.centre_mm)
+        return radiance
 
     def _remembered(self, light: int, compute: Callable[[], Radiance]) -> Radiance:
         """What fits into memory is computed once per pose."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform
+from sim.arm_bodies import tool_capsules
 from sim.camera_body import Exposed
 from sim.config import Config
 from sim.picture import Photographer
@@ -20,6 +21,7 @@ class Stills:
     def __init__(self, config: Mapping[str, Any]) -> None:
         checked = Config.model_validate(config)
         self._photographer = Photographer(checked.scene, checked.photographed, checked.settings)
+        self._tool = checked.scene.tool
         self._shape = (checked.camera.height_px, checked.camera.width_px)
         self._taken = 0
 
@@ -32,10 +34,11 @@ class Stills:
         exposure_s: float,
         gain: float = 1.0,
     ) -> NDArray[np.uint16]:
-        """A RAW frame [h, w], DN, with LEDs and panels that shine throughout."""
+        """A RAW frame [h, w], DN; LEDs and panels shine throughout, and of the arm only the tool is there."""
         pixels = np.empty(self._shape, np.uint16)
         shining = dict.fromkeys(leds, exposure_s)
-        exposed = Exposed(shining, list(panels), exposure_s, gain, self._taken, base_from_flange)
+        tool = tool_capsules(base_from_flange, self._tool)
+        exposed = Exposed(shining, list(panels), exposure_s, gain, self._taken, base_from_flange, tool)
         self._photographer.render(pixels, exposed)
         self._taken += 1
         return pixels

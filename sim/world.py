@@ -24,6 +24,7 @@ from pydantic import BaseModel
 from coupole.devices import NO_LIGHT
 from sim import camera, gige_camera, kuka_controller, ledbox_firmware, robot
 from sim import faults as script
+from sim.arm_bodies import Capsules, arm_capsules, tool_capsules
 from sim.camera_body import Exposed
 from sim.clock import ClockWriter
 from sim.config import CameraConfig, Config
@@ -48,6 +49,7 @@ class World:
         self._photographer = Photographer(config.scene, config.photographed, settings)
         self._flashes = Flashes(settings.leds)
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
+        self._tool = config.scene.tool
         self.robot, robot_endpoint = robot.build(self.reactor, settings.robot)
         self.camera, camera_endpoint = camera.build(
             self.reactor,
@@ -66,6 +68,7 @@ class World:
             lighting=self.lighting,
             pose=self.robot.true_base_from_flange,
             render=self._photographer.render,
+            arm=self._arm,
         )
         self.box = ledbox_firmware.LedBoxFirmware(
             self.reactor,
@@ -106,6 +109,13 @@ class World:
         self._photographer.render(np.zeros((camera.height_px, camera.width_px), np.uint16), lit)
 
     # -- the cables ---------------------------------------------------------------------------------------
+
+    def _arm(self) -> Capsules:
+        """What of arm and tool is in the way of light."""
+        tool = tool_capsules(self.robot.true_base_from_flange(), self._tool)
+        if self._robot_settings.kind == "ur":
+            return tool
+        return np.concatenate([arm_capsules(self.robot.joints_deg), tool])
 
     def _light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
         """The box drives an LED, which shines as bright as it can now."""

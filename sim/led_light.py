@@ -59,7 +59,7 @@ class LedModel:
     spectrum: LedSpectrum = LedSpectrum()
 
 
-STEADY = LedModel(flux_spread=0.0, pump_spread_nm=0.0, flux_per_k=0.0, flicker=0.0, hours_to_70_percent=np.inf)
+STEADY = LedModel(flux_spread=0.0, pump_spread_nm=0.0, flux_per_k=0.0, flicker=0.0)
 """LEDs that give what their table says, always."""
 
 

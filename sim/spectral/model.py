@@ -1,0 +1,40 @@
+"""What the parts of a scene file have in common."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from coupole.geometry import Transform, transform
+
+Vector = tuple[float, float, float]
+Share = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0)]
+Roughness = Annotated[float, Field(ge=0.01, le=1)]
+"""GGX alpha. A perfect mirror has none: lights that are points would never be seen in it."""
+Index = Annotated[float, Field(gt=1, le=3)]
+"""Of refraction, of something transparent."""
+
+
+class Model(BaseModel):
+    """Frozen; unknown keys are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Pose(Model):
+    """Where a thing stands: translation in mm, KUKA's A, B, C in degrees."""
+
+    translation_mm: Vector = (0.0, 0.0, 0.0)
+    abc_deg: Vector = (0.0, 0.0, 0.0)
+
+    def scene_from_thing(self) -> Transform:
+        return transform(self.translation_mm, self.abc_deg)
+
+
+def unit(vector: Vector) -> Vector:
+    """`vector` at length 1."""
+    x, y, z = np.asarray(vector, dtype=float) / np.linalg.norm(vector)
+    return float(x), float(y), float(z)

@@ -125,6 +125,8 @@ class Settings(_Model):
     faults: tuple[script.Fault, ...] = ()
     things: tuple[Thing, ...] = ()
     """What stands on the support beside the plan's object."""
+    arm_shadows: bool = True
+    """Whether arm and tool stand in the light."""
     stickers: Stickers | None = None
     """On the plan's object."""
     leds: LedModel = STEADY

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform
-from sim.arm_bodies import tool_capsules
+from sim.arm_bodies import NONE, tool_capsules
 from sim.camera_body import Exposed
 from sim.config import Config
 from sim.picture import Photographer
@@ -21,7 +21,7 @@ class Stills:
     def __init__(self, config: Mapping[str, Any]) -> None:
         checked = Config.model_validate(config)
         self._photographer = Photographer(checked.scene, checked.photographed, checked.settings)
-        self._tool = checked.scene.tool
+        self._tool, self._arm_shadows = checked.scene.tool, checked.settings.arm_shadows
         self._shape = (checked.camera.height_px, checked.camera.width_px)
         self._taken = 0
 
@@ -37,7 +37,7 @@ class Stills:
         """A RAW frame [h, w], DN; LEDs and panels shine throughout, and of the arm only the tool is there."""
         pixels = np.empty(self._shape, np.uint16)
         shining = dict.fromkeys(leds, exposure_s)
-        tool = tool_capsules(base_from_flange, self._tool)
+        tool = tool_capsules(base_from_flange, self._tool) if self._arm_shadows else NONE
         exposed = Exposed(shining, list(panels), exposure_s, gain, self._taken, base_from_flange, tool)
         self._photographer.render(pixels, exposed)
         self._taken += 1

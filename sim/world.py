@@ -24,7 +24,7 @@ from pydantic import BaseModel
 from coupole.devices import NO_LIGHT
 from sim import camera, gige_camera, kuka_controller, ledbox_firmware, robot
 from sim import faults as script
-from sim.arm_bodies import Capsules, arm_capsules, tool_capsules
+from sim.arm_bodies import NONE, Capsules, arm_capsules, tool_capsules
 from sim.camera_body import Exposed
 from sim.clock import ClockWriter
 from sim.config import CameraConfig, Config
@@ -49,7 +49,7 @@ class World:
         self._photographer = Photographer(config.scene, config.photographed, settings)
         self._flashes = Flashes(settings.leds)
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
-        self._tool = config.scene.tool
+        self._tool, self._arm_shadows = config.scene.tool, settings.arm_shadows
         self.robot, robot_endpoint = robot.build(self.reactor, settings.robot)
         self.camera, camera_endpoint = camera.build(
             self.reactor,
@@ -112,6 +112,8 @@ class World:
 
     def _arm(self) -> Capsules:
         """What of arm and tool is in the way of light."""
+        if not self._arm_shadows:
+            return NONE
         tool = tool_capsules(self.robot.true_base_from_flange(), self._tool)
         if self._robot_settings.kind == "ur":
             return tool

@@ -84,7 +84,8 @@ class CellFolder:
         rig["dome"]["leds"] = str(REPO / "configs/domes/coupole.csv")
         rig["ledbox"]["settings"]["watchdog_s"] = 4 * self.speed  # of the world's time; the machine may be busy
         rig["storage"] = {"folder": str(self.folder / "storage"), "reserve_bytes": 0}
-        rig["world"] = {"serves": "always", "settings": {"seed": 1, "speed": self.speed}}
+        settings = {"seed": 1, "speed": self.speed, "arm_shadows": False}  # `Expectation` knows of no arm
+        rig["world"] = {"serves": "always", "settings": settings}
         self.rig_data = rig
         self.plan_data = {
             "schema_version": 1,

@@ -4,8 +4,8 @@ The extra `gentl` installs both. Any maker's producer gives access to its camera
 the producer's buffer into page-aligned memory of ours, 8-bit and packed ones widened on the way, and the producer
 gets its buffer back at once.
 
-What the tests have run is the producer that the package genicam ships (no trigger, no timestamps), so triggers,
-counters and camera timestamps have **never been seen working** here.
+The tests run it on a producer of their own (tests/conformance/gentl_producer), and on the one that the package
+genicam ships, which knows no trigger. **No real camera** has been seen behind it yet.
 """
 
 from __future__ import annotations
@@ -16,27 +16,25 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceRefused
-from drivers.aravis_pixels import FORMATS, PixelFormat, pixels_in_a_group, widen
 from drivers.frame_pool import FramePool, Slot
 from drivers.gentl_features import Features
+from drivers.gentl_image import copy_pixels, frame_format, pixel_format, readout_us, set_region, timestamp_ns
 from drivers.gentl_producer import Gaps, open_camera, reporting, told, when_incomplete
-from drivers.gentl_settings import Counter, Region, Settings
+from drivers.gentl_settings import Counter, Settings
 from drivers.turns import Turns
 
-_NO_WAIT_S = 1e-9
+_A_LOOK_S = 1e-4
+"""harvesters may not look at all in less: its clock steps by 0.2 us."""
 _NAP_S = 1e-3
 """Between two looks for a frame: genicam 1.6 would keep all of Python waiting while it waits."""
+_SILENCE_S = 0.5
+"""Without frames for so long, the camera is asked whether it is there: not every producer tells when it goes."""
 _IN_HAND = 16
 """Frames that are on their way to the disk at once."""
 _LAST_WIDE_ID = 2**62
 """Stands for the end of 64-bit ids, which is never reached."""
-_PLAIN_IMAGE = 1
-"""PAYLOAD_TYPE_IMAGE of the GenTL standard."""
 
 
 class GenTLCamera:
@@ -53,6 +51,7 @@ class GenTLCamera:
         self._turns, self._armed = Turns(), threading.Event()
         self._gaps = Gaps()
         self._counted_before = (0, 0)
+        self._heard_s = 0.0
         self._last = CameraStatistics(-1, 0, 0, -1, 0)
         self._harvester, self._acquirer, self._info = open_camera(settings)
         try:
@@ -72,21 +71,8 @@ class GenTLCamera:
     def _set_up(self) -> None:
         self._features.write_all(self._settings.features)
         if self._settings.region is not None:
-            self._set_region(self._settings.region)
+            set_region(self._features, self._settings.region)
         self._features.write("PixelFormat", self._settings.pixel_format)
-
-    def _set_region(self, region: Region) -> None:
-        """Offsets first to zero: they bound the size, and the size bounds them."""
-        for name, value in (
-            ("OffsetX", 0),
-            ("OffsetY", 0),
-            ("Width", region.width_px),
-            ("Height", region.height_px),
-            ("OffsetX", region.left_px),
-            ("OffsetY", region.top_px),
-        ):
-            if value or self._features.has(name):
-                self._features.write(name, value)
 
     def _ids(self) -> tuple[int, int]:
         """16 bits on GigE Vision, unless the camera says that it uses the extended ones; else 64."""
@@ -100,8 +86,10 @@ class GenTLCamera:
         with contextlib.suppress(DeviceError):
             self.disarm()
         with self._turns.mine():
-            self._acquirer.destroy()
-            self._harvester.reset()
+            with contextlib.suppress(DeviceError), reporting(self._name, "the camera to close"):
+                self._acquirer.destroy()
+            with contextlib.suppress(DeviceError), reporting(self._name, "the producer to close"):
+                self._harvester.reset()
 
     # -- who it is ----------------------------------------------------------------------------------------
 
@@ -125,7 +113,7 @@ class GenTLCamera:
         with self._turns.mine():
             if not self._settings.free_running:
                 self._set_exposure(exposure)
-            self._format = self._frame_format()
+            self._format = frame_format(self._features, self._name, self._settings.black_dn)
         self._exposure = exposure
         return self._format
 
@@ -150,50 +138,10 @@ class GenTLCamera:
         if exposure.gain_db or features.has("Gain"):
             features.write("Gain", float(exposure.gain_db))
 
-    def _frame_format(self) -> FrameFormat:
-        features, pixel_format = self._features, self._pixel_format()
-        width_px, height_px = int(features.number("Width")), int(features.number("Height"))
-        if width_px * height_px % pixels_in_a_group(pixel_format):
-            raise DeviceRefused(
-                self._name,
-                expected=f"an image whose pixels fill whole bytes in {pixel_format.name}",
-                happened=f"it has {width_px} x {height_px}",
-                remedy="Choose another region or pixel format in the rig.",
-            )
-        black_dn = self._settings.black_dn
-        if black_dn is None:
-            black_dn = round(features.number("BlackLevel")) if features.has("BlackLevel") else 0
-        bits = pixel_format.bit_depth
-        return FrameFormat(height_px, width_px, bits, pixel_format.bayer_pattern, black_dn, (1 << bits) - 1)
-
-    def _pixel_format(self) -> PixelFormat:
-        name = str(self._features.read("PixelFormat"))
-        if name not in FORMATS:
-            raise DeviceRefused(
-                self._name,
-                expected="a Bayer or mono format of 8 to 16 bits",
-                happened=f"it sends {name}",
-                remedy=f"Choose one of {', '.join(FORMATS)} for `pixel_format` in the rig.",
-            )
-        return FORMATS[name]
-
     def min_period_us(self, exposure: Exposure) -> int:
-        return max(self._readout_us(), exposure.exposure_us + self._settings.exposure_gap_us)
-
-    def _readout_us(self) -> int:
-        if self._settings.readout_us is not None:
-            return self._settings.readout_us
         with self._turns.mine():
-            if self._features.has("SensorReadoutTime"):
-                return int(np.ceil(self._features.number("SensorReadoutTime")))
-            if self._features.has("AcquisitionFrameRate"):
-                return int(np.ceil(1e6 / self._features.bounds("AcquisitionFrameRate")[1]))
-        raise DeviceRefused(
-            self._name,
-            expected="the camera's readout time",
-            happened="it has neither `SensorReadoutTime` nor `AcquisitionFrameRate`",
-            remedy="Give `readout_us` in the camera's settings of the rig, from its data sheet.",
-        )
+            readout = readout_us(self._features, self._name, self._settings.readout_us)
+        return max(readout, exposure.exposure_us + self._settings.exposure_gap_us)
 
     # -- acquisition --------------------------------------------------------------------------------------
 
@@ -201,18 +149,19 @@ class GenTLCamera:
         if self._format is None:
             raise self._misused("configure() before arm()", "no exposure is set")
         self.disarm()
-        wanted = max(buffers, self._settings.buffers)
+        wanted = max(buffers, self._settings.buffers, self._acquirer.min_num_buffers)
         slots = min(wanted, _IN_HAND)
         if (self._pool.slots, self._pool.slot_bytes) != (slots, self._format.frame_bytes):
             self._pool = FramePool(slots, self._format.frame_bytes)
         self._pool.begin()
         with self._turns.mine():
-            self._wire_format = self._pixel_format()
+            self._wire_format = pixel_format(self._features, self._name)
             self._gaps.begin(self.id_modulus)
             self._counted_before = self._count()
             with reporting(self._name, "the acquisition to start"):
                 self._acquirer.num_buffers = wanted
                 self._acquirer.start()
+            self._heard_s = time.monotonic()
             self._armed.set()
 
     def next_frame(self, timeout_s: float) -> Frame | None:
@@ -223,15 +172,25 @@ class GenTLCamera:
                 slot = self._pool.take(left_s)
                 frame = self._fetch(slot) if slot is not None else None
                 if frame is not None:
+                    self._heard_s = time.monotonic()
                     return frame
+                self._listen()
             if time.monotonic() >= end_s:
                 return None
             time.sleep(_NAP_S)
 
+    def _listen(self) -> None:
+        """Raises DeviceLost if the camera has been silent for long and does not answer."""
+        if time.monotonic() > self._heard_s + _SILENCE_S:
+            with self._turns.mine():
+                if self._armed.is_set():
+                    self._features.expect_answer()
+            self._heard_s = time.monotonic()
+
     def _fetch(self, slot: Slot) -> Frame | None:
         """The oldest whole image that has come, in `slot`; None, and the slot is free again, if there is none."""
         with self._turns.mine(), reporting(self._name, "an image"):
-            buffer = self._acquirer.try_fetch(timeout=_NO_WAIT_S, is_raw=True) if self._armed.is_set() else None
+            buffer = self._acquirer.try_fetch(timeout=_A_LOOK_S, is_raw=True) if self._armed.is_set() else None
             if buffer is None:
                 slot.release()
                 return None
@@ -241,50 +200,12 @@ class GenTLCamera:
                 buffer.parent.queue_buffer(buffer)
 
     def _frame(self, buffer: Any, slot: Slot) -> Frame:
-        """Raises DeviceRefused for an image that is not what `configure` promised."""
         assert self._format is not None
-        promised, wire = self._format, self._wire_format
-        wanted = {
-            "payload_type": _PLAIN_IMAGE,
-            "height": promised.height_px,
-            "width": promised.width_px,
-            "pixel_format": wire.code,
-            "padding_x": 0,
-        }
-        for what, value in wanted.items():
-            seen = told(buffer, what)
-            if seen not in {None, value}:
-                raise DeviceRefused(
-                    self._name,
-                    expected=f"images with {what} {value}",
-                    happened=f"one came with {seen}",
-                    remedy="Set the camera up in the rig so that it sends plain images of one size and format.",
-                )
-        offset = told(buffer, "image_offset") or 0
-        wire_bytes = wire.wire_bytes(promised.height_px * promised.width_px)
-        data = np.frombuffer(buffer.raw_buffer, np.uint8, wire_bytes, offset)
-        pixels = slot.memory.view(np.uint16)
-        _copy(pixels, data, wire)
+        pixels = copy_pixels(buffer, slot.memory, self._format, self._wire_format, self._name)
         self._gaps.whole(int(buffer.frame_id))
-        return Frame(
-            frame_id=int(buffer.frame_id),
-            timestamp_ns=self._timestamp_ns(buffer),
-            pixels=pixels.reshape(promised.height_px, promised.width_px),
-            release=slot.release,
-        )
-
-    def _timestamp_ns(self, buffer: Any) -> int:
-        if self._settings.timestamps == "host":
-            return self._clock.now_ns()
-        stamp_ns = told(buffer, "timestamp_ns")
-        if stamp_ns is None:
-            raise DeviceRefused(
-                self._name,
-                expected="timestamps in nanoseconds from the producer",
-                happened="it gives none",
-                remedy="Set `timestamps: host` to look through this camera; shots cannot be proven with it.",
-            )
-        return stamp_ns
+        by_host = self._settings.timestamps == "host"
+        stamp_ns = self._clock.now_ns() if by_host else timestamp_ns(buffer, self._acquirer.device, self._name)
+        return Frame(int(buffer.frame_id), stamp_ns, pixels, slot.release)
 
     def trigger(self) -> None:
         if self._settings.free_running or self._exposure is None or self._exposure.hardware_trigger:
@@ -344,10 +265,3 @@ class GenTLCamera:
 
 def _since(count: int, before: int) -> int:
     return count if count < 0 else count - before
-
-
-def _copy(pixels: NDArray[np.uint16], data: NDArray[np.uint8], wire: PixelFormat) -> None:
-    if wire.packing == "two bytes":
-        pixels[:] = data.view("<u2")
-    else:
-        widen(pixels, data, wire)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NoReturn
 
-from coupole.errors import DeviceRefused
+from coupole.errors import DeviceLost, DeviceRefused
 from drivers.gentl_settings import Value
 
 _READBACK_TOLERANCE = 0.01
@@ -25,7 +25,8 @@ _TYPES: dict[str, tuple[type, ...]] = {
 class Features:
     """Reads and writes the features of one camera; `device` is its name in the rig.
 
-    Each method raises DeviceRefused where the camera has no such feature or says no.
+    Each method raises DeviceRefused where the camera has no such feature or says no, DeviceLost where it does not
+    answer.
     """
 
     def __init__(self, node_map: Any, device: str) -> None:
@@ -33,12 +34,24 @@ class Features:
         import genicam.gentl
 
         self._genapi = genicam.genapi
-        self._errors = (genicam.genapi.GenericException, genicam.gentl.GenericException)
+        gentl = genicam.gentl
+        self._errors = (genicam.genapi.GenericException, gentl.GenericException)
+        self._silence = (gentl.IoException, gentl.TimeoutException, gentl.InvalidHandleException)
         self._nodes, self._device = node_map, device
 
     def has(self, name: str) -> bool:
         """True if the camera has the feature and it can be used now."""
-        return bool(self._nodes.has_node(name) and self._genapi.is_available(self._nodes.get_node(name).node))
+        try:
+            return bool(self._nodes.has_node(name) and self._genapi.is_available(self._nodes.get_node(name).node))
+        except self._errors as error:
+            self._failed(f"to learn whether it has `{name}`", error)
+
+    def expect_answer(self) -> None:
+        """Ask the camera itself, not what is remembered of it. Raises DeviceLost."""
+        try:
+            self._node("Width").get_value(ignore_cache=True)
+        except self._errors as error:
+            self._gone("the camera to answer", error)
 
     def first_of(self, *names: str) -> str | None:
         """The first of these features that the camera has."""
@@ -51,7 +64,7 @@ class Features:
         try:
             value: Value = node.value
         except self._errors as error:
-            self._refuse(f"a value of `{name}`", str(error))
+            self._failed(f"a value of `{name}`", error)
         return value
 
     def number(self, name: str) -> float:
@@ -66,20 +79,23 @@ class Features:
         node = self._node(name)
         if self._kind(node) not in {"IInteger", "IFloat"}:
             self._refuse(f"a number in `{name}`", f"it is a {self._kind(node)[1:].lower()}")
-        return float(node.min), float(node.max)
+        try:
+            return float(node.min), float(node.max)
+        except self._errors as error:
+            self._failed(f"the bounds of `{name}`", error)
 
     def write(self, name: str, value: Value) -> None:
         """Set a feature and read it back; `True` runs a command."""
         node = self._node(name)
-        self._check(name, node, value)
         try:
+            self._check(name, node, value)
             if self._kind(node) == "ICommand":
                 node.execute()
                 return
             node.value = value
             held = node.value
         except self._errors as error:
-            self._refuse(f"`{name}` to take {value!r}", str(error))
+            self._failed(f"`{name}` to take {value!r}", error)
         if not _alike(held, value):
             self._refuse(f"`{name}` to hold {value!r} once it is set", f"it holds {held!r}")
 
@@ -116,6 +132,20 @@ class Features:
             self._refuse(f"{node.min:.10g} to {node.max:.10g} for `{name}`", f"{value:.10g} was given")
         if self._kind(node) == "IInteger" and node.inc > 1 and (value - node.min) % node.inc:
             self._refuse(f"{node.min} plus a multiple of {node.inc} for `{name}`", f"{value:.10g} was given")
+
+    def _failed(self, expected: str, error: Exception) -> NoReturn:
+        """A camera that does not answer is gone, whatever it was asked."""
+        if isinstance(error, self._silence):
+            self._gone(expected, error)
+        self._refuse(expected, str(error))
+
+    def _gone(self, expected: str, error: Exception) -> NoReturn:
+        raise DeviceLost(
+            self._device,
+            expected=expected,
+            happened=str(error),
+            remedy="Check cable and power, then resume the run.",
+        ) from error
 
     def _refuse(self, expected: str, happened: str) -> NoReturn:
         raise DeviceRefused(

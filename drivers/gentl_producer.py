@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import signal
 import threading
 from collections.abc import Iterator
@@ -10,6 +11,10 @@ from typing import Any
 
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.gentl_settings import Settings
+
+_LOG = logging.getLogger("harvesters")
+"""In place of harvesters' own, which prints to the terminal what is raised here anyway."""
+_LOG.addHandler(logging.NullHandler())
 
 
 def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
@@ -24,11 +29,14 @@ def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
         ) from error
     if not settings.producer.is_file():
         raise _lost(name, f"a GenTL producer {settings.producer}", "there is no such file", "Correct the rig.")
-    harvester = Harvester()
+    harvester = Harvester(logger=_LOG)
     handler = signal.getsignal(signal.SIGINT)
     try:
         harvester.add_file(str(settings.producer))
         harvester.update()
+        if not harvester.device_info_list:
+            harvester.reset()
+            _open_in_vain(str(settings.producer))
         found = [(one, _describe(one)) for one in harvester.device_info_list]
         wanted = {"serial": settings.serial, "model": settings.model}
         fitting = [
@@ -53,6 +61,23 @@ def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, handler)  # harvesters would catch Ctrl-C and close the camera
     return harvester, acquirer, fitting[0][1]
+
+
+def _open_in_vain(producer: str) -> None:
+    """Raises what the producer says if it does not open: harvesters keeps that to itself and finds no camera.
+
+    A producer can be open but once in a process (GenTL standard, GCInitLib).
+    """
+    import genicam.gentl
+
+    library = genicam.gentl.GenTLProducer.create_producer()
+    library.open(producer)
+    try:
+        system = library.create_system()
+        system.open()
+        system.close()
+    finally:
+        library.close()
 
 
 def _opening_failed(name: str, error: Exception) -> DeviceError:

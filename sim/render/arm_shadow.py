@@ -18,7 +18,7 @@ def cast(
     light_mm: NDArray[np.float64],
 ) -> None:
     """Set `radiance` [n, 3] to 0 where a capsule of [m, 7] (two ends, radius) hides the light from a centroid."""
-    if len(centroids_mm) == 0:
+    if len(centroids_mm) == 0 or len(capsules_mm) == 0:
         return
     low, high = centroids_mm.min(axis=0).astype(np.float64), centroids_mm.max(axis=0).astype(np.float64)
     middle, reach = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))

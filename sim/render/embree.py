@@ -23,6 +23,10 @@ _TRIANGLES, _INDEX, _VERTEX, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
 _COMPACT, _ROBUST = 1 << 1, 1 << 2
 _PACKET = 16
 _CHUNK = 4096
+_COHERENT, _ALL_FEATURES = 1 << 16, 0xFFFFFFFF
+_ARGUMENTS = np.array([_ALL_FEATURES << 32 | _COHERENT, 0, 0, 0, 0, 0], np.uint64)
+"""RTCOccludedArguments: flags, features; no context, filter or function. Rays from neighbouring triangles to one
+light go the same way through the tree."""
 OFFSET_MM = 2e-3
 """A shadow ray starts so far above its triangle, on the light's side: ten times the rounding of float32
 coordinates of 2 m, and a hundredth of a scanned triangle."""
@@ -98,7 +102,7 @@ class Obstacles:
         zero for every place before; sides that face away from the light keep it.
         """
         address, scene = self._library.occluded, np.uint64(self._scene)
-        _trace(address, scene, self.corners_mm, sides, light_mm, first, bits)
+        _trace(address, scene, self.corners_mm, sides, light_mm, first, bits, _ARGUMENTS)
 
     def __del__(self) -> None:
         if hasattr(self, "_scene"):
@@ -106,17 +110,17 @@ class Obstacles:
             self._library.release_device(self._device)
 
 
-def _occluded16(_context, _address, _valid, _scene, _rays):  # type: ignore[no-untyped-def]
-    """`rtcOccluded16(valid, scene, rays, NULL)` at an address that is an argument, so that code can be cached."""
+def _occluded16(_context, _address, _valid, _scene, _rays, _arguments):  # type: ignore[no-untyped-def]
+    """`rtcOccluded16(valid, scene, rays, arguments)` at an address that is one too, so that code can be cached."""
 
     def generate(context, builder, _signature, values):  # type: ignore[no-untyped-def]
         word = ir.IntType(64)
         kind = ir.FunctionType(ir.VoidType(), [word] * 4)
         function = builder.inttoptr(values[0], kind.as_pointer())
-        builder.call(function, [values[1], values[2], values[3], word(0)])
+        builder.call(function, values[1:])
         return context.get_dummy_value()
 
-    return types.void(types.uint64, types.uint64, types.uint64, types.uint64), generate
+    return types.void(types.uint64, types.uint64, types.uint64, types.uint64, types.uint64), generate
 
 
 _call_occluded16: Any = intrinsic(_occluded16)
@@ -139,7 +143,7 @@ def centroid_and_normal(corners, t, centroid, normal):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _trace(occluded, scene, corners, sides, light, first, bits):  # type: ignore[no-untyped-def]
+def _trace(occluded, scene, corners, sides, light, first, bits, arguments):  # type: ignore[no-untyped-def]
     chunks = -(-len(sides) // _CHUNK)
     start = first // _CHUNK
     for chunk in numba.prange(start, chunks):
@@ -163,7 +167,13 @@ def _trace(occluded, scene, corners, sides, light, first, bits):  # type: ignore
                 lane += 1
             if lane == _PACKET or (place == last - 1 and lane > 0):
                 valid[lane:] = 0
-                _call_occluded16(occluded, np.uint64(valid.ctypes.data), scene, np.uint64(rays.ctypes.data))
+                _call_occluded16(
+                    occluded,
+                    np.uint64(valid.ctypes.data),
+                    scene,
+                    np.uint64(rays.ctypes.data),
+                    np.uint64(arguments.ctypes.data),
+                )
                 for k in range(lane):
                     if rays[8, k] >= 0.0:  # Embree sets tfar of a ray that hit something to minus infinity
                         bits[place_of_lane[k] >> 3] |= np.uint8(1 << (place_of_lane[k] & 7))

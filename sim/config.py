@@ -127,6 +127,8 @@ class Settings(_Model):
     """What stands on the support beside the plan's object."""
     arm_shadows: bool = True
     """Whether arm and tool stand in the light."""
+    material: MaterialConfig | None = None
+    """Of the plan's object, times its mesh's own colours; without it these alone, or a warm stone."""
     stickers: Stickers | None = None
     """On the plan's object."""
     leds: LedModel = STEADY

@@ -29,7 +29,7 @@ from sim.render.view import View, Viewer, tangents
 from sim.scene import Leds, build_scene, load_surface, read_leds, support_disk
 from sim.sensor import electrons, expose, expose_electrons, mosaic
 from sim.surface import Material, Surface
-from sim.things import Stickers, placed
+from sim.things import placed
 
 _POSE_TOLERANCE, _ARM_TOLERANCE_MM = 1e-6, 1e-3
 _SHADOW_BYTES = 512 << 20
@@ -46,7 +46,7 @@ class Photographer:
         base_from_support = np.array(scene.base_from_support)
         surfaces = [(support_disk(scene.support_diameter_mm), base_from_support)]
         surfaces += [
-            (_surface(mesh, settings.stickers), base_from_support @ np.array(mesh.support_from_object))
+            (_surface(mesh, settings), base_from_support @ np.array(mesh.support_from_object))
             for mesh in scene.objects
         ]
         surfaces += placed(settings.things, base_from_support)
@@ -261,8 +261,8 @@ def _reference_lux(emitters: list[Emitter], base_from_support: Transform) -> flo
     return float(np.median([irradiance(emitter, centre, up)[0] for emitter in emitters]))
 
 
-def _surface(mesh: MeshConfig, stickers: Stickers | None) -> Surface:
-    given = mesh.material
+def _surface(mesh: MeshConfig, settings: Settings) -> Surface:
+    given = mesh.material or settings.material
     material = Material(mesh.path.stem, given.diffuse, given.f0, given.roughness) if given else None
     surface = load_surface(mesh.path, mesh.unit, material)
-    return stickers.on(surface) if stickers else surface
+    return settings.stickers.on(surface) if settings.stickers else surface

@@ -8,7 +8,7 @@
 `render`                              passes, Stokes vectors
 `colour`, `pictures`                  observer, adaptation, sRGB; EXR and PNG
 `studio`                              one scene from checked data to files
-`arcature`, `caustic`                 a gilded niche, and the sun's light in it by photons
+`arcature`, `caustic`, `wall`         a gilded niche, and the sun's light in it by photons
 `interreflection`                     light from surface to surface for the simulated camera
 ====================================  =================================================================
 

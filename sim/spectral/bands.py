@@ -1,12 +1,12 @@
 """81 bands through a renderer that carries four wavelengths along a path.
 
-Mitsuba's spectral variants draw one wavelength from each quarter of 360 to 830 nm for every path. If a spectrum is
-constant over each quarter, four bands of ours are rendered at once, without any noise of the choice of wavelengths;
-with the same seed every group of four meets the same random numbers. So noise is that of light, not of colour.
-(A film of 81 channels and full spectra took 5.6 times as long here for four times the noise.)
+Mitsuba's spectral variants draw one wavelength from each quarter of 360 to 830 nm for every path. If a spectrum
+is constant over each quarter, four bands of ours are rendered at once, without any noise of the choice of
+wavelengths; with the same seed every group of four meets the same random numbers. So noise is that of light, not
+of colour. (A film of 81 channels and full spectra took 5.6 times as long here for three times the noise.)
 
-A scene is described once, with an array [81] wherever a spectrum stands; `for_group` puts in its place what Mitsuba
-shall see of it.
+A scene is described once, with an array [81] wherever a spectrum stands; `for_group` puts in its place what
+Mitsuba shall see of it.
 """
 
 from __future__ import annotations

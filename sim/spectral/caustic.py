@@ -1,8 +1,9 @@
-"""The caustic that gilding throws on stone, by photons: sunlight through the opening of a niche (seed 001, figure 9).
+"""The caustic that gilding throws on stone, by photons: sunlight through a niche's opening (seed 001, figure 9).
 
-Photons start evenly over the opening, are thrown on by gold as often as they meet it, and stay where they meet stone:
-this is the first pass of photon mapping (Jensen 1999). A photon carries all 81 bands, as metal bends none of them apart.
-It meets microfacets of GGX, drawn as the photon sees them (Heitz, JCGT 7(4), 2018), and keeps Fresnel's share of them.
+Photons start evenly over the opening, are thrown on by gold as often as they meet it, and stay where they meet
+stone: this is the first pass of photon mapping (Jensen 1999). A photon carries all 81 bands, as metal bends none
+of them apart. It meets microfacets of GGX, drawn as it sees them (Heitz, JCGT 7(4), 2018), and Fresnel's share of
+it goes on.
 """
 
 from __future__ import annotations
@@ -84,7 +85,8 @@ def photons(niche: Niche, sun: Sun, opening_mm: tuple[float, float, float], coun
 def irradiance(
     found: Photons, width_mm: tuple[float, float], height_mm: float, cell_mm: float, y_mm: float
 ) -> Array:
-    """[rows, columns, 81] W/(m^2 nm) on the plane y = `y_mm`: x over `width_mm`, z from 0 to `height_mm`, top first."""
+    """[rows, columns, 81] W/(m^2 nm) on the plane y = `y_mm`: x over `width_mm`, z from 0 to `height_mm`, top
+    first."""
     from scipy.sparse import csr_matrix
 
     columns, rows = round((width_mm[1] - width_mm[0]) / cell_mm), round(height_mm / cell_mm)

@@ -1,7 +1,7 @@
 """A stack of films as one metal: Mitsuba's rough conductor knows complex indices, but no films.
 
-At each wavelength the index n + i k of bulk is sought that reflects as the stack does: exactly along the normal, and
-as well as it can at other angles. A metal leaf finds itself nearly unchanged; a film that interferes finds an
+At each wavelength the index n + i k of bulk is sought that reflects as the stack does: exactly along the normal,
+and as well as it can at other angles. A metal leaf finds itself nearly unchanged; a film that interferes finds an
 index that is no substance's, and where its hues shift much with the angle none serves.
 """
 
@@ -27,7 +27,7 @@ def equivalent_index(reflectance: Callable[[Array], Array]) -> Complex:
     """
     wanted = reflectance(_COSINES)
     normal = np.clip(wanted[0], 1e-6, 1.0 - 1e-6)
-    # R = ((n-1)^2 + k^2)/((n+1)^2 + k^2) at normal incidence: k follows from n, which lies between the two n of k = 0.
+    # R = ((n-1)^2 + k^2)/((n+1)^2 + k^2) along the normal: k follows from n, between the two n that need no k.
     root = np.sqrt(normal)
     least, most = (1.0 - root) / (1.0 + root), (1.0 + root) / (1.0 - root)
     n = least * (most / least) ** np.linspace(0.0, 1.0, _TRIED)[:, None]
@@ -37,8 +37,8 @@ def equivalent_index(reflectance: Callable[[Array], Array]) -> Complex:
     off = float(np.abs(tried[:, best, np.arange(BANDS)] - wanted).max())
     if off > MOST_OFF:
         raise InputError(
-            f"films: expected a stack that reflects like a metal within {MOST_OFF}; its reflectance changes with the "
-            f"angle by {off:.2f} more than any bulk's. Take thinner films, or fewer"
+            f"films: expected a stack that reflects like some bulk within {MOST_OFF} at all angles; the nearest "
+            f"is off by {off:.2f}. Take thinner films, or fewer"
         )
     chosen: Complex = n[best, np.arange(BANDS)] + 1j * k[best, np.arange(BANDS)]
     return chosen

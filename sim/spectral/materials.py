@@ -1,4 +1,4 @@
-"""Materials of a scene file, and what each is in Mitsuba: its own plugins, with spectra that `sim.materials` computes.
+"""Materials of a scene file, and what each is in Mitsuba: its own plugins, with spectra of `sim.materials`.
 
 Kept: complex indices of metals, interference in films by reflectance at every angle, Kubelka and Munk's layers,
 Fresnel's surface with all inner reflections (Saunderson), GGX facets, polarisation by surfaces. Simplified: bodies
@@ -139,8 +139,8 @@ def coated(body: Array, index: float, roughness: float) -> Description:
     """A body of reflectance `body` [81] inside a medium with a glossy face.
 
     Mitsuba's polarised plastic (Baek et al. 2020) lets light in and out once. All inner reflections together make
-    it body/(n^2 (1 - k2 body)), with k2 the face's reflectance for diffuse light from within: then light that comes
-    along the normal is returned as Saunderson says.
+    it body/(n^2 (1 - k2 body)), with k2 the face's reflectance for diffuse light from within: then light that
+    comes along the normal is returned as Saunderson says.
     """
     return {
         "type": "pplastic",
@@ -220,8 +220,8 @@ def _gilt(material: Gilt, folder: Path) -> Description:
 def _sum(mirror: Description, mirror_share: Array, through: Array) -> Description:
     """A metal and a Lambertian part together.
 
-    Mitsuba blends, w of one and 1 - w of the other; each is divided by its weight first. The weight is the same for
-    all bands, so that they share their paths.
+    Mitsuba blends, w of one and 1 - w of the other; each is divided by its weight first. The weight is the same
+    for all bands, so that they share their paths.
     """
     weight = float(np.clip(through.mean() / (through + mirror_share).mean(), _LEAST_SHARE, 1.0 - _LEAST_SHARE))
     stronger = {**mirror, "specular_reflectance": mirror["specular_reflectance"] / (1.0 - weight)}

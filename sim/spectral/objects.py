@@ -221,7 +221,7 @@ def _nashiji(thing: NashijiSlab) -> list[Piece]:
     parts = [Piece(slab(width, length, _NASHIJI_BODY_MM) + middle, black)]
     points, faces = nashiji.triangulate(found, around=12, along=4)
     top_mm = _NASHIJI_BODY_MM + thing.depth_mm
-    corners = (points + [0.0, 0.0, top_mm])[faces].reshape(len(found.centres_mm), -1, 3, 3)
+    corners = (points + np.array([0.0, 0.0, top_mm]))[faces].reshape(len(found.centres_mm), -1, 3, 3)
     level = (-found.centres_mm[:, 2] / thing.depth_mm * _NASHIJI_LEVELS).astype(int).clip(0, _NASHIJI_LEVELS - 1)
     for k in np.unique(level):
         depth_mm = (k + 0.5) / _NASHIJI_LEVELS * thing.depth_mm

@@ -87,16 +87,15 @@ def _write_exr(path: Path, scene: Scene, found: Spectral, xyz: Array, about: str
     names = list("XYZ") if scene.outputs.xyz else []
     for number, part in enumerate(found.stokes):
         planes.append(part)
-        names += [f"S{number}.{nm:g}nm".replace(".", ",").replace(",", ".", 1) for nm in found.wavelengths_nm]
+        names += [f"S{number}.{nm:.0f}nm" for nm in found.wavelengths_nm]
     pixels = np.concatenate(planes, axis=2).astype(np.float32)
     if scene.outputs.spectra == "half" and np.abs(pixels).max() > _HALF_MOST:
         raise InputError(
-            f"{path.name}: expected values up to {_HALF_MOST:g} for half precision, found {np.abs(pixels).max():.3g}; "
-            "write `outputs: {spectra: float}`"
+            f"{path.name}: expected values up to {_HALF_MOST:g} for half precision, found "
+            f"{np.abs(pixels).max():.3g}; write `outputs: {{spectra: float}}`"
         )
-    bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, names)
-    if scene.outputs.spectra == "half":
-        bitmap = bitmap.convert(component_format=mi.Struct.Type.Float16, srgb_gamma=False)
+    numbers = pixels.astype(np.float16) if scene.outputs.spectra == "half" else pixels
+    bitmap = mi.Bitmap(numbers, mi.Bitmap.PixelFormat.MultiChannel, names)
     told = bitmap.metadata()
     told["spectralLayoutVersion"] = "1.0"
     told["emissiveUnits"] = "W.m^-2.sr^-1.nm^-1"

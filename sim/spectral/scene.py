@@ -90,6 +90,13 @@ class Outputs(Model):
     """Whether it has X, Y, Z beside the bands."""
 
 
+class Caustic(Model):
+    """A picture of the light on the arcature's back wall, by photons; the sun is the first distant light."""
+
+    photons: Annotated[int, Field(ge=1000, le=100_000_000)] = 1_000_000
+    cell_mm: Positive = 4.0
+
+
 class Scene(Model):
     """One scene; all cameras see the same."""
 
@@ -109,12 +116,20 @@ class Scene(Model):
     """Stokes vectors of every band; four times the work, and slower."""
     display: Display = Display()
     outputs: Outputs = Outputs()
+    caustic: Caustic | None = None
 
     @model_validator(mode="after")
     def _names(self) -> Scene:
         names = [camera.name for camera in self.cameras]
         if len(set(names)) < len(names):
             raise ValueError("two cameras have the same name; their pictures would overwrite each other")
+        return self
+
+    @model_validator(mode="after")
+    def _sun(self) -> Scene:
+        kinds = {part.kind for part in (*self.objects, *self.lights)}
+        if self.caustic is not None and not {"arcature", "distant"} <= kinds:
+            raise ValueError("`caustic` needs an object of kind `arcature` and a light of kind `distant`")
         return self
 
 

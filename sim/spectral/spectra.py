@@ -1,4 +1,4 @@
-"""Spectra that a scene file can name: how things reflect, and what lights give, [81] on the grid of the materials."""
+"""Spectra that a scene file can name: how things reflect, and what lights give; [81] on the materials' grid."""
 
 from __future__ import annotations
 

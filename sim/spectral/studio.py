@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sim.spectral import pictures, variant
-from sim.spectral.render import Renderer
+from sim.spectral import pictures, variant, wall
+from sim.spectral.render import opened
 from sim.spectral.scene import Scene, files
 
 Progress = Callable[[str, int, int], None]
@@ -38,19 +38,24 @@ class Studio:
 
     @staticmethod
     def render(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[str, Any]:
-        """Render all cameras into the folder `out`; returns the summary. Paths of the scene are relative to `folder`.
+        """Render all cameras into the folder `out`; returns the summary. `folder` is where a scene's paths begin.
 
         Raises InputError for what the scene cannot mean or this machine lacks, OSError for files.
         """
-        with Renderer(scene, folder) as renderer:
+        with opened(scene, folder) as renderer:
             white = pictures.white_of(scene, folder)
-            written_by = f"Mitsuba {renderer.version}, {renderer.variant}"
+            written_by = f"Mitsuba {renderer.version}, {renderer.variant_name}"
             seen = {}
             for camera in scene.cameras:
                 name = camera.name
                 found = renderer.render(camera, lambda done, total, name=name: progress(name, done, total))  # type: ignore[misc]
                 stem = out / f"{scene.name}-{name}"
                 seen[name] = pictures.write(scene, found, stem, white=white, written_by=written_by)
+            summary: dict[str, Any] = {"cameras": seen}
+            if scene.caustic is not None:
+                progress("caustic", 0, 1)
+                summary["caustic"] = wall.write_wall(scene, folder, out / f"{scene.name}-caustic", white)
+                progress("caustic", 1, 1)
         return {
             "scene": scene.name,
             "synthetic": True,
@@ -60,5 +65,5 @@ class Studio:
             "depth": scene.depth,
             "seed": scene.seed,
             "observer": f"CIE {scene.observer}",
-            "cameras": seen,
+            **summary,
         }

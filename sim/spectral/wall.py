@@ -1,0 +1,76 @@
+"""The back wall of a scene's arcature under its sun: light by photons (`caustic`), as a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coupole.errors import InputError
+from sim.materials import gilding, layered
+from sim.materials.grid import Array
+from sim.spectral import arcature, caustic, colour
+from sim.spectral.lights import Distant
+from sim.spectral.materials import Gilt, metal_index
+from sim.spectral.model import unit
+from sim.spectral.objects import Arcature
+from sim.spectral.pictures import SYNTHETIC, write_png
+from sim.spectral.scene import Scene
+from sim.spectral.spectra import luminous, power, reflectance, scaled
+
+
+def write_wall(scene: Scene, folder: Path, stem: Path, white: Array) -> dict[str, Any]:
+    """Write `stem`.png, the wall's colour were it white, brightest cell but 0.5 % white; returns figures.
+
+    Light of the sun only: no sky, and no light from stone to stone.
+    """
+    assert scene.caustic is not None
+    thing = next(thing for thing in scene.objects if isinstance(thing, Arcature))
+    light = next(light for light in scene.lights if isinstance(light, Distant))
+    top_mm = thing.height_mm + thing.radius_mm
+    sides = (-thing.radius_mm, thing.radius_mm)
+    sun = _sun(light, thing, folder, scene.name)
+    found = caustic.photons(_niche(thing, folder), sun, (*sides, top_mm), scene.caustic.photons, scene.seed)
+    lit = caustic.irradiance(found, sides, top_mm, scene.caustic.cell_mm, thing.depth_mm)
+    xyz = colour.tristimulus(lit / np.pi, range(lit.shape[-1]), 5, scene.observer)
+    brightest = float(np.quantile(xyz[..., 1], 0.995))
+    picture, _ = colour.displayed(colour.adapted(xyz / brightest, white, scene.display.adaptation))
+    about = f"{scene.name}, light on the back wall: {SYNTHETIC}; {scene.caustic.photons} photons"
+    write_png(stem.with_suffix(".png"), picture, about)
+    on_gold = found.power[found.bounces > 0].sum(axis=0, dtype=float)
+    return {
+        "file": stem.with_suffix(".png").name,
+        "photons": scene.caustic.photons,
+        "direct_lux": round(float(luminous(sun.irradiance) * sun.direction[1]), 3),
+        "greatest_lux": round(float(luminous(lit).max()), 3),
+        "share_by_gold": round(float(luminous(on_gold) / luminous(found.started)), 5),
+    }
+
+
+def _sun(light: Distant, thing: Arcature, folder: Path, scene_name: str) -> caustic.Sun:
+    """In the niche's frame."""
+    direction = thing.scene_from_thing()[:3, :3].T @ np.array(unit(light.direction))
+    if direction[1] <= 0.0:
+        raise InputError(
+            f"{scene_name}: expected a sun that shines into the arcature, found it behind the wall; "
+            "turn one of them"
+        )
+    return caustic.Sun(direction, light.width_deg, scaled(power(light.spectrum, folder), light.illuminance_lux))
+
+
+def _niche(thing: Arcature, folder: Path) -> caustic.Niche:
+    parts = arcature.arcature(thing.radius_mm, thing.height_mm, thing.depth_mm)
+    leaf = _leaf(thing.gilt, folder)
+    return caustic.Niche(
+        parts.gilded_mm, parts.stone_mm, lambda cosines: layered.at_cosine(leaf, cosines), thing.gilt.roughness
+    )
+
+
+def _leaf(gilt: Gilt, folder: Path) -> Array:
+    """Mirror part of the covered share, as `layered.Sheet` holds it; the bole's light is left away."""
+    index = metal_index(gilt.gold)
+    if gilt.holes > 0.0:
+        index = gilding.leaf_index(index, gilt.holes)
+    gilded = gilding.gilt(index, gilt.thickness_nm, reflectance(gilt.bole, folder))
+    return np.asarray((1.0 - gilt.uncovered) * gilded.leaf.reflectance)

@@ -107,9 +107,9 @@ class Job:
 
     def _hidden_from_home(self) -> dict[str, list[int]]:
         itinerary = self.itinerary(self.schedule.views, self.cell.rig.motion.home_joints_deg)
-        lit = {int(led) for burst in self.schedule.bursts[0] for led in burst.table["led"]}
         hidden: dict[str, list[int]] = {}
-        for view, visit in zip(self.schedule.views, itinerary.visits, strict=True):
+        for view, visit, bursts in zip(self.schedule.views, itinerary.visits, self.schedule.bursts, strict=True):
+            lit = {int(led) for burst in bursts for led in burst.table["led"]}
             useless = self.useless_leds(self.shadows.at(visit.joints_deg)) if visit else []
             if leds := [led for led in useless if led in lit]:
                 hidden[view.name] = leds

@@ -111,6 +111,7 @@ def metering_plan(plan: Plan, leds: LedTable, rows: NDArray[np.int64]) -> Plan:
     if len(rows):
         spread = rows[_spread(leds.positions_mm[rows], METERING_LIGHTS)]
         changes["lights"] = LightIds(kind="ids", ids=tuple(int(led) for led in leds.ids[spread]))
+        changes["views"] = tuple(view.model_copy(update={"lights": None}) for view in plan.views)
     return plan.model_copy(update=changes)
 
 

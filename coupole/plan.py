@@ -38,41 +38,6 @@ class Pose(Model):
         return transform(self.translation_mm, self.abc_deg)
 
 
-class LookAt(Model):
-    """One view: the camera looks at a point from a direction."""
-
-    kind: Literal["look_at"]
-    name: Name
-    target_mm: Vector
-    distance_mm: Annotated[float, Field(gt=0, le=3000, description="to the camera's projection centre")]
-    azimuth_deg: Degrees
-    elevation_deg: Annotated[float, Field(ge=-90, le=90)]
-    roll_deg: Degrees = 0.0
-
-
-class Grid(Model):
-    """Views from all pairs of azimuth and elevation, named `<name>-az<azimuth>-el<elevation>`."""
-
-    kind: Literal["grid"]
-    name: Name
-    target_mm: Vector
-    distance_mm: Annotated[float, Field(gt=0, le=3000)]
-    azimuths_deg: Annotated[tuple[Degrees, ...], Field(min_length=1)]
-    elevations_deg: Annotated[tuple[Annotated[float, Field(ge=-90, le=90)], ...], Field(min_length=1)]
-    roll_deg: Degrees = 0.0
-
-
-class Joints(Model):
-    """One view from given joint angles of the arm."""
-
-    kind: Literal["joints"]
-    name: Name
-    joints_deg: tuple[Degrees, Degrees, Degrees, Degrees, Degrees, Degrees]
-
-
-View = Annotated[LookAt | Grid | Joints, Field(discriminator="kind")]
-
-
 class AllLights(Model):
     kind: Literal["all"]
 
@@ -129,6 +94,47 @@ class NoLights(Model):
 Lights = Annotated[
     AllLights | LightIds | LightBoards | EveryLight | LightCone | Panels | NoLights, Field(discriminator="kind")
 ]
+
+
+class LookAt(Model):
+    """One view: the camera looks at a point from a direction."""
+
+    kind: Literal["look_at"]
+    name: Name
+    target_mm: Vector
+    distance_mm: Annotated[float, Field(gt=0, le=3000, description="to the camera's projection centre")]
+    azimuth_deg: Degrees
+    elevation_deg: Annotated[float, Field(ge=-90, le=90)]
+    roll_deg: Degrees = 0.0
+    lights: Lights | None = None
+    """Of this view; the plan's if not given."""
+
+
+class Grid(Model):
+    """Views from all pairs of azimuth and elevation, named `<name>-az<azimuth>-el<elevation>`."""
+
+    kind: Literal["grid"]
+    name: Name
+    target_mm: Vector
+    distance_mm: Annotated[float, Field(gt=0, le=3000)]
+    azimuths_deg: Annotated[tuple[Degrees, ...], Field(min_length=1)]
+    elevations_deg: Annotated[tuple[Annotated[float, Field(ge=-90, le=90)], ...], Field(min_length=1)]
+    roll_deg: Degrees = 0.0
+    lights: Lights | None = None
+    """Of this view; the plan's if not given."""
+
+
+class Joints(Model):
+    """One view from given joint angles of the arm."""
+
+    kind: Literal["joints"]
+    name: Name
+    joints_deg: tuple[Degrees, Degrees, Degrees, Degrees, Degrees, Degrees]
+    lights: Lights | None = None
+    """Of this view; the plan's if not given."""
+
+
+View = Annotated[LookAt | Grid | Joints, Field(discriminator="kind")]
 
 
 class FixedExposure(Model):
@@ -199,6 +205,7 @@ class Plan(Model):
 
     @model_validator(mode="after")
     def _something_to_shoot(self) -> Plan:
-        if isinstance(self.lights, NoLights) and self.darks_per_view == 0:
-            raise ValueError("lights, or at least one dark frame per view: this plan shoots nothing")
+        lights = [view.lights or self.lights for view in self.views]
+        if any(isinstance(one, NoLights) for one in lights) and self.darks_per_view == 0:
+            raise ValueError("lights, or at least one dark frame per view: a view would shoot nothing")
         return self

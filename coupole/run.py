@@ -119,9 +119,10 @@ class Run:
 
     def expected_shots(self) -> Iterable[str]:
         """Ids of all shots and dark frames of the plan, those apart that were left out as hidden in their view."""
+        labels: list[str] | dict[str, list[str]] = self.about["labels"]
         for view in self.about["views"]:
             hidden = {f"led{led:04d}" for led in self.hidden_leds.get(view, ())}
-            for label in self.about["labels"]:
+            for label in labels[view] if isinstance(labels, dict) else labels:
                 if label.partition("/")[0] not in hidden:
                     yield f"{view}/{label}"
 

@@ -38,7 +38,7 @@ from coupole.recorder import DryRecorder, RunRecorder
 from coupole.rig import Rig, in_world
 from coupole.run import Run, is_shot
 from coupole.sequencer import Sequencer
-from coupole.shots import EXPOSURE_MARGIN_US, select_leds
+from coupole.shots import EXPOSURE_MARGIN_US, Schedule, leds_of_plan
 
 
 def _refuse(found: Report) -> None:
@@ -193,10 +193,17 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
         "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
         "scaling": cell.world_endpoints["camera"]["scaling"] if cell.world_endpoints else None,
         "views": [view.name for view in job.schedule.views],
-        "labels": job.schedule.labels,
+        "labels": _labels(job.schedule),
         "hidden_leds": job.hidden_leds,
         "expected": {"shots": job.schedule.shots, "frames": job.schedule.frames},
     }
+
+
+def _labels(schedule: Schedule) -> list[str] | dict[str, list[str]]:
+    """One list where all views have the same frames; else one for each view, by its name."""
+    if len(set(schedule.labels)) == 1:
+        return list(schedule.labels[0])
+    return {view.name: list(labels) for view, labels in zip(schedule.views, schedule.labels, strict=True)}
 
 
 def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
@@ -289,7 +296,7 @@ def meter(job: Job, console: Console, wish: metering.Wish, *, confirm: bool) -> 
     Interrupted, and UnprovenError where pictures stay missing.
     """
     cell_leds, base_from_support = job.cell.leds, job.cell.rig.support.base_from_support.matrix()
-    few = metering.metering_plan(job.plan, cell_leds, select_leds(job.plan, cell_leds, base_from_support))
+    few = metering.metering_plan(job.plan, cell_leds, leds_of_plan(job.plan, cell_leds, base_from_support))
     small = replace(job, plan=few, schedule=schedule_of(few, job.cell))
     small, preflight = check_job(small, StorageFacts(UNLIMITED_BYTES))
     _refuse(preflight)

@@ -7,7 +7,7 @@ the first with `/r<repeat>` behind: `top/led0417/e0`, `top/dark0/e0`, `top/panel
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,9 +25,11 @@ from coupole.plan import (
     LightBoards,
     LightCone,
     LightIds,
+    Lights,
     LookAt,
     Panels,
     Plan,
+    View,
 )
 
 MARK_UNITS = 16
@@ -142,8 +144,8 @@ class Schedule:
     views: tuple[ViewPose, ...]
     bursts: tuple[tuple[Burst, ...], ...]
     """Bursts of each view."""
-    labels: tuple[str, ...]
-    """Of all frames that a view can have, before any was left out, in the order of its bursts."""
+    labels: tuple[tuple[str, ...], ...]
+    """Of all frames that each view can have, before any was left out, in the order of its bursts."""
 
     @property
     def shots(self) -> int:
@@ -166,38 +168,39 @@ class Schedule:
         )
 
 
-def expand_views(plan: Plan) -> list[ViewPose]:
-    """The plan's views in order, grids spelt out."""
-    poses: list[ViewPose] = []
-    for view in plan.views:
-        match view:
-            case LookAt():
-                pose = look_at(
-                    view.target_mm, view.distance_mm, view.azimuth_deg, view.elevation_deg, view.roll_deg
+def expand_view(view: View) -> list[ViewPose]:
+    """The poses that one entry of a plan's views stands for: a grid has many."""
+    match view:
+        case LookAt():
+            pose = look_at(view.target_mm, view.distance_mm, view.azimuth_deg, view.elevation_deg, view.roll_deg)
+            return [ViewPose(view.name, pose, None, view.target_mm)]
+        case Grid():
+            return [
+                ViewPose(
+                    f"{view.name}-az{azimuth:g}-el{elevation:g}",
+                    look_at(view.target_mm, view.distance_mm, azimuth, elevation, view.roll_deg),
+                    None,
+                    view.target_mm,
                 )
-                poses.append(ViewPose(view.name, pose, None, view.target_mm))
-            case Grid():
-                poses += [
-                    ViewPose(
-                        f"{view.name}-az{azimuth:g}-el{elevation:g}",
-                        look_at(view.target_mm, view.distance_mm, azimuth, elevation, view.roll_deg),
-                        None,
-                        view.target_mm,
-                    )
-                    for elevation in view.elevations_deg
-                    for azimuth in view.azimuths_deg
-                ]
-            case Joints():
-                poses.append(ViewPose(view.name, None, view.joints_deg, None))
-    return poses
+                for elevation in view.elevations_deg
+                for azimuth in view.azimuths_deg
+            ]
+        case Joints():
+            return [ViewPose(view.name, None, view.joints_deg, None)]
 
 
-def select_leds(plan: Plan, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
-    """Rows of the LED table that the plan lights, in the order of the table; none for panels and darks.
+def leds_of_plan(plan: Plan, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
+    """Rows of the LED table that any view of the plan lights. Raises KeyError as `select_leds`."""
+    rows = [select_leds(view.lights or plan.lights, leds, base_from_support) for view in plan.views]
+    return np.unique(np.concatenate(rows))
+
+
+def select_leds(lights: Lights, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
+    """Rows of the LED table that are lit, in the order of the table; none for panels and darks.
 
     Raises KeyError for an LED or a board that the dome does not have (`missing_lights` says it better).
     """
-    match plan.lights:
+    match lights:
         case AllLights():
             return np.arange(len(leds.ids))
         case LightIds(ids=ids):
@@ -218,18 +221,27 @@ def select_leds(plan: Plan, leds: LedTable, base_from_support: Transform) -> NDA
 
 def missing_lights(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
     """Key path and message for each light of the plan that the dome does not have."""
-    match plan.lights:
+    own = [(("views", i, "lights"), view.lights) for i, view in enumerate(plan.views) if view.lights is not None]
+    return [
+        (where + key, message)
+        for where, lights in [(("lights",), plan.lights), *own]
+        for key, message in _missing(lights, leds)
+    ]
+
+
+def _missing(lights: Lights, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
+    match lights:
         case LightIds(ids=ids):
             have, key, what = set(leds.ids.tolist()), "ids", "LED"
             asked: tuple[int, ...] = ids
         case LightBoards(boards=boards):
             have, key, what, asked = set(leds.boards.tolist()), "boards", "board", boards
         case EveryLight(offset=offset) if offset >= len(leds.ids):
-            return [(("lights", "offset"), f"expected less than the dome's {len(leds.ids)} LEDs, found {offset}")]
+            return [(("offset",), f"expected less than the dome's {len(leds.ids)} LEDs, found {offset}")]
         case _:
             return []
     return [
-        (("lights", key, i), f"the dome has no {what} {n}; it has {min(have)} to {max(have)}")
+        ((key, i), f"the dome has no {what} {n}; it has {min(have)} to {max(have)}")
         for i, n in enumerate(asked)
         if n not in have
     ]
@@ -284,38 +296,65 @@ def build_schedule(
     pace: Pace = FASTEST,
 ) -> Schedule:
     """All bursts of all views. Tables are shared between views: the box need not be loaded anew."""
-    rows = select_leds(plan, leds, base_from_support)
-    rows = rows[interleave(leds.boards[rows])]
-    lights = [(int(leds.ids[row]), f"led{int(leds.ids[row]):04d}") for row in rows]
+    bursts_of: dict[Lights, list[Burst]] = {}
+    views: list[ViewPose] = []
+    bursts: list[list[Burst]] = []
     hardware = plan.trigger == "hardware"
-    templates: list[Burst] = []
-    for repeat in range(plan.repeats):
-        for index, exposure_us in enumerate(plan.exposure.exposures_us):
-            timing = burst_timing(
-                exposure_us,
-                rise_us=rise_us,
-                readout_us=readout_us,
-                exposure_gap_us=exposure_gap_us,
-                hardware=hardware,
-                pace=pace,
-            )
-            ending = f"/e{index}" + (f"/r{repeat}" if repeat else "")
-            darks = plan.darks_per_view if repeat == 0 else 0
-            for panel, steps in _steps(plan, lights):
-                templates.append(
-                    _burst(steps, darks, ending, timing, index, repeat, panel=panel, hardware=hardware)
+    for view in plan.views:
+        lights = view.lights or plan.lights
+        if lights not in bursts_of:
+            rows = select_leds(lights, leds, base_from_support)
+            rows = rows[interleave(leds.boards[rows])]
+            lit = [(int(leds.ids[row]), f"led{int(leds.ids[row]):04d}") for row in rows]
+            steps = _steps(lights, lit)
+            bursts_of[lights] = [
+                burst
+                for repeat in range(plan.repeats)
+                for index, exposure_us in enumerate(plan.exposure.exposures_us)
+                for burst in _bursts(
+                    steps,
+                    burst_timing(
+                        exposure_us,
+                        rise_us=rise_us,
+                        readout_us=readout_us,
+                        exposure_gap_us=exposure_gap_us,
+                        hardware=hardware,
+                        pace=pace,
+                    ),
+                    index,
+                    repeat,
+                    darks=plan.darks_per_view if repeat == 0 else 0,
+                    hardware=hardware,
                 )
-                darks = 0
-    views = tuple(expand_views(plan))
-    bursts = tuple(tuple(replace(b, view=view.name) for b in templates) for view in views)
-    return Schedule(views, bursts, tuple(label for b in templates for label in b.labels))
+            ]
+        for pose in expand_view(view):
+            views.append(pose)
+            bursts.append([replace(burst, view=pose.name) for burst in bursts_of[lights]])
+    labels = tuple(tuple(label for burst in mine for label in burst.labels) for mine in bursts)
+    return Schedule(tuple(views), tuple(map(tuple, bursts)), labels)
 
 
-def _steps(plan: Plan, lights: list[tuple[int, str]]) -> list[tuple[int, list[tuple[int, str]]]]:
+def _bursts(
+    steps: list[tuple[int, list[tuple[int, str]]]],
+    timing: BurstTiming,
+    exposure_index: int,
+    repeat: int,
+    *,
+    darks: int,
+    hardware: bool,
+) -> Iterator[Burst]:
+    """The bursts of one exposure; dark frames are the first one's."""
+    ending = f"/e{exposure_index}" + (f"/r{repeat}" if repeat else "")
+    for number, (panel, lit) in enumerate(steps):
+        own_darks = darks if number == 0 else 0
+        yield _burst(lit, own_darks, ending, timing, exposure_index, repeat, panel=panel, hardware=hardware)
+
+
+def _steps(lights: Lights, lit: list[tuple[int, str]]) -> list[tuple[int, list[tuple[int, str]]]]:
     """Panel and (led, label) of the lit steps of each burst: one burst for LEDs, one for each panel."""
-    if isinstance(plan.lights, Panels):
-        return [(panel, [(NO_LIGHT, f"panel{panel}")]) for panel in plan.lights.panels]
-    return [(0, lights)]
+    if isinstance(lights, Panels):
+        return [(panel, [(NO_LIGHT, f"panel{panel}")]) for panel in lights.panels]
+    return [(0, lit)]
 
 
 def _burst(

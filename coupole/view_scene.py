@@ -21,7 +21,7 @@ from coupole.job import Job
 from coupole.paths import Joints
 from coupole.rig import KeepOutBox, Rig
 from coupole.shadow import Shadow, Shadows, Sight, capsule_axes, sight_of
-from coupole.shots import ViewPose, select_leds
+from coupole.shots import ViewPose, leds_of_plan
 from coupole.view_sight import footprint
 from coupole.view_solids import Points, Solid, ball, box, capsule, joined
 
@@ -151,7 +151,7 @@ def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals
         vertices, faces = np.unique(corners_mm.reshape(-1, 3), axis=0, return_inverse=True)
         measured = Solid("object", vertices, faces.reshape(-1, 3))
     used = np.zeros(len(job.cell.leds.ids), np.bool_)
-    used[select_leds(job.plan, job.cell.leds, rig.support.base_from_support.matrix())] = True
+    used[leds_of_plan(job.plan, job.cell.leds, rig.support.base_from_support.matrix())] = True
     return Scene(
         job.plan.name,
         rig,

@@ -289,7 +289,12 @@ def is_light(shot: str) -> bool:
 def assert_each_shot_proven_once(run: Path) -> None:
     """Every frame of the plan has one journal line, and `verify` finds each whole."""
     about = json.loads((run / "run.json").read_text())
-    expected = sorted(f"{view}/{label}" for view in about["views"] for label in about["labels"])
+    labels = about["labels"]
+    expected = sorted(
+        f"{view}/{label}"
+        for view in about["views"]
+        for label in (labels[view] if isinstance(labels, dict) else labels)
+    )
     assert sorted(event["shot"] for event in events(run, "frame")) == expected
     verified = here("verify", run, "--json")
     assert verified.code == 0, verified

@@ -62,12 +62,19 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--width", type=int, default=1024, help="of frames, px; 4096 is the real camera")
     parser.add_argument("--images", type=int, default=24)
+    parser.add_argument("--samples", type=int, default=8, help="rays a pixel and direction")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--absolute", action="store_true", help="the arm is off by 0.3 mm and 0.02 deg as well")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     joints_deg = postures(arguments.images)
-    prove = partial(prove_cell, joints_deg=joints_deg, width_px=arguments.width, absolute=arguments.absolute)
+    prove = partial(
+        prove_cell,
+        joints_deg=joints_deg,
+        width_px=arguments.width,
+        samples=arguments.samples,
+        absolute=arguments.absolute,
+    )
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.cells)
     judged: list[list[Judged]] = []
     started_s = time.monotonic()
@@ -141,7 +148,7 @@ def postures(count: int) -> Floats:
     return np.array(angles)[np.unique(np.linspace(0, len(angles) - 1, count).astype(int))]
 
 
-def random_cell(seed: int, joints_deg: Floats, width_px: int, *, absolute: bool) -> TrueCell:
+def random_cell(seed: int, joints_deg: Floats, width_px: int, samples: int, *, absolute: bool) -> TrueCell:
     from coupole.cell import world_config
     from coupole.geometry import transform
     from coupole.job import read_cell
@@ -170,7 +177,7 @@ def random_cell(seed: int, joints_deg: Floats, width_px: int, *, absolute: bool)
         "abc_deg": turn_deg,
     }
     config["settings"] |= {"seed": seed, "things": [board], "arm_shadows": False}
-    config["settings"]["camera"] = {"kind": "memory", "samples_per_side": 3, "distortion": distortion}
+    config["settings"]["camera"] = {"kind": "memory", "samples_per_side": samples, "distortion": distortion}
     corner_mm = (-0.5 * SQUARES[0] * SQUARE_MM, 0.5 * SQUARES[1] * SQUARE_MM, THICKNESS_MM)
     board_in_thing = transform(corner_mm, (0.0, 0.0, 180.0))
     base_from_support = cell.rig.support.base_from_support.matrix()
@@ -186,7 +193,7 @@ def random_cell(seed: int, joints_deg: Floats, width_px: int, *, absolute: bool)
     )
 
 
-def prove_cell(seed: int, *, joints_deg: Floats, width_px: int, absolute: bool) -> list[Judged]:
+def prove_cell(seed: int, *, joints_deg: Floats, width_px: int, samples: int, absolute: bool) -> list[Judged]:
     """Render, find, adjust, and compare with the truth."""
     from coupole.calibration.arm_errors import axis_sensitivity
     from coupole.calibration.board import Board, detect, plane
@@ -196,7 +203,7 @@ def prove_cell(seed: int, *, joints_deg: Floats, width_px: int, absolute: bool) 
     from coupole.rig import planning_arm
     from sim.stills import Stills
 
-    cell = random_cell(seed, joints_deg, width_px, absolute=absolute)
+    cell = random_cell(seed, joints_deg, width_px, samples, absolute=absolute)
     stills = Stills(cell.config)
     camera = cell.config["camera"]
     board = Board(

@@ -78,3 +78,22 @@ def test_a_run_is_resumed_without_what_it_began_without(hidden: CellFolder) -> N
     assert resumed.code == 0, resumed.err
     assert cells.about(run)["hidden_leds"] == before
     assert cells.here("verify", run).code == 0
+
+
+def test_an_led_that_preflight_calls_hidden_gives_a_dark_frame(cell: CellFolder) -> None:
+    """The world's arm and the controller's are two pictures of one thing: where the controller finds that an LED
+    reaches nothing of what is seen, the simulated frame has hardly any light."""
+    cell.world_settings["arm_shadows"] = True
+    cell.write(views=[STEEP], lights={"kind": "every", "every": 5})
+    assert cell.acquire().code == 0
+    run = cell.run_folder
+    hidden = set(next(event for event in cells.events(run, "view"))["hidden_leds"])
+    means = {
+        int(frame.record["led"]): float(frame.pixels.mean()) - cells.BLACK_DN
+        for shot, frame in cells.stored(run).items()
+        if cells.is_light(shot)
+    }
+    dark = [mean for led, mean in means.items() if led in hidden]
+    lit = [mean for led, mean in means.items() if led not in hidden]
+    assert dark
+    assert np.median(dark) < 0.1 * np.median(lit)

@@ -228,6 +228,28 @@ def test_a_board_that_the_dome_does_not_have_is_named() -> None:
     assert problems == [(("lights", "boards", 0), "the dome has no board 180; it has 0 to 179")]
 
 
+def test_a_view_may_have_lights_of_its_own() -> None:
+    own = {**TOP, "name": "own", "elevation_deg": 60, "lights": {"kind": "ids", "ids": [5, 900]}}
+    panel = {**TOP, "name": "panel", "elevation_deg": 50, "lights": {"kind": "panels", "panels": [3]}}
+    schedule = schedule_of(plan_of(ALL, views=[{**TOP, "elevation_deg": 80}, own, panel]))
+    assert [len(lit_leds(bursts[0])) for bursts in schedule.bursts] == [1080, 2, 0]
+    assert sorted(lit_leds(schedule.bursts[1][0])) == [5, 900]
+    assert schedule.bursts[2][0].panel == 3
+    assert schedule.shots == 1080 + 2 + 1
+    assert [len(labels) for labels in schedule.labels] == [len(bursts[0].labels) for bursts in schedule.bursts]
+
+
+def test_a_light_of_a_view_that_the_dome_does_not_have_is_named_at_the_view() -> None:
+    own = {**TOP, "elevation_deg": 60, "lights": {"kind": "ids", "ids": [1080]}}
+    (problem,) = missing_lights(plan_of(ALL, views=[own]), DOME)
+    assert problem == (("views", 0, "lights", "ids", 0), "the dome has no LED 1080; it has 0 to 1079")
+
+
+def test_views_with_the_same_lights_share_their_tables() -> None:
+    schedule = schedule_of(plan_of(ALL))
+    assert schedule.bursts[0][0].table is schedule.bursts[1][0].table
+
+
 def test_a_grid_is_named_by_azimuth_and_elevation() -> None:
     grid = {k: TOP[k] for k in ("name", "target_mm", "distance_mm")} | {"kind": "grid"}
     plan = plan_of(views=[{**grid, "azimuths_deg": [0, -120.5], "elevations_deg": [45, 60]}])

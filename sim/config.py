@@ -72,6 +72,14 @@ class SceneConfig(_Model):
     """What the flange carries, which stands in the light."""
 
 
+class InterreflectionConfig(_Model):
+    """Light that goes from surface to surface, by Mitsuba (the extra `mitsuba`): seconds for each LED and pose."""
+
+    bounces: Annotated[int, Field(ge=2, le=16)] = 4
+    samples: Annotated[int, Field(ge=1, le=4096)] = 64
+    """Paths from each triangle that is seen."""
+
+
 class CameraConfig(_Model):
     """Sensor and lens of the simulated camera."""
 
@@ -125,6 +133,8 @@ class Settings(_Model):
     faults: tuple[script.Fault, ...] = ()
     things: tuple[Thing, ...] = ()
     """What stands on the support beside the plan's object."""
+    interreflection: InterreflectionConfig | None = None
+    """`{}` adds it; without it light meets one surface."""
     arm_shadows: bool = True
     """Whether arm and tool stand in the light."""
     material: MaterialConfig | None = None

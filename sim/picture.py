@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,9 @@ from sim.scene import Leds, build_scene, load_surface, read_leds, support_disk
 from sim.sensor import electrons, expose, expose_electrons, mosaic
 from sim.surface import Material, Surface
 from sim.things import placed
+
+if TYPE_CHECKING:
+    from sim.spectral.interreflection import Prepared
 
 _POSE_TOLERANCE, _ARM_TOLERANCE_MM = 1e-6, 1e-3
 _SHADOW_BYTES = 512 << 20
@@ -96,6 +99,9 @@ class Photographer:
         self._empty: NDArray[np.float32] | None = None
         self._base_from_camera: Transform = np.zeros((4, 4))
         self._arm_mm = NONE
+        self._interreflection = settings.interreflection
+        self._prepared: Prepared | None = None
+        """For light that goes from surface to surface, at this pose."""
         self._radiance: dict[int, Radiance] = {}
         self._colour: dict[int, NDArray[np.float32]] = {}
         self._warm_up(base_from_support)
@@ -163,7 +169,7 @@ class Photographer:
         if self._view is None or np.abs(base_from_camera - self._base_from_camera).max() > _POSE_TOLERANCE:
             self._view = self._viewer.look(base_from_camera)
             self._places = self._shadows.places(self._view.sides)
-            self._empty = None
+            self._empty = self._prepared = None
             self._base_from_camera = base_from_camera
             self._radiance.clear()
         return self._view
@@ -173,7 +179,10 @@ class Photographer:
     def _led(self, view: View, led: int) -> Radiance:
         """Radiance of the view's triangles under one LED at its tabulated flux."""
         row = self._row_of_led[led]
-        return self._remembered(led, lambda: self._shaded(view, self._emitters[row], row) * self._colour_of(led))
+        return self._remembered(led, lambda: self._lit_by_led(view, row) * self._colour_of(led))
+
+    def _lit_by_led(self, view: View, row: int) -> Radiance:
+        return self._shaded(view, self._emitters[row], row) + self._indirect(view, self._emitters[row])
 
     def _panel(self, view: View, panel: int) -> Radiance:
         """Radiance of the view's triangles under panel 1 to 4."""
@@ -185,7 +194,7 @@ class Photographer:
 
     def _lit_by_panel(self, view: View, panel: int) -> Radiance:
         count = panels.PARTS**2
-        radiance = np.zeros((len(view.sides), 3), np.float32)
+        radiance = np.zeros((len(view.sides), 3), np.float32) + self._indirect(view, self._panels[panel - 1][0])
         for piece in range((panel - 1) * count, panel * count):
             radiance += self._shaded(view, self._pieces[piece], len(self._emitters) + piece, "lambertian")
         return radiance
@@ -201,6 +210,17 @@ class Photographer:
         )
         cast(radiance, view.centroids_mm, self._arm_mm, emitter.centre_mm)
         return radiance
+
+    def _indirect(self, view: View, emitter: Emitter) -> Radiance:
+        """What reaches the view's triangles by way of others; zeros where that is not asked for."""
+        if self._interreflection is None or len(view.sides) == 0:
+            return np.zeros((len(view.sides), 3), np.float32)
+        from sim.spectral.interreflection import indirect_radiance, prepare
+
+        if self._prepared is None:
+            self._prepared = prepare(self._scene, view.sides >> 1, view.towards_camera)
+        asked = self._interreflection
+        return indirect_radiance(self._prepared, emitter, bounces=asked.bounces, samples=asked.samples)
 
     def _remembered(self, light: int, compute: Callable[[], Radiance]) -> Radiance:
         """What fits into memory is computed once per pose."""

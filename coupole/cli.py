@@ -10,6 +10,8 @@ import typer
 
 from coupole.commands import keeping, planning, running
 from coupole.commands.calibrate import calibrate_app
+from coupole.commands.calibrate_light import budget
+from coupole.commands.render import render
 from coupole.errors import CoupoleError, InputError, Interrupted
 
 app = typer.Typer(
@@ -33,6 +35,8 @@ for command in (
     keeping.archive,
     keeping.export,
     keeping.scan,
+    render,
+    budget,
     planning.schema,
 ):
     app.command()(command)

@@ -64,4 +64,54 @@ lights: {{{{kind: panels, panels: [1]}}}}
 exposure: {{{{kind: fixed, exposure_us: 8000}}}}
 darks_per_view: 0
 """,
+    "response": """\
+# A scene of different brightness that stands still, under a panel; for `coupole calibrate response`.
+schema_version: 1
+name: {name}
+rig: {rig}
+views:
+  - {{kind: look_at, name: still, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: -90, elevation_deg: 80}}
+lights: {{kind: panels, panels: [1]}}
+repeats: 2
+exposure: {{kind: bracket, exposures_us: [500, 1000, 2000, 4000, 8000, 12000, 16000, 24000, 32000, 64000, 128000]}}
+darks_per_view: 8
+""",
+    "flat-field": """\
+# Panel 1 filling the field, shifted and turned; for `coupole calibrate flat-field --panel-mm 335`.
+# `target_mm` is the panel's middle, about which the views are shifted: set it to where yours stands.
+schema_version: 1
+name: {name}
+rig: {rig}
+views:
+  - {{kind: look_at, name: f1, target_mm: [0, 650, 450], distance_mm: 335, azimuth_deg: -90, elevation_deg: 0}}
+  - {{kind: look_at, name: f2, target_mm: [60, 650, 450], distance_mm: 335, azimuth_deg: -90, elevation_deg: 0,
+     roll_deg: 60}}
+  - {{kind: look_at, name: f3, target_mm: [-60, 650, 450], distance_mm: 335, azimuth_deg: -90, elevation_deg: 0,
+     roll_deg: -60}}
+  - {{kind: look_at, name: f4, target_mm: [0, 650, 510], distance_mm: 335, azimuth_deg: -90, elevation_deg: 0,
+     roll_deg: 90}}
+  - {{kind: look_at, name: f5, target_mm: [0, 650, 390], distance_mm: 335, azimuth_deg: -90, elevation_deg: 0,
+     roll_deg: -90}}
+  - {{kind: look_at, name: f6, target_mm: [60, 650, 510], distance_mm: 335, azimuth_deg: -90, elevation_deg: 0,
+     roll_deg: 30}}
+  - {{kind: look_at, name: f7, target_mm: [-60, 650, 390], distance_mm: 335, azimuth_deg: -90, elevation_deg: 0,
+     roll_deg: -30}}
+lights: {{kind: panels, panels: [1]}}
+repeats: 3
+exposure: {{kind: bracket, exposures_us: [50, 100, 200, 800]}}
+darks_per_view: 8
+""",
+    "spectralon": """\
+# A white tile at the support's centre, seen from all around; for `coupole calibrate led-power`.
+schema_version: 1
+name: {name}
+rig: {rig}
+views:
+  - {{kind: grid, name: tile, target_mm: [0, 0, 10], distance_mm: 335,
+     azimuths_deg: [-150, -90, -30, 30, 90, 150], elevations_deg: [50]}}
+lights: {{kind: all}}
+hidden_lights: skip
+exposure: {{kind: bracket, exposures_us: [2000, 6000]}}
+darks_per_view: 8
+""",
 }

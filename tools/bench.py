@@ -181,6 +181,14 @@ def bench_mesh(rounds: int) -> None:
         line(**figure)
 
 
+def bench_calibration(rounds: int) -> None:
+    """Finding a board, and the adjustments of hand-eye and LEDs, against plain use of OpenCV and scipy."""
+    from bench_calibration import figures
+
+    for figure in figures(ROOT, rounds):
+        line(**figure)
+
+
 def bench_render(rounds: int) -> None:
     """Pictures of the simulated dome, against Open3D, Embree and Mitsuba, and memory for a large scan."""
     from bench_render import figures
@@ -199,6 +207,7 @@ BENCHES: dict[str, Callable[[int], None]] = {
     "archive": bench_archive,
     "render": bench_render,
     "mesh": bench_mesh,
+    "calibration": bench_calibration,
 }
 
 

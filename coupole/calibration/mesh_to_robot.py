@@ -4,9 +4,10 @@ The scanner's table says where the stickers are in the mesh's frame, to its own 
 are in the base, to that of camera, hand-eye and robot. Points are found in space, matched with the table by the
 triangles they form, and then everything is adjusted at once:
 
-    pixel = project((base_from_camera_i . E_i)^-1 . base_from_mesh . (q_j + d_j))
+    pixel = project((base_from_flange_i . E_i . flange_from_camera)^-1 . base_from_mesh . (q_j + d_j))
 
-with q_j the table's target, d_j what it is off, E_i what the arm is off in view i. (Seed 003, section 4, "mesh to
+with q_j the table's target, d_j what it is off, E_i what the arm is off in view i; the hand-eye is observed by its
+record, whose error all views share. (Seed 003, section 4, "mesh to
 robot", which has no uncertainty of target or arm in it.)
 """
 
@@ -24,7 +25,13 @@ from coupole.calibration.optics import Intrinsics
 from coupole.calibration.point_sets import match_points
 from coupole.calibration.rotations import Floats, between, inverses, moved, skew
 
-STICKERS, SCANNER, POSITION, ORIENTATION = "stickers", "scanner", "robot position", "robot orientation"
+STICKERS, SCANNER, POSITION, ORIENTATION, HAND_EYE = (
+    "stickers",
+    "scanner",
+    "robot position",
+    "robot orientation",
+    "hand-eye",
+)
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,16 @@ class Stated:
     """Accuracy of the scanner (seed 003: 30 um)."""
     robot_mm: float = 0.3
     robot_deg: float = 0.02
-    """What camera poses are off: robot and hand-eye together."""
+    """What the arm is off from pose to pose."""
+
+
+@dataclass(frozen=True)
+class HandEye:
+    """The hand-eye that the views' poses were made with."""
+
+    flange_from_camera: Floats
+    covariance: Floats
+    """[6, 6] of a step of `rotations.moved`, mm and rad."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +72,11 @@ class MeshPose:
     """Of the points found in space, before the adjustment, from the table's."""
     noise: dict[str, float]
     """Seen over stated, by group."""
+    redundancy: dict[str, float]
+    degrees: Floats
+    """[6] degrees of freedom behind the covariance."""
+    dominated_by: tuple[str, ...]
+    """[6] the group that most of each variance comes from."""
 
     def uncertainty_at(self, mesh_mm: Floats) -> float:
         """Standard uncertainty of a mesh point's place in the base, mm: root of the sum of its variances."""
@@ -71,6 +92,8 @@ class _State:
     """[views, 4, 4]."""
     targets_mm: Floats
     """[matched, 3] in the mesh's frame."""
+    hand_eye_step: Floats
+    """[6] from its record, mm and rad."""
 
 
 def mesh_to_robot(
@@ -80,10 +103,12 @@ def mesh_to_robot(
     names: Sequence[str],
     *,
     stated: Stated = Stated(),
+    hand_eye: HandEye | None = None,
     depth_mm: tuple[float, float] = (200.0, 900.0),
 ) -> MeshPose:
     """Find a mesh by its targets [n, 3] (mesh frame) in views in which things like stickers were seen.
 
+    Without `hand_eye` the views' poses have no error in common.
     Raises InputError if too few stickers are seen in three views, or if their layout fits nowhere or twice.
     """
     pose_px = intrinsics.fx * (stated.robot_mm / np.mean(depth_mm) + np.radians(stated.robot_deg))
@@ -95,7 +120,7 @@ def mesh_to_robot(
     found_mm = np.array([point.base_mm for point in points]).reshape(-1, 3)
     match = match_points(found_mm, targets_mm, tolerance_mm)
     seen = [points[row] for row in match.found]
-    adjusted = _adjust(views, intrinsics, seen, targets_mm[match.known], match.found_from_known, stated)
+    adjusted = _adjust(views, intrinsics, seen, targets_mm[match.known], match.found_from_known, stated, hand_eye)
     recognised = [names[row] for row in match.known.tolist()]
     to_degrees = np.diag([1.0, 1.0, 1.0, *np.degrees([1.0, 1.0, 1.0])])
     sightings = sum(len(point.views) for point in seen)
@@ -112,6 +137,9 @@ def mesh_to_robot(
         float(np.sqrt(np.mean(residuals**2)) * stated.sticker_px),
         match.rms_mm,
         {component.name: component.factor for component in adjusted.components},
+        {component.name: component.redundancy for component in adjusted.components},
+        adjusted.degrees[:6],
+        tuple(adjusted.components[int(row)].name for row in adjusted.contributions[:, :6].argmax(axis=0)),
     )
 
 
@@ -122,8 +150,9 @@ def _adjust(
     targets_mm: Floats,
     start: Floats,
     stated: Stated,
+    hand_eye: HandEye | None,
 ) -> Adjusted[_State]:
-    """Unknowns: the mesh's step [6], a step [6] for each view, an offset [3] for each target."""
+    """Unknowns: the mesh's step [6], one [6] for each view, an offset [3] for each target, the hand-eye's [6]."""
     reported = np.array([view.base_from_camera for view in views])
     first_target = 6 + 6 * len(views)
     pose_sigma = np.array([stated.robot_mm] * 3 + [np.radians(stated.robot_deg)] * 3)
@@ -132,7 +161,14 @@ def _adjust(
         Group(SCANNER, estimated=False),
         Group(POSITION, estimated=True),
         Group(ORIENTATION, estimated=True),
+        Group(HAND_EYE, estimated=False),
     )
+    first_shared = first_target + 3 * len(seen)
+    if hand_eye is None:
+        held, by_hand_eye = np.eye(6), np.zeros((len(views), 6, 6))
+    else:
+        held = np.asarray(np.linalg.inv(np.linalg.cholesky(hand_eye.covariance)))
+        by_hand_eye = _by_hand_eye(reported, hand_eye.flange_from_camera)
 
     row_of = np.concatenate([np.full(len(point.views), row) for row, point in enumerate(seen)])
     view_of = np.concatenate([point.views for point in seen])
@@ -167,21 +203,32 @@ def _adjust(
             off = (targets_mm[row] - state.targets_mm[row]) / stated.scanner_mm
             columns_of = np.arange(first_target + 3 * row, first_target + 3 * row + 3)
             blocks.append(Block(off, np.eye(3) / stated.scanner_mm, columns_of, 1))
-        off_by = between(state.base_from_camera, reported)
+        off_by = between(state.base_from_camera, reported) + by_hand_eye @ state.hand_eye_step
         for view in range(len(views)):
             for group, part in ((2, slice(0, 3)), (3, slice(3, 6))):
-                columns_of = 6 + 6 * view + np.arange(6)[part]
-                weight = np.diag(1.0 / pose_sigma[part])
-                blocks.append(Block(off_by[view, part] / pose_sigma[part], weight, columns_of, group))
+                columns_of = np.concatenate([6 + 6 * view + own[part], first_shared + own])
+                by_both = np.concatenate([np.eye(6), -by_hand_eye[view]], axis=1)[part][
+                    :, [*own[part], *(6 + own)]
+                ]
+                weighted = by_both / pose_sigma[part][:, None]
+                blocks.append(Block(off_by[view, part] / pose_sigma[part], weighted, columns_of, group))
+        blocks.append(Block(-held @ state.hand_eye_step, held, first_shared + own, 4))
         return blocks
 
     def move(state: _State, step: Floats) -> _State:
         return _State(
             moved(state.base_from_mesh, step[:6]),
             moved(state.base_from_camera, step[6:first_target].reshape(-1, 6)),
-            state.targets_mm + step[first_target:].reshape(-1, 3),
+            state.targets_mm + step[first_target:first_shared].reshape(-1, 3),
+            state.hand_eye_step + step[first_shared:],
         )
 
-    begin = _State(start, reported, targets_mm)
-    parameters = first_target + 3 * len(seen)
-    return adjust(begin, evaluate, move, groups, parameters, what="mesh to robot")
+    begin = _State(start, reported, targets_mm, np.zeros(6))
+    return adjust(begin, evaluate, move, groups, first_shared + 6, what="mesh to robot")
+
+
+def _by_hand_eye(base_from_camera: Floats, flange_from_camera: Floats) -> Floats:
+    """[v, 6, 6] step of each camera's pose for a step of the hand-eye: its shift turned with the flange."""
+    by = np.broadcast_to(np.eye(6), (len(base_from_camera), 6, 6)).copy()
+    by[:, :3, :3] = base_from_camera[:, :3, :3] @ flange_from_camera[:3, :3].T
+    return by

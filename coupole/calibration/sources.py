@@ -175,7 +175,7 @@ def _of_run(run: Run) -> Sources:
     for view, frames in by_view.items():
         path = run.view_path(view)
         table = store.read_frames(path)
-        poses, attributes = _poses_and_attributes(path)
+        poses, attributes = poses_and_attributes(path)
         lit = _at_one_pose([frame for frame in frames if is_shot(frame.shot)], table)
         if not lit:
             continue
@@ -186,8 +186,8 @@ def _of_run(run: Run) -> Sources:
         read = partial(_mean_image, path, lit, dark, table)
         images.append(Source(view, read, tuple(map(float, pose["joints_deg"]))))
         flanges.append(np.array(pose["base_from_flange"], dtype=np.float64))
-        inputs.append((f"{run.folder.name}/views/{path.name}", _frames_sha256([*lit, *dark])))
-        about = _about(run, attributes)
+        inputs.append((f"{run.folder.name}/views/{path.name}", frames_sha256([*lit, *dark])))
+        about = about_of(run, attributes)
     if not images:
         raise InputError(f"{run.folder}: no proven frame under light; acquire the plan first")
     low_high = (min(temperatures), max(temperatures))
@@ -240,13 +240,14 @@ def _spread(frames: Sequence[ProvenFrame]) -> Iterator[ProvenFrame]:
     return iter(frames[::step])
 
 
-def _frames_sha256(frames: Sequence[ProvenFrame]) -> str:
+def frames_sha256(frames: Sequence[ProvenFrame]) -> str:
     """Of the frames' proven checksums: the same however the file is packed or archived."""
     lines = sorted(f"{frame.shot} {frame.xxh3}" for frame in frames)
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def _poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
+def poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
+    """The table of poses and the attributes of a view's file. Raises StorageError."""
     try:
         with h5py.File(path, "r") as file:
             return file[store.POSES][:], dict(file["entry"].attrs)
@@ -254,7 +255,8 @@ def _poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]
         raise StorageError(f"{path}: not a view file of a run: {error}") from error
 
 
-def _about(run: Run, attributes: dict[str, Any]) -> About:
+def about_of(run: Run, attributes: dict[str, Any]) -> About:
+    """What a view's attributes say of camera and lens."""
     def number(key: str) -> float | None:
         return float(attributes[key]) if key in attributes else None
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from sim.objects import appearance
-from sim.objects.mesh import Array, disk, flat_normals, joined, moved, of_material, slab
+from sim.objects.mesh import Array, disk, flat_normals, joined, moved, of_material, rectangle, skirt
 from sim.objects.shapes import sphere
 from sim.surface import Material, Surface
 
@@ -15,6 +15,7 @@ _SEGMENTS = 48
 _BORDER = 10.0 / 6.0
 """Diameter of a sticker over that of its bright disk."""
 _THICKNESS_MM = 0.05
+_CELL_MM = 2.0
 _TRIES = 20_000
 
 
@@ -157,4 +158,7 @@ def _standing(centre_mm: Array, normal: Array) -> Array:
 
 
 def _tile(width_mm: float, depth_mm: float, thickness_mm: float, material: Material) -> Surface:
-    return of_material(slab(width_mm, depth_mm, thickness_mm), material)
+    """A slab whose face has cells of `_CELL_MM`: light that falls off over it is shaded triangle by triangle."""
+    columns, rows = (max(1, round(length_mm / _CELL_MM)) for length_mm in (width_mm, depth_mm))
+    face = rectangle(width_mm, depth_mm, columns, rows, z_mm=thickness_mm)
+    return of_material(np.concatenate([face, skirt(face)]), material)

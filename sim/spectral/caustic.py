@@ -62,24 +62,30 @@ class Photons:
     """[81], W/nm, that left the niche again; what is missing then was absorbed by gold."""
 
 
-def photons(niche: Niche, sun: Sun, opening_mm: tuple[float, float, float], count: int, seed: int) -> Photons:
+def photons(
+    niche: Niche, sun: Sun, opening_mm: tuple[float, float, float], count: int, seed: int | tuple[int, ...]
+) -> Photons:
     """Trace `count` photons that pass the rectangle x from `opening_mm[0]` to [1], z from 0 to [2] in y = 0."""
     met = _Met(niche)
     left, right, top = opening_mm
     area_m2 = (right - left) * top * 1e-6
-    each = sun.irradiance * sun.direction[1] * area_m2 / count
+    facing = sun.irradiance * area_m2 / count
     random = np.random.default_rng(seed)
-    parts, escaped = [], np.zeros(BANDS)
+    parts, started, escaped = [], np.zeros(BANDS), np.zeros(BANDS)
     for first in range(0, count, _CHUNK):
         n = min(_CHUNK, count - first)
         starts = np.stack([random.uniform(left, right, n), np.zeros(n), random.uniform(0.0, top, n)], axis=1)
         ways = _blurred(sun, random, n)
+        # Drawn evenly as the sun's own direction sees its disk, each part of which meets the opening differently.
+        shares = np.maximum(0.0, ways[:, 1]) / (ways @ sun.direction)
+        power = (shares[:, None] * facing).astype(np.float32)
+        started += power.sum(axis=0, dtype=float)
         # From a little outside, so that the wall round the opening can stop them.
-        part, lost = _traced(met, starts - ways, ways, each, random)
+        part, lost = _traced(met, starts - ways, ways, power, random)
         parts.append(part)
         escaped += lost
-    places, power, bounces = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Photons(places, power, bounces, each * count, escaped)
+    places, kept, bounces = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Photons(places, kept, bounces, started, escaped)
 
 
 def irradiance(
@@ -132,9 +138,8 @@ class _Met:
 
 
 def _traced(
-    met: _Met, starts: Array, ways: Array, each: Array, random: np.random.Generator
+    met: _Met, starts: Array, ways: Array, power: NDArray[np.float32], random: np.random.Generator
 ) -> tuple[tuple[Array, NDArray[np.float32], NDArray[np.int64]], Array]:
-    power = np.repeat(each[None], len(starts), axis=0).astype(np.float32)
     places, kept, bounces = [], [], []
     escaped = np.zeros(BANDS)
     gold_count = len(met.niche.gilded_mm)
@@ -151,7 +156,7 @@ def _traced(
         facing = np.where(np.sum(normals[gold] * ways[gold], axis=1) > 0.0, -1.0, 1.0)[:, None] * normals[gold]
         turned, share = _reflected(ways[gold], facing, met.niche, random)
         alive = np.sum(turned * facing, axis=1) > 0.0
-        power = (power[gold] * share)[alive]
+        power = (power[gold] * share)[alive].astype(np.float32)
         starts, ways = (here[gold] + _OFFSET_MM * facing)[alive], turned[alive]
     return (np.concatenate(places), np.concatenate(kept), np.concatenate(bounces)), escaped
 

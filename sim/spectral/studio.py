@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,14 +49,13 @@ class Studio:
             seen = {}
             for camera in scene.cameras:
                 name = camera.name
-                found = renderer.render(camera, lambda done, total, name=name: progress(name, done, total))  # type: ignore[misc]
+                found = renderer.render(camera, partial(progress, name))
                 stem = out / f"{scene.name}-{name}"
                 seen[name] = pictures.write(scene, found, stem, white=white, written_by=written_by)
             summary: dict[str, Any] = {"cameras": seen}
             if scene.caustic is not None:
-                progress("caustic", 0, 1)
-                summary["caustic"] = wall.write_wall(scene, folder, out / f"{scene.name}-caustic", white)
-                progress("caustic", 1, 1)
+                stem = out / f"{scene.name}-caustic"
+                summary["caustic"] = wall.write_wall(scene, folder, stem, white, partial(progress, "caustic"))
         return {
             "scene": scene.name,
             "synthetic": True,

@@ -12,13 +12,13 @@ from photographed import BOARD_YAML, FLANGE_FROM_CAMERA, LENS, SIZE_PX, shoot, w
 from synthesis import Array
 from typer.testing import CliRunner, Result
 
-from coupole.commands.calibrate import calibrate_app
 from coupole.calibration.arm_errors import axis_sensitivity
 from coupole.calibration.board import Board
 from coupole.calibration.poses import Convention, read_poses
 from coupole.calibration.record import read_record
 from coupole.calibration.rotations import between
 from coupole.calibration.sources import find_board, open_sources
+from coupole.commands.calibrate import calibrate_app
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
 from coupole.kinematics import KR10_R1100_SIXX, forward
 

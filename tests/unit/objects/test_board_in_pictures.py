@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from coupole.geometry import inverse
 from sim import blur
-from sim.objective import Objective
+from sim.objective import Objective, vignetting
 from sim.objects.board import Charuco, charuco_board, inner_corners_mm, opencv_board
-from sim.render.lens import Lens
-from sim.render.view import View, Viewer
+from sim.render.lens import Lens, sight
+from sim.render.view import View, Viewer, tangents
 from sim.scene import build_scene
-from sim.sensor import SensorModel, electrons, expose, expose_electrons, mosaic
+from sim.sensor import electrons, expose, expose_electrons, mosaic
+from sim.sensor_model import SensorModel
 
 cv2 = pytest.importorskip("cv2")
 pytest.importorskip("colour")
@@ -30,6 +31,7 @@ LENS = Lens.focused(
 )
 MONO = SensorModel(bayer_pattern="MONO", seed=3)
 WHITE_E = 8_000.0
+FALLOFF = vignetting(Objective(), tangents(sight(LENS))).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +45,8 @@ def base_from_camera() -> NDArray[np.float64]:
     return pose
 
 
-def view_of_board(base_from_camera: NDArray[np.float64], samples: int) -> tuple[Viewer, View]:
-    viewer = Viewer(build_scene([(charuco_board(BOARD), np.eye(4))]), LENS, samples)
-    return viewer, viewer.look(base_from_camera)
+def view_of_board(base_from_camera: NDArray[np.float64], samples: int) -> View:
+    return Viewer(build_scene([(charuco_board(BOARD), np.eye(4))]), LENS, samples).look(base_from_camera)
 
 
 def misses_px(frame: NDArray[np.uint16], base_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -69,9 +70,9 @@ def misses_px(frame: NDArray[np.uint16], base_from_camera: NDArray[np.float64]) 
 def test_corners_of_a_supersampled_frame_are_found_to_a_tenth_of_a_pixel(
     base_from_camera: NDArray[np.float64],
 ) -> None:
-    viewer, view = view_of_board(base_from_camera, 4)
+    view = view_of_board(base_from_camera, 4)
     frame = np.empty((768, 1024), np.uint16)
-    light = (view.triangle, view.diffuse, viewer.falloff)
+    light = (view.triangle, view.diffuse, FALLOFF)
     expose(frame, *light, model=MONO, electrons_per_radiance=WHITE_E, frame=1)
     misses = misses_px(frame, base_from_camera)
     assert np.sqrt(np.mean(misses**2)) < 0.14
@@ -79,8 +80,8 @@ def test_corners_of_a_supersampled_frame_are_found_to_a_tenth_of_a_pixel(
 
 
 def test_blur_leaves_the_corners_in_place(base_from_camera: NDArray[np.float64]) -> None:
-    viewer, view = view_of_board(base_from_camera, 1)
-    image = electrons(view.triangle, view.diffuse, viewer.falloff, electrons_per_radiance=WHITE_E)
+    view = view_of_board(base_from_camera, 1)
+    image = electrons(view.triangle, view.diffuse, FALLOFF, electrons_per_radiance=WHITE_E)
     depth_mm = np.full(view.triangle.shape, 380.0, np.float32)
     soft = blur.through(Objective(f_number=4.0), image, depth_mm, pixel_pitch_um=PITCH_UM)
     misses = []

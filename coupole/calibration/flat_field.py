@@ -1,0 +1,284 @@
+"""Flat field: what share of the light of the field's best place reaches each pixel, per channel.
+
+Seed 003, section 4.2 (g in its Eq. 1). A luminous panel is photographed shifted and turned. Its signal is
+a_v * g(p) * s(q), with a_v the view's brightness, g the lens's fall-off, which stays with the pixel p, and s the
+panel's own unevenness, which stays with the place q on the panel: that tells them apart. In logarithms
+
+    ln g = -2 ln(1 + r^2/f^2) + k1 (r/R)^2 + k2 (r/R)^4 + k3 (r/R)^6,   r = |p - centre|,   R half the diagonal,
+    ln s = e1 x + e2 y + e3 x^2 + e4 x y + e5 y^2,                      (x, y) = q / `panel_scale_mm`.
+
+The first term is cos^4 with the focal length f; the polynomial is what a real lens departs from it. Images are
+reduced to means of blocks of pixels; dust and dead pixels do not reach the result, as each block's mean leaves out
+what stands out and each block's weight falls with its residual (Tukey's). A block's errors are alike in all views
+(its pixels' own responses): covariance is that of clusters of blocks ("sandwich", Liang and Zeger 1986), each
+with its residual as if it were left out (Bell and McCaffrey 2002).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+
+G_NAMES = ("cx_px", "cy_px", "k1", "k2", "k3")
+PANEL_NAMES = ("e1", "e2", "e3", "e4", "e5")
+_TUKEY = 4.685
+_ROUNDS = 40
+_MAD = 1.4826
+_LEAST_BLOCKS = 60
+_INDEFINITE = 1e11
+
+
+@dataclass(frozen=True)
+class FlatView:
+    """One view of the panel, reduced to blocks; NaN where a block cannot be used."""
+
+    name: str
+    pixels: Floats
+    """[n, 2] centres of the blocks, column and row."""
+    signal: Floats
+    """[n] means, any unit that is linear in light."""
+    panel_mm: Floats
+    """[n, 2] places on the panel that they see."""
+
+
+@dataclass(frozen=True)
+class FlatField:
+    """Fall-off of one channel."""
+
+    channel: str
+    parameters: Floats
+    """[5] as `G_NAMES`."""
+    covariance: Floats
+    """[5, 5]."""
+    focal_px: float
+    """f, held: the polynomial takes up what it is off by."""
+    size_px: tuple[int, int]
+    """Width and height."""
+    panel: Floats
+    """[5] unevenness of the panel as `PANEL_NAMES`."""
+    panel_covariance: Floats
+    residual: float
+    """Relative, robust standard deviation of a block."""
+    residuals: tuple[Floats, ...]
+    """Of each view, relative; NaN where a block was not used."""
+    rejected: float
+    """Share of the blocks with weight 0."""
+    views: tuple[str, ...]
+    degrees_of_freedom: float
+
+    def at(self, pixels: Floats) -> Floats:
+        """g [...] at pixels [..., 2]; 1 at its centre."""
+        radial, _ = _radial(pixels, self.parameters[:2], self.focal_px, self.size_px)
+        value: Floats = np.exp(radial[0] + np.tensordot(self.parameters[2:], radial[1:], 1))
+        return value
+
+    def u_at(self, pixels: Floats) -> Floats:
+        """Relative standard uncertainty [...] of g at pixels [..., 2] against the mean over the field.
+
+        A common factor of g is one of the LEDs' power as well and drops out of every reflectance.
+        """
+        grid = _grid(self.size_px)
+        by = self._slopes(pixels) - self._slopes(grid).mean(axis=1).reshape(5, *[1] * (pixels.ndim - 1))
+        return np.asarray(np.sqrt(np.einsum("i...,ij,j...->...", by, self.covariance, by)))
+
+    def map(self) -> NDArray[np.float32]:
+        """[H, W] g of every pixel."""
+        width, height = self.size_px
+        columns = np.arange(width, dtype=float)
+        rows = (np.column_stack([columns, np.full(width, float(row))]) for row in range(height))
+        return np.stack([self.at(row).astype(np.float32) for row in rows])
+
+    def _slopes(self, pixels: Floats) -> Floats:
+        """[5, ...] derivatives of ln g."""
+        radial, by_centre = _radial(pixels, self.parameters[:2], self.focal_px, self.size_px)
+        moved = by_centre[:, 0] + np.einsum("k,ck...->c...", self.parameters[2:], by_centre[:, 1:])
+        return np.concatenate([moved, radial[1:]])
+
+
+def fit_flat_field(
+    views: Sequence[FlatView],
+    *,
+    channel: str,
+    focal_px: float,
+    size_px: tuple[int, int],
+    panel_scale_mm: float = 100.0,
+) -> FlatField:
+    """Fit one channel. Raises InputError if the views cannot tell panel and lens apart, or have too few blocks."""
+    used = [np.isfinite(view.signal) & (view.signal > 0) for view in views]
+    if len(views) < 3 or min(int(u.sum()) for u in used) < _LEAST_BLOCKS:
+        least = min((int(u.sum()) for u in used), default=0)
+        raise InputError(
+            f"flat field: expected three views or more with {_LEAST_BLOCKS} usable blocks each, found "
+            f"{len(views)} with {least} or more; photograph the panel, shifted and turned, filling the field, "
+            "unsaturated"
+        )
+    pixels = np.concatenate([view.pixels[u] for view, u in zip(views, used, strict=True)])
+    logs = np.log(np.concatenate([view.signal[u] for view, u in zip(views, used, strict=True)]))
+    places = np.concatenate([view.panel_mm[u] for view, u in zip(views, used, strict=True)]) / panel_scale_mm
+    number = np.concatenate([np.full(int(u.sum()), i) for i, u in enumerate(used)])
+    x, y = places.T
+    even = np.column_stack([x, y, x * x, x * y, y * y])
+    brightness = np.eye(len(views))[number]
+    p = np.concatenate([np.array([size_px[0] - 1, size_px[1] - 1]) / 2.0, np.zeros(3)])
+    rest = np.zeros(len(views) + 5)
+    weight = np.ones(len(logs))
+    sigma, left = 0.0, logs
+    design = np.zeros((len(logs), 0))
+    for _ in range(_ROUNDS):
+        radial, by_centre = _radial(pixels, p[:2], focal_px, size_px)
+        moved = by_centre[:, 0] + np.einsum("k,ckn->cn", p[2:], by_centre[:, 1:])
+        design = np.column_stack([moved.T, radial[1:].T, brightness, even])
+        left = logs - radial[0] - radial[1:].T @ p[2:] - design[:, 5:] @ rest
+        scale = np.linalg.norm(design, axis=0)
+        normal = (design / scale).T @ ((design / scale) * weight[:, None])
+        if np.linalg.cond(normal) > _INDEFINITE:
+            raise InputError(
+                "flat field: these views cannot tell the panel's unevenness from the lens's fall-off; add views "
+                "shifted both ways by a third of the field, and turned by 90 degrees or more about the view"
+            )
+        step = np.linalg.solve(normal, (design / scale).T @ (weight * left)) / scale
+        # The centre is looked for inside the field: far outside, fall-off is no longer radial about it.
+        step[:2] = np.clip(step[:2], -0.1 * max(size_px), 0.1 * max(size_px))
+        p, rest = p + step[:5], rest + step[5:]
+        left = left - design @ step
+        sigma = max(_MAD * float(np.median(np.abs(left))), 1e-9)
+        weight = np.clip(1.0 - (left / (_TUKEY * sigma)) ** 2, 0.0, None) ** 2
+        if np.abs(step[:2]).max() < 1e-3 and np.abs(step[2:5]).max() < 1e-7:
+            break
+    covariance = _clustered(design, weight, left, pixels)
+    parts = np.split(left, np.cumsum([int(u.sum()) for u in used])[:-1])
+    residuals = []
+    for use, part in zip(used, parts, strict=True):
+        whole = np.full(len(use), np.nan)
+        whole[use] = part
+        residuals.append(whole)
+    clusters = len(np.unique(pixels, axis=0))
+    return FlatField(
+        channel,
+        p,
+        covariance[:5, :5],
+        focal_px,
+        size_px,
+        rest[-5:],
+        covariance[-5:, -5:],
+        sigma,
+        tuple(residuals),
+        float(np.mean(weight == 0.0)),
+        tuple(view.name for view in views),
+        float(max(1, clusters - design.shape[1])),
+    )
+
+
+def block_means(
+    image: Floats, mask: NDArray[np.bool_], block_px: int, *, saturated: NDArray[np.bool_] | None = None
+) -> tuple[Floats, Floats]:
+    """Centres [n, 2] and means [n] of the masked pixels of square blocks; NaN for a block with saturated pixels.
+
+    A block's mean leaves out pixels that lie 4 robust standard deviations from its median: dust, hot pixels.
+    """
+    height, width = image.shape
+    rows, columns = height // block_px, width // block_px
+    centres, means = [], []
+    for i in range(rows):
+        for j in range(columns):
+            part = slice(i * block_px, (i + 1) * block_px), slice(j * block_px, (j + 1) * block_px)
+            values = image[part][mask[part]]
+            centres.append(((j + 0.5) * block_px - 0.5, (i + 0.5) * block_px - 0.5))
+            full = saturated is not None and bool(saturated[part][mask[part]].mean() > 1e-3)
+            middle = np.median(values)
+            spread = _MAD * np.median(np.abs(values - middle))
+            kept = values[np.abs(values - middle) <= 4.0 * max(float(spread), 1e-9)]
+            means.append(np.nan if full or not len(kept) else float(kept.mean()))
+    return np.array(centres), np.array(means)
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Dust on the sensor: pixels that are darker than their neighbours in all views."""
+
+    column_px: float
+    row_px: float
+    pixels: int
+    depth: float
+    """Relative loss where it is deepest."""
+
+
+def dust_spots(ratio: NDArray[np.float32], *, smooth_px: int = 5, least_depth: float = 0.01) -> list[Spot]:
+    """Spots in [H, W] mean over views of signal / fitted signal (NaN where unknown), the deepest first.
+
+    The ratio is smoothed over `smooth_px`, so that the single pixels' own responses are no dust.
+    """
+    from scipy import ndimage
+
+    known = np.isfinite(ratio)
+    filled = np.where(known, ratio, 1.0)
+    smooth = ndimage.uniform_filter(filled, smooth_px)
+    middle = float(np.median(smooth))
+    spread = _MAD * float(np.median(np.abs(smooth - middle)))
+    dark = smooth < middle - max(least_depth, 6.0 * spread)
+    labels, _ = ndimage.label(dark)
+    spots = []
+    for label, where in enumerate(ndimage.find_objects(labels), 1):
+        mine = labels[where] == label
+        at = np.argwhere(mine).mean(axis=0) + np.array([where[0].start, where[1].start])
+        depth = float(middle - smooth[where][mine].min())
+        spots.append(Spot(float(at[1]), float(at[0]), int(mine.sum()), depth))
+    return sorted(spots, key=lambda spot: -spot.depth)
+
+
+def panel_places(
+    pixels: Floats, focal_px: float, size_px: tuple[int, int], base_from_camera: Floats, base_from_panel: Floats
+) -> Floats:
+    """[n, 2] mm on the panel's plane z = 0 that pixels [n, 2] of a pinhole see."""
+    centre = (np.array(size_px) - 1) / 2.0
+    rays = np.column_stack([(pixels - centre) / focal_px, np.ones(len(pixels))])
+    panel_from_camera = np.linalg.inv(base_from_panel) @ base_from_camera
+    directions, origin = rays @ panel_from_camera[:3, :3].T, panel_from_camera[:3, 3]
+    places: Floats = (origin - directions * (origin[2] / directions[:, 2])[:, None])[:, :2]
+    return places
+
+
+def _radial(pixels: Floats, centre: Floats, focal_px: float, size_px: tuple[int, int]) -> tuple[Floats, Floats]:
+    """[4, ...] ln cos^4 and the powers 2, 4, 6 of r/R; [2, 4, ...] their derivatives by the centre's x and y."""
+    reach = 0.5 * float(np.hypot(*size_px))
+    away = np.moveaxis(np.asarray(pixels, float), -1, 0) - np.reshape(centre, (2, *[1] * (np.ndim(pixels) - 1)))
+    square = (away**2).sum(axis=0)
+    s = square / reach**2
+    radial = np.stack([-2.0 * np.log1p(square / focal_px**2), s, s**2, s**3])
+    by_square = np.stack(
+        [-2.0 / (focal_px**2 + square), np.full_like(s, reach**-2), 2 * s / reach**2, 3 * s**2 / reach**2]
+    )
+    return radial, -2.0 * away[:, None] * by_square[None]
+
+
+def _clustered(design: Floats, weight: Floats, left: Floats, pixels: Floats) -> Floats:
+    """Covariance of a weighted fit whose errors are alike within a block, in whatever view it is seen."""
+    scale = np.linalg.norm(design, axis=0)
+    scaled = design / scale
+    bread = np.linalg.inv(scaled.T @ (scaled * weight[:, None]))
+    _, cluster = np.unique(pixels, axis=0, return_inverse=True)
+    order = np.argsort(cluster.ravel(), kind="stable")
+    starts = np.flatnonzero(np.diff(cluster.ravel()[order])) + 1
+    scores = []
+    for members in np.split(order, starts):
+        mine, root = scaled[members], np.sqrt(weight[members])
+        hat = (root[:, None] * mine) @ bread @ (mine * root[:, None]).T
+        # A block at the field's rim pulls the fit to itself; its residual is what it would be without that.
+        alone = np.linalg.solve(np.eye(len(members)) - hat, root * left[members])
+        scores.append((mine * root[:, None]).T @ alone)
+    middle = np.array(scores).T @ np.array(scores)
+    # How the weighted residuals answer to a step: Tukey's psi grows less steeply than its weight lets expect.
+    u2 = 1.0 - np.sqrt(weight)
+    answer = np.linalg.inv(scaled.T @ (scaled * (np.sqrt(weight) * (1.0 - 5.0 * u2))[:, None]))
+    return np.asarray(answer @ middle @ answer / scale / scale[:, None])
+
+
+def _grid(size_px: tuple[int, int]) -> Floats:
+    x, y = np.meshgrid(np.linspace(0, size_px[0] - 1, 13), np.linspace(0, size_px[1] - 1, 13))
+    return np.column_stack([x.ravel(), y.ravel()])

@@ -1,0 +1,82 @@
+"""The dome's boards as rigid bodies, taken from its table: what stands on each, and where each is said to be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.point_sets import Indices, rigid_motion
+from coupole.calibration.rotations import Floats
+from coupole.dome import LedTable
+from coupole.errors import InputError
+
+_PLANE = 2
+"""Rank of points that do not stand in one line."""
+_PARALLEL = np.cos(np.radians(2.0))
+
+
+@dataclass(frozen=True)
+class Boards:
+    """Boards [b] and the places [n] of LEDs on them; a place is a row of the dome's table.
+
+    A board's frame has its origin in the middle of its LEDs, z along their normal (into the dome) and x from its
+    first LED towards its last, laid into the board.
+    """
+
+    numbers: NDArray[np.int64]
+    """[b] as the table numbers them."""
+    board_of: Indices
+    """[n] rows of `numbers`."""
+    base_from_board: Floats
+    """[b, 4, 4] by the table."""
+    places_mm: Floats
+    """[n, 3] in the frame of the board that each belongs to."""
+
+    def rows_of(self, board: int) -> Indices:
+        """Places on a board (row of `numbers`)."""
+        return np.flatnonzero(self.board_of == board)
+
+    def in_base(self, base_from_board: Floats, offsets_mm: Floats | float = 0.0) -> Floats:
+        """Centres [n, 3] of LEDs if the boards stand so and LEDs are off by so much on them."""
+        pose = base_from_board[self.board_of]
+        turned: Floats = np.einsum("nij,nj->ni", pose[:, :3, :3], self.places_mm + offsets_mm)
+        return turned + pose[:, :3, 3]
+
+
+def placed(boards: Boards, found_mm: Floats) -> Floats:
+    """`base_from_board` [b, 4, 4] by LEDs found at places [n, 3] (NaN where none was), by the table where fewer
+    than three were."""
+    poses = boards.base_from_board.copy()
+    for board in range(len(poses)):
+        rows = boards.rows_of(board)
+        rows = rows[np.isfinite(found_mm[rows, 0])]
+        if np.linalg.matrix_rank(boards.places_mm[rows] - boards.places_mm[rows[:1]], tol=1.0) >= _PLANE:
+            poses[board] = rigid_motion(boards.places_mm[rows], found_mm[rows])
+    return poses
+
+
+def boards_of(table: LedTable) -> Boards:
+    """Derive the boards from a dome's table. Raises InputError if one has LEDs of different normals."""
+    numbers, board_of = np.unique(table.boards, return_inverse=True)
+    poses = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
+    places_mm = np.empty_like(table.positions_mm)
+    for board, number in enumerate(numbers):
+        rows = np.flatnonzero(board_of == board)
+        normal = table.normals[rows].mean(axis=0)
+        normal /= np.linalg.norm(normal)
+        if (table.normals[rows] @ normal).min() < _PARALLEL:
+            raise InputError(
+                f"dome's table: board {number} has LEDs whose normals differ by more than 2 degrees; a flat board "
+                "has one normal. Correct the table, or give LEDs that are alone boards of their own"
+            )
+        middle_mm = table.positions_mm[rows].mean(axis=0)
+        along = table.positions_mm[rows[-1]] - table.positions_mm[rows[0]]
+        along = along - (along @ normal) * normal
+        if np.linalg.norm(along) < 1e-6:  # an LED alone: any direction in the board
+            along = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+        x = along / np.linalg.norm(along)
+        poses[board, :3, :] = np.column_stack([x, np.cross(normal, x), normal, middle_mm])
+        places_mm[rows] = (table.positions_mm[rows] - middle_mm) @ poses[board, :3, :3]
+    return Boards(numbers, board_of.astype(np.intp), poses, places_mm)

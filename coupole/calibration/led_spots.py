@@ -1,0 +1,157 @@
+"""Where lit LEDs stand in RAW frames: centres of bright spots, with what they are known to.
+
+A camera that looks into an LED sees some 1e5 times what a white target sends back: the spot is white to its rim at
+the shortest exposure, and as wide as the LED and the blur of defocus together. Only the rim tells where it is. So
+the signal is clipped into a narrow band about half of white, and the spot's centre is the centroid of that:
+
+    w = clip((signal / white - 1/4) / (1/2), 0, 1)
+
+Blur of a round aperture and glare widen the spot to all sides alike, which leaves a centroid where it is. Colours
+differ in how far out their rim lies, but the pixels of each lie evenly about the centre: all are taken as they
+are. What is left is perspective within the LED itself: `outline_offsets`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration import optics
+from coupole.calibration.rotations import Floats
+
+LOW, HIGH = 0.25, 0.75
+"""Of white: below it is no spot, above it is all of it."""
+LEAST_AREA_PX = 9.0
+"""Smaller ones are hot pixels and sparks."""
+LEAST_FILL, MOST_FILL, MOST_STRETCH = 0.935, 1.04, 4.0
+"""Of a disk the fill is 1, of a square 3/pi = 0.955; two spots that touch have less. An LED seen at 75 degrees is
+four times as wide as high."""
+MOST_SPOTS = 12
+"""In a frame with more something else shines."""
+_COARSE = 0.4
+"""By how much the fill of a small spot is off, made of whole pixels as it is; times its width."""
+_MARGIN_PX = 8
+_CROSSING = 0.25
+"""Variance of a rim pixel's share: half a pixel either way, as neighbours along a straight side err alike."""
+
+
+@dataclass(frozen=True)
+class Spot:
+    """One bright spot."""
+
+    pixel: Floats
+    """[2], centre of the first pixel (0, 0)."""
+    covariance: Floats
+    """[2, 2], px^2."""
+    area_px: float
+    fill: float
+    """Area over that of the ellipse with the same second moments."""
+
+
+@dataclass(frozen=True)
+class Spots:
+    """What a frame shows."""
+
+    good: tuple[Spot, ...]
+    """Largest first."""
+    rejected: tuple[str, ...]
+    """Why other bright things were no spots."""
+    brightest: float
+    """Largest green signal over white."""
+
+
+def find_spots(frame: NDArray[np.uint16], dark: Floats | float, pattern: str, white_dn: float) -> Spots:
+    """Spots in a RAW frame [H, W] with a dark frame [H, W] (or the black level) of the same exposure, DN."""
+    import cv2
+
+    row, column = _green_place(pattern)
+    at_green = frame[row::2, column::2]
+    black = dark[row::2, column::2] if isinstance(dark, np.ndarray) else dark
+    white = float(white_dn - np.mean(black))
+    lit = (at_green > np.min(black) + LOW * white) & (at_green - black > LOW * white)
+    count, _, boxes, _ = cv2.connectedComponentsWithStats(lit.astype(np.uint8), connectivity=8)
+    brightest = float(np.max(at_green - black)) / white
+    places = sorted(range(1, count), key=lambda label: -int(boxes[label, cv2.CC_STAT_AREA]))
+    good, rejected = [], []
+    for label in [p for p in places if 4 * boxes[p, cv2.CC_STAT_AREA] > LEAST_AREA_PX][:MOST_SPOTS]:
+        left, top, across, down = (2 * int(v) for v in boxes[label, :4])
+        rows = slice(max(top - _MARGIN_PX, 0), min(top + down + _MARGIN_PX, frame.shape[0]))
+        columns = slice(max(left - _MARGIN_PX, 0), min(left + across + _MARGIN_PX, frame.shape[1]))
+        black = dark[rows, columns] if isinstance(dark, np.ndarray) else dark
+        found = _spot(np.asarray((frame[rows, columns] - black) / white, dtype=np.float64))
+        if isinstance(found, str):
+            rejected.append(f"at ({left + across // 2}, {top + down // 2}): {found}")
+        else:
+            corner = np.array([columns.start, rows.start], dtype=np.float64)
+            good.append(Spot(found.pixel + corner, found.covariance, found.area_px, found.fill))
+    return Spots(tuple(good), tuple(rejected), brightest)
+
+
+def outline_offsets(
+    base_from_board: Floats, centres_mm: Floats, camera_from_base: Floats, lens: Floats, side_mm: float
+) -> Floats:
+    """How far the centroid of each LED's outline lies from its centre's picture [n, 2], px.
+
+    LEDs are squares of `side_mm` about `centres_mm` [n, 3] (base frame) in the plane of their boards [n, 4, 4].
+    The centroid of a quadrangle is that of its two triangles, weighted by area.
+    """
+    half = side_mm / 2 * np.array([(0, 0, 0), (-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], dtype=np.float64)
+    in_base = centres_mm[:, None] + half @ np.swapaxes(base_from_board[:, :3, :3], 1, 2)
+    in_camera = np.einsum("nij,nkj->nki", camera_from_base[:, :3, :3], in_base) + camera_from_base[:, None, :3, 3]
+    pixels = optics.project(in_camera.reshape(-1, 3), lens).pixels.reshape(-1, 5, 2)
+    centre, corners = pixels[:, 0], pixels[:, 1:]
+    parts = [corners[:, [0, k, k + 1]] for k in (1, 2)]
+    areas = [np.abs(_cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])) for p in parts]
+    middles = [p.mean(axis=1) for p in parts]
+    whole = (areas[0] + areas[1])[:, None]
+    return np.asarray((areas[0][:, None] * middles[0] + areas[1][:, None] * middles[1]) / whole - centre)
+
+
+def _spot(signal: Floats) -> Spot | str:
+    """The largest spot in a part of a frame, signal over white; or why it is none.
+
+    How far into a rim's pixel the spot reaches is not known, as any part of it makes it white. The centroid's
+    covariance is what that makes of it over the whole rim.
+    """
+    import cv2
+
+    weight = np.clip((signal - LOW) / (HIGH - LOW), 0.0, 1.0)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats((weight > 0).astype(np.uint8), connectivity=8)
+    if count < 2:
+        return "fades away at full resolution"
+    label = 1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA]))
+    left, top, across, down = (int(v) for v in boxes[label, :4])
+    if left == 0 or top == 0 or left + across == weight.shape[1] or top + down == weight.shape[0]:
+        return "cut by the frame's edge"
+    weight = np.where(labels == label, weight, 0.0)
+    area = float(weight.sum())
+    if area < LEAST_AREA_PX:
+        return f"too small: {area:.0f} px"
+    inner = cv2.erode((weight > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
+    y, x = np.nonzero(weight)
+    w, at_rim = weight[y, x], inner[y, x] == 0
+    places = np.stack([x, y], axis=1).astype(np.float64)
+    centre = w @ places / area
+    about = places - centre
+    moments = (about * w[:, None]).T @ about / area
+    widths = np.linalg.eigvalsh(moments)
+    if widths[0] <= 0 or widths[1] > MOST_STRETCH**2 * widths[0]:
+        return "a streak, not an LED"
+    fill = area / (4 * np.pi * float(np.sqrt(widths[0] * widths[1])))
+    coarse = _COARSE / np.sqrt(area)
+    if not LEAST_FILL - coarse < fill < MOST_FILL + coarse:
+        return f"not like a square or disk (fill {fill:.2f}): spots that touch, or half hidden"
+    covariance = _CROSSING * about[at_rim].T @ about[at_rim] / area**2
+    return Spot(centre, covariance, area, fill)
+
+
+def _green_place(pattern: str) -> tuple[int, int]:
+    """Row and column of a green pixel in the 2 x 2 pattern; of `MONO` the first."""
+    place = max(pattern.find("G"), 0) if pattern != "MONO" else 0
+    return place // 2, place % 2
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])

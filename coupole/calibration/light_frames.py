@@ -1,0 +1,164 @@
+"""Frames of runs as radiometric calibrations need them: one by one, with light, exposure, time and temperature.
+
+A frame is read when it is asked for, so a calibration that looks at one after the other needs memory for few.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole import store
+from coupole.calibration.rotations import Floats
+from coupole.calibration.sources import About
+from coupole.errors import InputError, StorageError
+from coupole.run import ProvenFrame, Run, is_shot, sha256
+
+CHANNELS = ("R", "G", "B")
+
+
+@dataclass(frozen=True)
+class LightFrame:
+    """One proven frame."""
+
+    shot: str
+    light: str
+    """`led0012`, `panel1`, or empty for a dark frame."""
+    exposure_us: float
+    t_s: float
+    """Of its trigger, on the box's clock."""
+    temperature_c: float
+    """Of the LED's board; NaN where the box said nothing."""
+    base_from_camera: Floats
+    """[4, 4] measured, mm."""
+    read: Callable[[], NDArray[np.uint16]]
+    """[H, W] DN."""
+
+    @property
+    def view(self) -> str:
+        return self.shot.split("/")[0]
+
+
+@dataclass(frozen=True)
+class LightFrames:
+    """All frames that a calibration may look at, and what they have in common."""
+
+    frames: tuple[LightFrame, ...]
+    pattern: str
+    """Bayer pattern, 2 x 2 from the top left."""
+    black_dn: int
+    white_dn: int
+    about: About
+    focal_px: float
+    """Focal length over pixel pitch at the focus, f (1 + m): what a tangent of 1 is long on the sensor."""
+    inputs: tuple[tuple[str, str], ...]
+    """Name and SHA-256 of every file that was or will be read."""
+
+    @property
+    def lit(self) -> tuple[LightFrame, ...]:
+        return tuple(frame for frame in self.frames if frame.light)
+
+    @property
+    def dark(self) -> tuple[LightFrame, ...]:
+        return tuple(frame for frame in self.frames if not frame.light)
+
+
+def open_light_frames(paths: Sequence[Path]) -> LightFrames:
+    """All proven frames of some runs, without the bursts' marks. Raises InputError: no frames, different cameras,
+    lenses or levels of black."""
+    frames: list[LightFrame] = []
+    inputs: list[tuple[str, str]] = []
+    common: tuple[Any, ...] | None = None
+    for path in paths:
+        run = Run(path)
+        inputs.append((f"{run.folder.name}/run.json", sha256(run.folder / "run.json")))
+        for view_path, proven in _by_view(run).items():
+            found, here = _of_view(run, view_path, proven)
+            if common is not None and here != common:
+                raise InputError(
+                    f"{view_path}: expected frames as in the files before it ({common}), found {here}; calibrate "
+                    "from runs of one camera, lens and gain"
+                )
+            common = here
+            frames += found
+            lines = sorted(f"{frame.shot} {frame.xxh3}" for frame in proven)
+            digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()
+            inputs.append((f"{run.folder.name}/views/{view_path.name}", digest))
+    if common is None or not frames:
+        raise InputError(f"{', '.join(map(str, paths))}: no proven frame; acquire the plan first")
+    pattern, black_dn, white_dn, _gain_db, focal_px, about = common
+    return LightFrames(tuple(frames), pattern, black_dn, white_dn, about, focal_px, tuple(inputs))
+
+
+def channel_mask(shape: tuple[int, int], pattern: str, channel: str) -> NDArray[np.bool_]:
+    """[H, W] True where the Bayer filter has a channel; all of a MONO sensor is green."""
+    letters = np.array(list("GGGG" if pattern == "MONO" else pattern)).reshape(2, 2)
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    return np.asarray(letters[rows % 2, columns % 2] == channel)
+
+
+def channels_of(pattern: str) -> tuple[str, ...]:
+    """The channels that a sensor has."""
+    return ("G",) if pattern == "MONO" else CHANNELS
+
+
+def temperatures_of(frames: Sequence[LightFrame]) -> tuple[float, float] | None:
+    """Lowest and highest, C; None if no frame knows one."""
+    known = [frame.temperature_c for frame in frames if np.isfinite(frame.temperature_c)]
+    return (min(known), max(known)) if known else None
+
+
+def _by_view(run: Run) -> dict[Path, list[ProvenFrame]]:
+    """Proven frames by their view's file, marks left out: they are dark, but end when their light may glow."""
+    found: dict[Path, list[ProvenFrame]] = {}
+    for shot, frame in run.proven().items():
+        light = shot.split("/")[1]
+        if "mark" not in light:
+            found.setdefault(run.view_path(shot.split("/")[0]), []).append(frame)
+    return found
+
+
+def _of_view(
+    run: Run, path: Path, proven: Sequence[ProvenFrame]
+) -> tuple[list[LightFrame], tuple[str, int, int, float, float, About]]:
+    layout, table, facts = store.read_layout(path), store.read_frames(path), store.read_facts(path)
+    try:
+        with h5py.File(path, "r") as file:
+            poses, attributes = file[store.POSES][:], dict(file["entry"].attrs)
+    except (OSError, KeyError) as error:
+        raise StorageError(f"{path}: not a view file of a run: {error}") from error
+    frames = []
+    for frame in proven:
+        record = table[frame.index]
+        decicelsius = int(record["board_temperature_dc"])
+        frames.append(
+            LightFrame(
+                frame.shot,
+                frame.shot.split("/")[1] if is_shot(frame.shot) else "",
+                float(record["exposure_us"]),
+                float(record["t_trigger_ns"]) * 1e-9,
+                decicelsius / 10.0 if decicelsius else float("nan"),
+                np.array(poses[int(record["pose"])]["base_from_camera"], dtype=np.float64),
+                partial(store.read_frame, path, layout, frame.index),
+            )
+        )
+    focal_mm, focus_mm = float(attributes["focal_length_mm"]), float(attributes["focus_distance_mm"])
+    image_mm = focal_mm * focus_mm / (focus_mm - focal_mm)
+    about = About(
+        simulated=bool(run.about["simulated"]),
+        camera=str(attributes["camera"]) if "camera" in attributes else None,
+        focal_length_mm=focal_mm,
+        focus_distance_mm=focus_mm,
+        f_number=float(attributes["f_number"]) if "f_number" in attributes else None,
+    )
+    focal_px = image_mm * 1e3 / float(attributes["pixel_pitch_um"])
+    gain_db = float(attributes.get("gain_db", 0.0))
+    return frames, (facts["pattern"], facts["black_dn"], facts["white_dn"], gain_db, focal_px, about)

@@ -1,0 +1,111 @@
+"""Camera and hand-eye by their records: what turns a pixel and a reported pose into a ray, and how well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coupole.calibration.optics import Intrinsics
+from coupole.calibration.record import Record, intrinsics_of, read_record, step_names
+from coupole.calibration.rotations import Floats
+from coupole.calibration.sources import About
+from coupole.errors import InputError
+from coupole.geometry import transform
+
+HAND_EYE = "flange_from_camera"
+MOST_APART = 5.0
+"""Two records of one lens differ by no more of their joint standard uncertainty."""
+_SAME_FIGURE = 1e-3
+
+
+@dataclass(frozen=True)
+class CameraPrior:
+    """Lens and hand-eye with their common covariance."""
+
+    lens: Intrinsics
+    free: tuple[str, ...]
+    """Parameters of the lens that were estimated."""
+    flange_from_camera: Floats
+    covariance: Floats
+    """[free + 6, free + 6]: lens, then the hand-eye's step (mm, rad)."""
+
+    @property
+    def hand_eye_covariance(self) -> Floats:
+        """[6, 6], mm and rad."""
+        return self.covariance[len(self.free) :, len(self.free) :]
+
+
+def read_posed_camera(hand_eye: Path, camera: Path | None, about: About, size_px: tuple[int, int]) -> CameraPrior:
+    """Camera and hand-eye from a hand-eye record, whose lens is its own camera's.
+
+    `camera` may name that camera's record too, as a check. `about` and `size_px` say what took the images at hand.
+    Raises InputError: a record of another kind, camera, focus, aperture or size; two records of different lenses.
+    """
+    record = _of_kind(hand_eye, "hand-eye")
+    refuse_other_camera(hand_eye, record, about, size_px)
+    prior = _prior(record)
+    if camera is not None:
+        alone = _of_kind(camera, "camera")
+        refuse_other_camera(camera, alone, about, size_px)
+        _refuse_other_lens(hand_eye, prior, camera, alone)
+    return prior
+
+
+def refuse_other_camera(path: Path, record: Record, about: About, size_px: tuple[int, int]) -> None:
+    """Raise InputError unless a record holds for the camera, lens, focus and size of these images."""
+    holds = record.validity
+    if holds.focus_distance_mm is not None and about.focus_distance_mm is not None:
+        off_mm = abs(holds.focus_distance_mm - about.focus_distance_mm)
+        if off_mm > holds.focus_tolerance_mm:
+            raise InputError(
+                f"{path}: holds for a focus of {holds.focus_distance_mm:g} mm, within "
+                f"{holds.focus_tolerance_mm:g} mm; the images were taken at {about.focus_distance_mm:g} mm. "
+                "Name the record of this focus"
+            )
+    for what, valid, found in (
+        ("focal length", holds.focal_length_mm, about.focal_length_mm),
+        ("f-number", holds.f_number, about.f_number),
+    ):
+        if valid is not None and found is not None and abs(valid - found) > _SAME_FIGURE * valid:
+            raise InputError(f"{path}: holds for {what} {valid:g}; the images were taken with {found:g}")
+    if holds.size_px is not None and holds.size_px != size_px:
+        raise InputError(
+            f"{path}: holds for frames of {holds.size_px[0]} x {holds.size_px[1]} pixels; these have "
+            f"{size_px[0]} x {size_px[1]}"
+        )
+    if holds.camera is not None and about.camera is not None and holds.camera != about.camera:
+        raise InputError(f"{path}: holds for the camera {holds.camera}; the images are of {about.camera}")
+
+
+def _of_kind(path: Path, kind: str) -> Record:
+    record = read_record(path)
+    if record.kind != kind:
+        raise InputError(f"{path}: expected a record of the kind `{kind}`, found one of `{record.kind}`")
+    return record
+
+
+def _prior(record: Record) -> CameraPrior:
+    lens, free = intrinsics_of(record)
+    names = [parameter.name for parameter in record.parameters]
+    wanted = [n for n in names if n.removesuffix("_px") in free] + list(step_names(HAND_EYE))
+    at = [names.index(name) for name in wanted]
+    units = np.ones(len(at))
+    units[-3:] = np.radians(1.0)
+    covariance = record.covariance_matrix[np.ix_(at, at)] * np.outer(units, units)
+    pose = record.transforms[HAND_EYE]
+    return CameraPrior(lens, free, transform(pose.translation_mm, pose.abc_deg), covariance)
+
+
+def _refuse_other_lens(hand_eye: Path, prior: CameraPrior, camera: Path, alone: Record) -> None:
+    lens, free = intrinsics_of(alone)
+    u = dict(zip(free, np.sqrt(np.diag(alone.covariance_matrix)), strict=True))
+    for i, name in enumerate(prior.free):
+        together = float(np.hypot(np.sqrt(prior.covariance[i, i]), u.get(name, 0.0)))
+        apart = abs(getattr(lens, name) - getattr(prior.lens, name))
+        if apart > MOST_APART * together:
+            raise InputError(
+                f"{camera} and {hand_eye} are of different lenses or focus: {name} differs by {apart:.4g}, "
+                f"{apart / together:.0f} times its standard uncertainty. Calibrate one of them anew"
+            )

@@ -1,0 +1,296 @@
+"""Propagation of distributions: GUM's linear formula and Monte Carlo, and whether the first will do.
+
+JCGM 100:2008 (GUM) section 5 for the linear formula; JCGM 101:2008 (Supplement 1) for Monte Carlo: adaptive number
+of trials (7.9), coverage intervals (7.7), test of the linear formula (8). A model is a function of arrays: it gets
+one array [trials] for each quantity and gives one back, so a million trials are one call on arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.stats import t as student
+
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+
+Shape = Literal["normal", "student", "rectangular", "triangular", "arcsine"]
+Model = Callable[[Mapping[str, Floats]], Floats]
+_LEAST_BATCH = 10_000
+_STEP = 1e-3
+"""Of a standard uncertainty: for central differences."""
+COVERAGES = (0.68, 0.95)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One input of a measurement."""
+
+    name: str
+    """With its unit."""
+    value: float
+    u: float
+    """Standard uncertainty, in the name's unit."""
+    shape: Shape = "normal"
+    source: str = ""
+    """Which record or document says so."""
+    group: str = ""
+    """Inputs of one group count as one source in the table of what dominates; the name if empty."""
+    degrees_of_freedom: float = np.inf
+    """Of Student's distribution."""
+
+    @property
+    def source_group(self) -> str:
+        return self.group or self.name
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The quantities of a model, and how they are correlated."""
+
+    quantities: tuple[Quantity, ...]
+    correlations: tuple[tuple[str, str, float], ...] = ()
+    """Coefficients of pairs of normal quantities; all others are independent."""
+
+    def matrix(self) -> Floats:
+        """[n, n] of correlation. Raises InputError for a pair that is not there or not normal, and if there can be
+        no such correlations."""
+        names = [q.name for q in self.quantities]
+        matrix = np.eye(len(names))
+        for one, other, coefficient in self.correlations:
+            for name in (one, other):
+                if name not in names:
+                    raise InputError(
+                        f"budget: correlation of `{name}`: no such input; there are {', '.join(names)}"
+                    )
+                if self.quantities[names.index(name)].shape != "normal":
+                    raise InputError(f"budget: correlation of `{name}`: only normal inputs can be correlated here")
+            i, j = names.index(one), names.index(other)
+            matrix[i, j] = matrix[j, i] = coefficient
+        if np.linalg.eigvalsh(matrix)[0] < -1e-9:
+            raise InputError("budget: no quantities can have these correlations: their matrix has a negative root")
+        return matrix
+
+    def values(self) -> dict[str, float]:
+        return {q.name: q.value for q in self.quantities}
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A coverage interval, as ends."""
+
+    coverage: float
+    low: float
+    high: float
+    kind: Literal["symmetric", "shortest", "normal"]
+    """Probabilistically symmetric, shortest, or from the linear formula."""
+
+
+@dataclass(frozen=True)
+class Propagated:
+    """What a propagation says of the output."""
+
+    estimate: float
+    u: float
+    intervals: tuple[Interval, ...]
+    trials: int
+    """0 for the linear formula."""
+    samples: Floats
+    """[trials] sorted; empty for the linear formula."""
+    stable: bool = True
+    """False if the number of trials was not enough for the asked digits."""
+
+    def interval(self, coverage: float, kind: str) -> Interval:
+        return next(i for i in self.intervals if i.coverage == coverage and i.kind == kind)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """GUM's propagation, with what each input adds."""
+
+    result: Propagated
+    sensitivities: Floats
+    """[inputs] derivative of the output by each input."""
+    shares: Floats
+    """[inputs] of the variance; with correlations the pair's part is halved between both. They sum to 1."""
+    degrees_of_freedom: float
+    """Effective (Welch-Satterthwaite, GUM G.4); independent inputs only."""
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Whether the linear formula will do (JCGM 101, section 8)."""
+
+    coverage: float
+    d_low: float
+    d_high: float
+    tolerance: float
+
+    @property
+    def passed(self) -> bool:
+        return max(self.d_low, self.d_high) <= self.tolerance
+
+
+def linear(model: Model, inputs: Inputs, coverages: Sequence[float] = COVERAGES) -> Linear:
+    """GUM 5.2: u^2 = sum_ij c_i c_j u_i u_j r_ij, with derivatives by central differences."""
+    values = inputs.values()
+    estimate = float(model({name: np.array([value]) for name, value in values.items()})[0])
+    u = np.array([q.u for q in inputs.quantities])
+    sensitivities = np.zeros(len(u))
+    for i, q in enumerate(inputs.quantities):
+        step = _STEP * q.u
+        if step == 0.0:
+            continue
+        ends = {name: np.full(2, value) for name, value in values.items()}
+        ends[q.name] = q.value + np.array([-step, step])
+        low, high = model(ends)
+        sensitivities[i] = (high - low) / (2 * step)
+    parts = sensitivities * u
+    terms = parts[:, None] * inputs.matrix() * parts
+    variance = float(terms.sum())
+    combined = float(np.sqrt(max(variance, 0.0)))
+    dof = np.array([q.degrees_of_freedom for q in inputs.quantities])
+    fourth = float(np.sum(parts**4 / dof))
+    effective = variance**2 / fourth if fourth > 0.0 else float("inf")
+    intervals = []
+    for coverage in coverages:
+        k = float(student.ppf(0.5 + coverage / 2, min(effective, 1e6)))
+        intervals.append(Interval(coverage, estimate - k * combined, estimate + k * combined, "normal"))
+    shares = terms.sum(axis=1) / variance if variance > 0.0 else np.zeros(len(u))
+    result = Propagated(estimate, combined, tuple(intervals), 0, np.zeros(0))
+    return Linear(result, sensitivities, shares, effective)
+
+
+def monte_carlo(
+    model: Model,
+    inputs: Inputs,
+    *,
+    coverages: Sequence[float] = COVERAGES,
+    digits: int = 2,
+    most_trials: int = 4_000_000,
+    seed: int = 1,
+) -> Propagated:
+    """JCGM 101, 7.9: batches of trials until mean, u and the ends of the intervals are stable.
+
+    Stable is what scatters, at two standard deviations of the mean over batches, by less than the numerical
+    tolerance of u at so many significant `digits`. Raises InputError if the model gives a number that is none.
+    """
+    batch = max(_LEAST_BATCH, int(np.ceil(100.0 / (1.0 - max(coverages)))))
+    random = np.random.default_rng(seed)
+    half = _root(inputs.matrix())
+    batches: list[Floats] = []
+    figures: list[list[float]] = []
+    stable = False
+    while len(batches) * batch < most_trials:
+        samples = _sorted(model(draw(inputs, half, batch, random)))
+        batches.append(samples)
+        limits = [end for p in coverages for end in ends(samples, p)]
+        figures.append([float(samples.mean()), float(samples.std(ddof=1)), *limits])
+        count = len(batches)
+        if count >= 2:
+            found = np.array(figures)
+            u = float(found[:, 1].mean())
+            scatter = found.std(axis=0, ddof=1) / np.sqrt(count)
+            stable = bool((2.0 * scatter <= tolerance(u, digits)).all())
+            if stable:
+                break
+    samples = np.sort(np.concatenate(batches))
+    intervals = []
+    for p in coverages:
+        intervals.append(Interval(p, *ends(samples, p), "symmetric"))
+        intervals.append(Interval(p, *_shortest(samples, p), "shortest"))
+    mean, u = float(samples.mean()), float(samples.std(ddof=1))
+    return Propagated(mean, u, tuple(intervals), len(samples), samples, stable)
+
+
+def trials_of(
+    model: Model, inputs: Inputs, trials: int, seed: int = 1, fixed: frozenset[str] = frozenset()
+) -> Floats:
+    """[trials] sorted values of the output. Inputs of the groups `fixed` keep their values; the others are drawn
+    as they would be without. A few may be infinite: ends of intervals stay what they are. Raises InputError if
+    more than 1 % are, or one is no number."""
+    random = np.random.default_rng(seed)
+    return _sorted(model(draw(inputs, _root(inputs.matrix()), trials, random, fixed)), infinite=0.01)
+
+
+def validate(linear_result: Propagated, numeric: Propagated, *, digits: int = 2) -> tuple[Validation, ...]:
+    """JCGM 101, 8.1: do the ends of the linear intervals agree with Monte Carlo's within the tolerance of u?"""
+    found = []
+    for interval in linear_result.intervals:
+        other = numeric.interval(interval.coverage, "symmetric")
+        found.append(
+            Validation(
+                interval.coverage,
+                abs(interval.low - other.low),
+                abs(interval.high - other.high),
+                tolerance(linear_result.u, digits),
+            )
+        )
+    return tuple(found)
+
+
+def tolerance(u: float, digits: int) -> float:
+    """Numerical tolerance of u: half a unit of its last significant digit (JCGM 101, 7.9.2)."""
+    if u <= 0.0:
+        return 0.0
+    power = np.floor(np.log10(u)) - (digits - 1)
+    if round(u / 10.0**power) >= 10**digits:  # 0.0996 has the digits 10 and the power -2
+        power += 1
+    return float(0.5 * 10.0**power)
+
+
+def draw(
+    inputs: Inputs, half: Floats, trials: int, random: np.random.Generator, fixed: frozenset[str] = frozenset()
+) -> dict[str, Floats]:
+    """Samples [trials] of each quantity (JCGM 101, section 6.4). `half` [n, n] is a root of the correlations. The
+    half widths of bounded distributions are those of JCGM 101, table 1."""
+    normal = random.standard_normal((trials, len(inputs.quantities))) @ half.T
+    found = {}
+    for i, q in enumerate(inputs.quantities):
+        if q.shape == "normal":
+            standard = normal[:, i]
+        elif q.shape == "student":
+            standard = random.standard_t(q.degrees_of_freedom, trials)
+        elif q.shape == "rectangular":
+            standard = np.sqrt(3.0) * random.uniform(-1.0, 1.0, trials)
+        elif q.shape == "triangular":
+            standard = np.sqrt(6.0) * random.triangular(-1.0, 0.0, 1.0, trials)
+        else:
+            standard = np.sqrt(2.0) * np.sin(2.0 * np.pi * random.random(trials))
+        found[q.name] = q.value + (0.0 if q.source_group in fixed else q.u) * standard
+    return found
+
+
+def _sorted(values: Floats, *, infinite: float = 0.0) -> Floats:
+    """Values in order. Raises InputError if more than a share of `infinite` is so, or any is no number."""
+    if np.isnan(values).any() or float(np.mean(np.isinf(values))) > infinite:
+        raise InputError(
+            f"budget: {np.mean(~np.isfinite(values)):.2%} of the trials give no finite value: an input's "
+            "distribution reaches where the measurement equation has no meaning, as a light below the horizon"
+        )
+    return np.sort(values)
+
+
+def _root(correlation: Floats) -> Floats:
+    values, vectors = np.linalg.eigh(correlation)
+    root: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
+    return root
+
+
+def ends(ordered: Floats, coverage: float) -> tuple[float, float]:
+    """Ends of the probabilistically symmetric interval of sorted samples (JCGM 101, 7.7.2)."""
+    count = len(ordered)
+    inside = round(coverage * count)
+    first = (count - inside) // 2
+    return float(ordered[first]), float(ordered[first + inside])
+
+
+def _shortest(ordered: Floats, coverage: float) -> tuple[float, float]:
+    """JCGM 101, 7.7.4."""
+    inside = round(coverage * len(ordered))
+    widths = ordered[inside:] - ordered[:-inside]
+    first = int(np.argmin(widths))
+    return float(ordered[first]), float(ordered[first + inside])

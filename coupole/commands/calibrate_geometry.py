@@ -1,0 +1,137 @@
+"""`coupole calibrate leds` and `mesh`."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from coupole.commands.calibrating import DaysOption, NameOption, OutOption, bar, calibrate
+from coupole.commands.common import JsonOption
+from coupole.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.calibration.report import Outcome
+    from coupole.calibration.workflow import Wish
+    from coupole.job import Cell
+
+Runs = Annotated[list[Path], typer.Argument(help="Runs.", show_default=False, metavar="RUN...")]
+HandEyeOption = Annotated[Path, typer.Option("--hand-eye", help="The hand-eye record, which has the lens too.")]
+CameraOption = Annotated[
+    Path | None, typer.Option("--camera", help="The camera's record, as a check that it is the same lens.")
+]
+RepeatabilityMm = Annotated[float, typer.Option(min=1e-4, help="Noise of the robot from pose to pose, as stated.")]
+RepeatabilityDeg = Annotated[
+    float, typer.Option(min=1e-5, help="Noise of the robot from pose to pose, as stated.")
+]
+
+
+def leds(
+    runs: Runs,
+    hand_eye: HandEyeOption,
+    camera: CameraOption = None,
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="The rig with the dome; the run's own if not given.")
+    ] = None,
+    repeatability_mm: RepeatabilityMm = 0.03,
+    repeatability_deg: RepeatabilityDeg = 0.003,
+    tolerance_mm: Annotated[float, typer.Option(min=1e-4, help="Of LEDs on their boards, as stated.")] = 0.05,
+    out: OutOption = Path("calibrations"),
+    name: NameOption = None,
+    valid_days: DaysOption = 180,
+    as_json: JsonOption = False,
+) -> None:
+    """Where all LEDs are and face, from views of the lit LEDs themselves, each seen six times or more."""
+    from coupole.calibration.led_equations import Stated
+    from coupole.calibration.led_picture import draw_leds
+    from coupole.calibration.led_sources import find_leds
+    from coupole.calibration.led_workflow import leds_from
+    from coupole.calibration.posed_camera import read_posed_camera
+    from coupole.calibration.report import Outcome
+
+    def work(console: Console, wish: Wish) -> Outcome:
+        table = _cell(rig, runs).leds
+        with bar(console, "looking for spots") as progress:
+            images = find_leds(runs, table, progress)
+        console.print(
+            f"{len(images.seen.led)} spots in {len(images.seen.frames)} images of {len(images.views)} views"
+        )
+        prior = read_posed_camera(hand_eye, camera, images.about, images.size_px)
+        stated = Stated(tolerance_mm=tolerance_mm, robot_mm=repeatability_mm, robot_deg=repeatability_deg)
+        with console.status("adjusting boards, poses, lens and hand-eye"):
+            found = leds_from(images, table, prior, wish, stated=stated)
+        return Outcome(found.record, partial(draw_leds, found), found.files)
+
+    calibrate("leds", work, out=out, name=name, lens=None, valid_days=valid_days, as_json=as_json)
+
+
+def mesh(
+    runs: Runs,
+    scan: Annotated[Path, typer.Option("--scan", help="Folder that `coupole scan` wrote, with targets.")],
+    hand_eye: HandEyeOption,
+    camera: CameraOption = None,
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="The rig, for the mesh's place on the support as plans want it.")
+    ] = None,
+    diameter_mm: Annotated[float, typer.Option(min=1.0, max=50.0, help="Of a sticker's bright disk.")] = 6.0,
+    nearest_mm: Annotated[
+        float, typer.Option(min=50.0, help="Nearest that a sticker stands to the camera.")
+    ] = 200.0,
+    farthest_mm: Annotated[float, typer.Option(min=60.0, help="Farthest that one stands.")] = 900.0,
+    scanner_mm: Annotated[float, typer.Option(min=1e-4, help="Accuracy of the scanner, as stated.")] = 0.03,
+    repeatability_mm: RepeatabilityMm = 0.03,
+    repeatability_deg: RepeatabilityDeg = 0.003,
+    out: OutOption = Path("calibrations"),
+    name: NameOption = None,
+    valid_days: DaysOption = 180,
+    as_json: JsonOption = False,
+) -> None:
+    """Where a scanned object lies in the base, by its stickers in six views or more."""
+    from coupole.calibration.mesh_to_robot import Stated
+    from coupole.calibration.posed_camera import read_posed_camera
+    from coupole.calibration.report import Outcome
+    from coupole.calibration.sources import open_sources
+    from coupole.calibration.sticker_picture import draw_mesh
+    from coupole.calibration.sticker_sources import find_all_stickers, read_scan
+    from coupole.calibration.sticker_workflow import mesh_from
+    from coupole.geometry import transform
+
+    def work(console: Console, wish: Wish) -> Outcome:
+        known, sources = read_scan(scan), open_sources(runs, None)
+        height_px, width_px = sources.images[0].read()[0].shape
+        prior = read_posed_camera(hand_eye, camera, sources.about, (width_px, height_px))
+        depth_mm = (nearest_mm, farthest_mm)
+        with bar(console, "looking for stickers") as progress:
+            images = find_all_stickers(
+                sources, prior.lens, diameter_mm=diameter_mm, depth_mm=depth_mm, progress=progress
+            )
+        console.print(f"{sum(map(len, images.stickers))} stickers in {len(images.names)} images")
+        support = None
+        if rig is not None:
+            place = _cell(rig, runs).rig.support.base_from_support
+            support = transform(place.translation_mm, place.abc_deg)
+        stated = Stated(scanner_mm=scanner_mm, robot_mm=repeatability_mm, robot_deg=repeatability_deg)
+        found = mesh_from(
+            images, sources, known, prior, wish, stated=stated, depth_mm=depth_mm, base_from_support=support
+        )
+        return Outcome(found.record, partial(draw_mesh, found))
+
+    calibrate("mesh", work, out=out, name=name, lens=None, valid_days=valid_days, as_json=as_json)
+
+
+def _cell(rig: Path | None, runs: list[Path]) -> Cell:
+    """The rig that is named, or that of the first run if it is still what it was."""
+    from coupole.job import read_cell
+    from coupole.run import Run, sha256
+
+    if rig is not None:
+        return read_cell(rig)
+    about = Run(runs[0]).about["rig"]
+    path = Path(about["path"])
+    if not path.is_file() or sha256(path) != about["sha256"]:
+        raise InputError(f"{runs[0]}: its rig {path} is gone or was changed since; name one with --rig")
+    return read_cell(path)

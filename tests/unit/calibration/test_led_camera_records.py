@@ -1,0 +1,67 @@
+"""Which camera and hand-eye records LEDs and meshes may be found with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from photographed import BOARD, SIZE_PX, write_run
+
+from coupole.calibration.bundle import RobotNoise
+from coupole.calibration.posed_camera import read_posed_camera
+from coupole.calibration.record import write_record
+from coupole.calibration.sources import Sources, find_board, open_sources
+from coupole.calibration.workflow import Wish, hand_eye_from
+from coupole.errors import InputError
+
+NOW = datetime(2026, 5, 1, tzinfo=UTC)
+
+
+@cache
+def sources_in(folder: Path) -> Sources:
+    return open_sources([write_run(folder).folder], None)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Sources]:
+    """A hand-eye record, and the images that it was made from."""
+    folder = tmp_path_factory.mktemp("recorded")
+    sources = sources_in(folder / "run")
+    found = find_board(BOARD, sources)
+    shown = hand_eye_from(found, sources, BOARD, "brown4", Wish("he", NOW), robot=RobotNoise())[2]
+    write_record(folder / "he.yaml", shown.record)
+    return folder / "he.yaml", sources
+
+
+def test_lens_and_hand_eye_come_with_their_common_covariance(recorded: tuple[Path, Sources]) -> None:
+    path, sources = recorded
+    prior = read_posed_camera(path, None, sources.about, SIZE_PX)
+    assert prior.covariance.shape == (len(prior.free) + 6, len(prior.free) + 6)
+    assert (np.linalg.eigvalsh(prior.covariance) > 0).all()
+    assert np.abs(prior.flange_from_camera[:3, 3] - [31.0, -42.0, 118.0]).max() < 2.0
+    assert np.sqrt(np.diag(prior.hand_eye_covariance))[3:].max() < np.radians(0.5)
+
+
+def test_a_record_of_another_focus_is_refused(recorded: tuple[Path, Sources]) -> None:
+    path, sources = recorded
+    about = replace(sources.about, focus_distance_mm=500.0)
+    with pytest.raises(
+        InputError, match="holds for a focus of 335 mm, within 2 mm; the images were taken at 500 mm"
+    ):
+        read_posed_camera(path, None, about, SIZE_PX)
+
+
+def test_a_record_of_other_frames_is_refused(recorded: tuple[Path, Sources]) -> None:
+    path, sources = recorded
+    with pytest.raises(InputError, match="holds for frames of 480 x 360 pixels"):
+        read_posed_camera(path, None, sources.about, (4096, 3072))
+
+
+def test_a_hand_eye_record_in_a_cameras_place_is_refused(recorded: tuple[Path, Sources]) -> None:
+    path, sources = recorded
+    with pytest.raises(InputError, match="expected a record of the kind `camera`"):
+        read_posed_camera(path, path, sources.about, SIZE_PX)

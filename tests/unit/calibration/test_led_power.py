@@ -1,0 +1,212 @@
+"""LED power from a white tile, against domes of the tests' own with small emitters added up point by point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from light_synthesis import Array, coverage
+
+from coupole.calibration.irradiance import irradiance_per_flux, lambert_vector, led_corners_mm
+from coupole.calibration.led_power import LedPower, Positions, TileView, calibrate_led_power
+from coupole.calibration.spectralon import Tile
+from coupole.errors import InputError
+
+TILE = Tile(reflectance=0.99, u_reflectance=0.005, minnaert=1.1, u_minnaert=0.03, u_tilt_deg=0.2)
+EXPOSURE_S = 0.01
+
+
+def turned(x_deg: float, y_deg: float, z_deg: float = 0.0) -> Array:
+    a, b, c = np.radians([x_deg, y_deg, z_deg])
+    x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+    return np.asarray(z @ y @ x)
+
+
+def dome(count: int, random: np.random.Generator) -> Positions:
+    """LEDs over the upper half of a sphere of 1 m, looking to its middle."""
+    up = random.uniform(0.25, 0.98, count)
+    turn = random.uniform(0, 2 * np.pi, count)
+    out = np.sqrt(1 - up**2)
+    centres = 1000 * np.stack([out * np.cos(turn), out * np.sin(turn), up], axis=1)
+    return Positions(np.arange(count), centres, -centres / 1000)
+
+
+def summed_irradiance(point: Array, normal: Array, centres: Array, normals: Array) -> Array:
+    """E/Phi in m^-2 by 8 x 8 small Lambertian emitters on each LED."""
+    total = np.zeros(len(centres))
+    for k, (centre, axis) in enumerate(zip(centres, normals, strict=True)):
+        u = np.linalg.svd(axis[None])[2][1:]
+        a, b = np.meshgrid(*[(np.arange(8) + 0.5) / 8 * 7 - 3.5] * 2)
+        away = point - (centre + a.ravel()[:, None] * u[0] + b.ravel()[:, None] * u[1])
+        far = np.linalg.norm(away, axis=1)
+        total[k] = np.mean((away @ axis) * -(away @ normal) / far**4) / np.pi * 1e6
+    return total
+
+
+def views_of(
+    positions: Positions,
+    power: Array,
+    random: np.random.Generator,
+    *,
+    tilts_deg: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
+    truth: Tile = TILE,
+    noise: float = 1e-3,
+    cameras: int = 2,
+) -> list[TileView]:
+    """What cameras see of the tile in each of its places; `tilts_deg` is how it lies otherwise than described."""
+    found = []
+    for place, tilt in enumerate(tilts_deg):
+        pose = np.eye(4)
+        pose[:3, :3] = turned(0, 0, 90 * place)
+        normal = pose[:3, :3] @ turned(*tilt) @ (0, 0, 1)
+        a, b = np.meshgrid(*[np.array([-15.0, 0.0, 15.0])] * 2)
+        points = np.stack([a.ravel(), b.ravel(), np.zeros(9)], axis=1)
+        lit = np.stack([summed_irradiance(p, normal, positions.centres_mm, positions.normals) for p in points], 1)
+        for camera in range(cameras):
+            eye = np.array([120.0 * (camera - 0.5), 40.0, 320.0])
+            towards = positions.centres_mm[:, None] - points
+            cos_in = towards @ normal / np.linalg.norm(towards, axis=2)
+            cos_out = (eye - points) @ normal / np.linalg.norm(eye - points, axis=1)
+            k = truth.minnaert
+            f = truth.reflectance * (k + 1) / 2 / np.pi * (cos_in * cos_out) ** (k - 1)
+            signal = f * lit * power[:, None]
+            u = noise * signal
+            seen = signal + u * random.standard_normal(signal.shape)
+            saturated = np.zeros(len(power), bool)
+            name = f"p{place}c{camera}"
+            found.append(TileView(name, place, pose, points, eye, positions.ids, seen, u, saturated))
+    return found
+
+
+def powers(count: int, random: np.random.Generator) -> Array:
+    return np.asarray(1e4 * np.exp(0.04 * random.standard_normal(count)))
+
+
+def small_dome(seed: int = 1, count: int = 60) -> tuple[Positions, Array, np.random.Generator]:
+    random = np.random.default_rng(seed)
+    return dome(count, random), powers(count, random), random
+
+
+def test_irradiance_has_the_reference_values() -> None:
+    def seen_at(angle_deg: float) -> float:
+        a = np.radians(angle_deg)
+        return float(
+            irradiance_per_flux([0, 0, 0], [0, 0, 1], 1000 * np.array([np.sin(a), 0, np.cos(a)]), [0, 0, -1])
+        )
+
+    assert seen_at(0) == pytest.approx(0.318304687, abs=5e-10)
+    assert seen_at(30) == pytest.approx(0.238731440, abs=5e-10)
+    assert seen_at(60) == pytest.approx(0.0795790963, abs=1e-10)
+    view_factor = lambert_vector([0, 0, 0], led_corners_mm([0, 0, 7], [0, 0, -1]))[2] / (2 * np.pi)
+    assert view_factor == pytest.approx(0.2394564705, abs=5e-11)
+
+
+def test_the_paper_takes_the_emitters_cosine_twice() -> None:
+    led = 1000 * np.array([np.sin(1), 0, np.cos(1)])
+    once = irradiance_per_flux([0, 0, 0], [0, 0, 1], led, [0, 0, -1])
+    twice = irradiance_per_flux([0, 0, 0], [0, 0, 1], led, [0, 0, -1], emission="paper")
+    assert twice / once == pytest.approx(np.cos(1))
+
+
+def test_irradiance_is_that_of_many_small_emitters() -> None:
+    positions, _, _ = small_dome()
+    normal = turned(10, 20) @ (0, 0, 1)
+    exact = irradiance_per_flux([5, 3, 1], normal, positions.centres_mm, positions.normals)
+    lit = exact > 0
+    summed = summed_irradiance(np.array([5, 3, 1]), normal, positions.centres_mm, positions.normals)
+    assert np.abs(summed[lit] / exact[lit] - 1).max() < 1e-5
+
+
+def test_powers_lie_in_their_intervals(scale: Callable[[int, int], int]) -> None:
+    off: list[float] = []
+    for seed in range(scale(5, 100)):
+        positions, power, random = small_dome(seed, 30)
+        truth = replace_tile(random)
+        tilts = tuple(map(tuple, random.normal(0, TILE.u_tilt_deg, (2, 2))))
+        found = calibrate_led_power(
+            views_of(positions, power, random, tilts_deg=tilts, truth=truth), positions, TILE
+        )
+        error = np.log(found.power / power)
+        against = error - error.mean()
+        off += list(random.choice(against / found.u_against_mean(), 4))
+        off.append(float(error.mean()) / found.u_scale)
+    inside, rms = coverage(off)
+    few = len(off) < 100
+    assert inside >= (0.7 if few else 0.9)
+    assert (0.3 if few else 0.8) < rms < (1.8 if few else 1.25)
+
+
+def replace_tile(random: np.random.Generator) -> Tile:
+    """A tile that is what its description says, within its uncertainty."""
+    return TILE.model_copy(
+        update={
+            "reflectance": TILE.reflectance + TILE.u_reflectance * random.standard_normal(),
+            "minnaert": TILE.minnaert + TILE.u_minnaert * random.standard_normal(),
+        }
+    )
+
+
+def test_a_tile_in_several_places_tells_its_tilt() -> None:
+    positions, power, random = small_dome()
+    tilts = ((0.2, -0.1), (-0.15, 0.1), (0.1, 0.2))
+    found = calibrate_led_power(views_of(positions, power, random, tilts_deg=tilts), positions, TILE)
+    u = np.sqrt(np.diag(found.common_covariance))
+    assert (np.abs(found.found[:6] - np.ravel(tilts)) < 4 * u[:6]).all()
+    one = calibrate_led_power(views_of(positions, power, random), positions, TILE)
+    assert (u[:2] < 0.8 * np.sqrt(np.diag(one.common_covariance))[:2]).all()
+
+
+def changed(views: list[TileView], number: int, factor: Array | float) -> list[TileView]:
+    views[number] = replace(views[number], signal=views[number].signal * factor)
+    return views
+
+
+def found_with(views: list[TileView], positions: Positions) -> LedPower:
+    return calibrate_led_power(views, positions, TILE)
+
+
+def test_a_dead_led_is_named() -> None:
+    positions, power, random = small_dome()
+    power[7] = 1e-3
+    views = [replace(v, u_signal=np.full(v.signal.shape, 1.0)) for v in views_of(positions, power, random)]
+    found = found_with(views, positions)
+    assert found.power[7] == 0
+    assert "dead LEDs, or hidden in every view: LED 7" in found.remarks
+
+
+def test_a_shadow_on_the_tile_is_named_and_not_used() -> None:
+    positions, power, random = small_dome()
+    factor = np.ones((60, 9))
+    factor[11, 6:] = 0.7
+    found = found_with(changed(views_of(positions, power, random), 0, factor), positions)
+    assert any("view p0c0: the tile is partly in shadow under LED 11" in remark for remark in found.remarks)
+    assert abs(found.power[11] / power[11] - 1) < 4 * found.u()[11]
+
+
+def test_an_led_that_the_arm_hides_in_one_view_is_not_dead() -> None:
+    positions, power, random = small_dome()
+    factor = np.ones((60, 9))
+    factor[11] = 1e-4
+    found = found_with(changed(views_of(positions, power, random), 0, factor), positions)
+    assert any("view p0c0: the tile is wholly in shadow under LED 11" in remark for remark in found.remarks)
+    assert abs(found.power[11] / power[11] - 1) < 4 * found.u()[11]
+
+
+def test_a_saturated_tile_is_named_and_not_used() -> None:
+    positions, power, random = small_dome()
+    views = views_of(positions, power, random)
+    views[1].saturated[5] = True
+    found = found_with(views, positions)
+    assert any("view p0c1: the tile is saturated under LED 5" in remark for remark in found.remarks)
+
+
+def test_a_tile_that_moved_between_views_is_named() -> None:
+    positions, power, random = small_dome()
+    first = views_of(positions, power, random)[:1]
+    moved = views_of(positions, power, random, tilts_deg=((1.0, 0.3),))[1:]
+    with pytest.raises(InputError, match=r"did not lie still: view p0c[01] sees it tilted by"):
+        found_with([*first, *moved], positions)

@@ -21,6 +21,8 @@ def _board_views(count: int = 40) -> str:
     return "\n".join(lines)
 
 
+LEDS = "leds"
+"""A plan that is made for a rig's dome: `coupole.calibration.led_plan`."""
 TEMPLATES = {
     "views": """\
 # yaml-language-server: $schema=plan.schema.json   (made by `coupole schema plan > plan.schema.json`)
@@ -98,7 +100,7 @@ views:
      roll_deg: -30}}
 lights: {{kind: panels, panels: [1]}}
 repeats: 3
-exposure: {{kind: bracket, exposures_us: [50, 100, 200, 800]}}
+exposure: {{kind: bracket, exposures_us: [20, 80, 800, 6400]}}
 darks_per_view: 8
 """,
     "spectralon": """\

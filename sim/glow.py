@@ -117,7 +117,9 @@ def _cover(coverage, edges, top, left, focal, centre_x, centre_y, shift):  # typ
             at[1, 0] = at[2, 1] = 1.0 / focal
             if bent:
                 _bend(at, shift, top + row, left + col)
-            lines[:] = edges @ at.T
+            for k in range(4):
+                for i in range(3):
+                    lines[k, i] = edges[k, 0] * at[i, 0] + edges[k, 1] * at[i, 1] + edges[k, 2] * at[i, 2]
             inside, outside = True, False
             for k in range(4):
                 reach = 0.5 * (abs(lines[k, 1]) + abs(lines[k, 2]))

@@ -100,6 +100,7 @@ class Photographer:
         self._base_from_camera: Transform = np.zeros((4, 4))
         self._arm_mm = NONE
         self._interreflection = settings.interreflection
+        self._glow_of_light: dict[int, Glow | None] = {}
         self._prepared: Prepared | None = None
         """For light that goes from surface to surface, at this pose."""
         self._radiance: dict[int, Radiance] = {}
@@ -170,6 +171,7 @@ class Photographer:
             self._view = self._viewer.look(base_from_camera)
             self._places = self._shadows.places(self._view.sides)
             self._empty = self._prepared = None
+            self._glow_of_light.clear()
             self._base_from_camera = base_from_camera
             self._radiance.clear()
         return self._view
@@ -245,12 +247,12 @@ class Photographer:
         """[h, w] mean electrons of lamps that the camera looks at, or None if it sees none."""
         seen: list[tuple[Glow, NDArray[np.float32]]] = []
         for led, lit_s in exposed.seconds_of_led.items():
-            if spot := self._glow(view, self._emitters[self._row_of_led[led]], self._emission):
+            if spot := self._glow(view, led, self._emitters[self._row_of_led[led]], self._emission):
                 seen.append((spot, self._colour_of(led) * np.float32(lit_s)))
         for panel in exposed.panels:
             if panel <= len(self._panels):
                 whole, unevenness = self._panels[panel - 1]
-                if area := self._glow(view, whole, "lambertian", unevenness):
+                if area := self._glow(view, -panel, whole, "lambertian", unevenness):
                     seen.append((area, np.full(3, exposed.exposure_s, np.float32)))
         if not seen:
             return None
@@ -261,11 +263,15 @@ class Photographer:
             mean_e[lamp.rows, lamp.columns] += lamp.radiance * weights
         return mean_e * self._falloff * np.float32(self._electrons)
 
-    def _glow(self, view: View, lamp: Emitter, emission: str, unevenness: float = 0.0) -> Glow | None:
-        if self._empty is None:
-            self._empty = view.empty(self._camera.samples_per_side)
-        blur = (self._objective, self._camera.pixel_pitch_um) if self._camera.blur else None
-        return glow(lamp, emission, self._sight, self._base_from_camera, self._empty, blur, unevenness)
+    def _glow(self, view: View, light: int, lamp: Emitter, emission: str, unevenness: float = 0.0) -> Glow | None:
+        """What the camera sees of a lamp; computed once per pose."""
+        if light not in self._glow_of_light:
+            if self._empty is None:
+                self._empty = view.empty(self._camera.samples_per_side)
+            blur = (self._objective, self._camera.pixel_pitch_um) if self._camera.blur else None
+            seen = glow(lamp, emission, self._sight, self._base_from_camera, self._empty, blur, unevenness)
+            self._glow_of_light[light] = seen
+        return self._glow_of_light[light]
 
 
 def _emitters(leds: Leds) -> list[Emitter]:

@@ -13,8 +13,7 @@ from coupole import store
 from coupole.calibration.led_matching import LedSightings
 from coupole.calibration.led_spots import find_spots
 from coupole.calibration.rotations import Floats
-from coupole.calibration.sources import About
-from coupole.calibration.sources import about_of, frames_sha256, poses_and_attributes
+from coupole.calibration.sources import About, about_of, frames_sha256, poses_and_attributes
 from coupole.dome import LedTable
 from coupole.errors import InputError
 from coupole.run import ProvenFrame, Run, sha256

@@ -86,6 +86,13 @@ def led_views(
     return LedViews(tuple(chosen), images, few, np.sqrt(np.trace(np.linalg.inv(known), axis1=1, axis2=2)))
 
 
+def boards_seen(
+    boards: Boards, base_from_camera: Floats, lens: Intrinsics, size_px: tuple[int, int], margin_px: float
+) -> NDArray[np.bool_]:
+    """[c, b] which boards each of the poses [c, 4, 4] sees whole."""
+    return _sightings(boards, base_from_camera, lens, size_px, margin_px)[0]
+
+
 def _gain(known: Floats, information: Floats) -> Floats:
     """What each view [c] adds to each board [b]: growth of log det."""
     return np.asarray(np.linalg.slogdet(known[None] + information)[1] - np.linalg.slogdet(known)[1])

@@ -257,6 +257,7 @@ def poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
 
 def about_of(run: Run, attributes: dict[str, Any]) -> About:
     """What a view's attributes say of camera and lens."""
+
     def number(key: str) -> float | None:
         return float(attributes[key]) if key in attributes else None
 

@@ -147,11 +147,20 @@ class Campaign:
 
     def _plan(self, step: Step) -> Path:
         """The step's plan; one that stands there, and may have been changed by hand, is kept."""
-        from coupole.templates import TEMPLATES
+        from coupole.calibration.led_plan import led_plan
+        from coupole.job import read_cell
+        from coupole.templates import LEDS, TEMPLATES
 
         path = self._out / "plans" / f"{step.name}.yaml"
-        if not path.exists():
-            path.write_text(TEMPLATES[step.name].format(name=step.name, rig=self._rig_of(step)), encoding="utf-8")
+        if path.exists():
+            return path
+        rig = self._rig_of(step)
+        if step.name == LEDS:
+            with self._console.status("reading the rig") as status:
+                text = led_plan(read_cell(rig), name=step.name, rig=str(rig), tell=status.update)
+        else:
+            text = TEMPLATES[step.name].format(name=step.name, rig=rig)
+        path.write_text(text, encoding="utf-8")
         return path
 
     def _rig_of(self, step: Step) -> Path:

@@ -147,17 +147,26 @@ def plan_new(
         str | None, typer.Option("--template", help="Which template; the one called NAME, else `views`.")
     ] = None,
     rig: Annotated[str, typer.Option("--rig", help="Path of the rig, relative to the plan.")] = "../rigs/sim.yaml",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the views of `leds`, which are drawn.")] = 1,
 ) -> None:
-    """Write a plan to start from."""
-    from coupole.templates import TEMPLATES
+    """Write a plan to start from. The views of `leds` are chosen for the rig's dome: a minute or two."""
+    from coupole.console import make_console
+    from coupole.templates import LEDS, TEMPLATES
 
-    template = template or (name if name in TEMPLATES else "views")
-    if template not in TEMPLATES:
-        raise typer.BadParameter(f"expected one of {', '.join(sorted(TEMPLATES))}; found {template}")
+    known = sorted([*TEMPLATES, LEDS])
+    template = template or (name if name in known else "views")
+    if template not in known:
+        raise typer.BadParameter(f"expected one of {', '.join(known)}; found {template}")
     path = Path(f"{name}.yaml")
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(TEMPLATES[template].format(name=name, rig=rig))
-    except FileExistsError as error:
-        raise InputError(f"{path}: stands here already; choose another name") from error
+    if path.exists():
+        raise InputError(f"{path}: stands here already; choose another name")
+    if template == LEDS:
+        from coupole.calibration.led_plan import led_plan
+        from coupole.job import read_cell
+
+        with make_console(quiet=False).status("reading the rig") as status:
+            text = led_plan(read_cell(path.parent / rig), name=name, rig=rig, seed=seed, tell=status.update)
+    else:
+        text = TEMPLATES[template].format(name=name, rig=rig)
+    path.write_text(text, encoding="utf-8")
     print(path)

@@ -110,7 +110,7 @@ name: {name}
 rig: {rig}
 views:
   - {{kind: grid, name: tile, target_mm: [0, 0, 10], distance_mm: 335,
-     azimuths_deg: [-150, -90, -30, 30, 90, 150], elevations_deg: [50]}}
+     azimuths_deg: [-135, -45, 45, 135], elevations_deg: [50]}}
 lights: {{kind: all}}
 hidden_lights: skip
 exposure: {{kind: bracket, exposures_us: [2000, 6000]}}

@@ -110,6 +110,27 @@ ray and one radiance for each triangle, so large triangles show. Materials are r
 the camera's three channels. What they answer to in the papers is named; the papers' own pictures are of real
 objects or of spectral path tracing, and the likeness is for you to judge.
 """
+_RENDERINGS = """
+## Spectral renderings
+
+By `coupole render` (Mitsuba; `tools/make_renderings.py`), from the scenes in `configs/scenes/`. These
+pictures have 11 bands and few samples; the scene files ask for 81. *All are simulated.*
+
+"""
+_RENDERED = (
+    ("gilt-step-wedge-d65-main", "Gold leaf of 0 to 250 nm on red bole, under D65 (seed 001)"),
+    ("gilt-step-wedge-a-main", "The same under illuminant A"),
+    ("paint-wedge-main", "Azurite, 10 to 320 um, over black and white (seed 000)"),
+    ("urushi-makie-main", "Sprinkled gold on black urushi (seed 002)"),
+    ("nashiji-stereo-left", "Nashiji for the left eye (seed 002)"),
+    ("nashiji-stereo-right", "Nashiji for the right eye"),
+    ("sunset-gilding-main", "Gilding under a low sun"),
+    (
+        "arcature-main",
+        "A gilded niche in the sun, by path tracing: grainy, for the sun is found by way of gold by chance",
+    ),
+    ("arcature-caustic", "The sun's light on the niche's ground and back wall, by photons (seed 001)"),
+)
 
 
 def make(piece: Piece) -> Path:
@@ -159,7 +180,11 @@ def page() -> str:
             f"\n## {piece.title}\n\n![{piece.title} under four LEDs, simulated](pictures/gallery/{kind}.png)\n\n"
             f"*Simulated.* {piece.caption}\n"
         )
-    return "".join(parts)
+    parts.append(_RENDERINGS)
+    parts += [
+        f"![{caption}, simulated](pictures/renderings/{name}.png)\n\n{caption}.\n\n" for name, caption in _RENDERED
+    ]
+    return "".join(parts).rstrip() + "\n"
 
 
 def main() -> None:

@@ -11,6 +11,12 @@
     chromatic.py    a lens for each colour channel: lateral chromatic aberration
     hand_eye.py     A X = X B in closed form: Park, Tsai, Daniilidis
     bundle.py       camera, hand-eye, board and errors of the robot in one adjustment
+    led_*.py        LEDs: spots in frames, boards as rigid bodies, wiring, one adjustment, the plan of views
+    sticker_*.py    the scanner's targets: ellipses in frames, points in space, record
+    mesh_to_robot.py  which target is which sticker, and where that puts the mesh
+    dark.py response.py flat_field.py led_power.py drift.py  sensor, lens and LEDs as radiometers
+    light_*.py      frames and records of these; spectralon.py, irradiance.py: what a white tile gives back
+    measurement.py propagation.py budget.py  the measurement equation and its uncertainty (JCGM 100 and 101)
     diagnosis.py    why robot and camera contradict each other
     workflow.py     images to record and report, with acceptance limits
     record.py       the result on disk, sealed by its checksum

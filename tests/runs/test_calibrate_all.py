@@ -1,0 +1,67 @@
+"""`coupole calibrate all`: plans, runs and records from nothing, gone on with after a stop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cells
+import pytest
+from ruamel.yaml import YAML
+
+from coupole.calibration.record import read_record
+from coupole.templates import TEMPLATES
+
+STEPS = ("--only", "darks", "--only", "response")
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    """The imperfect cell with small frames, faster than life."""
+    content: dict[str, Any] = YAML(typ="safe").load(cells.REPO / "configs/rigs/sim-imperfect.yaml")
+    content["sensor"] |= {"width_px": 256, "height_px": 192, "pixel_pitch_um": 88.0}
+    content["dome"]["leds"] = str(cells.REPO / "configs/domes/coupole.csv")
+    content["ledbox"]["settings"]["watchdog_s"] = 40.0
+    content["world"]["settings"] |= {"speed": 5.0}
+    path = tmp_path / "rig.yaml"
+    with path.open("w") as file:
+        YAML().dump(content, file)
+    return path
+
+
+@pytest.mark.timeout(600)
+def test_records_are_made_from_nothing_and_not_made_twice(rig: Path, tmp_path: Path) -> None:
+    out = tmp_path / "calibrations"
+    first = cells.here("calibrate", "all", "--rig", rig, "--out", out, *STEPS, "--json")
+    assert first.code == 0, first.err
+    assert set(first.document["records"]) == {"dark", "response"}
+    for kind, path in first.document["records"].items():
+        record = read_record(Path(path))
+        assert record.kind == kind
+        assert record.simulated
+        assert record.passed
+    runs = sorted((out / "runs").glob("2*"))
+    assert len(runs) == 2
+
+    (out / "response.yaml").unlink()
+    again = cells.here("calibrate", "all", "--rig", rig, "--out", out, *STEPS, "--json")
+    assert again.code == 0, again.err
+    assert again.document["records"] == first.document["records"]
+    assert sorted((out / "runs").glob("2*")) == runs  # its run was there: only the record was made again
+
+
+def test_a_plan_that_was_changed_by_hand_is_kept(rig: Path, tmp_path: Path) -> None:
+    out = tmp_path / "calibrations"
+    plan = out / "plans" / "darks.yaml"
+    plan.parent.mkdir(parents=True)
+    text = TEMPLATES["darks"].format(name="darks", rig=rig).replace("darks_per_view: 20", "darks_per_view: 12")
+    plan.write_text(text)
+    ended = cells.here("calibrate", "all", "--rig", rig, "--out", out, "--only", "darks", "--json")
+    assert ended.code == 0, ended.err
+    assert plan.read_text() == text
+
+
+def test_a_step_that_does_not_exist_is_refused() -> None:
+    ended = cells.here("calibrate", "all", "--only", "nothing")
+    assert ended.code == 2
+    assert "darks" in ended.err

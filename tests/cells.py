@@ -154,7 +154,7 @@ class CellFolder:
         """The world that the rig joins: it outlives its controllers, and holds the plan's object."""
         job = read_job(self.plan)
         config = world_config(job.cell, job, job.cell.rig.sensor, speed=self.speed)
-        config["settings"] |= {"seed": 1, "faults": list(faults), **settings}
+        config["settings"] |= {"seed": 1, "arm_shadows": False, "faults": list(faults), **settings}
         world = World.start(config)
         self._endpoints.write_text(json.dumps(world.endpoints) + "\n")
         try:

@@ -19,7 +19,7 @@ from sim.glow import Glow, glow
 from sim.led_light import channel_factors
 from sim.materials import light
 from sim.objective import Objective, vignetting
-from sim.render.arm_shadow import cast
+from sim.render import arm_shadow
 from sim.render.embree import Obstacles
 from sim.render.emitter import LED_SIDE_MM, Emitter, irradiance, square
 from sim.render.lens import Lens, sight
@@ -38,6 +38,9 @@ _POSE_TOLERANCE, _ARM_TOLERANCE_MM = 1e-6, 1e-3
 _SHADOW_BYTES = 512 << 20
 _RADIANCE_BYTES = 256 << 20
 _WARM_UP_HEIGHT_MM = 1000.0
+
+_AHEAD = square((0.0, 0.0, 1000.0), (0.0, 0.0, -1.0), side_mm=LED_SIDE_MM, flux_lm=1.0)
+"""A lamp before the camera, to try it on."""
 
 Radiance = NDArray[np.float32]
 
@@ -113,6 +116,8 @@ class Photographer:
         support_from_camera[2, 3] = _WARM_UP_HEIGHT_MM
         view = self._look_from(base_from_support @ support_from_camera @ inverse(self.flange_from_camera))
         self._led(view, int(self.leds.ids[0]))
+        arm_shadow.warm_up()
+        glow(_AHEAD, "lambertian", self._sight, np.eye(4), view.empty(self._camera.samples_per_side), None)
 
     def render(self, out: NDArray[np.uint16], exposed: Exposed) -> None:
         """Fill `out` [h, w] with the frame of one exposure, DN."""
@@ -210,7 +215,7 @@ class Photographer:
             self._places,
             self._shadows.reached(row),
         )
-        cast(radiance, view.centroids_mm, self._arm_mm, emitter.centre_mm)
+        arm_shadow.cast(radiance, view.centroids_mm, self._arm_mm, emitter.centre_mm)
         return radiance
 
     def _indirect(self, view: View, emitter: Emitter) -> Radiance:

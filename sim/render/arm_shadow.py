@@ -27,6 +27,12 @@ def cast(
         _cast(radiance, centroids_mm, np.array(near), light_mm)
 
 
+def warm_up() -> None:
+    """Compile, before anybody waits for a frame."""
+    capsules = np.array([[0.0, 0.0, 50.0, 0.0, 10.0, 50.0, 5.0]])
+    cast(np.ones((1, 3), np.float32), np.zeros((1, 3), np.float32), capsules, np.array([0.0, 0.0, 100.0]))
+
+
 @numba.njit(cache=True, nogil=True)
 def distance_mm(a, b, c, d):  # type: ignore[no-untyped-def]
     """Between the segments a b and c d (Ericson, Real-Time Collision Detection, 5.1.9)."""

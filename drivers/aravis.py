@@ -20,11 +20,11 @@ from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameForma
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.aravis_discovery import name_of, open_controlled
 from drivers.aravis_features import Features
-from drivers.aravis_image import frame_format, pixel_format, readout_us, set_region
 from drivers.aravis_library import ON_CONTROL_LOST, call, is_a, require
-from drivers.aravis_pixels import widen
 from drivers.aravis_settings import Counter, Settings
 from drivers.aravis_stream import Pool, Stream, StreamStatistics
+from drivers.genicam_image import frame_format, pixel_format, readout_us, set_region
+from drivers.pixel_formats import widen
 
 __all__ = ["AravisCamera", "Settings"]
 

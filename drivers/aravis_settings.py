@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.aravis_features import Value
+from drivers.genicam_image import Region
 
 
 class Counter(BaseModel):
@@ -16,17 +17,6 @@ class Counter(BaseModel):
 
     select: dict[str, Value] = Field(default_factory=dict)
     read: str = "CounterValue"
-
-
-class Region(BaseModel):
-    """Part of the sensor, in pixels."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    width_px: Annotated[int, Field(gt=0)]
-    height_px: Annotated[int, Field(gt=0)]
-    left_px: Annotated[int, Field(ge=0)] = 0
-    top_px: Annotated[int, Field(ge=0)] = 0
 
 
 class Settings(BaseModel):

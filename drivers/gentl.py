@@ -19,8 +19,9 @@ from typing import Any
 from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceRefused
 from drivers.frame_pool import FramePool, Slot
+from drivers.genicam_image import frame_format, pixel_format, readout_us, set_region
 from drivers.gentl_features import Features
-from drivers.gentl_image import copy_pixels, frame_format, pixel_format, readout_us, set_region, timestamp_ns
+from drivers.gentl_image import copy_pixels, timestamp_ns
 from drivers.gentl_producer import Gaps, open_camera, reporting, told, when_incomplete
 from drivers.gentl_settings import Counter, Settings
 from drivers.turns import Turns

@@ -7,19 +7,10 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, StrictStr
 
+from drivers.genicam_image import Region
+
 Value = StrictBool | StrictInt | StrictFloat | StrictStr
 """What a feature holds; an enumeration's is the name of its entry."""
-
-
-class Region(BaseModel):
-    """Part of the sensor, in pixels."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    width_px: Annotated[int, Field(gt=0)]
-    height_px: Annotated[int, Field(gt=0)]
-    left_px: Annotated[int, Field(ge=0)] = 0
-    top_px: Annotated[int, Field(ge=0)] = 0
 
 
 class Counter(BaseModel):

@@ -5,21 +5,19 @@ A frame is read when it is asked for, so a calibration that looks at one after t
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole import store
 from coupole.calibration.rotations import Floats
-from coupole.calibration.sources import About
-from coupole.errors import InputError, StorageError
+from coupole.calibration.sources import About, about_of, frames_sha256, poses_and_attributes
+from coupole.errors import InputError
 from coupole.run import ProvenFrame, Run, is_shot, sha256
 
 CHANNELS = ("R", "G", "B")
@@ -89,9 +87,7 @@ def open_light_frames(paths: Sequence[Path]) -> LightFrames:
                 )
             common = here
             frames += found
-            lines = sorted(f"{frame.shot} {frame.xxh3}" for frame in proven)
-            digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()
-            inputs.append((f"{run.folder.name}/views/{view_path.name}", digest))
+            inputs.append((f"{run.folder.name}/views/{view_path.name}", frames_sha256(proven)))
     if common is None or not frames:
         raise InputError(f"{', '.join(map(str, paths))}: no proven frame; acquire the plan first")
     pattern, black_dn, white_dn, _gain_db, focal_px, about = common
@@ -130,11 +126,7 @@ def _of_view(
     run: Run, path: Path, proven: Sequence[ProvenFrame]
 ) -> tuple[list[LightFrame], tuple[str, int, int, float, float, About]]:
     layout, table, facts = store.read_layout(path), store.read_frames(path), store.read_facts(path)
-    try:
-        with h5py.File(path, "r") as file:
-            poses, attributes = file[store.POSES][:], dict(file["entry"].attrs)
-    except (OSError, KeyError) as error:
-        raise StorageError(f"{path}: not a view file of a run: {error}") from error
+    poses, attributes = poses_and_attributes(path)
     frames = []
     for frame in proven:
         record = table[frame.index]
@@ -152,13 +144,7 @@ def _of_view(
         )
     focal_mm, focus_mm = float(attributes["focal_length_mm"]), float(attributes["focus_distance_mm"])
     image_mm = focal_mm * focus_mm / (focus_mm - focal_mm)
-    about = About(
-        simulated=bool(run.about["simulated"]),
-        camera=str(attributes["camera"]) if "camera" in attributes else None,
-        focal_length_mm=focal_mm,
-        focus_distance_mm=focus_mm,
-        f_number=float(attributes["f_number"]) if "f_number" in attributes else None,
-    )
+    about = about_of(run, attributes)
     focal_px = image_mm * 1e3 / float(attributes["pixel_pitch_um"])
     gain_db = float(attributes.get("gain_db", 0.0))
     return frames, (facts["pattern"], facts["black_dn"], facts["white_dn"], gain_db, focal_px, about)

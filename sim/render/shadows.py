@@ -2,7 +2,7 @@
 
 LEDs, support and object stand still in the base frame, so whether an LED reaches a side of a triangle holds for
 every view. One ray goes from the triangle's centroid, lifted off it by `embree.OFFSET_MM`, to the emitter's
-centre: shadows are hard and follow triangles' edges. Arm and camera cast none.
+centre: shadows are hard and follow triangles' edges. What moves casts its own: `sim.render.arm_shadow`.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from drivers.aravis_pixels import FORMATS, pixels_in_a_group, widen
+from drivers.pixel_formats import FORMATS, pixels_in_a_group, widen
 from sim import gige_pixels
 
 COUNT = 40

@@ -1,14 +1,43 @@
-"""What an opened camera's features say of its images, and setting the region that it reads out."""
+"""What a GenICam camera's features say of its images, and setting the region that it reads out.
+
+For all drivers that reach such features, by whichever library.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Annotated, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from coupole.devices import FrameFormat
 from coupole.errors import DeviceRefused
-from drivers.aravis_features import Features
-from drivers.aravis_pixels import FORMATS, PixelFormat, pixels_in_a_group
-from drivers.aravis_settings import Region
+from drivers.pixel_formats import FORMATS, PixelFormat, pixels_in_a_group
+
+
+class Region(BaseModel):
+    """Part of the sensor, in pixels."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    width_px: Annotated[int, Field(gt=0)]
+    height_px: Annotated[int, Field(gt=0)]
+    left_px: Annotated[int, Field(ge=0)] = 0
+    top_px: Annotated[int, Field(ge=0)] = 0
+
+
+class Features(Protocol):
+    """Of an opened camera, by name; see the drivers' own."""
+
+    def has(self, name: str) -> bool: ...
+
+    def read(self, name: str) -> bool | int | float | str: ...
+
+    def number(self, name: str) -> float: ...
+
+    def bounds(self, name: str) -> tuple[float, float]: ...
+
+    def write(self, name: str, value: bool | int | float | str) -> None: ...
 
 
 def set_region(features: Features, region: Region) -> None:
@@ -21,7 +50,8 @@ def set_region(features: Features, region: Region) -> None:
         ("OffsetX", region.left_px),
         ("OffsetY", region.top_px),
     ):
-        features.write(name, value)
+        if value or features.has(name):
+            features.write(name, value)
 
 
 def pixel_format(features: Features, device: str) -> PixelFormat:

@@ -17,6 +17,8 @@ from drivers.ur_messages import Ask, Config, Failure, State
 
 _LEAVE_S = 4.0
 """Longer than the process takes to bring the arm to rest and end."""
+_WATCHDOG_MARGIN_S = 0.3
+"""How late the controller may be: it hears a sign of life after that was sent, and brakes at its own rate."""
 _FAILURES: dict[str, type[DeviceError]] = {"refused": DeviceRefused, "fault": DeviceFault, "lost": DeviceLost}
 
 
@@ -83,7 +85,7 @@ class UrProcess:
         said = None
         if not self._lost:
             try:
-                said = messages.receive(self._link)
+                said = self._receive()
             except TimeoutError:
                 self._lost = f"ur-rtde hung for {self._link.gettimeout():.1f} s"
             except OSError as error:
@@ -102,13 +104,20 @@ class UrProcess:
             remedy="Check the cable and the controller, then open the robot again",
         )
 
+    def _receive(self) -> Ask | State | Failure | None:
+        try:
+            return messages.receive(self._link)
+        except ConnectionResetError:  # it ended with an ask of ours unread; its last word stands behind that error
+            return messages.receive(self._link)
+
     def _end(self) -> None:
         """End the process. One that did not bring the arm to rest leaves that to the controller's watchdog, and
         this waits for it."""
         self._process.kill()
         code = self._process.wait()
         if self._began and code != 0 and not self._rested:
-            time.sleep(self._config.watchdog_s + self._config.speed_deg_s / self._config.stop_deg_s2)
+            brake_s = self._config.speed_deg_s / self._config.stop_deg_s2
+            time.sleep(self._config.watchdog_s + brake_s + _WATCHDOG_MARGIN_S)
             self._rested = True
 
     def _last_error(self) -> str:

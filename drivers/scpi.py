@@ -12,7 +12,7 @@ from typing import NoReturn, Protocol
 from coupole.devices import Clock, Deadline
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 
-REPLY_MARGIN_S = 1.0
+REPLY_MARGIN_S = 2.0
 """What a device may take to answer, the bytes' own time apart."""
 _SHORT_REPLY_BYTES = 200
 _ERROR = re.compile(r'([+-]?[0-9]+),"(.*)"')

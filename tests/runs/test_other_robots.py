@@ -57,7 +57,8 @@ def test_a_plan_is_rehearsed_through_ethernetkrl_faster_than_life(eki: CellFolde
     assert ended.code == 0, ended.err
     found = ended.document
     assert (found["proven"], found["missing"]) == (2160, 0)
-    assert found["duration_s"] == pytest.approx(found["preflight_s"], rel=0.15)
+    # Twenty times faster than life, a busy machine is late; never is it early.
+    assert 0.9 < found["duration_s"] / found["preflight_s"] < 1.6
 
 
 @pytest.mark.parametrize(

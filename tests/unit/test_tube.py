@@ -42,7 +42,7 @@ def test_it_is_never_less_than_the_farthest_point_is_off(
     joints_deg = start + share * (goal - start) + off_deg
     on_the_way = start + np.linspace(0, 1, 2001)[:, None] * (goal - start)
     apart_mm = np.linalg.norm(_points_mm(joints_deg) - _points_mm(on_the_way), axis=-1).max(axis=-1).min()
-    step_mm = np.linalg.norm(np.diff(_points_mm(on_the_way[:2]), axis=0), axis=-1).max()
+    step_mm = np.linalg.norm(np.diff(_points_mm(on_the_way), axis=0), axis=-1).max()
     assert off_the_way_mm([start, goal], joints_deg) >= apart_mm - step_mm
 
 

@@ -35,6 +35,8 @@ class Lens:
     height_px: int
     focal_px: float
     distortion: Distortion = NO_DISTORTION
+    samples: int = 1
+    """Pixels along the sides of a pixel of the sensor: 1 but for a lens that is `supersampled`."""
 
     @staticmethod
     def focused(
@@ -55,13 +57,22 @@ class Lens:
         return 0.5 * self.width_px - 0.5, 0.5 * self.height_px - 0.5
 
     def supersampled(self, factor: int) -> Lens:
-        """The lens of a sensor whose pixels are divided into `factor` x `factor`."""
+        """The lens of a sensor whose pixels are divided into `factor` x `factor`; see `rook_shifts_px`."""
         return replace(
             self,
             width_px=self.width_px * factor,
             height_px=self.height_px * factor,
             focal_px=self.focal_px * factor,
+            samples=factor,
         )
+
+
+def rook_shifts_px(samples: int, count: int) -> NDArray[np.float64]:
+    """[count] how far the rays of a supersampled pixel are shifted: of row r by the r-th to the right, of column c
+    by the c-th upwards. So the grid of a pixel's rays is turned, none stands in another's row or column, and an
+    edge along the rows grows in `samples`^2 steps, not in `samples`. Zeros for one sample.
+    """
+    return (np.arange(count) % samples + 0.5) / samples - 0.5
 
 
 @dataclass(frozen=True)
@@ -73,7 +84,7 @@ class Sight:
     """[h, w, 2] what to add to a pixel's place in the image to undo distortion, in units of the focal length; None
     where there is none."""
     shift_slope: float
-    """Largest change of a component of `shift` from one pixel to the next one in its row."""
+    """Bound of the change of distortion's part of `shift` from one pixel to the next one in its row."""
     reach: tuple[float, float]
     """No pixel looks farther from the axis than this, in x and y, in units of the focal length."""
     bend_slope: float
@@ -82,12 +93,13 @@ class Sight:
 
 def sight(lens: Lens) -> Sight:
     """The inverse of a lens. Raises InputError where distortion folds the image."""
-    half_x, half_y = ((centre + 1.0) / lens.focal_px for centre in lens.centre_px)
+    half_x, half_y = ((centre + 1.5) / lens.focal_px for centre in lens.centre_px)
     if lens.distortion == NO_DISTORTION:
         return Sight(lens, None, 0.0, (half_x, half_y), 0.0)
     shift = np.empty((lens.height_px, lens.width_px, 2), np.float32)
     terms = np.array(lens.distortion)
-    if not _undistort(lens.focal_px, *lens.centre_px, terms, shift):
+    rooks = rook_shifts_px(lens.samples, max(lens.width_px, lens.height_px))
+    if not _undistort(lens.focal_px, *lens.centre_px, terms, rooks, shift):
         raise InputError(
             f"simulated lens: distortion {lens.distortion} folds the image of {lens.width_px} x {lens.height_px} "
             f"pixels at a focal length of {lens.focal_px:.0f} pixels, so that a pixel would look two ways; "
@@ -95,7 +107,9 @@ def sight(lens: Lens) -> Sight:
         )
     most = float(np.abs(shift).max())
     reach = half_x + most, half_y + most
-    return Sight(lens, shift, float(np.abs(np.diff(shift, axis=1)).max()), reach, _bend_slope(lens, reach))
+    slope = _bend_slope(lens, reach)
+    undone = slope / max(1.0 - slope, 1e-3)  # of the inverse (Banach)
+    return Sight(lens, shift, undone / lens.focal_px, reach, slope)
 
 
 def _bend_slope(lens: Lens, reach: tuple[float, float]) -> float:
@@ -137,14 +151,13 @@ def bend(x, y, terms):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _undistort(focal, centre_x, centre_y, terms, shift):  # type: ignore[no-untyped-def]
+def _undistort(focal, centre_x, centre_y, terms, rooks, shift):  # type: ignore[no-untyped-def]
     """Fill `shift` [h, w, 2] by fixed-point iteration, to 1e-7 pixel; False where it does not settle."""
     height, width = shift.shape[:2]
     settled = np.ones(height, np.bool_)
     for row in numba.prange(height):
-        goal_y = (row - centre_y) / focal
         for col in range(width):
-            goal_x = (col - centre_x) / focal
+            goal_x, goal_y = (col + rooks[row] - centre_x) / focal, (row - rooks[col] - centre_y) / focal
             x, y = goal_x, goal_y
             change = 1.0
             for _ in range(60):
@@ -155,6 +168,6 @@ def _undistort(focal, centre_x, centre_y, terms, shift):  # type: ignore[no-unty
                     break
             if not change * focal < 1e-7:
                 settled[row] = False
-            shift[row, col, 0] = x - goal_x
-            shift[row, col, 1] = y - goal_y
+            shift[row, col, 0] = x - (col - centre_x) / focal
+            shift[row, col, 1] = y - (row - centre_y) / focal
     return settled.all()

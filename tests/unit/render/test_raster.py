@@ -107,6 +107,22 @@ def test_samples_of_a_pixel_lie_within_it() -> None:
     assert np.array_equal(share == 1.0, ids(quad((0, 0, 0), 50.0), LENS, camera_above(200.0)) >= 0)
 
 
+@pytest.mark.parametrize("distortion", [NO_DISTORTION, (1e-9, 0.0, 0.0, 0.0, 0.0)], ids=["straight", "bent"])
+@pytest.mark.parametrize("across", [False, True], ids=["rows", "columns"])
+def test_an_edge_along_the_pixels_grows_in_as_many_steps_as_a_pixel_has_samples(
+    distortion: Distortion, across: bool
+) -> None:
+    samples, lens = 3, Lens(40, 40, 200.0, distortion)
+    shares = []
+    for step in range(28):
+        edge_mm = step / 27.0  # 1 mm at 200 mm is a pixel
+        corners = quad((50.0 + edge_mm, 0, 0) if across else (0, 50.0 + edge_mm, 0), 50.0)
+        fine = ids(corners, lens.supersampled(samples), camera_above(200.0)) >= 0
+        shares.append(fine.sum() / (40 * samples**2))
+    steps = np.unique(np.round(np.abs(np.diff(shares)), 6))
+    assert steps == pytest.approx([0.0, 1.0 / samples**2])
+
+
 _WITH_THREADS = """
 import hashlib, sys
 sys.path[:0] = {paths!r}

@@ -1,0 +1,232 @@
+"""Corners of a board to a few thousandths of a pixel: the picture of two crossing edges, fitted to RAW pixels.
+
+About a corner at q the values are, with S_k the picture of edge k as a pixel's square sees it,
+
+    (m + c ((2 S_1 - 1) (2 S_2 - 1) + r)) (1 + g (p - q))
+
+for level m, contrast c and a gradient g of the light. An edge under the angle a, blurred by a Gaussian of sigma,
+is seen by a square pixel as S(d) = [G(d + s) - G(d + t) - G(d - t) + G(d - s)] / (|cos a| |sin a|), where d is the
+distance of pixel and edge, s and t are half the sum and the difference of |cos a| and |sin a|, and G'' is the
+normal distribution (two boxes, then a Gaussian). So edges finer than a pixel have no error that comes and goes
+with their place between pixels, and no colour need be interpolated: pixels of other colours take no part. The rest
+r is what blur does where edges cross at another angle than 90 degrees: of the sign's expectation over two normal
+variables with the correlation k = n_1 n_2 of the edges' normals, the terms up to k^3 of the tetrachoric series
+(Pearson 1900).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.rotations import Floats
+
+LEAST_RADIUS_PX = 4.0
+"""Below, nine unknowns are too many for the pixels there are."""
+_UNKNOWNS = 9
+_X, _Y, _FIRST, _SECOND, _SIGMA, _LEVEL, _CONTRAST, _ALONG_X, _ALONG_Y = range(_UNKNOWNS)
+_MOST_STEPS = 40
+_CLOSE_PX = 1e-5
+_WORST = 0.2
+"""Of the contrast: a fit that leaves a greater rms is of something else than a corner."""
+_LEAST_SIGMA_PX = 0.05
+_THIN = 0.01
+"""Least width of a box: an edge along the pixels' rows."""
+_SECTORS = 64
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Corners as fitted."""
+
+    pixels: Floats
+    """[n, 2], centre of the first pixel (0, 0)."""
+    fits: NDArray[np.bool_]
+    """[n] False where no corner was found; `pixels` are then where the search began."""
+    sigma_px: Floats
+    """[n] blur of the picture."""
+
+
+def fit_corners(image: NDArray[Any], known: NDArray[np.bool_], rough: Floats, radius_px: float) -> Corners:
+    """Corners about `rough` [n, 2] from the pixels within `radius_px`, at least `LEAST_RADIUS_PX`.
+
+    `image` [H, W] are RAW values; `known` [h, w] says which pixels take part, repeated over the image.
+    """
+    values = np.ascontiguousarray(image, dtype=np.float32)
+    found = np.full((len(rough), _UNKNOWNS), np.nan)
+    _fit_all(values, np.ascontiguousarray(known), np.ascontiguousarray(rough, dtype=np.float64), radius_px, found)
+    fits = np.isfinite(found[:, _X])
+    return Corners(np.where(fits[:, None], found[:, :2], rough), fits, found[:, _SIGMA].copy())
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _fit_all(image, known, rough, radius, found):  # type: ignore[no-untyped-def]
+    for n in numba.prange(len(rough)):
+        unknowns = np.zeros(_UNKNOWNS)
+        unknowns[_X], unknowns[_Y] = rough[n]
+        if not _start(image, known, radius, unknowns):
+            continue
+        # Again about the corner found: only a window that lies evenly about it is fair to both sides.
+        fits = _fit(image, known, rough[n, 0], rough[n, 1], radius, unknowns)
+        if fits and _fit(image, known, unknowns[_X], unknowns[_Y], radius, unknowns):
+            # Blur mixes light and edges: p F, blurred, is p F + sigma^2 grad F, as if the corner stood elsewhere.
+            spread2 = unknowns[_SIGMA] ** 2 + 1.0 / 12.0
+            unknowns[_X] += spread2 * unknowns[_ALONG_X]
+            unknowns[_Y] += spread2 * unknowns[_ALONG_Y]
+            found[n] = unknowns
+
+
+@numba.njit(cache=True, nogil=True)
+def _start(image, known, radius, unknowns):  # type: ignore[no-untyped-def]
+    """Directions of both edges, level and contrast from the values all around; False where there are no four
+    sectors."""
+    sums, counts = np.zeros(_SECTORS), np.zeros(_SECTORS)
+    x, y = unknowns[_X], unknowns[_Y]
+    for row in range(max(0, math.ceil(y - radius)), min(image.shape[0], math.floor(y + radius) + 1)):
+        for col in range(max(0, math.ceil(x - radius)), min(image.shape[1], math.floor(x + radius) + 1)):
+            far = math.hypot(col - x, row - y)
+            if far > radius or far < 0.4 * radius or not known[row % known.shape[0], col % known.shape[1]]:
+                continue
+            angle = math.atan2(row - y, col - x) % (2.0 * math.pi)
+            sector = int(angle / (2.0 * math.pi) * _SECTORS) % _SECTORS
+            # Spread over neighbours, so that few pixels leave no gap.
+            for step in range(-2, 3):
+                weight = 3.0 - abs(step)
+                sums[(sector + step) % _SECTORS] += weight * image[row, col]
+                counts[(sector + step) % _SECTORS] += weight
+    if counts.min() == 0.0:
+        return False
+    around = sums / counts
+    level, contrast = 0.5 * (around.max() + around.min()), 0.5 * (around.max() - around.min())
+    if contrast <= 0.0:
+        return False
+    crossings, many, rises = np.zeros(4), 0, 0.0
+    for k in range(_SECTORS):
+        here, there = around[k] - level, around[(k + 1) % _SECTORS] - level
+        if (here > 0.0) != (there > 0.0):
+            if many == 4:
+                return False
+            crossings[many] = (k + 0.5 + here / (here - there)) * 2.0 * math.pi / _SECTORS
+            if many == 0:
+                rises = 1.0 if there > 0.0 else -1.0
+            many += 1
+    if many != 4:
+        return False
+    for k in range(2):
+        # Opposite crossings are one edge, seen from both sides.
+        unknowns[_FIRST + k] = 0.5 * (crossings[k] + crossings[k + 2] - math.pi)
+    unknowns[_SIGMA], unknowns[_LEVEL] = 0.7, level
+    # After the first crossing a point is on the first edge's left and on the second one's right.
+    unknowns[_CONTRAST] = -rises * contrast
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit(image, known, x, y, radius, unknowns):  # type: ignore[no-untyped-def]
+    """Levenberg and Marquardt's descent; False where it leads away or what it leaves is too much."""
+    squares, count, normal, right = _equations(image, known, x, y, radius, unknowns)
+    damping = 1e-3
+    for _ in range(_MOST_STEPS):
+        damped = normal.copy()
+        for k in range(_UNKNOWNS):
+            damped[k, k] *= 1.0 + damping
+            damped[k, k] += 1e-12
+        tried = unknowns + np.linalg.solve(damped, right)
+        tried[_SIGMA] = min(max(tried[_SIGMA], _LEAST_SIGMA_PX), 0.5 * radius)
+        if math.hypot(tried[_X] - x, tried[_Y] - y) > 0.5 * radius or not np.all(np.isfinite(tried)):
+            return False
+        left, count, tried_normal, tried_right = _equations(image, known, x, y, radius, tried)
+        if left <= squares:
+            change = math.hypot(tried[_X] - unknowns[_X], tried[_Y] - unknowns[_Y])
+            unknowns[:] = tried
+            squares, normal, right = left, tried_normal, tried_right
+            damping *= 0.1
+            if change < _CLOSE_PX:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e8:
+                break
+    return count > 2 * _UNKNOWNS and squares <= count * (_WORST * unknowns[_CONTRAST]) ** 2
+
+
+@numba.njit(cache=True, nogil=True)
+def _equations(image, known, middle_x, middle_y, radius, unknowns):  # type: ignore[no-untyped-def]
+    """Sum of squares left, number of pixels, normal equations [9, 9] and right side [9] of one step."""
+    x, y, sigma = unknowns[_X], unknowns[_Y], unknowns[_SIGMA]
+    level, contrast = unknowns[_LEVEL], unknowns[_CONTRAST]
+    cos1, sin1 = math.cos(unknowns[_FIRST]), math.sin(unknowns[_FIRST])
+    cos2, sin2 = math.cos(unknowns[_SECOND]), math.sin(unknowns[_SECOND])
+    normal, right, slope = np.zeros((_UNKNOWNS, _UNKNOWNS)), np.zeros(_UNKNOWNS), np.empty(_UNKNOWNS)
+    squares, count = 0.0, 0
+    height, width = image.shape
+    together = cos1 * cos2 + sin1 * sin2
+    spread = math.sqrt(sigma * sigma + 1.0 / 12.0)
+    for row in range(max(0, math.ceil(middle_y - radius)), min(height, math.floor(middle_y + radius) + 1)):
+        for col in range(max(0, math.ceil(middle_x - radius)), min(width, math.floor(middle_x + radius) + 1)):
+            if not known[row % known.shape[0], col % known.shape[1]]:
+                continue
+            if (col - middle_x) ** 2 + (row - middle_y) ** 2 > radius * radius:
+                continue
+            right_x, down_y = col - x, row - y
+            # Distance on the left of an edge that points along (cos, sin), and how far along it.
+            apart1, along1 = cos1 * down_y - sin1 * right_x, cos1 * right_x + sin1 * down_y
+            apart2, along2 = cos2 * down_y - sin2 * right_x, cos2 * right_x + sin2 * down_y
+            one, one_apart, one_sigma = _edge(apart1, abs(cos1), abs(sin1), sigma)
+            two, two_apart, two_sigma = _edge(apart2, abs(cos2), abs(sin2), sigma)
+            light = 1.0 + unknowns[_ALONG_X] * right_x + unknowns[_ALONG_Y] * down_y
+            checks = one * two + _crossing(apart1 / spread, apart2 / spread, together)
+            board = level + contrast * checks
+            by_one, by_two = light * contrast * two * one_apart, light * contrast * one * two_apart
+            slope[_X] = by_one * sin1 + by_two * sin2 - board * unknowns[_ALONG_X]
+            slope[_Y] = -by_one * cos1 - by_two * cos2 - board * unknowns[_ALONG_Y]
+            slope[_FIRST], slope[_SECOND] = -by_one * along1, -by_two * along2
+            slope[_SIGMA] = light * contrast * (two * one_sigma + one * two_sigma)
+            slope[_LEVEL], slope[_CONTRAST] = light, light * checks
+            slope[_ALONG_X], slope[_ALONG_Y] = board * right_x, board * down_y
+            left = image[row, col] - board * light
+            squares += left * left
+            count += 1
+            for i in range(_UNKNOWNS):
+                right[i] += slope[i] * left
+                for j in range(i + 1):
+                    normal[i, j] += slope[i] * slope[j]
+    for i in range(_UNKNOWNS):
+        for j in range(i):
+            normal[j, i] = normal[i, j]
+    return squares, count, normal, right
+
+
+@numba.njit(cache=True, nogil=True)
+def _crossing(a, b, together):  # type: ignore[no-untyped-def]
+    """The rest r at a point `a` and `b` standard deviations of blur away from the edges."""
+    squares = a * a + b * b
+    if squares > 72.0:
+        return 0.0
+    series = 1.0 + together * a * b / 2.0 + together * together * (a * a - 1.0) * (b * b - 1.0) / 6.0
+    return 2.0 / math.pi * math.exp(-0.5 * squares) * together * series
+
+
+@numba.njit(cache=True, nogil=True)
+def _edge(apart, wide, high, sigma):  # type: ignore[no-untyped-def]
+    """2 S - 1 of an edge at distance `apart` from a pixel's middle, and its derivatives by that and by sigma."""
+    wide, high = max(wide, _THIN), max(high, _THIN)
+    outer, inner = 0.5 * (wide + high), 0.5 * (wide - high)
+    if abs(apart) > outer + 6.0 * sigma:
+        return (1.0 if apart > 0.0 else -1.0), 0.0, 0.0
+    value, by_apart, by_sigma = 0.0, 0.0, 0.0
+    for k in range(4):
+        t = apart + (outer, inner, -inner, -outer)[k]
+        sign = (1.0, -1.0, -1.0, 1.0)[k]
+        below = 0.5 * math.erfc(-t / (sigma * math.sqrt(2.0)))
+        bell = sigma * math.exp(-0.5 * (t / sigma) ** 2) / math.sqrt(2.0 * math.pi)
+        value += sign * 0.5 * ((t * t + sigma * sigma) * below + t * bell)
+        by_apart += sign * (t * below + bell)
+        by_sigma += sign * sigma * below
+    per_area = 2.0 / (wide * high)
+    return per_area * value - 1.0, per_area * by_apart, per_area * by_sigma

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +28,7 @@ from sim.render.lens import Lens, sight
 from sim.render.radiance import led_radiance, panel_radiance
 from sim.render.shadows import Shadows
 from sim.render.view import View, Viewer, tangents
-from sim.scene import Leds, build_scene, load_surface, read_leds, support_disk
+from sim.scene import Leds, Scene, build_scene, load_surface, read_leds, support_disk
 from sim.sensor import electrons, expose, expose_electrons, mosaic
 from sim.surface import Material, Surface
 from sim.things import placed
@@ -45,8 +47,38 @@ _AHEAD = square((0.0, 0.0, 1000.0), (0.0, 0.0, -1.0), side_mm=LED_SIDE_MM, flux_
 Radiance = NDArray[np.float32]
 
 
+@dataclass
+class Look:
+    """What one pose of camera and arm sees, and what was worked out for it so far."""
+
+    base_from_camera: Transform
+    arm_mm: Capsules
+    """Bodies of the arm, which cast shadows."""
+    view: View
+    places: NDArray[np.int32]
+    """[seen] of the triangles seen, in the table of shadows."""
+    samples: int
+    scene: Scene
+    radiance: dict[int, Radiance] = field(default_factory=dict)
+    """Of the triangles seen, by LED, or by minus the number of a panel."""
+    glows: dict[int, Glow | None] = field(default_factory=dict)
+    """By the same numbers."""
+
+    @cached_property
+    def empty(self) -> NDArray[np.float32]:
+        """[h, w] share of each pixel that sees nothing."""
+        return self.view.empty(self.samples)
+
+    @cached_property
+    def prepared(self) -> Prepared:
+        """For light that goes from surface to surface."""
+        from sim.spectral.interreflection import prepare
+
+        return prepare(self.scene, self.view.sides >> 1, self.view.towards_camera)
+
+
 class Photographer:
-    """Holds the scene, its shadows and the last pose's view; `render` is called from one worker thread."""
+    """Holds the scene, its shadows and the last look at it; `render` is called from one worker thread."""
 
     def __init__(self, scene: SceneConfig, camera: CameraConfig, settings: Settings) -> None:
         base_from_support = np.array(scene.base_from_support)
@@ -97,16 +129,8 @@ class Photographer:
         self._pieces = pieces
         places_mm = np.array([*self.leds.positions_mm, *(piece.centre_mm for piece in pieces)])
         self._shadows = Shadows(Obstacles(self._scene.corners_mm), places_mm, _SHADOW_BYTES)
-        self._view: View | None = None
-        self._places = np.empty(0, np.int32)
-        self._empty: NDArray[np.float32] | None = None
-        self._base_from_camera: Transform = np.zeros((4, 4))
-        self._arm_mm = NONE
+        self._look: Look | None = None
         self._interreflection = settings.interreflection
-        self._glow_of_light: dict[int, Glow | None] = {}
-        self._prepared: Prepared | None = None
-        """For light that goes from surface to surface, at this pose."""
-        self._radiance: dict[int, Radiance] = {}
         self._colour: dict[int, NDArray[np.float32]] = {}
         self._warm_up(base_from_support)
 
@@ -114,15 +138,15 @@ class Photographer:
         """Compile by looking down at the support under one LED, before anybody waits for a frame."""
         support_from_camera = np.diag([1.0, -1.0, -1.0, 1.0])
         support_from_camera[2, 3] = _WARM_UP_HEIGHT_MM
-        view = self._look_from(base_from_support @ support_from_camera @ inverse(self.flange_from_camera))
-        self._led(view, int(self.leds.ids[0]))
+        look = self._look_from(base_from_support @ support_from_camera @ inverse(self.flange_from_camera))
+        self._led(look, int(self.leds.ids[0]))
         arm_shadow.warm_up()
-        glow(_AHEAD, "lambertian", self._sight, np.eye(4), view.empty(self._camera.samples_per_side), None)
+        glow(_AHEAD, "lambertian", self._sight, np.eye(4), look.empty, None)
 
     def render(self, out: NDArray[np.uint16], exposed: Exposed) -> None:
         """Fill `out` [h, w] with the frame of one exposure, DN."""
-        view = self._look_from(exposed.base_from_flange, exposed.arm_mm)
-        radiance, seconds = self._lit(view, exposed)
+        look = self._look_from(exposed.base_from_flange, exposed.arm_mm)
+        radiance, seconds = self._lit(look, exposed)
         sensed: dict[str, Any] = {
             "model": self.sensor,
             "frame": exposed.number,
@@ -130,12 +154,12 @@ class Photographer:
             "gain": exposed.gain,
             "temperature_c": self._camera.sensor_temperature_c,
         }
-        glows = self._glows(view, exposed)
+        glows = self._glows(look, exposed)
         scale = self._electrons * seconds
         if self._camera.blur:
-            sharp = electrons(view.triangle, radiance, self._falloff, electrons_per_radiance=scale)
+            sharp = electrons(look.view.triangle, radiance, self._falloff, electrons_per_radiance=scale)
             k = self._camera.samples_per_side
-            depth_mm = view.depth_mm(self._base_from_camera)[k // 2 :: k, k // 2 :: k]
+            depth_mm = look.view.depth_mm(look.base_from_camera)[k // 2 :: k, k // 2 :: k]
             image = through(self._objective, sharp, depth_mm, pixel_pitch_um=self._camera.pixel_pitch_um)
             mean_e = mosaic(image, self.sensor)
             if glows is not None:
@@ -144,7 +168,7 @@ class Photographer:
         else:
             expose(
                 out,
-                view.triangle,
+                look.view.triangle,
                 radiance,
                 self._falloff,
                 electrons_per_radiance=scale,
@@ -152,91 +176,79 @@ class Photographer:
                 **sensed,
             )
 
-    def _lit(self, view: View, exposed: Exposed) -> tuple[Radiance, float]:
+    def _lit(self, look: Look, exposed: Exposed) -> tuple[Radiance, float]:
         """Radiance of what is seen, and for how many seconds."""
-        lights = [(self._led(view, led), lit_s) for led, lit_s in exposed.seconds_of_led.items()]
-        lights += [(self._panel(view, panel), exposed.exposure_s) for panel in exposed.panels]
+        lights = [(self._led(look, led), lit_s) for led, lit_s in exposed.seconds_of_led.items()]
+        lights += [(self._panel(look, panel), exposed.exposure_s) for panel in exposed.panels]
         if len(lights) == 1:
             return lights[0]
-        radiance = np.zeros((max(1, len(view.sides)), 3), np.float32)
+        count = len(look.view.sides)
+        radiance = np.zeros((max(1, count), 3), np.float32)
         for each, lit_s in lights:
-            radiance[: len(view.sides)] += each * np.float32(lit_s)
+            radiance[:count] += each * np.float32(lit_s)
         return radiance, 1.0
 
-    def _look_from(self, base_from_flange: Transform, arm_mm: Capsules = NONE) -> View:
+    def _look_from(self, base_from_flange: Transform, arm_mm: Capsules = NONE) -> Look:
         """Rasterise from a flange pose, unless it is the last one still."""
-        if (
-            arm_mm.shape != self._arm_mm.shape
-            or np.abs(arm_mm - self._arm_mm).max(initial=0.0) > _ARM_TOLERANCE_MM
-        ):
-            self._radiance.clear()
-            self._arm_mm = arm_mm
         base_from_camera = base_from_flange @ self.flange_from_camera
-        if self._view is None or np.abs(base_from_camera - self._base_from_camera).max() > _POSE_TOLERANCE:
-            self._view = self._viewer.look(base_from_camera)
-            self._places = self._shadows.places(self._view.sides)
-            self._empty = self._prepared = None
-            self._glow_of_light.clear()
-            self._base_from_camera = base_from_camera
-            self._radiance.clear()
-        return self._view
+        look = self._look
+        if look is None or np.abs(base_from_camera - look.base_from_camera).max() > _POSE_TOLERANCE:
+            view = self._viewer.look(base_from_camera)
+            places, samples = self._shadows.places(view.sides), self._camera.samples_per_side
+            look = self._look = Look(base_from_camera, arm_mm, view, places, samples, self._scene)
+        arm_moved = arm_mm.shape != look.arm_mm.shape or np.abs(arm_mm - look.arm_mm).max(initial=0.0)
+        if arm_moved > _ARM_TOLERANCE_MM:
+            look.arm_mm = arm_mm
+            look.radiance.clear()
+        return look
 
     # -- what lights things -------------------------------------------------------------------------------
 
-    def _led(self, view: View, led: int) -> Radiance:
+    def _led(self, look: Look, led: int) -> Radiance:
         """Radiance of the view's triangles under one LED at its tabulated flux."""
         row = self._row_of_led[led]
-        return self._remembered(led, lambda: self._lit_by_led(view, row) * self._colour_of(led))
+        return _remembered(look, led, lambda: self._lit_by_led(look, row) * self._colour_of(led))
 
-    def _lit_by_led(self, view: View, row: int) -> Radiance:
-        return self._shaded(view, self._emitters[row], row) + self._indirect(view, self._emitters[row])
+    def _lit_by_led(self, look: Look, row: int) -> Radiance:
+        return self._shaded(look, self._emitters[row], row) + self._indirect(look, self._emitters[row])
 
-    def _panel(self, view: View, panel: int) -> Radiance:
+    def _panel(self, look: Look, panel: int) -> Radiance:
         """Radiance of the view's triangles under panel 1 to 4."""
         if not self._panels:
-            return panel_radiance(view, self._scene.materials, self.reference_lux)
+            return panel_radiance(look.view, self._scene.materials, self.reference_lux)
         if panel > len(self._panels):
-            return np.zeros((len(view.sides), 3), np.float32)
-        return self._remembered(-panel, lambda: self._lit_by_panel(view, panel))
+            return np.zeros((len(look.view.sides), 3), np.float32)
+        return _remembered(look, -panel, lambda: self._lit_by_panel(look, panel))
 
-    def _lit_by_panel(self, view: View, panel: int) -> Radiance:
+    def _lit_by_panel(self, look: Look, panel: int) -> Radiance:
         count = panels.PARTS**2
-        radiance = np.zeros((len(view.sides), 3), np.float32) + self._indirect(view, self._panels[panel - 1][0])
+        radiance = np.zeros((len(look.view.sides), 3), np.float32) + self._indirect(
+            look, self._panels[panel - 1][0]
+        )
         for piece in range((panel - 1) * count, panel * count):
-            radiance += self._shaded(view, self._pieces[piece], len(self._emitters) + piece, "lambertian")
+            radiance += self._shaded(look, self._pieces[piece], len(self._emitters) + piece, "lambertian")
         return radiance
 
-    def _shaded(self, view: View, emitter: Emitter, row: int, emission: str = "") -> Radiance:
+    def _shaded(self, look: Look, emitter: Emitter, row: int, emission: str = "") -> Radiance:
         radiance = led_radiance(
-            view,
+            look.view,
             self._scene.materials,
             emitter,
             emission or self._emission,
-            self._places,
+            look.places,
             self._shadows.reached(row),
         )
-        arm_shadow.cast(radiance, view.centroids_mm, self._arm_mm, emitter.centre_mm)
+        arm_shadow.cast(radiance, look.view.centroids_mm, look.arm_mm, emitter.centre_mm)
         return radiance
 
-    def _indirect(self, view: View, emitter: Emitter) -> Radiance:
+    def _indirect(self, look: Look, emitter: Emitter) -> Radiance:
         """What reaches the view's triangles by way of others; zeros where that is not asked for."""
-        if self._interreflection is None or len(view.sides) == 0:
-            return np.zeros((len(view.sides), 3), np.float32)
-        from sim.spectral.interreflection import indirect_radiance, prepare
+        if self._interreflection is None or len(look.view.sides) == 0:
+            return np.zeros((len(look.view.sides), 3), np.float32)
+        from sim.spectral.interreflection import indirect_radiance
 
-        if self._prepared is None:
-            self._prepared = prepare(self._scene, view.sides >> 1, view.towards_camera)
         asked = self._interreflection
-        return indirect_radiance(self._prepared, emitter, bounces=asked.bounces, samples=asked.samples)
-
-    def _remembered(self, light: int, compute: Callable[[], Radiance]) -> Radiance:
-        """What fits into memory is computed once per pose."""
-        if light in self._radiance:
-            return self._radiance[light]
-        radiance = compute()
-        if (len(self._radiance) + 1) * radiance.nbytes <= _RADIANCE_BYTES:
-            self._radiance[light] = radiance
-        return radiance
+        return indirect_radiance(look.prepared, emitter, bounces=asked.bounces, samples=asked.samples)
 
     def _colour_of(self, led: int) -> NDArray[np.float32]:
         """[3] signal of white under this LED over that under the median one, at equal flux."""
@@ -248,16 +260,16 @@ class Photographer:
 
     # -- lamps in the picture -----------------------------------------------------------------------------
 
-    def _glows(self, view: View, exposed: Exposed) -> NDArray[np.float32] | None:
+    def _glows(self, look: Look, exposed: Exposed) -> NDArray[np.float32] | None:
         """[h, w] mean electrons of lamps that the camera looks at, or None if it sees none."""
         seen: list[tuple[Glow, NDArray[np.float32]]] = []
         for led, lit_s in exposed.seconds_of_led.items():
-            if spot := self._glow(view, led, self._emitters[self._row_of_led[led]], self._emission):
+            if spot := self._glow(look, led, self._emitters[self._row_of_led[led]], self._emission):
                 seen.append((spot, self._colour_of(led) * np.float32(lit_s)))
         for panel in exposed.panels:
             if panel <= len(self._panels):
                 whole, unevenness = self._panels[panel - 1]
-                if area := self._glow(view, -panel, whole, "lambertian", unevenness):
+                if area := self._glow(look, -panel, whole, "lambertian", unevenness):
                     seen.append((area, np.full(3, exposed.exposure_s, np.float32)))
         if not seen:
             return None
@@ -268,15 +280,24 @@ class Photographer:
             mean_e[lamp.rows, lamp.columns] += lamp.radiance * weights
         return mean_e * self._falloff * np.float32(self._electrons)
 
-    def _glow(self, view: View, light: int, lamp: Emitter, emission: str, unevenness: float = 0.0) -> Glow | None:
+    def _glow(self, look: Look, light: int, lamp: Emitter, emission: str, unevenness: float = 0.0) -> Glow | None:
         """What the camera sees of a lamp; computed once per pose."""
-        if light not in self._glow_of_light:
-            if self._empty is None:
-                self._empty = view.empty(self._camera.samples_per_side)
+        if light not in look.glows:
             blur = (self._objective, self._camera.pixel_pitch_um) if self._camera.blur else None
-            seen = glow(lamp, emission, self._sight, self._base_from_camera, self._empty, blur, unevenness)
-            self._glow_of_light[light] = seen
-        return self._glow_of_light[light]
+            look.glows[light] = glow(
+                lamp, emission, self._sight, look.base_from_camera, look.empty, blur, unevenness
+            )
+        return look.glows[light]
+
+
+def _remembered(look: Look, light: int, compute: Callable[[], Radiance]) -> Radiance:
+    """What fits into memory is computed once per pose."""
+    if light in look.radiance:
+        return look.radiance[light]
+    radiance = compute()
+    if (len(look.radiance) + 1) * radiance.nbytes <= _RADIANCE_BYTES:
+        look.radiance[light] = radiance
+    return radiance
 
 
 def _emitters(leds: Leds) -> list[Emitter]:

@@ -1,0 +1,112 @@
+"""Disks without room: refused or told, and no half line left behind."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from view_files import FORMAT, METADATA, SLOTS, frame
+
+from coupole import journal, store
+from coupole.errors import DiskFull
+from coupole.journal import Journal
+from coupole.store import ViewWriter
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 1 MiB of its own."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], check=False, capture_output=True, text=True
+    )
+    if mounted.returncode != 0:
+        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+def fill(disk: Path, leave_bytes: int) -> None:
+    """Take all space of a disk but for some bytes (whole pages)."""
+    facts = os.statvfs(disk)
+    with (disk / "ballast").open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, facts.f_bavail * facts.f_frsize - leave_bytes)
+
+
+def test_a_view_for_which_there_is_no_room_is_refused_and_leaves_no_file(small_disk: Path) -> None:
+    with pytest.raises(DiskFull, match="the disk is full"):
+        store.create(small_disk / "top.h5", 200, FORMAT, METADATA)
+    assert list(small_disk.iterdir()) == []
+
+
+def test_the_space_of_a_view_is_its_own_though_the_disk_fills_up(small_disk: Path) -> None:
+    store.create(small_disk / "top.h5", SLOTS, FORMAT, METADATA)
+    fill(small_disk, 0)
+    writer = ViewWriter(small_disk / "top.h5", {})
+    for number in range(SLOTS):
+        writer.put(frame(number), frame_id=number, camera_ns=number, exposure_us=8000)
+    writer.sync()
+    writer.close()
+
+
+def test_a_commit_on_a_full_disk_leaves_no_half_line(small_disk: Path) -> None:
+    path = small_disk / "journal.jsonl"
+    diary = Journal(path)
+    diary.write("start", plan="p")
+    diary.commit()
+    before = path.read_bytes()
+    fill(small_disk, 8192)
+    diary.write("fault", message="x" * 20_000)
+    with pytest.raises(DiskFull, match="Free space on it, then resume"):
+        diary.commit()
+    diary.close()
+    assert path.read_bytes() == before
+
+
+def test_lines_that_found_the_disk_full_never_count_and_later_ones_are_whole(small_disk: Path) -> None:
+    path = small_disk / "journal.jsonl"
+    diary = Journal(path)
+    fill(small_disk, 4096)
+    diary.write("frame", shot="x" * 20_000)
+    with pytest.raises(DiskFull):
+        diary.commit()
+    (small_disk / "ballast").unlink()
+    diary.write("stop")
+    diary.commit()
+    diary.close()
+    assert [event["event"] for event in journal.read(path)] == ["stop"]
+
+
+def test_a_journal_over_a_limit_of_the_system_leaves_no_half_line(tmp_path: Path) -> None:
+    path = tmp_path / "journal.jsonl"
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from coupole.journal import Journal; from coupole.errors import StorageError\n"
+        "diary = Journal(Path(sys.argv[1])); diary.write('start'); diary.commit()\n"
+        "diary.write('fault', message='x' * 50_000)\n"
+        "try: diary.commit()\n"
+        "except StorageError as error: print(type(error).__name__)\n"
+    )
+
+    def limited() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path)],
+        check=True,
+        capture_output=True,
+        text=True,
+        preexec_fn=limited,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+    )
+    assert done.stdout.strip() == "StorageError"
+    assert [event["event"] for event in journal.read(path)] == ["start"]
+    assert path.read_bytes().endswith(b"\n")

@@ -67,7 +67,9 @@ def glow(
     edges = np.cross(seen, np.roll(seen, -1, axis=0))
     if edges[0] @ seen[2] < 0.0:
         edges = -edges
-    shift = np.zeros((1, 1, 2), np.float32) if through.shift is None else through.shift
+    shift = np.zeros((2, 1, 1), np.float32)
+    if through.shift is not None:
+        shift = through.shift[:, :, : through.lens.width_px]
     focal_px, (centre_x, centre_y) = through.lens.focal_px, through.lens.centre_px
     _cover(coverage, edges, rows.start, columns.start, focal_px, centre_x, centre_y, shift)
     if unevenness > 0.0:
@@ -106,7 +108,7 @@ def _cover(coverage, edges, top, left, focal, centre_x, centre_y, shift):  # typ
     Within a pixel rays depend linearly on the place, so the share is the area of a square cut by straight lines.
     """
     height, width = coverage.shape
-    bent = shift.shape[0] > 1
+    bent = shift.shape[1] > 1
     for row in numba.prange(height):
         at, lines = np.empty((3, 3)), np.empty((4, 3))
         square, cut = np.empty((8, 2)), np.empty((8, 2))
@@ -134,12 +136,12 @@ def _cover(coverage, edges, top, left, focal, centre_x, centre_y, shift):  # typ
 @numba.njit(cache=True, nogil=True)
 def _bend(at, shift, row, col):  # type: ignore[no-untyped-def]
     """Add the lens's shift and its slopes to a pixel's ray."""
-    above, below = max(row - 1, 0), min(row + 1, shift.shape[0] - 1)
-    before, after = max(col - 1, 0), min(col + 1, shift.shape[1] - 1)
+    above, below = max(row - 1, 0), min(row + 1, shift.shape[1] - 1)
+    before, after = max(col - 1, 0), min(col + 1, shift.shape[2] - 1)
     for k in range(2):
-        at[0, k] += shift[row, col, k]
-        at[1, k] += (shift[row, after, k] - shift[row, before, k]) / (after - before)
-        at[2, k] += (shift[below, col, k] - shift[above, col, k]) / (below - above)
+        at[0, k] += shift[k, row, col]
+        at[1, k] += (shift[k, row, after] - shift[k, row, before]) / (after - before)
+        at[2, k] += (shift[k, below, col] - shift[k, above, col]) / (below - above)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -182,7 +184,7 @@ def _evenness(
     x = (np.arange(columns.start, columns.stop)[None, :] - through.lens.centre_px[0]) / through.lens.focal_px
     y = (np.arange(rows.start, rows.stop)[:, None] - through.lens.centre_px[1]) / through.lens.focal_px
     if through.shift is not None:
-        x, y = x + through.shift[rows, columns, 0], y + through.shift[rows, columns, 1]
+        x, y = x + through.shift[0, rows, columns], y + through.shift[1, rows, columns]
     x, y = np.broadcast_arrays(x, y)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     centre = seen_mm.mean(axis=0)

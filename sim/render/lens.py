@@ -21,6 +21,8 @@ from coupole.errors import InputError
 
 Distortion = tuple[float, float, float, float, float]
 NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+LANES = 8
+"""Pixels of a row that the rasteriser tests at once; tables by column are so much longer than the image."""
 _PROBES = 65
 _MARGIN = 1.25
 """The steepest slope found between probes is taken this much steeper."""
@@ -81,8 +83,8 @@ class Sight:
 
     lens: Lens
     shift: NDArray[np.float32] | None
-    """[h, w, 2] what to add to a pixel's place in the image to undo distortion, in units of the focal length; None
-    where there is none."""
+    """[2, h, w + LANES] what to add to x and y of a pixel's place in the image to undo distortion, in units of the
+    focal length (beyond the image: any number); None where there is no distortion."""
     shift_slope: float
     """Bound of the change of distortion's part of `shift` from one pixel to the next one in its row."""
     reach: tuple[float, float]
@@ -96,7 +98,7 @@ def sight(lens: Lens) -> Sight:
     half_x, half_y = ((centre + 1.5) / lens.focal_px for centre in lens.centre_px)
     if lens.distortion == NO_DISTORTION:
         return Sight(lens, None, 0.0, (half_x, half_y), 0.0)
-    shift = np.empty((lens.height_px, lens.width_px, 2), np.float32)
+    shift = np.zeros((2, lens.height_px, lens.width_px + LANES), np.float32)
     terms = np.array(lens.distortion)
     rooks = rook_shifts_px(lens.samples, max(lens.width_px, lens.height_px))
     if not _undistort(lens.focal_px, *lens.centre_px, terms, rooks, shift):
@@ -152,8 +154,8 @@ def bend(x, y, terms):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _undistort(focal, centre_x, centre_y, terms, rooks, shift):  # type: ignore[no-untyped-def]
-    """Fill `shift` [h, w, 2] by fixed-point iteration, to 1e-7 pixel; False where it does not settle."""
-    height, width = shift.shape[:2]
+    """Fill `shift` by fixed-point iteration, to 1e-7 pixel; False where it does not settle."""
+    height, width = shift.shape[1], shift.shape[2] - LANES
     settled = np.ones(height, np.bool_)
     for row in numba.prange(height):
         for col in range(width):
@@ -168,6 +170,6 @@ def _undistort(focal, centre_x, centre_y, terms, rooks, shift):  # type: ignore[
                     break
             if not change * focal < 1e-7:
                 settled[row] = False
-            shift[row, col, 0] = x - (col - centre_x) / focal
-            shift[row, col, 1] = y - (row - centre_y) / focal
+            shift[0, row, col] = x - (col - centre_x) / focal
+            shift[1, row, col] = y - (row - centre_y) / focal
     return settled.all()

@@ -18,13 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform, inverse
-from sim.render.lens import Sight, bend, rook_shifts_px
+from sim.render.lens import LANES, Sight, bend, rook_shifts_px
 
 NEAR_MM = 1.0
 """What is nearer to the projection centre is not seen."""
 _BAND_ROWS = 32
-_LANES = 8
-"""Pixels of a row that are tested at once; rows are so much longer than the image."""
 _LAST = np.int64(0xFFFFFFFF)
 _CHUNK = 16384
 _WIDE = 32
@@ -60,7 +58,7 @@ def visible_triangles(
             0.0 if lens.samples == 1 else 0.5,
         ]
     )
-    rooks = None if lens.samples == 1 else rook_shifts_px(lens.samples, max(width, height) + _LANES)
+    rooks = None if lens.samples == 1 else rook_shifts_px(lens.samples, max(width, height) + LANES)
     bands = -(-height // _BAND_ROWS)
     boxes = np.empty((len(corners_mm), 4), np.int16)
     counts = np.zeros((-(-len(corners_mm) // _CHUNK), bands), np.int64)
@@ -173,7 +171,7 @@ def _fill_bands(  # type: ignore[no-untyped-def]
         band = order[place]
         v = np.empty((3, 3))
         top, bottom = band * _BAND_ROWS, min(height, (band + 1) * _BAND_ROWS)
-        nearest = np.zeros((bottom - top, width + _LANES), np.int64)
+        nearest = np.zeros((bottom - top, width + LANES), np.int64)
         start, count = bounds[band], bounds[band + 1] - bounds[band]
         for member in range(count):
             t = members[start + member]
@@ -277,32 +275,25 @@ def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: i
         start, stop = first_col, last_col + 1
         if stop - start > _WIDE:
             start, stop = _span(row, start, stop, edges, lens, shift)
-        if shift is None:
-            shift_x = 0.0
-            if rooks is not None:
-                shift_x = rooks[image_row]
-            # Whole groups of lanes, without a branch; a pixel beyond `stop` is tested in vain.
-            first = np.uint64(start)
-            for lane in range(np.uint64((stop - start + _LANES - 1) & -_LANES)):
-                at = first + lane
-                x = (np.float64(np.int64(at)) - centre_x + shift_x) * scale
-                e0, e1, e2, e_z = a0 * x + rest0, a1 * x + rest1, a2 * x + rest2, z0 * x + rest_z
-                if rooks is not None:
-                    y = -rooks[at] * scale
-                    e0, e1, e2, e_z = e0 + b0 * y, e1 + b1 * y, e2 + b2 * y, e_z + z1 * y
-                nearness = np.float32(e_z)
-                sees = (min(e0, e1, e2) >= 0.0) & (nearness > nothing) & (nearness <= too_near)
-                key = (np.int64(nearness.view(np.int32)) << 32) | below
-                nearest[line, at] = max(nearest[line, at], key if sees else np.int64(0))
-        else:
-            for col in range(np.uint64(start), np.uint64(stop)):
-                x = (np.float64(np.int64(col)) - centre_x) * scale + shift[image_row, col, 0]
-                y = middle_y + shift[image_row, col, 1]
-                if min(a0 * x + b0 * y + c0, a1 * x + b1 * y + c1, a2 * x + b2 * y + c2) >= 0.0:
-                    nearness = np.float32(z0 * x + z1 * y + z2)
-                    if nothing < nearness <= too_near:
-                        key = (np.int64(nearness.view(np.int32)) << 32) | below
-                        nearest[line, col] = max(nearest[line, col], key)
+        shift_x = 0.0
+        if rooks is not None:
+            shift_x = rooks[image_row]
+        # Whole groups of lanes, without a branch; a pixel beyond `stop` is tested in vain.
+        first = np.uint64(start)
+        for lane in range(np.uint64((stop - start + LANES - 1) & -LANES)):
+            col = first + lane
+            x, y = (np.float64(np.int64(col)) - centre_x) * scale, 0.0
+            if shift is not None:
+                x, y = x + np.float64(shift[0, image_row, col]), np.float64(shift[1, image_row, col])
+            elif rooks is not None:
+                x, y = x + shift_x * scale, -rooks[col] * scale
+            e0, e1, e2, e_z = a0 * x + rest0, a1 * x + rest1, a2 * x + rest2, z0 * x + rest_z
+            if shift is not None or rooks is not None:
+                e0, e1, e2, e_z = e0 + b0 * y, e1 + b1 * y, e2 + b2 * y, e_z + z1 * y
+            nearness = np.float32(e_z)
+            sees = (min(e0, e1, e2) >= 0.0) & (nearness > nothing) & (nearness <= too_near)
+            key = (np.int64(nearness.view(np.int32)) << 32) | below
+            nearest[line, col] = max(nearest[line, col], key if sees else np.int64(0))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -314,7 +305,7 @@ def _span(row, start, stop, edges, lens, shift):  # type: ignore[no-untyped-def]
     if shift is not None:
         # The shift in the middle of the row; towards its ends it changes by no more than `spare`.
         middle = (start + stop) >> 1
-        shift_x, y = np.float64(shift[row, middle, 0]), y + shift[row, middle, 1]
+        shift_x, y = np.float64(shift[0, row, middle]), y + shift[1, row, middle]
         spare = 0.5 * (stop - start + 2) * lens[8] + 2.0 * spare
     low, high = _between(a0, b0 * y + c0 + abs(b0) * spare, -1e30, 1e30)
     low, high = _between(a1, b1 * y + c1 + abs(b1) * spare, low, high)

@@ -82,7 +82,7 @@ def tangents(through: Sight) -> NDArray[np.float64]:
     x = (np.arange(lens.width_px)[None, :] - lens.centre_px[0]) / lens.focal_px
     y = (np.arange(lens.height_px)[:, None] - lens.centre_px[1]) / lens.focal_px
     if through.shift is not None:
-        x, y = x + through.shift[..., 0], y + through.shift[..., 1]
+        x, y = x + through.shift[0, :, : lens.width_px], y + through.shift[1, :, : lens.width_px]
     return np.asarray(np.hypot(x, y))
 
 

@@ -45,7 +45,7 @@ def test_undoing_distortion_and_distorting_again_leads_back_to_the_pixel(x: floa
     assert shift is not None
     col, row = int(x), int(y)
     place = (np.array([col, row]) - lens.centre_px) / lens.focal_px
-    assert distorted(place + shift[row, col], BENT) == pytest.approx(place, abs=1e-7)
+    assert distorted(place + shift[:, row, col], BENT) == pytest.approx(place, abs=1e-7)
 
 
 def test_a_lens_that_folds_its_image_is_refused() -> None:

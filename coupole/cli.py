@@ -9,8 +9,8 @@ from typing import Any
 import typer
 
 from coupole.commands import keeping, planning, running
+from coupole.commands.budget import budget
 from coupole.commands.calibrate import calibrate_app
-from coupole.commands.calibrate_light import budget
 from coupole.commands.render import render
 from coupole.errors import CoupoleError, InputError, Interrupted
 

@@ -103,14 +103,37 @@ repeats: 3
 exposure: {{kind: bracket, exposures_us: [20, 80, 800, 6400]}}
 darks_per_view: 8
 """,
-    "spectralon": """\
-# A white tile at the support's centre, seen from all around; for `coupole calibrate led-power`.
+    "mesh": """\
+# An object with the scanner's stickers, seen from all around at two heights; for `coupole calibrate mesh`.
+# `target_mm` is its middle: set it to where yours stands, and name its mesh once it is known where that lies.
 schema_version: 1
 name: {name}
 rig: {rig}
 views:
-  - {{kind: grid, name: tile, target_mm: [0, 0, 10], distance_mm: 335,
-     azimuths_deg: [-135, -45, 45, 135], elevations_deg: [50]}}
+  - {{kind: grid, name: low, target_mm: [0, 0, 15], distance_mm: 335,
+     azimuths_deg: [-180, -135, -90, -45, 0, 45, 90, 135], elevations_deg: [48]}}
+  - {{kind: grid, name: high, target_mm: [0, 0, 15], distance_mm: 335,
+     azimuths_deg: [-157.5, -112.5, -67.5, -22.5, 22.5, 67.5, 112.5, 157.5], elevations_deg: [70]}}
+lights: {{kind: panels, panels: [1, 2, 3, 4]}}
+exposure: {{kind: fixed, exposure_us: 8000}}
+darks_per_view: 2
+""",
+    "spectralon": """\
+# A white tile at the support's centre, for `coupole calibrate led-power`. Each LED is taken from two sides: where
+# the arm shades the tile in one, it does not in the other. Two elevations tell how the tile departs from Lambert's
+# law.
+schema_version: 1
+name: {name}
+rig: {rig}
+views:
+  - {{kind: look_at, name: even-low, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: 45, elevation_deg: 45,
+     lights: {{kind: every, every: 2}}}}
+  - {{kind: look_at, name: even-high, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: -45, elevation_deg: 60,
+     lights: {{kind: every, every: 2}}}}
+  - {{kind: look_at, name: odd-low, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: -45, elevation_deg: 45,
+     lights: {{kind: every, every: 2, offset: 1}}}}
+  - {{kind: look_at, name: odd-high, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: 45, elevation_deg: 60,
+     lights: {{kind: every, every: 2, offset: 1}}}}
 lights: {{kind: all}}
 hidden_lights: skip
 exposure: {{kind: bracket, exposures_us: [2000, 6000]}}

@@ -11,13 +11,15 @@ from collections.abc import Callable
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from coupole.geometry import Transform, transform
 from sim.surface import Surface
 
 _Length = Annotated[float, Field(gt=0)]
 _Vector = tuple[float, float, float]
+Poses = NDArray[np.float64]
 
 
 class _Thing(BaseModel):
@@ -62,6 +64,46 @@ class Sphere(_Thing):
         return shapes.glossy_sphere(self.diameter_mm / 2)
 
 
+class Stickers(BaseModel):
+    """The scanner's retro-reflective targets, stuck where the surface is flat enough."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    count: Annotated[int, Field(ge=1)]
+    """How many there are now."""
+    seed: int = 1
+    diameter_mm: _Length = 6.0
+    gap_mm: _Length = 0.8
+    """As in `sim.objects.targets.sticker_poses`, which tells where they are."""
+    new: Annotated[int, Field(ge=0)] = 0
+    """So many of them were put on after the scan: its table does not know them."""
+    fallen: Annotated[int, Field(ge=0)] = 0
+    """So many more there were then, which have come off."""
+
+    @model_validator(mode="after")
+    def _some_stayed(self) -> Stickers:
+        if self.new > self.count:
+            raise ValueError(f"`new` is {self.new}, but there are only {self.count} stickers")
+        return self
+
+    def on(self, surface: Surface) -> Surface:
+        """The surface with its stickers as it is now. Raises InputError if it has no room for so many."""
+        from sim.objects.targets import stuck_on
+
+        return stuck_on(surface, self._poses(surface)[: self.count], diameter_mm=self.diameter_mm)
+
+    def poses_when_scanned(self, surface: Surface) -> Poses:
+        """[n, 4, 4] of the stickers that the scanner saw, in the thing's frame."""
+        return self._poses(surface)[self.new :]
+
+    def _poses(self, surface: Surface) -> Poses:
+        """Of all that ever were on it: first the new ones, last those that fell off."""
+        from sim.objects.targets import sticker_poses
+
+        total = self.count + self.fallen
+        return sticker_poses(surface, total, self.seed, diameter_mm=self.diameter_mm, gap_mm=self.gap_mm)
+
+
 class Sample(_Thing):
     """A sample of a material, at the measures of its generator."""
 
@@ -75,8 +117,13 @@ class Sample(_Thing):
         "fabric",
         "sculpted_relief",
     ]
+    stickers: Stickers | None = None
 
     def surface(self) -> Surface:
+        return self.bare() if self.stickers is None else self.stickers.on(self.bare())
+
+    def bare(self) -> Surface:
+        """Without its stickers."""
         from sim.objects import fabric, shapes, targets, urushi, wedges
 
         generators: dict[str, Callable[[], Surface]] = {
@@ -90,24 +137,6 @@ class Sample(_Thing):
             "sculpted_relief": shapes.sculpted_relief,
         }
         return generators[self.kind]()
-
-
-class Stickers(BaseModel):
-    """The scanner's retro-reflective targets, stuck where the surface is flat enough."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    count: Annotated[int, Field(ge=1)]
-    seed: int = 1
-    diameter_mm: _Length = 6.0
-    gap_mm: _Length = 0.8
-    """As in `sim.objects.targets.sticker_poses`, which tells where they are."""
-
-    def on(self, surface: Surface) -> Surface:
-        """The surface with its stickers. Raises InputError if it has no room for so many."""
-        from sim.objects.targets import with_stickers
-
-        return with_stickers(surface, self.count, self.seed, diameter_mm=self.diameter_mm, gap_mm=self.gap_mm)
 
 
 Thing = Annotated[CharucoBoard | Sphere | Sample, Field(discriminator="kind")]

@@ -41,6 +41,7 @@ def _detection(rounds: int) -> dict[str, Any]:
     import cv2
 
     from coupole.calibration.board import Board, detect
+    from coupole.calibration.picture import Picture
 
     board = Board(kind="charuco", corners=(11, 8), square_mm=16.0, marker_mm=12.0)
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
@@ -57,7 +58,7 @@ def _detection(rounds: int) -> dict[str, Any]:
 
     return _compared(
         "calibration_board_detection_12mp",
-        lambda: detect(board, image, "image", white=4095),
+        lambda: detect(board, Picture.of_grey(image, white=4095.0)),
         "opencv",
         plain,
         rounds,

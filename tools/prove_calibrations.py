@@ -196,9 +196,10 @@ def random_cell(seed: int, joints_deg: Floats, width_px: int, samples: int, *, a
 def prove_cell(seed: int, *, joints_deg: Floats, width_px: int, samples: int, absolute: bool) -> list[Judged]:
     """Render, find, adjust, and compare with the truth."""
     from coupole.calibration.arm_errors import axis_sensitivity
-    from coupole.calibration.board import Board, detect, plane
+    from coupole.calibration.board import Board, detect
     from coupole.calibration.bundle import Poses, RobotNoise, calibrate_hand_eye
     from coupole.calibration.camera import calibrate_camera, without_gross_errors
+    from coupole.calibration.picture import Picture
     from coupole.job import read_cell
     from coupole.rig import planning_arm
     from sim.stills import Stills
@@ -213,7 +214,7 @@ def prove_cell(seed: int, *, joints_deg: Floats, width_px: int, samples: int, ab
     sightings, chosen = [], []
     for number, pose in enumerate(cell.true):
         frame = stills.take(pose, leds=[], panels=[1], exposure_s=EXPOSURE_S).astype(np.float64)
-        seen = detect(board, plane(frame - camera["black_dn"], camera["bayer_pattern"]), str(number), white=white)
+        seen = detect(board, Picture(frame - camera["black_dn"], camera["bayer_pattern"], white, str(number)))
         if not isinstance(seen, str):
             sightings.append(seen)
             chosen.append(number)

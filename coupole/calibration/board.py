@@ -1,8 +1,8 @@
 """The board: what is printed on it, and its corners in an image.
 
 A board's frame is OpenCV's: x along the rows of squares, y along the columns, z into the board; the origin is the
-outer corner of a ChArUco board, the first inner corner of a chess board. Corners are found in 8-bit pictures and
-refined in all the bits that the image has; in a RAW frame on the green pixels, which are half of all.
+outer corner of a ChArUco board, the first inner corner of a chess board. Corners are found by OpenCV in 8 bits of
+one colour, and then fitted to that colour's own pixels in all the bits they have (`corner_fit`).
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from coupole import yamlfile
+from coupole.calibration.corner_fit import enough_pixels, fit_corners
+from coupole.calibration.picture import Channel, Picture
 from coupole.calibration.rotations import Floats
 from coupole.plan import Model
 
-Channel = Literal["green", "red", "blue"]
 Count = Annotated[int, Field(ge=3, le=200)]
 Millimetres = Annotated[float, Field(gt=0, le=1000)]
 
@@ -94,52 +95,46 @@ def read_board(path: Path) -> Board:
     return yamlfile.read(path).validate(Board)
 
 
-def plane(frame: NDArray[Any], pattern: str, channel: Channel = "green") -> Floats:
-    """One channel of a RAW frame [H, W] at full size [H, W], DN: corners in it are corners in the frame.
-
-    `pattern` is the names of the four pixels at the frame's top left, row by row; `MONO` has one channel. Pixels
-    of other colours are left out of a mean with the weights 1 2 1 in both directions. Of green pixels it always
-    finds a weight of 8, of red and blue of 4, and both lie evenly about each pixel: nothing is shifted.
-    """
-    if pattern == "MONO":
-        return frame.astype(np.float64)
-    sparse = np.zeros(frame.shape)
-    for place, letter in enumerate(pattern):
-        if letter == channel[0].upper():
-            sparse[place // 2 :: 2, place % 2 :: 2] = frame[place // 2 :: 2, place % 2 :: 2]
-    around = np.pad(sparse, 1, mode="reflect")  # reflection keeps the colours in step
-    across = around[:, :-2] + 2 * around[:, 1:-1] + around[:, 2:]
-    both = across[:-2] + 2 * across[1:-1] + across[2:]
-    return np.asarray(both / (8 if channel == "green" else 4))
-
-
-def detect(board: Board, image: NDArray[Any], name: str, *, white: float | None = None) -> Sighting | str:
-    """The board's corners in a grey image [H, W], or why it cannot be used. `white` is the value of saturation."""
+def detect(board: Board, picture: Picture) -> Sighting | str:
+    """The board's corners in a picture, of a coloured one in green, or why it cannot be used."""
     import cv2
 
-    if white is None:
-        white = float(np.iinfo(image.dtype).max) if np.issubdtype(image.dtype, np.integer) else np.inf
-    picture = _picture(image)
-    ids, rough = _chess(board, picture) if board.kind == "chessboard" else _charuco(board, picture)
+    image = picture.plane()
+    eight_bits = _eight_bits(image)
+    ids, rough = _chess(board, eight_bits) if board.kind == "chessboard" else _charuco(board, eight_bits)
     if len(ids) < LEAST_CORNERS:
         return f"{len(ids)} of {len(board.points_mm)} corners seen, {LEAST_CORNERS} needed"
     outline = cv2.boundingRect(rough.astype(np.float32))
     part = image[max(outline[1], 0) : outline[1] + outline[3], max(outline[0], 0) : outline[0] + outline[2]]
-    if (share := float(np.mean(part >= white))) > CLIPPED_SHARE:
+    if (share := float(np.mean(part >= picture.white))) > CLIPPED_SHARE:
         return f"clipped: {share:.0%} of the pixels on the board are saturated. Expose shorter"
-    board_mm = board.points_mm[ids]
-    if np.linalg.matrix_rank(board_mm[:, :2] - board_mm[0, :2]) < 2:
+    seen = _refined(Sighting(picture.name, ids, board.points_mm[ids], rough), board, picture, "green")
+    if len(seen.ids) < LEAST_CORNERS:
+        return f"{len(seen.ids)} of {len(ids)} corners are sharp enough, {LEAST_CORNERS} needed"
+    if np.linalg.matrix_rank(seen.board_mm[:, :2] - seen.board_mm[0, :2]) < 2:
         return "all corners seen lie on one line"
-    return Sighting(name, ids, board_mm, refine(image, rough, _window_px(board, ids, rough)))
+    return seen
 
 
-def in_channel(board: Board, image: NDArray[Any], green: Sighting) -> Sighting:
-    """The corners of a sighting in green, refined in another channel's plane [H, W]."""
-    return replace(green, pixels=refine(image, green.pixels, _window_px(board, green.ids, green.pixels)))
+def in_channel(board: Board, picture: Picture, channel: Channel, green: Sighting) -> Sighting:
+    """The corners of a sighting in green, found in another colour of its picture."""
+    return _refined(green, board, picture, channel)
+
+
+def _refined(rough: Sighting, board: Board, picture: Picture, channel: Channel) -> Sighting:
+    """The corners to a fraction of a pixel, without those that turn out to be none. Where they are too close
+    together for a fit, they are where OpenCV sees all gradients point away or along."""
+    window_px = _window_px(board, rough.ids, rough.pixels)
+    values, known = picture.measured(channel)
+    if not enough_pixels(known, window_px):
+        side_px = max(2, int(window_px / np.sqrt(2)))
+        return replace(rough, pixels=refine(picture.plane(channel), rough.pixels, side_px))
+    found = fit_corners(values, known, rough.pixels, window_px)
+    return Sighting(rough.name, rough.ids[found.fits], rough.board_mm[found.fits], found.pixels[found.fits])
 
 
 def refine(image: NDArray[Any], corners: Floats, window_px: int) -> Floats:
-    """Corners [n, 2] to a fraction of a pixel: where the gradients about them all point away or along."""
+    """Corners [n, 2] by OpenCV's `cornerSubPix`, `window_px` being half its window."""
     import cv2
 
     scaled = np.ascontiguousarray(image, dtype=np.float32)
@@ -150,24 +145,31 @@ def refine(image: NDArray[Any], corners: Floats, window_px: int) -> Floats:
     return np.asarray(found, dtype=np.float64).reshape(-1, 2)
 
 
-def _picture(image: NDArray[Any]) -> NDArray[np.uint8]:
+def _eight_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
     """8 bits for the search alone: dark to white as the image's own extremes."""
     if image.dtype == np.uint8:
         return np.ascontiguousarray(image)
-    low, high = np.percentile(image, [0.5, 99.5])
+    step = max(1, image.shape[0] // 500)
+    low, high = np.percentile(image[::step, ::step], [0.5, 99.5])
     return np.asarray(np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255), dtype=np.uint8)
 
 
-def _window_px(board: Board, ids: NDArray[np.intp], corners: Floats) -> int:
-    """Half the window of refinement, 2 to 11 px: a third of the way to the nearest corner, and short of a ChArUco
-    board's markers, whose edges would pull corners by half a pixel."""
+def _window_px(board: Board, ids: NDArray[np.intp], corners: Floats) -> float:
+    """Radius of the window that a corner is found in, 2 to 11 px: a third of the way to the nearest corner, and
+    short of a ChArUco board's markers, whose corners stand on the diagonals and would pull by half a pixel."""
     apart = np.linalg.norm(corners[:, None] - corners[None], axis=-1)
     np.fill_diagonal(apart, np.inf)
     steps = np.linalg.norm(board.points_mm[ids][:, None] - board.points_mm[ids][None], axis=-1)
-    neighbours = apart[np.isclose(steps, board.square_mm)]
-    nearest = float(np.percentile(neighbours, 5)) if len(neighbours) else float(apart.min())
-    white = (1 - (board.marker_mm or 0.0) / board.square_mm) / 2 if board.kind == "charuco" else 1.0
-    return int(np.clip(min(nearest / 3, nearest * white - 1), 2, 11))
+
+    def nearest(step_mm: float) -> float:
+        neighbours = apart[np.isclose(steps, step_mm)]
+        return float(np.percentile(neighbours, 5)) if len(neighbours) else float(apart.min())
+
+    radius_px = nearest(board.square_mm) / 3
+    if board.kind == "charuco":
+        white = (1 - (board.marker_mm or 0.0) / board.square_mm) / 2
+        radius_px = min(radius_px, nearest(np.sqrt(2) * board.square_mm) * white - 1)
+    return float(np.clip(radius_px, 2, 11))
 
 
 def _charuco(board: Board, picture: NDArray[np.uint8]) -> tuple[NDArray[np.intp], Floats]:

@@ -15,8 +15,9 @@ from functools import partial
 import numpy as np
 
 from coupole.calibration.irradiance import Emission
-from coupole.calibration.measurement import LED_PLACE, LED_TURN, MESH_STEP, VERTICES, reflectance_of
+from coupole.calibration.measurement import LED_PLACE, LED_TURN, MESH_STEP, SEEN_OFF, VERTICES, reflectance_of
 from coupole.calibration.propagation import (
+    COVERAGES,
     Inputs,
     Linear,
     Model,
@@ -32,18 +33,21 @@ from coupole.calibration.propagation import (
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
-SOURCES = (
-    "vertices",
-    "pixel value",
-    "LED position",
-    "LED normal",
-    "mesh to robot",
-    "flat field",
-    "response",
-    "LED power, own",
-    "LED power, common",
-    "drift",
-)
+STATED = {
+    "vertices": "seed 003",
+    "pixel value": "assumed",
+    "LED position": "seed 003",
+    "LED normal": "seed 003",
+    "mesh to robot": "seed 003",
+    "camera": "seed 003",
+    "lens": "assumed",
+    "flat field": "assumed",
+    "response": "assumed",
+    "LED power, own": "assumed",
+    "LED power, common": "assumed",
+    "drift": "assumed",
+}
+"""All sources of uncertainty, and what says how large each is where no record does."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,14 @@ class Known:
     mesh_deg: float = 0.02
     robot_mm: float = 0.03
     """Of the robot's common error: it shifts LEDs and mesh alike, and so correlates them."""
+    camera_mm: float = 0.3
+    """Of the camera's ray where it meets the object, both directions across it together."""
+    lens_px: float = 0.3
+    """Of where the lens sees a direction, both directions together."""
+    pixel_mm: float = 0.047
+    """Side of a pixel on the object."""
+    contrast_per_mm: float = 0.02
+    """Relative change of albedo along the surface."""
     flat_field: float = 0.003
     response: float = 0.002
     power_own: float = 0.003
@@ -76,8 +88,25 @@ class Known:
     sources: tuple[tuple[str, str], ...] = ()
     """Source of uncertainty and the record that says so."""
 
-    def source(self, group: str, otherwise: str = "seed 003") -> str:
-        return dict(self.sources).get(group, otherwise)
+    def source(self, group: str) -> str:
+        return dict(self.sources).get(group, STATED[group])
+
+    def figure(self, group: str) -> str:
+        """What a source was taken to be, in words."""
+        return {
+            "vertices": f"{self.vertex_mm:.3g} mm, edges {self.edge_mm:.3g}",
+            "pixel value": f"{self.read_noise_dn:.2g} DN, {self.pixels} pixels",
+            "LED position": f"{self.led_mm:.2g} mm",
+            "LED normal": f"{self.led_deg:.2g} deg",
+            "mesh to robot": f"{self.mesh_mm:.2g} mm, {self.mesh_deg:.2g} deg",
+            "camera": f"{self.camera_mm:.2g} mm",
+            "lens": f"{self.lens_px:.2g} px",
+            "flat field": f"{self.flat_field:.2%}",
+            "response": f"{self.response:.2%}",
+            "LED power, own": f"{self.power_own:.2%}",
+            "LED power, common": f"{self.power_common:.2%}",
+            "drift": f"{self.drift:.2%}",
+        }[group]
 
 
 @dataclass(frozen=True)
@@ -100,6 +129,8 @@ class Share:
     """What one source does."""
 
     source: str
+    figure: str
+    """What it was taken to be, in words."""
     said_by: str
     linear: float
     """Share of the linear variance."""
@@ -120,6 +151,7 @@ class Budget:
     numeric: Propagated
     linear: Linear
     validations: tuple[Validation, ...]
+    """For one and two significant digits of u, at each coverage."""
     shares: tuple[Share, ...]
 
     def relative(self, coverage: float, kind: str = "symmetric") -> tuple[float, float]:
@@ -144,10 +176,10 @@ def sample_inputs(known: Known, geometry: Geometry, *, emission: Emission = "lam
     signal = known.full_scale_dn * geometry.exposure_share * geometry.reflectance * cosine
     noise = np.sqrt((known.read_noise_dn**2 + 1.0 / 12.0 + known.gain_dn_per_e * signal) / known.pixels)
     led_axis, mesh_axis = known.led_mm / np.sqrt(3.0), known.mesh_mm / np.sqrt(3.0)
-    robot = known.robot_mm / np.sqrt(3.0)
+    robot, lens_mm = known.robot_mm / np.sqrt(3.0), known.lens_px / np.sqrt(2.0) * known.pixel_mm
 
-    def one(name: str, value: float, u: float, group: str, otherwise: str = "seed 003") -> Quantity:
-        return Quantity(name, value, u, source=known.source(group, otherwise), group=group)
+    def one(name: str, value: float, u: float, group: str) -> Quantity:
+        return Quantity(name, value, u, source=known.source(group), group=group)
 
     def vertex(name: str, value: float) -> Quantity:
         u, said_by = known.vertex_mm / np.sqrt(3.0), known.source("vertices")
@@ -159,15 +191,18 @@ def sample_inputs(known: Known, geometry: Geometry, *, emission: Emission = "lam
         *(one(n, 0.0, known.led_deg / np.sqrt(2.0), "LED normal") for n in LED_TURN),
         *(one(n, 0.0, mesh_axis, "mesh to robot") for n in MESH_STEP[:3]),
         *(one(n, 0.0, known.mesh_deg / np.sqrt(3.0), "mesh to robot") for n in MESH_STEP[3:]),
-        one("signal_dn", signal, noise, "pixel value", "photon transfer"),
+        one(SEEN_OFF[0], 0.0, lens_mm, "lens"),
+        one(SEEN_OFF[1], 0.0, known.camera_mm / np.sqrt(2.0), "camera"),
+        Quantity("contrast_per_mm", known.contrast_per_mm, 0.0, source="stated", group="camera"),
+        one("signal_dn", signal, noise, "pixel value"),
         Quantity("exposure_s", 0.01, 0.0, source="camera's clock", group="pixel value"),
         Quantity("flat", 1.0, 0.0, source="at the field's middle", group="flat field"),
-        one("flat_field", 1.0, known.flat_field, "flat field", "assumed"),
-        one("response", 1.0, known.response, "response", "assumed"),
+        one("flat_field", 1.0, known.flat_field, "flat field"),
+        one("response", 1.0, known.response, "response"),
         Quantity("power_dn_m2_sr_per_s", 1e4, 0.0, source="scale", group="LED power, common"),
-        one("power.own", 1.0, known.power_own, "LED power, own", "assumed"),
-        one("power.common", 1.0, known.power_common, "LED power, common", "assumed"),
-        one("drift", 1.0, known.drift, "drift", "assumed"),
+        one("power.own", 1.0, known.power_own, "LED power, own"),
+        one("power.common", 1.0, known.power_common, "LED power, common"),
+        one("drift", 1.0, known.drift, "drift"),
     ]
     share = robot**2 / max(led_axis * mesh_axis, 1e-30)
     correlations = tuple((LED_PLACE[i], MESH_STEP[i], float(min(share, 0.99))) for i in range(3) if share > 0)
@@ -179,6 +214,7 @@ def budget_of(
     geometry: Geometry,
     *,
     emission: Emission = "lambertian",
+    coverages: Sequence[float] = COVERAGES,
     digits: int = 2,
     most_trials: int = 500_000,
     seed: int = 1,
@@ -186,21 +222,21 @@ def budget_of(
     """Propagate one sample's uncertainty, and take each source away in turn and alone."""
     inputs, led_normal = sample_inputs(known, geometry, emission=emission)
     model = partial(_model, led_normal=led_normal, emission=emission)
-    numeric = monte_carlo(model, inputs, digits=digits, most_trials=most_trials, seed=seed)
-    linearly = linear(model, inputs)
+    numeric = monte_carlo(model, inputs, coverages=coverages, digits=digits, most_trials=most_trials, seed=seed)
+    linearly = linear(model, inputs, coverages)
     return Budget(
         geometry,
         inputs,
         linearly.result.estimate,
         numeric,
         linearly,
-        validate(linearly.result, numeric, digits=digits),
-        shares_of(model, inputs, linearly, seed=seed),
+        (*validate(linearly.result, numeric, digits=1), *validate(linearly.result, numeric, digits=2)),
+        shares_of(model, inputs, linearly, known, seed=seed),
     )
 
 
 def shares_of(
-    model: Model, inputs: Inputs, linearly: Linear, *, seed: int = 1, trials: int = 20_000
+    model: Model, inputs: Inputs, linearly: Linear, known: Known, *, seed: int = 1, trials: int = 20_000
 ) -> tuple[Share, ...]:
     """What each group of inputs does, the greatest first. All propagations draw the same numbers, so that their
     differences have little noise."""
@@ -217,9 +253,10 @@ def shares_of(
         mine = [i for i, q in enumerate(inputs.quantities) if q.source_group == group]
         without = half_width(frozenset({group}))
         alone = half_width(frozenset(groups) - {group})
-        said_by = next(inputs.quantities[i].source for i in mine if inputs.quantities[i].u > 0.0)
         share = float(linearly.shares[mine].sum())
-        found.append(Share(group, said_by, share, 1.0 - without / whole, alone / nominal))
+        found.append(
+            Share(group, known.figure(group), known.source(group), share, 1.0 - without / whole, alone / nominal)
+        )
     return tuple(sorted(found, key=lambda share: -share.alone))
 
 

@@ -1,7 +1,9 @@
 """Lateral chromatic aberration: a lens for each colour channel, all from the same images.
 
 The board's poses are shared, so what the lenses have in common (focal length against distance, principal point
-against tilt) cancels out of their differences, which are known far better than each lens alone.
+against tilt) cancels out of their differences, which are known far better than each lens alone. Colours differ in
+scale, centre and the first term of radial distortion; the higher terms, which few corners at the field's rim tell,
+are one for all.
 """
 
 from __future__ import annotations
@@ -19,6 +21,10 @@ from coupole.calibration.optics import Intrinsics
 from coupole.calibration.rotations import Floats, moved, skew
 from coupole.errors import InputError
 
+OWN = ("fx", "fy", "cx", "cy", "k1")
+"""Parameters that each colour has for itself, where the lens model has them."""
+SHARED = "shared"
+
 
 @dataclass(frozen=True)
 class ChannelLenses:
@@ -26,7 +32,7 @@ class ChannelLenses:
 
     intrinsics: Mapping[str, Intrinsics]
     names: tuple[str, ...]
-    """[s] of the parameters, as `red.fx`."""
+    """[s] of the parameters, as `red.fx`, or `shared.k2` of those that all colours have in common."""
     covariance: Floats
     """[s, s] of all channels together."""
     degrees: Floats
@@ -45,9 +51,9 @@ class ChannelLenses:
         slopes = np.zeros((len(points), 2, len(self.names)))
         for at, name in enumerate(self.names):
             owner, _, parameter = name.partition(".")
-            if owner in seen:
-                sign = 1.0 if owner == channel else -1.0
-                slopes[:, :, at] = sign * seen[owner].by_intrinsics[:, :, optics.NAMES.index(parameter)]
+            for name_of, sign in ((channel, 1.0), (against, -1.0)):
+                if owner in (name_of, SHARED):
+                    slopes[:, :, at] += sign * seen[name_of].by_intrinsics[:, :, optics.NAMES.index(parameter)]
         spread = slopes @ self.covariance @ np.swapaxes(slopes, 1, 2)
         return seen[channel].pixels - seen[against].pixels, spread
 
@@ -65,11 +71,13 @@ def calibrate_channels(
         raise InputError(f"camera: every channel needs the same images; found {sorted(counts)} of them")
     starts = {channel: calibrate_camera(sightings[channel], size_px, model) for channel in channels}
     corners = {channel: Corners.of(sightings[channel]) for channel in channels}
-    columns = [optics.NAMES.index(name) for name in starts[channels[0]].free]
-    width, images = len(columns), counts.pop()
-    shared = width * len(channels)
     first = starts[channels[0]]
-    state = (np.stack([starts[channel].intrinsics.vector() for channel in channels]), first.camera_from_board)
+    own = [optics.NAMES.index(name) for name in first.free if name in OWN]
+    common = [optics.NAMES.index(name) for name in first.free if name not in OWN]
+    images, width = counts.pop(), len(own)
+    of_lens = width * len(channels) + len(common)
+    lenses = np.stack([starts[channel].intrinsics.vector() for channel in channels])
+    lenses[:, common] = lenses[0, common]
 
     def evaluate(at: tuple[Floats, Floats]) -> list[Block]:
         lenses, poses = at
@@ -79,25 +87,33 @@ def calibrate_channels(
             seen = optics.project(mine.in_camera(poses), lenses[number])
             turned = poses[mine.view, :3, :3] @ skew(mine.board_mm)
             by_pose = np.concatenate([seen.by_point, -seen.by_point @ turned], axis=-1)
-            jacobian = np.concatenate([seen.by_intrinsics[:, :, columns], by_pose], axis=-1) / PIXEL_SIGMA_PX
+            by_lens = seen.by_intrinsics[:, :, own + common]
+            jacobian = np.concatenate([by_lens, by_pose], axis=-1) / PIXEL_SIGMA_PX
             residuals = (mine.pixels - seen.pixels) / PIXEL_SIGMA_PX
+            of_mine = np.r_[width * number : width * (number + 1), width * len(channels) : of_lens]
             for view, part in enumerate(mine.parts):
-                own = shared + 6 * view
-                where = np.r_[width * number : width * (number + 1), own : own + 6]
-                blocks.append(Block(residuals[part].ravel(), jacobian[part].reshape(-1, width + 6), where, number))
+                pose = of_lens + 6 * view
+                where = np.r_[of_mine, pose : pose + 6]
+                blocks.append(
+                    Block(residuals[part].ravel(), jacobian[part].reshape(-1, len(where)), where, number)
+                )
         return blocks
 
     def move(at: tuple[Floats, Floats], change: Floats) -> tuple[Floats, Floats]:
         lenses = at[0].copy()
-        lenses[:, columns] += change[:shared].reshape(len(channels), width)
-        return lenses, moved(at[1], change[shared:].reshape(-1, 6))
+        lenses[:, own] += change[: width * len(channels)].reshape(len(channels), width)
+        lenses[:, common] += change[width * len(channels) : of_lens]
+        return lenses, moved(at[1], change[of_lens:].reshape(-1, 6))
 
     groups = [Group(channel, estimated=True, rejects=2) for channel in channels]
-    found = adjust(state, evaluate, move, groups, shared + 6 * images, what="camera")
+    state = (lenses, first.camera_from_board)
+    found = adjust(state, evaluate, move, groups, of_lens + 6 * images, what="camera")
+    names = [f"{channel}.{optics.NAMES[column]}" for channel in channels for column in own]
+    names += [f"{SHARED}.{optics.NAMES[column]}" for column in common]
     return ChannelLenses(
         {channel: Intrinsics(*map(float, found.state[0][i])) for i, channel in enumerate(channels)},
-        tuple(f"{channel}.{name}" for channel in channels for name in first.free),
-        found.covariance[:shared, :shared],
-        found.degrees[:shared],
+        tuple(names),
+        found.covariance[:of_lens, :of_lens],
+        found.degrees[:of_lens],
         {channel: PIXEL_SIGMA_PX * found.factor(channel) for channel in channels},
     )

@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 
 from coupole.calibration.rotations import Floats
 
-LEAST_RADIUS_PX = 4.0
-"""Below, nine unknowns are too many for the pixels there are."""
 _UNKNOWNS = 9
+_LEAST_PIXELS = 24
 _X, _Y, _FIRST, _SECOND, _SIGMA, _LEVEL, _CONTRAST, _ALONG_X, _ALONG_Y = range(_UNKNOWNS)
 _MOST_STEPS = 40
 _CLOSE_PX = 1e-5
@@ -52,8 +51,13 @@ class Corners:
     """[n] blur of the picture."""
 
 
+def enough_pixels(known: NDArray[np.bool_], radius_px: float) -> bool:
+    """Whether a window of that radius has pixels enough for a fit."""
+    return bool(np.pi * radius_px**2 * known.mean() >= _LEAST_PIXELS)
+
+
 def fit_corners(image: NDArray[Any], known: NDArray[np.bool_], rough: Floats, radius_px: float) -> Corners:
-    """Corners about `rough` [n, 2] from the pixels within `radius_px`, at least `LEAST_RADIUS_PX`.
+    """Corners about `rough` [n, 2] from the pixels within `radius_px`, of which there must be `enough_pixels`.
 
     `image` [H, W] are RAW values; `known` [h, w] says which pixels take part, repeated over the image.
     """

@@ -7,15 +7,16 @@ would have to be read; the one under which the contradiction goes away is the li
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, permutations, product
+from itertools import combinations
 
 import numpy as np
 from scipy.stats import t as student
 
-from coupole.calibration.hand_eye import METHODS, Motions, motions, park, solution, solve
-from coupole.calibration.poses import Convention, ReportedPoses
+from coupole.calibration.hand_eye import METHODS, motions, solution
+from coupole.calibration.hypotheses import Expected, Hypothesis, faults, rereadings, scatter_of
+from coupole.calibration.poses import ReportedPoses
 from coupole.calibration.rotations import Floats, between, inverses, moved
 from coupole.errors import InputError
 
@@ -28,45 +29,10 @@ _WORTH_A_LOOK = 0.3
 """With a share of the expected scatter like this a moved board may still hide in what a bad robot is allowed."""
 _AS_GOOD = 1.5
 """Hypotheses this near to the best are told apart by how much they change."""
-_LEAST_SEGMENT = 3
 _DEPTH_WORSE = 5.0
 """A board's distance is seen so many times worse than its place across the image."""
-_PLAUSIBLE_MM = (5.0, 5000.0)
-"""Distances between camera and board, and ways of the robot, that a cell may have."""
 _FALSE_ALARMS = 0.01
 _RESAMPLED = 24
-
-UNITS, ANGLES, INVERSE, MOVED_BOARD, WRONG_PAIR, SHIFTED = (
-    "wrong unit",
-    "angle convention",
-    "inverse pose",
-    "moved board",
-    "wrong pair",
-    "shifted pairs",
-)
-
-
-@dataclass(frozen=True)
-class Expected:
-    """What scatter of the board noise explains, root mean square."""
-
-    position_mm: float
-    orientation_deg: float
-
-    def score(self, scatter_mm: float, scatter_deg: float) -> float:
-        """Scatter over what is expected, the worse of both."""
-        return max(scatter_mm / self.position_mm, scatter_deg / self.orientation_deg)
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """What may be wrong, and what the scatter would be if it is."""
-
-    causes: tuple[str, ...]
-    """Names, as in this module's constants."""
-    sentence: str
-    scatter_mm: float
-    scatter_deg: float
 
 
 @dataclass(frozen=True)
@@ -154,11 +120,11 @@ def diagnose(
     poses: ReportedPoses, camera_from_board: Floats, expected: Expected, names: Sequence[str]
 ) -> Diagnosis:
     """Judge poses [n] against the board as seen [n, 4, 4]; `names` of the images."""
-    given = _scatter(poses.base_from_flange, camera_from_board)
+    given = scatter_of(poses.base_from_flange, camera_from_board)
     found, score = Diagnosis(*given, expected, (), ()), expected.score(*given)
     if score > _WORTH_A_LOOK:
-        tried = list(_rereadings(poses, camera_from_board)) if score > CONTRADICTION else []
-        tried += _faults(poses.base_from_flange, camera_from_board, names)
+        tried = list(rereadings(poses, camera_from_board)) if score > CONTRADICTION else []
+        tried += faults(poses.base_from_flange, camera_from_board, names, expected)
         found = replace(found, likely=_likely(tried, expected, given))
     if np.isfinite(given[0]):
         apart = disagreements(poses.base_from_flange, camera_from_board, expected)
@@ -210,12 +176,13 @@ def _by_method(base_from_flange: Floats, camera_from_board: Floats) -> dict[str,
 def _likely(tried: list[Hypothesis], expected: Expected, given: tuple[float, float]) -> tuple[Hypothesis, ...]:
     """Hypotheses that cure, those that change least first among the equally good.
 
-    A cure makes the scatter of places or of turns so much smaller, and the other no larger.
+    A cure makes the scatter of places or of turns so much smaller, and the other no larger; or it explains what
+    noise cannot.
     """
     cures = []
     for h in tried:
         gains = given[0] / max(h.scatter_mm, 1e-12), given[1] / max(h.scatter_deg, 1e-12)
-        if max(gains) > CURE and min(gains) > _NO_WORSE:
+        if (max(gains) > CURE or h.sure) and min(gains) > _NO_WORSE:
             cures.append(h)
     if not cures:
         return ()
@@ -226,125 +193,3 @@ def _likely(tried: list[Hypothesis], expected: Expected, given: tuple[float, flo
         return score > _AS_GOOD * best, len(h.causes), score
 
     return tuple(sorted(cures, key=rank))
-
-
-def _scatter(base_from_flange: Floats, camera_from_board: Floats) -> tuple[float, float]:
-    """mm and degrees; infinite where the motions have no solution."""
-    try:
-        found = solve(base_from_flange, camera_from_board)
-    except InputError:
-        return np.inf, np.inf
-    return found.scatter_mm, found.scatter_deg
-
-
-def _rereadings(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypothesis]:
-    """All numbers mean something else."""
-    yield from _other_conventions(poses, camera_from_board)
-    yield from _other_board_unit(poses.base_from_flange, camera_from_board)
-
-
-def _faults(base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str]) -> Iterator[Hypothesis]:
-    """Some poses do not belong to the others."""
-    yield from _wrong_pairs(base_from_flange, camera_from_board, names)
-    yield from _moved_board(base_from_flange, camera_from_board, names)
-
-
-def _other_conventions(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypothesis]:
-    said = poses.convention
-    turns: list[tuple[str, dict[str, object]]] = [("", {})]
-    if said.rotation != "quaternion_wxyz":
-        turns = [
-            (words, {"rotation": kind, "order": order})
-            for kind, word in (("abc", "Rz Ry Rx"), ("xyz", "Rx Ry Rz"), ("rotation_vector", "a rotation vector"))
-            for order in ([(0, 1, 2)] if kind == "rotation_vector" else permutations(range(3)))
-            for words in [f"{word}{'' if order == (0, 1, 2) else f' with the numbers in the order {order}'}"]
-        ]
-    other_length = "m" if said.length_unit == "mm" else "mm"
-    other_angle = "rad" if said.angle_unit == "deg" else "deg"
-    other_sense = "flange_from_base" if said.gives == "base_from_flange" else "base_from_flange"
-    for length, angle, sense, (words, turn) in product(
-        (said.length_unit, other_length), (said.angle_unit, other_angle), (said.gives, other_sense), turns
-    ):
-        read = said.model_copy(update={"length_unit": length, "angle_unit": angle, "gives": sense, **turn})
-        if read != said and not (said.rotation == "quaternion_wxyz" and angle != said.angle_unit):
-            yield from _if_read_as(poses.numbers, said, read, words, camera_from_board)
-
-
-def _if_read_as(
-    numbers: Floats, said: Convention, read: Convention, words: str, camera_from_board: Floats
-) -> Iterator[Hypothesis]:
-    as_read = replace(ReportedPoses(numbers, said), convention=read).base_from_flange
-    way_mm = float(np.median(np.linalg.norm(as_read[:, :3, 3] - as_read[:, :3, 3].mean(axis=0), axis=1)))
-    if not _PLAUSIBLE_MM[0] < way_mm < _PLAUSIBLE_MM[1]:
-        return
-    causes, says = [], []
-    if read.length_unit != said.length_unit:
-        causes.append(UNITS)
-        says.append(f"positions are in {read.length_unit}, not {said.length_unit}")
-    if read.angle_unit != said.angle_unit:
-        causes.append(UNITS)
-        says.append(f"angles are in {_WORDS[read.angle_unit]}, not {_WORDS[said.angle_unit]}")
-    if (read.rotation, read.order) != (said.rotation, said.order):
-        causes.append(ANGLES)
-        says.append(f"rotations are {words}")
-    if read.gives != said.gives:
-        causes.append(INVERSE)
-        says.append(f"poses are {read.gives}, not {said.gives}")
-    yield Hypothesis(tuple(causes), " and ".join(says), *_scatter(as_read, camera_from_board))
-
-
-_WORDS = {"deg": "degrees", "rad": "radians"}
-
-
-def _other_board_unit(base_from_flange: Floats, camera_from_board: Floats) -> Iterator[Hypothesis]:
-    """The board's squares given in m, or in um."""
-    for factor, unit in ((1000.0, "m"), (1e-3, "um")):
-        scaled = camera_from_board.copy()
-        scaled[:, :3, 3] *= factor
-        distance_mm = float(np.median(np.linalg.norm(scaled[:, :3, 3], axis=1)))
-        if _PLAUSIBLE_MM[0] < distance_mm < _PLAUSIBLE_MM[1]:
-            sentence = f"the board's squares are given in {unit}, not mm"
-            yield Hypothesis((UNITS,), sentence, *_scatter(base_from_flange, scaled))
-
-
-def _wrong_pairs(
-    base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str]
-) -> Iterator[Hypothesis]:
-    """One image does not belong to its pose, or all are off by one."""
-    count = len(base_from_flange)
-    for left_out in range(count if count > _LEAST_SEGMENT + 1 else 0):
-        keep = [i for i in range(count) if i != left_out]
-        sentence = f"image and pose of {names[left_out]} do not belong together"
-        yield Hypothesis((WRONG_PAIR,), sentence, *_scatter(base_from_flange[keep], camera_from_board[keep]))
-    if count > _LEAST_SEGMENT + 1:
-        for words, flange, camera in (
-            ("after", base_from_flange[1:], camera_from_board[:-1]),
-            ("before", base_from_flange[:-1], camera_from_board[1:]),
-        ):
-            yield Hypothesis(
-                (SHIFTED,), f"each image belongs to the pose {words} its own", *_scatter(flange, camera)
-            )
-
-
-def _moved_board(
-    base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str]
-) -> Iterator[Hypothesis]:
-    """The board stood in two places: motions within each part are true, those between them are not."""
-    count = len(base_from_flange)
-    for change in range(_LEAST_SEGMENT, count - _LEAST_SEGMENT + 1):
-        parts = slice(None, change), slice(change, None)
-        try:
-            pairs = [motions(base_from_flange[part], camera_from_board[part]) for part in parts]
-        except InputError:
-            continue
-        both = Motions(*(np.concatenate([getattr(p, what) for p in pairs]) for what in ("flange", "camera")))
-        flange_from_camera = park(both)
-        before, after = (solution(base_from_flange[p], camera_from_board[p], flange_from_camera) for p in parts)
-        step = between(before.base_from_board, after.base_from_board)
-        scatter = np.concatenate([before.scatter, after.scatter])
-        pooled = replace(before, scatter=scatter)
-        sentence = (
-            f"the board was moved between {names[change - 1]} and {names[change]}, by "
-            f"{np.linalg.norm(step[:3]):.3g} mm and {np.degrees(np.linalg.norm(step[3:])):.3g} deg"
-        )
-        yield Hypothesis((MOVED_BOARD,), sentence, pooled.scatter_mm, pooled.scatter_deg)

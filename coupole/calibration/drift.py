@@ -1,13 +1,16 @@
 """Drift of the LEDs between their calibration and a run, seen on a tile that is in every run.
 
 A reading is the tile's signal over what the calibrated power makes of it: 1 if nothing changed. In logarithms it
-is common level + rate * hours + coefficient * (T - T0) + noise. The coefficient of board temperature has a prior
-(white power LEDs: about -0.3 % per kelvin), since within a run temperature and time go up together. So each
-frame gets a factor of its own, from its board's temperature and its time, with an uncertainty.
+is common level + rate * hours + coefficient * (T - T0) + noise, T0 being the board's temperature when the LED's
+power was calibrated. The coefficient has a prior (white power LEDs: about -0.3 % per kelvin), since within a run
+temperature and time go up together. So each frame gets a factor of its own, from its board's temperature and its
+time, with an uncertainty. What all readings share (the tile's tilt, now and when the powers were calibrated) is
+estimated along with it, within what is known of it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +20,15 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 NAMES = ("level", "rate_per_h", "per_k")
-_LEAST_READINGS = 3
+LEAST_READINGS = 3
 _SUDDEN_SIGMA = 5.0
 _SUDDEN = 0.003
 """Relative: a smaller step is no matter."""
 _UNKNOWN = 10.0
+_NEIGHBOURS = 11
+_ODD_SIGMA, _ODD = 6.0, 0.01
+"""A reading so far from its neighbours' median says something of its LED, not of the drift."""
+_NO_FIGURES: Floats = np.zeros((0, 0))
 
 
 @dataclass(frozen=True)
@@ -30,11 +37,14 @@ class Reading:
 
     name: str
     t_s: float
-    temperature_c: float
+    warmer_k: float
+    """Temperature of the LED's board over that at which its power was calibrated; NaN if either is not known."""
     ratio: float
     """Signal seen over signal expected from the LED's calibrated power."""
     u_ratio: float
-    """From noise; what all readings share is no matter of drift."""
+    """From noise, and from the LED's own calibration."""
+    by_shared: tuple[float, ...] = ()
+    """Relative change of the ratio by one unit of each figure that all readings share."""
 
 
 @dataclass(frozen=True)
@@ -46,101 +56,151 @@ class Drift:
     covariance: Floats
     """[3, 3]."""
     start_s: float
-    reference_c: float
+    """Of the first reading, on the frames' clock."""
     noise: float
     """Relative scatter of one reading, over its stated noise if that is greater."""
+    used: tuple[Reading, ...]
+    """In their order."""
     residuals: Floats
-    """[readings] relative."""
-    hours: tuple[float, float]
-    """From the first to the last reading; beyond them the factor is an extrapolation."""
+    """[used] relative."""
+    odd: tuple[Reading, ...]
+    """Left out: single readings far from their neighbours."""
+    freedom: float
 
-    def factor(self, temperature_c: ArrayLike, t_s: ArrayLike) -> Floats:
-        """Power now over calibrated power, of frames at board temperatures and times [...]."""
-        value: Floats = np.exp(self._design(temperature_c, t_s) @ self.parameters)
+    @property
+    def hours(self) -> float:
+        """From the first to the last reading; beyond them the factor is an extrapolation."""
+        return (self.used[-1].t_s - self.used[0].t_s) / 3600.0
+
+    def factor(self, warmer_k: ArrayLike, t_s: ArrayLike) -> Floats:
+        """Power now over calibrated power, of frames whose boards are so much warmer, at times [...]."""
+        value: Floats = np.exp(self._design(warmer_k, t_s) @ self.parameters)
         return value
 
-    def u_factor(self, temperature_c: ArrayLike, t_s: ArrayLike) -> Floats:
+    def u_factor(self, warmer_k: ArrayLike, t_s: ArrayLike) -> Floats:
         """Its relative standard uncertainty [...]."""
-        design = self._design(temperature_c, t_s)
+        design = self._design(warmer_k, t_s)
         u: Floats = np.sqrt(np.einsum("...i,ij,...j->...", design, self.covariance, design))
         return u
 
-    def _design(self, temperature_c: ArrayLike, t_s: ArrayLike) -> Floats:
+    def _design(self, warmer_k: ArrayLike, t_s: ArrayLike) -> Floats:
         hours = (np.asarray(t_s, float) - self.start_s) / 3600.0
-        warm = np.asarray(temperature_c, float) - self.reference_c
-        hours, warm = np.broadcast_arrays(hours, warm)
+        hours, warm = np.broadcast_arrays(hours, np.nan_to_num(np.asarray(warmer_k, float)))
         return np.stack([np.ones_like(hours), hours, warm], axis=-1)
 
 
 def fit_drift(
-    readings: tuple[Reading, ...] | list[Reading],
+    readings: Sequence[Reading],
     *,
-    reference_c: float,
+    shared_covariance: Floats = _NO_FIGURES,
     per_k: float = -0.003,
     u_per_k: float = 0.002,
     rate_per_h: float = 0.0,
     u_rate_per_h: float = 0.005,
 ) -> Drift:
-    """The factor from a run's readings; `reference_c` is the board temperature of the powers' calibration.
+    """The factor from a run's readings; `shared_covariance` [c, c] is what is known of the shared figures, whose
+    mean is 0.
 
     Raises InputError: too few readings, a dark tile, a sudden change, named by the frames it lies between.
     """
     ordered = sorted(readings, key=lambda reading: reading.t_s)
-    if len(ordered) < _LEAST_READINGS:
-        raise InputError(
-            f"drift: expected {_LEAST_READINGS} readings of the reference tile or more, found {len(ordered)}; put "
-            "the tile into the field of a view, or add a view of it"
-        )
-    ratio = np.array([reading.ratio for reading in ordered])
+    _refuse_few(ordered)
     if dark := [reading.name for reading in ordered if reading.ratio < 0.1]:
         raise InputError(
             f"drift: the reference tile is dark in {', '.join(dark[:5])}; is the LED dead, or the tile hidden?"
         )
-    t_s = np.array([reading.t_s for reading in ordered])
-    warm = np.array([reading.temperature_c for reading in ordered])
-    start_s = float(t_s[0])
-    hours = (t_s - start_s) / 3600.0
-    design = np.column_stack([np.ones_like(hours), hours, np.nan_to_num(warm - reference_c)])
-    noise = np.array([reading.u_ratio / reading.ratio for reading in ordered])
-    prior = np.array([0.0, rate_per_h, per_k])
-    precision = np.diag(np.array([_UNKNOWN, u_rate_per_h, u_per_k]) ** -2.0)
+    prior = np.concatenate([[0.0, rate_per_h, per_k], np.zeros(len(shared_covariance))])
+    precision = np.zeros((len(prior), len(prior)))
+    precision[:3, :3] = np.diag(np.array([_UNKNOWN, u_rate_per_h, u_per_k]) ** -2.0)
+    precision[3:, 3:] = np.linalg.inv(shared_covariance)
+    first = _solve(ordered, prior, precision)
+    odd = _odd(first.left, first.noise)
+    used = [reading for reading, out in zip(ordered, odd, strict=True) if not out]
+    _refuse_few(used)
+    found = _solve(used, prior, precision) if odd.any() else first
+    _refuse_sudden([reading.name for reading in used], found.left, found.noise)
+    return Drift(
+        found.parameters[:3],
+        found.covariance[:3, :3],
+        used[0].t_s,
+        float(np.median(found.noise) * found.scale),
+        tuple(used),
+        found.left,
+        tuple(reading for reading, out in zip(ordered, odd, strict=True) if out),
+        found.freedom,
+    )
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Solved:
+    parameters: Floats
+    covariance: Floats
+    left: Floats
+    """[readings] residuals, relative."""
+    noise: Floats
+    """[readings] as stated, relative."""
+    scale: float
+    """Of the noise as found over that as stated, 1 or more."""
+    freedom: float
+
+
+def _solve(readings: Sequence[Reading], prior: Floats, precision: Floats) -> _Solved:
+    """Least squares with a prior; the noise is scaled by what residuals say of it."""
+    ratio = np.array([reading.ratio for reading in readings])
+    hours = np.array([(reading.t_s - readings[0].t_s) / 3600.0 for reading in readings])
+    warm = np.nan_to_num(np.array([reading.warmer_k for reading in readings]))
+    shared = np.array([reading.by_shared for reading in readings]).reshape(len(readings), len(prior) - 3)
+    design = np.column_stack([np.ones_like(hours), hours, warm, shared])
+    noise = np.array([reading.u_ratio for reading in readings]) / ratio
+    freedom = max(1, len(readings) - 3)
     scale = 1.0
-    found, covariance = prior, np.eye(3)
     for _ in range(3):
         weight = (noise * scale) ** -2.0
         covariance = np.asarray(np.linalg.inv(precision + design.T @ (design * weight[:, None])), np.float64)
         found = covariance @ (precision @ prior + design.T @ (weight * np.log(ratio)))
         left = np.log(ratio) - design @ found
-        degrees = max(1, len(ordered) - 3)
-        scale = max(1.0, float(np.sqrt(np.sum((left / noise) ** 2) / degrees)))
-    _refuse_sudden([reading.name for reading in ordered], left, noise)
-    return Drift(
-        found,
-        covariance,
-        start_s,
-        reference_c,
-        float(np.median(noise) * scale),
-        left,
-        (float(hours[0]), float(hours[-1])),
-    )
+        scale = max(1.0, float(np.sqrt(np.sum((left / noise) ** 2) / freedom)))
+    return _Solved(found, covariance, left, noise, scale, float(freedom))
 
 
-def _refuse_sudden(names: list[str], left: Floats, noise: NDArray[np.float64]) -> None:
-    """Raise InputError if the readings' level steps: the greatest step of means before and after, over its noise.
-
-    Noise is that of neighbouring readings' differences (one step among many changes their median little).
-    """
-    count = len(left)
-    differences = np.abs(np.diff(left))
-    single = max(float(np.median(differences)) * 1.4826 / np.sqrt(2.0), float(np.median(noise)))
-    best, place, size = 0.0, 0, 0.0
-    for k in range(1, count):
-        step = float(left[k:].mean() - left[:k].mean())
-        over = abs(step) / (single * np.sqrt(1.0 / k + 1.0 / (count - k)))
-        if over > best:
-            best, place, size = over, k, step
-    if best > _SUDDEN_SIGMA and abs(size) > _SUDDEN:
+def _refuse_few(readings: Sequence[Reading]) -> None:
+    if len(readings) < LEAST_READINGS:
         raise InputError(
-            f"drift: the light changed suddenly by {size:+.2%} between {names[place - 1]} and {names[place]}; "
+            f"drift: expected {LEAST_READINGS} readings of the reference tile or more, found {len(readings)}; put "
+            "the tile into the field of a view, or add a view of it"
+        )
+
+
+def _excess(left: Floats, noise: Floats) -> float:
+    """Noise as found over that as stated, by neighbours' differences: one step among many changes their median
+    little."""
+    differences = np.abs(np.diff(left)) / np.hypot(noise[1:], noise[:-1])
+    return max(1.0, float(np.median(differences) * 1.4826))
+
+
+def _odd(left: Floats, noise: Floats) -> NDArray[np.bool_]:
+    """Which readings [n] stand alone, far from their neighbours' median; a step that lasts is none."""
+    from scipy.ndimage import median_filter
+
+    if len(left) < _NEIGHBOURS:
+        return np.zeros(len(left), np.bool_)
+    off = np.abs(left - median_filter(left, _NEIGHBOURS, mode="nearest"))
+    return np.asarray(off > np.maximum(_ODD, _ODD_SIGMA * _excess(left, noise) * noise))
+
+
+def _refuse_sudden(names: Sequence[str], left: Floats, noise: Floats) -> None:
+    """Raise InputError if the readings' level steps: the greatest step of means before and after, by its noise."""
+    weight = (_excess(left, noise) * noise) ** -2.0
+    before, sums = np.cumsum(weight)[:-1], np.cumsum(weight * left)[:-1]
+    after, rest = weight.sum() - before, (weight * left).sum() - sums
+    steps = rest / after - sums / before
+    over = np.abs(steps) / np.sqrt(1.0 / before + 1.0 / after)
+    at = int(np.argmax(over))
+    if over[at] > _SUDDEN_SIGMA and abs(steps[at]) > _SUDDEN:
+        raise InputError(
+            f"drift: the light changed suddenly by {steps[at]:+.2%} between {names[at]} and {names[at + 1]}; "
             "look at the tile, the supply and the LED, and take the frames after it again"
         )

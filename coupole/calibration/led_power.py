@@ -32,8 +32,8 @@ _DEAD_SHARE = 0.01
 _SHADED = 0.03
 """Relative departure of a part of the tile that noise does not explain."""
 _SHADED_SIGMA = 6.0
-_LOWEST_COSINE = 0.1
-"""Of incidence on the tile: LEDs nearer to its horizon (6 degrees) tell more of its tilt than of themselves."""
+_LOWEST_COSINE = 0.05
+"""Of incidence on the tile: LEDs nearer to its horizon (3 degrees) tell nothing but its tilt."""
 _UNLIKELY = 1e-6
 _STEP = 1e-4
 
@@ -142,11 +142,19 @@ def calibrate_led_power(
         [tile.u_tilt_deg] * (2 * len(places)) + [tile.u_reflectance / tile.reflectance, tile.u_minnaert]
     )
     remarks: list[str] = []
-    rows: list[_Row] = []
+    rows: list[Row] = []
     lit_elsewhere: set[int] = set()
     for v, view in enumerate(views):
-        found, not_used = _rows_of(
-            v, view, positions, tile, emission, side_mm, places.index(view.place), len(names), remarks
+        found, not_used = rows_of(
+            v,
+            view,
+            positions,
+            tile,
+            emission,
+            side_mm=side_mm,
+            place=places.index(view.place),
+            figures=len(names),
+            remarks=remarks,
         )
         rows += found
         lit_elsewhere |= not_used
@@ -173,7 +181,7 @@ def calibrate_led_power(
         residuals.append(mine)
     missing = ids[~used & ~dead]
     if len(missing):
-        remarks.append(f"{len(missing)} LEDs have no usable picture: {_list(missing)}")
+        remarks.append(f"{len(missing)} LEDs have no usable picture: {list_of(missing)}")
     return LedPower(
         ids,
         power,
@@ -193,15 +201,17 @@ def calibrate_led_power(
 
 
 @dataclass(frozen=True)
-class _Row:
+class Row:
     """One LED in one view."""
 
     view: int
     led: int
     value: float
-    """S / h, before the logarithm."""
+    """S / h, before the logarithm: the power, if the tile lies as described."""
     u: float
+    """Of the value, from noise."""
     design: Floats
+    """Relative change of h by the figures that LEDs share: tilts of all places, ln reflectance, Minnaert's k."""
 
 
 def transfer(
@@ -230,18 +240,23 @@ def transfer(
     return h, cos_in
 
 
-def _rows_of(
+def rows_of(
     number: int,
     view: TileView,
     positions: Positions,
     tile: Tile,
     emission: Emission,
-    side_mm: float,
-    place: int,
-    figures: int,
+    *,
+    side_mm: float = LED_SIDE_MM,
+    place: int = 0,
+    figures: int = 4,
     remarks: list[str],
-) -> tuple[list[_Row], set[int]]:
-    """Observations of one view, and LEDs that are lit there though their picture cannot be used."""
+) -> tuple[list[Row], set[int]]:
+    """Observations of view `number`, and LEDs that are lit there though their picture cannot be used.
+
+    `figures` are shared by all LEDs: two tilts for each place of the tile, of which the view's is number `place`,
+    ln reflectance, Minnaert's k. What cannot be used is added to `remarks`.
+    """
     centres, normals = positions.of(view.leds)
 
     def log_h(tilt_deg: Floats, minnaert: float) -> Floats:
@@ -263,26 +278,27 @@ def _rows_of(
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio, u_ratio = view.signal / h, view.u_signal / h
     usable = (cos_in.min(axis=1) > _LOWEST_COSINE) & (h > 0).all(axis=1) & np.isfinite(view.signal).all(axis=1)
-    rows: list[_Row] = []
+    rows: list[Row] = []
     shaded: list[int] = []
     for n in np.flatnonzero(usable & ~view.saturated):
         middle = float(np.median(ratio[n]))
-        limit = _SHADED * abs(middle) + _SHADED_SIGMA * u_ratio[n]
+        # A shadow's edge across a part makes that part's own noise great: what the parts have in common counts.
+        limit = _SHADED * abs(middle) + _SHADED_SIGMA * float(np.median(u_ratio[n]))
         if (np.abs(ratio[n] - middle) > limit).any():
             shaded.append(int(view.leds[n]))
             continue
         total = float(h[n].sum())
         u = float(np.sqrt(np.sum(view.u_signal[n] ** 2)) / total)
-        rows.append(_Row(number, int(view.leds[n]), float(view.signal[n].sum() / total), u, slopes[n]))
+        rows.append(Row(number, int(view.leds[n]), float(view.signal[n].sum() / total), u, slopes[n]))
     if shaded:
-        remarks.append(f"view {view.name}: the tile is partly in shadow under {_list(shaded)}; not used")
+        remarks.append(f"view {view.name}: the tile is partly in shadow under {list_of(shaded)}; not used")
     if (full := view.leds[view.saturated & usable]).size:
-        remarks.append(f"view {view.name}: the tile is saturated under {_list(full)}; not used, expose less")
+        remarks.append(f"view {view.name}: the tile is saturated under {list_of(full)}; not used, expose less")
     return rows, {*shaded, *map(int, full)}
 
 
 def _arrays(
-    rows: Sequence[_Row], ids: NDArray[np.int64], flash_noise: float
+    rows: Sequence[Row], ids: NDArray[np.int64], flash_noise: float
 ) -> tuple[Floats, Floats, NDArray[np.intp], NDArray[np.intp], Floats]:
     """Logarithms, weights, number of the LED, number of the view, derivatives."""
     value = np.array([row.value for row in rows])
@@ -296,27 +312,27 @@ def _arrays(
 
 
 def _without_dark(
-    rows: Sequence[_Row],
+    rows: Sequence[Row],
     views: Sequence[TileView],
     ids: NDArray[np.int64],
     lit_elsewhere: set[int],
     remarks: list[str],
-) -> tuple[list[_Row], NDArray[np.bool_]]:
+) -> tuple[list[Row], NDArray[np.bool_]]:
     """Rows in which the tile is lit, and which LEDs [n] are dead: dark in every view, so far as can be seen."""
     bright = float(np.median([row.value for row in rows]))
 
-    def lit(row: _Row) -> bool:
+    def lit(row: Row) -> bool:
         return row.value > max(_DEAD_SIGMA * row.u, _DEAD_SHARE * bright)
 
     alive = {row.led for row in rows if lit(row)} | lit_elsewhere
     seen = {row.led for row in rows}
     dead = np.array([int(led) in seen - alive for led in ids])
     if dead.any():
-        remarks.append(f"dead LEDs, or hidden in every view: {_list(ids[dead])}")
+        remarks.append(f"dead LEDs, or hidden in every view: {list_of(ids[dead])}")
     for v, view in enumerate(views):
         shadowed = [row.led for row in rows if row.view == v and row.led in alive and not lit(row)]
         if shadowed:
-            remarks.append(f"view {view.name}: the tile is wholly in shadow under {_list(shadowed)}; not used")
+            remarks.append(f"view {view.name}: the tile is wholly in shadow under {list_of(shadowed)}; not used")
     return [row for row in rows if lit(row)], dead
 
 
@@ -385,6 +401,7 @@ def _refuse_moved(
             )
 
 
-def _list(ids: Sequence[int] | NDArray[np.int64]) -> str:
+def list_of(ids: Sequence[int] | NDArray[np.int64]) -> str:
+    """The first of them by number, for people."""
     named = ", ".join(f"{int(led)}" for led in list(ids)[:8])
     return f"LED {named}" + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")

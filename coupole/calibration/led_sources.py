@@ -36,6 +36,8 @@ class LedImages:
     about: About
     inputs: tuple[tuple[str, str], ...]
     """Name and SHA-256 of every file that was read."""
+    joints_deg: Floats | None = None
+    """[v, axes] as the robot reported them; None if it did not."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,7 @@ def find_leds(
         )
     collected = _Collected([], [], [])
     poses: list[Floats] = []
+    joints: list[Floats] = []
     views: list[str] = []
     inputs = [(f"{run.folder.name}/run.json", sha256(run.folder / "run.json")) for run in runs]
     about: About | None = None
@@ -99,6 +102,7 @@ def find_leds(
             number_of[pose] = len(views)
             views.append(view if len(runs) == 1 else f"{run.folder.name}/{view}")
             poses.append(np.array(reported[pose]["base_from_flange"], dtype=np.float64))
+            joints.append(np.array(reported[pose]["joints_deg"], dtype=np.float64))
         temperatures += (records["board_temperature_dc"][[f.frame.index for f in lit]] / 10.0).tolist()
         facts, darks = store.read_facts(path), _darks(path, layout, proven, records)
         for frame in lit:
@@ -123,6 +127,7 @@ def find_leds(
         tuple(collected.left_out),
         replace(about, temperature_c=(min(temperatures), max(temperatures))),
         tuple(inputs),
+        np.stack(joints),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, timedelta
 
 import h5py
@@ -13,44 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 import coupole
+from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
 from coupole.calibration.led_adjustment import LedGeometry, adjust_leds
 from coupole.calibration.led_boards import Boards, boards_of, placed
 from coupole.calibration.led_equations import GROUPS, ORIENTATION, POSITION, SPOTS, TOLERANCE, Stated
 from coupole.calibration.led_matching import Fault, Matching, fault_lines, match_leds
 from coupole.calibration.led_sources import LedImages
+from coupole.calibration.limits import LEDS, judged
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.record import ImageResidual, Input, Limit, Noise, Parameter, Record, Validity, sealed
 from coupole.calibration.rotations import Floats, rotation_vector
 from coupole.calibration.workflow import Wish
 from coupole.dome import COLUMNS, LedTable
 from coupole.errors import InputError
-from coupole.plan import Model
 
 MOVED_MM, MOVED_DEG = 5.0, 1.0
 """A board farther from its table than this is named: it was mounted anew, or pushed."""
-_LENS_STEP = 4.0
-"""Beyond so many standard uncertainties lens or hand-eye are not what their record says."""
 _COVARIANCE_OF_SINGLE = 1e-12
-
-
-class LedAcceptance(Model):
-    """What the geometry of a dome must reach to be accepted."""
-
-    missing: float = 0.02
-    """Share of the LEDs that were not found."""
-    centre_mm: float = 0.7
-    """Median standard uncertainty of a centre, all directions together (seed 003: 700 um)."""
-    normal_deg: float = 0.21
-    """Median standard uncertainty of a normal (seed 003)."""
-    robot_noise_ratio: float = 3.0
-    """Robot's noise as found over as stated."""
-    rejected: float = 0.05
-    """Share of the spots that were left out as gross errors."""
-    record_step: float = _LENS_STEP
-    """How far lens and hand-eye may be from their record, in its standard uncertainties."""
-
-
-ACCEPTANCE = LedAcceptance()
 
 
 @dataclass(frozen=True)
@@ -79,9 +58,15 @@ def leds_from(
     wish: Wish,
     *,
     stated: Stated,
-    acceptance: LedAcceptance = ACCEPTANCE,
+    arm: CalibratedArm | None = None,
 ) -> LedsFound:
-    """Find all LEDs of a dome. Raises InputError if none is found, or the spots contradict the camera's record."""
+    """Find all LEDs of a dome. Raises InputError if none is found, or the spots contradict the camera's record.
+
+    `arm` corrects the reported poses by the axis zeros that the hand-eye record found.
+    """
+    if arm is not None and images.joints_deg is not None:
+        poses, _ = calibrated_poses(images.base_from_flange, images.joints_deg, arm, prior)
+        images = replace(images, base_from_flange=poses)
     boards = boards_of(table)
     base_from_camera = images.base_from_flange @ prior.flange_from_camera
     matching = match_leds(
@@ -117,6 +102,7 @@ def leds_from(
         f"{wish.name}.h5": _h5(geometry, matching, boards, where, place, len(table.ids)),
     }
     views = len(images.base_from_flange)
+    limits = judged(LEDS, wish.limits, _figures(geometry, found, u_mm[where], u_deg[where]))
     record = sealed(
         kind="leds",
         name=wish.name,
@@ -139,8 +125,13 @@ def leds_from(
         files=tuple(Input(name=name, sha256=hashlib.sha256(data).hexdigest()) for name, data in files.items()),
         noise=_noise(geometry, stated),
         images=_views(images.views, sightings.view, geometry),
-        limits=_limits(geometry, stated, acceptance, found, u_mm[where], u_deg[where]),
-        remarks=(*fault_lines(faults), *_of_records(geometry, prior, acceptance), *_of_spots(images.left_out)),
+        limits=limits,
+        remarks=(
+            *fault_lines(faults),
+            *_of_records(geometry, prior, limits),
+            *_of_spots(images.left_out),
+            *_of_the_arm(arm),
+        ),
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in images.inputs),
     )
     return LedsFound(
@@ -293,39 +284,33 @@ def _views(names: Sequence[str], view: NDArray[np.intp], geometry: LedGeometry) 
     return tuple(lines)
 
 
-def _limits(
-    geometry: LedGeometry,
-    stated: Stated,
-    asked: LedAcceptance,
-    found: NDArray[np.bool_],
-    u_mm: Floats,
-    u_deg: Floats,
-) -> tuple[Limit, ...]:
-    robot = float(max(geometry.noise[POSITION], geometry.noise[ORIENTATION]))
-    return (
-        Limit(what="LEDs not found", found=float(1 - found.mean()), limit=asked.missing, unit=""),
-        Limit(what="median centre", found=float(np.median(u_mm[found])), limit=asked.centre_mm, unit="mm"),
-        Limit(what="median normal", found=float(np.median(u_deg[found])), limit=asked.normal_deg, unit="deg"),
-        Limit(what="robot's noise, found over stated", found=robot, limit=asked.robot_noise_ratio, unit=""),
-        Limit(what="spots left out", found=float(1 - geometry.kept.mean()), limit=asked.rejected, unit=""),
-        Limit(
-            what="camera and hand-eye from their record, in its u",
-            found=float(np.abs(geometry.prior_step).max()),
-            limit=asked.record_step,
-            unit="",
-        ),
-    )
+def _figures(geometry: LedGeometry, found: NDArray[np.bool_], u_mm: Floats, u_deg: Floats) -> dict[str, float]:
+    """What `limits.LEDS` are held against."""
+    return {
+        "missing": float(1 - found.mean()),
+        "centre_mm": float(np.median(u_mm[found])),
+        "normal_deg": float(np.median(u_deg[found])),
+        "robot_ratio": float(max(geometry.noise[POSITION], geometry.noise[ORIENTATION])),
+        "rejected": float(1 - geometry.kept.mean()),
+        "record_step": float(np.abs(geometry.prior_step).max()),
+    }
 
 
-def _of_records(geometry: LedGeometry, prior: CameraPrior, asked: LedAcceptance) -> list[str]:
+def _of_records(geometry: LedGeometry, prior: CameraPrior, limits: Sequence[Limit]) -> list[str]:
+    if next(limit.passed for limit in limits if limit.name == "record_step"):
+        return []
     names = [*prior.free, *(f"flange_from_camera.{s}" for s in ("x", "y", "z", "rx", "ry", "rz"))]
     worst = int(np.argmax(np.abs(geometry.prior_step)))
-    if abs(geometry.prior_step[worst]) <= asked.record_step:
-        return []
     return [
         f"{names[worst]} would have to be {abs(geometry.prior_step[worst]):.0f} standard uncertainties from its "
         "record: a record of another focus, or a camera that was pushed since. Calibrate camera and hand-eye anew"
     ]
+
+
+def _of_the_arm(arm: CalibratedArm | None) -> list[str]:
+    if arm is None:
+        return []
+    return ["poses are corrected by the axis zeros of the hand-eye record; use them with these LEDs"]
 
 
 def _of_spots(left_out: Sequence[str]) -> list[str]:

@@ -6,7 +6,7 @@ A frame is read when it is asked for, so a calibration that looks at one after t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,8 +35,10 @@ class LightFrame:
     """Of its trigger, on the box's clock."""
     temperature_c: float
     """Of the LED's board; NaN where the box said nothing."""
-    base_from_camera: Floats
+    base_from_flange: Floats
     """[4, 4] measured, mm."""
+    base_from_camera: Floats
+    """[4, 4] mm, by the rig's hand-eye, or by a record's (`seen_through`)."""
     read: Callable[[], NDArray[np.uint16]]
     """[H, W] DN."""
 
@@ -67,6 +69,13 @@ class LightFrames:
     @property
     def dark(self) -> tuple[LightFrame, ...]:
         return tuple(frame for frame in self.frames if not frame.light)
+
+    def seen_through(self, flange_from_camera: Floats) -> LightFrames:
+        """The same frames, of a camera that sits on the flange as this [4, 4] says."""
+        frames = (
+            replace(frame, base_from_camera=frame.base_from_flange @ flange_from_camera) for frame in self.frames
+        )
+        return replace(self, frames=tuple(frames))
 
 
 def open_light_frames(paths: Sequence[Path]) -> LightFrames:
@@ -138,6 +147,7 @@ def _of_view(
                 float(record["exposure_us"]),
                 float(record["t_trigger_ns"]) * 1e-9,
                 decicelsius / 10.0 if decicelsius else float("nan"),
+                np.array(poses[int(record["pose"])]["base_from_flange"], dtype=np.float64),
                 np.array(poses[int(record["pose"])]["base_from_camera"], dtype=np.float64),
                 partial(store.read_frame, path, layout, frame.index),
             )

@@ -176,16 +176,20 @@ def draw_led_power(powers: Mapping[str, LedPower], positions: Positions, record:
 
 
 def _dome_map(positions: Positions, ids: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places of LEDs on a flat map, degrees: where they look from, the angle to the dome's middle axis kept."""
-    _, normals = positions.of(ids)
-    axis = normals.mean(axis=0)
+    """Places of LEDs on a flat map, degrees: seen from where their axes cross, angles to the dome's axis kept."""
+    centres_mm, normals = positions.of(ids)
+    across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
+    middle_mm = np.linalg.lstsq(across.sum(axis=0), (across @ centres_mm[:, :, None]).sum(axis=0)[:, 0])[0]
+    inwards = middle_mm - centres_mm
+    inwards /= np.linalg.norm(inwards, axis=1)[:, None]
+    axis = inwards.mean(axis=0)
     axis /= np.linalg.norm(axis)
     helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
     u = np.cross(helper, axis)
     u /= np.linalg.norm(u)
     v = np.cross(axis, u)
-    polar_deg = np.degrees(np.arccos(np.clip(normals @ axis, -1.0, 1.0)))
-    turn = np.arctan2(-(normals @ v), -(normals @ u))
+    polar_deg = np.degrees(np.arccos(np.clip(inwards @ axis, -1.0, 1.0)))
+    turn = np.arctan2(-(inwards @ v), -(inwards @ u))
     return polar_deg * np.cos(turn), polar_deg * np.sin(turn)
 
 

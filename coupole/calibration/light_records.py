@@ -10,6 +10,7 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, timedelta
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,8 @@ from coupole.calibration.light_frames import (
     channels_of,
     temperatures_of,
 )
+from coupole.calibration.light_limits import DARK, RESPONSE
+from coupole.calibration.limits import judged
 from coupole.calibration.record import Input, Limit, Noise, Parameter, Record, Validity, read_record, sealed
 from coupole.calibration.report import Outcome
 from coupole.calibration.response import Linearity, Pair, PhotonTransfer, linearity, photon_transfer
@@ -37,9 +40,6 @@ from coupole.errors import InputError
 Progress = Callable[[int, int], None]
 _MOST_PIXELS = 200_000
 """Of a channel that response looks at."""
-_MOST_HOT = 1e-3
-_MOST_NONLINEAR = 0.003
-_MOST_FLICKER = 0.005
 
 
 def sealed_outcome(
@@ -137,7 +137,7 @@ def dark_outcome(frames: LightFrames, wish: Wish, progress: Progress) -> Outcome
         parameters,
         np.diag([p.u**2 for p in parameters]),
         partial(pictures.draw_dark, dark),
-        limits=(limit_of("share of hot pixels", len(dark.hot) / pixels, _MOST_HOT),),
+        limits=judged(DARK, wish.limits, {"hot": len(dark.hot) / pixels}),
         files={f"{wish.name}.h5": content},
         fixed=fixed,
         remarks=(f"{len(dark.hot)} hot pixels of {pixels}; the list is in {wish.name}.h5",),
@@ -246,10 +246,7 @@ def response_outcome(frames: LightFrames, wish: Wish, dark_record: Path | None, 
         parameters,
         covariance,
         partial(pictures.draw_response, transfers, lines),
-        limits=(
-            limit_of("uncertainty of linearity", worst, _MOST_NONLINEAR),
-            limit_of("flicker of the light", flicker, _MOST_FLICKER),
-        ),
+        limits=judged(RESPONSE, wish.limits, {"linearity": worst, "flicker": flicker}),
         noise=noise,
         fixed=fixed,
         remarks=remarks,
@@ -335,6 +332,12 @@ def mean_of(frames: Sequence[LightFrame]) -> NDArray[np.float32]:
     return total / np.float32(len(frames))
 
 
+def counter(progress: Progress, total: int) -> Callable[[], None]:
+    """What moves a progress bar by one of `total`."""
+    done = count(1)
+    return lambda: progress(next(done), total)
+
+
 def h5_of(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """An HDF5 file of these arrays; large ones compressed."""
     buffer = io.BytesIO()
@@ -358,5 +361,5 @@ def limit_of(what: str, found: float, limit: float, unit: str = "") -> Limit:
 
 
 def record_input(path: Path | None) -> tuple[tuple[str, str], ...]:
-    """A record that a calibration was made with, as an input: none or one."""
+    """A file that a calibration was made with, as an input: none or one."""
     return () if path is None else ((path.name, hashlib.sha256(path.read_bytes()).hexdigest()),)

@@ -6,9 +6,9 @@ triangles they form, and then everything is adjusted at once:
 
     pixel = project((base_from_flange_i . E_i . flange_from_camera)^-1 . base_from_mesh . (q_j + d_j))
 
-with q_j the table's target, d_j what it is off, E_i what the arm is off in view i; the hand-eye is observed by its
-record, whose error all views share. (Seed 003, section 4, "mesh to
-robot", which has no uncertainty of target or arm in it.)
+with q_j the table's target, d_j what it is off, E_i what the arm is off in view i; lens, hand-eye and, where they
+are known, the zeros of the arm's axes are observed by a record whose error all views share. (Seed 003, section 4,
+"mesh to robot", which has no uncertainty of target or arm in it.)
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ STICKERS, SCANNER, POSITION, ORIENTATION, HAND_EYE = (
     "scanner",
     "robot position",
     "robot orientation",
-    "hand-eye",
+    "camera and hand-eye",
 )
 
 
@@ -48,11 +48,16 @@ class Stated:
 
 @dataclass(frozen=True)
 class HandEye:
-    """The hand-eye that the views' poses were made with."""
+    """The hand-eye that the views' poses were made with, and the lens that was calibrated together with it."""
 
     flange_from_camera: Floats
     covariance: Floats
-    """[6, 6] of a step of `rotations.moved`, mm and rad."""
+    """[f + 6 + k, f + 6 + k] of f figures of the lens, of a step of `rotations.moved` (mm and rad), and of k axes'
+    zeros (deg)."""
+    lens: tuple[str, ...] = ()
+    """Names of these figures (`optics.NAMES`)."""
+    axis_sensitivity: Floats | None = None
+    """[views, 6, k] step of the flange in its own frame (mm, rad) by degrees of these axes; None: k is 0."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +97,8 @@ class _State:
     """[views, 4, 4]."""
     targets_mm: Floats
     """[matched, 3] in the mesh's frame."""
-    hand_eye_step: Floats
-    """[6] from its record, mm and rad."""
+    shared_step: Floats
+    """[f + 6 + k] of lens, hand-eye and axes from their record."""
 
 
 def mesh_to_robot(
@@ -152,7 +157,7 @@ def _adjust(
     stated: Stated,
     hand_eye: HandEye | None,
 ) -> Adjusted[_State]:
-    """Unknowns: the mesh's step [6], one [6] for each view, an offset [3] for each target, the hand-eye's [6]."""
+    """Unknowns: the mesh's step [6], one [6] for each view, an offset [3] for each target, what views share."""
     reported = np.array([view.base_from_camera for view in views])
     first_target = 6 + 6 * len(views)
     pose_sigma = np.array([stated.robot_mm] * 3 + [np.radians(stated.robot_deg)] * 3)
@@ -164,11 +169,14 @@ def _adjust(
         Group(HAND_EYE, estimated=False),
     )
     first_shared = first_target + 3 * len(seen)
+    lens = np.array([], np.intp)
     if hand_eye is None:
-        held, by_hand_eye = np.eye(6), np.zeros((len(views), 6, 6))
+        held, by_shared = np.eye(6), np.zeros((len(views), 6, 6))
     else:
+        lens = np.array([optics.NAMES.index(name) for name in hand_eye.lens], np.intp)
         held = np.asarray(np.linalg.inv(np.linalg.cholesky(hand_eye.covariance)))
-        by_hand_eye = _by_hand_eye(reported, hand_eye.flange_from_camera)
+        by_shared = _by_shared(reported, hand_eye)
+    shared = np.arange(len(held))
 
     row_of = np.concatenate([np.full(len(point.views), row) for row, point in enumerate(seen)])
     view_of = np.concatenate([point.views for point in seen])
@@ -181,6 +189,7 @@ def _adjust(
             np.tile(own, (len(row_of), 1)),
             first_target + 3 * row_of[:, None] + own[:3],
             6 + 6 * view_of[:, None] + own,
+            np.tile(first_shared + np.arange(len(lens)), (len(row_of), 1)),
         ],
         axis=1,
     )
@@ -190,29 +199,28 @@ def _adjust(
         camera_from_base = inverses(state.base_from_camera)[view_of]
         in_base = places @ turn.T + state.base_from_mesh[:3, 3]
         in_camera = np.einsum("nij,nj->ni", camera_from_base[:, :3, :3], in_base) + camera_from_base[:, :3, 3]
-        projected = optics.project(in_camera, intrinsics.vector())
+        vector = intrinsics.vector()
+        vector[lens] += state.shared_step[: len(lens)]
+        projected = optics.project(in_camera, vector)
         by_base = projected.by_point @ camera_from_base[:, :3, :3]
         by_turn = by_base @ (-turn @ skew(places))
         by_view = projected.by_point @ skew(in_camera)
-        jacobian = (
-            np.concatenate([by_base, by_turn, by_base @ turn, -by_base, by_view], axis=2) / stated.sticker_px
-        )
+        by_all = [by_base, by_turn, by_base @ turn, -by_base, by_view, projected.by_intrinsics[:, :, lens]]
+        jacobian = np.concatenate(by_all, axis=2) / stated.sticker_px
         residuals = (observed - projected.pixels) / stated.sticker_px
         blocks = [Block(residuals[k], jacobian[k], columns[k], 0) for k in range(len(row_of))]
         for row in range(len(seen)):
             off = (targets_mm[row] - state.targets_mm[row]) / stated.scanner_mm
             columns_of = np.arange(first_target + 3 * row, first_target + 3 * row + 3)
             blocks.append(Block(off, np.eye(3) / stated.scanner_mm, columns_of, 1))
-        off_by = between(state.base_from_camera, reported) + by_hand_eye @ state.hand_eye_step
+        off_by = between(state.base_from_camera, reported) + by_shared @ state.shared_step
         for view in range(len(views)):
             for group, part in ((2, slice(0, 3)), (3, slice(3, 6))):
-                columns_of = np.concatenate([6 + 6 * view + own[part], first_shared + own])
-                by_both = np.concatenate([np.eye(6), -by_hand_eye[view]], axis=1)[part][
-                    :, [*own[part], *(6 + own)]
-                ]
+                columns_of = np.concatenate([6 + 6 * view + own[part], first_shared + shared])
+                by_both = np.concatenate([np.eye(3), -by_shared[view, part]], axis=1)
                 weighted = by_both / pose_sigma[part][:, None]
                 blocks.append(Block(off_by[view, part] / pose_sigma[part], weighted, columns_of, group))
-        blocks.append(Block(-held @ state.hand_eye_step, held, first_shared + own, 4))
+        blocks.append(Block(-held @ state.shared_step, held, first_shared + shared, 4))
         return blocks
 
     def move(state: _State, step: Floats) -> _State:
@@ -220,15 +228,24 @@ def _adjust(
             moved(state.base_from_mesh, step[:6]),
             moved(state.base_from_camera, step[6:first_target].reshape(-1, 6)),
             state.targets_mm + step[first_target:first_shared].reshape(-1, 3),
-            state.hand_eye_step + step[first_shared:],
+            state.shared_step + step[first_shared:],
         )
 
-    begin = _State(start, reported, targets_mm, np.zeros(6))
-    return adjust(begin, evaluate, move, groups, first_shared + 6, what="mesh to robot")
+    begin = _State(start, reported, targets_mm, np.zeros(len(held)))
+    return adjust(begin, evaluate, move, groups, first_shared + len(held), what="mesh to robot")
 
 
-def _by_hand_eye(base_from_camera: Floats, flange_from_camera: Floats) -> Floats:
-    """[v, 6, 6] step of each camera's pose for a step of the hand-eye: its shift turned with the flange."""
-    by = np.broadcast_to(np.eye(6), (len(base_from_camera), 6, 6)).copy()
-    by[:, :3, :3] = base_from_camera[:, :3, :3] @ flange_from_camera[:3, :3].T
-    return by
+def _by_shared(base_from_camera: Floats, hand_eye: HandEye) -> Floats:
+    """[v, 6, f + 6 + k] step of each camera's pose for figures of the lens: none; for a step of the hand-eye, its
+    shift turned with the flange; for steps of the axes, which move the flange with the camera on it."""
+    turn, shift = hand_eye.flange_from_camera[:3, :3], hand_eye.flange_from_camera[:3, 3]
+    base_from_flange = base_from_camera[:, :3, :3] @ turn.T
+    first = len(hand_eye.lens)
+    by = np.zeros((len(base_from_camera), 6, first + 6))
+    by[:, :, first:] = np.eye(6)
+    by[:, :3, first : first + 3] = base_from_flange
+    if hand_eye.axis_sensitivity is None:
+        return by
+    moved_by, turned_by = hand_eye.axis_sensitivity[:, :3], hand_eye.axis_sensitivity[:, 3:]
+    of_centre = base_from_flange @ (moved_by - skew(shift) @ turned_by)
+    return np.concatenate([by, np.concatenate([of_centre, turn.T @ turned_by], axis=1)], axis=2)

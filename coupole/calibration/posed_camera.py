@@ -54,7 +54,7 @@ def read_posed_camera(hand_eye: Path, camera: Path | None, about: About, size_px
 
 
 def refuse_other_camera(path: Path, record: Record, about: About, size_px: tuple[int, int]) -> None:
-    """Raise InputError unless a record holds for the camera, lens, focus and size of these images."""
+    """Raise InputError unless a record holds for the camera, lens, focus, size and warmth of these images."""
     holds = record.validity
     if holds.focus_distance_mm is not None and about.focus_distance_mm is not None:
         off_mm = abs(holds.focus_distance_mm - about.focus_distance_mm)
@@ -75,6 +75,14 @@ def refuse_other_camera(path: Path, record: Record, about: About, size_px: tuple
             f"{path}: holds for frames of {holds.size_px[0]} x {holds.size_px[1]} pixels; these have "
             f"{size_px[0]} x {size_px[1]}"
         )
+    if holds.temperature_c is not None and about.temperature_c is not None:
+        low, high = holds.temperature_c
+        room = about.temperature_c[0]  # of all LED boards the coolest, which is nearest to the room and the camera
+        if not low <= room <= high:
+            raise InputError(
+                f"{path}: holds from {low:g} to {high:g} C; the coolest LED board of these images had {room:g} C. "
+                "Let room, camera and boards come back to that temperature, or calibrate at this one"
+            )
     if holds.camera is not None and about.camera is not None and holds.camera != about.camera:
         raise InputError(f"{path}: holds for the camera {holds.camera}; the images are of {about.camera}")
 

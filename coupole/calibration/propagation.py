@@ -20,6 +20,8 @@ from coupole.errors import InputError
 Shape = Literal["normal", "student", "rectangular", "triangular", "arcsine"]
 Model = Callable[[Mapping[str, Floats]], Floats]
 _LEAST_BATCH = 10_000
+_ADVISED = 0.2
+"""Of the tolerance: how well Monte Carlo's ends should be known for a validation (JCGM 101, 8.2)."""
 _STEP = 1e-3
 """Of a standard uncertainty: for central differences."""
 COVERAGES = (0.68, 0.95)
@@ -87,6 +89,8 @@ class Interval:
     high: float
     kind: Literal["symmetric", "shortest", "normal"]
     """Probabilistically symmetric, shortest, or from the linear formula."""
+    numerical: float = 0.0
+    """Twice the standard deviation of the worse end, as the trials' batches scatter; 0 for the linear formula."""
 
 
 @dataclass(frozen=True)
@@ -122,16 +126,27 @@ class Linear:
 
 @dataclass(frozen=True)
 class Validation:
-    """Whether the linear formula will do (JCGM 101, section 8)."""
+    """Whether the linear formula will do (JCGM 101, section 8), for u with so many significant digits."""
 
     coverage: float
+    digits: int
     d_low: float
     d_high: float
+    """How far the ends of the linear interval are from Monte Carlo's."""
     tolerance: float
+    """That of u at so many digits (7.9.2)."""
+    numerical: float
+    """How well Monte Carlo's ends are known; 8.2 advises a fifth of the tolerance."""
 
     @property
     def passed(self) -> bool:
         return max(self.d_low, self.d_high) <= self.tolerance
+
+    @property
+    def sure(self) -> bool:
+        """True if more trials would not change the verdict."""
+        apart = abs(max(self.d_low, self.d_high) - self.tolerance)
+        return self.numerical <= max(_ADVISED * self.tolerance, apart)
 
 
 def linear(model: Model, inputs: Inputs, coverages: Sequence[float] = COVERAGES) -> Linear:
@@ -170,40 +185,44 @@ def monte_carlo(
     *,
     coverages: Sequence[float] = COVERAGES,
     digits: int = 2,
+    within: float = 1.0,
     most_trials: int = 4_000_000,
     seed: int = 1,
 ) -> Propagated:
-    """JCGM 101, 7.9: batches of trials until mean, u and the ends of the intervals are stable.
+    """JCGM 101, 7.9.4: batches of trials until mean, u and the ends of the intervals are stable.
 
-    Stable is what scatters, at two standard deviations of the mean over batches, by less than the numerical
-    tolerance of u at so many significant `digits`. Raises InputError if the model gives a number that is none.
+    Stable is what scatters, at two standard deviations of the mean over batches, by no more than `within` times
+    the numerical tolerance of u at so many significant `digits`; a validation asks for 0.2 (8.2). Raises
+    InputError if the model gives a number that is none.
     """
     batch = max(_LEAST_BATCH, int(np.ceil(100.0 / (1.0 - max(coverages)))))
     random = np.random.default_rng(seed)
     half = _root(inputs.matrix())
     batches: list[Floats] = []
     figures: list[list[float]] = []
+    scatter = np.full(2 + 2 * len(coverages), np.inf)
     stable = False
-    while len(batches) * batch < most_trials:
+    while not stable and (len(batches) + 1) * batch <= max(most_trials, batch):
         samples = _sorted(model(draw(inputs, half, batch, random)))
         batches.append(samples)
         limits = [end for p in coverages for end in ends(samples, p)]
         figures.append([float(samples.mean()), float(samples.std(ddof=1)), *limits])
-        count = len(batches)
-        if count >= 2:
+        if len(batches) > 1:
             found = np.array(figures)
-            u = float(found[:, 1].mean())
-            scatter = found.std(axis=0, ddof=1) / np.sqrt(count)
-            stable = bool((2.0 * scatter <= tolerance(u, digits)).all())
-            if stable:
-                break
+            scatter = 2.0 * found.std(axis=0, ddof=1) / np.sqrt(len(batches))
+            stable = bool((scatter <= within * tolerance(_pooled(found[:, 0], found[:, 1]), digits)).all())
     samples = np.sort(np.concatenate(batches))
     intervals = []
-    for p in coverages:
-        intervals.append(Interval(p, *ends(samples, p), "symmetric"))
-        intervals.append(Interval(p, *_shortest(samples, p), "shortest"))
+    for p, numerical in zip(coverages, scatter[2:].reshape(-1, 2).max(axis=1), strict=True):
+        intervals.append(Interval(p, *ends(samples, p), "symmetric", float(numerical)))
+        intervals.append(Interval(p, *_shortest(samples, p), "shortest", float(numerical)))
     mean, u = float(samples.mean()), float(samples.std(ddof=1))
     return Propagated(mean, u, tuple(intervals), len(samples), samples, stable)
+
+
+def _pooled(means: Floats, us: Floats) -> float:
+    """u by all trials so far (7.9.4, step j), from mean and u of batches of one size."""
+    return float(np.sqrt(np.mean(us**2) + np.var(means)))
 
 
 def trials_of(
@@ -216,7 +235,7 @@ def trials_of(
     return _sorted(model(draw(inputs, _root(inputs.matrix()), trials, random, fixed)), infinite=0.01)
 
 
-def validate(linear_result: Propagated, numeric: Propagated, *, digits: int = 2) -> tuple[Validation, ...]:
+def validate(linear_result: Propagated, numeric: Propagated, *, digits: int = 1) -> tuple[Validation, ...]:
     """JCGM 101, 8.1: do the ends of the linear intervals agree with Monte Carlo's within the tolerance of u?"""
     found = []
     for interval in linear_result.intervals:
@@ -224,9 +243,11 @@ def validate(linear_result: Propagated, numeric: Propagated, *, digits: int = 2)
         found.append(
             Validation(
                 interval.coverage,
+                digits,
                 abs(interval.low - other.low),
                 abs(interval.high - other.high),
-                tolerance(linear_result.u, digits),
+                tolerance(numeric.u, digits),
+                other.numerical,
             )
         )
     return tuple(found)

@@ -27,9 +27,17 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0)]
-Kind = Literal["camera", "hand-eye", "leds", "mesh", "flat-field", "dark", "response", "led-power"]
+Kind = Literal[
+    "camera", "chromatic", "hand-eye", "leds", "mesh", "flat-field", "dark", "response", "led-power", "drift"
+]
+SEAL = "# A calibration of Coupole"
+"""How a record's file begins."""
 _STEPS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
 _MOST_ASYMMETRY = 1e-9
+
+
+def _not_said(value: object) -> bool:
+    return value is None
 
 
 class Parameter(Model):
@@ -73,6 +81,10 @@ class Limit(Model):
     found: float
     limit: float
     unit: str
+    name: str | None = Field(default=None, exclude_if=_not_said)
+    """What `--limit` calls it; None where an operator cannot set it."""
+    usual: float | None = Field(default=None, exclude_if=_not_said)
+    """What the limit is unless an operator sets another; None if it is that."""
 
     @property
     def passed(self) -> bool:
@@ -163,7 +175,7 @@ def content_sha256(plain: dict[str, Any]) -> str:
 def write_record(path: Path, record: Record) -> None:
     """Write a record; a file that is there is whole. Raises StorageError."""
     plain = json.loads(record.model_dump_json())
-    text = "# A calibration of Coupole. It carries its own checksum: do not edit it, calibrate anew.\n"
+    text = f"{SEAL}. It carries its own checksum: do not edit it, calibrate anew.\n"
     partial = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

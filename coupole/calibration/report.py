@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ from coupole.errors import StorageError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_STYLE = """
+STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:.5em 0}td,th{padding:.15em 1em .15em 0;text-align:left}
 td.n,th.n{text-align:right;font-variant-numeric:tabular-nums}
@@ -90,14 +90,15 @@ def _page(record: Record, picture: bytes) -> str:
     data = base64.b64encode(picture).decode()
     remarks = "".join(f"<li>{html.escape(remark)}" for remark in record.remarks)
     return (
-        f"<!doctype html><meta charset=utf-8><title>{name}</title><style>{_STYLE}</style><h1>{name}</h1>"
+        f"<!doctype html><meta charset=utf-8><title>{name}</title><style>{STYLE}</style><h1>{name}</h1>"
         f"{simulated}{_limits(record)}<h2>Result</h2>{_transforms(record)}{_parameters(record)}{_noise(record)}"
         + (f"<h2>Remarks</h2><ul>{remarks}</ul>" if remarks else "")
         + f'<h2>Residuals</h2><img src="data:image/png;base64,{data}" alt="residuals">{_validity(record)}'
     )
 
 
-def _table(head: str, rows: list[str]) -> str:
+def table(head: str, rows: Sequence[str]) -> str:
+    """An HTML table of rows of cells, as `<td>a<td>b`."""
     return f"<table><tr>{head}{''.join(f'<tr>{row}' for row in rows)}</table>"
 
 
@@ -106,9 +107,11 @@ def _limits(record: Record) -> str:
     rows = [
         f"<td>{html.escape(limit.what)}<td class=n>{limit.found:.3g}<td class=n>{limit.limit:.3g}"
         f"<td>{limit.unit}<td class={'ok>met' if limit.passed else 'bad>missed'}"
+        f"<td>{'' if limit.name is None else f'<code>{limit.name}</code>'}"
+        f"{'' if limit.usual is None else f', usually {limit.usual:.3g}'}"
         for limit in record.limits
     ]
-    return verdict + _table("<th>limit<th class=n>found<th class=n>at most<th><th>", rows)
+    return verdict + table("<th>limit<th class=n>found<th class=n>at most<th><th><th>set by --limit", rows)
 
 
 def _transforms(record: Record) -> str:
@@ -119,7 +122,7 @@ def _transforms(record: Record) -> str:
     head = "<th>transform" + "".join(
         f"<th class=n>{h}" for h in ("x mm", "y mm", "z mm", "A deg", "B deg", "C deg")
     )
-    return _table(head, rows) if rows else ""
+    return table(head, rows) if rows else ""
 
 
 def _parameters(record: Record) -> str:
@@ -131,7 +134,7 @@ def _parameters(record: Record) -> str:
         "<th>parameter<th class=n>value<th class=n>expanded uncertainty (95 %)<th class=n>k"
         "<th class=n>degrees of freedom<th>most of it from"
     )
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def _parameter(parameter: Parameter) -> str:
@@ -155,7 +158,7 @@ def _noise(record: Record) -> str:
         f"<td>{n.unit}<td class=n>{n.redundancy:.0f}"
         for n in record.noise
     ]
-    return _table("<th>noise of<th class=n>found<th class=n>stated<th><th class=n>redundancy", rows)
+    return table("<th>noise of<th class=n>found<th class=n>stated<th><th class=n>redundancy", rows)
 
 
 def _validity(record: Record) -> str:
@@ -168,4 +171,4 @@ def _validity(record: Record) -> str:
         f"<td>made<td>{record.created:%Y-%m-%d %H:%M} UTC by {html.escape(record.software)}",
         f"<td>record<td><code>{record.sha256}</code>",
     ]
-    return "<h2>Validity and inputs</h2>" + _table("<th><th>", rows)
+    return "<h2>Validity and inputs</h2>" + table("<th><th>", rows)

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole import store
-from coupole.calibration.board import Board, Sighting, detect, plane
+from coupole.calibration.board import Board, Sighting, detect
+from coupole.calibration.picture import COLOUR, Picture
 from coupole.calibration.poses import PoseFile, ReportedPoses, read_poses, reported
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError, StorageError
@@ -51,8 +52,7 @@ class Source:
     """One image to look for the board in, read when it is asked for."""
 
     name: str
-    read: Callable[[], tuple[NDArray[Any], float]]
-    """Grey image [H, W], and its value of saturation."""
+    read: Callable[[], Picture]
     joints_deg: tuple[float, ...] | None = None
 
 
@@ -107,12 +107,12 @@ def find_board(
     sightings, chosen, left_out = [], [], []
     size_px: tuple[int, int] | None = None
     for number, source in enumerate(sources.images):
-        image, white = source.read()
-        size = (image.shape[1], image.shape[0])
+        picture = source.read()
+        size = picture.size_px
         if size_px is not None and size != size_px:
             raise InputError(f"{source.name}: {size[0]} x {size[1]} pixels, the images before it {size_px}")
         size_px = size
-        seen = detect(board, image, source.name, white=white)
+        seen = detect(board, picture)
         if isinstance(seen, str):
             left_out.append(f"{source.name}: {seen}")
         else:
@@ -150,15 +150,15 @@ def _of_folder(folder: Path, poses: Path | None) -> Sources:
     return Sources(images, numbers, About(simulated=False), inputs)
 
 
-def _picture(path: Path) -> tuple[NDArray[Any], float]:
-    """Grey, in the bits that the file has. Raises InputError if it is no picture."""
+def _picture(path: Path) -> Picture:
+    """In the bits and colours that the file has. Raises InputError if it is no picture."""
     import cv2
 
-    image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
     if image is None:
         raise InputError(f"{path}: not a picture that OpenCV can read")
-    whites = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
-    return image, whites.get(image.dtype, float("inf"))
+    grey = Picture.of_grey(image, name=path.name)
+    return grey if image.ndim == 2 else replace(grey, values=image[..., ::-1], pattern=COLOUR)
 
 
 # -- runs -------------------------------------------------------------------------------------------------
@@ -183,7 +183,7 @@ def _of_run(run: Run) -> Sources:
         records = table[[frame.index for frame in lit]]
         pose = poses[int(records["pose"][0])]
         temperatures += (records["board_temperature_dc"] / 10.0).tolist()
-        read = partial(_mean_image, path, lit, dark, table)
+        read = partial(_mean_frame, view, path, lit, dark, table)
         images.append(Source(view, read, tuple(map(float, pose["joints_deg"]))))
         flanges.append(np.array(pose["base_from_flange"], dtype=np.float64))
         inputs.append((f"{run.folder.name}/views/{path.name}", frames_sha256([*lit, *dark])))
@@ -202,10 +202,10 @@ def _at_one_pose(frames: Sequence[ProvenFrame], table: NDArray[np.void]) -> list
     return [frame for frame in frames if int(table[frame.index]["pose"]) == taken.most_common(1)[0][0]]
 
 
-def _mean_image(
-    path: Path, lit: Sequence[ProvenFrame], dark: Sequence[ProvenFrame], table: NDArray[np.void]
-) -> tuple[NDArray[Any], float]:
-    """Mean of the frames at the longest exposure that clips little, green, dark frames subtracted."""
+def _mean_frame(
+    name: str, path: Path, lit: Sequence[ProvenFrame], dark: Sequence[ProvenFrame], table: NDArray[np.void]
+) -> Picture:
+    """Mean of the frames at the longest exposure that clips little, dark frames subtracted."""
     layout, facts = store.read_layout(path), store.read_facts(path)
     exposures = {frame.shot: int(table[frame.index]["exposure_us"]) for frame in (*lit, *dark)}
     for exposure_us in sorted({exposures[frame.shot] for frame in lit}, reverse=True):
@@ -223,7 +223,7 @@ def _mean_image(
     else:
         black = np.full(mean.shape, float(facts["black_dn"]))
     white = facts["white_dn"] - float(black.mean())
-    return plane(mean - black, facts["pattern"]), white
+    return Picture(mean - black, facts["pattern"], white, name)
 
 
 def _mean(frames: Sequence[NDArray[np.uint16]]) -> Floats:

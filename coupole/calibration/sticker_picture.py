@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coupole.calibration.report import BLUE, DARK, GREY, RED
-from coupole.calibration.sticker_workflow import MeshFound, mesh_edges_px, reprojected
+from coupole.calibration.sticker_workflow import MeshFound, outline_px, reprojected
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,15 +25,20 @@ def draw_mesh(found: MeshFound, figure: Figure) -> None:
 
 
 def _draw_frame(ax: Axes, found: MeshFound) -> None:
-    """One frame, with the mesh's vertices and the table's stickers where they should be."""
+    """One frame, with the mesh's outline and the table's stickers where they should be."""
+    from matplotlib.collections import LineCollection
+
     image = found.images.picture
     step = max(1, max(image.shape) // _MOST_SHOWN_PX)
     height, width = image.shape
     bright = float(np.percentile(image, 99.5))
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
     ax.imshow(np.sqrt(np.clip(image[::step, ::step] / bright, 0, 1)), cmap="gray", extent=extent)
-    mesh = mesh_edges_px(found, found.scan.mesh)
-    ax.plot(mesh[:, 0], mesh[:, 1], ",", color="#6fd08c", alpha=0.5)
+    ax.add_collection(
+        LineCollection(
+            list(outline_px(found, found.scan.mesh)), colors="#6fd08c", linewidths=0.8, label="outline of the mesh"
+        )
+    )
     seen = np.array([s.middle for s in found.images.stickers[found.images.shown]])
     ax.plot(seen[:, 0], seen[:, 1], "o", ms=13, mfc="none", color=BLUE, label="found in the image")
     should = reprojected(found, found.scan.targets_mm)

@@ -78,7 +78,7 @@ def find_all_stickers(
     size_px: tuple[int, int] | None = None
     shown, picture = 0, np.zeros((1, 1))
     for number, source in enumerate(sources.images):
-        image, _ = source.read()
+        image = source.read().plane()
         size = (image.shape[1], image.shape[0])
         if size_px is not None and size != size_px:
             raise InputError(f"{source.name}: {size[0]} x {size[1]} pixels, the images before it {size_px}")

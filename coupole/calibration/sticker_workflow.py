@@ -10,6 +10,8 @@ import numpy as np
 
 import coupole
 from coupole.calibration import optics
+from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
+from coupole.calibration.limits import judged
 from coupole.calibration.mesh_to_robot import (
     ORIENTATION,
     POSITION,
@@ -24,7 +26,6 @@ from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.record import (
     ImageResidual,
     Input,
-    Limit,
     Noise,
     Parameter,
     Record,
@@ -34,28 +35,17 @@ from coupole.calibration.record import (
 )
 from coupole.calibration.rotations import Floats, inverses
 from coupole.calibration.sources import Sources
+from coupole.calibration.sticker_limits import MESH
 from coupole.calibration.sticker_points import corrected, views_of
 from coupole.calibration.sticker_sources import Scan, StickerImages
 from coupole.calibration.workflow import Wish
 from coupole.errors import InputError
 from coupole.geometry import Transform, abc_from_rotation, inverse
-from coupole.plan import Model, Pose
+from coupole.plan import Pose
 
 _LEAST_SIGMA_PX = 0.02
-
-
-class MeshAcceptance(Model):
-    """What the place of a mesh must reach to be accepted."""
-
-    place_mm: float = 0.1
-    """Largest standard uncertainty of a sticker's place in the base (seed 003: 100 um)."""
-    missing: float = 0.5
-    """Share of the table's stickers that were not found."""
-    residual_px: float = 0.5
-    robot_noise_ratio: float = 3.0
-
-
-ACCEPTANCE = MeshAcceptance()
+_MOST_FACES = 1_000_000
+"""Of the mesh that is laid onto a frame."""
 
 
 @dataclass(frozen=True)
@@ -83,19 +73,23 @@ def mesh_from(
     stated: Stated,
     depth_mm: tuple[float, float],
     base_from_support: Transform | None = None,
-    acceptance: MeshAcceptance = ACCEPTANCE,
+    arm: CalibratedArm | None = None,
 ) -> MeshFound:
     """Find where a scanned mesh lies. Raises InputError if its stickers are not those in the images."""
     if sources.poses is None:
         raise InputError("mesh: the images have no poses; give runs, or a folder with poses")
-    base_from_camera = sources.poses.base_from_flange @ prior.flange_from_camera
+    base_from_flange = sources.poses.base_from_flange
+    hand_eye = HandEye(prior.flange_from_camera, prior.covariance, prior.free)
+    if arm is not None:
+        joints_deg = np.array([source.joints_deg for source in sources.images])
+        base_from_flange, hand_eye = calibrated_poses(base_from_flange, joints_deg, arm, prior)
+    base_from_camera = base_from_flange @ prior.flange_from_camera
     sigma_px = _sigma_px(images)
     stated = replace(stated, sticker_px=sigma_px)
     pose_px = prior.lens.fx * (stated.robot_mm / float(np.mean(depth_mm)) + np.radians(stated.robot_deg))
     views = views_of(images.names, base_from_camera, images.stickers)
     points = seen_points(views, prior.lens, tolerance_px=4 * float(np.hypot(0.2, pose_px)), depth_mm=depth_mm)
     views = corrected(views, images.stickers, points)
-    hand_eye = HandEye(prior.flange_from_camera, prior.hand_eye_covariance)
     pose = mesh_to_robot(
         views, prior.lens, scan.targets_mm, scan.names, stated=stated, hand_eye=hand_eye, depth_mm=depth_mm
     )
@@ -121,8 +115,8 @@ def mesh_from(
             ImageResidual(name=name, corners=len(seen), rejected=0, rms_px=pose.residual_px)
             for name, seen in zip(images.names, images.stickers, strict=True)
         ),
-        limits=_limits(pose, scan, u_mm, acceptance),
-        remarks=_remarks(pose),
+        limits=judged(MESH, wish.limits, _figures(pose, scan, u_mm)),
+        remarks=(*_remarks(pose), *(() if arm is None else (_of_the_arm(arm),))),
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in (*sources.inputs, *scan.inputs)),
     )
     camera_from_mesh = inverses(base_from_camera[images.shown]) @ pose.base_from_mesh
@@ -135,19 +129,33 @@ def _sigma_px(images: StickerImages) -> float:
     return max(float(np.sqrt(np.median(variances))), _LEAST_SIGMA_PX)
 
 
-def mesh_edges_px(found: MeshFound, mesh: Path, most: int = 20_000) -> Floats:
-    """Pixels [n, 2] of the mesh's vertices as the shown image should have them, at most so many."""
+def outline_px(found: MeshFound, mesh: Path) -> Floats:
+    """Ends [n, 2, 2] (px) of the mesh's edges between triangles that face the shown image's camera and triangles
+    that do not: its outline, and that of what stands out of it."""
     import trimesh
 
-    vertices = np.asarray(trimesh.load_mesh(mesh, process=False).vertices, dtype=np.float64)
-    vertices = vertices[:: max(1, len(vertices) // most)]
-    return reprojected(found, vertices)
+    from coupole.view_solids import Solid, simplified
+
+    whole = trimesh.load_mesh(mesh, process=False)
+    coarse = simplified(Solid("mesh", np.asarray(whole.vertices), np.asarray(whole.faces)), _MOST_FACES)
+    scanned = trimesh.Trimesh(coarse.vertices_mm, coarse.faces, process=False)
+    eye_mm = inverse(found.camera_from_mesh)[:3, 3]
+    corners = np.asarray(scanned.triangles)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    faces_eye = np.einsum("ij,ij->i", normals, eye_mm - corners[:, 0]) > 0
+    one, other = np.asarray(scanned.face_adjacency).T
+    edges = np.asarray(scanned.face_adjacency_edges)[faces_eye[one] != faces_eye[other]]
+    ends = np.asarray(scanned.vertices, dtype=np.float64)[edges.reshape(-1)]
+    return reprojected(found, ends).reshape(-1, 2, 2)
 
 
 def reprojected(found: MeshFound, mesh_mm: Floats) -> Floats:
-    """Pixels [n, 2] of points [n, 3] of the mesh in the image that is shown."""
+    """Pixels [n, 2] of points [n, 3] of the mesh in the image that is shown; NaN for what is not before it."""
     in_camera = mesh_mm @ found.camera_from_mesh[:3, :3].T + found.camera_from_mesh[:3, 3]
-    return optics.project(in_camera[in_camera[:, 2] > 1.0], found.lens.vector()).pixels
+    pixels = np.full((len(mesh_mm), 2), np.nan)
+    before = in_camera[:, 2] > 1.0
+    pixels[before] = optics.project(in_camera[before], found.lens.vector()).pixels
+    return pixels
 
 
 def _parameters(pose: MeshPose) -> tuple[Parameter, ...]:
@@ -182,19 +190,14 @@ def _noise(pose: MeshPose, stated: Stated) -> tuple[Noise, ...]:
     )
 
 
-def _limits(pose: MeshPose, scan: Scan, u_mm: Floats, asked: MeshAcceptance) -> tuple[Limit, ...]:
-    robot = max(pose.noise[POSITION], pose.noise[ORIENTATION])
-    return (
-        Limit(what="place of the worst sticker", found=float(u_mm.max()), limit=asked.place_mm, unit="mm"),
-        Limit(
-            what="stickers not found",
-            found=1 - len(pose.matched) / len(scan.names),
-            limit=asked.missing,
-            unit="",
-        ),
-        Limit(what="residual of stickers", found=pose.residual_px, limit=asked.residual_px, unit="px"),
-        Limit(what="robot's noise, found over stated", found=float(robot), limit=asked.robot_noise_ratio, unit=""),
-    )
+def _figures(pose: MeshPose, scan: Scan, u_mm: Floats) -> dict[str, float]:
+    """What `sticker_limits.MESH` are held against."""
+    return {
+        "place_mm": float(u_mm.max()),
+        "missing": 1 - len(pose.matched) / len(scan.names),
+        "residual_px": pose.residual_px,
+        "robot_ratio": float(max(pose.noise[POSITION], pose.noise[ORIENTATION])),
+    }
 
 
 def _remarks(pose: MeshPose) -> tuple[str, ...]:
@@ -206,6 +209,11 @@ def _remarks(pose: MeshPose) -> tuple[str, ...]:
     if pose.false_points:
         remarks.append(f"{pose.false_points} things like stickers are none of the table's")
     return tuple(remarks)
+
+
+def _of_the_arm(arm: CalibratedArm) -> str:
+    zeros = ", ".join(f"A{axis} {zero:+.4f}" for axis, zero in enumerate(arm.zeros_deg[1:], start=2))
+    return f"poses are corrected by the axis zeros of the hand-eye record ({zeros} deg); use them with the mesh"
 
 
 def _pose(transform: Floats) -> Pose:

@@ -6,7 +6,7 @@ numbers would be nonsense; one without a simple cause goes into the record as a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Literal
@@ -27,34 +27,17 @@ from coupole.calibration.bundle import (
 )
 from coupole.calibration.camera import CameraCalibration, calibrate_camera, without_gross_errors
 from coupole.calibration.diagnosis import Diagnosis, diagnose, expected_scatter
+from coupole.calibration.limits import CAMERA, HAND_EYE, judged
 from coupole.calibration.poses import ReportedPoses
-from coupole.calibration.record import ImageResidual, Input, Limit, Noise, Parameter, Record, Validity, sealed
+from coupole.calibration.record import ImageResidual, Input, Noise, Parameter, Record, Validity, sealed
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import Found, Sources
 from coupole.errors import InputError
 from coupole.geometry import abc_from_rotation
 from coupole.kinematics import Arm
-from coupole.plan import Model, Pose
+from coupole.plan import Pose
 
 FIELD_CELLS = (8, 6)
-
-
-class Acceptance(Model):
-    """What a calibration must reach to be accepted."""
-
-    pixel_px: float = 0.3
-    """Noise of a corner's coordinate."""
-    field_without_corners: float = 0.4
-    """Share of the field's 8 x 6 cells."""
-    rejected: float = 0.05
-    """Share of the corners that were left out as gross errors."""
-    ray_px: float = 0.5
-    """Standard uncertainty of where the calibrated lens sees a point at the field's corners."""
-    camera_centre_mm: float = 0.3
-    """Standard uncertainty of the camera's place on the flange, all directions together (seed 003: 300 um)."""
-    camera_turn_deg: float = 0.05
-    robot_noise_ratio: float = 3.0
-    """Robot's noise as found over as stated."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +50,8 @@ class Wish:
     lens: str | None = None
     focus_tolerance_mm: float = 2.0
     temperature_margin_c: float = 5.0
-    acceptance: Acceptance = field(default_factory=Acceptance)
+    limits: Mapping[str, float] = field(default_factory=dict)
+    """Acceptance limits that the operator set, by name (`coupole.calibration.limits`)."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +79,7 @@ def camera_from(found: Found, sources: Sources, model: str, wish: Wish) -> tuple
     u = np.sqrt(np.diag(fit.covariance))
     parameters = [
         Parameter(
-            name=_unit(name),
+            name=unit_name(name),
             value=getattr(fit.intrinsics, name),
             u=float(u[i]),
             degrees_of_freedom=float(fit.degrees[i]),
@@ -103,21 +87,18 @@ def camera_from(found: Found, sources: Sources, model: str, wish: Wish) -> tuple
         )
         for i, name in enumerate(fit.free)
     ]
-    asked = wish.acceptance
-    limits = [
-        *_image_limits(fit, asked),
-        _limit("uncertainty at the field's corners", ray_u_px(fit), asked.ray_px, "px"),
-    ]
     redundancy = float(np.sum([2 * k.sum() for k in fit.kept]) - len(fit.free) - 6 * len(kept))
     record = sealed(
         kind="camera",
         transforms={},
         parameters=tuple(parameters),
-        covariance=_rows(fit.covariance),
+        covariance=rows_of(fit.covariance),
         noise=(_noise("corners", "px", 0.0, fit.sigma_px, redundancy),),
-        limits=tuple(limits),
+        limits=judged(CAMERA, wish.limits, {**image_figures(fit, found), "ray_px": ray_u_px(fit)}),
         remarks=found.left_out,
-        **_common(found, sources, wish, fit.intrinsics, fit.free, kept, residuals, fit.sightings),
+        fixed=held(fit.intrinsics, fit.free),
+        images=image_lines(kept, residuals, fit.sightings),
+        **content_of(found, sources, wish),
     )
     shown = Shown(
         record,
@@ -183,20 +164,13 @@ def hand_eye_from(
             "base_from_board": _pose(result.base_from_board),
         },
         parameters=_hand_eye_parameters(result),
-        covariance=_rows(result.covariance),
+        covariance=rows_of(result.covariance),
         noise=_hand_eye_noise(result),
-        limits=(*_image_limits(fit, wish.acceptance), *_hand_eye_limits(result, wish.acceptance)),
+        limits=judged(HAND_EYE, wish.limits, {**image_figures(fit, found), **_hand_eye_figures(result)}),
         remarks=tuple(filter(None, (*found.left_out, *diagnosis.sentences(), diagnosis.of_methods()))),
-        **_common(
-            found,
-            sources,
-            wish,
-            result.intrinsics,
-            lens.free if lens else optics.MODELS[model],
-            kept,
-            result.residuals_px,
-            fit.sightings,
-        ),
+        fixed=held(result.intrinsics, lens.free if lens else optics.MODELS[model]),
+        images=image_lines(kept, result.residuals_px, fit.sightings),
+        **content_of(found, sources, wish),
     )
     shown = Shown(
         record,
@@ -238,21 +212,11 @@ def field_without_corners(sightings: Sequence[Sighting], size_px: tuple[int, int
     return 1.0 - len(np.unique(cells, axis=0)) / (FIELD_CELLS[0] * FIELD_CELLS[1])
 
 
-def _common(
-    found: Found,
-    sources: Sources,
-    wish: Wish,
-    intrinsics: optics.Intrinsics,
-    free: Sequence[str],
-    kept: Sequence[Sighting],
-    residuals: Sequence[Floats],
-    all_seen: Sequence[Sighting],
-) -> dict[str, object]:
-    """What both kinds of record have."""
-    about = sources.about
-    temperature = about.temperature_c
-    margin = wish.temperature_margin_c
-    images = [
+def image_lines(
+    kept: Sequence[Sighting], residuals: Sequence[Floats], all_seen: Sequence[Sighting]
+) -> tuple[ImageResidual, ...]:
+    """How each image fits."""
+    return tuple(
         ImageResidual(
             name=seen.name,
             corners=len(seen.ids),
@@ -260,7 +224,14 @@ def _common(
             rms_px=float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
         )
         for seen, left, before in zip(kept, residuals, all_seen, strict=True)
-    ]
+    )
+
+
+def content_of(found: Found, sources: Sources, wish: Wish) -> dict[str, object]:
+    """What all records made from a board's images have."""
+    about = sources.about
+    temperature = about.temperature_c
+    margin = wish.temperature_margin_c
     return {
         "name": wish.name,
         "created": wish.now.astimezone(UTC).replace(microsecond=0),
@@ -277,37 +248,43 @@ def _common(
             f_number=about.f_number,
             temperature_c=None if temperature is None else (temperature[0] - margin, temperature[1] + margin),
         ),
-        "fixed": {_unit(n): getattr(intrinsics, n) for n in optics.NAMES if n not in free},
-        "images": tuple(images),
         "inputs": tuple(Input(name=name, sha256=digest) for name, digest in sources.inputs),
     }
 
 
-def _image_limits(fit: CameraCalibration, asked: Acceptance) -> list[Limit]:
+def held(intrinsics: optics.Intrinsics, free: Sequence[str]) -> dict[str, float]:
+    """The lens parameters that were not estimated, by the record's names."""
+    return {unit_name(n): getattr(intrinsics, n) for n in optics.NAMES if n not in free}
+
+
+def image_figures(fit: CameraCalibration, found: Found) -> dict[str, float]:
+    """What `limits.IMAGES` are held against."""
     rejected = np.concatenate([~keep for keep in fit.kept])
-    bare = field_without_corners(fit.sightings, fit.size_px)
-    return [
-        _limit("noise of corners", fit.sigma_px, asked.pixel_px, "px"),
-        _limit("field without corners", bare, asked.field_without_corners, ""),
-        _limit("corners left out", float(rejected.mean()), asked.rejected, ""),
-    ]
+    clipped = sum(": clipped" in line for line in found.left_out)
+    return {
+        "pixel_px": fit.sigma_px,
+        "bare_field": field_without_corners(fit.sightings, fit.size_px),
+        "rejected": float(rejected.mean()),
+        "clipped": clipped / (len(found.sightings) + len(found.left_out)),
+    }
 
 
-def _hand_eye_limits(result: HandEyeCalibration, asked: Acceptance) -> list[Limit]:
+def _hand_eye_figures(result: HandEyeCalibration) -> dict[str, float]:
     def together(steps: Sequence[str]) -> float:
         return float(np.linalg.norm([result.u(f"flange_from_camera.{step}") for step in steps]))
 
     noise = result.noise
-    worst = max(noise.position_mm / noise.stated_position_mm, noise.orientation_deg / noise.stated_orientation_deg)
-    return [
-        _limit("camera centre on the flange", together(("x_mm", "y_mm", "z_mm")), asked.camera_centre_mm, "mm"),
-        _limit("camera's turn", together(("rx_deg", "ry_deg", "rz_deg")), asked.camera_turn_deg, "deg"),
-        _limit("robot's noise, found over stated", worst, asked.robot_noise_ratio, ""),
-    ]
+    return {
+        "centre_mm": together(("x_mm", "y_mm", "z_mm")),
+        "turn_deg": together(("rx_deg", "ry_deg", "rz_deg")),
+        "robot_ratio": max(
+            noise.position_mm / noise.stated_position_mm, noise.orientation_deg / noise.stated_orientation_deg
+        ),
+    }
 
 
 def _hand_eye_parameters(result: HandEyeCalibration) -> tuple[Parameter, ...]:
-    values: dict[str, float] = {_unit(name): getattr(result.intrinsics, name) for name in optics.NAMES}
+    values: dict[str, float] = {unit_name(name): getattr(result.intrinsics, name) for name in optics.NAMES}
     values["board_scale"] = result.board_scale
     values |= {f"axis_zero.a{i + 1}_deg": float(zero) for i, zero in enumerate(result.axis_zeros_deg)}
     for name in ("flange_from_camera", "base_from_board"):
@@ -348,11 +325,8 @@ def _noise(name: str, unit: Literal["px", "mm", "deg"], stated: float, found: fl
     return Noise(name=name, unit=unit, stated=stated, found=found, redundancy=redundancy)
 
 
-def _limit(what: str, found: float, limit: float, unit: str) -> Limit:
-    return Limit(what=what, found=found, limit=limit, unit=unit)
-
-
-def _unit(name: str) -> str:
+def unit_name(name: str) -> str:
+    """A lens parameter with its unit, as records call it."""
     return f"{name}_px" if name in ("fx", "fy", "cx", "cy") else name
 
 
@@ -361,6 +335,7 @@ def _pose(transform: Floats) -> Pose:
     return Pose(translation_mm=(x, y, z), abc_deg=abc_from_rotation(transform[:3, :3]))
 
 
-def _rows(matrix: Floats) -> tuple[tuple[float, ...], ...]:
+def rows_of(matrix: Floats) -> tuple[tuple[float, ...], ...]:
+    """A covariance as records keep it."""
     symmetric = 0.5 * (matrix + matrix.T)
     return tuple(tuple(map(float, row)) for row in symmetric)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.commands.calibrating import DaysOption, NameOption, OutOption, bar, calibrate
+from coupole.calibration.limits import LEDS
+from coupole.calibration.sticker_limits import MESH
+from coupole.commands.calibrating import DaysOption, NameOption, OutOption, bar, calibrate, limit_option
 from coupole.commands.common import JsonOption
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from coupole.calibration.calibrated_arm import CalibratedArm
     from coupole.calibration.report import Outcome
     from coupole.calibration.workflow import Wish
     from coupole.job import Cell
@@ -24,10 +28,9 @@ HandEyeOption = Annotated[Path, typer.Option("--hand-eye", help="The hand-eye re
 CameraOption = Annotated[
     Path | None, typer.Option("--camera", help="The camera's record, as a check that it is the same lens.")
 ]
-RepeatabilityMm = Annotated[float, typer.Option(min=1e-4, help="Noise of the robot from pose to pose, as stated.")]
-RepeatabilityDeg = Annotated[
-    float, typer.Option(min=1e-5, help="Noise of the robot from pose to pose, as stated.")
-]
+_OF_THE_ROBOT = "Noise of the robot from pose to pose, as stated; its absolute error where that is not calibrated."
+RepeatabilityMm = Annotated[float, typer.Option("--repeatability-mm", min=1e-4, help=_OF_THE_ROBOT)]
+RepeatabilityDeg = Annotated[float, typer.Option("--repeatability-deg", min=1e-5, help=_OF_THE_ROBOT)]
 
 
 def leds(
@@ -43,6 +46,7 @@ def leds(
     out: OutOption = Path("calibrations"),
     name: NameOption = None,
     valid_days: DaysOption = 180,
+    limit: Annotated[list[str] | None, limit_option(LEDS)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Where all LEDs are and face, from views of the lit LEDs themselves, each seen six times or more."""
@@ -52,21 +56,35 @@ def leds(
     from coupole.calibration.led_workflow import leds_from
     from coupole.calibration.posed_camera import read_posed_camera
     from coupole.calibration.report import Outcome
+    from coupole.run import sha256
 
     def work(console: Console, wish: Wish) -> Outcome:
-        table = _cell(rig, runs).leds
+        cell = _cell(rig, runs)
+        table = cell.leds
         with bar(console, "looking for spots") as progress:
             images = find_leds(runs, table, progress)
+        made_with = [(path.name, sha256(path)) for path in (hand_eye, camera, rig) if path is not None]
+        images = replace(images, inputs=(*images.inputs, *made_with))
         console.print(
             f"{len(images.seen.led)} spots in {len(images.seen.frames)} images of {len(images.views)} views"
         )
         prior = read_posed_camera(hand_eye, camera, images.about, images.size_px)
         stated = Stated(tolerance_mm=tolerance_mm, robot_mm=repeatability_mm, robot_deg=repeatability_deg)
         with console.status("adjusting boards, poses, lens and hand-eye"):
-            found = leds_from(images, table, prior, wish, stated=stated)
+            found = leds_from(images, table, prior, wish, stated=stated, arm=_arm(cell, hand_eye))
         return Outcome(found.record, partial(draw_leds, found), found.files)
 
-    calibrate("leds", work, out=out, name=name, lens=None, valid_days=valid_days, as_json=as_json)
+    calibrate(
+        "leds",
+        work,
+        out=out,
+        name=name,
+        lens=None,
+        valid_days=valid_days,
+        as_json=as_json,
+        limit=limit,
+        limits=LEDS,
+    )
 
 
 def mesh(
@@ -88,9 +106,11 @@ def mesh(
     out: OutOption = Path("calibrations"),
     name: NameOption = None,
     valid_days: DaysOption = 180,
+    limit: Annotated[list[str] | None, limit_option(MESH)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Where a scanned object lies in the base, by its stickers in six views or more."""
+    from coupole.calibration.calibrated_arm import has_axis_zeros
     from coupole.calibration.mesh_to_robot import Stated
     from coupole.calibration.posed_camera import read_posed_camera
     from coupole.calibration.report import Outcome
@@ -102,25 +122,64 @@ def mesh(
 
     def work(console: Console, wish: Wish) -> Outcome:
         known, sources = read_scan(scan), open_sources(runs, None)
-        height_px, width_px = sources.images[0].read()[0].shape
-        prior = read_posed_camera(hand_eye, camera, sources.about, (width_px, height_px))
+        for made_with in (hand_eye, camera, rig):
+            sources = sources.with_file(made_with)
+        size_px = sources.images[0].read().size_px
+        prior = read_posed_camera(hand_eye, camera, sources.about, size_px)
         depth_mm = (nearest_mm, farthest_mm)
         with bar(console, "looking for stickers") as progress:
             images = find_all_stickers(
                 sources, prior.lens, diameter_mm=diameter_mm, depth_mm=depth_mm, progress=progress
             )
         console.print(f"{sum(map(len, images.stickers))} stickers in {len(images.names)} images")
-        support = None
+        support, arm = None, None
         if rig is not None:
             place = _cell(rig, runs).rig.support.base_from_support
             support = transform(place.translation_mm, place.abc_deg)
+        if has_axis_zeros(hand_eye):
+            arm = _arm(_cell(rig, runs), hand_eye)
         stated = Stated(scanner_mm=scanner_mm, robot_mm=repeatability_mm, robot_deg=repeatability_deg)
         found = mesh_from(
-            images, sources, known, prior, wish, stated=stated, depth_mm=depth_mm, base_from_support=support
+            images,
+            sources,
+            known,
+            prior,
+            wish,
+            stated=stated,
+            depth_mm=depth_mm,
+            base_from_support=support,
+            arm=arm,
         )
         return Outcome(found.record, partial(draw_mesh, found))
 
-    calibrate("mesh", work, out=out, name=name, lens=None, valid_days=valid_days, as_json=as_json)
+    calibrate(
+        "mesh",
+        work,
+        out=out,
+        name=name,
+        lens=None,
+        valid_days=valid_days,
+        as_json=as_json,
+        limit=limit,
+        limits=MESH,
+    )
+
+
+def _arm(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
+    """The rig's arm by a hand-eye record; None for a record without axis zeros. Raises InputError where the rig's
+    driver knows no model of the arm."""
+    from coupole.calibration.calibrated_arm import has_axis_zeros, read_arm
+    from coupole.rig import planning_arm
+
+    if not has_axis_zeros(hand_eye):
+        return None
+    arm = planning_arm(cell.rig)
+    if arm is None:
+        raise InputError(
+            f"{hand_eye}: was made with the arm's model, but the rig's robot has none; name the rig that it was "
+            "made with by --rig"
+        )
+    return read_arm(hand_eye, arm)
 
 
 def _cell(rig: Path | None, runs: list[Path]) -> Cell:

@@ -1,4 +1,4 @@
-"""`coupole calibrate camera` and `hand-eye`."""
+"""`coupole calibrate camera`, `chromatic` and `hand-eye`."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from coupole.calibration.limits import CAMERA, CHROMATIC, HAND_EYE
 from coupole.commands.calibrating import (
     DaysOption,
     LensOption,
@@ -16,6 +17,7 @@ from coupole.commands.calibrating import (
     Paths,
     bar,
     calibrate,
+    limit_option,
 )
 from coupole.commands.common import JsonOption
 from coupole.errors import InputError
@@ -43,6 +45,7 @@ def camera(
     paths: Paths,
     board: BoardOption = None,
     model: ModelOption = "brown5",
+    limit: Annotated[list[str] | None, limit_option(CAMERA)] = None,
     out: OutOption = Path("calibrations"),
     name: NameOption = None,
     lens: LensOption = None,
@@ -57,7 +60,34 @@ def camera(
         sources, _, found = _look(paths, board, None, console)
         return _drawn(camera_from(found, sources, model, wish)[1])
 
-    calibrate("camera", work, out=out, name=name, lens=lens, valid_days=valid_days, as_json=as_json)
+    calibrate("camera", work, out=out, name=name, lens=lens, valid_days=valid_days, as_json=as_json,
+              limit=limit, limits=CAMERA)  # fmt: skip
+
+
+def chromatic(
+    paths: Paths,
+    board: BoardOption = None,
+    model: ModelOption = "brown5",
+    limit: Annotated[list[str] | None, limit_option(CHROMATIC)] = None,
+    out: OutOption = Path("calibrations"),
+    name: NameOption = None,
+    lens: LensOption = None,
+    valid_days: DaysOption = 180,
+    as_json: JsonOption = False,
+) -> None:
+    """How far red and blue are seen beside green, from the images that give the lens."""
+    from coupole.calibration.chromatic_workflow import chromatic_from, draw_chromatic
+    from coupole.calibration.report import Outcome
+
+    def work(console: Console, wish: Wish) -> Outcome:
+        _refuse_unknown_model(model)
+        sources, described, shown = _look(paths, board, None, console)
+        with console.status("adjusting a lens for each colour"):
+            found = chromatic_from(shown, sources, described, model, wish)
+        return Outcome(found.record, partial(draw_chromatic, found))
+
+    calibrate("chromatic", work, out=out, name=name, lens=lens, valid_days=valid_days, as_json=as_json,
+              limit=limit, limits=CHROMATIC)  # fmt: skip
 
 
 def hand_eye(
@@ -76,6 +106,7 @@ def hand_eye(
     absolute_mm: Annotated[float, typer.Option(min=0.0, help="The robot's absolute error, as stated.")] = 0.3,
     absolute_deg: Annotated[float, typer.Option(min=1e-5, help="Of orientation, or of each axis' zero.")] = 0.02,
     model: ModelOption = "brown5",
+    limit: Annotated[list[str] | None, limit_option(HAND_EYE)] = None,
     out: OutOption = Path("calibrations"),
     name: NameOption = None,
     lens: LensOption = None,
@@ -88,15 +119,17 @@ def hand_eye(
 
     def work(console: Console, wish: Wish) -> Outcome:
         _refuse_unknown_model(model)
-        earlier, arm = _earlier_lens(camera_record), _arm(rig)
+        arm = _arm(rig)
         sources, described, found = _look(paths, board, poses, console)
+        earlier = _earlier_lens(camera_record, sources, found)
         sources = sources.with_file(camera_record).with_file(rig)
         robot = RobotNoise(repeatability_mm, repeatability_deg, absolute_mm, absolute_deg)
         with console.status("adjusting lens, hand-eye, board and the robot's errors"):
             shown = hand_eye_from(found, sources, described, model, wish, robot=robot, arm=arm, lens=earlier)[2]
         return _drawn(shown)
 
-    calibrate("hand-eye", work, out=out, name=name, lens=lens, valid_days=valid_days, as_json=as_json)
+    calibrate("hand-eye", work, out=out, name=name, lens=lens, valid_days=valid_days, as_json=as_json,
+              limit=limit, limits=HAND_EYE)  # fmt: skip
 
 
 def _drawn(shown: Shown) -> Outcome:
@@ -134,9 +167,11 @@ def _look(
     return sources, described, found
 
 
-def _earlier_lens(path: Path | None) -> EarlierLens | None:
-    """The lens of a camera's record, with its covariance."""
+def _earlier_lens(path: Path | None, sources: Sources, found: Found) -> EarlierLens | None:
+    """The lens of a camera's record, with its covariance. Raises InputError for a record that does not hold for
+    these images."""
     from coupole.calibration.bundle import EarlierLens
+    from coupole.calibration.posed_camera import refuse_other_camera
     from coupole.calibration.record import intrinsics_of, read_record
 
     if path is None:
@@ -144,6 +179,7 @@ def _earlier_lens(path: Path | None) -> EarlierLens | None:
     record = read_record(path)
     if record.kind != "camera":
         raise InputError(f"{path}: expected a camera's record, found one of the kind `{record.kind}`")
+    refuse_other_camera(path, record, sources.about, found.size_px)
     intrinsics, free = intrinsics_of(record)
     return EarlierLens(intrinsics, free, record.covariance_matrix)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from coupole.calibration.limits import Allowed, asked, words_of
 from coupole.commands.common import fail
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from coupole.calibration.irradiance import Emission
     from coupole.calibration.record import Record
     from coupole.calibration.report import Outcome
     from coupole.calibration.workflow import Wish
@@ -28,7 +30,23 @@ Paths = Annotated[
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for the record, its page and its picture.")]
 NameOption = Annotated[str | None, typer.Option("--name", help="Of the record; kind and date if not given.")]
 LensOption = Annotated[str | None, typer.Option("--lens", help="Which lens it is, in words.")]
+EmissionOption = Annotated[str, typer.Option("--emission", help="lambertian, or paper (its cosine twice).")]
 DaysOption = Annotated[int, typer.Option("--valid-days", min=1, max=3650, help="When the record expires.")]
+
+
+def limit_option(limits: Sequence[Allowed]) -> Any:
+    """`--limit`, with a calibration's limits in its help."""
+    words = f"Set an acceptance limit; again for more. Usual are {words_of(limits)}."
+    return typer.Option("--limit", metavar="NAME=VALUE", help=words)
+
+
+def emission_of(name: str) -> Emission:
+    """The profile of that name. Raises InputError if there is none."""
+    if name == "lambertian":
+        return "lambertian"
+    if name == "paper":
+        return "paper"
+    raise InputError(f"--emission: expected lambertian or paper, found {name}")
 
 
 def calibrate(
@@ -40,8 +58,13 @@ def calibrate(
     lens: str | None,
     valid_days: int,
     as_json: bool,
+    limit: Sequence[str] | None = None,
+    limits: Sequence[Allowed] = (),
 ) -> None:
-    """Do the work, write record, files and report, say what was found, refuse what misses its limits."""
+    """Do the work, write record, files and report, say what was found, refuse what misses its limits.
+
+    `limit` is what the operator said of the calibration's `limits`.
+    """
     from coupole.calibration.report import write_outcome
     from coupole.calibration.workflow import Wish
     from coupole.console import make_console
@@ -49,7 +72,7 @@ def calibrate(
     console = make_console(quiet=as_json)
     now = datetime.now(UTC)
     try:
-        wish = Wish(name or f"{kind}-{now:%Y%m%d}", now, valid_days, lens)
+        wish = Wish(name or f"{kind}-{now:%Y%m%d}", now, valid_days, lens, limits=asked(limit or (), limits))
         record_path = out / f"{wish.name}.yaml"
         if record_path.exists():
             raise InputError(f"{record_path}: a record stands here already. Choose another --name or --out.")
@@ -104,8 +127,11 @@ def _show(console: Console, record: Record) -> None:
         console.print(f"[yellow]{remark}[/]")
     for limit in record.limits:
         colour, how = ("green", "met") if limit.passed else ("red", "missed")
+        usual = "" if limit.usual is None else f", usually {limit.usual:.3g}"
+        name = "" if limit.name is None else f", --limit {limit.name}"
         console.print(
-            f"[{colour}]{how}[/] {limit.what}: {limit.found:.3g} {limit.unit} (at most {limit.limit:.3g})"
+            f"[{colour}]{how}[/] {limit.what}: {limit.found:.3g} {limit.unit} "
+            f"(at most {limit.limit:.3g}{usual}{name})"
         )
 
 

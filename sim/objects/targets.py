@@ -63,6 +63,11 @@ def with_stickers(
 ) -> Surface:
     """The surface with `count` flat stickers put onto it; `sticker_poses` says where, and is the truth."""
     poses = sticker_poses(surface, count, seed, diameter_mm=diameter_mm, gap_mm=gap_mm, where=where)
+    return stuck_on(surface, poses, diameter_mm=diameter_mm)
+
+
+def stuck_on(surface: Surface, poses: Array, *, diameter_mm: float = 6.0) -> Surface:
+    """The surface with a flat sticker at each of `poses` [n, 4, 4]."""
     one = sticker(diameter_mm, border_mm=diameter_mm * _BORDER)
     return joined([surface, *(moved(one, pose) for pose in poses)])
 

@@ -10,6 +10,8 @@ import pytest
 from ruamel.yaml import YAML
 
 from coupole.calibration.record import read_record
+from coupole.commands.campaign import Campaign, Repeatability
+from coupole.console import make_console
 from coupole.templates import TEMPLATES
 
 STEPS = ("--only", "darks", "--only", "response")
@@ -65,3 +67,20 @@ def test_a_step_that_does_not_exist_is_refused() -> None:
     ended = cells.here("calibrate", "all", "--only", "nothing")
     assert ended.code == 2
     assert "darks" in ended.err
+
+
+def test_a_real_cell_is_asked_for_the_object_s_scan(tmp_path: Path) -> None:
+    rig = cells.REPO / "configs/rigs/la-coupole.yaml"
+    ended = cells.here("calibrate", "all", "--rig", rig, "--out", tmp_path, "--only", "mesh")
+    assert ended.code == 2
+    assert "--scan FOLDER" in ended.err
+
+
+def test_a_description_of_the_tile_that_was_changed_by_hand_is_kept(rig: Path, tmp_path: Path) -> None:
+    out = tmp_path / "calibrations"
+    out.mkdir()
+    (out / "tile.yaml").write_text("schema_version: 1\nside_mm: 40.0\n")
+    Campaign(
+        rig, out, None, Repeatability(0.03, 0.003), simulated=True, ask=False, console=make_console(quiet=True)
+    )
+    assert (out / "tile.yaml").read_text() == "schema_version: 1\nside_mm: 40.0\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -58,49 +59,64 @@ def shoot(count: int = 9, seed: int = 3) -> Shoot:
     return Shoot(tuple(pictures), tuple(poses))
 
 
-def write_folder(folder: Path, *, metres_said_mm: bool = False) -> Path:
-    """Pictures of 8 bits, `poses.yaml` and `board.yaml`; positions in metres, said to be in mm if so wanted."""
+def write_folder(folder: Path, *, metres_said_mm: bool = False, radians_said_deg: bool = False) -> Path:
+    """Pictures of 8 bits, `poses.yaml` and `board.yaml`; in metres that are said to be mm, with Euler angles in
+    radians that are said to be degrees, if so wanted."""
     import cv2
 
     folder.mkdir(parents=True)
     made = shoot()
-    lines = ["schema_version: 1", f"length_unit: {'mm' if metres_said_mm else 'm'}", "angle_unit: rad"]
-    lines += ["rotation: rotation_vector", "poses:"]
+    lines = ["schema_version: 1", f"length_unit: {'mm' if metres_said_mm else 'm'}"]
+    lines += [f"angle_unit: {'deg' if radians_said_deg else 'rad'}"]
+    lines += [f"rotation: {'abc' if radians_said_deg else 'rotation_vector'}", "poses:"]
     for number, (picture, pose) in enumerate(zip(made.pictures, made.base_from_flange, strict=True)):
         cv2.imwrite(str(folder / f"{number}.png"), np.rint(20 + 190 * picture).astype(np.uint8))
-        numbers = [*(pose[:3, 3] / 1000), *Rotation.from_matrix(pose[:3, :3]).as_rotvec()]
+        turn = Rotation.from_matrix(pose[:3, :3])
+        angles = turn.as_euler("ZYX") if radians_said_deg else turn.as_rotvec()
+        numbers = [*(pose[:3, 3] / 1000), *angles]
         lines.append(f"  {number}.png: [{', '.join(f'{v:.9f}' for v in numbers)}]")
     (folder / "poses.yaml").write_text("\n".join(lines) + "\n")
     (folder / "board.yaml").write_text(BOARD_YAML)
     return folder
 
 
-def write_run(folder: Path) -> Run:
-    """A run with two lit frames and a dark one in each view, some noise on all of them."""
+def write_run(
+    folder: Path,
+    made: Shoot | None = None,
+    *,
+    light: Sequence[float] | float = 0.8,
+    room_c: float = 25.1,
+    red_scale: float = 1.0,
+) -> Run:
+    """A run with two lit frames and a dark one in each view, some noise on all of them.
+
+    `light` is that of each view's brighter frame; at 1.4 half of the board is white beyond the scale. Red pixels
+    see all `red_scale` times as far from the lens's centre.
+    """
     folder.mkdir(parents=True)
     for name in ("plan.yaml", "rig.yaml"):
         (folder / name).write_text(f"# {name}\n")
-    made = shoot()
+    made = made or shoot()
+    lights = np.broadcast_to(light, len(made.pictures))
     views = [f"v{number}" for number in range(len(made.pictures))]
     labels = ["dark0/e0", "led0003/e0", "led0500/e0"]
     about = {"views": views, "labels": labels, "simulated": True}
     run = Run.create(folder, "board", Inputs(folder / "plan.yaml", folder / "rig.yaml", ()), about)
     diary, random = Journal(run.journal_path), np.random.default_rng(8)
     diary.write("start")
-    for view, picture, pose in zip(views, made.pictures, made.base_from_flange, strict=True):
+    for view, picture, pose, bright in zip(views, made.pictures, made.base_from_flange, lights, strict=True):
         path = run.view_path(view)
         store.create(path, len(labels), FORMAT, {**METADATA, "title": view, "focus_distance_mm": 335.0})
         writer = ViewWriter(path, {})
         at = writer.add_pose(ArmState((0, -90, 90, 0, 90, 0), pose, 7, moving=False), pose @ FLANGE_FROM_CAMERA)
         for number, label in enumerate(labels):
-            light = 0.0 if label.startswith("dark") else (0.8, 0.5)[number - 1]
+            share = 0.0 if label.startswith("dark") else bright * (1.0, 0.625)[number - 1]
             pixels = np.frombuffer(mmap.mmap(-1, FORMAT.frame_bytes), np.uint16).reshape(picture.shape)
-            signal = 64 + light * _bayer(200 + 3000 * picture) + random.normal(0, 6, picture.shape)
+            signal = 64 + share * _bayer(200 + 3000 * picture, red_scale) + random.normal(0, 6, picture.shape)
             pixels[:] = np.clip(np.rint(signal), 0, 4095)
             slot = writer.put(pixels, frame_id=number, camera_ns=number, exposure_us=8000)
-            digest = writer.prove(
-                slot, f"{view}/{label}", led=number, pose=at, board_temperature_dc=251, led_current_ma=700
-            )
+            warmth = {"board_temperature_dc": round(10 * room_c), "led_current_ma": 700}
+            digest = writer.prove(slot, f"{view}/{label}", led=number, pose=at, **warmth)
             file = str(path.relative_to(run.folder))
             diary.write(
                 "frame", shot=f"{view}/{label}", file=file, index=slot, frame_id=number, xxh3=f"{digest:016x}"
@@ -113,9 +129,15 @@ def write_run(folder: Path) -> Run:
     return run
 
 
-def _bayer(picture: Array) -> Array:
+def _bayer(picture: Array, red_scale: float) -> Array:
     """Each colour at a brightness of its own, GBRG."""
+    from scipy.ndimage import affine_transform
+
     coloured = picture.copy()
     coloured[0::2, 1::2] *= 0.45
-    coloured[1::2, 0::2] *= 0.6
+    centre = np.array(LENS.centre_px[::-1])
+    red = affine_transform(
+        picture, np.full(2, 1 / red_scale), centre * (1 - 1 / red_scale), order=3, mode="nearest"
+    )
+    coloured[1::2, 0::2] = 0.6 * red[1::2, 0::2]
     return coloured

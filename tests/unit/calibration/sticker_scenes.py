@@ -10,8 +10,8 @@ from bright_squares import BLACK_DN, covered, raw
 from scipy.spatial.transform import Rotation
 from synthesis import Array, TrueLens, frame
 
-from coupole.calibration.board import plane
 from coupole.calibration.optics import NAMES, Intrinsics
+from coupole.calibration.picture import Picture
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.poses import reported
 from coupole.calibration.sources import About, Source, Sources
@@ -47,8 +47,8 @@ def scene(seed: int, *, stickers: int = 14, views: int = 8, missing: int = 0) ->
         mesh_from_camera = _eye(random, 360.0 * number / views)
         camera_from_mesh = np.linalg.inv(mesh_from_camera)
         picture = _picture(camera_from_mesh, places[: stickers - missing], normals)
-        image = plane(raw(picture, random) - float(BLACK_DN), "GBRG")
-        images.append(Source(f"v{number}", lambda image=image: (image, 4031.0)))  # type: ignore[misc]
+        image = Picture(raw(picture, random) - float(BLACK_DN), "GBRG", 4031.0)
+        images.append(Source(f"v{number}", lambda image=image: image))  # type: ignore[misc]
         flange = base_from_mesh @ mesh_from_camera @ np.linalg.inv(flange_from_camera)
         off = frame(random.normal(0, 0.03, 3), random.normal(0, 0.003, 3))
         said = flange.copy()

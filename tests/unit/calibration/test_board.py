@@ -9,15 +9,16 @@ import pytest
 from boards import CHARUCO, CHESS, LENS, as_dn, magnified, picture_of
 from synthesis import Array
 
-from coupole.calibration.board import Board, Sighting, detect, in_channel, plane, read_board
+from coupole.calibration.board import Board, Sighting, detect, in_channel, read_board
+from coupole.calibration.picture import Picture
 from coupole.errors import InputError
 
 PATTERNS = ("GBRG", "GRBG", "RGGB", "BGGR")
 BOARDS = pytest.mark.parametrize("board", [CHARUCO, CHESS], ids=lambda board: board.kind)
 
 
-def found(board: Board, image: Array, **options: float) -> Sighting:
-    sighting = detect(board, image, "picture", **options)
+def found(board: Board, picture: Picture) -> Sighting:
+    sighting = detect(board, picture)
     assert isinstance(sighting, Sighting), sighting
     return sighting
 
@@ -28,20 +29,21 @@ def rms(distances: Array) -> float:
 
 @BOARDS
 @pytest.mark.parametrize(("dtype", "white"), [(np.uint8, 255), (np.uint16, 4095)], ids=["8 bits", "12 bits"])
-def test_corners_are_found_to_a_twentieth_of_a_pixel(board: Board, dtype: type, white: int) -> None:
+def test_corners_are_found_to_a_fiftieth_of_a_pixel(board: Board, dtype: type, white: int) -> None:
     picture = picture_of(board, 3)
-    seen = found(board, as_dn(picture.pixels, white, noise_dn=white / 400).astype(dtype), white=float(white))
+    image = as_dn(picture.pixels, white, noise_dn=white / 400).astype(dtype)
+    seen = found(board, Picture.of_grey(image, white=float(white)))
     error = seen.pixels - picture.corners[seen.ids]
     assert len(seen.ids) > 0.9 * len(board.points_mm)
-    assert rms(error) < 0.06
-    assert np.abs(error.mean(axis=0)).max() < 0.02
+    assert rms(error) < 0.02
+    assert np.abs(error.mean(axis=0)).max() < 0.005
 
 
 @BOARDS
 def test_a_board_seen_upside_down_has_the_same_numbers(board: Board) -> None:
     for seed in (1, 4):  # turned by different angles
         picture = picture_of(board, seed)
-        seen = found(board, as_dn(picture.pixels, 255).astype(np.uint8))
+        seen = found(board, Picture.of_grey(as_dn(picture.pixels, 255).astype(np.uint8)))
         assert np.abs(seen.pixels - picture.corners[seen.ids]).max() < 0.5
 
 
@@ -49,18 +51,18 @@ def test_a_board_seen_upside_down_has_the_same_numbers(board: Board) -> None:
 def test_the_green_pixels_of_a_raw_frame_give_corners_where_they_are_in_the_frame(pattern: str) -> None:
     picture = picture_of(CHARUCO, 2)
     frame = raw(picture.pixels, picture.pixels, pattern)
-    seen = found(CHARUCO, plane(frame, pattern), white=4095.0)
+    seen = found(CHARUCO, Picture(frame, pattern, 4095.0))
     error = seen.pixels - picture.corners[seen.ids]
-    assert rms(error) < 0.08
-    assert np.abs(error.mean(axis=0)).max() < 0.02
+    assert rms(error) < 0.03
+    assert np.abs(error.mean(axis=0)).max() < 0.005
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_lateral_colour_is_seen_between_green_and_red(pattern: str) -> None:
     green, red = picture_of(CHARUCO, 2), picture_of(CHARUCO, 2, magnified(LENS, 1.003))
     frame = raw(green.pixels, red.pixels, pattern)
-    in_green = found(CHARUCO, plane(frame, pattern), white=4095.0)
-    in_red = in_channel(CHARUCO, plane(frame, pattern, "red"), in_green)
+    in_green = found(CHARUCO, Picture(frame, pattern, 4095.0))
+    in_red = in_channel(CHARUCO, Picture(frame, pattern, 4095.0), "red", in_green)
     error = in_red.pixels - red.corners[in_red.ids]
     apart = (red.corners - green.corners)[in_red.ids]
     assert rms(error) < 0.2
@@ -82,20 +84,21 @@ def raw(green: Array, red: Array, pattern: str) -> Array:
 def test_a_clipped_picture_is_named_so() -> None:
     picture = picture_of(CHARUCO, 0)
     overexposed = np.clip(as_dn(picture.pixels, 4095) * 1.6, 0, 4095).astype(np.uint16)
-    assert "clipped" in str(detect(CHARUCO, overexposed, "picture", white=4095.0))
+    assert "clipped" in str(detect(CHARUCO, Picture.of_grey(overexposed, white=4095.0)))
 
 
 def test_a_picture_without_a_board_says_how_many_corners_it_has() -> None:
-    assert detect(CHARUCO, np.full((480, 640), 100, np.uint8), "empty") == "0 of 70 corners seen, 8 needed"
+    empty = Picture.of_grey(np.full((480, 640), 100, np.uint8))
+    assert detect(CHARUCO, empty) == "0 of 70 corners seen, 8 needed"
 
 
 def test_a_board_that_is_partly_hidden_gives_the_corners_that_are_left() -> None:
     picture = picture_of(CHARUCO, 0)
     image = as_dn(picture.pixels, 255).astype(np.uint8)
     image[:, :330] = 128
-    seen = found(CHARUCO, image)
+    seen = found(CHARUCO, Picture.of_grey(image))
     assert 10 < len(seen.ids) < 60
-    assert rms(seen.pixels - picture.corners[seen.ids]) < 0.1
+    assert rms(seen.pixels - picture.corners[seen.ids]) < 0.03
 
 
 def test_a_description_is_read_and_its_mistakes_are_named_with_their_lines(tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def test_intervals_are_asymmetric_where_the_normal_is_uncertain() -> None:
 
 def test_with_exact_vertices_the_linear_formula_will_do() -> None:
     found = budget_of(Known(vertex_mm=1e-6), Geometry(30.0), digits=1, most_trials=300_000)
-    assert all(validation.passed for validation in found.validations)
+    assert all(validation.passed for validation in found.validations if validation.digits == 1)
     assert found.numeric.u == pytest.approx(found.linear.result.u, rel=0.02)
 
 

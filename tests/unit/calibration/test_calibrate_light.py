@@ -15,6 +15,7 @@ from typer.testing import CliRunner, Result
 
 from coupole.calibration.record import Record, read_record
 from coupole.commands import calibrate_light
+from coupole.commands.budget import budget
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
 
 SHAPE = (SIZE_PX[1], SIZE_PX[0])
@@ -130,7 +131,7 @@ def test_views_of_a_panel_become_a_flat_field(tmp_path: Path, dark_record: Path)
 
 
 def test_the_budget_takes_what_records_say(tmp_path: Path, response_record: Path) -> None:
-    result = run(calibrate_light.budget, response_record, "--out", tmp_path / "budget.png", "--json")
+    result = run(budget, response_record, "--out", tmp_path / "budget.png", "--json")
     document = json.loads(result.stdout)
     assert {s["said_by"] for s in document["sources"]} >= {"response x", "seed 003"}
     assert (tmp_path / "budget.png").stat().st_size > 10_000

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import cells
 import numpy as np
 import pytest
+from photographed import BOARD_YAML, write_folder, write_run
 from synthesis import Cell, make_cell
 
 from coupole.calibration.board import Sighting
 from coupole.calibration.chromatic import calibrate_channels
+from coupole.calibration.record import read_record
 from coupole.errors import InputError
 
 MAGNIFIED = 1.0004
@@ -51,3 +55,30 @@ def test_channels_with_different_images_are_refused() -> None:
     cell = make_cell(32, images=8)
     with pytest.raises(InputError, match="every channel needs the same images"):
         calibrate_channels({"green": cell.sightings, "red": cell.sightings[:7]}, cell.size_px)
+
+
+def test_the_command_finds_a_red_that_is_magnified_and_a_blue_that_is_not(tmp_path: Path) -> None:
+    board = tmp_path / "board.yaml"
+    board.write_text(BOARD_YAML)
+    run = write_run(tmp_path / "run", red_scale=1.002).folder
+    words = ("--board", board, "--model", "radial", "--out", tmp_path, "--name", "colours", "--json")
+    ended = cells.here("calibrate", "chromatic", run, *words)
+    assert ended.code in (0, 3), ended.err
+    record = read_record(tmp_path / "colours.yaml")
+    assert record.kind == "chromatic"
+    names = [parameter.name for parameter in record.parameters]
+    for channel, true in (("red", 1.002), ("blue", 1.0)):
+        apart = np.zeros(len(names))
+        apart[names.index(f"{channel}.fx_px")], apart[names.index("green.fx_px")] = 1.0, -1.0
+        found = record.value(f"{channel}.fx_px") - record.value("green.fx_px")
+        u = np.sqrt(apart @ record.covariance_matrix @ apart)
+        assert abs(found - (true - 1.0) * record.value("green.fx_px")) < 4.0 * u
+        assert u < 0.5
+    assert any(remark.startswith("red is seen up to 0.") for remark in record.remarks)
+    assert (tmp_path / "colours.png").stat().st_size > 10_000
+
+
+def test_pictures_without_colours_are_refused(tmp_path: Path) -> None:
+    ended = cells.here("calibrate", "chromatic", write_folder(tmp_path / "grey"), "--out", tmp_path)
+    assert ended.code == 2
+    assert "there is no red in it" in ended.err

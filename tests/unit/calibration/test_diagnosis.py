@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthesis import Array, Cell, frame, make_cell
 
-from coupole.calibration import diagnosis
+from coupole.calibration import hypotheses
 from coupole.calibration.camera import calibrate_camera
 from coupole.calibration.diagnosis import Diagnosis, diagnose, expected_scatter
 from coupole.calibration.poses import Convention, ReportedPoses, reported
@@ -56,7 +56,7 @@ def test_positions_in_another_unit_are_named(said: str) -> None:
     poses = numbers()
     poses[:, :3] *= 1e-3 if said == "mm" else 1.0  # what is said is wrong
     found = judged(ReportedPoses(poses, Convention(length_unit=said)))
-    assert found.cause == diagnosis.UNITS
+    assert found.cause == hypotheses.UNITS
     assert f"positions are in {'m' if said == 'mm' else 'mm'}, not {said}" in found.sentences()[1]
 
 
@@ -80,7 +80,7 @@ def test_radians_taken_for_degrees_and_the_other_way_are_named(rotation: str) ->
 def test_angles_written_backwards_are_named() -> None:
     poses = numbers()[:, [0, 1, 2, 5, 4, 3]]
     found = judged(ReportedPoses(poses, Convention()))
-    assert found.cause == diagnosis.ANGLES
+    assert found.cause == hypotheses.ANGLES
     assert "order (2, 1, 0)" in found.sentences()[1]
 
 
@@ -89,18 +89,18 @@ def test_angles_written_backwards_are_named() -> None:
 )
 def test_another_kind_of_angles_is_named(meant: str, said: str) -> None:
     found = judged(ReportedPoses(numbers(meant), Convention(rotation=said)))
-    assert found.cause == diagnosis.ANGLES
+    assert found.cause == hypotheses.ANGLES
 
 
 def test_inverse_poses_are_named() -> None:
     found = judged(reported(np.linalg.inv(seen()[0].base_from_flange)))
-    assert found.cause == diagnosis.INVERSE
+    assert found.cause == hypotheses.INVERSE
 
 
 def test_two_mistakes_at_once_are_both_named() -> None:
     poses = reported(np.linalg.inv(seen()[0].base_from_flange)).numbers
     poses[:, :3] *= 1e-3
-    assert judged(ReportedPoses(poses, Convention())).cause == f"{diagnosis.UNITS} and {diagnosis.INVERSE}"
+    assert judged(ReportedPoses(poses, Convention())).cause == f"{hypotheses.UNITS} and {hypotheses.INVERSE}"
 
 
 @pytest.mark.parametrize("change", [4, 7, 10])
@@ -108,7 +108,7 @@ def test_a_board_that_was_moved_in_mid_run_is_named_with_the_moment(change: int)
     board = seen()[1].copy()
     board[change:] = board[change:] @ frame(np.array([3.0, -2.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     found = judged(reported(seen()[0].base_from_flange), board)
-    assert found.cause == diagnosis.MOVED_BOARD
+    assert found.cause == hypotheses.MOVED_BOARD
     assert f"between image {change - 1} and image {change}" in found.sentences()[1]
 
 
@@ -119,8 +119,42 @@ def test_a_board_that_moved_by_less_than_a_bad_robot_may_err_is_named_too() -> N
     allowed = expected_scatter(board, pixel_px=0.1, focal_px=1600.0, robot_mm=0.3, robot_deg=0.02)
     names = [f"image {i}" for i in range(IMAGES)]
     found = diagnose(reported(cell.base_from_flange), board, allowed, names)
-    assert found.cause == diagnosis.MOVED_BOARD
+    assert found.cause == hypotheses.MOVED_BOARD
     assert "between image 5 and image 6" in found.sentences()[1]
+
+
+@cache
+def steady() -> tuple[Cell, Array]:
+    """A cell whose arm has repeatability alone, and the board as seen."""
+    cell = make_cell(3, images=24, robot_mm=0.03, robot_deg=0.003)
+    return cell, calibrate_camera(cell.sightings, cell.size_px).camera_from_board
+
+
+def of_steady(base_from_flange: Array, order: Array | None = None) -> Diagnosis:
+    cell, board = steady()
+    expected = expected_scatter(
+        board, pixel_px=0.1, focal_px=cell.lens.focal_px[0], robot_mm=0.03, robot_deg=0.003
+    )
+    order = np.arange(len(board)) if order is None else order
+    return diagnose(reported(base_from_flange[order]), board[order], expected, [f"image {i}" for i in order])
+
+
+def test_a_board_that_moved_by_a_few_times_the_noise_is_named_though_the_scatter_falls_little() -> None:
+    flange = steady()[0].base_from_flange
+    step = frame(np.array([0.2, -0.25, 0.0]), np.zeros(3))
+    moved = np.stack([step @ pose if n >= 13 else pose for n, pose in enumerate(flange)])
+    found = of_steady(moved)
+    assert found.scatter_mm < 3.0 * of_steady(flange).scatter_mm
+    assert found.cause == hypotheses.MOVED_BOARD
+    assert "between image 12 and image 13, by 0.3" in found.sentences()[1]
+
+
+def test_an_arm_that_errs_smoothly_over_the_cell_is_not_called_a_moved_board() -> None:
+    flange = steady()[0].base_from_flange.copy()
+    along = flange[:, 0, 3] - flange[:, 0, 3].mean()
+    flange[:, 1, 3] += 0.3 * along / np.abs(along).max()
+    found = of_steady(flange, np.argsort(along))
+    assert found.cause is None
 
 
 @pytest.mark.parametrize("wrong", [0, 6, 13])
@@ -128,14 +162,22 @@ def test_a_wrong_pair_is_named(wrong: int) -> None:
     flange = seen()[0].base_from_flange.copy()
     flange[wrong] = flange[wrong] @ frame(np.array([20.0, 0.0, 5.0]), np.array([3.0, 0.0, 0.0]))
     found = judged(reported(flange))
-    assert found.cause == diagnosis.WRONG_PAIR
+    assert found.cause == hypotheses.WRONG_PAIR
     assert f"image {wrong} " in found.sentences()[1]
+
+
+def test_two_poses_that_are_exchanged_are_named() -> None:
+    flange = seen()[0].base_from_flange.copy()
+    flange[[3, 9]] = flange[[9, 3]]
+    found = judged(reported(flange))
+    assert found.cause == hypotheses.WRONG_PAIR
+    assert "the poses of image 3 and image 9 are exchanged" in found.sentences()[1]
 
 
 def test_images_that_are_one_off_from_their_poses_are_named() -> None:
     cell, board = seen()
     found = judged(reported(cell.base_from_flange[:-1]), board[1:])
-    assert found.cause == diagnosis.SHIFTED
+    assert found.cause == hypotheses.SHIFTED
 
 
 def test_a_robot_that_is_merely_worse_than_stated_is_given_no_false_cause() -> None:

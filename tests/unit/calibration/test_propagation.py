@@ -86,10 +86,34 @@ def test_a_product_of_powers_agrees_with_its_closed_form() -> None:
     assert shortest.high - shortest.low < 2 * np.exp(sigma**2 / 2) * np.sinh(1.95996 * sigma)
 
 
-def test_a_linear_model_of_normal_inputs_passes_the_comparison() -> None:
+def test_a_linear_model_of_normal_inputs_passes_the_comparison_for_sure() -> None:
     inputs = four("normal")
-    found = validate(linear(added, inputs).result, monte_carlo(added, inputs, most_trials=2_000_000), digits=1)
-    assert all(test.passed for test in found)
+    numeric = monte_carlo(added, inputs, digits=1, within=0.2)
+    found = validate(linear(added, inputs).result, numeric, digits=1)
+    assert all(test.passed and test.sure for test in found)
+    assert {test.tolerance for test in found} == {0.5}, "u = 2 is 2 x 10^0 to one digit"
+
+
+def test_a_comparison_with_too_few_trials_near_the_tolerance_is_not_sure() -> None:
+    inputs = four("normal")
+    found = validate(linear(added, inputs).result, monte_carlo(added, inputs, most_trials=20_000), digits=3)
+    assert not all(test.sure for test in found)
+
+
+def test_the_ends_scatter_as_much_as_is_said_of_them() -> None:
+    inputs = four("normal")
+    runs = [monte_carlo(added, inputs, coverages=(0.95,), most_trials=100_000, seed=seed) for seed in range(40)]
+    lows = np.array([run.interval(0.95, "symmetric").low for run in runs])
+    said = np.median([run.interval(0.95, "symmetric").numerical for run in runs])
+    assert 0.6 < said / (2 * lows.std(ddof=1)) < 2.0
+
+
+def test_a_fifth_of_the_tolerance_takes_many_more_trials() -> None:
+    inputs = four("normal")
+    rough, fine = (monte_carlo(added, inputs, within=within, most_trials=4_000_000) for within in (1.0, 0.2))
+    assert rough.stable
+    assert fine.stable
+    assert fine.trials > 5 * rough.trials
 
 
 @given(st.floats(-0.99, 0.99))

@@ -21,6 +21,7 @@ from coupole.calibration.camera import board_pose, calibrate_camera, without_gro
 from coupole.calibration.diagnosis import diagnose, expected_scatter
 from coupole.calibration.hand_eye import METHODS, solve
 from coupole.calibration.optics import Intrinsics
+from coupole.calibration.picture import Picture
 from coupole.calibration.poses import Convention, ReportedPoses
 
 DATA = Path(__file__).parents[4] / "shared/data/handeye"
@@ -36,7 +37,8 @@ pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="ViSP's data are not o
 def sightings() -> tuple[Sighting, ...]:
     import cv2
 
-    found = [detect(BOARD, cv2.imread(str(DATA / f"{i}.png"), 0), f"{i}.png") for i in range(1, 9)]
+    images = [cv2.imread(str(DATA / f"{i}.png"), 0) for i in range(1, 9)]
+    found = [detect(BOARD, Picture.of_grey(image, name=f"{i}.png")) for i, image in enumerate(images, start=1)]
     assert all(isinstance(seen, Sighting) for seen in found), found
     return tuple(seen for seen in found if isinstance(seen, Sighting))
 

@@ -1,0 +1,107 @@
+"""Acceptance limits: which a calibration has, and how an operator sets one.
+
+A calibration lists its limits once, as `Allowed`; its command takes the list for `--limit NAME=VALUE` and for its
+help, its workflow for the record (`judged`). The record keeps what was usual beside what was asked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from coupole.errors import InputError
+
+if TYPE_CHECKING:
+    from coupole.calibration.record import Limit
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """One limit: the most that a figure may be."""
+
+    name: str
+    """For `--limit`, with its unit."""
+    what: str
+    usual: float
+    unit: str = ""
+
+
+IMAGES = (
+    Allowed("pixel_px", "noise of corners", 0.3, "px"),
+    Allowed("bare_field", "field without corners", 0.4),
+    Allowed("rejected", "corners left out", 0.05),
+    Allowed("clipped", "images too clipped for corners", 0.2),
+)
+"""`bare_field`: share of the field's 8 x 6 cells. `rejected`: share of the corners left out as gross errors."""
+CAMERA = (*IMAGES, Allowed("ray_px", "uncertainty at the field's corners", 0.5, "px"))
+"""`ray_px`: standard uncertainty of where the calibrated lens sees a point at the field's corners."""
+HAND_EYE = (
+    *IMAGES,
+    Allowed("centre_mm", "camera centre on the flange", 0.3, "mm"),
+    Allowed("turn_deg", "camera's turn", 0.05, "deg"),
+    Allowed("robot_ratio", "robot's noise, found over stated", 3.0),
+)
+"""`centre_mm`: standard uncertainty, all directions together (seed 003: 300 um)."""
+CHROMATIC = (
+    *IMAGES,
+    Allowed("shift_px", "uncertainty of the shift between colours", 0.1, "px"),
+)
+"""`shift_px`: standard uncertainty, the largest over the field."""
+
+LEDS = (
+    Allowed("missing", "LEDs not found", 0.02),
+    Allowed("centre_mm", "median centre", 0.7, "mm"),
+    Allowed("normal_deg", "median normal", 0.21, "deg"),
+    Allowed("robot_ratio", "robot's noise, found over stated", 3.0),
+    Allowed("rejected", "spots left out", 0.05),
+    Allowed("record_step", "camera and hand-eye from their record, in its u", 4.0),
+)
+"""`centre_mm`, `normal_deg`: standard uncertainties (seed 003: 700 um, 0.21 deg)."""
+
+
+def words_of(limits: Sequence[Allowed]) -> str:
+    """The limits for a command's help."""
+    return "; ".join(f"{each.name}={each.usual:g} ({each.what})" for each in limits)
+
+
+def asked(words: Sequence[str], limits: Sequence[Allowed]) -> dict[str, float]:
+    """`NAME=VALUE` as operators write it. Raises InputError: no such limit, given twice, not a positive number."""
+    found: dict[str, float] = {}
+    known = {each.name for each in limits}
+    for word in words:
+        name, _, text = word.partition("=")
+        if name not in known:
+            raise InputError(
+                f"--limit {word}: expected one of {', '.join(each.name for each in limits)}, then =VALUE"
+            )
+        if name in found:
+            raise InputError(f"--limit {word}: {name} is given twice")
+        try:
+            found[name] = float(text)
+        except ValueError:
+            found[name] = math.nan
+        if not 0.0 < found[name] < math.inf:
+            raise InputError(f"--limit {word}: expected a number greater than 0 after `{name}=`")
+    return found
+
+
+def judged(
+    limits: Sequence[Allowed], wanted: Mapping[str, float], found: Mapping[str, float]
+) -> tuple[Limit, ...]:
+    """How a calibration stands against its limits, as the record keeps it. `wanted` are those that the operator
+    set; `found` has a figure for each limit."""
+    from coupole.calibration.record import Limit
+
+    return tuple(
+        Limit(
+            what=each.what,
+            found=found[each.name],
+            limit=wanted.get(each.name, each.usual),
+            unit=each.unit,
+            name=each.name,
+            usual=each.usual if each.name in wanted else None,
+        )
+        for each in limits
+    )

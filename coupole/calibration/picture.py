@@ -1,0 +1,85 @@
+"""An image as calibrations look at it: RAW, grey or in three colours, one colour at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+
+Channel = Literal["green", "red", "blue"]
+CHANNELS: tuple[Channel, ...] = ("green", "red", "blue")
+"""Green first: the others are compared with it."""
+MONO, COLOUR = "MONO", "COLOUR"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What one camera image holds, black subtracted."""
+
+    values: NDArray[Any]
+    """[H, W]; of pattern `COLOUR` [H, W, 3]: red, green, blue."""
+    pattern: str
+    """Names of the four pixels at a RAW frame's top left, row by row; or `MONO`, or `COLOUR`."""
+    white: float
+    """Value of saturation."""
+    name: str = "picture"
+
+    @staticmethod
+    def of_grey(values: NDArray[Any], *, white: float | None = None, name: str = "picture") -> Picture:
+        """A grey image [H, W]; white is the greatest number that its type holds, if not given."""
+        if white is None:
+            white = float(np.iinfo(values.dtype).max) if np.issubdtype(values.dtype, np.integer) else float("inf")
+        return Picture(values, MONO, white, name)
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.values.shape[1], self.values.shape[0]
+
+    def plane(self, channel: Channel = "green") -> NDArray[Any]:
+        """One colour at full size [H, W]; grey is green. Raises InputError for another colour of a grey image."""
+        if self.pattern == COLOUR:
+            return np.asarray(self.values[..., ("red", "green", "blue").index(channel)])
+        if self.pattern == MONO:
+            self._refuse_grey(channel)
+            return self.values
+        return plane(self.values, self.pattern, channel)
+
+    def measured(self, channel: Channel = "green") -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """The values [H, W] that one colour's pixels really had, and which pixels those are: a tile [h, w] to be
+        repeated over the image."""
+        if self.pattern in (COLOUR, MONO):
+            return self.plane(channel), np.ones((1, 1), np.bool_)
+        known = np.array([letter == channel[0].upper() for letter in self.pattern]).reshape(2, 2)
+        return self.values, known
+
+    def _refuse_grey(self, channel: Channel) -> None:
+        if channel != "green":
+            raise InputError(
+                f"{self.name}: a grey image; there is no {channel} in it. Give colour pictures, or runs of a "
+                "colour camera"
+            )
+
+
+def plane(frame: NDArray[Any], pattern: str, channel: Channel = "green") -> NDArray[np.float32]:
+    """One channel of a RAW frame [H, W] at full size [H, W], DN: edges in it are edges in the frame.
+
+    `pattern` is the names of the four pixels at the frame's top left, row by row; `MONO` has one channel. Pixels
+    of other colours are left out of a mean with the weights 1 2 1 in both directions. Of green pixels it always
+    finds a weight of 8, of red and blue of 4, and both lie evenly about each pixel: nothing is shifted.
+    """
+    import cv2
+
+    if pattern == MONO:
+        return frame.astype(np.float32)
+    sparse = np.zeros(frame.shape, np.float32)
+    for place, letter in enumerate(pattern):
+        if letter == channel[0].upper():
+            sparse[place // 2 :: 2, place % 2 :: 2] = frame[place // 2 :: 2, place % 2 :: 2]
+    weights = np.array([1.0, 2.0, 1.0]) / np.sqrt(8.0 if channel == "green" else 4.0)
+    # The border is mirrored about its pixels, which keeps the colours in step.
+    return np.asarray(cv2.sepFilter2D(sparse, -1, weights, weights, borderType=cv2.BORDER_REFLECT_101))

@@ -1,0 +1,256 @@
+"""A campaign of calibrations: its steps in their order, and the folder that holds what they need and find."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from coupole.commands import calibrate_geometry, calibrate_lens, calibrate_light
+from coupole.errors import Interrupted
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+BOARD = """\
+schema_version: 1
+kind: charuco
+corners: [11, 8]
+square_mm: 16.0
+marker_mm: 9.6
+dictionary: DICT_5X5_250
+"""
+TILE = """\
+schema_version: 1
+side_mm: 50.0
+support_from_tile: {translation_mm: [0, 0, 10]}
+"""
+CERTIFICATE_OF_SIMULATED_TILE = "minnaert: 1.0\n"
+OBJECT: Mapping[str, Any] = {
+    "kind": "sculpted_relief",
+    "translation_mm": [6.0, -4.0, 0.5],
+    "abc_deg": [25.0, 0.0, 0.0],
+    "stickers": {"count": 24},
+}
+"""What a simulated cell has on its support for the mesh, and its scanner scans."""
+SCANNER = "sim.scanner:export_scan"
+MESH = "mesh"
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """Noise of the robot from pose to pose, as stated."""
+
+    mm: float
+    deg: float
+
+
+@dataclass(frozen=True)
+class Step:
+    """One acquisition and the records that are made from it."""
+
+    name: str
+    """Of the plan, and of its template."""
+    stands: str
+    """What must be on the support, for the operator."""
+    things: tuple[Mapping[str, Any], ...]
+    """The same for a simulated cell, which sets it up itself (`world.settings.things`)."""
+    records: tuple[str, ...]
+
+
+STEPS = (
+    Step("darks", "nothing; close the dome, no light of the room", (), ("dark",)),
+    Step("response", "a grey card", ({"kind": "grey_card"},), ("response",)),
+    Step("flat-field", "nothing", (), ("flat-field",)),
+    Step(
+        "charuco",
+        "the ChArUco board at the centre",
+        ({"kind": "charuco_board", "square_mm": 16.0, "marker_mm": 9.6},),
+        ("camera", "hand-eye"),
+    ),
+    Step("leds", "nothing", (), ("leds",)),
+    Step("spectralon", "the white tile at the centre", ({"kind": "spectralon_tile"},), ("led-power",)),
+    Step(MESH, "the scanned object with its stickers", (OBJECT,), (MESH,)),
+)
+
+
+class Campaign:
+    """The folder of a campaign: `plans/`, `rigs/`, `runs/`, and the records with their reports.
+
+    Plans and the descriptions of board and tile that stand there are kept: change them to yours.
+    """
+
+    def __init__(
+        self,
+        rig: Path,
+        out: Path,
+        scan: Path | None,
+        stated: Repeatability,
+        *,
+        simulated: bool,
+        ask: bool,
+        console: Console,
+    ) -> None:
+        self._rig, self._out, self._console = rig.resolve(), out.resolve(), console
+        self._given_scan, self._stated = scan, stated
+        self._simulated, self._ask = simulated, ask
+        for folder in ("plans", "rigs", "runs"):
+            (self._out / folder).mkdir(parents=True, exist_ok=True)
+        tile = TILE + (CERTIFICATE_OF_SIMULATED_TILE if simulated else "")
+        for name, text in (("board.yaml", BOARD), ("tile.yaml", tile)):
+            if not (self._out / name).exists():
+                (self._out / name).write_text(text, encoding="utf-8")
+
+    def found(self) -> dict[str, str]:
+        """Records that stand, by kind."""
+        kinds = [kind for step in STEPS for kind in step.records]
+        return {kind: str(self._record(kind)) for kind in kinds if self._record(kind).is_file()}
+
+    def do(self, step: Step) -> None:
+        """Acquire what is missing of a step, and calibrate what has no record yet."""
+        todo = [kind for kind in step.records if not self._record(kind).is_file()]
+        if not todo:
+            self._console.print(f"{step.name}: its records stand already")
+            return
+        run = self._acquire(step)
+        for kind in todo:
+            self._console.rule(f"calibrate {kind}")
+            self._calibrations()[kind](run)
+
+    def _acquire(self, step: Step) -> Path:
+        """The step's run, complete."""
+        from coupole.job import read_job
+        from coupole.run import Run, status
+        from coupole.session import acquire_plan
+
+        plan = self._plan(step)
+        begun = sorted((self._out / "runs").glob(f"*-{step.name}"))
+        resumed = begun[-1] if begun and (begun[-1] / "run.json").is_file() else None
+        if resumed is not None and not status(Run(resumed)).missing:
+            return resumed
+        self._console.rule(f"acquire {step.name}")
+        if self._ask:
+            self._console.print(f"On the support must stand: [bold]{step.stands}[/].")
+            if not typer.confirm("Ready?", default=True):
+                raise Interrupted("stopped by the operator; call it again to go on")
+        found: dict[str, Any] = {}
+        job = read_job(plan)
+        acquire_plan(job, self._console, parent=self._out / "runs", resume=resumed, confirm=self._ask, found=found)
+        return Path(found["run"])
+
+    def _plan(self, step: Step) -> Path:
+        """The step's plan; one that stands there, and may have been changed by hand, is kept."""
+        from coupole.calibration.led_plan import led_plan
+        from coupole.job import read_cell
+        from coupole.templates import LEDS, TEMPLATES
+
+        path, rig = self._out / "plans" / f"{step.name}.yaml", self._rig_of(step)
+        if path.exists():
+            return path
+        if step.name == LEDS:
+            with self._console.status("reading the rig") as status:
+                text = led_plan(read_cell(rig), name=step.name, rig=str(rig), tell=status.update)
+        else:
+            text = TEMPLATES[step.name].format(name=step.name, rig=rig)
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    def _rig_of(self, step: Step) -> Path:
+        """The rig; of a simulated cell a copy with the step's things on the support, kept as it stands there."""
+        path = self._out / "rigs" / f"{step.name}.yaml"
+        if not self._simulated:
+            return self._rig
+        if path.exists():
+            return path
+        from ruamel.yaml import YAML
+
+        yaml = YAML()
+        content = yaml.load(self._rig.read_text(encoding="utf-8"))
+        folder = self._rig.parent
+        content["dome"]["leds"] = str((folder / content["dome"]["leds"]).resolve())
+        content["storage"]["folder"] = str(self._out / "runs")
+        settings = content["world"].setdefault("settings", {})
+        settings["things"] = [*settings.get("things", ()), *(dict(thing) for thing in step.things)]
+        with path.open("w", encoding="utf-8") as file:
+            yaml.dump(content, file)
+        return path
+
+    def _scan(self) -> Path:
+        """The object's scan; a simulated cell's scanner makes one, which is taken in like any other."""
+        from coupole.rig import load_class
+        from coupole.scan import import_scan
+
+        if self._given_scan is not None:
+            return self._given_scan
+        folder = self._out / "scan"
+        if not folder.exists():
+            export: Any = load_class(SCANNER)
+            mesh, targets = export(OBJECT, self._out / "scanner")
+            with self._console.status("taking the scan in") as status:
+                import_scan(
+                    mesh,
+                    targets,
+                    folder,
+                    unit="mm",
+                    targets_unit=None,
+                    accept_defects=False,
+                    progress=status.update,
+                )
+        return folder
+
+    def _record(self, kind: str) -> Path:
+        return self._out / f"{kind}.yaml"
+
+    def _calibrations(self) -> dict[str, Callable[[Path], None]]:
+        """How each record is made from a run, with the records before it."""
+        record, out = self._record, self._out
+        dark, response, flat = record("dark"), record("response"), record("flat-field")
+        camera, hand_eye = record("camera"), record("hand-eye")
+        board = self._out / "board.yaml"
+        return {
+            "dark": lambda run: calibrate_light.dark([run], name="dark", out=out),
+            "response": lambda run: calibrate_light.response([run], dark_record=dark, name="response", out=out),
+            "flat-field": lambda run: calibrate_light.flat_field(
+                [run], dark_record=dark, response_record=response, name="flat-field", out=out
+            ),
+            "camera": lambda run: calibrate_lens.camera([run], board=board, name="camera", out=out),
+            "hand-eye": lambda run: calibrate_lens.hand_eye(
+                [run], board=board, camera_record=camera, rig=self._rig, name="hand-eye", out=out
+            ),
+            "leds": lambda run: calibrate_geometry.leds(
+                [run],
+                hand_eye=hand_eye,
+                camera=camera,
+                rig=self._rig,
+                repeatability_mm=self._stated.mm,
+                repeatability_deg=self._stated.deg,
+                name="leds",
+                out=out,
+            ),
+            "led-power": lambda run: calibrate_light.led_power(
+                [run],
+                tile=self._out / "tile.yaml",
+                rig=self._rig,
+                leds=record("leds") if record("leds").is_file() else None,
+                hand_eye=hand_eye,
+                camera=camera,
+                dark_record=dark,
+                response_record=response,
+                flat=flat,
+                name="led-power",
+                out=out,
+            ),
+            "mesh": lambda run: calibrate_geometry.mesh(
+                [run],
+                scan=self._scan(),
+                hand_eye=hand_eye,
+                rig=self._rig,
+                repeatability_mm=self._stated.mm,
+                repeatability_deg=self._stated.deg,
+                name="mesh",
+                out=out,
+            ),
+        }

@@ -1,0 +1,157 @@
+"""The loop closed for drift: LEDs that are warmer and older than when they were calibrated, seen on a tile."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import cells
+import numpy as np
+import pytest
+from cells import Ended
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+
+from coupole.calibration.light_frames import LightFrame, open_light_frames
+from coupole.calibration.record import Record, read_record
+from sim.led_light import LedModel, led_flux_factor
+
+LEDS = {"kind": "every", "every": 24}
+"""45 of them, all round the dome."""
+HOURS_SHONE, AMBIENT_C = 3000.0, 38.0
+BESIDE_MM = (60.0, -90.0)
+"""Where the tile lies beside an object."""
+
+
+def rig(folder: Path, things: list[dict[str, Any]], *, hours_shone: float, ambient_c: float) -> Path:
+    """The imperfect cell with small frames, faster than life."""
+    content: dict[str, Any] = YAML(typ="safe").load(cells.REPO / "configs/rigs/sim-imperfect.yaml")
+    content["sensor"] |= {"width_px": 256, "height_px": 192, "pixel_pitch_um": 88.0}
+    content["dome"]["leds"] = str(cells.REPO / "configs/domes/coupole.csv")
+    content["ledbox"]["settings"]["watchdog_s"] = 60.0
+    content["storage"]["folder"] = str(folder / "runs")
+    settings = content["world"]["settings"]
+    settings |= {"speed": 20.0, "things": things, "ledbox": {"ambient_c": ambient_c}}
+    settings["leds"] = {"hours_shone": hours_shone}
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "rig.yaml"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def acquire(folder: Path, x_mm: float, y_mm: float) -> Path:
+    """Two views of the tile at a place; returns the run."""
+    view = {"kind": "look_at", "target_mm": [x_mm, y_mm, 10], "distance_mm": 335}
+    directions = {
+        "low": {"azimuth_deg": -120, "elevation_deg": 45},
+        "high": {"azimuth_deg": 60, "elevation_deg": 72},
+    }
+    content = {
+        "schema_version": 1,
+        "name": "tile",
+        "rig": "rig.yaml",
+        "views": [{**view, "name": name, **direction} for name, direction in directions.items()],
+        "lights": LEDS,
+        "exposure": {"kind": "bracket", "exposures_us": [2000, 6000]},
+        "darks_per_view": 4,
+    }
+    (folder / "plan.yaml").write_text(json.dumps(content))
+    ended = cells.here("acquire", folder / "plan.yaml", "--json")
+    assert ended.code == 0, ended.err
+    return Path(ended.document["run"])
+
+
+def tile(folder: Path, x_mm: float, y_mm: float) -> Path:
+    """Its description."""
+    path = folder / "tile.yaml"
+    place = {"translation_mm": [x_mm, y_mm, 10.0]}
+    path.write_text(json.dumps({"schema_version": 1, "minnaert": 1.0, "support_from_tile": place}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the LEDs' powers, calibrated when they were new and cool."""
+    folder = tmp_path_factory.mktemp("calibrated")
+    new = rig(folder, [{"kind": "spectralon_tile"}], hours_shone=0.0, ambient_c=24.0)
+    run = acquire(folder, 0.0, 0.0)
+    where = ["--tile", tile(folder, 0.0, 0.0), "--rig", new, "--out", folder, "--name", "led-power"]
+    ended = cells.here("calibrate", "led-power", run, *where, "--json")
+    assert ended.code == 0, ended.err
+    return folder
+
+
+@pytest.fixture(scope="module")
+def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run of an object, the tile beside it, when the LEDs were old and warm."""
+    folder = tmp_path_factory.mktemp("later")
+    x_mm, y_mm = BESIDE_MM
+    things = [
+        {"kind": "spectralon_tile", "translation_mm": [x_mm, y_mm, 0.0]},
+        {"kind": "paint_wedge", "translation_mm": [-80.0, 60.0, 0.0]},
+    ]
+    rig(folder, things, hours_shone=HOURS_SHONE, ambient_c=AMBIENT_C)
+    run = acquire(folder, x_mm, y_mm)
+    run.rename(folder / "run")
+    return folder
+
+
+def drift(calibrated: Path, later: Path, out: Path, x_mm: float, y_mm: float) -> Ended:
+    where = ["--led-power", calibrated / "led-power.yaml", "--rig", later / "rig.yaml"]
+    where += ["--tile", tile(later, x_mm, y_mm), "--out", out, "--name", "drift"]
+    return cells.here("calibrate", "drift", later / "run", *where, "--json")
+
+
+def by_record(record: Record, frames: list[LightFrame], table: Path) -> tuple[NDArray[np.float64], ...]:
+    """Factor of each frame by the formula of the record, its relative uncertainty, and the truth."""
+    board_c = {int(row["id"]): float(row["board_c"]) for row in rows_of(table)}
+    leds = [int(frame.light[3:]) for frame in frames]
+    hours = np.array([(frame.t_s - record.value("start_s")) / 3600 for frame in frames])
+    warmer_k = np.array([frame.temperature_c - board_c[led] for frame, led in zip(frames, leds, strict=True)])
+    design = np.stack([np.ones_like(hours), hours, warmer_k], axis=1)
+    found = design @ [record.value(name) for name in ("level", "rate_per_h", "per_k")]
+    u = np.sqrt(np.einsum("ni,ij,nj->n", design, record.covariance_matrix, design))
+    steady = LedModel(flicker=0.0)
+    true = [
+        led_flux_factor(steady, led, 0, frame.temperature_c, hours=HOURS_SHONE)
+        / led_flux_factor(steady, led, 0, board_c[led])
+        for frame, led in zip(frames, leds, strict=True)
+    ]
+    return found, u, np.log(true)
+
+
+def rows_of(table: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(line for line in table.read_text().splitlines() if not line.startswith("#")))
+
+
+@pytest.mark.timeout(600)
+def test_the_factor_of_each_frame_is_that_of_the_world(calibrated: Path, later: Path, tmp_path: Path) -> None:
+    ended = drift(calibrated, later, tmp_path, *BESIDE_MM)
+    assert ended.code == 0, ended.err
+    record = read_record(tmp_path / "drift.yaml")
+    assert record.kind == "drift"
+    assert {line.name for line in record.inputs} >= {"led-power.yaml", "tile.yaml", "rig.yaml"}
+    frames = [frame for frame in open_light_frames([later / "run"]).lit if frame.light.startswith("led")]
+    found, u, true = by_record(record, frames, calibrated / "led-power.csv")
+    assert true.max() < -0.05  # it is drift that is looked for
+    assert np.abs(found - true).max() < 0.01
+    assert (np.abs(found - true) < 3 * u).all()
+
+
+@pytest.mark.timeout(600)
+def test_a_record_of_something_else_is_refused(calibrated: Path, later: Path, tmp_path: Path) -> None:
+    ended = drift(calibrated, later, tmp_path, *BESIDE_MM)
+    assert ended.code == 0, ended.err
+    own = ["--led-power", tmp_path / "drift.yaml", "--rig", later / "rig.yaml", "--tile", later / "tile.yaml"]
+    again = cells.here("calibrate", "drift", later / "run", *own, "--out", tmp_path, "--name", "again", "--json")
+    assert again.code == 2
+    assert "expected a record of the kind `led-power`, found `drift`" in again.err
+
+
+@pytest.mark.timeout(600)
+def test_a_run_without_the_tile_is_refused(calibrated: Path, later: Path, tmp_path: Path) -> None:
+    ended = drift(calibrated, later, tmp_path, 400.0, 300.0)
+    assert ended.code == 2
+    assert "no view shows the whole reference tile" in ended.err

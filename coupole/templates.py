@@ -22,7 +22,7 @@ def _board_views(count: int = 40) -> str:
 
 
 LEDS = "leds"
-"""A plan that is made for a rig's dome: `coupole.calibration.led_plan`."""
+"""A plan that is made for a rig's dome: `coupole.calibration.leds.plan`."""
 TEMPLATES = {
     "views": """\
 # yaml-language-server: $schema=plan.schema.json   (made by `coupole schema plan > plan.schema.json`)

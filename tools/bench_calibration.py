@@ -40,7 +40,7 @@ def _detection(rounds: int) -> dict[str, Any]:
     """One 12-megapixel image of a ChArUco board, to corners refined in 12 bits."""
     import cv2
 
-    from coupole.calibration.board import Board, detect
+    from coupole.calibration.lens.board import Board, detect
     from coupole.calibration.picture import Picture
 
     board = Board(kind="charuco", corners=(11, 8), square_mm=16.0, marker_mm=12.0)
@@ -121,8 +121,8 @@ def _scene(
 
 def _bundle(rounds: int) -> dict[str, Any]:
     """Lens, hand-eye and board from 45 images of 88 corners."""
-    from coupole.calibration.board import Sighting
-    from coupole.calibration.bundle import Poses, RobotNoise, calibrate_hand_eye
+    from coupole.calibration.lens.board import Sighting
+    from coupole.calibration.lens.bundle import Poses, RobotNoise, calibrate_hand_eye
     from coupole.calibration.optics import Intrinsics
 
     random = np.random.default_rng(1)
@@ -149,10 +149,10 @@ def _bundle(rounds: int) -> dict[str, Any]:
 
 def _leds(rounds: int) -> dict[str, Any]:
     """1080 LEDs on 180 boards, each seen six times."""
-    from coupole.calibration.led_adjustment import adjust_leds
-    from coupole.calibration.led_boards import Boards
-    from coupole.calibration.led_equations import Stated
-    from coupole.calibration.led_matching import LedSightings
+    from coupole.calibration.leds.adjustment import adjust_leds
+    from coupole.calibration.leds.boards import Boards
+    from coupole.calibration.leds.equations import Stated
+    from coupole.calibration.leds.matching import LedSightings
     from coupole.calibration.optics import NAMES, Intrinsics
     from coupole.calibration.posed_camera import CameraPrior
 

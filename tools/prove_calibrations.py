@@ -196,9 +196,9 @@ def random_cell(seed: int, joints_deg: Floats, width_px: int, samples: int, *, a
 def prove_cell(seed: int, *, joints_deg: Floats, width_px: int, samples: int, absolute: bool) -> list[Judged]:
     """Render, find, adjust, and compare with the truth."""
     from coupole.calibration.arm_errors import axis_sensitivity
-    from coupole.calibration.board import Board, detect
-    from coupole.calibration.bundle import Poses, RobotNoise, calibrate_hand_eye
-    from coupole.calibration.camera import calibrate_camera, without_gross_errors
+    from coupole.calibration.lens.board import Board, detect
+    from coupole.calibration.lens.bundle import Poses, RobotNoise, calibrate_hand_eye
+    from coupole.calibration.lens.camera import calibrate_camera, without_gross_errors
     from coupole.calibration.picture import Picture
     from coupole.job import read_cell
     from coupole.rig import planning_arm

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from coupole.calibration.arm_errors import axis_sensitivity
-from coupole.calibration.mesh_to_robot import HandEye
 from coupole.calibration.posed_camera import HAND_EYE, CameraPrior
 from coupole.calibration.record import intrinsics_of, read_record, step_names
 from coupole.calibration.rotations import Floats, rotation
+from coupole.calibration.stickers.mesh_to_robot import HandEye
 from coupole.kinematics import Arm
 
 ZEROS = tuple(f"axis_zero.a{axis}_deg" for axis in range(2, 7))

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole import store
-from coupole.calibration.board import Board, Sighting, detect
 from coupole.calibration.picture import COLOUR, Picture
 from coupole.calibration.poses import PoseFile, ReportedPoses, read_poses, reported
 from coupole.calibration.rotations import Floats
@@ -72,19 +71,6 @@ class Sources:
         return self if path is None else replace(self, inputs=(*self.inputs, (path.name, sha256(path))))
 
 
-@dataclass(frozen=True)
-class Found:
-    """The board in the images, and what became of the others."""
-
-    sightings: tuple[Sighting, ...]
-    chosen: NDArray[np.intp]
-    """[sightings] which of the images they are."""
-    size_px: tuple[int, int]
-    """Width and height."""
-    left_out: tuple[str, ...]
-    """One line for each image that cannot be used."""
-
-
 def open_sources(paths: Sequence[Path], poses: Path | None) -> Sources:
     """Runs, or one folder of pictures with poses in `poses` or its own `poses.yaml`.
 
@@ -98,31 +84,6 @@ def open_sources(paths: Sequence[Path], poses: Path | None) -> Sources:
     if len(paths) != 1:
         raise InputError(f"expected runs, or one folder of pictures; found {len(paths)} paths")
     return _of_folder(paths[0], poses)
-
-
-def find_board(
-    board: Board, sources: Sources, progress: Callable[[int, int], None] = lambda done, total: None
-) -> Found:
-    """Look for the board in all images. Raises InputError if they differ in size, or none shows it."""
-    sightings, chosen, left_out = [], [], []
-    size_px: tuple[int, int] | None = None
-    for number, source in enumerate(sources.images):
-        picture = source.read()
-        size = picture.size_px
-        if size_px is not None and size != size_px:
-            raise InputError(f"{source.name}: {size[0]} x {size[1]} pixels, the images before it {size_px}")
-        size_px = size
-        seen = detect(board, picture)
-        if isinstance(seen, str):
-            left_out.append(f"{source.name}: {seen}")
-        else:
-            sightings.append(seen)
-            chosen.append(number)
-        progress(number + 1, len(sources.images))
-    if not sightings or size_px is None:
-        why = f"; {left_out[0]}" if left_out else ""
-        raise InputError(f"the board is in none of {len(sources.images)} images{why}. Is it the one described?")
-    return Found(tuple(sightings), np.array(chosen, dtype=np.intp), size_px, tuple(left_out))
 
 
 # -- folders ----------------------------------------------------------------------------------------------

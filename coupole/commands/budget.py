@@ -18,8 +18,8 @@ from coupole.errors import CoupoleError, StorageError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from coupole.calibration.budget import Budget, Known, Spread
-    from coupole.calibration.budget_accuracy import Accuracy, Case
+    from coupole.calibration.budget.accuracy import Accuracy, Case
+    from coupole.calibration.budget.budget import Budget, Known, Spread
     from coupole.calibration.in_force import InForce
 
 _SAMPLES = 24
@@ -62,13 +62,13 @@ def budget(
 
     Monte Carlo (JCGM 101) gives the intervals, the linear formula checks them.
     """
-    from coupole.calibration.budget import Geometry, Known, budget_of
-    from coupole.calibration.budget_accuracy import Case, accuracies
-    from coupole.calibration.budget_page import page
-    from coupole.calibration.budget_records import doubts, known_from, read_records
-    from coupole.calibration.budget_report import as_json as figures_of
-    from coupole.calibration.budget_report import draw_budget
-    from coupole.calibration.propagation import COVERAGES
+    from coupole.calibration.budget.accuracy import Case, accuracies
+    from coupole.calibration.budget.budget import Geometry, Known, budget_of
+    from coupole.calibration.budget.page import page
+    from coupole.calibration.budget.propagation import COVERAGES
+    from coupole.calibration.budget.records import doubts, known_from, read_records
+    from coupole.calibration.budget.report import as_json as figures_of
+    from coupole.calibration.budget.report import draw_budget
     from coupole.console import make_console
 
     console = make_console(quiet=as_json)
@@ -113,7 +113,7 @@ def budget(
 
 def _with_plan(given: tuple[InForce, ...], plan: Path | None) -> tuple[InForce, ...]:
     """The records given, and those in force for a plan of the kinds that are not given."""
-    from coupole.calibration.budget_records import of_use
+    from coupole.calibration.budget.records import of_use
     from coupole.job import read_job
 
     if plan is None:
@@ -129,7 +129,7 @@ def _folder(records: tuple[InForce, ...]) -> str:
 
 def _spread(known: Known) -> Spread:
     """Samples all over a dome: as many LEDs in each part of the sky above 20 degrees."""
-    from coupole.calibration.budget import Geometry, spread_over
+    from coupole.calibration.budget.budget import Geometry, spread_over
 
     steps = [(number + 0.5) / _SAMPLES for number in range(_SAMPLES)]
     cosines = [1.0 - step * (1.0 - math.cos(math.radians(70.0))) for step in steps]
@@ -148,7 +148,7 @@ def _write(files: Mapping[Path, bytes]) -> None:
 def _show(console: Console, found: Budget) -> None:
     from rich.table import Table
 
-    from coupole.calibration.budget_page import verdict
+    from coupole.calibration.budget.page import verdict
 
     table = Table("source", "taken as", "said by", "alone", "variance", "without", box=None)
     for share in found.shares:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.calibration.limits import LEDS
-from coupole.calibration.sticker_limits import MESH
+from coupole.calibration.leds.limits import LEDS
+from coupole.calibration.stickers.limits import MESH
 from coupole.commands.calibrating import DaysOption, NameOption, OutOption, bar, calibrate, limit_option
 from coupole.commands.common import JsonOption
 from coupole.errors import InputError
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from coupole.calibration.calibrated_arm import CalibratedArm
     from coupole.calibration.report import Outcome
-    from coupole.calibration.workflow import Wish
+    from coupole.calibration.wish import Wish
     from coupole.job import Cell
 
 Runs = Annotated[list[Path], typer.Argument(help="Runs.", show_default=False, metavar="RUN...")]
@@ -50,10 +50,10 @@ def leds(
     as_json: JsonOption = False,
 ) -> None:
     """Where all LEDs are and face, from views of the lit LEDs themselves, each seen six times or more."""
-    from coupole.calibration.led_equations import Stated
-    from coupole.calibration.led_picture import draw_leds
-    from coupole.calibration.led_sources import find_leds
-    from coupole.calibration.led_workflow import leds_from
+    from coupole.calibration.leds.drawing import draw_leds
+    from coupole.calibration.leds.equations import Stated
+    from coupole.calibration.leds.sources import find_leds
+    from coupole.calibration.leds.workflow import leds_from
     from coupole.calibration.posed_camera import read_posed_camera
     from coupole.calibration.report import Outcome
     from coupole.run import sha256
@@ -111,13 +111,13 @@ def mesh(
 ) -> None:
     """Where a scanned object lies in the base, by its stickers in six views or more."""
     from coupole.calibration.calibrated_arm import has_axis_zeros
-    from coupole.calibration.mesh_to_robot import Stated
     from coupole.calibration.posed_camera import read_posed_camera
     from coupole.calibration.report import Outcome
     from coupole.calibration.sources import open_sources
-    from coupole.calibration.sticker_picture import draw_mesh
-    from coupole.calibration.sticker_sources import find_all_stickers, read_scan
-    from coupole.calibration.sticker_workflow import mesh_from
+    from coupole.calibration.stickers.drawing import draw_mesh
+    from coupole.calibration.stickers.mesh_to_robot import Stated
+    from coupole.calibration.stickers.sources import find_all_stickers, read_scan
+    from coupole.calibration.stickers.workflow import mesh_from
     from coupole.geometry import transform
 
     def work(console: Console, wish: Wish) -> Outcome:

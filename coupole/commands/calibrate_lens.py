@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.calibration.limits import CAMERA, CHROMATIC, HAND_EYE
+from coupole.calibration.lens.limits import CAMERA, CHROMATIC, HAND_EYE
 from coupole.commands.calibrating import (
     DaysOption,
     LensOption,
@@ -25,11 +25,13 @@ from coupole.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from coupole.calibration.board import Board
-    from coupole.calibration.bundle import EarlierLens
+    from coupole.calibration.lens.board import Board
+    from coupole.calibration.lens.bundle import EarlierLens
+    from coupole.calibration.lens.images import Found
+    from coupole.calibration.lens.workflow import Shown
     from coupole.calibration.report import Outcome
-    from coupole.calibration.sources import Found, Sources
-    from coupole.calibration.workflow import Shown, Wish
+    from coupole.calibration.sources import Sources
+    from coupole.calibration.wish import Wish
     from coupole.kinematics import Arm
 
 BoardOption = Annotated[
@@ -53,7 +55,7 @@ def camera(
     as_json: JsonOption = False,
 ) -> None:
     """Lens and distortion from 8 to 60 images of a board, tilted to all sides, corners over the whole field."""
-    from coupole.calibration.workflow import camera_from
+    from coupole.calibration.lens.workflow import camera_from
 
     def work(console: Console, wish: Wish) -> Outcome:
         _refuse_unknown_model(model)
@@ -76,7 +78,7 @@ def chromatic(
     as_json: JsonOption = False,
 ) -> None:
     """How far red and blue are seen beside green, from the images that give the lens."""
-    from coupole.calibration.chromatic_workflow import chromatic_from, draw_chromatic
+    from coupole.calibration.lens.chromatic_workflow import chromatic_from, draw_chromatic
     from coupole.calibration.report import Outcome
 
     def work(console: Console, wish: Wish) -> Outcome:
@@ -114,8 +116,8 @@ def hand_eye(
     as_json: JsonOption = False,
 ) -> None:
     """Where the camera sits on the flange, from 10 to 60 images of a board that stands still."""
-    from coupole.calibration.bundle import RobotNoise
-    from coupole.calibration.workflow import hand_eye_from
+    from coupole.calibration.lens.bundle import RobotNoise
+    from coupole.calibration.lens.workflow import hand_eye_from
 
     def work(console: Console, wish: Wish) -> Outcome:
         _refuse_unknown_model(model)
@@ -133,7 +135,7 @@ def hand_eye(
 
 
 def _drawn(shown: Shown) -> Outcome:
-    from coupole.calibration.lens_picture import draw_lens
+    from coupole.calibration.lens.drawing import draw_lens
     from coupole.calibration.report import Outcome
 
     return Outcome(shown.record, partial(draw_lens, shown))
@@ -150,8 +152,9 @@ def _look(
     paths: list[Path], board: Path | None, poses: Path | None, console: Console
 ) -> tuple[Sources, Board, Found]:
     """Open the images and find the board in them."""
-    from coupole.calibration.board import read_board
-    from coupole.calibration.sources import BOARD_NAME, find_board, open_sources
+    from coupole.calibration.lens.board import read_board
+    from coupole.calibration.lens.images import find_board
+    from coupole.calibration.sources import BOARD_NAME, open_sources
 
     beside = paths[0] / BOARD_NAME
     if board is None and not beside.is_file():
@@ -170,7 +173,7 @@ def _look(
 def _earlier_lens(path: Path | None, sources: Sources, found: Found) -> EarlierLens | None:
     """The lens of a camera's record, with its covariance. Raises InputError for a record that does not hold for
     these images."""
-    from coupole.calibration.bundle import EarlierLens
+    from coupole.calibration.lens.bundle import EarlierLens
     from coupole.calibration.posed_camera import refuse_other_camera
     from coupole.calibration.record import intrinsics_of, read_record
 

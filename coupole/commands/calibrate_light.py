@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.calibration.light_limits import DARK, DRIFT, LED_POWER, RESPONSE
+from coupole.calibration.light.limits import DARK, DRIFT, LED_POWER, RESPONSE
 from coupole.commands.calibrating import (
     DaysOption,
     EmissionOption,
@@ -25,11 +25,11 @@ from coupole.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from coupole.calibration.led_power_tile import Setting
-    from coupole.calibration.light_frames import LightFrames
+    from coupole.calibration.light.frames import LightFrames
+    from coupole.calibration.light.led_power_tile import Setting
     from coupole.calibration.optics import Intrinsics
     from coupole.calibration.report import Outcome
-    from coupole.calibration.workflow import Wish
+    from coupole.calibration.wish import Wish
 
 Runs = Annotated[list[Path], typer.Argument(help="Runs.", show_default=False, metavar="RUN...")]
 DarkOption = Annotated[
@@ -61,8 +61,8 @@ def dark(
     as_json: JsonOption = False,
 ) -> None:
     """Offset, dark current and hot pixels from dark frames of two or more exposures."""
-    from coupole.calibration.light_frames import open_light_frames
-    from coupole.calibration.light_records import dark_outcome
+    from coupole.calibration.light.frames import open_light_frames
+    from coupole.calibration.light.records import dark_outcome
 
     def work(console: Console, wish: Wish) -> Outcome:
         with bar(console, "dark frames") as progress:
@@ -92,8 +92,8 @@ def response(
     as_json: JsonOption = False,
 ) -> None:
     """Gain, read noise, full well and linearity from a bracket of a scene that stands still, each frame twice."""
-    from coupole.calibration.light_frames import open_light_frames
-    from coupole.calibration.light_records import response_outcome
+    from coupole.calibration.light.frames import open_light_frames
+    from coupole.calibration.light.records import response_outcome
 
     def work(console: Console, wish: Wish) -> Outcome:
         with bar(console, "exposures") as progress:
@@ -126,8 +126,8 @@ def flat_field(
     as_json: JsonOption = False,
 ) -> None:
     """Fall-off of the lens, per channel, from views of a luminous panel, shifted and turned."""
-    from coupole.calibration.flat_field_records import flat_field_outcome
-    from coupole.calibration.light_frames import open_light_frames
+    from coupole.calibration.light.flat_field_records import flat_field_outcome
+    from coupole.calibration.light.frames import open_light_frames
 
     def work(console: Console, wish: Wish) -> Outcome:
         frames = open_light_frames(runs)
@@ -156,8 +156,8 @@ def led_power(
     as_json: JsonOption = False,
 ) -> None:
     """Power of each LED from views of a white tile whose place is known."""
-    from coupole.calibration.led_power_records import led_power_outcome
-    from coupole.calibration.light_frames import open_light_frames
+    from coupole.calibration.light.frames import open_light_frames
+    from coupole.calibration.light.led_power_records import led_power_outcome
 
     def work(console: Console, wish: Wish) -> Outcome:
         frames = _posed(open_light_frames(runs), hand_eye)
@@ -203,8 +203,8 @@ def drift(
 
     Give the same records, and the same tile, as `led-power` had.
     """
-    from coupole.calibration.drift_records import drift_outcome
-    from coupole.calibration.light_frames import open_light_frames
+    from coupole.calibration.light.drift_records import drift_outcome
+    from coupole.calibration.light.frames import open_light_frames
 
     def work(console: Console, wish: Wish) -> Outcome:
         frames = _posed(open_light_frames(runs), hand_eye)
@@ -252,9 +252,9 @@ def _setting(
     emission: str,
 ) -> Setting:
     """What pictures of a tile are read with. Raises InputError for files that are none."""
-    from coupole.calibration.led_power import Positions
-    from coupole.calibration.led_power_tile import Setting, calibrated_positions
-    from coupole.calibration.spectralon import read_tile
+    from coupole.calibration.light.led_power import Positions
+    from coupole.calibration.light.led_power_tile import Setting, calibrated_positions
+    from coupole.calibration.light.spectralon import read_tile
     from coupole.job import read_cell
 
     cell = read_cell(rig)

@@ -18,10 +18,10 @@ from coupole.errors import CalibrationRefused, CoupoleError, InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from coupole.calibration.irradiance import Emission
+    from coupole.calibration.light.irradiance import Emission
     from coupole.calibration.record import Record
     from coupole.calibration.report import Outcome
-    from coupole.calibration.workflow import Wish
+    from coupole.calibration.wish import Wish
 
 Paths = Annotated[
     list[Path],
@@ -66,7 +66,7 @@ def calibrate(
     `limit` is what the operator said of the calibration's `limits`.
     """
     from coupole.calibration.report import write_outcome
-    from coupole.calibration.workflow import Wish
+    from coupole.calibration.wish import Wish
     from coupole.console import make_console
 
     console = make_console(quiet=as_json)

@@ -143,7 +143,7 @@ class Campaign:
 
     def _plan(self, step: Step) -> Path:
         """The step's plan; one that stands there, and may have been changed by hand, is kept."""
-        from coupole.calibration.led_plan import led_plan
+        from coupole.calibration.leds.plan import led_plan
         from coupole.job import read_cell
         from coupole.templates import LEDS, TEMPLATES
 

@@ -161,7 +161,7 @@ def plan_new(
     if path.exists():
         raise InputError(f"{path}: stands here already; choose another name")
     if template == LEDS:
-        from coupole.calibration.led_plan import led_plan
+        from coupole.calibration.leds.plan import led_plan
         from coupole.job import read_cell
 
         with make_console(quiet=False).status("reading the rig") as status:

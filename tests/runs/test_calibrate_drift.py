@@ -14,7 +14,7 @@ from cells import Ended
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from coupole.calibration.light_frames import LightFrame, open_light_frames
+from coupole.calibration.light.frames import LightFrame, open_light_frames
 from coupole.calibration.record import Record, read_record
 from sim.led_light import LedModel, led_flux_factor
 

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from synthesis import Array, TrueLens, frame, render
 
-from coupole.calibration.board import Board
+from coupole.calibration.lens.board import Board
 
 CHARUCO = Board(kind="charuco", corners=(10, 7), square_mm=16.0, marker_mm=12.0)
 CHESS = Board(kind="chessboard", corners=(9, 6), square_mm=16.0)

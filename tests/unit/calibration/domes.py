@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from synthesis import Array, TrueLens, frame
 
-from coupole.calibration.led_matching import LedSightings
+from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.dome import LedTable

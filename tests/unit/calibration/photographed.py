@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from synthesis import Array, TrueLens, frame, looking_at_board, render
 
 from coupole import store
-from coupole.calibration.board import Board
+from coupole.calibration.lens.board import Board
 from coupole.devices import ArmState, FrameFormat
 from coupole.journal import Journal
 from coupole.run import Inputs, Run

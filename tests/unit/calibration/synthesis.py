@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from coupole.calibration.board import Sighting
+from coupole.calibration.lens.board import Sighting
 
 PSF_PX = 0.6
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]

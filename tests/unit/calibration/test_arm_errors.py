@@ -8,9 +8,9 @@ import numpy as np
 from synthesis import Array, TrueLens, board_points, frame, looking_at_board
 
 from coupole.calibration.arm_errors import axis_sensitivity
-from coupole.calibration.board import Sighting
-from coupole.calibration.bundle import HandEyeCalibration, Poses, RobotNoise, calibrate_hand_eye
-from coupole.calibration.camera import calibrate_camera
+from coupole.calibration.lens.board import Sighting
+from coupole.calibration.lens.bundle import HandEyeCalibration, Poses, RobotNoise, calibrate_hand_eye
+from coupole.calibration.lens.camera import calibrate_camera
 from coupole.calibration.rotations import between
 from coupole.kinematics import KR10_R1100_SIXX, forward, inverse, nearest
 from sim.kuka_kinematics import PoseErrors

@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from coupole.calibration.budget import Budget, Geometry, Known, budget_of, sample_inputs, spread_over
-from coupole.calibration.measurement import reflectance, reflectance_of
-from coupole.calibration.propagation import linear
+from coupole.calibration.budget.budget import Budget, Geometry, Known, budget_of, sample_inputs, spread_over
+from coupole.calibration.budget.measurement import reflectance, reflectance_of
+from coupole.calibration.budget.propagation import linear
 from coupole.errors import InputError
 
 

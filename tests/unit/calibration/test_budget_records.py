@@ -18,9 +18,9 @@ from raw_runs import write_hand_eye
 from sticker_scenes import scene
 from test_led_record import found as leds_found
 
-from coupole.calibration.budget import Known
-from coupole.calibration.budget_accuracy import Case, accuracies
-from coupole.calibration.budget_records import doubts, known_from, ray_mm, read_records
+from coupole.calibration.budget.accuracy import Case, accuracies
+from coupole.calibration.budget.budget import Known
+from coupole.calibration.budget.records import doubts, known_from, ray_mm, read_records
 from coupole.calibration.optics import project
 from coupole.calibration.record import Input, Limit, Parameter, Validity, sealed, step_names, write_record
 from coupole.calibration.report import Outcome, write_outcome

@@ -13,11 +13,12 @@ from synthesis import Array
 from typer.testing import CliRunner, Result
 
 from coupole.calibration.arm_errors import axis_sensitivity
-from coupole.calibration.board import Board
+from coupole.calibration.lens.board import Board
+from coupole.calibration.lens.images import find_board
 from coupole.calibration.poses import Convention, read_poses
 from coupole.calibration.record import read_record
 from coupole.calibration.rotations import between
-from coupole.calibration.sources import find_board, open_sources
+from coupole.calibration.sources import open_sources
 from coupole.commands.calibrate import calibrate_app
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
 from coupole.kinematics import KR10_R1100_SIXX, forward

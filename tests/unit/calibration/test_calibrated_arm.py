@@ -11,11 +11,11 @@ from synthesis import Array, TrueLens, frame, looking_at_board
 from test_point_sets import layout
 
 from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
-from coupole.calibration.mesh_to_robot import HandEye, Stated, mesh_to_robot
 from coupole.calibration.multi_view import CameraView
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.rotations import moved
+from coupole.calibration.stickers.mesh_to_robot import HandEye, Stated, mesh_to_robot
 from coupole.kinematics import KR10_R1100_SIXX, forward, inverse, nearest
 
 LENS = TrueLens((1740.0, 1740.0), (511.5, 383.5), (0.0, 0.0, 0.0, 0.0, 0.0))

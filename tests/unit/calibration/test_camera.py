@@ -10,7 +10,7 @@ import pytest
 from synthesis import make_cell
 
 from coupole.calibration.adjustment import coverage_factor
-from coupole.calibration.camera import calibrate_camera, without_gross_errors
+from coupole.calibration.lens.camera import calibrate_camera, without_gross_errors
 from coupole.calibration.optics import MODELS
 from coupole.errors import InputError
 

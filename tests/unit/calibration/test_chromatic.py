@@ -11,8 +11,8 @@ import pytest
 from photographed import BOARD_YAML, write_folder, write_run
 from synthesis import Cell, make_cell
 
-from coupole.calibration.board import Sighting
-from coupole.calibration.chromatic import calibrate_channels
+from coupole.calibration.lens.board import Sighting
+from coupole.calibration.lens.chromatic import calibrate_channels
 from coupole.calibration.record import read_record
 from coupole.errors import InputError
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from coupole.calibration.corner_fit import fit_corners
+from coupole.calibration.lens.corner_fit import fit_corners
 
 SIZE_PX, RAYS, RADIUS_PX = 41, 32, 9.0
 ALL = np.ones((1, 1), np.bool_)

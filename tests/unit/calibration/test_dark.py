@@ -11,7 +11,7 @@ import pytest
 from light_synthesis import TrueSensor, coverage
 from scipy.stats import t as student
 
-from coupole.calibration.dark import DarkFrame, calibrate_dark
+from coupole.calibration.light.dark import DarkFrame, calibrate_dark
 from coupole.errors import InputError
 
 SHAPE = (96, 128)

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthesis import Array, Cell, frame, make_cell
 
-from coupole.calibration import hypotheses
-from coupole.calibration.camera import calibrate_camera
-from coupole.calibration.diagnosis import Diagnosis, diagnose, expected_scatter
+from coupole.calibration.lens import hypotheses
+from coupole.calibration.lens.camera import calibrate_camera
+from coupole.calibration.lens.diagnosis import Diagnosis, diagnose, expected_scatter
 from coupole.calibration.poses import Convention, ReportedPoses, reported
 
 IMAGES = 14

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from light_synthesis import coverage
 
-from coupole.calibration.drift import Reading, fit_drift
+from coupole.calibration.light.drift import Reading, fit_drift
 from coupole.errors import InputError
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from light_synthesis import Array, coverage
 
-from coupole.calibration.flat_field import FlatField, FlatView, block_means, dust_spots, fit_flat_field
+from coupole.calibration.light.flat_field import FlatField, FlatView, block_means, dust_spots, fit_flat_field
 from coupole.errors import InputError
 
 SIZE_PX = (128, 96)

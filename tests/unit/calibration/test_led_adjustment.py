@@ -9,10 +9,10 @@ import numpy as np
 from domes import Dome, Noise, dome
 from synthesis import Array
 
-from coupole.calibration.led_adjustment import LedGeometry, adjust_leds
-from coupole.calibration.led_boards import boards_of, placed
-from coupole.calibration.led_equations import Stated
-from coupole.calibration.led_matching import match_leds
+from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
+from coupole.calibration.leds.boards import boards_of, placed
+from coupole.calibration.leds.equations import Stated
+from coupole.calibration.leds.matching import match_leds
 
 NONE = Noise(pixel_px=0.0, robot_mm=0.0, robot_deg=0.0, tolerance_mm=0.0, records=0.0)
 ABSOLUTE = Noise(robot_mm=0.3, robot_deg=0.02)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from test_led_record import WISH, images
 
 from coupole.calibration.calibrated_arm import CalibratedArm
-from coupole.calibration.led_equations import Stated
-from coupole.calibration.led_workflow import LedsFound, leds_from
+from coupole.calibration.leds.equations import Stated
+from coupole.calibration.leds.workflow import LedsFound, leds_from
 from coupole.kinematics import KR10_R1100_SIXX, forward
 
 ZEROS_DEG = np.array([0.0, 0.03, -0.02, 0.025, -0.03, 0.02])

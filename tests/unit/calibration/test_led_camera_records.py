@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from photographed import BOARD, SIZE_PX, write_run
 
-from coupole.calibration.bundle import RobotNoise
+from coupole.calibration.lens.bundle import RobotNoise
+from coupole.calibration.lens.images import find_board
+from coupole.calibration.lens.workflow import hand_eye_from
 from coupole.calibration.posed_camera import read_posed_camera
 from coupole.calibration.record import write_record
-from coupole.calibration.sources import Sources, find_board, open_sources
-from coupole.calibration.workflow import Wish, hand_eye_from
+from coupole.calibration.sources import Sources, open_sources
+from coupole.calibration.wish import Wish
 from coupole.errors import InputError
 
 NOW = datetime(2026, 5, 1, tzinfo=UTC)

@@ -8,8 +8,8 @@ import numpy as np
 from domes import Dome, Noise, dome
 from synthesis import Array
 
-from coupole.calibration.led_boards import boards_of
-from coupole.calibration.led_matching import LedSightings, Matching, fault_lines, match_leds
+from coupole.calibration.leds.boards import boards_of
+from coupole.calibration.leds.matching import LedSightings, Matching, fault_lines, match_leds
 
 WELL_SEEN = {"views": 40}
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coupole.calibration.led_power_tile import calibrated_positions
-from coupole.calibration.led_workflow import led_csv
+from coupole.calibration.leds.workflow import led_csv
+from coupole.calibration.light.led_power_tile import calibrated_positions
 from coupole.calibration.record import Input, Parameter, Validity, sealed, write_record
 from coupole.dome import LedTable
 from coupole.errors import InputError

@@ -14,15 +14,15 @@ import pytest
 from domes import SIZE_PX, Dome, Noise, dome
 from test_led_matching import rewired
 
-from coupole.calibration.led_equations import Stated
-from coupole.calibration.led_picture import draw_leds
-from coupole.calibration.led_sources import LedImages
-from coupole.calibration.led_workflow import LedsFound, leds_from
+from coupole.calibration.leds.drawing import draw_leds
+from coupole.calibration.leds.equations import Stated
+from coupole.calibration.leds.sources import LedImages
+from coupole.calibration.leds.workflow import LedsFound, leds_from
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.record import read_record
 from coupole.calibration.report import Outcome, write_outcome
 from coupole.calibration.sources import About
-from coupole.calibration.workflow import Wish
+from coupole.calibration.wish import Wish
 from coupole.dome import read_led_table
 from coupole.errors import InputError
 

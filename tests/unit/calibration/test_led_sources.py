@@ -12,7 +12,7 @@ from bright_squares import covered, raw, square
 from synthesis import Array
 
 from coupole import store
-from coupole.calibration.led_sources import find_leds
+from coupole.calibration.leds.sources import find_leds
 from coupole.devices import ArmState, FrameFormat
 from coupole.dome import LedTable
 from coupole.errors import InputError

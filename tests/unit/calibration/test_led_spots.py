@@ -9,7 +9,7 @@ import pytest
 from bright_squares import BLACK_DN, WHITE_DN, covered, defocused, raw, square
 from synthesis import Array
 
-from coupole.calibration.led_spots import Spots, find_spots, outline_offsets
+from coupole.calibration.leds.spots import Spots, find_spots, outline_offsets
 
 SHAPE = (160, 200)
 LED = 3e4

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from domes import LENS, SIZE_PX, eyes, table
 
-from coupole.calibration.led_boards import boards_of
-from coupole.calibration.led_views import LedViews, led_views
+from coupole.calibration.leds.boards import boards_of
+from coupole.calibration.leds.views import LedViews, led_views
 from coupole.calibration.optics import NAMES, Intrinsics
 
 LENS_KNOWN = Intrinsics(**dict(zip(NAMES, LENS.vector(), strict=True)))

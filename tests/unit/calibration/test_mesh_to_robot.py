@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from synthesis import Array, TrueLens, frame
 from test_point_sets import layout
 
-from coupole.calibration.mesh_to_robot import MeshPose, Stated, mesh_to_robot
 from coupole.calibration.multi_view import CameraView, unproject
 from coupole.calibration.optics import Intrinsics
+from coupole.calibration.stickers.mesh_to_robot import MeshPose, Stated, mesh_to_robot
 from coupole.errors import InputError
 
 LENS = TrueLens((6960.0, 6960.0), (2047.5, 1535.5), (-0.05, 0.02, 2e-4, -3e-4, 0.0))

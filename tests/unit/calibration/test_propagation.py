@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coupole.calibration.propagation import Inputs, Quantity, linear, monte_carlo, tolerance, validate
+from coupole.calibration.budget.propagation import Inputs, Quantity, linear, monte_carlo, tolerance, validate
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 

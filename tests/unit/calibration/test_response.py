@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from light_synthesis import Array, TrueSensor, coverage
 
-from coupole.calibration.response import Pair, linearity, photon_transfer
+from coupole.calibration.light.response import Pair, linearity, photon_transfer
 from coupole.errors import InputError
 
 SHAPE = (96, 128)

@@ -10,7 +10,7 @@ from synthesis import Array, TrueLens
 
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.picture import plane
-from coupole.calibration.sticker_detection import Sticker, find_stickers
+from coupole.calibration.stickers.detection import Sticker, find_stickers
 
 SHAPE = (240, 320)
 LENS = TrueLens((3480.0, 3480.0), (160.3, 118.6), (-0.05, 0.02, 2e-4, -3e-4, 0.0))

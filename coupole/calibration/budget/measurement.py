@@ -1,0 +1,93 @@
+"""The measurement equation: from a pixel's value to a reflectance (seed 003, Eq. 3).
+
+With camera and LEDs calibrated in the same digital numbers (`calibration.light.led_power`), the constants of
+Eq. 1, pi among them, stand in numerator and denominator alike, and
+
+    f = V / (t g Phi_k e(x, n, l_k, n_k)),        e = E / Phi of `coupole.calibration.light.irradiance`, in m^-2,
+
+with V the signal above dark made linear (DN), t the exposure (s), g the flat field, Phi_k the LED's power
+(DN s^-1 m^2 sr). The emission profile is e's: `lambertian`, or `paper`, which takes the emitter's cosine twice. A
+pixel that is laid on the mesh beside its place brings its neighbour's value, so that a change of albedo along the
+surface goes into f as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coupole.calibration.light.irradiance import LED_SIDE_MM, Emission, irradiance_per_flux
+from coupole.calibration.rotations import Floats
+
+VERTICES = tuple(f"vertex{i}.{axis}_mm" for i in range(3) for axis in "xyz")
+LED_PLACE = tuple(f"led.{axis}_mm" for axis in "xyz")
+LED_TURN = ("led.turn1_deg", "led.turn2_deg")
+SEEN_OFF = ("lens.x_mm", "camera.x_mm")
+"""How far beside its place a pixel is laid on the mesh, along the surface's steepest change of albedo."""
+MESH_STEP = (*(f"mesh.{axis}_mm" for axis in "xyz"), *(f"mesh.r{axis}_deg" for axis in "xyz"))
+
+
+def reflectance(
+    signal_dn: ArrayLike,
+    exposure_s: ArrayLike,
+    flat: ArrayLike,
+    power: ArrayLike,
+    point_mm: ArrayLike,
+    normal: ArrayLike,
+    led_mm: ArrayLike,
+    led_normal: ArrayLike,
+    *,
+    emission: Emission = "lambertian",
+    side_mm: float = LED_SIDE_MM,
+) -> Floats:
+    """f in 1/sr; points and directions are [..., 3], all broadcast. Infinite for an LED below the horizon."""
+    lit = irradiance_per_flux(point_mm, normal, led_mm, led_normal, side_mm=side_mm, emission=emission)
+    signal, t, g, phi = (np.asarray(value, float) for value in (signal_dn, exposure_s, flat, power))
+    with np.errstate(divide="ignore"):
+        value: Floats = signal / (t * g * phi * lit)
+    return value
+
+
+def reflectance_of(q: Mapping[str, Floats], led_normal: Floats, *, emission: Emission = "lambertian") -> Floats:
+    """The measurement equation of a triangle's sample, of quantities [trials] by name.
+
+    Point and normal are made from the triangle's `VERTICES` in the base frame, moved by `MESH_STEP` (a small step
+    of base_from_mesh about the triangle's middle); the LED's normal [3] is turned by `LED_TURN` about two axes
+    across it. `response`, `flat_field`, `power.own`, `power.common` and `drift` are factors about 1. The mesh's
+    step along x and `SEEN_OFF` say how far beside its place the surface is seen, whose albedo changes there by
+    `contrast_per_mm`.
+    """
+    corners = np.stack([q[name] for name in VERTICES], axis=-1)
+    corners = corners.reshape(*corners.shape[:-1], 3, 3)
+    point = corners.mean(axis=-2)
+    normal = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+    normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    step = np.stack([q[name] for name in MESH_STEP], axis=-1)
+    point = point + step[..., :3]
+    normal = _turned(normal, np.radians(step[..., 3:]))
+    led = np.stack([q[name] for name in LED_PLACE], axis=-1)
+    across = np.linalg.svd(led_normal[None])[2][1:]
+    turns = np.radians(np.stack([q[name] for name in LED_TURN], axis=-1)) @ across
+    beside_mm = q[SEEN_OFF[0]] + q[SEEN_OFF[1]] - step[..., 0]
+    power = q["power_dn_m2_sr_per_s"] * q["power.own"] * q["power.common"] * q["drift"]
+    return reflectance(
+        q["signal_dn"] * q["response"] * (1.0 + q["contrast_per_mm"] * beside_mm),
+        q["exposure_s"],
+        q["flat"] * q["flat_field"],
+        power,
+        point,
+        normal,
+        led,
+        _turned(np.broadcast_to(led_normal, led.shape), turns),
+        emission=emission,
+    )
+
+
+def _turned(vectors: Floats, turns_rad: Floats) -> Floats:
+    """Vectors [..., 3] turned by small rotation vectors [..., 3], to second order, at unit length."""
+    once = np.cross(turns_rad, vectors)
+    turned = vectors + once + 0.5 * np.cross(turns_rad, once)
+    result: Floats = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+    return result

@@ -1,0 +1,227 @@
+"""What calibration records say to the uncertainty budget."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coupole.calibration import optics
+from coupole.calibration.budget.budget import Known
+from coupole.calibration.in_force import InForce, read_in_force
+from coupole.calibration.record import SEAL, Record, intrinsics_of, step_names
+from coupole.calibration.rotations import Floats, skew
+from coupole.errors import InputError
+
+WORKING_MM = 334.0
+"""From camera to object, where a record does not say for which focus it holds (seed 003's field and pixels)."""
+_FIELD = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])
+_SEEN_FROM_HAND_EYE = "flange_from_camera"
+
+
+@dataclass(frozen=True)
+class Said:
+    """What one record says: figures of `Known` by name, and the sources that it settles."""
+
+    figures: dict[str, float]
+    sources: tuple[str, ...]
+
+
+def read_records(paths: Sequence[Path]) -> tuple[InForce, ...]:
+    """Records, and those of use to a budget in folders. Raises InputError: no such file, nothing of use in a
+    folder, a record of a kind that says nothing here, two of one kind."""
+    found: list[InForce] = []
+    for path in paths:
+        if path.is_dir():
+            inside = of_use(read_in_force([file for file in sorted(path.glob("*.yaml")) if _is_record(file)]))
+            if not inside:
+                raise InputError(f"{path}: expected records of the kinds {', '.join(READERS)} in this folder")
+            found += inside
+        else:
+            found += read_in_force([path])
+    for number, item in enumerate(found):
+        if item.record.kind not in READERS:
+            raise InputError(
+                f"{item.path}: a record of the kind `{item.record.kind}` says nothing to this budget; expected "
+                f"{', '.join(READERS)}"
+            )
+        if any(item.record.kind == other.record.kind for other in found[:number]):
+            raise InputError(f"{item.path}: a second record of the kind `{item.record.kind}`; give one of each")
+    return tuple(found)
+
+
+def of_use(items: Sequence[InForce]) -> tuple[InForce, ...]:
+    """Those that say something to a budget."""
+    return tuple(item for item in items if item.record.kind in READERS)
+
+
+def doubts(items: Sequence[InForce], now: datetime) -> tuple[str, ...]:
+    """What speaks against records: limits that were missed, an expired validity."""
+    missed = [
+        f"{item.path}: not accepted: {limit.what} is {limit.found:.3g} {limit.unit}, at most {limit.limit:.3g}"
+        for item in items
+        for limit in item.record.limits
+        if not limit.passed
+    ]
+    expired = [
+        f"{item.path}: expired on {item.record.validity.expires:%Y-%m-%d %H:%M} UTC"
+        for item in items
+        if now >= item.record.validity.expires
+    ]
+    return (*missed, *expired)
+
+
+def known_from(items: Sequence[InForce], start: Known) -> Known:
+    """What records say, in place of what is stated."""
+    changes: dict[str, Any] = {}
+    sources: list[tuple[str, str]] = []
+    kinds = {item.record.kind for item in items}
+    for item in items:
+        if item.record.kind == "camera" and "hand-eye" in kinds:
+            continue  # rays use the lens that the hand-eye record has, with their common covariance
+        said = READERS[item.record.kind](item.record, item.path)
+        changes |= said.figures
+        sources += [(group, _called(item.record)) for group in said.sources]
+    if {"leds", "mesh"} <= kinds:
+        # Each is found from views of its own, LEDs looking up and mesh looking down: nothing shows that their
+        # errors are alike, and to take them as independent is the careful way.
+        changes["robot_mm"] = 0.0
+    return replace(start, **changes, sources=tuple(sources))
+
+
+def _called(record: Record) -> str:
+    return record.name if record.kind in record.name else f"{record.kind} {record.name}"
+
+
+def _is_record(file: Path) -> bool:
+    with file.open(encoding="utf-8", errors="replace") as stream:
+        return stream.readline().startswith(SEAL)
+
+
+# -- what each kind says --------------------------------------------------------------------------------------
+
+
+def _of_response(record: Record, path: Path) -> Said:
+    read = max(record.value("dark_variance_dn2.G") - 1.0 / 12.0, 0.0) ** 0.5
+    figures = {
+        "gain_dn_per_e": record.value("gain_dn_per_e.G"),
+        "read_noise_dn": read,
+        "full_scale_dn": record.value("range_dn"),
+        "response": _limit_found(record, path, "uncertainty of linearity"),
+    }
+    return Said(figures, ("pixel value", "response"))
+
+
+def _of_flat_field(record: Record, path: Path) -> Said:
+    return Said({"flat_field": _limit_found(record, path, "uncertainty")}, ("flat field",))
+
+
+def _of_drift(record: Record, path: Path) -> Said:
+    return Said({"drift": _limit_found(record, path, "uncertainty")}, ("drift",))
+
+
+def _of_led_power(record: Record, path: Path) -> Said:
+    table = next(file.name for file in record.files if file.name.endswith(".csv"))
+    text = (path.parent / table).read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    names = lines[0].split(",")
+    values = np.genfromtxt(lines[1:], delimiter=",", ndmin=2)
+    good = values[:, names.index("power_G")] > 0
+    own, all_of_it = values[good, names.index("u_own_G")], values[good, names.index("u_G")]
+    common = np.sqrt(np.maximum(all_of_it**2 - own**2, 0.0))
+    figures = {"power_own": float(np.median(own)), "power_common": float(np.median(common))}
+    return Said(figures, ("LED power, own", "LED power, common"))
+
+
+def _of_leds(record: Record, path: Path) -> Said:
+    figures = {
+        "led_mm": record.value("led_centre_median_u_mm"),
+        "led_deg": record.value("led_normal_median_u_deg"),
+    }
+    return Said(figures, ("LED position", "LED normal"))
+
+
+def _of_mesh(record: Record, path: Path) -> Said:
+    """The worst sticker's place stands for all points of the object."""
+    turn = step_names("base_from_mesh")[3:]
+    u = {parameter.name: parameter.u for parameter in record.parameters}
+    figures = {
+        "mesh_mm": _limit_found(record, path, "place of the worst sticker"),
+        "mesh_deg": float(np.linalg.norm([u[name] for name in turn])),
+    }
+    return Said(figures, ("mesh to robot",))
+
+
+def _of_camera(record: Record, path: Path) -> Said:
+    lens, _ = intrinsics_of(record)
+    distance_mm = record.validity.focus_distance_mm or WORKING_MM
+    px = _limit_found(record, path, "uncertainty at the field's corners")
+    return Said({"lens_px": px, "pixel_mm": distance_mm / lens.fx}, ("lens",))
+
+
+def _of_hand_eye(record: Record, path: Path) -> Said:
+    """Lens and hand-eye together, whose errors make up for each other, and the robot's noise at one pose."""
+    lens, _ = intrinsics_of(record)
+    distance_mm = record.validity.focus_distance_mm or WORKING_MM
+    noise = {line.name: line.found for line in record.noise}
+    turned_mm = np.radians(noise["robot orientation"]) * (distance_mm + camera_reach_mm(record))
+    pose_mm = float(np.sqrt(2.0 * (noise["robot position"] ** 2 + turned_mm**2)))
+    figures = {
+        "camera_mm": float(np.hypot(ray_mm(record, distance_mm), pose_mm)),
+        "lens_px": 0.0,
+        "pixel_mm": distance_mm / lens.fx,
+    }
+    return Said(figures, ("camera", "lens"))
+
+
+READERS: dict[str, Callable[[Record, Path], Said]] = {
+    "camera": _of_camera,
+    "hand-eye": _of_hand_eye,
+    "leds": _of_leds,
+    "mesh": _of_mesh,
+    "flat-field": _of_flat_field,
+    "response": _of_response,
+    "led-power": _of_led_power,
+    "drift": _of_drift,
+}
+
+
+def camera_reach_mm(record: Record) -> float:
+    """From the flange's middle to the camera's."""
+    return float(np.linalg.norm(record.transforms[_SEEN_FROM_HAND_EYE].translation_mm))
+
+
+def ray_mm(record: Record, distance_mm: float) -> float:
+    """Standard uncertainty of where a ray meets an object so far away, across the ray, both directions together,
+    root mean square over the field: of lens and hand-eye with their common covariance.
+
+    A step of flange_from_camera by t (flange's axes) and r (camera's axes) moves a point p of the camera's frame
+    by -(R^T t + r x p).
+    """
+    lens, free = intrinsics_of(record)
+    names = [parameter.name for parameter in record.parameters]
+    wanted = [n for n in names if n.removesuffix("_px") in free] + list(step_names(_SEEN_FROM_HAND_EYE))
+    at = [names.index(name) for name in wanted]
+    covariance = record.covariance_matrix[np.ix_(at, at)]
+    half = np.array(record.validity.size_px or (2 * lens.cx, 2 * lens.cy)) / 2.0
+    points = distance_mm * np.column_stack([_FIELD * half / (lens.fx, lens.fy), np.ones(len(_FIELD))])
+    seen = optics.project(points, lens.vector())
+    turn = record.transforms[_SEEN_FROM_HAND_EYE].matrix()[:3, :3]
+    by_step = np.concatenate(
+        [np.broadcast_to(-turn.T, (len(points), 3, 3)), np.radians(skew(points))], axis=2
+    )  # -(r x p) = p x r
+    by_lens = seen.by_intrinsics[:, :, [optics.NAMES.index(name) for name in free]]
+    slopes: Floats = np.concatenate([by_lens, seen.by_point @ by_step], axis=2)
+    variance_px2 = np.einsum("kia,ab,kib->k", slopes, covariance, slopes)
+    return float(np.sqrt(variance_px2.mean()) * distance_mm / lens.fx)
+
+
+def _limit_found(record: Record, path: Path, words: str) -> float:
+    for limit in record.limits:
+        if limit.what.startswith(words):
+            return limit.found
+    raise InputError(f"{path}: expected a limit that begins with `{words}` in a record of `{record.kind}`")

@@ -1,0 +1,328 @@
+"""All LEDs in one adjustment: rigid boards, the arm's noise at each view, camera and hand-eye with theirs.
+
+    pixel = project((base_from_flange_i . E_i . flange_from_camera)^-1 . base_from_board_b . (q_j + d_j))
+
+with q_j a place on the board by the table, d_j what the LED is off it, E_i what the arm is off at view i; camera
+and hand-eye are observed by their record, with its covariance. (Seed 003, section 4 triangulates each LED by
+itself.) The arm's error at one view moves all LEDs seen from it alike, so the LEDs themselves tell it.
+
+A board touches only its own six parameters, its LEDs' and what the views share. So boards are eliminated one by
+one (Schur's complement; Triggs et al., Bundle adjustment - a modern synthesis, 2000, section 6): the rest is as
+small as the number of views. Noise is estimated as in `adjustment`, from residuals and redundancy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from coupole.calibration.adjustment import HUBER, REJECT_SIGMA
+from coupole.calibration.leds.boards import Boards
+from coupole.calibration.leds.equations import (
+    GROUPS,
+    ORIENTATION,
+    POSITION,
+    SPOTS,
+    TOLERANCE,
+    LedState,
+    Linear,
+    Problem,
+    Stated,
+    at_centres,
+    camera_step,
+    cost_of,
+    linearised,
+    problem_of,
+    stepped,
+    table_sigmas,
+    whitened,
+)
+from coupole.calibration.leds.matching import LedSightings
+from coupole.calibration.point_sets import Indices
+from coupole.calibration.posed_camera import CameraPrior
+from coupole.calibration.rotations import Floats, between, skew
+from coupole.errors import InputError
+
+_MOST_STEPS, _MOST_ROUNDS = 40, 25
+_SETTLED, _STILL = 1e-2, 1e-6
+_LEAST_REDUNDANCY, _LEAST_FACTOR = 3.0, 0.03
+
+
+@dataclass(frozen=True)
+class LedGeometry:
+    """Where all LEDs are."""
+
+    state: LedState
+    centres_mm: Floats
+    """[n, 3] by place, base frame."""
+    centre_covariance: Floats
+    """[n, 3, 3], mm^2."""
+    normal_covariance: Floats
+    """[b, 2, 2], deg^2: of a board's turns about its own x and y."""
+    shared_part: Floats
+    """[n] share of the centre's variance that comes from poses, hand-eye and lens."""
+    noise: Floats
+    """[groups] seen over stated."""
+    redundancy: Floats
+    """[groups]."""
+    residuals_px: Floats
+    """[k, 2] observed minus computed."""
+    kept: NDArray[np.bool_]
+    """[k] spots that are no gross errors."""
+    prior_step: Floats
+    """[free + 6] of lens and hand-eye over the standard deviations of their record."""
+    steps: int
+
+    @property
+    def normals(self) -> Floats:
+        """[b, 3] of boards, base frame."""
+        return self.state.base_from_board[:, :3, 2]
+
+
+def adjust_leds(
+    seen: LedSightings,
+    place: Indices,
+    base_from_flange: Floats,
+    boards: Boards,
+    start: Floats,
+    prior: CameraPrior,
+    stated: Stated,
+) -> LedGeometry:
+    """Adjust boards, LEDs, poses [v, 4, 4] as reported, lens and hand-eye.
+
+    `place` [k] is that of each spot; `start` [b, 4, 4] is roughly where the boards stand.
+    Raises InputError if the spots contradict each other so that it does not converge.
+    """
+    state = LedState(
+        start,
+        np.zeros_like(boards.places_mm),
+        base_from_flange,
+        prior.flange_from_camera,
+        prior.lens.vector(),
+    )
+    problem = problem_of(seen, place, boards, base_from_flange, prior, stated)
+    factors, kept, taken = np.ones(len(GROUPS)), np.ones(len(place), np.bool_), 0
+    state, taken = _descend(problem, state, factors, kept, 3.0 * HUBER)
+    problem = at_centres(problem, state)
+    for robust in (True, False):
+        for _ in range(_MOST_ROUNDS):
+            state, steps = _descend(problem, state, factors, kept, HUBER if robust else np.inf)
+            taken += steps
+            residuals = whitened(problem, state)
+            off = np.sqrt(np.mean(residuals**2, axis=1))
+            before, seen_factors = kept, factors.copy()
+            if robust:
+                seen_factors[SPOTS] = max(1.4826 * float(np.median(np.abs(residuals))), _LEAST_FACTOR)
+            else:
+                seen_factors = _solved(problem, state, factors, kept).seen
+            settled = bool(np.all(np.abs(seen_factors / factors - 1) < _SETTLED))
+            factors = seen_factors
+            kept = off <= REJECT_SIGMA * factors[SPOTS] / np.sqrt(2)
+            if settled and (robust or bool((kept == before).all())):
+                break
+    return _summary(problem, state, factors, kept, taken)
+
+
+# -- normal equations, board by board ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _BoardPart:
+    """One board's share of the normal equations: its own parameters (pose, then its LEDs' offsets) and how they
+    hang together with the shared ones in `columns`."""
+
+    own: Floats
+    """[m, m]."""
+    cross: Floats
+    """[m, columns]."""
+    side: Floats
+    """[m]."""
+    jacobian: Floats
+    """[2 k, m + columns] of its spots, weighted."""
+    columns: Indices
+
+
+def _board_parts(
+    problem: Problem, state: LedState, linear: Linear, factors: Floats, weights: Floats
+) -> Iterator[tuple[_BoardPart, Floats]]:
+    """For each board its part, and the residuals [2 k] of its spots."""
+    off_table = between(state.base_from_board, problem.boards.base_from_board)
+    tolerance = problem.stated.tolerance_mm * factors[TOLERANCE]
+    root = np.sqrt(weights)[:, None] / factors[SPOTS]
+    for board, (rows, columns) in enumerate(zip(problem.sightings_of, problem.columns_of, strict=True)):
+        places = problem.boards.rows_of(board)
+        count, own = len(rows), 6 + 3 * len(places)
+        jacobian = np.zeros((count, 2, own + len(columns)))
+        jacobian[:, :, :6] = linear.by_board[rows]
+        at = np.arange(count)[:, None]
+        led = np.searchsorted(places, problem.place[rows])
+        view = np.searchsorted(columns[: -_tail(problem) : 6], 6 * problem.view[rows])
+        for axis in range(2):
+            jacobian[at, axis, 6 + 3 * led[:, None] + np.arange(3)] = linear.by_offset[rows, axis]
+            jacobian[at, axis, own + 6 * view[:, None] + np.arange(6)] = linear.by_view[rows, axis]
+        jacobian[:, :, -_tail(problem) :] = linear.by_camera[rows]
+        jacobian *= root[rows][:, :, None]
+        flat = jacobian.reshape(2 * count, jacobian.shape[2])
+        residuals = (linear.residuals[rows] * root[rows]).ravel()
+        normal, side = flat[:, :own].T @ flat, flat[:, :own].T @ residuals
+        held = np.concatenate([table_sigmas(problem), np.full(own - 6, tolerance)]) ** -2
+        normal[np.arange(own), np.arange(own)] += held
+        side += held * np.concatenate([off_table[board], -state.offsets_mm[places].ravel()])
+        yield _BoardPart(normal[:, :own], normal[:, own:], side, flat, columns), residuals
+
+
+def _tail(problem: Problem) -> int:
+    return len(problem.prior_whiten)
+
+
+def _normal(
+    problem: Problem, state: LedState, factors: Floats, weights: Floats
+) -> tuple[list[_BoardPart], list[Floats], Floats, Floats]:
+    """Boards' parts with G = own^-1 [cross, side] of each, and the reduced normal matrix and side of what they
+    share."""
+    parts: list[_BoardPart] = []
+    eliminated: list[Floats] = []
+    views, tail = 6 * len(problem.reported), _tail(problem)
+    matrix, side = np.zeros((problem.shared, problem.shared)), np.zeros(problem.shared)
+    for part, residuals in _board_parts(problem, state, linearised(problem, state), factors, weights):
+        shared = part.jacobian[:, len(part.own) :]
+        solved = _solve(part.own, np.column_stack([part.cross, part.side]))
+        matrix[np.ix_(part.columns, part.columns)] += shared.T @ shared - part.cross.T @ solved[:, :-1]
+        side[part.columns] += shared.T @ residuals - part.cross.T @ solved[:, -1]
+        parts.append(part)
+        eliminated.append(solved)
+    held = (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** -2
+    off = between(state.base_from_flange, problem.reported)
+    matrix[np.arange(views), np.arange(views)] += np.tile(held, len(problem.reported))
+    side[:views] += (held * off).ravel()
+    camera = problem.prior_whiten.T @ problem.prior_whiten
+    matrix[views:, views:] += camera
+    side[views:] -= camera @ camera_step(problem, state)
+    assert len(matrix) == views + tail
+    return parts, eliminated, matrix, side
+
+
+def _descend(
+    problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_], huber: float
+) -> tuple[LedState, int]:
+    """Gauss-Newton with Huber's weights, steps halved where they gain nothing, until one changes nothing."""
+    cost = cost_of(problem, state, factors, kept, huber)
+    for step in range(1, _MOST_STEPS + 1):
+        off = np.sqrt(np.sum(whitened(problem, state) ** 2, axis=1)) / factors[SPOTS]
+        weights = np.where(kept, np.minimum(1.0, huber / np.maximum(off, 1e-12)), 0.0)
+        parts, eliminated, matrix, side = _normal(problem, state, factors, weights)
+        shared = cho_solve(_factored(matrix), side)
+        own = [s[:, -1] - s[:, :-1] @ shared[p.columns] for p, s in zip(parts, eliminated, strict=True)]
+        share, tried = 1.0, stepped(problem, state, shared, own, 1.0)
+        while (now := cost_of(problem, tried, factors, kept, huber)) > cost * (1 + 1e-12) and share > 1e-3:
+            share /= 2
+            tried = stepped(problem, state, shared, own, share)
+        if now > cost * (1 + 1e-12):
+            return state, step
+        state, gain, cost = tried, cost - now, now
+        if gain < _STILL * max(cost, 1.0):
+            return state, step
+    raise InputError(
+        f"LEDs: no convergence in {_MOST_STEPS} steps. Look for views of another camera or dome, and for "
+        "records of another lens"
+    )
+
+
+def _solve(matrix: Floats, side: Floats) -> Floats:
+    return np.asarray(np.linalg.solve(matrix, side), dtype=np.float64)
+
+
+def _factored(matrix: Floats) -> tuple[Floats, bool]:
+    try:
+        return cho_factor(matrix, lower=True)  # type: ignore[no-any-return]
+    except LinAlgError:
+        raise InputError(
+            "LEDs: the spots do not determine the camera's poses. Take views that differ, each of several boards"
+        ) from None
+
+
+# -- noise and uncertainty --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Covariances at the solution, and what residuals say of the noise."""
+
+    own: list[Floats]
+    """[b] of each board's own parameters."""
+    alone: list[Floats]
+    """[b] the same if all that views share were known."""
+    seen: Floats
+    redundancy: Floats
+
+
+def _solved(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_]) -> _Solved:
+    parts, eliminated, matrix, _ = _normal(problem, state, factors, kept.astype(np.float64))
+    shared = cho_solve(_factored(matrix), np.eye(len(matrix)))
+    own: list[Floats] = []
+    alone: list[Floats] = []
+    taken = np.zeros(len(GROUPS))
+    for part, solved in zip(parts, eliminated, strict=True):
+        count, gain = len(part.own), solved[:, :-1]
+        block = shared[np.ix_(part.columns, part.columns)]
+        alone.append(_solve(part.own, np.eye(count)))
+        own.append(alone[-1] + gain @ block @ gain.T)
+        whole = np.block([[own[-1], -gain @ block], [-block @ gain.T, block]])
+        taken[SPOTS] += float(np.sum((part.jacobian @ whole) * part.jacobian))
+        taken[TOLERANCE] += float(np.trace(own[-1][6:, 6:]))
+        assert count == len(own[-1])
+    variance = np.diag(shared)[: 6 * len(problem.reported)].reshape(-1, 6)
+    taken[TOLERANCE] /= (problem.stated.tolerance_mm * factors[TOLERANCE]) ** 2
+    scaled = variance / (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** 2
+    taken[POSITION], taken[ORIENTATION] = scaled[:, :3].sum(), scaled[:, 3:].sum()
+    off = between(problem.reported, state.base_from_flange) / problem.sigmas
+    groups = (
+        whitened(problem, state)[kept],
+        state.offsets_mm / problem.stated.tolerance_mm,
+        off[:, :3],
+        off[:, 3:],
+    )
+    redundancy = np.array([part.size for part in groups]) - taken
+    chi2 = np.array([float(np.sum(part**2)) for part in groups])
+    seen = np.sqrt(chi2 / np.maximum(redundancy, 1e-9))
+    told = redundancy >= _LEAST_REDUNDANCY
+    return _Solved(own, alone, np.where(told, np.maximum(seen, _LEAST_FACTOR), factors), redundancy)
+
+
+def _summary(
+    problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_], steps: int
+) -> LedGeometry:
+    solved = _solved(problem, state, factors, kept)
+    boards = problem.boards
+    centres = np.empty((len(boards.places_mm), 3, 3))
+    shared_part = np.empty(len(centres))
+    normals = np.empty((len(boards.numbers), 2, 2))
+    for board, (own, alone) in enumerate(zip(solved.own, solved.alone, strict=True)):
+        turn = state.base_from_board[board, :3, :3]
+        normals[board] = np.degrees(np.degrees(own[3:5, 3:5]))
+        for led, place in enumerate(boards.rows_of(board)):
+            by = np.zeros((3, len(own)))
+            by[:, :3] = np.eye(3)
+            by[:, 3:6] = -turn @ skew(boards.places_mm[place] + state.offsets_mm[place])
+            by[:, 6 + 3 * led : 9 + 3 * led] = turn
+            centres[place] = by @ own @ by.T
+            shared_part[place] = 1 - np.trace(by @ alone @ by.T) / np.trace(centres[place])
+    residuals = _solve(problem.whiten, whitened(problem, state)[:, :, None])[:, :, 0]
+    step = camera_step(problem, state) / np.sqrt(np.diag(problem.prior.covariance))
+    return LedGeometry(
+        state,
+        boards.in_base(state.base_from_board, state.offsets_mm),
+        centres,
+        normals,
+        shared_part,
+        factors,
+        solved.redundancy,
+        residuals,
+        kept,
+        step,
+        steps,
+    )

@@ -1,0 +1,106 @@
+"""The picture of a dome's geometry: how well each LED is known, and how far it is from where the table had it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from coupole.calibration.leds.workflow import LedsFound
+from coupole.calibration.report import BLUE, DARK, GREY, RED
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_ARROW_MM = 120.0
+"""Length of the arrow of a typical shift."""
+
+
+def draw_leds(found: LedsFound, figure: Figure) -> None:
+    """Fill the figure."""
+    axes = figure.subplots(2, 3)
+    for ax, (across, up, title) in zip(
+        axes[0], ((0, 1, "From above"), (0, 2, "From the side"), (1, 2, "From the front")), strict=True
+    ):
+        _draw_dome(ax, found, across, up, title)
+    _draw_uncertainty(axes[1, 0], found)
+    _draw_residuals(axes[1, 1], found)
+    _draw_robot(axes[1, 2], found)
+
+
+def _draw_dome(ax: Axes, found: LedsFound, across: int, up: int, title: str) -> None:
+    """LEDs by uncertainty; arrows of boards from table to found, enlarged; red rings where none was found."""
+    place = found.new_table.positions_mm
+    known = np.isfinite(found.u_mm)
+    order = np.argsort(np.nan_to_num(found.u_mm))
+    order = order[known[order]]
+    x, y = place[:, across], place[:, up]
+    dots = ax.scatter(x[order], y[order], c=1e3 * found.u_mm[order], s=9, cmap="viridis", linewidths=0)
+    ax.figure.colorbar(dots, ax=ax, label="u of the centre (um)", shrink=0.8)
+    ax.scatter(x[~known], y[~known], s=40, facecolors="none", edgecolors=RED, linewidths=1.5)
+    boards = np.unique(found.table.boards)
+    before = np.array([found.table.positions_mm[found.table.boards == b].mean(axis=0) for b in boards])
+    after = np.array([place[found.table.boards == b].mean(axis=0) for b in boards])
+    shift = after - before
+    enlarged = _round(_ARROW_MM / max(float(np.median(np.linalg.norm(shift, axis=1))), 1e-6))
+    ax.quiver(
+        *before[:, [across, up]].T,
+        *shift[:, [across, up]].T * enlarged,
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        width=0.002,
+        color=DARK,
+    )
+    names = "xyz"
+    ax.set(
+        aspect="equal", xlabel=f"{names[across]} (mm, base)", ylabel=f"{names[up]} (mm, base)",
+        title=f"{title}; shifts of boards x {enlarged:g}",
+    )  # fmt: skip
+    if up == 2:
+        ax.invert_yaxis()  # the arm hangs: z of its base points down
+
+
+def _draw_uncertainty(ax: Axes, found: LedsFound) -> None:
+    known = found.u_mm[np.isfinite(found.u_mm)] * 1e3
+    ax.hist(known, bins=40, range=(0, float(np.percentile(known, 99.5)) * 1.1), color=BLUE)
+    for share, style in ((50, "-"), (95, "--")):
+        value = float(np.percentile(known, share))
+        ax.axvline(value, color=RED, ls=style, label=f"{share} %: {value:.0f} um")
+    ax.legend(frameon=False)
+    ax.set(title="Uncertainty of centres", xlabel="u (um)", ylabel="LEDs")
+
+
+def _draw_residuals(ax: Axes, found: LedsFound) -> None:
+    """Residuals of all spots; those left out red, at the rim if they are farther off."""
+    residuals, kept = found.geometry.residuals_px, found.geometry.kept
+    reach = 6.0 * float(np.sqrt(np.mean(residuals[kept] ** 2)))
+    x, y = np.clip(residuals, -reach, reach).T
+    ax.scatter(x[kept], y[kept], s=3, color=BLUE, alpha=0.4, linewidths=0)
+    ax.scatter(x[~kept], y[~kept], s=16, color=RED, marker="x")
+    ax.axhline(0, color=GREY, lw=0.8)
+    ax.axvline(0, color=GREY, lw=0.8)
+    out = int((~kept).sum())
+    ax.set(
+        xlim=(-1.05 * reach, 1.05 * reach), ylim=(-1.05 * reach, 1.05 * reach), aspect="equal",
+        title=f"Residuals of {kept.sum()} spots, {out} left out", xlabel="x (px)", ylabel="y (px)",
+    )  # fmt: skip
+
+
+def _draw_robot(ax: Axes, found: LedsFound) -> None:
+    """What the arm was off at each view."""
+    views = np.arange(len(found.view_errors))
+    ax.plot(
+        views, 1e3 * np.linalg.norm(found.view_errors[:, :3], axis=1), "o", color=BLUE, ms=4, label="position (um)"
+    )
+    turn = 1e3 * np.linalg.norm(found.view_errors[:, 3:], axis=1)
+    ax.plot(views, turn, "s", color=RED, ms=4, label="orientation (mdeg)")
+    ax.set(title="What the arm was off", xlabel="view", ylim=(0, None))
+    ax.legend(frameon=False)
+
+
+def _round(value: float) -> float:
+    """1, 2 or 5 times a power of ten, at most the value."""
+    ten = 10.0 ** np.floor(np.log10(value))
+    return float(ten * max(step for step in (1, 2, 5) if step * ten <= value * (1 + 1e-9)))

@@ -1,0 +1,209 @@
+"""What the LEDs' adjustment is about: its unknowns, its residuals by the stated noise, and their derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration import optics
+from coupole.calibration.leds.boards import Boards
+from coupole.calibration.leds.matching import LedSightings
+from coupole.calibration.leds.spots import outline_offsets
+from coupole.calibration.point_sets import Indices
+from coupole.calibration.posed_camera import CameraPrior
+from coupole.calibration.rotations import Floats, between, inverses, moved, skew
+
+SPOTS, TOLERANCE, POSITION, ORIENTATION = range(4)
+GROUPS = ("spots", "LEDs on their boards", "robot position", "robot orientation")
+"""Observations whose noise is estimated. Table, lens and hand-eye are believed."""
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What is known of the noise beforehand, standard deviations of each coordinate."""
+
+    tolerance_mm: float = 0.05
+    """Of LEDs on their boards."""
+    robot_mm: float = 0.03
+    robot_deg: float = 0.003
+    table_mm: float = 10.0
+    """Of boards against their table: so wide that it decides only where nothing was seen."""
+    table_deg: float = 2.0
+    side_mm: float = 7.0
+    """Of an LED."""
+
+
+@dataclass(frozen=True)
+class LedState:
+    """All that is estimated."""
+
+    base_from_board: Floats
+    offsets_mm: Floats
+    """[n, 3] of LEDs on their boards."""
+    base_from_flange: Floats
+    flange_from_camera: Floats
+    lens: Floats
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What stays the same through all steps."""
+
+    boards: Boards
+    place: Indices
+    """[k] of each spot."""
+    view: Indices
+    observed: Floats
+    whiten: Floats
+    """[k, 2, 2] that bring residuals to unit variance."""
+    reported: Floats
+    prior: CameraPrior
+    prior_whiten: Floats
+    stated: Stated
+    sightings_of: tuple[Indices, ...]
+    """[b] spots on each board."""
+    columns_of: tuple[Indices, ...]
+    """[b] shared parameters that these depend on."""
+
+    @property
+    def sigmas(self) -> Floats:
+        """[6] of one pose's step."""
+        return np.repeat([self.stated.robot_mm, np.radians(self.stated.robot_deg)], 3)
+
+    @property
+    def shared(self) -> int:
+        """Shared parameters: six for each view, hand-eye and lens last."""
+        return 6 * len(self.reported) + len(self.prior_whiten)
+
+
+def problem_of(
+    seen: LedSightings, place: Indices, boards: Boards, reported: Floats, prior: CameraPrior, stated: Stated
+) -> Problem:
+    whiten = np.linalg.inv(np.linalg.cholesky(seen.covariance))
+    board = boards.board_of[place]
+    sightings_of = tuple(np.flatnonzero(board == b) for b in range(len(boards.numbers)))
+    tail = 6 * len(reported) + np.arange(6 + len(prior.free))
+    columns_of = tuple(
+        np.concatenate([(6 * np.unique(seen.view[rows])[:, None] + np.arange(6)).ravel(), tail])
+        for rows in sightings_of
+    )
+    prior_whiten = np.linalg.inv(np.linalg.cholesky(prior.covariance))
+    return Problem(
+        boards,
+        place,
+        seen.view,
+        seen.pixels,
+        whiten,
+        reported,
+        prior,
+        prior_whiten,
+        stated,
+        sightings_of,
+        columns_of,
+    )
+
+
+def at_centres(problem: Problem, state: LedState) -> Problem:
+    """The same with spots moved from the middle of the LEDs' outlines to where their centres are."""
+    board_pose = state.base_from_board[problem.boards.board_of[problem.place]]
+    centres = problem.boards.in_base(state.base_from_board, state.offsets_mm)[problem.place]
+    camera_from_base = inverses(state.base_from_flange @ state.flange_from_camera)[problem.view]
+    off = outline_offsets(board_pose, centres, camera_from_base, state.lens, problem.stated.side_mm)
+    return replace(problem, observed=problem.observed - off)
+
+
+# -- residuals and derivatives ----------------------------------------------------------------------------
+
+
+def points_seen(problem: Problem, state: LedState) -> tuple[Floats, Floats, Floats]:
+    """Points [k, 3] on their boards, in the flange's and in the camera's frame."""
+    on_board = (problem.boards.places_mm + state.offsets_mm)[problem.place]
+    pose = state.base_from_board[problem.boards.board_of[problem.place]]
+    in_base = np.einsum("kij,kj->ki", pose[:, :3, :3], on_board) + pose[:, :3, 3]
+    flange = state.base_from_flange[problem.view]
+    in_flange = np.einsum("kji,kj->ki", flange[:, :3, :3], in_base - flange[:, :3, 3])
+    in_camera = (in_flange - state.flange_from_camera[:3, 3]) @ state.flange_from_camera[:3, :3]
+    return on_board, in_flange, in_camera
+
+
+def whitened(problem: Problem, state: LedState) -> Floats:
+    """Residuals [k, 2] of unit variance by the stated noise."""
+    projected = optics.project(points_seen(problem, state)[2], state.lens)
+    result: Floats = np.einsum("kij,kj->ki", problem.whiten, problem.observed - projected.pixels)
+    return result
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Whitened residuals and derivatives of all spots."""
+
+    residuals: Floats
+    """[k, 2]."""
+    by_board: Floats
+    """[k, 2, 6]."""
+    by_offset: Floats
+    """[k, 2, 3]."""
+    by_view: Floats
+    """[k, 2, 6]."""
+    by_camera: Floats
+    """[k, 2, free + 6]: lens, then hand-eye."""
+
+
+def linearised(problem: Problem, state: LedState) -> Linear:
+    on_board, in_flange, in_camera = points_seen(problem, state)
+    projected = optics.project(in_camera, state.lens)
+    by_point = problem.whiten @ projected.by_point
+    by_flange_point = by_point @ state.flange_from_camera[:3, :3].T
+    by_base_point = by_flange_point @ np.swapaxes(state.base_from_flange[problem.view, :3, :3], 1, 2)
+    turn = state.base_from_board[problem.boards.board_of[problem.place], :3, :3]
+    by_offset = by_base_point @ turn
+    free = [optics.NAMES.index(name) for name in problem.prior.free]
+    return Linear(
+        np.einsum("kij,kj->ki", problem.whiten, problem.observed - projected.pixels),
+        np.concatenate([by_base_point, -by_offset @ skew(on_board)], axis=2),
+        by_offset,
+        np.concatenate([-by_base_point, by_flange_point @ skew(in_flange)], axis=2),
+        np.concatenate(
+            [problem.whiten @ projected.by_intrinsics[:, :, free], -by_flange_point, by_point @ skew(in_camera)],
+            axis=2,
+        ),
+    )
+
+
+def camera_step(problem: Problem, state: LedState) -> Floats:
+    """[free + 6] from the records to the state."""
+    free = [optics.NAMES.index(name) for name in problem.prior.free]
+    hand_eye = between(problem.prior.flange_from_camera, state.flange_from_camera)
+    return np.concatenate([(state.lens - problem.prior.lens.vector())[free], hand_eye])
+
+
+def cost_of(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_], huber: float) -> float:
+    off = np.sqrt(np.sum(whitened(problem, state)[kept] ** 2, axis=1)) / factors[SPOTS]
+    spots = np.where(off <= huber, off**2, huber * (2 * off - huber)) if np.isfinite(huber) else off**2
+    tolerance = state.offsets_mm / problem.stated.tolerance_mm / factors[TOLERANCE]
+    sigmas = problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)
+    poses = between(problem.reported, state.base_from_flange) / sigmas
+    table = between(problem.boards.base_from_board, state.base_from_board) / table_sigmas(problem)
+    camera = problem.prior_whiten @ camera_step(problem, state)
+    return float(spots.sum() + sum(np.sum(part**2) for part in (tolerance, poses, table, camera)))
+
+
+def table_sigmas(problem: Problem) -> Floats:
+    return np.repeat([problem.stated.table_mm, np.radians(problem.stated.table_deg)], 3)
+
+
+def stepped(problem: Problem, state: LedState, shared: Floats, own: list[Floats], share: float) -> LedState:
+    views, free = len(problem.reported), len(problem.prior.free)
+    offsets, lens = state.offsets_mm.copy(), state.lens.copy()
+    for board, step in enumerate(own):
+        offsets[problem.boards.rows_of(board)] += share * step[6:].reshape(-1, 3)
+    lens[[optics.NAMES.index(name) for name in problem.prior.free]] += share * shared[6 * views : 6 * views + free]
+    return LedState(
+        moved(state.base_from_board, share * np.array([step[:6] for step in own])),
+        offsets,
+        moved(state.base_from_flange, share * shared[: 6 * views].reshape(-1, 6)),
+        moved(state.flange_from_camera, share * shared[6 * views + free :]),
+        lens,
+    )

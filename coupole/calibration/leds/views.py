@@ -1,0 +1,127 @@
+"""From where to look at a dome's LEDs: the fewest views that see each board often enough, from sides that differ.
+
+An image shows one LED, so six sightings of 1080 LEDs are 6480 images, whatever the views; fewer views make fewer
+moves, and views that see many boards at once tie them together. Views are chosen one by one: each time the one
+that adds most to what is known of boards that need more (log det of the information on a board's place; sequential
+D-optimal design, Fedorov, Theory of Optimal Experiments, 1972).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration import optics
+from coupole.calibration.leds.boards import Boards
+from coupole.calibration.optics import Intrinsics
+from coupole.calibration.rotations import Floats, inverses
+
+ENOUGH = 6
+"""Sightings of each LED (seed 003)."""
+MOST_ANGLE_DEG = 65.0
+"""Between an LED's normal and the direction to the camera; seen flatter, boards' edges hide it."""
+NEAREST_MM, FARTHEST_MM = 400.0, 2600.0
+_START_MM = 50.0
+"""How well a board's place is known from the table."""
+_ANGLE_SIGMA = np.radians(0.004)
+"""Of one sighting, most of it the arm's."""
+
+
+@dataclass(frozen=True)
+class LedView:
+    """One of the candidates, and the boards to be lit there."""
+
+    candidate: int
+    boards: tuple[int, ...]
+    """As the table numbers them."""
+
+
+@dataclass(frozen=True)
+class LedViews:
+    """A choice of views."""
+
+    views: tuple[LedView, ...]
+    images: int
+    """LEDs of the boards of each view, added up."""
+    few: tuple[int, ...]
+    """Boards that the candidates see fewer times than wanted."""
+    u_mm: Floats
+    """[b] expected standard uncertainty of each board's place, all directions together, without what ties boards
+    to each other."""
+
+
+def led_views(
+    boards: Boards,
+    base_from_camera: Floats,
+    lens: Intrinsics,
+    size_px: tuple[int, int],
+    *,
+    enough: int = ENOUGH,
+    margin_px: float = 80.0,
+) -> LedViews:
+    """Choose among candidates [c, 4, 4] until each board is seen `enough` times by all its LEDs."""
+    visible, information = _sightings(boards, base_from_camera, lens, size_px, margin_px)
+    needed = np.full(len(boards.numbers), enough)
+    known = np.tile(np.eye(3) / _START_MM**2, (len(needed), 1, 1))
+    free = np.ones(len(base_from_camera), np.bool_)
+    chosen: list[LedView] = []
+    gain = _gain(known, information)
+    while True:
+        wanted = visible & free[:, None] & (needed > 0)[None]
+        best = int(np.argmax(np.where(wanted, gain, 0.0).sum(axis=1)))
+        if not wanted[best].any():
+            break
+        free[best] = False
+        rows = np.flatnonzero(wanted[best])
+        known[rows] += information[best, rows]
+        gain[:, rows] = _gain(known[rows], information[:, rows])
+        needed[rows] -= 1
+        chosen.append(LedView(best, tuple(int(n) for n in boards.numbers[rows])))
+    leds = np.bincount(boards.board_of)
+    of = {int(number): row for row, number in enumerate(boards.numbers)}
+    images = sum(int(leds[of[number]]) for view in chosen for number in view.boards)
+    few = tuple(int(n) for n in boards.numbers[needed > 0])
+    return LedViews(tuple(chosen), images, few, np.sqrt(np.trace(np.linalg.inv(known), axis1=1, axis2=2)))
+
+
+def boards_seen(
+    boards: Boards, base_from_camera: Floats, lens: Intrinsics, size_px: tuple[int, int], margin_px: float
+) -> NDArray[np.bool_]:
+    """[c, b] which boards each of the poses [c, 4, 4] sees whole."""
+    return _sightings(boards, base_from_camera, lens, size_px, margin_px)[0]
+
+
+def _gain(known: Floats, information: Floats) -> Floats:
+    """What each view [c] adds to each board [b]: growth of log det."""
+    return np.asarray(np.linalg.slogdet(known[None] + information)[1] - np.linalg.slogdet(known)[1])
+
+
+def _sightings(
+    boards: Boards, base_from_camera: Floats, lens: Intrinsics, size_px: tuple[int, int], margin_px: float
+) -> tuple[NDArray[np.bool_], Floats]:
+    """Which boards [c, b] each candidate sees whole, and what that tells of their places [c, b, 3, 3], 1/mm^2."""
+    leds_mm = boards.in_base(boards.base_from_board)
+    normals = boards.base_from_board[boards.board_of, :3, 2]
+    camera_from_base = inverses(base_from_camera)
+    seen = np.empty((len(base_from_camera), len(leds_mm)), np.bool_)
+    for number, pose in enumerate(camera_from_base):
+        there = leds_mm @ pose[:3, :3].T + pose[:3, 3]
+        towards = base_from_camera[number, :3, 3] - leds_mm
+        distance = np.linalg.norm(towards, axis=1)
+        facing = np.einsum("ni,ni->n", towards, normals) / distance
+        seen[number] = (there[:, 2] > NEAREST_MM) & (distance < FARTHEST_MM)
+        seen[number] &= facing > np.cos(np.radians(MOST_ANGLE_DEG))
+        rows = np.flatnonzero(seen[number])
+        pixels = optics.project(there[rows], lens.vector()).pixels
+        inside = (pixels > margin_px) & (pixels < np.array(size_px) - 1 - margin_px)
+        seen[number, rows] = inside.all(axis=1)
+    count = len(boards.numbers)
+    whole = np.stack([seen[:, boards.rows_of(b)].all(axis=1) for b in range(count)], axis=1)
+    middles = boards.base_from_board[:, :3, 3]
+    rays = middles[None] - base_from_camera[:, None, :3, 3]
+    distance = np.linalg.norm(rays, axis=2, keepdims=True)
+    rays = rays / distance
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    return whole, across / (distance[..., None] * _ANGLE_SIGMA) ** 2

@@ -1,0 +1,326 @@
+"""From the spots of a run to the record of all LEDs, the dome's new table and what the report shows."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, timedelta
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+import coupole
+from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
+from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
+from coupole.calibration.leds.boards import Boards, boards_of, placed
+from coupole.calibration.leds.equations import GROUPS, ORIENTATION, POSITION, SPOTS, TOLERANCE, Stated
+from coupole.calibration.leds.limits import LEDS
+from coupole.calibration.leds.matching import Fault, Matching, fault_lines, match_leds
+from coupole.calibration.leds.sources import LedImages
+from coupole.calibration.limits import judged
+from coupole.calibration.posed_camera import CameraPrior
+from coupole.calibration.record import ImageResidual, Input, Limit, Noise, Parameter, Record, Validity, sealed
+from coupole.calibration.rotations import Floats, rotation_vector
+from coupole.calibration.wish import Wish
+from coupole.dome import COLUMNS, LedTable
+from coupole.errors import InputError
+
+MOVED_MM, MOVED_DEG = 5.0, 1.0
+"""A board farther from its table than this is named: it was mounted anew, or pushed."""
+_COVARIANCE_OF_SINGLE = 1e-12
+
+
+@dataclass(frozen=True)
+class LedsFound:
+    """The result and what the report draws."""
+
+    record: Record
+    files: dict[str, bytes]
+    table: LedTable
+    """As it was known before."""
+    new_table: LedTable
+    geometry: LedGeometry
+    matching: Matching
+    u_mm: Floats
+    """[n] standard uncertainty of each LED's centre by row of the table; NaN where it was not found."""
+    u_deg: Floats
+    """[n] of its normal."""
+    view_errors: Floats
+    """[v, 6] what the arm was off, mm and degrees."""
+
+
+def leds_from(
+    images: LedImages,
+    table: LedTable,
+    prior: CameraPrior,
+    wish: Wish,
+    *,
+    stated: Stated,
+    arm: CalibratedArm | None = None,
+) -> LedsFound:
+    """Find all LEDs of a dome. Raises InputError if none is found, or the spots contradict the camera's record.
+
+    `arm` corrects the reported poses by the axis zeros that the hand-eye record found.
+    """
+    if arm is not None and images.joints_deg is not None:
+        poses, _ = calibrated_poses(images.base_from_flange, images.joints_deg, arm, prior)
+        images = replace(images, base_from_flange=poses)
+    boards = boards_of(table)
+    base_from_camera = images.base_from_flange @ prior.flange_from_camera
+    matching = match_leds(
+        images.seen,
+        base_from_camera,
+        prior.lens,
+        table.ids,
+        boards,
+        tolerance_px=tolerance_px(prior, stated, table, base_from_camera),
+    )
+    used = np.flatnonzero(matching.place_of[matching.sightings.led] >= 0)
+    if not len(used):
+        lines = "\n".join(fault_lines(matching.faults)[:5])
+        raise InputError(f"LEDs: none was found near its place of the table:\n{lines}")
+    sightings = matching.sightings.only(used)
+    place = matching.place_of[sightings.led]
+    start = placed(boards, matching.by_place_mm)
+    geometry = adjust_leds(sightings, place, images.base_from_flange, boards, start, prior, stated)
+    faults = (*matching.faults, *_moved_boards(boards, geometry, place))
+    u_mm = np.sqrt(np.trace(geometry.centre_covariance, axis1=1, axis2=2))
+    u_deg = np.sqrt(np.trace(geometry.normal_covariance, axis1=1, axis2=2))[boards.board_of]
+    found = matching.place_of >= 0
+    where = np.where(found, matching.place_of, np.arange(len(table.ids)))
+    new_table = LedTable(
+        table.ids,
+        table.boards[where],
+        geometry.centres_mm[where],
+        geometry.normals[boards.board_of[where]],
+        table.flux_lm,
+    )
+    files = {
+        f"{wish.name}.csv": led_csv(new_table, wish.name).encode("ascii"),
+        f"{wish.name}.h5": _h5(geometry, matching, boards, where, place, len(table.ids)),
+    }
+    views = len(images.base_from_flange)
+    limits = judged(LEDS, wish.limits, _figures(geometry, found, u_mm[where], u_deg[where]))
+    record = sealed(
+        kind="leds",
+        name=wish.name,
+        created=wish.now.astimezone(UTC).replace(microsecond=0),
+        software=f"coupole {coupole.__version__}",
+        simulated=images.about.simulated,
+        validity=Validity(
+            expires=(wish.now + timedelta(days=wish.valid_days)).astimezone(UTC).replace(microsecond=0)
+        ),
+        transforms={},
+        **_parameters(
+            geometry, stated, float(np.median(u_mm[where][found])), float(np.median(u_deg[where][found]))
+        ),
+        fixed={
+            "leds": float(len(table.ids)),
+            "leds_found": float(found.sum()),
+            "views": float(views),
+            "images": float(len(images.seen.frames)),
+        },
+        files=tuple(Input(name=name, sha256=hashlib.sha256(data).hexdigest()) for name, data in files.items()),
+        noise=_noise(geometry, stated),
+        images=_views(images.views, sightings.view, geometry),
+        limits=limits,
+        remarks=(
+            *fault_lines(faults),
+            *_of_records(geometry, prior, limits),
+            *_of_spots(images.left_out),
+            *_of_the_arm(arm),
+        ),
+        inputs=tuple(Input(name=name, sha256=digest) for name, digest in images.inputs),
+    )
+    return LedsFound(
+        record,
+        files,
+        table,
+        new_table,
+        geometry,
+        matching,
+        np.where(found, u_mm[where], np.nan),
+        np.where(found, u_deg[where], np.nan),
+        _view_errors(geometry, images.base_from_flange),
+    )
+
+
+def tolerance_px(prior: CameraPrior, stated: Stated, table: LedTable, base_from_camera: Floats) -> float:
+    """How far spots of one LED may be from one point: 4 sigma of the camera's poses at the dome's distance, and
+    3 px for the rest."""
+    eyes_mm = base_from_camera[:, :3, 3].mean(axis=0)
+    distance_mm = float(np.median(np.linalg.norm(table.positions_mm - eyes_mm, axis=1)))
+    hand_eye = np.sqrt(np.diag(prior.hand_eye_covariance))
+    shift_mm = float(np.hypot(stated.robot_mm, hand_eye[:3].max()))
+    turn = float(np.hypot(np.radians(stated.robot_deg), hand_eye[3:].max()))
+    return 3.0 + 4.0 * prior.lens.fx * (shift_mm / distance_mm + turn)
+
+
+def led_csv(table: LedTable, name: str) -> str:
+    """A dome's table in the format of `configs/domes`."""
+    lines = [
+        f"# LEDs of a dome, in the frame of the robot's base. By the calibration {name}.",
+        "# Positions in mm, normals of unit length into the dome, flux in lumen.",
+        ",".join(COLUMNS),
+    ]
+    for row, led in enumerate(table.ids):
+        place = ",".join(f"{v:z.4f}" for v in table.positions_mm[row])
+        normal = ",".join(f"{v:z.7f}" for v in table.normals[row])
+        lines.append(f"{led},{table.boards[row]},{place},{normal},{table.flux_lm[row]:.1f}")
+    return "\n".join(lines) + "\n"
+
+
+def _h5(
+    geometry: LedGeometry,
+    matching: Matching,
+    boards: Boards,
+    where: NDArray[np.intp],
+    place: NDArray[np.intp],
+    count: int,
+) -> bytes:
+    """Uncertainties by LED, in the table's order; the same numbers give the same bytes."""
+    kept = geometry.kept
+    views = np.bincount(place[kept], minlength=count)
+    square = np.bincount(place[kept], np.sum(geometry.residuals_px[kept] ** 2, axis=1), minlength=count)
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w", track_order=True) as file:
+        file.attrs["frame"] = "base"
+
+        def put(name: str, data: NDArray[np.generic], unit: str, what: str) -> None:
+            dataset = file.create_dataset(name, data=data, track_times=False)
+            dataset.attrs["units"] = unit
+            dataset.attrs["long_name"] = what
+
+        put("centre_covariance", geometry.centre_covariance[where], "mm^2", "[leds, 3, 3] of the centre")
+        normal = geometry.normal_covariance[boards.board_of[where]]
+        put("normal_covariance", normal, "deg^2", "[leds, 2, 2] of turns about the board's x and y")
+        axes = geometry.state.base_from_board[boards.board_of[where], :3, :2]
+        put("board_axes", axes, "", "[leds, 3, 2] x and y of its board in the base")
+        put("offset_mm", geometry.state.offsets_mm[where], "mm", "[leds, 3] off its place on the board")
+        put("views", views[where], "", "[leds] that it was found in")
+        put("residual_rms", np.sqrt(square / np.maximum(views, 1))[where], "px", "[leds]")
+        put("found", matching.place_of >= 0, "", "[leds] False: placed by its board alone")
+    return buffer.getvalue()
+
+
+def _moved_boards(boards: Boards, geometry: LedGeometry, place: NDArray[np.intp]) -> list[Fault]:
+    before, after = boards.base_from_board, geometry.state.base_from_board
+    shift_mm = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    turn = np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]
+    turn_deg = np.degrees(np.linalg.norm(rotation_vector(turn), axis=1))
+    seen = np.isin(np.arange(len(boards.numbers)), boards.board_of[place])
+    return [
+        Fault(
+            "moved",
+            (),
+            f"board {boards.numbers[b]} stands {shift_mm[b]:.1f} mm and {turn_deg[b]:.2f} deg from its table. "
+            "Its new place is in this record",
+        )
+        for b in np.flatnonzero(seen & ((shift_mm > MOVED_MM) | (turn_deg > MOVED_DEG)))
+    ]
+
+
+def _parameters(geometry: LedGeometry, stated: Stated, centre_mm: float, normal_deg: float) -> dict[str, object]:
+    """Figures of the whole dome. Their own uncertainty is that of a standard deviation, s / sqrt(2 nu)."""
+    robot_mm, robot_deg = (
+        stated.robot_mm * geometry.noise[POSITION],
+        stated.robot_deg * geometry.noise[ORIENTATION],
+    )
+    freedom = np.maximum(geometry.redundancy, 1.0)
+    poses = float(freedom[POSITION] + freedom[ORIENTATION])
+    by = "camera poses" if float(np.median(geometry.shared_part)) > 0.5 else GROUPS[SPOTS]
+    figures = [
+        ("led_centre_median_u_mm", centre_mm, poses, by),
+        ("led_normal_median_u_deg", normal_deg, poses, by),
+        ("robot_position_mm", robot_mm, float(freedom[POSITION]), "residuals"),
+        ("robot_orientation_deg", robot_deg, float(freedom[ORIENTATION]), "residuals"),
+        (
+            "led_on_board_mm",
+            stated.tolerance_mm * geometry.noise[TOLERANCE],
+            float(freedom[TOLERANCE]),
+            "residuals",
+        ),
+    ]
+    parameters = tuple(
+        Parameter(
+            name=name,
+            value=float(value),
+            u=float(value) / float(np.sqrt(2 * freedom)),
+            degrees_of_freedom=freedom,
+            dominated_by=cause,
+        )
+        for name, value, freedom, cause in figures
+    )
+    covariance = np.diag([max(p.u**2, _COVARIANCE_OF_SINGLE**2) for p in parameters])
+    return {"parameters": parameters, "covariance": tuple(map(tuple, covariance.tolist()))}
+
+
+def _noise(geometry: LedGeometry, stated: Stated) -> tuple[Noise, ...]:
+    spot_px = float(np.sqrt(np.mean(geometry.residuals_px[geometry.kept] ** 2)))
+    units = ("px", "mm", "mm", "deg")
+    numbers = (
+        (spot_px / max(float(geometry.noise[SPOTS]), 1e-9), spot_px),
+        (stated.tolerance_mm, stated.tolerance_mm * geometry.noise[TOLERANCE]),
+        (stated.robot_mm, stated.robot_mm * geometry.noise[POSITION]),
+        (stated.robot_deg, stated.robot_deg * geometry.noise[ORIENTATION]),
+    )
+    return tuple(
+        Noise(name=name, unit=unit, stated=float(said), found=float(seen), redundancy=float(left))
+        for name, unit, (said, seen), left in zip(GROUPS, units, numbers, geometry.redundancy, strict=True)
+    )
+
+
+def _views(names: Sequence[str], view: NDArray[np.intp], geometry: LedGeometry) -> tuple[ImageResidual, ...]:
+    """One line for each view: its spots are the corners of a board's image."""
+    lines = []
+    for number, name in enumerate(names):
+        rows = np.flatnonzero(view == number)
+        good = rows[geometry.kept[rows]]
+        square = np.sum(geometry.residuals_px[good] ** 2, axis=1)
+        rms_px = float(np.sqrt(square.mean())) if len(good) else 0.0
+        lines.append(ImageResidual(name=name, corners=len(good), rejected=len(rows) - len(good), rms_px=rms_px))
+    return tuple(lines)
+
+
+def _figures(geometry: LedGeometry, found: NDArray[np.bool_], u_mm: Floats, u_deg: Floats) -> dict[str, float]:
+    """What `limits.LEDS` are held against."""
+    return {
+        "missing": float(1 - found.mean()),
+        "centre_mm": float(np.median(u_mm[found])),
+        "normal_deg": float(np.median(u_deg[found])),
+        "robot_ratio": float(max(geometry.noise[POSITION], geometry.noise[ORIENTATION])),
+        "rejected": float(1 - geometry.kept.mean()),
+        "record_step": float(np.abs(geometry.prior_step).max()),
+    }
+
+
+def _of_records(geometry: LedGeometry, prior: CameraPrior, limits: Sequence[Limit]) -> list[str]:
+    if next(limit.passed for limit in limits if limit.name == "record_step"):
+        return []
+    names = [*prior.free, *(f"flange_from_camera.{s}" for s in ("x", "y", "z", "rx", "ry", "rz"))]
+    worst = int(np.argmax(np.abs(geometry.prior_step)))
+    return [
+        f"{names[worst]} would have to be {abs(geometry.prior_step[worst]):.0f} standard uncertainties from its "
+        "record: a record of another focus, or a camera that was pushed since. Calibrate camera and hand-eye anew"
+    ]
+
+
+def _of_the_arm(arm: CalibratedArm | None) -> list[str]:
+    if arm is None:
+        return []
+    return ["poses are corrected by the axis zeros of the hand-eye record; use them with these LEDs"]
+
+
+def _of_spots(left_out: Sequence[str]) -> list[str]:
+    if not left_out:
+        return []
+    return [f"{len(left_out)} bright things were no spots, e.g. {left_out[0]}"]
+
+
+def _view_errors(geometry: LedGeometry, reported: Floats) -> Floats:
+    shift = geometry.state.base_from_flange[:, :3, 3] - reported[:, :3, 3]
+    turn = np.swapaxes(reported[:, :3, :3], 1, 2) @ geometry.state.base_from_flange[:, :3, :3]
+    return np.concatenate([shift, np.degrees(rotation_vector(turn))], axis=1)

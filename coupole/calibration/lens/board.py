@@ -1,0 +1,210 @@
+"""The board: what is printed on it, and its corners in an image.
+
+A board's frame is OpenCV's: x along the rows of squares, y along the columns, z into the board; the origin is the
+outer corner of a ChArUco board, the first inner corner of a chess board. Corners are found by OpenCV in 8 bits of
+one colour, and then fitted to that colour's own pixels in all the bits they have (`corner_fit`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from coupole import yamlfile
+from coupole.calibration.lens.corner_fit import enough_pixels, fit_corners
+from coupole.calibration.picture import Channel, Picture
+from coupole.calibration.rotations import Floats
+from coupole.plan import Model
+
+Count = Annotated[int, Field(ge=3, le=200)]
+Millimetres = Annotated[float, Field(gt=0, le=1000)]
+
+LEAST_CORNERS = 8
+CLIPPED_SHARE = 0.02
+"""Where more pixels than this about the corners are white, edges are eaten: such an image is left out."""
+
+
+class Board(Model):
+    """A board as its owner measured it (YAML)."""
+
+    schema_version: Literal[1] = 1
+    kind: Literal["charuco", "chessboard"]
+    corners: tuple[Count, Count]
+    """Inner corners along x and y: one less than squares."""
+    square_mm: Millimetres
+    scale_u_ppm: Annotated[float, Field(ge=0, le=20_000)] = 50.0
+    """Standard uncertainty of all its lengths together: print, measurement, warmth."""
+    marker_mm: Millimetres | None = None
+    dictionary: str = "DICT_5X5_250"
+    """OpenCV's name of the markers' dictionary."""
+    legacy_pattern: bool = False
+    """ChArUco as OpenCV before 4.6 printed it, which starts with a marker where rows are even in number."""
+
+    @field_validator("dictionary")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        import cv2
+
+        if not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
+            raise ValueError(f"no dictionary of OpenCV; found {name}, expected e.g. DICT_5X5_250")
+        return name
+
+    @model_validator(mode="after")
+    def _markers_fit(self) -> Board:
+        if self.kind == "charuco" and not 0 < (self.marker_mm or 0) < self.square_mm:
+            raise ValueError("a ChArUco board with `marker_mm`, smaller than `square_mm`")
+        return self
+
+    @property
+    def points_mm(self) -> Floats:
+        """All corners [n, 3] in the board's frame, row by row."""
+        across, down = self.corners
+        grid = np.zeros((across * down, 3))
+        grid[:, :2] = np.mgrid[0:across, 0:down].T.reshape(-1, 2) * self.square_mm
+        if self.kind == "charuco":
+            grid[:, :2] += self.square_mm
+        return grid
+
+    @property
+    def has_a_top(self) -> bool:
+        """False for a chess board that looks the same upside down; its pose is then known up to half a turn."""
+        return self.kind == "charuco" or sum(self.corners) % 2 == 1
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """The corners seen in one image."""
+
+    name: str
+    """Of the view or file."""
+    ids: NDArray[np.intp]
+    """Which corners [n], numbers into `Board.points_mm`."""
+    board_mm: Floats
+    """[n, 3]."""
+    pixels: Floats
+    """[n, 2], centre of the first pixel (0, 0)."""
+
+
+def read_board(path: Path) -> Board:
+    """A board's description. Raises InputError with every problem of the file."""
+    return yamlfile.read(path).validate(Board)
+
+
+def detect(board: Board, picture: Picture) -> Sighting | str:
+    """The board's corners in a picture, of a coloured one in green, or why it cannot be used."""
+    import cv2
+
+    image = picture.plane()
+    eight_bits = _eight_bits(image)
+    ids, rough = _chess(board, eight_bits) if board.kind == "chessboard" else _charuco(board, eight_bits)
+    if len(ids) < LEAST_CORNERS:
+        return f"{len(ids)} of {len(board.points_mm)} corners seen, {LEAST_CORNERS} needed"
+    outline = cv2.boundingRect(rough.astype(np.float32))
+    part = image[max(outline[1], 0) : outline[1] + outline[3], max(outline[0], 0) : outline[0] + outline[2]]
+    if (share := float(np.mean(part >= picture.white))) > CLIPPED_SHARE:
+        return f"clipped: {share:.0%} of the pixels on the board are saturated. Expose shorter"
+    seen = _refined(Sighting(picture.name, ids, board.points_mm[ids], rough), board, picture, "green")
+    if len(seen.ids) < LEAST_CORNERS:
+        return f"{len(seen.ids)} of {len(ids)} corners are sharp enough, {LEAST_CORNERS} needed"
+    if np.linalg.matrix_rank(seen.board_mm[:, :2] - seen.board_mm[0, :2]) < 2:
+        return "all corners seen lie on one line"
+    return seen
+
+
+def in_channel(board: Board, picture: Picture, channel: Channel, green: Sighting) -> Sighting:
+    """The corners of a sighting in green, found in another colour of its picture."""
+    return _refined(green, board, picture, channel)
+
+
+def _refined(rough: Sighting, board: Board, picture: Picture, channel: Channel) -> Sighting:
+    """The corners to a fraction of a pixel, without those that turn out to be none. Where they are too close
+    together for a fit, they are where OpenCV sees all gradients point away or along."""
+    window_px = _window_px(board, rough.ids, rough.pixels)
+    values, known = picture.measured(channel)
+    if not enough_pixels(known, window_px):
+        side_px = max(2, int(window_px / np.sqrt(2)))
+        return replace(rough, pixels=refine(picture.plane(channel), rough.pixels, side_px))
+    found = fit_corners(values, known, rough.pixels, window_px)
+    return Sighting(rough.name, rough.ids[found.fits], rough.board_mm[found.fits], found.pixels[found.fits])
+
+
+def refine(image: NDArray[Any], corners: Floats, window_px: int) -> Floats:
+    """Corners [n, 2] by OpenCV's `cornerSubPix`, `window_px` being half its window."""
+    import cv2
+
+    scaled = np.ascontiguousarray(image, dtype=np.float32)
+    scaled *= np.float32(255.0 / max(float(scaled.max()), 1e-9))
+    points = np.ascontiguousarray(corners, dtype=np.float32).reshape(-1, 1, 2)
+    until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
+    found = cv2.cornerSubPix(scaled, points, (window_px, window_px), (-1, -1), until)
+    return np.asarray(found, dtype=np.float64).reshape(-1, 2)
+
+
+def _eight_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """8 bits for the search alone: dark to white as the image's own extremes."""
+    if image.dtype == np.uint8:
+        return np.ascontiguousarray(image)
+    step = max(1, image.shape[0] // 500)
+    low, high = np.percentile(image[::step, ::step], [0.5, 99.5])
+    return np.asarray(np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255), dtype=np.uint8)
+
+
+def _window_px(board: Board, ids: NDArray[np.intp], corners: Floats) -> float:
+    """Radius of the window that a corner is found in, 2 to 11 px: a third of the way to the nearest corner, and
+    short of a ChArUco board's markers, whose corners stand on the diagonals and would pull by half a pixel."""
+    apart = np.linalg.norm(corners[:, None] - corners[None], axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    steps = np.linalg.norm(board.points_mm[ids][:, None] - board.points_mm[ids][None], axis=-1)
+
+    def nearest(step_mm: float) -> float:
+        neighbours = apart[np.isclose(steps, step_mm)]
+        return float(np.percentile(neighbours, 5)) if len(neighbours) else float(apart.min())
+
+    radius_px = nearest(board.square_mm) / 3
+    if board.kind == "charuco":
+        white = (1 - (board.marker_mm or 0.0) / board.square_mm) / 2
+        radius_px = min(radius_px, nearest(np.sqrt(2) * board.square_mm) * white - 1)
+    return float(np.clip(radius_px, 2, 11))
+
+
+def _charuco(board: Board, picture: NDArray[np.uint8]) -> tuple[NDArray[np.intp], Floats]:
+    import cv2
+
+    aruco = cv2.aruco
+    squares = (board.corners[0] + 1, board.corners[1] + 1)
+    markers = aruco.getPredefinedDictionary(getattr(aruco, board.dictionary))
+    assert board.marker_mm is not None  # as `Board` has checked
+    printed = aruco.CharucoBoard(squares, board.square_mm, board.marker_mm, markers)
+    printed.setLegacyPattern(board.legacy_pattern)
+    found: Any
+    ids: Any  # OpenCV's stubs do not say that both are None where no corner was found
+    found, ids, _, _ = aruco.CharucoDetector(printed).detectBoard(picture)
+    if ids is None:
+        return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
+    return np.asarray(ids, dtype=np.intp).ravel(), np.asarray(found, dtype=np.float64).reshape(-1, 2)
+
+
+def _chess(board: Board, picture: NDArray[np.uint8]) -> tuple[NDArray[np.intp], Floats]:
+    import cv2
+
+    found, corners = cv2.findChessboardCorners(picture, board.corners)
+    if not found:
+        return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
+    points = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    if board.has_a_top and not _starts_dark(board, picture, points):
+        points = points[::-1].copy()
+    return np.arange(len(points)), points
+
+
+def _starts_dark(board: Board, picture: NDArray[np.uint8], points: Floats) -> bool:
+    """True if the square between the first four corners is darker than the next: so all images begin alike."""
+    across = board.corners[0]
+    centre = points[[0, 1, across, across + 1]].mean(axis=0)
+    beside = points[[1, 2, across + 1, across + 2]].mean(axis=0)
+    first, second = (picture[round(y), round(x)] for x, y in (centre, beside))
+    return bool(first < second)

@@ -1,0 +1,198 @@
+"""Intrinsics and distortion from images of a board, with covariance.
+
+OpenCV's Zhang calibration gives the start; one adjustment of all images follows, in which corners off by gross
+errors are left out and the noise of the rest is estimated from their own residuals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from coupole.calibration import optics
+from coupole.calibration.adjustment import Adjusted, Block, Group, adjust
+from coupole.calibration.lens.board import Sighting
+from coupole.calibration.optics import Intrinsics
+from coupole.calibration.rotations import Floats, moved, rotation, skew
+from coupole.errors import InputError
+
+LEAST_VIEWS, MOST_VIEWS = 4, 400
+PIXEL_SIGMA_PX = 0.1
+"""Stated noise of a corner, per coordinate; the adjustment finds what it is."""
+_START_VIEWS = 20
+
+
+@dataclass(frozen=True)
+class CameraState:
+    """What the adjustment moves: intrinsics [9] and `camera_from_board` [views, 4, 4]."""
+
+    intrinsics: Floats
+    camera_from_board: Floats
+
+
+@dataclass(frozen=True)
+class CameraCalibration:
+    """A camera with the uncertainty of its parameters, and what each image left over."""
+
+    intrinsics: Intrinsics
+    free: tuple[str, ...]
+    covariance: Floats
+    """[free, free] of the free parameters, in their order."""
+    degrees: Floats
+    """Degrees of freedom behind each [free]."""
+    sigma_px: float
+    """Noise of a corner, per coordinate, estimated."""
+    camera_from_board: Floats
+    """[views, 4, 4]."""
+    residuals_px: tuple[Floats, ...]
+    """[n, 2] of each image, observed minus computed."""
+    kept: tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], ...]
+    """[n] of each image: False for corners left out as gross errors."""
+    sightings: tuple[Sighting, ...]
+    size_px: tuple[int, int]
+    """Width and height."""
+
+
+def calibrate_camera(
+    sightings: Sequence[Sighting], size_px: tuple[int, int], model: str = "brown5"
+) -> CameraCalibration:
+    """Intrinsics from images [views] of one board; `model` is a key of `optics.MODELS`.
+
+    Raises InputError: too few images, or views that do not determine the model.
+    """
+    if not LEAST_VIEWS <= len(sightings) <= MOST_VIEWS:
+        raise InputError(
+            f"camera: {len(sightings)} usable images of the board, expected {LEAST_VIEWS} to {MOST_VIEWS} "
+            "(40 to 60 are good). Take more, tilted by 20 to 45 degrees, the board in all corners of the field."
+        )
+    free = optics.MODELS[model]
+    start = first_guess(sightings, size_px, model)
+    corners = Corners.of(sightings)
+    columns = [optics.NAMES.index(name) for name in free]
+    own = len(free)
+
+    def evaluate(state: CameraState) -> list[Block]:
+        seen = optics.project(corners.in_camera(state.camera_from_board), state.intrinsics)
+        turned = state.camera_from_board[corners.view, :3, :3] @ skew(corners.board_mm)
+        by_pose = np.concatenate([seen.by_point, -seen.by_point @ turned], axis=-1)
+        jacobian = np.concatenate([seen.by_intrinsics[:, :, columns], by_pose], axis=-1) / PIXEL_SIGMA_PX
+        residuals = (corners.pixels - seen.pixels) / PIXEL_SIGMA_PX
+        return [
+            Block(
+                residuals[part].ravel(),
+                jacobian[part].reshape(-1, own + 6),
+                np.r_[0:own, own + 6 * view : own + 6 * view + 6],
+                0,
+            )
+            for view, part in enumerate(corners.parts)
+        ]
+
+    def move(state: CameraState, change: Floats) -> CameraState:
+        intrinsics = state.intrinsics.copy()
+        intrinsics[columns] += change[:own]
+        return CameraState(intrinsics, moved(state.camera_from_board, change[own:].reshape(-1, 6)))
+
+    groups = [Group("corners", estimated=True, rejects=2)]
+    found = adjust(start, evaluate, move, groups, own + 6 * len(sightings), what="camera")
+    return _result(found, free, sightings, size_px)
+
+
+def _result(
+    found: Adjusted[CameraState], free: tuple[str, ...], sightings: Sequence[Sighting], size_px: tuple[int, int]
+) -> CameraCalibration:
+    own = len(free)
+    intrinsics = Intrinsics(*map(float, found.state.intrinsics))
+    return CameraCalibration(
+        intrinsics,
+        free,
+        found.covariance[:own, :own],
+        found.degrees[:own],
+        PIXEL_SIGMA_PX * found.factor("corners"),
+        found.state.camera_from_board,
+        tuple(PIXEL_SIGMA_PX * residuals.reshape(-1, 2) for residuals in found.residuals),
+        tuple(kept.reshape(-1, 2)[:, 0] for kept in found.kept),
+        tuple(sightings),
+        size_px,
+    )
+
+
+@dataclass(frozen=True)
+class Corners:
+    """All corners of all images, one after the other."""
+
+    board_mm: Floats
+    pixels: Floats
+    view: np.ndarray[tuple[int], np.dtype[np.intp]]
+    """[n], the number of the image."""
+    parts: tuple[slice, ...]
+    """Where each image's corners lie."""
+
+    @staticmethod
+    def of(sightings: Sequence[Sighting]) -> Corners:
+        counts = [len(sighting.ids) for sighting in sightings]
+        ends = np.cumsum(counts)
+        return Corners(
+            np.concatenate([sighting.board_mm for sighting in sightings]),
+            np.concatenate([sighting.pixels for sighting in sightings]),
+            np.repeat(np.arange(len(counts)), counts),
+            tuple(slice(int(end - count), int(end)) for count, end in zip(counts, ends, strict=True)),
+        )
+
+    def in_camera(self, camera_from_board: Floats) -> Floats:
+        """[n, 3], mm."""
+        pose = camera_from_board[self.view]
+        return np.asarray((pose[:, :3, :3] @ self.board_mm[:, :, None])[..., 0] + pose[:, :3, 3])
+
+
+def first_guess(sightings: Sequence[Sighting], size_px: tuple[int, int], model: str) -> CameraState:
+    """OpenCV's calibration from up to 20 images (Zhang, PAMI 22(11), 2000), and all images' poses with it."""
+    import cv2
+
+    chosen = [sightings[i] for i in np.unique(np.linspace(0, len(sightings) - 1, _START_VIEWS).astype(int))]
+    fixed = {
+        "pinhole": cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
+        "radial": cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
+        "brown4": cv2.CALIB_FIX_K3,
+        "brown5": 0,
+    }
+    try:
+        _, matrix, distortion, *_ = cv2.calibrateCameraExtended(
+            [sighting.board_mm.astype(np.float32) for sighting in chosen],
+            [sighting.pixels.astype(np.float32) for sighting in chosen],
+            size_px,
+            np.eye(3),
+            np.zeros(5),
+            flags=fixed[model],
+        )
+    except cv2.error as error:
+        raise InputError(
+            f"camera: OpenCV finds no first solution ({error.err}). Take views that differ in tilt and roll."
+        ) from error
+    vector = np.concatenate([matrix[[0, 1, 0, 1], [0, 1, 2, 2]], np.ravel(distortion)[:5]])
+    intrinsics = Intrinsics(*map(float, vector))
+    return CameraState(vector, np.stack([board_pose(sighting, intrinsics) for sighting in sightings]))
+
+
+def board_pose(sighting: Sighting, intrinsics: Intrinsics) -> Floats:
+    """`camera_from_board` from one image with known intrinsics. Raises InputError if there is none."""
+    import cv2
+
+    found, turn, shift = cv2.solvePnP(
+        sighting.board_mm, sighting.pixels, intrinsics.matrix(), intrinsics.distortion()
+    )
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation(np.ravel(turn)), np.ravel(shift)
+    in_front = (sighting.board_mm @ pose[:3, :3].T + pose[:3, 3])[:, 2] > 0
+    if not found or not in_front.all():
+        raise InputError(f"{sighting.name}: no pose of the board fits its corners. Leave this image out.")
+    return pose
+
+
+def without_gross_errors(calibration: CameraCalibration) -> tuple[Sighting, ...]:
+    """The sightings, less the corners that were left out."""
+    return tuple(
+        replace(sighting, ids=sighting.ids[kept], board_mm=sighting.board_mm[kept], pixels=sighting.pixels[kept])
+        for sighting, kept in zip(calibration.sightings, calibration.kept, strict=True)
+    )

@@ -1,0 +1,119 @@
+"""Lateral chromatic aberration: a lens for each colour channel, all from the same images.
+
+The board's poses are shared, so what the lenses have in common (focal length against distance, principal point
+against tilt) cancels out of their differences, which are known far better than each lens alone. Colours differ in
+scale, centre and the first term of radial distortion; the higher terms, which few corners at the field's rim tell,
+are one for all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from coupole.calibration import optics
+from coupole.calibration.adjustment import Block, Group, adjust
+from coupole.calibration.lens.board import Sighting
+from coupole.calibration.lens.camera import PIXEL_SIGMA_PX, Corners, calibrate_camera
+from coupole.calibration.optics import Intrinsics
+from coupole.calibration.rotations import Floats, moved, skew
+from coupole.errors import InputError
+
+OWN = ("fx", "fy", "cx", "cy", "k1")
+"""Parameters that each colour has for itself, where the lens model has them."""
+SHARED = "shared"
+
+
+@dataclass(frozen=True)
+class ChannelLenses:
+    """A lens for each channel."""
+
+    intrinsics: Mapping[str, Intrinsics]
+    names: tuple[str, ...]
+    """[s] of the parameters, as `red.fx`, or `shared.k2` of those that all colours have in common."""
+    covariance: Floats
+    """[s, s] of all channels together."""
+    degrees: Floats
+    """[s]."""
+    sigma_px: Mapping[str, float]
+    """Noise of a corner by channel."""
+
+    def shift(self, channel: str, against: str, pixels: Floats) -> tuple[Floats, Floats]:
+        """How far a channel sees directions from where another sees them, px [k, 2], and the covariance of that,
+        px^2 [k, 2, 2]. `pixels` [k, 2] say where in the field, as an undistorted lens would see the directions.
+        """
+        one, other = self.intrinsics[channel], self.intrinsics[against]
+        directions = (pixels - (other.cx, other.cy)) / (other.fx, other.fy)
+        points = np.column_stack([directions, np.ones(len(directions))])
+        seen = {name: optics.project(points, lens.vector()) for name, lens in ((channel, one), (against, other))}
+        slopes = np.zeros((len(points), 2, len(self.names)))
+        for at, name in enumerate(self.names):
+            owner, _, parameter = name.partition(".")
+            for name_of, sign in ((channel, 1.0), (against, -1.0)):
+                if owner in (name_of, SHARED):
+                    slopes[:, :, at] += sign * seen[name_of].by_intrinsics[:, :, optics.NAMES.index(parameter)]
+        spread = slopes @ self.covariance @ np.swapaxes(slopes, 1, 2)
+        return seen[channel].pixels - seen[against].pixels, spread
+
+
+def calibrate_channels(
+    sightings: Mapping[str, Sequence[Sighting]], size_px: tuple[int, int], model: str = "brown5"
+) -> ChannelLenses:
+    """Lenses from the same images [n] in several channels (`board.in_channel`).
+
+    Raises InputError: channels with different numbers of images, or images that do not determine a lens.
+    """
+    channels = tuple(sightings)
+    counts = {len(seen) for seen in sightings.values()}
+    if len(counts) != 1:
+        raise InputError(f"camera: every channel needs the same images; found {sorted(counts)} of them")
+    starts = {channel: calibrate_camera(sightings[channel], size_px, model) for channel in channels}
+    corners = {channel: Corners.of(sightings[channel]) for channel in channels}
+    first = starts[channels[0]]
+    own = [optics.NAMES.index(name) for name in first.free if name in OWN]
+    common = [optics.NAMES.index(name) for name in first.free if name not in OWN]
+    images, width = counts.pop(), len(own)
+    of_lens = width * len(channels) + len(common)
+    lenses = np.stack([starts[channel].intrinsics.vector() for channel in channels])
+    lenses[:, common] = lenses[0, common]
+
+    def evaluate(at: tuple[Floats, Floats]) -> list[Block]:
+        lenses, poses = at
+        blocks = []
+        for number, channel in enumerate(channels):
+            mine = corners[channel]
+            seen = optics.project(mine.in_camera(poses), lenses[number])
+            turned = poses[mine.view, :3, :3] @ skew(mine.board_mm)
+            by_pose = np.concatenate([seen.by_point, -seen.by_point @ turned], axis=-1)
+            by_lens = seen.by_intrinsics[:, :, own + common]
+            jacobian = np.concatenate([by_lens, by_pose], axis=-1) / PIXEL_SIGMA_PX
+            residuals = (mine.pixels - seen.pixels) / PIXEL_SIGMA_PX
+            of_mine = np.r_[width * number : width * (number + 1), width * len(channels) : of_lens]
+            for view, part in enumerate(mine.parts):
+                pose = of_lens + 6 * view
+                where = np.r_[of_mine, pose : pose + 6]
+                blocks.append(
+                    Block(residuals[part].ravel(), jacobian[part].reshape(-1, len(where)), where, number)
+                )
+        return blocks
+
+    def move(at: tuple[Floats, Floats], change: Floats) -> tuple[Floats, Floats]:
+        lenses = at[0].copy()
+        lenses[:, own] += change[: width * len(channels)].reshape(len(channels), width)
+        lenses[:, common] += change[width * len(channels) : of_lens]
+        return lenses, moved(at[1], change[of_lens:].reshape(-1, 6))
+
+    groups = [Group(channel, estimated=True, rejects=2) for channel in channels]
+    state = (lenses, first.camera_from_board)
+    found = adjust(state, evaluate, move, groups, of_lens + 6 * images, what="camera")
+    names = [f"{channel}.{optics.NAMES[column]}" for channel in channels for column in own]
+    names += [f"{SHARED}.{optics.NAMES[column]}" for column in common]
+    return ChannelLenses(
+        {channel: Intrinsics(*map(float, found.state[0][i])) for i, channel in enumerate(channels)},
+        tuple(names),
+        found.covariance[:of_lens, :of_lens],
+        found.degrees[:of_lens],
+        {channel: PIXEL_SIGMA_PX * found.factor(channel) for channel in channels},
+    )

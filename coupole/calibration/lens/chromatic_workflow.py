@@ -1,0 +1,175 @@
+"""From a board's images in three colours to the record of lateral chromatic aberration and its picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from coupole.calibration import optics
+from coupole.calibration.lens.board import Board, Sighting, in_channel
+from coupole.calibration.lens.camera import calibrate_camera, without_gross_errors
+from coupole.calibration.lens.chromatic import SHARED, ChannelLenses, calibrate_channels
+from coupole.calibration.lens.images import Found
+from coupole.calibration.lens.limits import CHROMATIC
+from coupole.calibration.lens.workflow import content_of, image_figures, image_lines, rows_of, unit_name
+from coupole.calibration.limits import judged
+from coupole.calibration.picture import CHANNELS, Channel
+from coupole.calibration.record import Noise, Parameter, Record, sealed
+from coupole.calibration.report import BLUE, DARK, RED
+from coupole.calibration.rotations import Floats
+from coupole.calibration.sources import Sources
+from coupole.calibration.wish import Wish
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_STEPS = (13, 10)
+
+
+@dataclass(frozen=True)
+class ChromaticFound:
+    """The result and what the report draws."""
+
+    record: Record
+    lenses: ChannelLenses
+    size_px: tuple[int, int]
+    field_px: Floats
+    """[k, 2] where shifts are told."""
+    shifts: dict[str, tuple[Floats, Floats]]
+    """By channel: shift against green, px [k, 2], and its covariance, px^2 [k, 2, 2]."""
+
+
+def chromatic_from(found: Found, sources: Sources, board: Board, model: str, wish: Wish) -> ChromaticFound:
+    """A lens for each colour from the same images. Raises InputError for images without colours."""
+    fit = calibrate_camera(found.sightings, found.size_px, model)
+    kept = without_gross_errors(fit)
+    sightings: dict[str, list[Sighting]] = {
+        channel: _in_channel(channel, kept, found, sources, board) for channel in CHANNELS
+    }
+    lenses = calibrate_channels(sightings, found.size_px, model)
+    field_px = _field(found.size_px)
+    shifts: dict[str, tuple[Floats, Floats]] = {
+        channel: lenses.shift(channel, "green", field_px) for channel in CHANNELS[1:]
+    }
+    u_px = max(float(np.sqrt(np.trace(spread, axis1=1, axis2=2).max())) for _, spread in shifts.values())
+    residuals = tuple(r[keep] for r, keep in zip(fit.residuals_px, fit.kept, strict=True))
+    record = sealed(
+        kind="chromatic",
+        transforms={},
+        parameters=_parameters(lenses),
+        covariance=rows_of(lenses.covariance),
+        noise=tuple(
+            Noise(
+                name=f"corners in {channel}",
+                unit="px",
+                stated=0.0,
+                found=sigma,
+                redundancy=_redundancy(kept, fit.free),
+            )
+            for channel, sigma in lenses.sigma_px.items()
+        ),
+        limits=judged(CHROMATIC, wish.limits, {**image_figures(fit, found), "shift_px": u_px}),
+        remarks=(*(_remark(channel, *shift) for channel, shift in shifts.items()), *found.left_out),
+        fixed={
+            f"{channel}.{unit_name(name)}": getattr(lenses.intrinsics[channel], name)
+            for channel in CHANNELS
+            for name in optics.NAMES
+            if name not in fit.free
+        },
+        images=image_lines(kept, residuals, fit.sightings),
+        **content_of(found, sources, wish),
+    )
+    return ChromaticFound(record, lenses, found.size_px, field_px, shifts)
+
+
+def _in_channel(
+    channel: Channel, kept: tuple[Sighting, ...], found: Found, sources: Sources, board: Board
+) -> list[Sighting]:
+    """The sightings, which are those in green, in a channel."""
+    if channel == "green":
+        return list(kept)
+    return [
+        in_channel(board, sources.images[number].read(), channel, seen)
+        for number, seen in zip(found.chosen, kept, strict=True)
+    ]
+
+
+def _field(size_px: tuple[int, int]) -> Floats:
+    """[k, 2] all over the field, rim included."""
+    across, down = (np.linspace(0.0, size - 1.0, count) for size, count in zip(size_px, _STEPS, strict=True))
+    return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+
+
+def _parameters(lenses: ChannelLenses) -> tuple[Parameter, ...]:
+    u = np.sqrt(np.diag(lenses.covariance))
+    found = []
+    for at, full in enumerate(lenses.names):
+        channel, _, name = full.partition(".")
+        lens = lenses.intrinsics["green" if channel == SHARED else channel]
+        found.append(
+            Parameter(
+                name=f"{channel}.{unit_name(name)}",
+                value=float(getattr(lens, name)),
+                u=float(u[at]),
+                degrees_of_freedom=float(lenses.degrees[at]),
+                dominated_by="corners",
+            )
+        )
+    return tuple(found)
+
+
+def _redundancy(kept: tuple[Sighting, ...], free: tuple[str, ...]) -> float:
+    """Of one channel, which has the images' poses in common with the others."""
+    return float(sum(2 * len(seen.ids) for seen in kept) - len(free) - 6 * len(kept) / len(CHANNELS))
+
+
+def _remark(channel: str, shift: Floats, spread: Floats) -> str:
+    length = np.linalg.norm(shift, axis=1)
+    worst = int(np.argmax(length))
+    u = float(np.sqrt(np.trace(spread[worst])))
+    return (
+        f"{channel} is seen up to {length[worst]:.3f} px (u {u:.3f} px) beside green, root mean square over the "
+        f"field {np.sqrt(np.mean(length**2)):.3f} px"
+    )
+
+
+# -- the picture ----------------------------------------------------------------------------------------------
+
+
+def draw_chromatic(found: ChromaticFound, figure: Figure) -> None:
+    """Fill the figure: shifts over the field above, along the radius below, red to the left, blue to the right."""
+    axes = figure.subplots(2, 2)
+    longest = max(float(np.linalg.norm(shift, axis=1).max()) for shift, _ in found.shifts.values())
+    enlarged = float(f"{0.06 * found.size_px[0] / max(longest, 1e-6):.1g}")
+    for column, (channel, colour) in enumerate((("red", RED), ("blue", BLUE))):
+        _draw_field(axes[0, column], found, channel, colour, enlarged)
+        _draw_radius(axes[1, column], found, channel, colour)
+
+
+def _draw_field(ax: Axes, found: ChromaticFound, channel: str, colour: str, enlarged: float) -> None:
+    shift, _ = found.shifts[channel]
+    width, height = found.size_px
+    ax.quiver(
+        *found.field_px.T, *shift.T * enlarged, angles="xy", scale_units="xy", scale=1, width=0.003, color=colour
+    )
+    ax.set(
+        xlim=(-0.05 * width, 1.05 * width), ylim=(1.05 * height, -0.05 * height), aspect="equal", xlabel="x (px)",
+        ylabel="y (px)", title=f"{channel} against green, {enlarged:g} times enlarged",
+    )  # fmt: skip
+
+
+def _draw_radius(ax: Axes, found: ChromaticFound, channel: str, colour: str) -> None:
+    """The shift away from the principal point, with its 95 % interval."""
+    shift, spread = found.shifts[channel]
+    lens = found.lenses.intrinsics["green"]
+    away = found.field_px - (lens.cx, lens.cy)
+    radius = np.linalg.norm(away, axis=1)
+    outward = away / np.maximum(radius, 1e-9)[:, None]
+    along = np.einsum("ki,ki->k", shift, outward)
+    u = np.sqrt(np.einsum("ki,kij,kj->k", outward, spread, outward))
+    ax.errorbar(radius, along, 1.96 * u, fmt=".", color=colour, lw=0.8)
+    ax.axhline(0.0, color=DARK, lw=0.8)
+    ax.set(title=f"{channel}: outward, 95 %", xlabel="from the principal point (px)", ylabel="px")

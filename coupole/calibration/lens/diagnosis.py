@@ -1,0 +1,195 @@
+"""Why robot and camera contradict each other: the likely cause, by name.
+
+If the board seems to stand somewhere else in each pose by more than noise explains, something is wrong. Each
+hypothesis (another unit, other angles, the inverse pose, a board that was moved, a wrong pair) says how the data
+would have to be read; the one under which the contradiction goes away is the likely cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy.stats import t as student
+
+from coupole.calibration.lens.hand_eye import METHODS, motions, solution
+from coupole.calibration.lens.hypotheses import Expected, Hypothesis, faults, rereadings, scatter_of
+from coupole.calibration.poses import ReportedPoses
+from coupole.calibration.rotations import Floats, between, inverses, moved
+from coupole.errors import InputError
+
+CONTRADICTION = 3.0
+"""Scatter beyond so many times what noise explains is none of noise."""
+CURE = 3.0
+"""A hypothesis that makes the scatter so many times smaller is a likely cause."""
+_NO_WORSE = 0.7
+_WORTH_A_LOOK = 0.3
+"""With a share of the expected scatter like this a moved board may still hide in what a bad robot is allowed."""
+_AS_GOOD = 1.5
+"""Hypotheses this near to the best are told apart by how much they change."""
+_DEPTH_WORSE = 5.0
+"""A board's distance is seen so many times worse than its place across the image."""
+_FALSE_ALARMS = 0.01
+_RESAMPLED = 24
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """By how much the results of two methods differ."""
+
+    methods: tuple[str, str]
+    distance_mm: float
+    angle_deg: float
+    sigmas: float
+    """Largest of the six components' differences over their uncertainty."""
+    beyond_noise: bool
+    """They differ by more than their poses' noise makes them differ."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found."""
+
+    scatter_mm: float
+    scatter_deg: float
+    expected: Expected
+    likely: tuple[Hypothesis, ...]
+    """Best first; empty if all is well or no hypothesis helps."""
+    disagreements: tuple[Disagreement, ...]
+
+    @property
+    def contradicts(self) -> bool:
+        return bool(self.likely) or self.expected.score(self.scatter_mm, self.scatter_deg) > CONTRADICTION
+
+    @property
+    def cause(self) -> str | None:
+        """The likely cause's name, several joined by `and`."""
+        return " and ".join(self.likely[0].causes) if self.likely else None
+
+    def sentences(self) -> tuple[str, ...]:
+        """What an operator should know; empty if robot and camera agree."""
+        found = []
+        if self.contradicts:
+            found.append(
+                f"robot and camera contradict each other: seen from the poses, the board's place scatters by "
+                f"{self.scatter_mm:.3g} mm and {self.scatter_deg:.3g} deg, where noise explains "
+                f"{self.expected.position_mm:.2g} mm and {self.expected.orientation_deg:.2g} deg"
+            )
+            found += [
+                f"likely cause: {h.sentence}: then {h.scatter_mm:.3g} mm and {h.scatter_deg:.3g} deg are left"
+                for h in self.likely[:1]
+            ]
+            if not self.likely:
+                found.append(
+                    "no simple cause explains it: the robot may be worse than stated, or the board not flat"
+                )
+        found += [
+            f"{d.methods[0]}'s and {d.methods[1]}'s methods disagree by {d.distance_mm:.3g} mm and "
+            f"{d.angle_deg:.3g} deg, {d.sigmas:.1f} times what noise explains"
+            for d in self.disagreements
+            if d.beyond_noise
+        ]
+        return tuple(found)
+
+    def of_methods(self) -> str:
+        """How far the closed forms are apart, alarming or not; empty if there are too few poses to tell."""
+        if not self.disagreements:
+            return ""
+        apart = ", ".join(
+            f"{d.methods[0]} and {d.methods[1]} by {d.distance_mm:.2g} mm and {d.angle_deg:.2g} deg "
+            f"({d.sigmas:.1f} sigma)"
+            for d in self.disagreements
+        )
+        return f"methods differ: {apart}"
+
+
+def expected_scatter(
+    camera_from_board: Floats, *, pixel_px: float, focal_px: float, robot_mm: float, robot_deg: float
+) -> Expected:
+    """From the corners' noise and the robot's stated one, at the distance that the board has."""
+    distance_mm = float(np.median(np.linalg.norm(camera_from_board[:, :3, 3], axis=1)))
+    seen_rad = _DEPTH_WORSE * pixel_px / focal_px
+    turned_rad = np.radians(robot_deg)
+    position = np.sqrt(3 * robot_mm**2 + 2 * (turned_rad * distance_mm) ** 2 + (seen_rad * distance_mm) ** 2)
+    return Expected(float(position), float(np.degrees(np.sqrt(3 * (turned_rad**2 + seen_rad**2)))))
+
+
+def diagnose(
+    poses: ReportedPoses, camera_from_board: Floats, expected: Expected, names: Sequence[str]
+) -> Diagnosis:
+    """Judge poses [n] against the board as seen [n, 4, 4]; `names` of the images."""
+    given = scatter_of(poses.base_from_flange, camera_from_board)
+    found, score = Diagnosis(*given, expected, (), ()), expected.score(*given)
+    if score > _WORTH_A_LOOK:
+        tried = list(rereadings(poses, camera_from_board)) if score > CONTRADICTION else []
+        tried += faults(poses.base_from_flange, camera_from_board, names, expected)
+        found = replace(found, likely=_likely(tried, expected, given))
+    if np.isfinite(given[0]):
+        apart = disagreements(poses.base_from_flange, camera_from_board, expected)
+        found = replace(found, disagreements=apart)
+    return found
+
+
+def disagreements(
+    base_from_flange: Floats, camera_from_board: Floats, expected: Expected
+) -> tuple[Disagreement, ...]:
+    """How far each two methods are apart, and whether that is more than expected noise makes them differ.
+
+    What noise does is seen on resampled poses: those that Park's result makes consistent, with noise drawn anew
+    (parametric bootstrap; Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 6). Empty where
+    the poses have no solution.
+    """
+    try:
+        given = _by_method(base_from_flange, camera_from_board)
+        board = solution(base_from_flange, camera_from_board, given["Park"]).base_from_board
+        consistent = inverses(base_from_flange @ given["Park"]) @ board
+        random = np.random.default_rng(0)
+        per_axis = np.repeat([expected.position_mm, np.radians(expected.orientation_deg)], 3) / np.sqrt(3)
+        drawn = [
+            _by_method(base_from_flange, moved(consistent, per_axis * random.normal(size=(len(consistent), 6))))
+            for _ in range(_RESAMPLED)
+        ]
+    except InputError:
+        return ()
+    limit = float(student.ppf(1 - _FALSE_ALARMS / (2 * 6 * len(METHODS)), _RESAMPLED))
+    found = []
+    for one, other in combinations(METHODS, 2):
+        difference = between(given[one], given[other])
+        by_noise = between(np.stack([d[one] for d in drawn]), np.stack([d[other] for d in drawn]))
+        sigma = np.sqrt(np.mean(by_noise**2, axis=0))
+        sigmas = float(np.max(np.abs(difference) / np.maximum(sigma, 1e-12)))
+        distance_mm, angle_deg = np.linalg.norm(difference[:3]), np.degrees(np.linalg.norm(difference[3:]))
+        found.append(
+            Disagreement((one, other), float(distance_mm), float(angle_deg), sigmas, beyond_noise=sigmas > limit)
+        )
+    return tuple(found)
+
+
+def _by_method(base_from_flange: Floats, camera_from_board: Floats) -> dict[str, Floats]:
+    """`flange_from_camera` by each method."""
+    pairs = motions(base_from_flange, camera_from_board)
+    return {name: method(pairs) for name, method in METHODS.items()}
+
+
+def _likely(tried: list[Hypothesis], expected: Expected, given: tuple[float, float]) -> tuple[Hypothesis, ...]:
+    """Hypotheses that cure, those that change least first among the equally good.
+
+    A cure makes the scatter of places or of turns so much smaller, and the other no larger; or it explains what
+    noise cannot.
+    """
+    cures = []
+    for h in tried:
+        gains = given[0] / max(h.scatter_mm, 1e-12), given[1] / max(h.scatter_deg, 1e-12)
+        if (max(gains) > CURE or h.sure) and min(gains) > _NO_WORSE:
+            cures.append(h)
+    if not cures:
+        return ()
+    best = min(expected.score(h.scatter_mm, h.scatter_deg) for h in cures)
+
+    def rank(h: Hypothesis) -> tuple[bool, int, float]:
+        score = expected.score(h.scatter_mm, h.scatter_deg)
+        return score > _AS_GOOD * best, len(h.causes), score
+
+    return tuple(sorted(cures, key=rank))

@@ -1,0 +1,221 @@
+"""What may be wrong with the poses of a robot or the images of a board, and what would be left of it if so.
+
+Each hypothesis reads the data in its way (other units or angles, the inverse pose, another pairing, a board in two
+places) and says how far the board's place then still scatters. `coupole.calibration.lens.diagnosis` judges them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, permutations, product
+
+import numpy as np
+from scipy.stats import f as fisher
+
+from coupole.calibration.lens.hand_eye import Motions, Solution, motions, park, solution, solve
+from coupole.calibration.poses import Convention, ReportedPoses
+from coupole.calibration.rotations import Floats, between
+from coupole.errors import InputError
+
+_LEAST_SEGMENT = 3
+_SUSPECTS = 6
+_PLAUSIBLE_MM = (5.0, 5000.0)
+"""Distances between camera and board, and ways of the robot, that a cell may have."""
+_SURE = 1e-4
+"""Probability that a step of the board is noise, below which the board was moved however small the step is."""
+
+UNITS, ANGLES, INVERSE, MOVED_BOARD, WRONG_PAIR, SHIFTED = (
+    "wrong unit",
+    "angle convention",
+    "inverse pose",
+    "moved board",
+    "wrong pair",
+    "shifted pairs",
+)
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What scatter of the board noise explains, root mean square."""
+
+    position_mm: float
+    orientation_deg: float
+
+    def score(self, scatter_mm: float, scatter_deg: float) -> float:
+        """Scatter over what is expected, the worse of both."""
+        return max(scatter_mm / self.position_mm, scatter_deg / self.orientation_deg)
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What may be wrong, and what the scatter would be if it is."""
+
+    causes: tuple[str, ...]
+    """Names, as in this module's constants."""
+    sentence: str
+    scatter_mm: float
+    scatter_deg: float
+    sure: bool = False
+    """True for what noise cannot explain, even if the scatter falls little."""
+
+
+def scatter_of(base_from_flange: Floats, camera_from_board: Floats) -> tuple[float, float]:
+    """mm and degrees; infinite where the motions have no solution."""
+    try:
+        found = solve(base_from_flange, camera_from_board)
+    except InputError:
+        return np.inf, np.inf
+    return found.scatter_mm, found.scatter_deg
+
+
+def rereadings(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypothesis]:
+    """All numbers mean something else."""
+    yield from _other_conventions(poses, camera_from_board)
+    yield from _other_board_unit(poses.base_from_flange, camera_from_board)
+
+
+def faults(
+    base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str], expected: Expected
+) -> Iterator[Hypothesis]:
+    """Some poses do not belong to the others."""
+    yield from _wrong_pairs(base_from_flange, camera_from_board, names)
+    yield from _moved_board(base_from_flange, camera_from_board, names, expected)
+
+
+def _other_conventions(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypothesis]:
+    said = poses.convention
+    turns: list[tuple[str, dict[str, object]]] = [("", {})]
+    if said.rotation != "quaternion_wxyz":
+        turns = [
+            (words, {"rotation": kind, "order": order})
+            for kind, word in (("abc", "Rz Ry Rx"), ("xyz", "Rx Ry Rz"), ("rotation_vector", "a rotation vector"))
+            for order in ([(0, 1, 2)] if kind == "rotation_vector" else permutations(range(3)))
+            for words in [f"{word}{'' if order == (0, 1, 2) else f' with the numbers in the order {order}'}"]
+        ]
+    other_length = "m" if said.length_unit == "mm" else "mm"
+    other_angle = "rad" if said.angle_unit == "deg" else "deg"
+    other_sense = "flange_from_base" if said.gives == "base_from_flange" else "base_from_flange"
+    for length, angle, sense, (words, turn) in product(
+        (said.length_unit, other_length), (said.angle_unit, other_angle), (said.gives, other_sense), turns
+    ):
+        read = said.model_copy(update={"length_unit": length, "angle_unit": angle, "gives": sense, **turn})
+        if read != said and not (said.rotation == "quaternion_wxyz" and angle != said.angle_unit):
+            yield from _if_read_as(poses.numbers, said, read, words, camera_from_board)
+
+
+def _if_read_as(
+    numbers: Floats, said: Convention, read: Convention, words: str, camera_from_board: Floats
+) -> Iterator[Hypothesis]:
+    as_read = replace(ReportedPoses(numbers, said), convention=read).base_from_flange
+    way_mm = float(np.median(np.linalg.norm(as_read[:, :3, 3] - as_read[:, :3, 3].mean(axis=0), axis=1)))
+    if not _PLAUSIBLE_MM[0] < way_mm < _PLAUSIBLE_MM[1]:
+        return
+    causes, says = [], []
+    if read.length_unit != said.length_unit:
+        causes.append(UNITS)
+        says.append(f"positions are in {read.length_unit}, not {said.length_unit}")
+    if read.angle_unit != said.angle_unit:
+        causes.append(UNITS)
+        says.append(f"angles are in {_WORDS[read.angle_unit]}, not {_WORDS[said.angle_unit]}")
+    if (read.rotation, read.order) != (said.rotation, said.order):
+        causes.append(ANGLES)
+        says.append(f"rotations are {words}")
+    if read.gives != said.gives:
+        causes.append(INVERSE)
+        says.append(f"poses are {read.gives}, not {said.gives}")
+    yield Hypothesis(tuple(causes), " and ".join(says), *scatter_of(as_read, camera_from_board))
+
+
+_WORDS = {"deg": "degrees", "rad": "radians"}
+
+
+def _other_board_unit(base_from_flange: Floats, camera_from_board: Floats) -> Iterator[Hypothesis]:
+    """The board's squares given in m, or in um."""
+    for factor, unit in ((1000.0, "m"), (1e-3, "um")):
+        scaled = camera_from_board.copy()
+        scaled[:, :3, 3] *= factor
+        distance_mm = float(np.median(np.linalg.norm(scaled[:, :3, 3], axis=1)))
+        if _PLAUSIBLE_MM[0] < distance_mm < _PLAUSIBLE_MM[1]:
+            sentence = f"the board's squares are given in {unit}, not mm"
+            yield Hypothesis((UNITS,), sentence, *scatter_of(base_from_flange, scaled))
+
+
+def _wrong_pairs(
+    base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str]
+) -> Iterator[Hypothesis]:
+    """One image does not belong to its pose, two are exchanged, or all are off by one."""
+    count = len(base_from_flange)
+    for left_out in range(count if count > _LEAST_SEGMENT + 1 else 0):
+        keep = [i for i in range(count) if i != left_out]
+        sentence = f"image and pose of {names[left_out]} do not belong together"
+        yield Hypothesis((WRONG_PAIR,), sentence, *scatter_of(base_from_flange[keep], camera_from_board[keep]))
+    if count > _LEAST_SEGMENT + 1:
+        for one, other in combinations(_worst(base_from_flange, camera_from_board), 2):
+            order = np.arange(count)
+            order[[one, other]] = other, one
+            sentence = f"the poses of {names[min(one, other)]} and {names[max(one, other)]} are exchanged"
+            yield Hypothesis((WRONG_PAIR,), sentence, *scatter_of(base_from_flange[order], camera_from_board))
+        for words, flange, camera in (
+            ("after", base_from_flange[1:], camera_from_board[:-1]),
+            ("before", base_from_flange[:-1], camera_from_board[1:]),
+        ):
+            yield Hypothesis(
+                (SHIFTED,), f"each image belongs to the pose {words} its own", *scatter_of(flange, camera)
+            )
+
+
+def _worst(base_from_flange: Floats, camera_from_board: Floats) -> list[int]:
+    """The poses that put the board farthest from its middle place; few, as each two of them are tried."""
+    try:
+        boards = (
+            base_from_flange @ solve(base_from_flange, camera_from_board).flange_from_camera @ camera_from_board
+        )
+    except InputError:
+        return []
+    places = boards[:, :3, 3]
+    away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    return [int(number) for number in np.argsort(-away)[:_SUSPECTS]]
+
+
+def _moved_board(
+    base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str], expected: Expected
+) -> Iterator[Hypothesis]:
+    """The board stood in two places: motions within each part are true, those between them are not."""
+    count = len(base_from_flange)
+    for change in range(_LEAST_SEGMENT, count - _LEAST_SEGMENT + 1):
+        parts = slice(None, change), slice(change, None)
+        try:
+            pairs = [motions(base_from_flange[part], camera_from_board[part]) for part in parts]
+        except InputError:
+            continue
+        both = Motions(*(np.concatenate([getattr(p, what) for p in pairs]) for what in ("flange", "camera")))
+        flange_from_camera = park(both)
+        before, after = (solution(base_from_flange[p], camera_from_board[p], flange_from_camera) for p in parts)
+        step = between(before.base_from_board, after.base_from_board)
+        scatter = np.concatenate([before.scatter, after.scatter])
+        pooled = replace(before, scatter=scatter)
+        step_mm, step_deg = float(np.linalg.norm(step[:3])), float(np.degrees(np.linalg.norm(step[3:])))
+        sentence = (
+            f"the board was moved between {names[change - 1]} and {names[change]}, by {step_mm:.3g} mm and "
+            f"{step_deg:.3g} deg"
+        )
+        sure = expected.score(step_mm, step_deg) > 1.0 and _by_chance(before, after) * count < _SURE
+        yield Hypothesis((MOVED_BOARD,), sentence, pooled.scatter_mm, pooled.scatter_deg, sure)
+
+
+def _by_chance(before: Solution, after: Solution) -> float:
+    """Probability that noise makes so great a step from one part's board to the other's.
+
+    Hotelling's T^2 of two samples with a common covariance (Anderson, An Introduction to Multivariate Statistical
+    Analysis, 3rd ed., 2003, section 5.3.4), less six degrees of freedom for the hand-eye that both parts share.
+    """
+    first, second = len(before.scatter), len(after.scatter)
+    degrees = first + second - 2 - 6
+    size = before.scatter.shape[1]
+    if degrees <= size:
+        return 1.0
+    covariance = (before.scatter.T @ before.scatter + after.scatter.T @ after.scatter) / degrees
+    step = between(before.base_from_board, after.base_from_board)
+    t_squared = first * second / (first + second) * float(step @ np.linalg.solve(covariance, step))
+    return float(fisher.sf(t_squared * (degrees - size + 1) / (degrees * size), size, degrees - size + 1))

@@ -1,0 +1,330 @@
+"""From images and poses to a record and what the report shows: what the commands call.
+
+Each function ends in a sealed record. A contradiction whose cause is known is refused with that cause, as its
+numbers would be nonsense; one without a simple cause goes into the record as a remark, and fails its limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, timedelta
+from typing import Literal
+
+import numpy as np
+
+import coupole
+from coupole.calibration import optics
+from coupole.calibration.adjustment import Component
+from coupole.calibration.arm_errors import axis_sensitivity
+from coupole.calibration.lens.board import Board, Sighting
+from coupole.calibration.lens.bundle import (
+    EarlierLens,
+    HandEyeCalibration,
+    Poses,
+    RobotNoise,
+    calibrate_hand_eye,
+)
+from coupole.calibration.lens.camera import CameraCalibration, calibrate_camera, without_gross_errors
+from coupole.calibration.lens.diagnosis import Diagnosis, diagnose, expected_scatter
+from coupole.calibration.lens.images import Found
+from coupole.calibration.lens.limits import CAMERA, HAND_EYE
+from coupole.calibration.limits import judged
+from coupole.calibration.poses import ReportedPoses
+from coupole.calibration.record import ImageResidual, Input, Noise, Parameter, Record, Validity, sealed
+from coupole.calibration.rotations import Floats
+from coupole.calibration.sources import Sources
+from coupole.calibration.wish import Wish
+from coupole.errors import InputError
+from coupole.geometry import abc_from_rotation
+from coupole.kinematics import Arm
+from coupole.plan import Pose
+
+FIELD_CELLS = (8, 6)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the report draws."""
+
+    record: Record
+    size_px: tuple[int, int]
+    names: tuple[str, ...]
+    """Of the images."""
+    pixels: tuple[Floats, ...]
+    """[k, 2] of each image."""
+    residuals_px: tuple[Floats, ...]
+    """[k, 2], observed minus computed."""
+    pixel_px: float
+    pose_errors: Floats | None
+    """[n, 6] of the robot, mm and degrees."""
+
+
+def camera_from(found: Found, sources: Sources, model: str, wish: Wish) -> tuple[CameraCalibration, Shown]:
+    """Calibrate a lens from the images of a board."""
+    fit = calibrate_camera(found.sightings, found.size_px, model)
+    kept = without_gross_errors(fit)
+    residuals = tuple(r[keep] for r, keep in zip(fit.residuals_px, fit.kept, strict=True))
+    u = np.sqrt(np.diag(fit.covariance))
+    parameters = [
+        Parameter(
+            name=unit_name(name),
+            value=getattr(fit.intrinsics, name),
+            u=float(u[i]),
+            degrees_of_freedom=float(fit.degrees[i]),
+            dominated_by="corners",
+        )
+        for i, name in enumerate(fit.free)
+    ]
+    redundancy = float(np.sum([2 * k.sum() for k in fit.kept]) - len(fit.free) - 6 * len(kept))
+    record = sealed(
+        kind="camera",
+        transforms={},
+        parameters=tuple(parameters),
+        covariance=rows_of(fit.covariance),
+        noise=(_noise("corners", "px", 0.0, fit.sigma_px, redundancy),),
+        limits=judged(CAMERA, wish.limits, {**image_figures(fit, found), "ray_px": ray_u_px(fit)}),
+        remarks=found.left_out,
+        fixed=held(fit.intrinsics, fit.free),
+        images=image_lines(kept, residuals, fit.sightings),
+        **content_of(found, sources, wish),
+    )
+    shown = Shown(
+        record,
+        found.size_px,
+        tuple(s.name for s in kept),
+        tuple(s.pixels for s in kept),
+        residuals,
+        fit.sigma_px,
+        None,
+    )
+    return fit, shown
+
+
+def hand_eye_from(
+    found: Found,
+    sources: Sources,
+    board: Board,
+    model: str,
+    wish: Wish,
+    *,
+    robot: RobotNoise,
+    arm: Arm | None = None,
+    lens: EarlierLens | None = None,
+) -> tuple[HandEyeCalibration, Diagnosis, Shown]:
+    """Calibrate where the camera sits on the flange. Raises InputError with the likely cause where robot and
+    camera contradict each other and one is known."""
+    if sources.poses is None:
+        raise InputError("hand-eye: the images have no poses; give a pose file with --poses")
+    if not board.has_a_top:
+        raise InputError(
+            "hand-eye: this chess board looks the same upside down; use one whose corners are even in one "
+            "direction and odd in the other, or a ChArUco board"
+        )
+    fit = calibrate_camera(found.sightings, found.size_px, model)
+    kept = without_gross_errors(fit)
+    chosen = ReportedPoses(sources.poses.numbers[found.chosen], sources.poses.convention)
+    joints = [sources.images[i].joints_deg for i in found.chosen]
+    known = [j for j in joints if j is not None]
+    axes = axis_sensitivity(arm, known) if arm is not None and len(known) == len(joints) else None
+    stated = robot.pose_sigmas(axes_known=False)
+    expected = expected_scatter(
+        fit.camera_from_board,
+        pixel_px=fit.sigma_px,
+        focal_px=fit.intrinsics.fx,
+        robot_mm=stated[0],
+        robot_deg=float(np.degrees(stated[1])),
+    )
+    diagnosis = diagnose(chosen, fit.camera_from_board, expected, [s.name for s in kept])
+    if diagnosis.cause is not None:
+        raise InputError("hand-eye: " + ".\n".join(diagnosis.sentences()[:2]) + ".")
+    result = calibrate_hand_eye(
+        kept,
+        Poses(chosen.base_from_flange, axes),
+        model=model,
+        lens=lens or fit.intrinsics,
+        robot=robot,
+        board_scale_u_ppm=board.scale_u_ppm,
+    )
+    record = sealed(
+        kind="hand-eye",
+        transforms={
+            "flange_from_camera": _pose(result.flange_from_camera),
+            "base_from_board": _pose(result.base_from_board),
+        },
+        parameters=_hand_eye_parameters(result),
+        covariance=rows_of(result.covariance),
+        noise=_hand_eye_noise(result),
+        limits=judged(HAND_EYE, wish.limits, {**image_figures(fit, found), **_hand_eye_figures(result)}),
+        remarks=tuple(filter(None, (*found.left_out, *diagnosis.sentences(), diagnosis.of_methods()))),
+        fixed=held(result.intrinsics, lens.free if lens else optics.MODELS[model]),
+        images=image_lines(kept, result.residuals_px, fit.sightings),
+        **content_of(found, sources, wish),
+    )
+    shown = Shown(
+        record,
+        found.size_px,
+        tuple(s.name for s in kept),
+        tuple(s.pixels for s in kept),
+        result.residuals_px,
+        result.noise.pixel_px,
+        result.pose_errors,
+    )
+    return result, diagnosis, shown
+
+
+def ray_u_px(fit: CameraCalibration) -> float:
+    """Largest standard uncertainty, at the corners and edges of the field, of where a direction is seen, px.
+
+    A turn of the camera that the intrinsics can be traded for is not counted: the board's poses take it up.
+    """
+    width, height = fit.size_px
+    steps = np.linspace(0.0, 1.0, 9)
+    field = np.array([(x * (width - 1), y * (height - 1)) for x in steps for y in steps])
+    rays = np.column_stack(
+        [(field - (fit.intrinsics.cx, fit.intrinsics.cy)) / (fit.intrinsics.fx, fit.intrinsics.fy)]
+    )
+    points = np.column_stack([rays, np.ones(len(rays))])
+    seen = optics.project(points, fit.intrinsics.vector())
+    by_lens = seen.by_intrinsics[:, :, [optics.NAMES.index(name) for name in fit.free]].reshape(-1, len(fit.free))
+    turns = np.cross(np.eye(3)[None], points[:, None])  # d point / d rotation about each axis, [k, 3, 3]
+    by_turn = np.einsum("kij,kaj->kia", seen.by_point, turns).reshape(-1, 3)
+    left = by_lens - by_turn @ np.linalg.lstsq(by_turn, by_lens, rcond=None)[0]
+    variance = np.einsum("ki,ij,kj->k", left, fit.covariance, left)
+    return float(np.sqrt(variance.reshape(-1, 2).sum(axis=1).max()))
+
+
+def field_without_corners(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> float:
+    """Share of the field's cells, 8 x 6, in which no corner was seen."""
+    pixels = np.concatenate([seen.pixels for seen in sightings])
+    cells = np.floor(pixels * FIELD_CELLS / size_px).astype(int)
+    return 1.0 - len(np.unique(cells, axis=0)) / (FIELD_CELLS[0] * FIELD_CELLS[1])
+
+
+def image_lines(
+    kept: Sequence[Sighting], residuals: Sequence[Floats], all_seen: Sequence[Sighting]
+) -> tuple[ImageResidual, ...]:
+    """How each image fits."""
+    return tuple(
+        ImageResidual(
+            name=seen.name,
+            corners=len(seen.ids),
+            rejected=len(before.ids) - len(seen.ids),
+            rms_px=float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
+        )
+        for seen, left, before in zip(kept, residuals, all_seen, strict=True)
+    )
+
+
+def content_of(found: Found, sources: Sources, wish: Wish) -> dict[str, object]:
+    """What all records made from a board's images have."""
+    about = sources.about
+    temperature = about.temperature_c
+    margin = wish.temperature_margin_c
+    return {
+        "name": wish.name,
+        "created": wish.now.astimezone(UTC).replace(microsecond=0),
+        "software": f"coupole {coupole.__version__}",
+        "simulated": about.simulated,
+        "validity": Validity(
+            expires=(wish.now + timedelta(days=wish.valid_days)).astimezone(UTC).replace(microsecond=0),
+            camera=about.camera,
+            lens=wish.lens,
+            size_px=found.size_px,
+            focal_length_mm=about.focal_length_mm,
+            focus_distance_mm=about.focus_distance_mm,
+            focus_tolerance_mm=wish.focus_tolerance_mm,
+            f_number=about.f_number,
+            temperature_c=None if temperature is None else (temperature[0] - margin, temperature[1] + margin),
+        ),
+        "inputs": tuple(Input(name=name, sha256=digest) for name, digest in sources.inputs),
+    }
+
+
+def held(intrinsics: optics.Intrinsics, free: Sequence[str]) -> dict[str, float]:
+    """The lens parameters that were not estimated, by the record's names."""
+    return {unit_name(n): getattr(intrinsics, n) for n in optics.NAMES if n not in free}
+
+
+def image_figures(fit: CameraCalibration, found: Found) -> dict[str, float]:
+    """What `limits.IMAGES` are held against."""
+    rejected = np.concatenate([~keep for keep in fit.kept])
+    clipped = sum(": clipped" in line for line in found.left_out)
+    return {
+        "pixel_px": fit.sigma_px,
+        "bare_field": field_without_corners(fit.sightings, fit.size_px),
+        "rejected": float(rejected.mean()),
+        "clipped": clipped / (len(found.sightings) + len(found.left_out)),
+    }
+
+
+def _hand_eye_figures(result: HandEyeCalibration) -> dict[str, float]:
+    def together(steps: Sequence[str]) -> float:
+        return float(np.linalg.norm([result.u(f"flange_from_camera.{step}") for step in steps]))
+
+    noise = result.noise
+    return {
+        "centre_mm": together(("x_mm", "y_mm", "z_mm")),
+        "turn_deg": together(("rx_deg", "ry_deg", "rz_deg")),
+        "robot_ratio": max(
+            noise.position_mm / noise.stated_position_mm, noise.orientation_deg / noise.stated_orientation_deg
+        ),
+    }
+
+
+def _hand_eye_parameters(result: HandEyeCalibration) -> tuple[Parameter, ...]:
+    values: dict[str, float] = {unit_name(name): getattr(result.intrinsics, name) for name in optics.NAMES}
+    values["board_scale"] = result.board_scale
+    values |= {f"axis_zero.a{i + 1}_deg": float(zero) for i, zero in enumerate(result.axis_zeros_deg)}
+    for name in ("flange_from_camera", "base_from_board"):
+        at = getattr(result, name)[:3, 3]
+        values |= {f"{name}.{axis}_mm": float(at[i]) for i, axis in enumerate("xyz")}
+    u = np.sqrt(np.diag(result.covariance))
+    return tuple(
+        Parameter(
+            name=name,
+            value=values.get(name),
+            u=float(u[i]),
+            degrees_of_freedom=float(result.degrees[i]),
+            dominated_by=result.components[int(np.argmax(result.shares[:, i]))].name,
+        )
+        for i, name in enumerate(result.names)
+    )
+
+
+def _hand_eye_noise(result: HandEyeCalibration) -> tuple[Noise, ...]:
+    left: dict[str, Component] = {component.name: component for component in result.components}
+    noise = result.noise
+    return (
+        _noise("corners", "px", 0.0, noise.pixel_px, left["corners"].redundancy),
+        _noise(
+            "robot position", "mm", noise.stated_position_mm, noise.position_mm, left["robot position"].redundancy
+        ),
+        _noise(
+            "robot orientation",
+            "deg",
+            noise.stated_orientation_deg,
+            noise.orientation_deg,
+            left["robot orientation"].redundancy,
+        ),
+    )
+
+
+def _noise(name: str, unit: Literal["px", "mm", "deg"], stated: float, found: float, redundancy: float) -> Noise:
+    return Noise(name=name, unit=unit, stated=stated, found=found, redundancy=redundancy)
+
+
+def unit_name(name: str) -> str:
+    """A lens parameter with its unit, as records call it."""
+    return f"{name}_px" if name in ("fx", "fy", "cx", "cy") else name
+
+
+def _pose(transform: Floats) -> Pose:
+    x, y, z = map(float, transform[:3, 3])
+    return Pose(translation_mm=(x, y, z), abc_deg=abc_from_rotation(transform[:3, :3]))
+
+
+def rows_of(matrix: Floats) -> tuple[tuple[float, ...], ...]:
+    """A covariance as records keep it."""
+    symmetric = 0.5 * (matrix + matrix.T)
+    return tuple(tuple(map(float, row)) for row in symmetric)

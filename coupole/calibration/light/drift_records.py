@@ -1,0 +1,222 @@
+"""From the frames of a run that show the reference tile to the record of its drift."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from coupole.calibration.light.drift import NAMES, Drift, Reading, fit_drift
+from coupole.calibration.light.drift_drawing import draw_drift
+from coupole.calibration.light.frames import LightFrame, LightFrames
+from coupole.calibration.light.led_power import rows_of
+from coupole.calibration.light.led_power_tile import Setting, TileReader
+from coupole.calibration.light.limits import DRIFT
+from coupole.calibration.light.records import Progress, counter, record_input, sealed_outcome
+from coupole.calibration.limits import judged
+from coupole.calibration.record import Parameter, read_record
+from coupole.calibration.report import Outcome
+from coupole.calibration.rotations import Floats
+from coupole.calibration.wish import Wish
+from coupole.errors import InputError
+
+CHANNEL = "G"
+"""What drifts is the light of an LED, not its colour: one channel tells it."""
+_DARK = 0.1
+"""Of what is expected: less is a shadow, or a dead LED."""
+_FLASH = 5e-4
+"""What flashes of an LED are believed to differ by (as `calibrate_led_power` has it)."""
+
+
+@dataclass(frozen=True)
+class Powers:
+    """The powers of a record, of one channel."""
+
+    row: dict[int, int]
+    """Of each LED in the arrays."""
+    power: Floats
+    u_own: Floats
+    board_c: Floats
+    """[n] temperature of its board when it was calibrated."""
+    common: Floats
+    """[n, c] relative change of each power by what the LEDs shared then."""
+    names: tuple[str, ...]
+    covariance: Floats
+    """[c, c]."""
+    found: dict[str, float]
+    """What the calibration found the shared figures to be off their description."""
+
+
+def read_powers(path: Path) -> Powers:
+    """The table beside a record of the kind `led-power`. Raises InputError for another or an older record."""
+    record = read_record(path)
+    if record.kind != "led-power":
+        raise InputError(f"{path}: expected a record of the kind `led-power`, found `{record.kind}`")
+    table = path.parent / record.files[0].name
+    lines = [line for line in table.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    columns = list(csv.DictReader(lines))
+    if "board_c" not in columns[0]:
+        raise InputError(f"{table}: has no temperatures of boards; calibrate the LEDs' power anew")
+    start, end = "d_", f"_{CHANNEL}"
+    names = tuple(key[len(start) : -len(end)] for key in columns[0] if key.startswith(start) and key.endswith(end))
+
+    def numbers(key: str) -> Floats:
+        return np.array([float(line[key]) for line in columns])
+
+    listed = [parameter.name for parameter in record.parameters]
+    at = [listed.index(f"{name}.{CHANNEL}") for name in names]
+    return Powers(
+        {int(line["id"]): row for row, line in enumerate(columns)},
+        numbers(f"power_{CHANNEL}"),
+        numbers(f"u_own_{CHANNEL}"),
+        numbers("board_c"),
+        np.column_stack([numbers(f"d_{name}_{CHANNEL}") for name in names]),
+        names,
+        record.covariance_matrix[np.ix_(at, at)],
+        {name: record.value(f"{name}.{CHANNEL}") for name in names},
+    )
+
+
+def drift_outcome(
+    frames: LightFrames, setting: Setting, led_power: Path, wish: Wish, progress: Progress
+) -> Outcome:
+    """How the LEDs' power drifted from its calibration to a run, from views that show the reference tile.
+
+    Raises InputError: no view shows the tile, or as `fit_drift` does.
+    """
+    powers = read_powers(led_power)
+    lit = [frame for frame in frames.lit if frame.light.startswith("led")]
+    if not lit:
+        raise InputError("drift: no frame under an LED in this run")
+    read = TileReader(frames, setting, lit[0].read().shape)
+    shown = [found for found in _by_view(lit) if read.sees(found[0].base_from_camera)]
+    if not shown:
+        raise InputError(
+            "drift: no view shows the whole reference tile where its description has it; correct the description, "
+            "or add a view of the tile to the plan"
+        )
+    remarks: list[str] = []
+    readings: list[Reading] = []
+    tell = counter(progress, sum(map(len, shown)))
+    for found in shown:
+        view = read.view(found, tell)[CHANNEL]
+        rows, _ = rows_of(0, view, setting.positions, setting.tile, setting.emission, remarks=remarks)
+        frame_of = {int(frame.light[3:]): frame for frame in found}
+        readings += [
+            _reading(frame_of[row.led], row.value, row.u, row.design, powers)
+            for row in rows
+            if powers.row.get(row.led) is not None and powers.power[powers.row[row.led]] > 0
+        ]
+    dark = [reading for reading in readings if reading.ratio < _DARK]
+    if dark:
+        remarks.append(f"{len(dark)} readings are dark (shadow, or a dead LED), not used: {_list(dark)}")
+    drift = fit_drift(
+        [reading for reading in readings if reading.ratio >= _DARK],
+        shared_covariance=_shared_covariance(setting, powers),
+    )
+    if drift.odd:
+        remarks.append(f"{len(drift.odd)} readings are off their neighbours, not used: {_list(drift.odd)}")
+    warmer_k = np.array([_warmer_k(frame, powers) for frame in lit])
+    t_s = np.array([frame.t_s for frame in lit])
+    u = drift.u_factor(warmer_k, t_s)
+    factor = drift.factor(warmer_k, t_s)
+    left_out = (len(dark) + len(drift.odd)) / len(readings)
+    height, width = read.shape
+    return sealed_outcome(
+        "drift",
+        wish,
+        frames,
+        (width, height),
+        _parameters(drift),
+        drift.covariance,
+        partial(draw_drift, drift, warmer_k, t_s),
+        limits=judged(DRIFT, wish.limits, {"factor": float(u.max()), "left_out": left_out}),
+        files={f"{wish.name}.csv": _table(drift).encode()},
+        fixed={"start_s": drift.start_s, "hours": drift.hours, "noise": drift.noise},
+        remarks=(
+            f"{len(drift.used)} readings in {len(shown)} views; factor {factor.min():.4f} to {factor.max():.4f}",
+            "ln factor = level + rate_per_h (t - start_s) / 3600 + per_k (T - board_c); T is the board's, board_c "
+            "that of the LED in the powers' table",
+            *remarks,
+        ),
+        more_inputs=(*record_input(led_power), *setting.inputs),
+    )
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _by_view(lit: Sequence[LightFrame]) -> list[list[LightFrame]]:
+    """Frames by view, exposure and repeat: each LED once."""
+    found: dict[tuple[str, ...], list[LightFrame]] = {}
+    for frame in lit:
+        view, _, *which = frame.shot.split("/")
+        found.setdefault((view, *which), []).append(frame)
+    return list(found.values())
+
+
+def _reading(frame: LightFrame, value: float, u: float, design: Floats, powers: Powers) -> Reading:
+    """The tile under one LED against its calibrated power; `design` as `rows_of` has it."""
+    row = powers.row[int(frame.light[3:])]
+    ratio, u_own = value / powers.power[row], float(powers.u_own[row])
+    # The figures of the tile itself are those that the powers were calibrated with.
+    ratio *= np.exp(-design[2] * powers.found["ln_reflectance"] - design[3] * powers.found["minnaert"])
+    common = powers.common[row].copy()
+    common[powers.names.index("ln_reflectance")] += design[2]
+    common[powers.names.index("minnaert")] += design[3]
+    noise = np.sqrt((u / value) ** 2 + u_own**2 + _FLASH**2) if value > 0 else 1.0
+    return Reading(
+        frame.shot,
+        frame.t_s,
+        _warmer_k(frame, powers),
+        float(ratio),
+        float(abs(ratio) * noise),
+        tuple(map(float, (*design[:2], *common))),
+    )
+
+
+def _shared_covariance(setting: Setting, powers: Powers) -> Floats:
+    """Of the tile's tilt in this run, then of what the powers' calibration shared."""
+    from scipy.linalg import block_diag
+
+    tilt = setting.tile.u_tilt_deg**2 * np.eye(2)
+    return np.asarray(block_diag(tilt, powers.covariance))
+
+
+def _warmer_k(frame: LightFrame, powers: Powers) -> float:
+    row = powers.row.get(int(frame.light[3:]))
+    return float("nan") if row is None else frame.temperature_c - float(powers.board_c[row])
+
+
+def _parameters(drift: Drift) -> list[Parameter]:
+    u = np.sqrt(np.diag(drift.covariance))
+    by = ("readings of the tile, its tilt", "prior of 0.5 % per hour", "prior of white LEDs, readings")
+    return [
+        Parameter(name=name, value=float(value), u=float(one), degrees_of_freedom=drift.freedom, dominated_by=why)
+        for name, value, one, why in zip(NAMES, drift.parameters, u, by, strict=True)
+    ]
+
+
+def _table(drift: Drift) -> str:
+    """CSV of the readings."""
+    text = io.StringIO()
+    text.write(
+        "# the reference tile: signal over what the calibrated power makes of it; residual against the fit\n"
+    )
+    text.write("shot,t_s,warmer_k,ratio,u_ratio,residual\n")
+    for reading, left in zip(drift.used, drift.residuals, strict=True):
+        text.write(
+            f"{reading.name},{reading.t_s:.6f},{reading.warmer_k:.2f},{reading.ratio:.6f},{reading.u_ratio:.2g},"
+            f"{left:.6f}\n"
+        )
+    return text.getvalue()
+
+
+def _list(readings: Sequence[Reading]) -> str:
+    named = ", ".join(reading.name for reading in readings[:5])
+    return named + (f" and {len(readings) - 5} more" if len(readings) > 5 else "")

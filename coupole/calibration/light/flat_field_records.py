@@ -1,0 +1,216 @@
+"""From views of a luminous panel to the record of the flat field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.light import drawing as pictures
+from coupole.calibration.light.flat_field import (
+    G_NAMES,
+    PANEL_NAMES,
+    FlatField,
+    FlatView,
+    block_means,
+    dust_spots,
+    fit_flat_field,
+    panel_places,
+)
+from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask, channels_of
+from coupole.calibration.light.records import (
+    Progress,
+    block_diagonal,
+    dark_signal,
+    h5_of,
+    limit_of,
+    linearise,
+    mean_of,
+    record_input,
+    sealed_outcome,
+)
+from coupole.calibration.record import Parameter
+from coupole.calibration.report import Outcome
+from coupole.calibration.rotations import Floats
+from coupole.calibration.wish import Wish
+from coupole.errors import InputError
+
+_BLOCKS = 64
+"""Across the field."""
+_ROWS = 64
+"""That are looked at together where every pixel is: memory stays small."""
+_MOST_SATURATED = 1e-3
+_MOST_FLAT_U = 0.005
+_MOST_DUST_DEPTH = 0.05
+
+
+def flat_field_outcome(
+    frames: LightFrames,
+    wish: Wish,
+    dark_record: Path | None,
+    response_record: Path | None,
+    panel_mm: float,
+    progress: Progress,
+) -> Outcome:
+    """Views of a panel, shifted and turned: fall-off per channel, dust. The panel stands `panel_mm` in front of
+    the camera's mean place, square to its mean axis."""
+    if not frames.lit:
+        raise InputError("flat field: no frame with light; acquire `coupole plan new flat-field`")
+    by_view = _brightest(frames)
+    base_from_panel = _plane_before([found[0].base_from_camera for found in by_view.values()], panel_mm)
+    dark = dark_signal(frames, dark_record)
+    channels = channels_of(frames.pattern)
+    straight = {channel: linearise(response_record, channel) for channel in channels}
+    height, width = frames.lit[0].read().shape
+    size_px = (width, height)
+    block_px = max(8, 2 * round(width / _BLOCKS / 2))
+    views: dict[str, list[FlatView]] = {channel: [] for channel in channels}
+    for number, ((view, light), found) in enumerate(by_view.items()):
+        mean, black = mean_of(found), dark(found[0])
+        saturated = _any_saturated(found, frames.white_dn)
+        for channel in channels:
+            mask = channel_mask((height, width), frames.pattern, channel)
+            signal = straight[channel](np.asarray(mean - black, np.float64))
+            pixels, values = block_means(signal, mask, block_px, saturated=saturated)
+            places = panel_places(pixels, frames.focal_px, size_px, found[0].base_from_camera, base_from_panel)
+            views[channel].append(FlatView(f"{view}/{light}", pixels, values, places))
+        progress(number + 1, len(by_view))
+    fits = {
+        channel: fit_flat_field(views[channel], channel=channel, focal_px=frames.focal_px, size_px=size_px)
+        for channel in channels
+    }
+    g = _map_of_pattern({channel: fit.map() for channel, fit in fits.items()}, frames.pattern)
+    ratio = _ratio(list(by_view.values()), dark, straight, fits, frames, base_from_panel)
+    spots = dust_spots(ratio)
+    parameters, covariance = _flat_parameters(fits)
+    corners = np.array([(0.0, 0.0), (width - 1.0, 0.0), (0.0, height - 1.0), (width - 1.0, height - 1.0)])
+    worst = max(float(fit.u_at(corners).max()) for fit in fits.values())
+    rejected = max(fit.rejected for fit in fits.values())
+    deepest = max((spot.depth for spot in spots), default=0.0)
+    dust = [f"({s.column_px:.0f}, {s.row_px:.0f}) by {s.depth:.1%}" for s in spots[:5]]
+    remarks = [f"{len(spots)} dust spots on the sensor, the deepest at {', '.join(dust)}"] if spots else []
+    table = np.array([(s.column_px, s.row_px, s.pixels, s.depth) for s in spots]).reshape(-1, 4)
+    return sealed_outcome(
+        "flat-field",
+        wish,
+        frames,
+        size_px,
+        parameters,
+        covariance,
+        partial(pictures.draw_flat_field, fits, ratio, spots),
+        limits=(
+            limit_of("uncertainty in the field's corners", worst, _MOST_FLAT_U),
+            limit_of("share of blocks left out", rejected, 0.05),
+            limit_of("deepest dust", deepest, _MOST_DUST_DEPTH),
+        ),
+        files={f"{wish.name}.h5": h5_of({"g": g, "pixel_response": ratio, "dust_x_y_pixels_depth": table})},
+        fixed={"focal_px": frames.focal_px},
+        remarks=remarks,
+        more_inputs=(*record_input(dark_record), *record_input(response_record)),
+    )
+
+
+def _brightest(frames: LightFrames) -> dict[tuple[str, str], list[LightFrame]]:
+    """Frames by view and light, of the longest exposure in which next to nothing is saturated.
+
+    Raises InputError if that is so in fewer than three views.
+    """
+    found: dict[tuple[str, str], list[LightFrame]] = {}
+    for frame in sorted(frames.lit, key=lambda frame: -frame.exposure_us):
+        mine = found.setdefault((frame.view, frame.light), [])
+        usable = not mine and bool(np.mean(frame.read() >= frames.white_dn) < _MOST_SATURATED)
+        if usable or (mine and mine[0].exposure_us == frame.exposure_us):
+            mine.append(frame)
+    views = {key: mine for key, mine in found.items() if mine}
+    if len(views) < 3:
+        raise InputError(
+            f"flat field: expected three views or more that are not saturated, found {len(views)} of {len(found)}"
+            "; bracket the exposure downwards"
+        )
+    return views
+
+
+def _plane_before(base_from_cameras: Sequence[Floats], panel_mm: float) -> Floats:
+    """[4, 4] base_from_panel."""
+    centre = np.mean([pose[:3, 3] for pose in base_from_cameras], axis=0)
+    axis = np.mean([pose[:3, 2] for pose in base_from_cameras], axis=0)
+    axis /= np.linalg.norm(axis)
+    x = base_from_cameras[0][:3, 0] - axis * (base_from_cameras[0][:3, 0] @ axis)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :4] = np.stack([x, np.cross(axis, x), axis, centre + panel_mm * axis], axis=1)
+    return pose
+
+
+def _flat_parameters(fits: Mapping[str, FlatField]) -> tuple[list[Parameter], Floats]:
+    parameters: list[Parameter] = []
+    blocks: list[Floats] = []
+    for channel, fit in fits.items():
+        for names, values, covariance in (
+            (G_NAMES, fit.parameters, fit.covariance),
+            (PANEL_NAMES, fit.panel, fit.panel_covariance),
+        ):
+            u = np.sqrt(np.diag(covariance))
+            parameters += [
+                Parameter(
+                    name=f"{name}.{channel}",
+                    value=float(value),
+                    u=float(one),
+                    degrees_of_freedom=fit.degrees_of_freedom,
+                    dominated_by="pixels' own responses",
+                )
+                for name, value, one in zip(names, values, u, strict=True)
+            ]
+            blocks.append(covariance)
+    return parameters, block_diagonal(blocks)
+
+
+def _ratio(
+    views: Sequence[Sequence[LightFrame]],
+    dark: Callable[[LightFrame], NDArray[np.float32]],
+    straight: Mapping[str, Callable[[Floats], Floats]],
+    fits: Mapping[str, FlatField],
+    frames: LightFrames,
+    base_from_panel: Floats,
+) -> NDArray[np.float32]:
+    """[H, W] mean over views of signal over fitted signal: each pixel's own response, and dust."""
+    size_px = next(iter(fits.values())).size_px
+    width, height = size_px
+    total = np.zeros((height, width), np.float32)
+    masks = {channel: channel_mask((height, width), frames.pattern, channel) for channel in fits}
+    for found in views:
+        signal = mean_of(found) - dark(found[0])
+        for channel, fit in fits.items():
+            ratio = np.zeros((height, width), np.float32)
+            for first in range(0, height, _ROWS):
+                rows = slice(first, min(first + _ROWS, height))
+                at = np.argwhere(masks[channel][rows]) + np.array([first, 0])
+                pixels = at[:, ::-1].astype(float)
+                pose = found[0].base_from_camera
+                x, y = panel_places(pixels, fit.focal_px, size_px, pose, base_from_panel).T / 100.0
+                shine = np.exp(np.column_stack([x, y, x * x, x * y, y * y]) @ fit.panel)
+                values = straight[channel](signal[at[:, 0], at[:, 1]].astype(np.float64))
+                ratio[at[:, 0], at[:, 1]] = values / (fit.at(pixels) * shine)
+            mine = ratio[masks[channel]]
+            total[masks[channel]] += mine / np.float32(np.median(mine) * len(views))
+    return total
+
+
+def _any_saturated(frames: Sequence[LightFrame], white_dn: int) -> NDArray[np.bool_]:
+    found = frames[0].read() >= white_dn
+    for frame in frames[1:]:
+        found |= frame.read() >= white_dn
+    return found
+
+
+def _map_of_pattern(maps: Mapping[str, NDArray[np.float32]], pattern: str) -> NDArray[np.float32]:
+    """[H, W] of each channel's map its own pixels."""
+    shape = next(iter(maps.values())).shape
+    found = np.zeros(shape, np.float32)
+    for channel, values in maps.items():
+        mask = channel_mask((shape[0], shape[1]), pattern, channel)
+        found[mask] = values[mask]
+    return found

@@ -1,0 +1,138 @@
+"""From frames of a white tile to the record of the LEDs' power."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from coupole.calibration.light import drawing as pictures
+from coupole.calibration.light.frames import LightFrame, LightFrames, channels_of
+from coupole.calibration.light.led_power import LedPower, TileView, calibrate_led_power, list_of
+from coupole.calibration.light.led_power_tile import Setting, TileReader
+from coupole.calibration.light.limits import LED_POWER
+from coupole.calibration.light.records import Progress, counter, sealed_outcome
+from coupole.calibration.limits import judged
+from coupole.calibration.record import Parameter
+from coupole.calibration.report import Outcome
+from coupole.calibration.rotations import Floats
+from coupole.calibration.wish import Wish
+from coupole.errors import InputError
+
+
+def led_power_outcome(frames: LightFrames, setting: Setting, wish: Wish, progress: Progress) -> Outcome:
+    """Power of each LED per channel, from the tile's views. Raises InputError as `calibrate_led_power` does."""
+    lit = [frame for frame in frames.lit if frame.light.startswith("led")]
+    if not lit:
+        raise InputError("LED power: no frame under an LED; acquire `coupole plan new spectralon`")
+    channels = channels_of(frames.pattern)
+    by_view: dict[tuple[str, float], list[LightFrame]] = {}
+    for frame in lit:
+        by_view.setdefault((frame.view, frame.exposure_us), []).append(frame)
+    read = TileReader(frames, setting, lit[0].read().shape)
+    views: dict[str, list[TileView]] = {channel: [] for channel in channels}
+    tell = counter(progress, len(lit))
+    for found in by_view.values():
+        for channel, view in read.view(found, tell).items():
+            views[channel].append(view)
+    powers = {
+        channel: calibrate_led_power(views[channel], setting.positions, setting.tile, emission=setting.emission)
+        for channel in channels
+    }
+    warm = board_temperatures(lit)
+    parameters = _parameters(powers)
+    height, width = read.shape
+    green = powers["G"]
+    good = np.isfinite(green.power) & (green.power > 0)
+    typical = float(np.median(green.u_against_mean()[good]))
+    unusable = float(np.mean(~np.isfinite(green.power)))
+    others = np.setdiff1d(setting.positions.ids, green.ids)
+    remarks = [f"{len(others)} LEDs of the dome are in no picture: {list_of(others)}"] if len(others) else []
+    remarks += list(dict.fromkeys(remark for power in powers.values() for remark in power.remarks))
+    return sealed_outcome(
+        "led-power",
+        wish,
+        frames,
+        (width, height),
+        parameters,
+        _covariance(powers),
+        partial(pictures.draw_led_power, powers, setting.positions),
+        limits=judged(LED_POWER, wish.limits, {"power": typical, "unusable": unusable}),
+        files={f"{wish.name}.csv": power_table(powers, warm).encode()},
+        fixed={"tile.reflectance": setting.tile.reflectance, "tile.minnaert": setting.tile.minnaert},
+        remarks=(f"emission profile `{setting.emission}`", *remarks),
+        more_inputs=setting.inputs,
+    )
+
+
+def board_temperatures(lit: Sequence[LightFrame]) -> dict[int, float]:
+    """Mean temperature of each LED's board over its frames, C: where its power holds; NaN where none is known."""
+    seen: dict[int, list[float]] = {}
+    for frame in lit:
+        seen.setdefault(int(frame.light[3:]), []).append(frame.temperature_c)
+    return {led: float(np.mean(celsius)) for led, celsius in seen.items()}
+
+
+def power_table(powers: Mapping[str, LedPower], board_c: Mapping[int, float]) -> str:
+    """CSV: each LED's board temperature, power by channel, own uncertainty, derivative by each common figure.
+
+    The covariance of two LEDs' relative powers is that of the common figures between their derivatives, and
+    u_own^2 on the diagonal.
+    """
+    first = next(iter(powers.values()))
+    text = io.StringIO()
+    columns = ["id", "board_c"]
+    for channel in powers:
+        columns += [f"power_{channel}", f"u_own_{channel}", f"u_{channel}"]
+        columns += [f"d_{name}_{channel}" for name in first.common_names]
+    text.write("# power in DN s^-1 m^2 sr, uncertainties relative; 0: dead, nan: no usable picture\n")
+    text.write(",".join(columns) + "\n")
+    for n, led in enumerate(first.ids):
+        row = [f"{led}", f"{board_c[int(led)]:.2f}"]
+        for power in powers.values():
+            row += [f"{power.power[n]:.9g}", f"{power.u_own[n]:.4g}", f"{power.u()[n]:.4g}"]
+            row += [f"{value:.5g}" for value in power.common[n]]
+        text.write(",".join(row) + "\n")
+    return text.getvalue()
+
+
+def _parameters(powers: Mapping[str, LedPower]) -> list[Parameter]:
+    """What all LEDs share, by channel; their own powers stand in the table."""
+    found = []
+    for channel, power in powers.items():
+        good = np.isfinite(power.power) & (power.power > 0)
+        u = np.sqrt(np.diag(power.common_covariance))
+        freedom = power.degrees_of_freedom
+        mean = float(np.mean(power.power[good]))
+        found.append(
+            Parameter(
+                name=f"mean_power.{channel}",
+                value=mean,
+                u=mean * float(np.sqrt(np.mean(power.u_own[good] ** 2) / good.sum())),
+                degrees_of_freedom=freedom,
+                dominated_by="noise; what LEDs share stands below",
+            )
+        )
+        found += [
+            Parameter(
+                name=f"{name}.{channel}",
+                value=float(value),
+                u=float(one),
+                degrees_of_freedom=freedom,
+                dominated_by="the tile's description",
+            )
+            for name, value, one in zip(power.common_names, power.found, u, strict=True)
+        ]
+    return found
+
+
+def _covariance(powers: Mapping[str, LedPower]) -> Floats:
+    from scipy.linalg import block_diag
+
+    blocks = []
+    for channel, power in powers.items():
+        mean = next(p for p in _parameters({channel: power}) if p.name.startswith("mean_power"))
+        blocks += [np.array([[mean.u**2]]), power.common_covariance]
+    return np.asarray(block_diag(*blocks))

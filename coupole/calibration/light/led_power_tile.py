@@ -1,0 +1,184 @@
+"""What frames show of a white tile: mean signals of its patches, with all that they are read with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration import optics
+from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask, channels_of
+from coupole.calibration.light.irradiance import Emission
+from coupole.calibration.light.led_power import Positions, TileView
+from coupole.calibration.light.records import dark_signal, linearise, map_beside, record_input
+from coupole.calibration.light.spectralon import Tile
+from coupole.calibration.record import read_record
+from coupole.calibration.rotations import Floats
+from coupole.dome import read_led_table
+from coupole.errors import InputError
+
+_PATCHES = 4
+"""Along each side of the tile."""
+_LEAST_PIXELS = 6
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What the tile's pictures are read with."""
+
+    tile: Tile
+    base_from_support: Floats
+    positions: Positions
+    lens: optics.Intrinsics
+    dark: Path | None = None
+    response: Path | None = None
+    flat: Path | None = None
+    emission: Emission = "lambertian"
+    files: tuple[Path, ...] = ()
+    """What tile, support and LEDs were read from: inputs of the record."""
+
+    @property
+    def base_from_tile(self) -> Floats:
+        return self.base_from_support @ self.tile.support_from_tile.matrix()
+
+    @property
+    def inputs(self) -> tuple[tuple[str, str], ...]:
+        """Name and SHA-256 of all files that stand behind this."""
+        made_with = (*self.files, self.dark, self.response, self.flat)
+        return tuple(pair for path in made_with for pair in record_input(path))
+
+
+def calibrated_positions(leds: Path) -> Positions:
+    """Where a record of the kind `leds` has the LEDs. Raises InputError for one of another kind.
+
+    Its uncertainties go no further: 0.05 mm at 1.5 m change an irradiance by a tenth of what flashes differ by.
+    """
+    record = read_record(leds)
+    if record.kind != "leds":
+        raise InputError(f"{leds}: expected a record of the kind `leds`, found `{record.kind}`")
+    table = read_led_table(leds.parent / next(file.name for file in record.files if file.name.endswith(".csv")))
+    return Positions(table.ids, table.positions_mm, table.normals)
+
+
+class TileReader:
+    """Reads mean signals of the tile's patches."""
+
+    def __init__(self, frames: LightFrames, setting: Setting, shape: tuple[int, ...]) -> None:
+        self.shape = (shape[0], shape[1])
+        self._white_dn, self._setting = frames.white_dn, setting
+        self._dark = dark_signal(frames, setting.dark)
+        channels = channels_of(frames.pattern)
+        self._straight: dict[str, Callable[[Floats], Floats]] = {
+            channel: linearise(setting.response, channel) for channel in channels
+        }
+        self._masks = {channel: channel_mask(self.shape, frames.pattern, channel) for channel in channels}
+        self._flat = None if setting.flat is None else map_beside(setting.flat, "flat-field", "g")
+
+    def view(self, found: Sequence[LightFrame], tell: Callable[[], None]) -> dict[str, TileView]:
+        """What the frames of one view, each under one LED, show of the tile, by channel; `tell` is called
+        after each.
+
+        Raises InputError if the view does not show the whole tile.
+        """
+        base_from_camera = found[0].base_from_camera
+        points_mm, pixels = self.patches(base_from_camera)
+        _refuse_few(min(map(len, pixels)))
+        seen = {channel: np.zeros((2, len(found), len(points_mm))) for channel in self._masks}
+        saturated = np.zeros(len(found), np.bool_)
+        for n, frame in enumerate(found):
+            for channel, (mean, u, full) in self.means(frame, pixels).items():
+                seen[channel][:, n] = mean, u
+                saturated[n] |= full
+            tell()
+        leds = np.array([int(frame.light[3:]) for frame in found])
+        return {
+            channel: TileView(
+                found[0].view,
+                0,
+                self._setting.base_from_tile,
+                points_mm,
+                base_from_camera[:3, 3],
+                leds,
+                signal,
+                u_signal,
+                saturated,
+            )
+            for channel, (signal, u_signal) in seen.items()
+        }
+
+    def sees(self, base_from_camera: Floats) -> bool:
+        """Whether a view shows all of the tile."""
+        return min(map(len, self.patches(base_from_camera)[1])) > 0
+
+    def patches(self, base_from_camera: Floats) -> tuple[Floats, list[NDArray[np.intp]]]:
+        """Middles [m, 3] of the patches in the base frame, and the pixels [k, 2] (row, column) that see each: none
+        of a patch that is not wholly in the picture."""
+        tile = self._setting.tile
+        base_from_tile = self._setting.base_from_tile
+        half = tile.side_mm / 2.0 - tile.margin_mm
+        edges = np.linspace(-half, half, _PATCHES + 1)
+        corners, middles = [], []
+        for i in range(_PATCHES):
+            for j in range(_PATCHES):
+                (left, right), (top, bottom) = edges[i : i + 2], edges[j : j + 2]
+                corners += [(left, top), (right, top), (right, bottom), (left, bottom)]
+                middles.append((0.5 * (left + right), 0.5 * (top + bottom)))
+        camera_from_tile = np.linalg.inv(base_from_camera) @ base_from_tile
+        flat = np.column_stack([np.array(corners), np.zeros(len(corners))])
+        seen = flat @ camera_from_tile[:3, :3].T + camera_from_tile[:3, 3]
+        pixels = [np.zeros((0, 2), np.intp)] * len(middles)
+        if (seen[:, 2] > 0).all():
+            polygons = optics.project(seen, self._setting.lens.vector()).pixels.reshape(-1, 4, 2)
+            pixels = [_inside(polygon, self.shape) for polygon in polygons]
+        points = np.column_stack([np.array(middles), np.zeros(len(middles))])
+        return points @ base_from_tile[:3, :3].T + base_from_tile[:3, 3], pixels
+
+    def means(
+        self, frame: LightFrame, patches: Sequence[NDArray[np.intp]]
+    ) -> dict[str, tuple[Floats, Floats, bool]]:
+        """By channel: mean signal of each patch over flat field, DN/s; its uncertainty; whether saturated."""
+        raw = frame.read()
+        signal = raw - self._dark(frame)
+        found = {}
+        for channel, mask in self._masks.items():
+            means, us, full = np.zeros(len(patches)), np.zeros(len(patches)), False
+            for p, pixels in enumerate(patches):
+                rows, columns = pixels[mask[pixels[:, 0], pixels[:, 1]]].T
+                values = self._straight[channel](signal[rows, columns].astype(np.float64))
+                if self._flat is not None:
+                    values = values / self._flat[rows, columns]
+                values = values / (frame.exposure_us * 1e-6)
+                means[p], us[p] = values.mean(), values.std(ddof=1) / np.sqrt(len(values))
+                full |= bool((raw[rows, columns] >= self._white_dn).any())
+            found[channel] = means, us, full
+        return found
+
+
+def _refuse_few(least: int) -> None:
+    if least == 0:
+        raise InputError(
+            "LED power: a part of the tile lies outside the picture, or behind the camera; correct its place in "
+            "its description, or leave out that view"
+        )
+    if least < 4 * _LEAST_PIXELS:
+        raise InputError(
+            f"LED power: expected {4 * _LEAST_PIXELS} pixels or more on each part of the tile, found {least}; go "
+            "nearer, or take a larger tile"
+        )
+
+
+def _inside(polygon: Floats, shape: tuple[int, int]) -> NDArray[np.intp]:
+    """[k, 2] row and column of the pixels inside a convex polygon [4, 2]; none if it leaves the picture."""
+    if (polygon < 0).any() or (polygon > np.array(shape[::-1]) - 1).any():
+        return np.zeros((0, 2), np.intp)
+    low, high = np.floor(polygon.min(axis=0)).astype(int), np.ceil(polygon.max(axis=0)).astype(int)
+    columns, rows = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
+    points = np.stack([columns, rows], axis=-1)
+    after = np.roll(polygon, -1, axis=0) - polygon
+    away = points[:, :, None] - polygon
+    side = after[:, 0] * away[..., 1] - after[:, 1] * away[..., 0]
+    inside = (side >= 0).all(axis=-1) | (side <= 0).all(axis=-1)
+    return np.stack([rows[inside], columns[inside]], axis=-1)

@@ -1,0 +1,365 @@
+"""From frames of runs to the records of dark frames and response, and what all radiometric records share.
+
+Each calibration ends in an `Outcome`: a sealed record, its maps or tables, its picture.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, timedelta
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+import coupole
+from coupole.calibration.light import drawing as pictures
+from coupole.calibration.light.dark import DarkFrame, calibrate_dark
+from coupole.calibration.light.frames import (
+    LightFrame,
+    LightFrames,
+    channel_mask,
+    channels_of,
+    temperatures_of,
+)
+from coupole.calibration.light.limits import DARK, RESPONSE
+from coupole.calibration.light.response import Linearity, Pair, PhotonTransfer, linearity, photon_transfer
+from coupole.calibration.limits import judged
+from coupole.calibration.record import Input, Limit, Noise, Parameter, Record, Validity, read_record, sealed
+from coupole.calibration.report import Outcome
+from coupole.calibration.rotations import Floats
+from coupole.calibration.wish import Wish
+from coupole.errors import InputError
+
+Progress = Callable[[int, int], None]
+_MOST_PIXELS = 200_000
+"""Of a channel that response looks at."""
+
+
+def sealed_outcome(
+    kind: str,
+    wish: Wish,
+    frames: LightFrames,
+    size_px: tuple[int, int],
+    parameters: Sequence[Parameter],
+    covariance: Floats,
+    draw: Callable[[Record, Any], None],
+    *,
+    limits: Sequence[Limit],
+    files: Mapping[str, bytes] | None = None,
+    noise: Sequence[Noise] = (),
+    fixed: Mapping[str, float] | None = None,
+    remarks: Sequence[str] = (),
+    more_inputs: Sequence[tuple[str, str]] = (),
+) -> Outcome:
+    """A record of a radiometric calibration, with its files; `draw` gets the record and an empty figure."""
+    about, given = frames.about, files or {}
+    warm, margin = temperatures_of(frames.frames), wish.temperature_margin_c
+    record = sealed(
+        kind=kind,
+        name=wish.name,
+        created=wish.now.astimezone(UTC).replace(microsecond=0),
+        software=f"coupole {coupole.__version__}",
+        simulated=about.simulated,
+        validity=Validity(
+            expires=(wish.now + timedelta(days=wish.valid_days)).astimezone(UTC).replace(microsecond=0),
+            camera=about.camera,
+            lens=wish.lens,
+            size_px=size_px,
+            focal_length_mm=about.focal_length_mm,
+            focus_distance_mm=about.focus_distance_mm,
+            focus_tolerance_mm=wish.focus_tolerance_mm,
+            f_number=about.f_number,
+            temperature_c=None if warm is None else (warm[0] - margin, warm[1] + margin),
+        ),
+        transforms={},
+        parameters=tuple(parameters),
+        fixed=dict(fixed or {}),
+        covariance=tuple(tuple(map(float, row)) for row in 0.5 * (covariance + covariance.T)),
+        files=tuple(Input(name=n, sha256=hashlib.sha256(content).hexdigest()) for n, content in given.items()),
+        noise=tuple(noise),
+        images=(),
+        limits=tuple(limits),
+        remarks=tuple(remarks),
+        inputs=tuple(Input(name=name, sha256=digest) for name, digest in (*frames.inputs, *more_inputs)),
+    )
+    return Outcome(record, partial(draw, record), given)
+
+
+# -- dark -----------------------------------------------------------------------------------------------------
+
+
+def dark_outcome(frames: LightFrames, wish: Wish, progress: Progress) -> Outcome:
+    """Dark frames of runs: maps of offset and current, noise, hot pixels."""
+    if not frames.dark:
+        raise InputError("dark: no dark frame in these runs; acquire `coupole plan new darks`")
+    listed = [DarkFrame(f.shot, f.exposure_us * 1e-6, f.temperature_c, f.read) for f in frames.dark]
+    dark = calibrate_dark(listed, white_dn=frames.white_dn, progress=progress)
+    height, width = dark.offset_dn.shape
+    pixels = height * width
+    values = {
+        "read_noise_dn": (dark.read_noise_dn, dark.read_noise_u_dn),
+        "row_noise_dn": (dark.row_noise_dn, dark.row_noise_u_dn),
+        "offset_dn": _mean_and_u(dark.offset_dn, dark.noise_dn * np.sqrt(dark.cofactor[0, 0]), dark.hot),
+        "current_dn_per_s": _mean_and_u(
+            dark.current_dn_per_s, dark.noise_dn * np.sqrt(dark.cofactor[1, 1]), dark.hot
+        ),
+    }
+    parameters = [
+        Parameter(
+            name=name, value=value, u=u, degrees_of_freedom=dark.degrees_of_freedom, dominated_by="read noise"
+        )
+        for name, (value, u) in values.items()
+    ]
+    fixed = {"doubling_k": dark.doubling_k, "offset_spread_dn": float(np.std(dark.offset_dn))}
+    fixed |= {} if dark.reference_c is None else {"reference_c": dark.reference_c}
+    fixed |= {f"cofactor.{i}{j}": float(dark.cofactor[i, j]) for i, j in ((0, 0), (0, 1), (1, 1))}
+    fixed["map_degrees_of_freedom"] = float(dark.degrees_of_freedom)
+    content = h5_of(
+        {
+            "offset_dn": dark.offset_dn,
+            "current_dn_per_s": dark.current_dn_per_s,
+            "noise_dn": dark.noise_dn,
+            "hot_row_column": dark.hot,
+        }
+    )
+    return sealed_outcome(
+        "dark",
+        wish,
+        frames,
+        (width, height),
+        parameters,
+        np.diag([p.u**2 for p in parameters]),
+        partial(pictures.draw_dark, dark),
+        limits=judged(DARK, wish.limits, {"hot": len(dark.hot) / pixels}),
+        files={f"{wish.name}.h5": content},
+        fixed=fixed,
+        remarks=(f"{len(dark.hot)} hot pixels of {pixels}; the list is in {wish.name}.h5",),
+    )
+
+
+def dark_signal(frames: LightFrames, record_path: Path | None) -> Callable[[LightFrame], NDArray[np.float32]]:
+    """What a frame holds without light [H, W], DN: from a dark record, else from the view's own dark frames of
+    the same exposure, else from any of that exposure, else the camera's black level."""
+    if record_path is not None:
+        offset = map_beside(record_path, "dark", "offset_dn")
+        current = map_beside(record_path, "dark", "current_dn_per_s")
+        return lambda frame: offset + current * np.float32(frame.exposure_us * 1e-6)
+    kept: dict[float, NDArray[np.float32]] = {}
+
+    def of_frames(frame: LightFrame) -> NDArray[np.float32]:
+        exposure_us = frame.exposure_us
+        if exposure_us not in kept:
+            alike = [f for f in frames.dark if f.exposure_us == exposure_us]
+            if not alike:
+                return np.full(frame.read().shape, frames.black_dn, np.float32)
+            kept[exposure_us] = mean_of(alike)
+        return kept[exposure_us]
+
+    return of_frames
+
+
+def map_beside(path: Path, kind: str, name: str) -> NDArray[np.float32]:
+    """[H, W] a map that stands beside a record. Raises InputError for a record of another kind."""
+    record = read_record(path)
+    if record.kind != kind:
+        raise InputError(f"{path}: expected a record of the kind `{kind}`, found `{record.kind}`")
+    with h5py.File(path.parent / record.files[0].name, "r") as file:
+        values: NDArray[np.float32] = file[name][()]
+        return values
+
+
+def _mean_and_u(
+    values: NDArray[np.float32], u: NDArray[np.float32], hot: NDArray[np.int64]
+) -> tuple[float, float]:
+    """Mean of a map without hot pixels, and its standard uncertainty: pixels' errors are independent."""
+    cold = np.ones(values.shape, np.bool_)
+    cold[hot[:, 0], hot[:, 1]] = False
+    variance = np.mean(np.square(u[cold], dtype=np.float64))
+    return float(values[cold].mean(dtype=np.float64)), float(np.sqrt(variance / cold.sum()))
+
+
+# -- response -------------------------------------------------------------------------------------------------
+
+
+def response_outcome(frames: LightFrames, wish: Wish, dark_record: Path | None, progress: Progress) -> Outcome:
+    """Bracketed exposures of a scene that stands still, each taken twice: gain, noise, linearity."""
+    lit = _one_scene(frames)
+    by_exposure: dict[float, list[LightFrame]] = {}
+    for frame in lit:
+        by_exposure.setdefault(frame.exposure_us, []).append(frame)
+    single = [exposure_us for exposure_us, found in by_exposure.items() if len(found) < 2]
+    if single:
+        raise InputError(
+            f"response: expected two frames of each exposure, found one of {single[0]:.0f} us; set `repeats: 2`"
+        )
+    dark = dark_signal(frames, dark_record)
+    channels = channels_of(frames.pattern)
+    pairs: dict[str, list[Pair]] = {channel: [] for channel in channels}
+    for number, (exposure_us, found) in enumerate(sorted(by_exposure.items())):
+        black = dark(found[0])
+        first, second = (frame.read() for frame in found[:2])
+        for channel in channels:
+            take = _sample(first.shape, frames.pattern, channel)
+            raw_a, raw_b, under = first[take], second[take], black[take]
+            full = np.maximum(raw_a, raw_b) >= frames.white_dn
+            a, b = (np.subtract(raw, under, dtype=np.float64) for raw in (raw_a, raw_b))
+            pairs[channel].append(Pair(found[0].shot, exposure_us, a, b, full))
+        progress(number + 1, len(by_exposure))
+    range_dn = float(frames.white_dn - frames.black_dn)
+    transfers = {channel: photon_transfer(pairs[channel]) for channel in channels}
+    lines = {channel: linearity(pairs[channel], range_dn) for channel in channels}
+    height, width = lit[0].read().shape
+    parameters, covariance = _response_parameters(transfers, lines)
+    worst = max(line.u_deviation for line in lines.values())
+    flicker = max(line.flicker for line in lines.values())
+    remarks = [_linear_remark(channel, line) for channel, line in lines.items()]
+    if not any(t.saturated_seen for t in transfers.values()):
+        remarks.append("no frame was saturated: full well is at least what is stated")
+    fixed = {"range_dn": range_dn}
+    for channel, transfer in transfers.items():
+        fixed[f"saturation_dn.{channel}"] = transfer.saturation_dn
+        fixed[f"saturation_e.{channel}"] = transfer.saturation_e.value
+        if transfer.prnu is not None:
+            fixed[f"prnu.{channel}"] = transfer.prnu.value
+    noise = [
+        Noise(
+            name=f"reading {channel}",
+            unit="e",
+            stated=0.0,
+            found=transfer.read_noise_e.value,
+            redundancy=float(transfer.used.sum() - 2),
+        )
+        for channel, transfer in transfers.items()
+    ]
+    return sealed_outcome(
+        "response",
+        wish,
+        frames,
+        (width, height),
+        parameters,
+        covariance,
+        partial(pictures.draw_response, transfers, lines),
+        limits=judged(RESPONSE, wish.limits, {"linearity": worst, "flicker": flicker}),
+        noise=noise,
+        fixed=fixed,
+        remarks=remarks,
+        more_inputs=record_input(dark_record),
+    )
+
+
+def _one_scene(frames: LightFrames) -> list[LightFrame]:
+    """The frames of one view under one light: of the light that most were taken with."""
+    if not frames.lit:
+        raise InputError("response: no frame with light; acquire `coupole plan new response`")
+    counted: dict[tuple[str, str], list[LightFrame]] = {}
+    for frame in frames.lit:
+        counted.setdefault((frame.view, frame.light), []).append(frame)
+    return max(counted.values(), key=len)
+
+
+def _sample(shape: tuple[int, ...], pattern: str, channel: str) -> NDArray[np.bool_]:
+    """[H, W] pixels of a channel, of whole rows so that neighbours stay neighbours."""
+    mask = channel_mask((shape[0], shape[1]), pattern, channel)
+    step = max(1, round(float(mask.sum()) / _MOST_PIXELS))
+    rows = (np.arange(shape[0]) // 2) % step == 0
+    return np.asarray(mask & rows[:, None])
+
+
+def _response_parameters(
+    transfers: Mapping[str, PhotonTransfer], lines: Mapping[str, Linearity]
+) -> tuple[list[Parameter], Floats]:
+    parameters: list[Parameter] = []
+    blocks: list[Floats] = []
+    for channel, found in transfers.items():
+        line = lines[channel]
+        gain = found.gain_dn_per_e
+        intercept = found.read_noise_dn.value**2 + 1.0 / 12.0
+        freedom = float(max(1, found.used.sum() - 2))
+        values = [
+            ("dark_variance_dn2", intercept, float(np.sqrt(found.covariance[0, 0])), "read noise"),
+            ("gain_dn_per_e", gain.value, gain.u, "shot noise"),
+            ("c2", float(line.coefficients[0]), float(np.sqrt(line.covariance[0, 0])), "flicker"),
+            ("c3", float(line.coefficients[1]), float(np.sqrt(line.covariance[1, 1])), "flicker"),
+            ("time_offset_us", line.time_offset_us.value, line.time_offset_us.u, "shortest exposures"),
+        ]
+        parameters += [
+            Parameter(name=f"{name}.{channel}", value=value, u=u, degrees_of_freedom=freedom, dominated_by=by)
+            for name, value, u, by in values
+        ]
+        blocks += [found.covariance, line.covariance, np.array([[line.time_offset_us.u**2]])]
+    return parameters, block_diagonal(blocks)
+
+
+def _linear_remark(channel: str, line: Linearity) -> str:
+    how = "corrected by a polynomial" if line.coefficients.any() else "not told from a straight line"
+    return f"{channel}: off a straight line by {line.worst_deviation:.2%} ({line.u_deviation:.2%}), {how}"
+
+
+def linearise(record_path: Path | None, channel: str) -> Callable[[Floats], Floats]:
+    """Signal above dark to linear signal, from a record of the kind `response`; the signal itself without one."""
+    if record_path is None:
+        return lambda signal: signal
+    record = read_record(record_path)
+    if record.kind != "response":
+        raise InputError(f"{record_path}: expected a record of the kind `response`, found `{record.kind}`")
+    c2, c3 = record.value(f"c2.{channel}"), record.value(f"c3.{channel}")
+    range_dn = record.value("range_dn")
+
+    def straight(signal: Floats) -> Floats:
+        x = signal / range_dn
+        return signal * (1.0 + x * (c2 + x * c3))
+
+    return straight
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def mean_of(frames: Sequence[LightFrame]) -> NDArray[np.float32]:
+    """[H, W] mean of frames, read one after the other."""
+    total: NDArray[np.float32] | None = None
+    for frame in frames:
+        pixels = frame.read()
+        total = pixels.astype(np.float32) if total is None else total + pixels
+    assert total is not None
+    return total / np.float32(len(frames))
+
+
+def counter(progress: Progress, total: int) -> Callable[[], None]:
+    """What moves a progress bar by one of `total`."""
+    done = count(1)
+    return lambda: progress(next(done), total)
+
+
+def h5_of(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """An HDF5 file of these arrays; large ones compressed."""
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        for name, values in arrays.items():
+            large = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if values.size > 4096 else {}
+            file.create_dataset(name, data=values, track_times=False, **large)
+    return buffer.getvalue()
+
+
+def block_diagonal(blocks: Sequence[Floats]) -> Floats:
+    """Covariance of groups of parameters that do not depend on each other."""
+    from scipy.linalg import block_diag
+
+    return np.asarray(block_diag(*blocks))
+
+
+def limit_of(what: str, found: float, limit: float, unit: str = "") -> Limit:
+    """An acceptance limit and how it is met."""
+    return Limit(what=what, found=found, limit=limit, unit=unit)
+
+
+def record_input(path: Path | None) -> tuple[tuple[str, str], ...]:
+    """A file that a calibration was made with, as an input: none or one."""
+    return () if path is None else ((path.name, hashlib.sha256(path.read_bytes()).hexdigest()),)

@@ -1,0 +1,70 @@
+"""The picture of a mesh's place: stickers and mesh laid onto a frame, what is known how well."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from coupole.calibration.report import BLUE, DARK, GREY, RED
+from coupole.calibration.stickers.workflow import MeshFound, outline_px, reprojected
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MOST_SHOWN_PX = 1600
+
+
+def draw_mesh(found: MeshFound, figure: Figure) -> None:
+    """Fill the figure."""
+    grid = figure.add_gridspec(2, 3)
+    _draw_frame(figure.add_subplot(grid[:, :2]), found)
+    _draw_uncertainty(figure.add_subplot(grid[0, 2]), found)
+    _draw_views(figure.add_subplot(grid[1, 2]), found)
+
+
+def _draw_frame(ax: Axes, found: MeshFound) -> None:
+    """One frame, with the mesh's outline and the table's stickers where they should be."""
+    from matplotlib.collections import LineCollection
+
+    image = found.images.picture
+    step = max(1, max(image.shape) // _MOST_SHOWN_PX)
+    height, width = image.shape
+    bright = float(np.percentile(image, 99.5))
+    extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+    ax.imshow(np.sqrt(np.clip(image[::step, ::step] / bright, 0, 1)), cmap="gray", extent=extent)
+    ax.add_collection(
+        LineCollection(
+            list(outline_px(found, found.scan.mesh)), colors="#6fd08c", linewidths=0.8, label="outline of the mesh"
+        )
+    )
+    seen = np.array([s.middle for s in found.images.stickers[found.images.shown]])
+    ax.plot(seen[:, 0], seen[:, 1], "o", ms=13, mfc="none", color=BLUE, label="found in the image")
+    should = reprojected(found, found.scan.targets_mm)
+    ax.plot(should[:, 0], should[:, 1], "+", ms=13, color=RED, label="by the scan, through the result")
+    ax.set(
+        xlim=(0, width), ylim=(height, 0), xlabel="x (px)", ylabel="y (px)",
+        title=f"Mesh and stickers laid onto {found.images.names[found.images.shown]}",
+    )  # fmt: skip
+    ax.legend(loc="lower right")
+
+
+def _draw_uncertainty(ax: Axes, found: MeshFound) -> None:
+    """How well each sticker's place in the base is known, from the side of the mesh."""
+    place = found.scan.targets_mm
+    dots = ax.scatter(place[:, 0], place[:, 1], c=1e3 * found.u_mm, s=40, cmap="viridis")
+    lost = np.isin(found.scan.names, found.pose.missing)
+    ax.scatter(place[lost, 0], place[lost, 1], s=110, facecolors="none", edgecolors=RED)
+    ax.figure.colorbar(dots, ax=ax, label="u of its place in the base (um)")
+    ax.set(aspect="equal", xlabel="x (mm, mesh)", ylabel="y (mm, mesh)", title="Stickers; red: not found")
+
+
+def _draw_views(ax: Axes, found: MeshFound) -> None:
+    """How many views saw each sticker."""
+    counts = [found.pose.views_of.get(name, 0) for name in found.scan.names]
+    colours = [BLUE if count else RED for count in counts]
+    ax.bar(np.arange(len(counts)), counts, color=colours)
+    ax.axhline(0, color=GREY, lw=0.8)
+    ax.set(title="Views that saw each sticker", xlabel="sticker", ylabel="views")
+    ax.tick_params(labelcolor=DARK)

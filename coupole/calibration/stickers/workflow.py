@@ -1,0 +1,221 @@
+"""From the stickers of a run and of a scan to the record of where the mesh lies, and what the report shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, timedelta
+from pathlib import Path
+
+import numpy as np
+
+import coupole
+from coupole.calibration import optics
+from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
+from coupole.calibration.limits import judged
+from coupole.calibration.multi_view import seen_points
+from coupole.calibration.posed_camera import CameraPrior
+from coupole.calibration.record import (
+    ImageResidual,
+    Input,
+    Noise,
+    Parameter,
+    Record,
+    Validity,
+    sealed,
+    step_names,
+)
+from coupole.calibration.rotations import Floats, inverses
+from coupole.calibration.sources import Sources
+from coupole.calibration.stickers.limits import MESH
+from coupole.calibration.stickers.mesh_to_robot import (
+    ORIENTATION,
+    POSITION,
+    STICKERS,
+    HandEye,
+    MeshPose,
+    Stated,
+    mesh_to_robot,
+)
+from coupole.calibration.stickers.points import corrected, views_of
+from coupole.calibration.stickers.sources import Scan, StickerImages
+from coupole.calibration.wish import Wish
+from coupole.errors import InputError
+from coupole.geometry import Transform, abc_from_rotation, inverse
+from coupole.plan import Pose
+
+_LEAST_SIGMA_PX = 0.02
+_MOST_FACES = 1_000_000
+"""Of the mesh that is laid onto a frame."""
+
+
+@dataclass(frozen=True)
+class MeshFound:
+    """The result and what the report draws."""
+
+    record: Record
+    pose: MeshPose
+    images: StickerImages
+    camera_from_mesh: Floats
+    """4x4 at the image that is shown."""
+    lens: optics.Intrinsics
+    scan: Scan
+    u_mm: Floats
+    """[n] standard uncertainty of each target's place in the base."""
+
+
+def mesh_from(
+    images: StickerImages,
+    sources: Sources,
+    scan: Scan,
+    prior: CameraPrior,
+    wish: Wish,
+    *,
+    stated: Stated,
+    depth_mm: tuple[float, float],
+    base_from_support: Transform | None = None,
+    arm: CalibratedArm | None = None,
+) -> MeshFound:
+    """Find where a scanned mesh lies. Raises InputError if its stickers are not those in the images."""
+    if sources.poses is None:
+        raise InputError("mesh: the images have no poses; give runs, or a folder with poses")
+    base_from_flange = sources.poses.base_from_flange
+    hand_eye = HandEye(prior.flange_from_camera, prior.covariance, prior.free)
+    if arm is not None:
+        joints_deg = np.array([source.joints_deg for source in sources.images])
+        base_from_flange, hand_eye = calibrated_poses(base_from_flange, joints_deg, arm, prior)
+    base_from_camera = base_from_flange @ prior.flange_from_camera
+    sigma_px = _sigma_px(images)
+    stated = replace(stated, sticker_px=sigma_px)
+    pose_px = prior.lens.fx * (stated.robot_mm / float(np.mean(depth_mm)) + np.radians(stated.robot_deg))
+    views = views_of(images.names, base_from_camera, images.stickers)
+    points = seen_points(views, prior.lens, tolerance_px=4 * float(np.hypot(0.2, pose_px)), depth_mm=depth_mm)
+    views = corrected(views, images.stickers, points)
+    pose = mesh_to_robot(
+        views, prior.lens, scan.targets_mm, scan.names, stated=stated, hand_eye=hand_eye, depth_mm=depth_mm
+    )
+    u_mm = np.array([pose.uncertainty_at(target) for target in scan.targets_mm])
+    transforms = {"base_from_mesh": _pose(pose.base_from_mesh)}
+    if base_from_support is not None:
+        transforms["support_from_object"] = _pose(inverse(base_from_support) @ pose.base_from_mesh)
+    record = sealed(
+        kind="mesh",
+        name=wish.name,
+        created=wish.now.astimezone(UTC).replace(microsecond=0),
+        software=f"coupole {coupole.__version__}",
+        simulated=sources.about.simulated,
+        validity=Validity(
+            expires=(wish.now + timedelta(days=wish.valid_days)).astimezone(UTC).replace(microsecond=0)
+        ),
+        transforms=transforms,
+        parameters=_parameters(pose),
+        fixed={"stickers_found": float(len(pose.matched)), "stickers_known": float(len(scan.names))},
+        covariance=tuple(map(tuple, (0.5 * (pose.covariance + pose.covariance.T)).tolist())),
+        noise=_noise(pose, stated),
+        images=tuple(
+            ImageResidual(name=name, corners=len(seen), rejected=0, rms_px=pose.residual_px)
+            for name, seen in zip(images.names, images.stickers, strict=True)
+        ),
+        limits=judged(MESH, wish.limits, _figures(pose, scan, u_mm)),
+        remarks=(*_remarks(pose), *(() if arm is None else (_of_the_arm(arm),))),
+        inputs=tuple(Input(name=name, sha256=digest) for name, digest in (*sources.inputs, *scan.inputs)),
+    )
+    camera_from_mesh = inverses(base_from_camera[images.shown]) @ pose.base_from_mesh
+    return MeshFound(record, pose, images, camera_from_mesh, prior.lens, scan, u_mm)
+
+
+def _sigma_px(images: StickerImages) -> float:
+    """Typical noise of a sticker's centre along one axis, by the fits of their rims."""
+    variances = [np.trace(sticker.covariance) / 2 for seen in images.stickers for sticker in seen]
+    return max(float(np.sqrt(np.median(variances))), _LEAST_SIGMA_PX)
+
+
+def outline_px(found: MeshFound, mesh: Path) -> Floats:
+    """Ends [n, 2, 2] (px) of the mesh's edges between triangles that face the shown image's camera and triangles
+    that do not: its outline, and that of what stands out of it."""
+    import trimesh
+
+    from coupole.view_solids import Solid, simplified
+
+    whole = trimesh.load_mesh(mesh, process=False)
+    coarse = simplified(Solid("mesh", np.asarray(whole.vertices), np.asarray(whole.faces)), _MOST_FACES)
+    scanned = trimesh.Trimesh(coarse.vertices_mm, coarse.faces, process=False)
+    eye_mm = inverse(found.camera_from_mesh)[:3, 3]
+    corners = np.asarray(scanned.triangles)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    faces_eye = np.einsum("ij,ij->i", normals, eye_mm - corners[:, 0]) > 0
+    one, other = np.asarray(scanned.face_adjacency).T
+    edges = np.asarray(scanned.face_adjacency_edges)[faces_eye[one] != faces_eye[other]]
+    ends = np.asarray(scanned.vertices, dtype=np.float64)[edges.reshape(-1)]
+    return reprojected(found, ends).reshape(-1, 2, 2)
+
+
+def reprojected(found: MeshFound, mesh_mm: Floats) -> Floats:
+    """Pixels [n, 2] of points [n, 3] of the mesh in the image that is shown; NaN for what is not before it."""
+    in_camera = mesh_mm @ found.camera_from_mesh[:3, :3].T + found.camera_from_mesh[:3, 3]
+    pixels = np.full((len(mesh_mm), 2), np.nan)
+    before = in_camera[:, 2] > 1.0
+    pixels[before] = optics.project(in_camera[before], found.lens.vector()).pixels
+    return pixels
+
+
+def _parameters(pose: MeshPose) -> tuple[Parameter, ...]:
+    place = pose.base_from_mesh[:3, 3]
+    return tuple(
+        Parameter(
+            name=name,
+            value=float(place[i]) if i < len(place) else None,
+            u=float(np.sqrt(pose.covariance[i, i])),
+            degrees_of_freedom=float(pose.degrees[i]),
+            dominated_by=pose.dominated_by[i],
+        )
+        for i, name in enumerate(step_names("base_from_mesh"))
+    )
+
+
+def _noise(pose: MeshPose, stated: Stated) -> tuple[Noise, ...]:
+    said = {
+        STICKERS: (stated.sticker_px, "px"),
+        POSITION: (stated.robot_mm, "mm"),
+        ORIENTATION: (stated.robot_deg, "deg"),
+    }
+    return tuple(
+        Noise(
+            name=name,
+            unit=unit,
+            stated=sigma,
+            found=sigma * pose.noise[name],
+            redundancy=float(pose.redundancy[name]),
+        )
+        for name, (sigma, unit) in said.items()
+    )
+
+
+def _figures(pose: MeshPose, scan: Scan, u_mm: Floats) -> dict[str, float]:
+    """What `sticker_limits.MESH` are held against."""
+    return {
+        "place_mm": float(u_mm.max()),
+        "missing": 1 - len(pose.matched) / len(scan.names),
+        "residual_px": pose.residual_px,
+        "robot_ratio": float(max(pose.noise[POSITION], pose.noise[ORIENTATION])),
+    }
+
+
+def _remarks(pose: MeshPose) -> tuple[str, ...]:
+    remarks = [
+        f"points in space off the scanner's table by {pose.point_rms_mm:.3f} mm (rms) before the adjustment"
+    ]
+    if pose.missing:
+        remarks.append(f"{len(pose.missing)} stickers of the table were not found: {', '.join(pose.missing[:20])}")
+    if pose.false_points:
+        remarks.append(f"{pose.false_points} things like stickers are none of the table's")
+    return tuple(remarks)
+
+
+def _of_the_arm(arm: CalibratedArm) -> str:
+    zeros = ", ".join(f"A{axis} {zero:+.4f}" for axis, zero in enumerate(arm.zeros_deg[1:], start=2))
+    return f"poses are corrected by the axis zeros of the hand-eye record ({zeros} deg); use them with the mesh"
+
+
+def _pose(transform: Floats) -> Pose:
+    x, y, z = map(float, transform[:3, 3])
+    return Pose(translation_mm=(x, y, z), abc_deg=abc_from_rotation(transform[:3, :3]))

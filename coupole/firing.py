@@ -31,8 +31,8 @@ from coupole.recorder import Recorder
 from coupole.shots import Burst
 
 _POLL_S = 0.05
-_CLOCK_TOLERANCE, _STALL_S = 1.02, 5.0
-"""A burst may take so much longer than its table says, as a factor and in seconds."""
+_STALL_S = 5.0
+"""A box that logs no step for so much longer than a step takes has stopped."""
 _LAST_STRETCH_S = 0.3
 """Of a burst: time enough for a host that fell behind in a hurry to catch up before the end."""
 _BOX_JITTER_US = 20.0
@@ -159,7 +159,8 @@ class Firing:
         """Read log and frames until the burst is over, proving as it goes."""
         box, clock, burst, intake = self._cell.ledbox, self._cell.clock, under_way.burst, under_way.intake
         readout_s = 1.0 / self._max_frames_per_s + burst.timing.exposure_us * 1e-6
-        whole = Deadline(clock, burst.duration_s * _CLOCK_TOLERANCE + _STALL_S)
+        step_s = burst.timing.period_us * 1e-6
+        next_step = Deadline(clock, step_s + _STALL_S)
         last_frames: Deadline | None = None
         edges = 0
         judged_at = (-1, -1)
@@ -168,7 +169,10 @@ class Firing:
             if (news_ns := self._posing.heard_at_rest()) > heard_ns:
                 heard_ns, confirmed = news_ns, taken  # what had come by the last round was taken at rest
             taken = len(intake)  # before the log is read: the proof needs frames that are older than the log
-            under_way.log = np.concatenate([under_way.log, box.poll_log()])
+            steps = box.poll_log()
+            if len(steps):
+                under_way.log = np.concatenate([under_way.log, steps])
+                next_step = Deadline(clock, step_s + _STALL_S)
             if len(under_way.log) == len(burst.table) and last_frames is None:
                 last_frames = Deadline(clock, readout_s + self._cell.camera.delivery_s)
                 edges = box.edges()
@@ -185,11 +189,12 @@ class Firing:
             if complete:
                 return
             self._recorder.commit(now=False)
-            if whole.expired:
+            if last_frames is None and next_step.expired:
                 raise DeviceTimeout(
                     "led box",
-                    expected=f"the burst's {len(burst.table)} steps within {whole.seconds:.1f} s",
-                    happened=f"only {len(under_way.log)} are in its log",
+                    expected=f"a step of the burst every {1e3 * step_s:.0f} ms",
+                    happened=f"none came for {next_step.seconds:.1f} s; "
+                    f"{len(under_way.log)} of {len(burst.table)} are in its log",
                     remedy="Check the box, then resume the run.",
                 )
             clock.sleep(_POLL_S)

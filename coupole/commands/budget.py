@@ -94,8 +94,13 @@ def budget(
         if out is not None:
             picture = draw_budget(found, spread)
             text = page(found, spread, cases, table, picture, doubted)
-            _write({out: picture, out.with_suffix(".html"): text.encode(),
-                    out.with_suffix(".json"): f"{json.dumps(document, indent=1)}\n".encode()})  # fmt: skip
+            _write(
+                {
+                    out: picture,
+                    out.with_suffix(".html"): text.encode(),
+                    out.with_suffix(".json"): f"{json.dumps(document, indent=1)}\n".encode(),
+                }
+            )
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise

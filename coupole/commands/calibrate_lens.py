@@ -62,8 +62,17 @@ def camera(
         sources, _, found = _look(paths, board, None, console)
         return _drawn(camera_from(found, sources, model, wish)[1])
 
-    calibrate("camera", work, out=out, name=name, lens=lens, valid_days=valid_days, as_json=as_json,
-              limit=limit, limits=CAMERA)  # fmt: skip
+    calibrate(
+        "camera",
+        work,
+        out=out,
+        name=name,
+        lens=lens,
+        valid_days=valid_days,
+        as_json=as_json,
+        limit=limit,
+        limits=CAMERA,
+    )
 
 
 def chromatic(
@@ -88,8 +97,17 @@ def chromatic(
             found = chromatic_from(shown, sources, described, model, wish)
         return Outcome(found.record, partial(draw_chromatic, found))
 
-    calibrate("chromatic", work, out=out, name=name, lens=lens, valid_days=valid_days, as_json=as_json,
-              limit=limit, limits=CHROMATIC)  # fmt: skip
+    calibrate(
+        "chromatic",
+        work,
+        out=out,
+        name=name,
+        lens=lens,
+        valid_days=valid_days,
+        as_json=as_json,
+        limit=limit,
+        limits=CHROMATIC,
+    )
 
 
 def hand_eye(
@@ -130,8 +148,17 @@ def hand_eye(
             shown = hand_eye_from(found, sources, described, model, wish, robot=robot, arm=arm, lens=earlier)[2]
         return _drawn(shown)
 
-    calibrate("hand-eye", work, out=out, name=name, lens=lens, valid_days=valid_days, as_json=as_json,
-              limit=limit, limits=HAND_EYE)  # fmt: skip
+    calibrate(
+        "hand-eye",
+        work,
+        out=out,
+        name=name,
+        lens=lens,
+        valid_days=valid_days,
+        as_json=as_json,
+        limit=limit,
+        limits=HAND_EYE,
+    )
 
 
 def _drawn(shown: Shown) -> Outcome:

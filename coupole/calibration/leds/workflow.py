@@ -6,13 +6,11 @@ import hashlib
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, timedelta
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-import coupole
 from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
 from coupole.calibration.leds.boards import Boards, boards_of, placed
@@ -106,13 +104,9 @@ def leds_from(
     limits = judged(LEDS, wish.limits, _figures(geometry, found, u_mm[where], u_deg[where]))
     record = sealed(
         kind="leds",
-        name=wish.name,
-        created=wish.now.astimezone(UTC).replace(microsecond=0),
-        software=f"coupole {coupole.__version__}",
+        **wish.head(),
         simulated=images.about.simulated,
-        validity=Validity(
-            expires=(wish.now + timedelta(days=wish.valid_days)).astimezone(UTC).replace(microsecond=0)
-        ),
+        validity=Validity(expires=wish.expires),
         transforms={},
         **_parameters(
             geometry, stated, float(np.median(u_mm[where][found])), float(np.median(u_deg[where][found]))

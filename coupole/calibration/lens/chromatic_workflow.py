@@ -13,10 +13,10 @@ from coupole.calibration.lens.camera import calibrate_camera, without_gross_erro
 from coupole.calibration.lens.chromatic import SHARED, ChannelLenses, calibrate_channels
 from coupole.calibration.lens.images import Found
 from coupole.calibration.lens.limits import CHROMATIC
-from coupole.calibration.lens.workflow import content_of, image_figures, image_lines, rows_of, unit_name
+from coupole.calibration.lens.workflow import content_of, image_figures, image_lines, unit_name
 from coupole.calibration.limits import judged
 from coupole.calibration.picture import CHANNELS, Channel
-from coupole.calibration.record import Noise, Parameter, Record, sealed
+from coupole.calibration.record import Noise, Parameter, Record, rows_of, sealed
 from coupole.calibration.report import BLUE, DARK, RED
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import Sources

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, timedelta
 from typing import Literal
 
 import numpy as np
 
-import coupole
 from coupole.calibration import optics
 from coupole.calibration.adjustment import Component
 from coupole.calibration.arm_errors import axis_sensitivity
@@ -31,14 +29,21 @@ from coupole.calibration.lens.images import Found
 from coupole.calibration.lens.limits import CAMERA, HAND_EYE
 from coupole.calibration.limits import judged
 from coupole.calibration.poses import ReportedPoses
-from coupole.calibration.record import ImageResidual, Input, Noise, Parameter, Record, Validity, sealed
+from coupole.calibration.record import (
+    ImageResidual,
+    Input,
+    Noise,
+    Parameter,
+    Record,
+    pose_of,
+    rows_of,
+    sealed,
+)
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import Sources
 from coupole.calibration.wish import Wish
 from coupole.errors import InputError
-from coupole.geometry import abc_from_rotation
 from coupole.kinematics import Arm
-from coupole.plan import Pose
 
 FIELD_CELLS = (8, 6)
 
@@ -149,8 +154,8 @@ def hand_eye_from(
     record = sealed(
         kind="hand-eye",
         transforms={
-            "flange_from_camera": _pose(result.flange_from_camera),
-            "base_from_board": _pose(result.base_from_board),
+            "flange_from_camera": pose_of(result.flange_from_camera),
+            "base_from_board": pose_of(result.base_from_board),
         },
         parameters=_hand_eye_parameters(result),
         covariance=rows_of(result.covariance),
@@ -219,24 +224,10 @@ def image_lines(
 def content_of(found: Found, sources: Sources, wish: Wish) -> dict[str, object]:
     """What all records made from a board's images have."""
     about = sources.about
-    temperature = about.temperature_c
-    margin = wish.temperature_margin_c
     return {
-        "name": wish.name,
-        "created": wish.now.astimezone(UTC).replace(microsecond=0),
-        "software": f"coupole {coupole.__version__}",
+        **wish.head(),
         "simulated": about.simulated,
-        "validity": Validity(
-            expires=(wish.now + timedelta(days=wish.valid_days)).astimezone(UTC).replace(microsecond=0),
-            camera=about.camera,
-            lens=wish.lens,
-            size_px=found.size_px,
-            focal_length_mm=about.focal_length_mm,
-            focus_distance_mm=about.focus_distance_mm,
-            focus_tolerance_mm=wish.focus_tolerance_mm,
-            f_number=about.f_number,
-            temperature_c=None if temperature is None else (temperature[0] - margin, temperature[1] + margin),
-        ),
+        "validity": wish.validity(about, found.size_px, about.temperature_c),
         "inputs": tuple(Input(name=name, sha256=digest) for name, digest in sources.inputs),
     }
 
@@ -317,14 +308,3 @@ def _noise(name: str, unit: Literal["px", "mm", "deg"], stated: float, found: fl
 def unit_name(name: str) -> str:
     """A lens parameter with its unit, as records call it."""
     return f"{name}_px" if name in ("fx", "fy", "cx", "cy") else name
-
-
-def _pose(transform: Floats) -> Pose:
-    x, y, z = map(float, transform[:3, 3])
-    return Pose(translation_mm=(x, y, z), abc_deg=abc_from_rotation(transform[:3, :3]))
-
-
-def rows_of(matrix: Floats) -> tuple[tuple[float, ...], ...]:
-    """A covariance as records keep it."""
-    symmetric = 0.5 * (matrix + matrix.T)
-    return tuple(tuple(map(float, row)) for row in symmetric)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Callable, Mapping, Sequence
-from datetime import UTC, timedelta
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -18,7 +17,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-import coupole
 from coupole.calibration.light import drawing as pictures
 from coupole.calibration.light.dark import DarkFrame, calibrate_dark
 from coupole.calibration.light.frames import (
@@ -31,7 +29,16 @@ from coupole.calibration.light.frames import (
 from coupole.calibration.light.limits import DARK, RESPONSE
 from coupole.calibration.light.response import Linearity, Pair, PhotonTransfer, linearity, photon_transfer
 from coupole.calibration.limits import judged
-from coupole.calibration.record import Input, Limit, Noise, Parameter, Record, Validity, read_record, sealed
+from coupole.calibration.record import (
+    Input,
+    Limit,
+    Noise,
+    Parameter,
+    Record,
+    read_record,
+    rows_of,
+    sealed,
+)
 from coupole.calibration.report import Outcome
 from coupole.calibration.rotations import Floats
 from coupole.calibration.wish import Wish
@@ -60,28 +67,15 @@ def sealed_outcome(
 ) -> Outcome:
     """A record of a radiometric calibration, with its files; `draw` gets the record and an empty figure."""
     about, given = frames.about, files or {}
-    warm, margin = temperatures_of(frames.frames), wish.temperature_margin_c
     record = sealed(
         kind=kind,
-        name=wish.name,
-        created=wish.now.astimezone(UTC).replace(microsecond=0),
-        software=f"coupole {coupole.__version__}",
+        **wish.head(),
         simulated=about.simulated,
-        validity=Validity(
-            expires=(wish.now + timedelta(days=wish.valid_days)).astimezone(UTC).replace(microsecond=0),
-            camera=about.camera,
-            lens=wish.lens,
-            size_px=size_px,
-            focal_length_mm=about.focal_length_mm,
-            focus_distance_mm=about.focus_distance_mm,
-            focus_tolerance_mm=wish.focus_tolerance_mm,
-            f_number=about.f_number,
-            temperature_c=None if warm is None else (warm[0] - margin, warm[1] + margin),
-        ),
+        validity=wish.validity(about, size_px, temperatures_of(frames.frames)),
         transforms={},
         parameters=tuple(parameters),
         fixed=dict(fixed or {}),
-        covariance=tuple(tuple(map(float, row)) for row in 0.5 * (covariance + covariance.T)),
+        covariance=rows_of(covariance),
         files=tuple(Input(name=n, sha256=hashlib.sha256(content).hexdigest()) for n, content in given.items()),
         noise=tuple(noise),
         images=(),

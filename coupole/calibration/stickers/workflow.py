@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from datetime import UTC, timedelta
 from pathlib import Path
 
 import numpy as np
 
-import coupole
 from coupole.calibration import optics
 from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
 from coupole.calibration.limits import judged
@@ -21,6 +19,8 @@ from coupole.calibration.record import (
     Parameter,
     Record,
     Validity,
+    pose_of,
+    rows_of,
     sealed,
     step_names,
 )
@@ -40,8 +40,7 @@ from coupole.calibration.stickers.points import corrected, views_of
 from coupole.calibration.stickers.sources import Scan, StickerImages
 from coupole.calibration.wish import Wish
 from coupole.errors import InputError
-from coupole.geometry import Transform, abc_from_rotation, inverse
-from coupole.plan import Pose
+from coupole.geometry import Transform, inverse
 
 _LEAST_SIGMA_PX = 0.02
 _MOST_FACES = 1_000_000
@@ -94,22 +93,18 @@ def mesh_from(
         views, prior.lens, scan.targets_mm, scan.names, stated=stated, hand_eye=hand_eye, depth_mm=depth_mm
     )
     u_mm = np.array([pose.uncertainty_at(target) for target in scan.targets_mm])
-    transforms = {"base_from_mesh": _pose(pose.base_from_mesh)}
+    transforms = {"base_from_mesh": pose_of(pose.base_from_mesh)}
     if base_from_support is not None:
-        transforms["support_from_object"] = _pose(inverse(base_from_support) @ pose.base_from_mesh)
+        transforms["support_from_object"] = pose_of(inverse(base_from_support) @ pose.base_from_mesh)
     record = sealed(
         kind="mesh",
-        name=wish.name,
-        created=wish.now.astimezone(UTC).replace(microsecond=0),
-        software=f"coupole {coupole.__version__}",
+        **wish.head(),
         simulated=sources.about.simulated,
-        validity=Validity(
-            expires=(wish.now + timedelta(days=wish.valid_days)).astimezone(UTC).replace(microsecond=0)
-        ),
+        validity=Validity(expires=wish.expires),
         transforms=transforms,
         parameters=_parameters(pose),
         fixed={"stickers_found": float(len(pose.matched)), "stickers_known": float(len(scan.names))},
-        covariance=tuple(map(tuple, (0.5 * (pose.covariance + pose.covariance.T)).tolist())),
+        covariance=rows_of(pose.covariance),
         noise=_noise(pose, stated),
         images=tuple(
             ImageResidual(name=name, corners=len(seen), rejected=0, rms_px=pose.residual_px)
@@ -214,8 +209,3 @@ def _remarks(pose: MeshPose) -> tuple[str, ...]:
 def _of_the_arm(arm: CalibratedArm) -> str:
     zeros = ", ".join(f"A{axis} {zero:+.4f}" for axis, zero in enumerate(arm.zeros_deg[1:], start=2))
     return f"poses are corrected by the axis zeros of the hand-eye record ({zeros} deg); use them with the mesh"
-
-
-def _pose(transform: Floats) -> Pose:
-    x, y, z = map(float, transform[:3, 3])
-    return Pose(translation_mm=(x, y, z), abc_deg=abc_from_rotation(transform[:3, :3]))

@@ -43,7 +43,7 @@ from coupole.cell import world_config
 from coupole.dome import LedTable
 from coupole.geometry import inverse, transform
 from coupole.itinerary import plan_itinerary
-from coupole.job import Cell, Job, read_cell, read_job
+from coupole.job import Cell, read_cell, read_job
 from coupole.kinematics import Arm
 from coupole.rig import planning_arm
 from coupole.scan import import_scan

@@ -7,7 +7,7 @@ aside by a third of a millimetre, the same way in every view: no residual tells.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,6 @@ from coupole.calibration.arm_errors import axis_sensitivity
 from coupole.calibration.posed_camera import HAND_EYE, CameraPrior
 from coupole.calibration.record import intrinsics_of, read_record, step_names
 from coupole.calibration.rotations import Floats, rotation
-from coupole.calibration.stickers.mesh_to_robot import HandEye
 from coupole.kinematics import Arm
 
 ZEROS = tuple(f"axis_zero.a{axis}_deg" for axis in range(2, 7))
@@ -53,11 +52,12 @@ def read_arm(hand_eye: Path, model: Arm) -> CalibratedArm:
 
 def calibrated_poses(
     base_from_flange: Floats, joints_deg: Floats, arm: CalibratedArm, prior: CameraPrior
-) -> tuple[Floats, HandEye]:
-    """Poses [v, 4, 4] as the axis zeros make them of the reported ones, and the hand-eye that belongs to them."""
+) -> tuple[Floats, CameraPrior]:
+    """Poses [v, 4, 4] as the axis zeros make them of the reported ones, and what is known of the camera at these:
+    with the uncertainty of the zeros."""
     sensitivity = axis_sensitivity(arm.model, joints_deg)
     steps = sensitivity @ arm.zeros_deg
     moves = np.broadcast_to(np.eye(4), base_from_flange.shape).copy()
     moves[:, :3, :3], moves[:, :3, 3] = rotation(steps[:, 3:]), steps[:, :3]
-    hand_eye = HandEye(prior.flange_from_camera, arm.covariance, prior.free, sensitivity[:, :, 1:])
-    return base_from_flange @ moves, hand_eye
+    known = replace(prior, covariance=arm.covariance, axis_sensitivity=sensitivity[:, :, 1:])
+    return base_from_flange @ moves, known

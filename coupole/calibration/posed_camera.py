@@ -29,12 +29,23 @@ class CameraPrior:
     """Parameters of the lens that were estimated."""
     flange_from_camera: Floats
     covariance: Floats
-    """[free + 6, free + 6]: lens, then the hand-eye's step (mm, rad)."""
+    """[free + 6 + k, free + 6 + k]: lens, the hand-eye's step (mm, rad), then the zeros of k axes (deg)."""
+    axis_sensitivity: Floats | None = None
+    """[views, 6, k] step of the flange in its own frame (mm, rad) for each degree of these axes, at the views that
+    the camera was carried to; None: k is 0."""
 
     @property
     def hand_eye_covariance(self) -> Floats:
         """[6, 6], mm and rad."""
-        return self.covariance[len(self.free) :, len(self.free) :]
+        own = slice(len(self.free), len(self.free) + 6)
+        return self.covariance[own, own]
+
+    def by_axes(self, base_from_flange: Floats) -> Floats:
+        """[v, 6, k] step of each pose [v, 4, 4] as `rotations.moved` has it, for each degree of the axes."""
+        if self.axis_sensitivity is None:
+            return np.zeros((len(base_from_flange), 6, 0))
+        shift = base_from_flange[:, :3, :3] @ self.axis_sensitivity[:, :3]
+        return np.concatenate([shift, self.axis_sensitivity[:, 3:]], axis=1)
 
 
 def read_posed_camera(hand_eye: Path, camera: Path | None, about: About, size_px: tuple[int, int]) -> CameraPrior:

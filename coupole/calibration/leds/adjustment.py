@@ -1,10 +1,11 @@
-"""All LEDs in one adjustment: rigid boards, the arm's noise at each view, camera and hand-eye with theirs.
+"""All LEDs in one adjustment: rigid boards, the arm's noise at each view, camera, hand-eye and axes with theirs.
 
     pixel = project((base_from_flange_i . E_i . flange_from_camera)^-1 . base_from_board_b . (q_j + d_j))
 
-with q_j a place on the board by the table, d_j what the LED is off it, E_i what the arm is off at view i; camera
-and hand-eye are observed by their record, with its covariance. (Seed 003, section 4 triangulates each LED by
-itself.) The arm's error at one view moves all LEDs seen from it alike, so the LEDs themselves tell it.
+with q_j a place on the board by the table, d_j what the LED is off it, E_i what the arm is off at view i; camera,
+hand-eye and the zeros of the arm's axes are observed by their record, with its covariance. (Seed 003, section 4
+triangulates each LED by itself.) The arm's error at one view moves all LEDs seen from it alike, so the LEDs
+themselves tell it.
 
 A board touches only its own six parameters, its LEDs' and what the views share. So boards are eliminated one by
 one (Schur's complement; Triggs et al., Bundle adjustment - a modern synthesis, 2000, section 6): the rest is as
@@ -36,6 +37,7 @@ from coupole.calibration.leds.equations import (
     camera_step,
     cost_of,
     linearised,
+    pose_errors,
     problem_of,
     stepped,
     table_sigmas,
@@ -74,7 +76,7 @@ class LedGeometry:
     kept: NDArray[np.bool_]
     """[k] spots that are no gross errors."""
     prior_step: Floats
-    """[free + 6] of lens and hand-eye over the standard deviations of their record."""
+    """[free + 6 + k] of lens, hand-eye and axes over the standard deviations of their record."""
     steps: int
 
     @property
@@ -103,6 +105,7 @@ def adjust_leds(
         base_from_flange,
         prior.flange_from_camera,
         prior.lens.vector(),
+        np.zeros(len(prior.covariance) - len(prior.free) - 6),
     )
     problem = problem_of(seen, place, boards, base_from_flange, prior, stated)
     factors, kept, taken = np.ones(len(GROUPS)), np.ones(len(place), np.bool_), 0
@@ -160,11 +163,11 @@ def _board_parts(
         jacobian[:, :, :6] = linear.by_board[rows]
         at = np.arange(count)[:, None]
         led = np.searchsorted(places, problem.place[rows])
-        view = np.searchsorted(columns[: -_tail(problem) : 6], 6 * problem.view[rows])
+        view = np.searchsorted(columns[: -problem.of_camera : 6], 6 * problem.view[rows])
         for axis in range(2):
             jacobian[at, axis, 6 + 3 * led[:, None] + np.arange(3)] = linear.by_offset[rows, axis]
             jacobian[at, axis, own + 6 * view[:, None] + np.arange(6)] = linear.by_view[rows, axis]
-        jacobian[:, :, -_tail(problem) :] = linear.by_camera[rows]
+        jacobian[:, :, -problem.of_camera :] = linear.by_camera[rows]
         jacobian *= root[rows][:, :, None]
         flat = jacobian.reshape(2 * count, jacobian.shape[2])
         residuals = (linear.residuals[rows] * root[rows]).ravel()
@@ -175,10 +178,6 @@ def _board_parts(
         yield _BoardPart(normal[:, :own], normal[:, own:], side, flat, columns), residuals
 
 
-def _tail(problem: Problem) -> int:
-    return len(problem.prior_whiten)
-
-
 def _normal(
     problem: Problem, state: LedState, factors: Floats, weights: Floats
 ) -> tuple[list[_BoardPart], list[Floats], Floats, Floats]:
@@ -186,7 +185,7 @@ def _normal(
     share."""
     parts: list[_BoardPart] = []
     eliminated: list[Floats] = []
-    views, tail = 6 * len(problem.reported), _tail(problem)
+    views, axes = 6 * len(problem.reported), slice(6 * len(problem.reported) + problem.of_camera, None)
     matrix, side = np.zeros((problem.shared, problem.shared)), np.zeros(problem.shared)
     for part, residuals in _board_parts(problem, state, linearised(problem, state), factors, weights):
         shared = part.jacobian[:, len(part.own) :]
@@ -196,13 +195,17 @@ def _normal(
         parts.append(part)
         eliminated.append(solved)
     held = (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** -2
-    off = between(state.base_from_flange, problem.reported)
+    off = held * pose_errors(problem, state)
+    by_axes = held[:, None] * problem.by_axes
     matrix[np.arange(views), np.arange(views)] += np.tile(held, len(problem.reported))
-    side[:views] += (held * off).ravel()
+    matrix[:views, axes] -= by_axes.reshape(views, -1)
+    matrix[axes, :views] -= by_axes.reshape(views, -1).T
+    matrix[axes, axes] += np.einsum("vij,vik->jk", problem.by_axes, by_axes)
+    side[:views] -= off.ravel()
+    side[axes] += np.einsum("vij,vi->j", problem.by_axes, off)
     camera = problem.prior_whiten.T @ problem.prior_whiten
     matrix[views:, views:] += camera
     side[views:] -= camera @ camera_step(problem, state)
-    assert len(matrix) == views + tail
     return parts, eliminated, matrix, side
 
 
@@ -275,11 +278,11 @@ def _solved(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np
         taken[SPOTS] += float(np.sum((part.jacobian @ whole) * part.jacobian))
         taken[TOLERANCE] += float(np.trace(own[-1][6:, 6:]))
         assert count == len(own[-1])
-    variance = np.diag(shared)[: 6 * len(problem.reported)].reshape(-1, 6)
+    variance = _of_pose_errors(problem, shared)
     taken[TOLERANCE] /= (problem.stated.tolerance_mm * factors[TOLERANCE]) ** 2
     scaled = variance / (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** 2
     taken[POSITION], taken[ORIENTATION] = scaled[:, :3].sum(), scaled[:, 3:].sum()
-    off = between(problem.reported, state.base_from_flange) / problem.sigmas
+    off = pose_errors(problem, state) / problem.sigmas
     groups = (
         whitened(problem, state)[kept],
         state.offsets_mm / problem.stated.tolerance_mm,
@@ -291,6 +294,16 @@ def _solved(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np
     seen = np.sqrt(chi2 / np.maximum(redundancy, 1e-9))
     told = redundancy >= _LEAST_REDUNDANCY
     return _Solved(own, alone, np.where(told, np.maximum(seen, _LEAST_FACTOR), factors), redundancy)
+
+
+def _of_pose_errors(problem: Problem, shared: Floats) -> Floats:
+    """[v, 6] variance of `pose_errors`, by the covariance of all shared parameters."""
+    views, axes = 6 * len(problem.reported), slice(6 * len(problem.reported) + problem.of_camera, None)
+    with_axes = shared[:views, axes].reshape(*problem.by_axes.shape)
+    by = problem.by_axes
+    own = np.diag(shared)[:views].reshape(-1, 6)
+    joint: Floats = np.einsum("vij,jk,vik->vi", by, shared[axes, axes], by) - 2 * np.sum(with_axes * by, axis=2)
+    return own + joint
 
 
 def _summary(

@@ -45,6 +45,8 @@ class LedState:
     base_from_flange: Floats
     flange_from_camera: Floats
     lens: Floats
+    axis_zeros_deg: Floats
+    """[k] what the arm's axes are off their record."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,8 @@ class Problem:
     reported: Floats
     prior: CameraPrior
     prior_whiten: Floats
+    by_axes: Floats
+    """[v, 6, k] step of each pose for each degree of the arm's axes."""
     stated: Stated
     sightings_of: tuple[Indices, ...]
     """[b] spots on each board."""
@@ -74,8 +78,13 @@ class Problem:
 
     @property
     def shared(self) -> int:
-        """Shared parameters: six for each view, hand-eye and lens last."""
+        """Shared parameters: six for each view, then lens, hand-eye and axes."""
         return 6 * len(self.reported) + len(self.prior_whiten)
+
+    @property
+    def of_camera(self) -> int:
+        """Of these, lens and hand-eye: what a spot depends on beside its view."""
+        return len(self.prior.free) + 6
 
 
 def problem_of(
@@ -99,6 +108,7 @@ def problem_of(
         reported,
         prior,
         prior_whiten,
+        prior.by_axes(reported),
         stated,
         sightings_of,
         columns_of,
@@ -172,11 +182,17 @@ def linearised(problem: Problem, state: LedState) -> Linear:
     )
 
 
+def pose_errors(problem: Problem, state: LedState) -> Floats:
+    """[v, 6] what the arm is off at each view, beside what its axes are off."""
+    off: Floats = between(problem.reported, state.base_from_flange) - problem.by_axes @ state.axis_zeros_deg
+    return off
+
+
 def camera_step(problem: Problem, state: LedState) -> Floats:
-    """[free + 6] from the records to the state."""
+    """[free + 6 + k] from the records to the state."""
     free = [optics.NAMES.index(name) for name in problem.prior.free]
     hand_eye = between(problem.prior.flange_from_camera, state.flange_from_camera)
-    return np.concatenate([(state.lens - problem.prior.lens.vector())[free], hand_eye])
+    return np.concatenate([(state.lens - problem.prior.lens.vector())[free], hand_eye, state.axis_zeros_deg])
 
 
 def cost_of(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_], huber: float) -> float:
@@ -184,7 +200,7 @@ def cost_of(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np
     spots = np.where(off <= huber, off**2, huber * (2 * off - huber)) if np.isfinite(huber) else off**2
     tolerance = state.offsets_mm / problem.stated.tolerance_mm / factors[TOLERANCE]
     sigmas = problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)
-    poses = between(problem.reported, state.base_from_flange) / sigmas
+    poses = pose_errors(problem, state) / sigmas
     table = between(problem.boards.base_from_board, state.base_from_board) / table_sigmas(problem)
     camera = problem.prior_whiten @ camera_step(problem, state)
     return float(spots.sum() + sum(np.sum(part**2) for part in (tolerance, poses, table, camera)))
@@ -204,6 +220,7 @@ def stepped(problem: Problem, state: LedState, shared: Floats, own: list[Floats]
         moved(state.base_from_board, share * np.array([step[:6] for step in own])),
         offsets,
         moved(state.base_from_flange, share * shared[: 6 * views].reshape(-1, 6)),
-        moved(state.flange_from_camera, share * shared[6 * views + free :]),
+        moved(state.flange_from_camera, share * shared[6 * views + free : 6 * views + problem.of_camera]),
         lens,
+        state.axis_zeros_deg + share * shared[6 * views + problem.of_camera :],
     )

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
+from coupole.calibration.calibrated_arm import ZEROS, CalibratedArm, calibrated_poses
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
 from coupole.calibration.leds.boards import Boards, boards_of, placed
 from coupole.calibration.leds.equations import GROUPS, ORIENTATION, POSITION, SPOTS, TOLERANCE, Stated
@@ -64,7 +64,7 @@ def leds_from(
     `arm` corrects the reported poses by the axis zeros that the hand-eye record found.
     """
     if arm is not None and images.joints_deg is not None:
-        poses, _ = calibrated_poses(images.base_from_flange, images.joints_deg, arm, prior)
+        poses, prior = calibrated_poses(images.base_from_flange, images.joints_deg, arm, prior)
         images = replace(images, base_from_flange=poses)
     boards = boards_of(table)
     base_from_camera = images.base_from_flange @ prior.flange_from_camera
@@ -294,7 +294,7 @@ def _figures(geometry: LedGeometry, found: NDArray[np.bool_], u_mm: Floats, u_de
 def _of_records(geometry: LedGeometry, prior: CameraPrior, limits: Sequence[Limit]) -> list[str]:
     if next(limit.passed for limit in limits if limit.name == "record_step"):
         return []
-    names = [*prior.free, *(f"flange_from_camera.{s}" for s in ("x", "y", "z", "rx", "ry", "rz"))]
+    names = [*prior.free, *(f"flange_from_camera.{s}" for s in ("x", "y", "z", "rx", "ry", "rz")), *ZEROS]
     worst = int(np.argmax(np.abs(geometry.prior_step)))
     return [
         f"{names[worst]} would have to be {abs(geometry.prior_step[worst]):.0f} standard uncertainties from its "

@@ -23,6 +23,7 @@ from coupole.calibration.adjustment import Adjusted, Block, Group, adjust
 from coupole.calibration.multi_view import CameraView, SeenPoint, seen_points
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.point_sets import match_points
+from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.rotations import Floats, between, inverses, moved, skew
 
 STICKERS, SCANNER, POSITION, ORIENTATION, HAND_EYE = (
@@ -44,20 +45,6 @@ class Stated:
     robot_mm: float = 0.3
     robot_deg: float = 0.02
     """What the arm is off from pose to pose."""
-
-
-@dataclass(frozen=True)
-class HandEye:
-    """The hand-eye that the views' poses were made with, and the lens that was calibrated together with it."""
-
-    flange_from_camera: Floats
-    covariance: Floats
-    """[f + 6 + k, f + 6 + k] of f figures of the lens, of a step of `rotations.moved` (mm and rad), and of k axes'
-    zeros (deg)."""
-    lens: tuple[str, ...] = ()
-    """Names of these figures (`optics.NAMES`)."""
-    axis_sensitivity: Floats | None = None
-    """[views, 6, k] step of the flange in its own frame (mm, rad) by degrees of these axes; None: k is 0."""
 
 
 @dataclass(frozen=True)
@@ -108,12 +95,12 @@ def mesh_to_robot(
     names: Sequence[str],
     *,
     stated: Stated = Stated(),
-    hand_eye: HandEye | None = None,
+    prior: CameraPrior | None = None,
     depth_mm: tuple[float, float] = (200.0, 900.0),
 ) -> MeshPose:
     """Find a mesh by its targets [n, 3] (mesh frame) in views in which things like stickers were seen.
 
-    Without `hand_eye` the views' poses have no error in common.
+    Without `prior` the views' poses have no error in common.
     Raises InputError if too few stickers are seen in three views, or if their layout fits nowhere or twice.
     """
     pose_px = intrinsics.fx * (stated.robot_mm / np.mean(depth_mm) + np.radians(stated.robot_deg))
@@ -125,7 +112,7 @@ def mesh_to_robot(
     found_mm = np.array([point.base_mm for point in points]).reshape(-1, 3)
     match = match_points(found_mm, targets_mm, tolerance_mm)
     seen = [points[row] for row in match.found]
-    adjusted = _adjust(views, intrinsics, seen, targets_mm[match.known], match.found_from_known, stated, hand_eye)
+    adjusted = _adjust(views, intrinsics, seen, targets_mm[match.known], match.found_from_known, stated, prior)
     recognised = [names[row] for row in match.known.tolist()]
     to_degrees = np.diag([1.0, 1.0, 1.0, *np.degrees([1.0, 1.0, 1.0])])
     sightings = sum(len(point.views) for point in seen)
@@ -155,7 +142,7 @@ def _adjust(
     targets_mm: Floats,
     start: Floats,
     stated: Stated,
-    hand_eye: HandEye | None,
+    prior: CameraPrior | None,
 ) -> Adjusted[_State]:
     """Unknowns: the mesh's step [6], one [6] for each view, an offset [3] for each target, what views share."""
     reported = np.array([view.base_from_camera for view in views])
@@ -170,12 +157,12 @@ def _adjust(
     )
     first_shared = first_target + 3 * len(seen)
     lens = np.array([], np.intp)
-    if hand_eye is None:
+    if prior is None:
         held, by_shared = np.eye(6), np.zeros((len(views), 6, 6))
     else:
-        lens = np.array([optics.NAMES.index(name) for name in hand_eye.lens], np.intp)
-        held = np.asarray(np.linalg.inv(np.linalg.cholesky(hand_eye.covariance)))
-        by_shared = _by_shared(reported, hand_eye)
+        lens = np.array([optics.NAMES.index(name) for name in prior.free], np.intp)
+        held = np.asarray(np.linalg.inv(np.linalg.cholesky(prior.covariance)))
+        by_shared = _by_shared(reported, prior)
     shared = np.arange(len(held))
 
     row_of = np.concatenate([np.full(len(point.views), row) for row, point in enumerate(seen)])
@@ -235,17 +222,15 @@ def _adjust(
     return adjust(begin, evaluate, move, groups, first_shared + len(held), what="mesh to robot")
 
 
-def _by_shared(base_from_camera: Floats, hand_eye: HandEye) -> Floats:
+def _by_shared(base_from_camera: Floats, prior: CameraPrior) -> Floats:
     """[v, 6, f + 6 + k] step of each camera's pose for figures of the lens: none; for a step of the hand-eye, its
     shift turned with the flange; for steps of the axes, which move the flange with the camera on it."""
-    turn, shift = hand_eye.flange_from_camera[:3, :3], hand_eye.flange_from_camera[:3, 3]
-    base_from_flange = base_from_camera[:, :3, :3] @ turn.T
-    first = len(hand_eye.lens)
+    turn, shift = prior.flange_from_camera[:3, :3], prior.flange_from_camera[:3, 3]
+    base_from_flange = base_from_camera @ inverses(prior.flange_from_camera)
+    first = len(prior.free)
     by = np.zeros((len(base_from_camera), 6, first + 6))
     by[:, :, first:] = np.eye(6)
-    by[:, :3, first : first + 3] = base_from_flange
-    if hand_eye.axis_sensitivity is None:
-        return by
-    moved_by, turned_by = hand_eye.axis_sensitivity[:, :3], hand_eye.axis_sensitivity[:, 3:]
-    of_centre = base_from_flange @ (moved_by - skew(shift) @ turned_by)
-    return np.concatenate([by, np.concatenate([of_centre, turn.T @ turned_by], axis=1)], axis=2)
+    by[:, :3, first : first + 3] = base_from_flange[:, :3, :3]
+    by_axes = prior.by_axes(base_from_flange)
+    of_centre = by_axes[:, :3] - base_from_flange[:, :3, :3] @ skew(shift) @ by_axes[:, 3:]
+    return np.concatenate([by, np.concatenate([of_centre, turn.T @ by_axes[:, 3:]], axis=1)], axis=2)

@@ -31,7 +31,6 @@ from coupole.calibration.stickers.mesh_to_robot import (
     ORIENTATION,
     POSITION,
     STICKERS,
-    HandEye,
     MeshPose,
     Stated,
     mesh_to_robot,
@@ -78,10 +77,9 @@ def mesh_from(
     if sources.poses is None:
         raise InputError("mesh: the images have no poses; give runs, or a folder with poses")
     base_from_flange = sources.poses.base_from_flange
-    hand_eye = HandEye(prior.flange_from_camera, prior.covariance, prior.free)
     if arm is not None:
         joints_deg = np.array([source.joints_deg for source in sources.images])
-        base_from_flange, hand_eye = calibrated_poses(base_from_flange, joints_deg, arm, prior)
+        base_from_flange, prior = calibrated_poses(base_from_flange, joints_deg, arm, prior)
     base_from_camera = base_from_flange @ prior.flange_from_camera
     sigma_px = _sigma_px(images)
     stated = replace(stated, sticker_px=sigma_px)
@@ -90,7 +88,7 @@ def mesh_from(
     points = seen_points(views, prior.lens, tolerance_px=4 * float(np.hypot(0.2, pose_px)), depth_mm=depth_mm)
     views = corrected(views, images.stickers, points)
     pose = mesh_to_robot(
-        views, prior.lens, scan.targets_mm, scan.names, stated=stated, hand_eye=hand_eye, depth_mm=depth_mm
+        views, prior.lens, scan.targets_mm, scan.names, stated=stated, prior=prior, depth_mm=depth_mm
     )
     u_mm = np.array([pose.uncertainty_at(target) for target in scan.targets_mm])
     transforms = {"base_from_mesh": pose_of(pose.base_from_mesh)}

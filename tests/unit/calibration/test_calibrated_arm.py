@@ -15,7 +15,7 @@ from coupole.calibration.multi_view import CameraView
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.rotations import moved
-from coupole.calibration.stickers.mesh_to_robot import HandEye, Stated, mesh_to_robot
+from coupole.calibration.stickers.mesh_to_robot import Stated, mesh_to_robot
 from coupole.kinematics import KR10_R1100_SIXX, forward, inverse, nearest
 
 LENS = TrueLens((1740.0, 1740.0), (511.5, 383.5), (0.0, 0.0, 0.0, 0.0, 0.0))
@@ -78,7 +78,7 @@ def reported(joints_deg: Array) -> Array:
     return np.stack([forward(KR10_R1100_SIXX, at) for at in joints_deg])
 
 
-def poses(made: Seen) -> tuple[Array, HandEye]:
+def poses(made: Seen) -> tuple[Array, CameraPrior]:
     return calibrated_poses(reported(made.joints_deg), made.joints_deg, made.arm, made.prior)
 
 
@@ -96,13 +96,13 @@ def test_intervals_hold_with_what_is_left_of_the_zero_errors(scale: Callable[[in
     normalised, off_mm = [], []
     for seed in range(scenes):
         made = seen(seed)
-        base_from_flange, hand_eye = poses(made)
+        base_from_flange, known = poses(made)
         views = [
             CameraView(f"v{number}", pose @ made.prior.flange_from_camera, spots)
             for number, (pose, spots) in enumerate(zip(base_from_flange, made.pixels, strict=True))
         ]
         names = [f"T{row}" for row in range(len(made.table_mm))]
-        found = mesh_to_robot(views, made.prior.lens, made.table_mm, names, stated=STATED, hand_eye=hand_eye)
+        found = mesh_to_robot(views, made.prior.lens, made.table_mm, names, stated=STATED, prior=known)
         turn = Rotation.from_matrix(found.base_from_mesh[:3, :3].T @ made.base_from_mesh[:3, :3])
         shift = made.base_from_mesh[:3, 3] - found.base_from_mesh[:3, 3]
         step = np.concatenate([shift, turn.as_rotvec(degrees=True)])

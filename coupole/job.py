@@ -328,15 +328,16 @@ def check_job(
         return paced, report
 
     job, report = _cooled(*checked(Pace(disk_us=_disk_us(rig, storage))), checked)
-    report.refusals += _calibration_refusals(job)
+    report.refusals += calibration_refusals(job)
     if planning_arm(rig) is None:
         why = "no model of this arm's links: whether it touches anything cannot be told"
         report.refusals.insert(0, f"robot {rig.robot.driver}: {why}")
     return job, report
 
 
-def _calibration_refusals(job: Job) -> list[str]:
-    """Why the records that the plan names do not hold here."""
+def calibration_refusals(job: Job, *, camera: str | None = None, temperature_c: float | None = None) -> list[str]:
+    """Why the records that the plan names do not hold here. Which camera there is and how warm the cell is, only
+    its devices know (`Situation`)."""
     if job.plan.calibrations == "none":
         return []
     from coupole.calibration.in_force import Situation, refusals
@@ -349,6 +350,8 @@ def _calibration_refusals(job: Job) -> list[str]:
         focal_length_mm=rig.lens.focal_length_mm,
         focus_distance_mm=rig.lens.focus_distance_mm,
         f_number=rig.lens.f_number,
+        camera=camera,
+        temperature_c=temperature_c,
     )
     return refusals(job.calibrations, here)
 

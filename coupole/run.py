@@ -107,6 +107,10 @@ class Run:
         return Run(folder)
 
     @property
+    def created(self) -> datetime:
+        return datetime.fromisoformat(self.about["created"])
+
+    @property
     def journal_path(self) -> Path:
         return self.folder / "journal.jsonl"
 

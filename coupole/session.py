@@ -4,73 +4,35 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
-from coupole import ledger, metering, report
+from coupole import report
+from coupole.attended import UNLIMITED_BYTES, ask_to_begin, enter_dose, operator_at, refuse, teller
 from coupole.cell import OpenedCell, open_cell
-from coupole.console import LiveFigures, RunObserver, ask, show_dry_run, show_preflight
-from coupole.devices import Identity
+from coupole.console import RunObserver, ask, show_dry_run, show_preflight
 from coupole.errors import (
     CoupoleError,
     DeviceError,
     DeviceFault,
-    InputError,
     Interrupted,
     PreflightRefused,
     StorageError,
 )
-from coupole.geometry import apply
-from coupole.job import Cell, Job, check_job, preflight_of, schedule_of
-from coupole.live import CellSource, Choice, RunSource, Source, Studio, choice_from, run_source
-from coupole.live_page import serve
+from coupole.job import Job, calibration_refusals, check_job, preflight_of
 from coupole.observer import Control, Outcome
-from coupole.preflight import Report, StorageFacts
+from coupole.preflight import StorageFacts
 from coupole.recorder import DryRecorder, RunRecorder
-from coupole.rig import Rig, in_world
 from coupole.run import Run, is_shot
 from coupole.sequencer import Sequencer
-from coupole.shots import EXPOSURE_MARGIN_US, Schedule, leds_of_plan
+from coupole.shots import Schedule
 
-
-def _refuse(found: Report) -> None:
-    if found.refusals:
-        raise PreflightRefused(found.refusals)
-
-
-@contextmanager
-def _operator(control: Control) -> Iterator[None]:
-    """Ctrl-C and SIGTERM stop, SIGUSR1 pauses and goes on; as before when this ends."""
-
-    def stop(*_: Any) -> None:
-        control.stop.set()
-
-    def pause(*_: Any) -> None:
-        (control.pause.clear if control.pause.is_set() else control.pause.set)()
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    wanted = {signal.SIGINT: stop, signal.SIGTERM: stop, signal.SIGUSR1: pause}
-    before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-_FIGURES_EVERY_S = 0.2
-UNLIMITED_BYTES = 2**62
-"""A rehearsal keeps nothing: the disk does not matter."""
+_ASKED_BOARDS = 12
+"""So many boards, all over the dome, are asked for their temperature."""
 
 
 # -- the run ----------------------------------------------------------------------------------------------
@@ -114,11 +76,12 @@ def _acquire_into(
         share_left=1.0 - len(run.proven()) / job.schedule.frames if run else 1.0,
     )
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
-    _refuse(preflight)
+    refuse(preflight)
     acknowledged = _ask_whether_clear(run.robot_fault()) if run else ""
-    _ask_to_begin(job.cell, confirm=confirm)
+    ask_to_begin(job.cell, confirm=confirm)
     console.print("opening the devices ...")
-    with open_cell(job.cell, job=job, on_opened=_teller(console)) as cell:
+    with open_cell(job.cell, job=job, on_opened=teller(console)) as cell:
+        room_c = _refuse_other_calibrations(job, cell)
         if run is None:
             run = Run.create(folder, job.plan.name, job.inputs, about_run(job, cell))
             held.callback(os.close, run.lock())
@@ -126,7 +89,8 @@ def _acquire_into(
         packed = job.cell.rig.storage.pixels == "packed12"
         recorder = RunRecorder(run, metadata_of_views(job, cell), packed=packed)
         try:
-            how = {"simulated": cell.simulated, **({"acknowledged": acknowledged} if acknowledged else {})}
+            how: dict[str, Any] = {"simulated": cell.simulated, "room_c": room_c}
+            how |= {"acknowledged": acknowledged} if acknowledged else {}
             recorder.event("resume" if resumed else "start", **how)
             _acquire(job, cell, run, recorder, console, found=found)
         except CoupoleError:
@@ -139,22 +103,22 @@ def _acquire_into(
             recorder.close()
 
 
-def _ask_to_begin(cell: Cell, *, confirm: bool) -> None:
-    """Nothing real moves or shines unasked."""
-    real = not in_world(cell.rig, dry_run=False)
-    if real and confirm and not ask("Move the arm and light the object?"):
-        raise Interrupted("not started: answer the question, or say `--yes`")
+def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float:
+    """What only devices can tell of the records in force: whose camera they are of, and how warm it may be.
+
+    Returns the temperature of the coolest LED board, which is nearest to the room's.
+    """
+    boards = np.unique(job.cell.leds.boards)
+    some = boards[np.unique(np.linspace(0, len(boards) - 1, _ASKED_BOARDS).astype(int))]
+    room_c = min(cell.ledbox.board_temperature_c(int(board)) for board in some)
+    if reasons := calibration_refusals(job, camera=_camera_name(cell), temperature_c=room_c):
+        raise PreflightRefused(reasons)
+    return room_c
 
 
-def _longest_exposure_us(rig: Rig) -> int:
-    """What the LEDs' longest on-time leaves for the exposure."""
-    return rig.led_limits.on_us[1] - rig.led_limits.rise_us - EXPOSURE_MARGIN_US
-
-
-def _enter_dose(job: Job, cell: OpenedCell, dose_lux_h: float, what_for: str) -> None:
-    """Light that a real cell gave an object goes into the object's ledger."""
-    if job.plan.object and not cell.simulated:
-        ledger.add(job.cell.storage_folder, job.plan.object.id, run=what_for, dose_lux_h=dose_lux_h)
+def _camera_name(cell: OpenedCell) -> str:
+    """As records of its calibration call it."""
+    return " ".join((cell.identities["camera"].model, cell.identities["camera"].serial))
 
 
 def _ask_whether_clear(fault: str) -> str:
@@ -174,14 +138,6 @@ def _ask_whether_clear(fault: str) -> str:
             remedy="See to the cell, then resume from a terminal and answer the question (`--yes` does not).",
         )
     return fault
-
-
-def _teller(console: Console) -> Any:
-    def tell(kind: str, identity: Identity) -> None:
-        how = " (simulated)" if identity.simulated else ""
-        console.print(f"  {kind}: {identity.vendor} {identity.model} {identity.serial}{how}")
-
-    return tell
 
 
 def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
@@ -218,7 +174,7 @@ def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
         "f_number": rig.lens.f_number,
         "focus_distance_mm": rig.lens.focus_distance_mm,
         "base_from_support": rig.support.base_from_support.matrix(),
-        "camera": " ".join((cell.identities["camera"].model, cell.identities["camera"].serial)),
+        "camera": _camera_name(cell),
         "gain_db": job.plan.gain_db,
     }
 
@@ -238,7 +194,7 @@ def _acquire(
     outcome = sequencer.outcome
     ended = "done"
     try:
-        with _operator(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
+        with operator_at(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
             sequencer.acquire()
     except CoupoleError as error:
         ended = "interrupted" if isinstance(error, Interrupted) else "failed"
@@ -252,7 +208,7 @@ def _acquire(
             console.print(f"[red]{trouble}[/]")
         recorder.event("stop", outcome=ended, robot=dict(cell.robot.statistics()))
         recorder.close_quietly()
-        _enter_dose(job, cell, outcome.dose_lux_h, run.folder.name)
+        enter_dose(job, cell, outcome.dose_lux_h, run.folder.name)
         found.update(_figures(run, job, outcome))
         _say_outcome(console, run, outcome, ended)
 
@@ -286,92 +242,6 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> No
         console.print(f"  go on with --resume {run.folder}")
 
 
-# -- exposure advice --------------------------------------------------------------------------------------
-
-
-def meter(job: Job, console: Console, wish: metering.Wish, *, confirm: bool) -> metering.Advice:
-    """Take a few pictures of each view under lights spread over the dome, keep none, and advise on exposure.
-
-    The light that this gives the object is entered in its ledger. Raises PreflightRefused, DeviceError,
-    Interrupted, and UnprovenError where pictures stay missing.
-    """
-    cell_leds, base_from_support = job.cell.leds, job.cell.rig.support.base_from_support.matrix()
-    few = metering.metering_plan(job.plan, cell_leds, leds_of_plan(job.plan, cell_leds, base_from_support))
-    small = replace(job, plan=few, schedule=schedule_of(few, job.cell))
-    small, preflight = check_job(small, StorageFacts(UNLIMITED_BYTES))
-    _refuse(preflight)
-    _ask_to_begin(job.cell, confirm=confirm)
-    recorder, control = metering.MeterRecorder(), Control()
-    with open_cell(job.cell, job=small, on_opened=_teller(console)) as cell:
-        observer = RunObserver(console, job.cell.rig.frame_bytes, 0)
-        sequencer = Sequencer(small, cell, recorder, observer=observer, control=control)
-        try:
-            with _operator(control), observer.showing(small.schedule.frames, len(small.schedule.views)):
-                sequencer.acquire()
-        finally:
-            cell.make_safe()
-            _enter_dose(job, cell, sequencer.outcome.dose_lux_h, "meter")
-    return metering.advise(recorder.views, wish, longest_us=_longest_exposure_us(job.cell.rig))
-
-
-# -- live view --------------------------------------------------------------------------------------------
-
-
-def watch_cell(
-    job_or_cell: Job | Cell, console: Console, choice: Choice, *, frames_per_s: float, port: int, confirm: bool
-) -> None:
-    """Show a cell's camera until the operator says stop; the arm is held where it stands."""
-    job = job_or_cell if isinstance(job_or_cell, Job) else None
-    rig_cell = job_or_cell.cell if isinstance(job_or_cell, Job) else job_or_cell
-    rig, leds = rig_cell.rig, rig_cell.leds
-    centre = rig.support.base_from_support.matrix()[:3, 3]
-    points = apply(rig.support.base_from_support.matrix(), job.object_points_support_mm) if job else centre[None]
-    lux_of_row = leds.illuminance_lux(points, emission=rig.dome.emission).max(axis=0)
-    lux = dict(zip(leds.ids.tolist(), lux_of_row.tolist(), strict=True))
-    ids = tuple(leds.ids.tolist())
-    studio = Studio(choice_from(vars(choice), choice, ids, _longest_exposure_us(rig)))
-    _ask_to_begin(rig_cell, confirm=confirm)
-    with open_cell(rig_cell, job=job, on_opened=_teller(console)) as cell:
-        source = CellSource(cell, rig, leds, lux.__getitem__, frames_per_s=frames_per_s)
-        try:
-            _show_live(source, studio, console, port, longest_us=_longest_exposure_us(rig))
-        finally:
-            given = studio.shown.dose_lux_h if studio.shown else 0.0
-            if job is not None and given:
-                _enter_dose(job, cell, given, "live")
-
-
-def watch_run(folder: Path, console: Console, *, port: int) -> None:
-    """Show the newest proven frame of a run until the operator says stop."""
-    _show_live(RunSource(folder), Studio(Choice(None, 0)), console, port, longest_us=0)
-
-
-def _show_live(source: Source, studio: Studio, console: Console, port: int, *, longest_us: int) -> None:
-    try:
-        server = serve(studio, source.leds, longest_us, port)
-    except OSError as error:
-        raise InputError(f"--port {port}: cannot serve the page there: {error.strerror}") from error
-    failures: list[Exception] = []
-    control = Control()
-    page = threading.Thread(target=server.serve_forever, name="page", daemon=True)
-    page.start()
-    console.print(f"live at http://127.0.0.1:{server.server_port}/  (Ctrl-C ends it)")
-    with _operator(control):
-        filling = run_source(source, studio, failures.append)
-        try:
-            with LiveFigures(console) as figures:
-                while not studio.closing.is_set() and not control.stop.is_set():
-                    figures.show(studio.shown)
-                    studio.closing.wait(_FIGURES_EVERY_S)
-        finally:
-            studio.closing.set()
-            filling.join()
-            server.shutdown()
-            server.server_close()
-    if failures:
-        raise failures[0]
-
-
 # -- the rehearsal ----------------------------------------------------------------------------------------
 
 
@@ -380,15 +250,15 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
     job = job.without_hidden()
     job, preflight = check_job(job, StorageFacts(UNLIMITED_BYTES))
     show_preflight(console, preflight, name=job.plan.name, rig=f"the twin of {job.cell.rig.name}")
-    _refuse(preflight)
+    refuse(preflight)
     recorder, control = DryRecorder(), Control()
-    with open_cell(job.cell, job=job, dry_run=True, speed=speed, on_opened=_teller(console)) as cell:
+    with open_cell(job.cell, job=job, dry_run=True, speed=speed, on_opened=teller(console)) as cell:
         observer = RunObserver(console, cell.sensor.width_px * cell.sensor.height_px * 2, 0)
         sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
         outcome = sequencer.outcome
         started_s = time.monotonic()
         try:
-            with _operator(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
+            with operator_at(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
                 sequencer.acquire()
         finally:
             machine_s = time.monotonic() - started_s

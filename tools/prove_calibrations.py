@@ -14,7 +14,7 @@ import json
 import os
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -26,6 +26,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from random_cells import Judged, postures, prove_cell
+
+from coupole.errors import CoupoleError
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="file of cells that are done, one line of JSON each")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    done = kept(arguments.keep)
+    done, refused = kept(arguments.keep), list[str]()
     wanted = range(arguments.first_seed, arguments.first_seed + arguments.cells)
     seeds = [seed for seed in wanted if seed not in done]
     if seeds:
@@ -67,15 +69,19 @@ def main() -> None:
         )
         started_s = time.monotonic()
         with ProcessPoolExecutor(arguments.jobs) as pool:
-            for seed, judged in zip(seeds, pool.map(work, seeds), strict=True):
-                done[seed] = judged
-                keep(arguments.keep, seed, judged)
+            seed_of = {pool.submit(work, seed): seed for seed in seeds}
+            for future in as_completed(seed_of):
+                seed = seed_of[future]
+                try:
+                    done[seed] = future.result()
+                except CoupoleError as error:
+                    refused.append(f"cell {seed}: {error}")
+                else:
+                    keep(arguments.keep, seed, done[seed])
                 spent_s = time.monotonic() - started_s
-                print(
-                    f"\r{len(done)} of {len(wanted)} cells, {spent_s:.0f} s", end="", file=sys.stderr, flush=True
-                )
+                print(f"\r{len(done)} of {len(wanted)} cells, {spent_s:.0f} s", end="", file=sys.stderr)
         print(file=sys.stderr)
-    for verdict in verdicts([done[seed] for seed in wanted]):
+    for verdict in verdicts([done[seed] for seed in wanted if seed in done]):
         if arguments.json:
             print(json.dumps(asdict(verdict)))
         else:
@@ -83,6 +89,8 @@ def main() -> None:
                 f"{verdict.name:32} covered {verdict.covered:6.1%}  rms(error/u) {verdict.rms_over_u:5.2f}  "
                 f"median error {verdict.median_error:.3g}, u {verdict.median_u:.3g}  ({verdict.values} values)"
             )
+    if refused:
+        sys.exit("\n".join(["not calibrated:", *refused]))
 
 
 def kept(path: Path | None) -> dict[int, list[Judged]]:

@@ -32,6 +32,7 @@ class Situation:
     camera: str | None = None
     """Model and serial number, once the camera is open."""
     temperature_c: float | None = None
+    """Of the coolest LED board, which is nearest to the room's."""
 
 
 @dataclass(frozen=True)
@@ -115,5 +116,8 @@ def _record_refusals(record: Record, here: Situation) -> list[str]:
     if holds.temperature_c is not None and here.temperature_c is not None:
         low, high = holds.temperature_c
         if not low <= here.temperature_c <= high:
-            reasons.append(f"holds from {low:g} to {high:g} C; the cell has {here.temperature_c:g} C")
+            reasons.append(
+                f"holds from {low:g} to {high:g} C; the cell's coolest LED board has {here.temperature_c:g} C. "
+                "Let it come back to that temperature, or calibrate at this one"
+            )
     return reasons

@@ -65,8 +65,13 @@ def read_posed_camera(hand_eye: Path, camera: Path | None, about: About, size_px
 
 
 def refuse_other_camera(path: Path, record: Record, about: About, size_px: tuple[int, int]) -> None:
-    """Raise InputError unless a record holds for the camera, lens, focus, size and warmth of these images."""
+    """Raise InputError unless a record holds for these images: their time, camera, lens, focus, size, warmth."""
     holds = record.validity
+    if about.begun is not None and about.begun >= holds.expires:
+        raise InputError(
+            f"{path}: expired on {holds.expires:%Y-%m-%d %H:%M} UTC, before these images were taken "
+            f"({about.begun:%Y-%m-%d %H:%M}). Calibrate camera and hand-eye anew"
+        )
     if holds.focus_distance_mm is not None and about.focus_distance_mm is not None:
         off_mm = abs(holds.focus_distance_mm - about.focus_distance_mm)
         if off_mm > holds.focus_tolerance_mm:

@@ -11,6 +11,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,8 @@ class About:
     f_number: float | None = None
     temperature_c: tuple[float, float] | None = None
     """Lowest and highest temperature of the LED boards, the only ones that a run knows."""
+    begun: datetime | None = None
+    """When the latest of the runs began."""
 
 
 @dataclass(frozen=True)
@@ -151,10 +154,8 @@ def _of_run(run: Run) -> Sources:
         about = about_of(run, attributes)
     if not images:
         raise InputError(f"{run.folder}: no proven frame under light; acquire the plan first")
-    low_high = (min(temperatures), max(temperatures))
-    return Sources(
-        tuple(images), reported(np.stack(flanges)), replace(about, temperature_c=low_high), tuple(inputs)
-    )
+    about = replace(about, temperature_c=(min(temperatures), max(temperatures)), begun=run.created)
+    return Sources(tuple(images), reported(np.stack(flanges)), about, tuple(inputs))
 
 
 def _at_one_pose(frames: Sequence[ProvenFrame], table: NDArray[np.void]) -> list[ProvenFrame]:
@@ -236,13 +237,18 @@ def _joined(parts: Sequence[Sources]) -> Sources:
     """Several runs as one. Raises InputError if they were taken with different lenses or cameras."""
     first = parts[0]
     for part in parts[1:]:
-        if replace(part.about, temperature_c=None) != replace(first.about, temperature_c=None):
+        here, there = (replace(one.about, temperature_c=None, begun=None) for one in (part, first))
+        if here != there:
             raise InputError(f"runs with different cameras, lenses or focus: {part.about} and {first.about}")
     warm = [t for part in parts if part.about.temperature_c for t in part.about.temperature_c]
     flanges: list[Floats] = [part.poses.base_from_flange for part in parts if part.poses is not None]
     return Sources(
         tuple(image for part in parts for image in part.images),
         reported(np.concatenate(flanges)),
-        replace(first.about, temperature_c=(min(warm), max(warm)) if warm else None),
+        replace(
+            first.about,
+            temperature_c=(min(warm), max(warm)) if warm else None,
+            begun=max((part.about.begun for part in parts if part.about.begun), default=None),
+        ),
         tuple(line for part in parts for line in part.inputs),
     )

@@ -100,8 +100,8 @@ def meter(
     """Advise on a plan's exposure: a few pictures of each view, under a few lights, none of them kept."""
     from coupole.console import make_console, show_advice
     from coupole.job import read_job
+    from coupole.looking import meter as meter_plan
     from coupole.metering import Wish, write_plan
-    from coupole.session import meter as meter_plan
 
     console = make_console(quiet=as_json)
     try:
@@ -144,7 +144,7 @@ def live(
     from coupole.console import make_console
     from coupole.job import read_cell, read_job
     from coupole.live import Choice
-    from coupole.session import watch_cell, watch_run
+    from coupole.looking import watch_cell, watch_run
     from coupole.yamlfile import read
 
     console = make_console(quiet=False)

@@ -12,7 +12,14 @@ from cells import CellFolder
 from coupole.calibration.record import Input, Limit, Parameter, Record, Validity, sealed, write_record
 
 
-def record(kind: str, *, focus_distance_mm: float = 335.0, days: float = 30.0) -> Record:
+def record(
+    kind: str,
+    *,
+    focus_distance_mm: float = 335.0,
+    days: float = 30.0,
+    camera: str | None = None,
+    temperature_c: tuple[float, float] | None = None,
+) -> Record:
     now = datetime.now(UTC)
     return sealed(
         kind=kind,
@@ -22,12 +29,12 @@ def record(kind: str, *, focus_distance_mm: float = 335.0, days: float = 30.0) -
         simulated=True,
         validity=Validity(
             expires=now + timedelta(days=days),
-            camera=None,
+            camera=camera,
             size_px=(128, 96),
             focal_length_mm=35.0,
             focus_distance_mm=focus_distance_mm,
             f_number=8.0,
-            temperature_c=None,
+            temperature_c=temperature_c,
         ),
         transforms={},
         parameters=(
@@ -94,3 +101,25 @@ def test_a_record_that_was_edited_by_hand_is_an_input_error(calibrated: CellFold
     ended = cells.here("check", calibrated.plan)
     assert ended.code == 2
     assert "camera.yaml" in ended.err
+
+
+def test_a_record_of_another_camera_is_refused_once_the_camera_is_open(calibrated: CellFolder) -> None:
+    write_record(calibrated.folder / "camera.yaml", record("camera", camera="Other 12"))
+    ended = calibrated.acquire()
+    assert ended.code == 3
+    assert "camera.yaml: holds for the camera Other 12; this one is" in ended.err
+    assert not list((calibrated.folder / "storage").glob("2*"))
+
+
+def test_a_cell_that_is_warmer_than_its_calibration_is_refused(calibrated: CellFolder) -> None:
+    write_record(calibrated.folder / "camera.yaml", record("camera", temperature_c=(10.0, 15.0)))
+    ended = calibrated.acquire()
+    assert ended.code == 3
+    assert "camera.yaml: holds from 10 to 15 C; the cell's coolest LED board has" in ended.err
+
+
+def test_the_temperature_of_the_room_stands_in_the_journal(calibrated: CellFolder) -> None:
+    write_record(calibrated.folder / "camera.yaml", record("camera", temperature_c=(10.0, 40.0)))
+    assert calibrated.acquire().code == 0
+    start = cells.events(calibrated.run_folder, "start")[0]
+    assert 10.0 < start["room_c"] < 40.0

@@ -125,7 +125,11 @@ def find_leds(
         tuple(views),
         size_px,
         tuple(collected.left_out),
-        replace(about, temperature_c=(min(temperatures), max(temperatures))),
+        replace(
+            about,
+            temperature_c=(min(temperatures), max(temperatures)),
+            begun=max(run.created for run in runs),
+        ),
         tuple(inputs),
         np.stack(joints),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from coupole.calibration.sources import Sources, open_sources
 from coupole.calibration.wish import Wish
 from coupole.errors import InputError
 
-NOW = datetime(2026, 5, 1, tzinfo=UTC)
+NOW = datetime.now(UTC)
 
 
 @cache
@@ -67,3 +67,10 @@ def test_a_hand_eye_record_in_a_cameras_place_is_refused(recorded: tuple[Path, S
     path, sources = recorded
     with pytest.raises(InputError, match="expected a record of the kind `camera`"):
         read_posed_camera(path, path, sources.about, SIZE_PX)
+
+
+def test_a_record_that_had_expired_when_the_images_were_taken_is_refused(recorded: tuple[Path, Sources]) -> None:
+    path, sources = recorded
+    about = replace(sources.about, begun=NOW + timedelta(days=400))
+    with pytest.raises(InputError, match=r"expired on .* UTC, before these images were taken"):
+        read_posed_camera(path, None, about, SIZE_PX)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from coupole.calibration.adjustment import coverage_factor
-from coupole.calibration.calibrated_arm import CalibratedArm, read_arm
+from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses, read_arm
 from coupole.calibration.leds.equations import Stated as StatedOfLeds
 from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.leds.plan import led_plan
@@ -41,7 +41,7 @@ from coupole.calibration.stickers.workflow import mesh_from
 from coupole.calibration.wish import Wish
 from coupole.cell import world_config
 from coupole.dome import LedTable
-from coupole.geometry import inverse, transform
+from coupole.geometry import apply, inverse, transform
 from coupole.itinerary import plan_itinerary
 from coupole.job import Cell, read_cell, read_job
 from coupole.kinematics import Arm
@@ -76,6 +76,15 @@ class Judged:
     u: float
     half_width: float
     """Of its 95 % interval."""
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What one cell's records are worth."""
+
+    judged: list[Judged]
+    accuracy: dict[str, float]
+    """Distances from the truth in mm and deg, by name; `_in_true_base`: with what the arm is off as a whole."""
 
 
 @dataclass(frozen=True)
@@ -289,9 +298,7 @@ def _once(read: Any, number: int) -> Any:
 # -- calibrated and judged --------------------------------------------------------------------------------
 
 
-def prove_cell(
-    seed: int, *, at: Postures, width_px: int, samples: int, absolute: bool, leds: bool = True, mesh: bool = True
-) -> list[Judged]:
+def prove_cell(seed: int, *, at: Postures, width_px: int, samples: int, absolute: bool) -> Proof:
     """Render, find, adjust, and compare what the records say with the truth."""
     cell = RandomCell(seed, width_px, samples, absolute)
     wish = Wish(f"cell{seed}", datetime.now(UTC))
@@ -302,12 +309,33 @@ def prove_cell(
         write_record(folder / "hand-eye.yaml", hand_eye)
         prior = read_posed_camera(folder / "hand-eye.yaml", None, About(simulated=True), cell.size_px)
         arm = None if model is None else read_arm(folder / "hand-eye.yaml", model)
-        judged = [*_of_camera(cell, camera), *_of_hand_eye(cell, hand_eye)]
-        if leds:
-            judged += _of_leds(cell, at, wish, prior, arm)
-        if mesh:
-            judged += _of_mesh(cell, at, wish, prior, arm, folder)
-    return judged
+        proof = Proof([*_of_camera(cell, camera), *_of_hand_eye(cell, hand_eye)], {})
+        _far(proof, "camera_mm", cell, *_camera_centres_mm(cell, at, prior, arm))
+        _prove_leds(proof, cell, at, wish, prior, arm)
+        _prove_mesh(proof, cell, at, wish, prior, arm, folder)
+    return proof
+
+
+def _far(proof: Proof, name: str, cell: RandomCell, found_mm: Floats, true_mm: Floats) -> None:
+    """Median and largest distance of points [n, 3] in the base from where they are."""
+    own = cell.own_base(np.eye(4))
+    own_mm = true_mm @ own[:3, :3].T + own[:3, 3]
+    for suffix, there_mm in (("", own_mm), ("_in_true_base", true_mm)):
+        off_mm = np.linalg.norm(found_mm - there_mm, axis=1)
+        proof.accuracy[f"{name}{suffix}"] = float(np.median(off_mm))
+        proof.accuracy[f"{name}_worst{suffix}"] = float(off_mm.max())
+
+
+def _camera_centres_mm(
+    cell: RandomCell, at: Postures, prior: CameraPrior, arm: CalibratedArm | None
+) -> tuple[Floats, Floats]:
+    """Where the camera is at the board's postures, by the records and truly, but for the arm's repeatability."""
+    poses = np.stack([flange_pose(joints) for joints in at.board])
+    steady = replace(cell.arm_errors, repeatability_um=0.0, repeatability_deg=0.0)
+    true = np.stack([steady.true_flange_pose(joints, 0) for joints in at.board]) @ cell.flange_from_camera
+    if arm is not None:
+        poses, prior = calibrated_poses(poses, at.board, arm, prior)
+    return (poses @ prior.flange_from_camera)[:, :3, 3], true[:, :3, 3]
 
 
 def _camera_and_hand_eye(cell: RandomCell, at: Postures, wish: Wish, model: Arm | None) -> tuple[Record, Record]:
@@ -347,9 +375,9 @@ def _of_hand_eye(cell: RandomCell, record: Record) -> Iterator[Judged]:
             yield _judged(parameter.name, error, parameter.u, parameter.degrees_of_freedom)
 
 
-def _of_leds(
-    cell: RandomCell, at: Postures, wish: Wish, prior: CameraPrior, arm: CalibratedArm | None
-) -> Iterator[Judged]:
+def _prove_leds(
+    proof: Proof, cell: RandomCell, at: Postures, wish: Wish, prior: CameraPrior, arm: CalibratedArm | None
+) -> None:
     whole = cell.cell.leds
     random = np.random.default_rng((cell.seed, 4))
     some = at.boards_of_leds[int(random.integers(len(at.boards_of_leds)))]
@@ -373,21 +401,32 @@ def _of_leds(
     own = cell.own_base(np.eye(4))
     true_mm = truth.positions_mm[at_truth] @ own[:3, :3].T + own[:3, 3]
     normals = truth.normals[at_truth] @ own[:3, :3].T
+    _far(proof, "led_mm", cell, found.centres_mm, truth.positions_mm[at_truth])
     for led, covariance in enumerate(found.centre_covariance):
         u = np.sqrt(np.diag(covariance))
         for axis, error in enumerate(found.centres_mm[led] - true_mm[led]):
-            yield _judged(f"leds.{'xyz'[axis]}_mm", error, u[axis])
+            proof.judged.append(_judged(f"leds.{'xyz'[axis]}_mm", error, u[axis]))
+    tilts_deg = []
     for number, board in enumerate(np.unique(table.boards)):
         mine = int(np.flatnonzero(table.boards == board)[0])
         turned = found.state.base_from_board[number, :3, :3].T @ normals[mine]
         u = np.sqrt(np.diag(found.normal_covariance[number]))
+        tilts_deg.append(float(np.degrees(np.linalg.norm(turned[:2]))))
         for axis, error in enumerate(np.degrees([-turned[1], turned[0]])):
-            yield _judged(f"leds.normal_r{'xy'[axis]}_deg", float(error), u[axis])
+            proof.judged.append(_judged(f"leds.normal_r{'xy'[axis]}_deg", float(error), u[axis]))
+    proof.accuracy["led_normal_deg"] = float(np.median(tilts_deg))
+    proof.accuracy["led_normal_deg_worst"] = max(tilts_deg)
 
 
-def _of_mesh(
-    cell: RandomCell, at: Postures, wish: Wish, prior: CameraPrior, arm: CalibratedArm | None, folder: Path
-) -> Iterator[Judged]:
+def _prove_mesh(
+    proof: Proof,
+    cell: RandomCell,
+    at: Postures,
+    wish: Wish,
+    prior: CameraPrior,
+    arm: CalibratedArm | None,
+    folder: Path,
+) -> None:
     place = cell.place(1)
     thing = {"kind": "sculpted_relief", "stickers": {"count": STICKERS, "seed": cell.seed}} | place
     scan = _scanned(thing, cell.seed, folder)
@@ -397,10 +436,11 @@ def _of_mesh(
     stated = StatedOfMesh(scanner_mm=0.03, robot_mm=0.03, robot_deg=0.003)
     found = mesh_from(images, sources, scan, prior, wish, stated=stated, depth_mm=depth_mm, arm=arm).pose
     in_support = transform(place["translation_mm"], place["abc_deg"])
-    true = cell.own_base(cell.base_from_support @ in_support @ inverse(scanner_from_thing(cell.seed)))
+    true = cell.base_from_support @ in_support @ inverse(scanner_from_thing(cell.seed))
     u = np.sqrt(np.diag(found.covariance))
-    for step, error, one in zip(STEPS, _error(found.base_from_mesh, true), u, strict=True):
-        yield _judged(f"base_from_mesh.{step}", error, one)
+    for step, error, one in zip(STEPS, _error(found.base_from_mesh, cell.own_base(true)), u, strict=True):
+        proof.judged.append(_judged(f"base_from_mesh.{step}", error, one))
+    _far(proof, "mesh_mm", cell, apply(found.base_from_mesh, scan.targets_mm), apply(true, scan.targets_mm))
 
 
 def _scanned(thing: dict[str, Any], seed: int, folder: Path) -> Scan:

@@ -52,6 +52,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--width", type=int, default=1024, help="of frames, px; 4096 is the real camera")
     parser.add_argument("--images", type=int, default=20, help="of the board")
+    parser.add_argument("--led-boards", type=int, help="so many boards instead of the whole dome: quick to plan")
     parser.add_argument("--samples", type=int, default=8, help="rays a pixel and direction")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--absolute", action="store_true", help="the arm is off by 0.3 mm and 0.02 deg as well")
@@ -64,7 +65,7 @@ def main() -> None:
     if seeds:
         work = partial(
             prove_cell,
-            at=postures(arguments.images),
+            at=postures(arguments.images, led_boards=arguments.led_boards),
             width_px=arguments.width,
             samples=arguments.samples,
             absolute=arguments.absolute,

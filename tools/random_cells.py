@@ -57,10 +57,13 @@ from sim.stills import Stills
 
 ROOT = Path(__file__).resolve().parents[1]
 RIG = ROOT / "configs/rigs/sim-imperfect.yaml"
-BOARD_EXPOSURE_S, LED_EXPOSURE_S = 0.008, 0.001
+EXPOSURE_S = 0.001
+LAMPS, LAMPS_ELEVATION_DEG = 6, 62.0
+"""LEDs that light board and object, all round it: a few, as each is shaded by itself."""
 SQUARES, SQUARE_MM, MARKER_MM, THICKNESS_MM = (12, 9), 16.0, 9.6, 4.0
 STICKERS, STICKER_MM = 16, 6.0
 LED_BOARDS, MESH_IMAGES = 8, 10
+_MIDDLE_BOARD = 60
 FULL_WIDTH_PX, FULL_PITCH_UM = 4096, 5.5
 STEPS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
 
@@ -101,12 +104,17 @@ class Postures:
     """[v] boards of the dome that are lit at each."""
 
 
-def postures(images: int) -> Postures:
-    """As `coupole plan new` wants them; so many images of the board."""
+def postures(images: int, *, led_boards: int | None = None) -> Postures:
+    """As `coupole plan new` wants them; so many images of the calibration board, and LEDs of so many boards that
+    stand together in the dome, instead of all."""
+    cell = read_cell(RIG)
+    middles_mm = cell.leds.positions_mm.reshape(-1, 6, 3).mean(axis=1)
+    nearest = np.argsort(np.linalg.norm(middles_mm - middles_mm[_MIDDLE_BOARD], axis=1))[:led_boards]
+    cell = replace(cell, leds=some_leds(cell.leds, cell.leds.boards[::6][nearest]))
     with tempfile.TemporaryDirectory() as folder:
         board, mesh = (_itinerary(Path(folder), TEMPLATES[name]) for name in ("charuco", "mesh"))
         plan = Path(folder) / "leds.yaml"
-        plan.write_text(led_plan(read_cell(RIG), name="leds", rig=str(RIG)))
+        plan.write_text(led_plan(cell, name="leds", rig=str(RIG)))
         views = read_job(plan).plan.views
     return Postures(
         _some(board, images),
@@ -114,6 +122,30 @@ def postures(images: int) -> Postures:
         np.array([view.joints_deg for view in views]),
         tuple(view.lights.boards for view in views),
     )
+
+
+def some_leds(table: LedTable, boards: Sequence[int] | NDArray[np.int64]) -> LedTable:
+    """The part of a dome's table that is on these boards."""
+    rows = np.isin(table.boards, boards)
+    return LedTable(
+        table.ids[rows], table.boards[rows], table.positions_mm[rows], table.normals[rows], table.flux_lm[rows]
+    )
+
+
+def lamps(table: LedTable, base_from_support: Floats) -> list[int]:
+    """LEDs nearest to so many directions about the support."""
+    azimuths = np.radians(np.arange(LAMPS) * 360.0 / LAMPS)
+    elevation = np.radians(LAMPS_ELEVATION_DEG)
+    wanted = np.stack(
+        [
+            np.cos(azimuths) * np.cos(elevation),
+            np.sin(azimuths) * np.cos(elevation),
+            np.full(LAMPS, np.sin(elevation)),
+        ]
+    )
+    there = apply(inverse(base_from_support), table.positions_mm)
+    nearest = np.argmax(there / np.linalg.norm(there, axis=1, keepdims=True) @ wanted, axis=0)
+    return [int(led) for led in table.ids[nearest]]
 
 
 def _itinerary(folder: Path, template: str) -> Floats:
@@ -234,22 +266,21 @@ class Photographs:
         self.truth = Config.model_validate(config)
         self._stills = Stills(config)
         self._joints_deg = joints_deg
+        self._lamps = lamps(cell.cell.leds, cell.base_from_support)
         self.reported = np.stack([flange_pose(joints) for joints in joints_deg])
         self._true = [
             cell.arm_errors.true_flange_pose(joints, first_stop + stop) for stop, joints in enumerate(joints_deg)
         ]
 
-    def frame(
-        self, number: int, *, leds: Sequence[int] = (), panels: Sequence[int] = (), exposure_s: float
-    ) -> NDArray[np.uint16]:
-        return self._stills.take(self._true[number], leds=leds, panels=panels, exposure_s=exposure_s)
+    def frame(self, number: int, leds: Sequence[int]) -> NDArray[np.uint16]:
+        return self._stills.take(self._true[number], leds=leds, panels=[], exposure_s=EXPOSURE_S)
 
-    def sources(self, panels: Sequence[int]) -> Sources:
-        """As a run under panels would give them."""
+    def sources(self) -> Sources:
+        """As a run of the things on the support would give them."""
         white = self.white_dn - self.camera["black_dn"]
 
         def read(number: int) -> Picture:
-            frame = self.frame(number, panels=panels, exposure_s=BOARD_EXPOSURE_S).astype(np.float64)
+            frame = self.frame(number, self._lamps).astype(np.float64)
             return Picture(frame - self.camera["black_dn"], self.camera["bayer_pattern"], white, str(number))
 
         images = tuple(
@@ -262,7 +293,7 @@ class Photographs:
         """Spots of LEDs: `lit` has view and row of the table of each frame."""
         spots = []
         for view, row in lit:
-            frame = self.frame(view, leds=[int(table.ids[row])], exposure_s=LED_EXPOSURE_S)
+            frame = self.frame(view, [int(table.ids[row])])
             found = find_spots(frame, float(self.camera["black_dn"]), self.camera["bayer_pattern"], self.white_dn)
             spots += [(view, row, spot.pixel, spot.covariance) for spot in found.good]
         seen = LedSightings(
@@ -341,7 +372,7 @@ def _camera_centres_mm(
 def _camera_and_hand_eye(cell: RandomCell, at: Postures, wish: Wish, model: Arm | None) -> tuple[Record, Record]:
     place = cell.place(0)
     thing = {"kind": "charuco_board", "square_mm": SQUARE_MM, "marker_mm": MARKER_MM, "thickness_mm": THICKNESS_MM}
-    sources = Photographs(cell, at.board, 0, thing | place).sources([1])
+    sources = Photographs(cell, at.board, 0, thing | place).sources()
     board = Board(
         kind="charuco", corners=(SQUARES[0] - 1, SQUARES[1] - 1), square_mm=SQUARE_MM, marker_mm=MARKER_MM
     )
@@ -378,14 +409,10 @@ def _of_hand_eye(cell: RandomCell, record: Record) -> Iterator[Judged]:
 def _prove_leds(
     proof: Proof, cell: RandomCell, at: Postures, wish: Wish, prior: CameraPrior, arm: CalibratedArm | None
 ) -> None:
-    whole = cell.cell.leds
     random = np.random.default_rng((cell.seed, 4))
     some = at.boards_of_leds[int(random.integers(len(at.boards_of_leds)))]
     boards = set(random.permutation(some)[:LED_BOARDS].tolist())
-    rows = np.isin(whole.boards, list(boards))
-    table = LedTable(
-        whole.ids[rows], whole.boards[rows], whole.positions_mm[rows], whole.normals[rows], whole.flux_lm[rows]
-    )
+    table = some_leds(cell.cell.leds, list(boards))
     views = [number for number, lit in enumerate(at.boards_of_leds) if boards & set(lit)]
     lit = [
         (number, int(row))
@@ -430,7 +457,7 @@ def _prove_mesh(
     place = cell.place(1)
     thing = {"kind": "sculpted_relief", "stickers": {"count": STICKERS, "seed": cell.seed}} | place
     scan = _scanned(thing, cell.seed, folder)
-    sources = Photographs(cell, at.mesh, 2000, thing).sources([1, 2, 3, 4])
+    sources = Photographs(cell, at.mesh, 2000, thing).sources()
     depth_mm = (200.0, 900.0)
     images = find_all_stickers(sources, prior.lens, diameter_mm=STICKER_MM, depth_mm=depth_mm)
     stated = StatedOfMesh(scanner_mm=0.03, robot_mm=0.03, robot_deg=0.003)

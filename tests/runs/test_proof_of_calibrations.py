@@ -1,0 +1,69 @@
+"""Random simulated cells, rendered, calibrated and held against the truth, by the tool that does it a hundredfold."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cells
+import pytest
+
+COMMAND = (sys.executable, str(cells.REPO / "tools/prove_calibrations.py"), "--json")
+
+
+@pytest.fixture(scope="module")
+def proof(tmp_path_factory: pytest.TempPathFactory, scale: Callable[[int, int], int]) -> list[dict[str, Any]]:
+    """Lines of the tool: small frames, few boards of LEDs."""
+    kept = tmp_path_factory.mktemp("proof") / "cells.jsonl"
+    options = ["--images", "16", "--samples", "3", "--led-boards", "24", "--keep", str(kept)]
+    width, count = str(scale(512, 1024)), str(scale(5, 100))
+    ended = subprocess.run(
+        [*COMMAND, "--cells", count, "--width", width, *options], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    return [json.loads(line) for line in ended.stdout.splitlines()]
+
+
+@pytest.mark.timeout(9000)  # 100 cells with --full
+def test_stated_intervals_hold_the_truth(proof: list[dict[str, Any]]) -> None:
+    judged = [line for line in proof if "covered" in line]
+    assert {line["name"].split(".")[0] for line in judged} == {
+        "camera",
+        "flange_from_camera",
+        "base_from_board",
+        "leds",
+        "base_from_mesh",
+    }
+    values = sum(line["values"] for line in judged)
+    covered = sum(line["covered"] * line["values"] for line in judged) / values
+    mean_square = sum(line["rms_over_u"] ** 2 * line["values"] for line in judged) / values
+    assert 0.90 <= covered <= 0.99
+    assert 0.8 < mean_square**0.5 < 1.25
+    for line in judged:  # five cells, a parameter each: one may lie outside, and none far
+        assert line["covered"] >= 0.6, line
+        assert line["rms_over_u"] < 2.0, line
+
+
+def test_camera_leds_and_mesh_are_near_the_truth(proof: list[dict[str, Any]]) -> None:
+    """An eighth of the real camera's resolution allows for twice the distances that the real one must meet."""
+    far = {line["name"]: line["median"] for line in proof if "median" in line}
+    assert far["camera_mm"] < 0.1
+    assert far["led_mm"] < 0.24
+    assert far["led_normal_deg"] < 0.2
+    assert far["mesh_mm"] < 0.12
+
+
+def test_cells_that_were_kept_are_not_done_again(tmp_path: Path) -> None:
+    judged = [{"name": "camera.fx_px", "error": 0.1, "u": 0.1, "half_width": 0.2}]
+    kept = tmp_path / "cells.jsonl"
+    kept.write_text(json.dumps({"seed": 1, "judged": judged, "accuracy": {"camera_mm": 0.03}}) + "\n")
+    ended = subprocess.run(
+        [*COMMAND, "--cells", "1", "--keep", str(kept)], capture_output=True, text=True, check=True
+    )
+    first, second = map(json.loads, ended.stdout.splitlines())
+    assert (first["name"], first["covered"], first["rms_over_u"]) == ("camera.fx_px", 1.0, 1.0)
+    assert second == {"name": "camera_mm", "median": 0.03, "percent_95": 0.03}

@@ -20,7 +20,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--full", action="store_true", help="full scale: minutes to an hour instead of seconds")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def scale(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
     """`scale(small, full)`: how many of something to test, with `--full` or without."""
     full = bool(request.config.getoption("--full"))

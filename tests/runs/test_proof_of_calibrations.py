@@ -1,4 +1,4 @@
-"""Random simulated cells, rendered, calibrated and held against the truth, by the tool that does it a hundredfold."""
+"""Random simulated cells, rendered, calibrated and held against the truth; the tool does it a hundredfold."""
 
 from __future__ import annotations
 

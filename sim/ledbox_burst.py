@@ -203,6 +203,7 @@ class Boards:
         *,
         leds_per_board: int,
         ambient_c: float,
+        warm_k: float,
         limit_c: float,
         led_power_w: float,
         heat_k_per_j: float,
@@ -212,7 +213,7 @@ class Boards:
         self._leds_per_board = leds_per_board
         self._kelvin_per_s = led_power_w * heat_k_per_j
         self._tau_ns = time_constant_s * 1e9
-        self._excess_k = [0.0] * count
+        self._excess_k = [warm_k] * count
         self._since_ns = [0] * count
         self.tripped = False
         """True from the moment that a board without light is over the limit, until it has cooled."""

@@ -48,6 +48,8 @@ class Settings(BaseModel):
     heat_k_per_j: float = Field(default=0.02, ge=0)
     thermal_time_constant_s: float = Field(default=240.0, gt=0)
     ambient_c: float = 22.0
+    warm_k: float = Field(default=0.0, ge=0)
+    """Boards' temperature over the ambient one when the box is switched on, as after a long run: they cool."""
     board_limit_c: float = 75.0
     block_timeout_s: float = Field(default=2.0, gt=0)
     """A block whose bytes stop coming for so long is forgotten."""
@@ -94,6 +96,7 @@ class LedBoxFirmware:
             -(-settings.led_count // settings.leds_per_board),
             leds_per_board=settings.leds_per_board,
             ambient_c=settings.ambient_c,
+            warm_k=settings.warm_k,
             limit_c=settings.board_limit_c,
             led_power_w=settings.led_power_w,
             heat_k_per_j=settings.heat_k_per_j,

@@ -21,19 +21,24 @@ from sim.led_light import LedModel, led_flux_factor
 LEDS = {"kind": "every", "every": 24}
 """45 of them, all round the dome."""
 HOURS_SHONE, AMBIENT_C = 3000.0, 38.0
+WARM_K, COOLING_S = 15.0, 8.0
+"""In the later run boards are warm from one before it, and cool."""
 BESIDE_MM = (60.0, -90.0)
 """Where the tile lies beside an object."""
 
 
-def rig(folder: Path, things: list[dict[str, Any]], *, hours_shone: float, ambient_c: float) -> Path:
+def rig(
+    folder: Path, things: list[dict[str, Any]], *, hours_shone: float, ambient_c: float, warm_k: float = 0.0
+) -> Path:
     """The imperfect cell with small frames, faster than life."""
     content: dict[str, Any] = YAML(typ="safe").load(cells.REPO / "configs/rigs/sim-imperfect.yaml")
     content["sensor"] |= {"width_px": 256, "height_px": 192, "pixel_pitch_um": 88.0}
     content["dome"]["leds"] = str(cells.REPO / "configs/domes/coupole.csv")
     content["ledbox"]["settings"]["watchdog_s"] = 60.0
     content["storage"]["folder"] = str(folder / "runs")
+    boards = {"ambient_c": ambient_c, "warm_k": warm_k, "thermal_time_constant_s": COOLING_S}
     settings = content["world"]["settings"]
-    settings |= {"speed": 20.0, "things": things, "ledbox": {"ambient_c": ambient_c}}
+    settings |= {"speed": 20.0, "things": things, "ledbox": boards}
     settings["leds"] = {"hours_shone": hours_shone}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "rig.yaml"
@@ -92,7 +97,7 @@ def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"kind": "spectralon_tile", "translation_mm": [x_mm, y_mm, 0.0]},
         {"kind": "paint_wedge", "translation_mm": [-80.0, 60.0, 0.0]},
     ]
-    rig(folder, things, hours_shone=HOURS_SHONE, ambient_c=AMBIENT_C)
+    rig(folder, things, hours_shone=HOURS_SHONE, ambient_c=AMBIENT_C, warm_k=WARM_K)
     run = acquire(folder, x_mm, y_mm)
     run.rename(folder / "run")
     return folder
@@ -136,6 +141,8 @@ def test_the_factor_of_each_frame_is_that_of_the_world(calibrated: Path, later: 
     frames = [frame for frame in open_light_frames([later / "run"]).lit if frame.light.startswith("led")]
     found, u, true = by_record(record, frames, calibrated / "led-power.csv")
     assert true.max() < -0.05  # it is drift that is looked for
+    warm_c = [frame.temperature_c for frame in frames]
+    assert max(warm_c) - min(warm_c) > 5.0  # within the run too
     assert np.abs(found - true).max() < 0.01
     assert (np.abs(found - true) < 3 * u).all()
 

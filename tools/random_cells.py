@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -284,7 +284,7 @@ class Photographs:
             return Picture(frame - self.camera["black_dn"], self.camera["bayer_pattern"], white, str(number))
 
         images = tuple(
-            Source(str(number), _once(read, number), tuple(joints))
+            Source(str(number), partial(read, number), tuple(joints))
             for number, joints in enumerate(self._joints_deg.tolist())
         )
         return Sources(images, reported(self.reported), About(simulated=True), (("rendered", "0" * 64),))
@@ -313,17 +313,6 @@ class Photographs:
     @property
     def white_dn(self) -> int:
         return (1 << self.camera["bit_depth"]) - 1
-
-
-def _once(read: Any, number: int) -> Any:
-    kept: list[Picture] = []
-
-    def again() -> Picture:
-        if not kept:
-            kept.append(read(number))
-        return kept[0]
-
-    return again
 
 
 # -- calibrated and judged --------------------------------------------------------------------------------

@@ -27,9 +27,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from random_cells import Judged, Proof, postures, prove_cell
-
+from cell_proof import Judged, Proof, prove_cell
 from coupole.errors import CoupoleError
+from random_cells import postures
 
 
 @dataclass(frozen=True)

@@ -1,58 +1,32 @@
-"""A simulated cell drawn at random, calibrated from rendered frames to records, and held against the truth.
-
-Frames are rendered by `sim`, found and adjusted by `coupole.calibration`, which share no code; what is judged is
-what stands in the records: camera, hand-eye, LEDs, and where a scanned mesh lies.
-"""
+"""A simulated cell drawn at random: what is true of it, and its rendered frames as a run would give them."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from coupole.calibration.adjustment import coverage_factor
-from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses, read_arm
-from coupole.calibration.leds.equations import Stated as StatedOfLeds
 from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.leds.plan import led_plan
 from coupole.calibration.leds.sources import LedImages
 from coupole.calibration.leds.spots import find_spots
-from coupole.calibration.leds.workflow import leds_from
-from coupole.calibration.lens.board import Board
-from coupole.calibration.lens.bundle import RobotNoise
-from coupole.calibration.lens.images import find_board
-from coupole.calibration.lens.workflow import camera_from, hand_eye_from
 from coupole.calibration.picture import Picture
-from coupole.calibration.posed_camera import CameraPrior, read_posed_camera
 from coupole.calibration.poses import reported
-from coupole.calibration.record import Record, write_record
 from coupole.calibration.sources import About, Source, Sources
-from coupole.calibration.stickers.mesh_to_robot import Stated as StatedOfMesh
-from coupole.calibration.stickers.sources import Scan, find_all_stickers, read_scan
-from coupole.calibration.stickers.workflow import mesh_from
-from coupole.calibration.wish import Wish
 from coupole.cell import world_config
 from coupole.dome import LedTable
 from coupole.geometry import apply, inverse, transform
 from coupole.itinerary import plan_itinerary
 from coupole.job import Cell, read_cell, read_job
-from coupole.kinematics import Arm
-from coupole.rig import planning_arm
-from coupole.scan import import_scan
 from coupole.templates import TEMPLATES
 from sim.config import Config
-from sim.dome import as_built
 from sim.kuka_kinematics import PoseErrors, flange_pose
-from sim.scanner import export_scan, scanner_from_thing
-from sim.scene import read_leds
 from sim.stills import Stills
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -65,29 +39,8 @@ STICKERS, STICKER_MM = 16, 6.0
 LED_BOARDS, MESH_IMAGES = 8, 10
 _MIDDLE_BOARD = 60
 FULL_WIDTH_PX, FULL_PITCH_UM = 4096, 5.5
-STEPS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Judged:
-    """One parameter of one cell."""
-
-    name: str
-    error: float
-    u: float
-    half_width: float
-    """Of its 95 % interval."""
-
-
-@dataclass(frozen=True)
-class Proof:
-    """What one cell's records are worth."""
-
-    judged: list[Judged]
-    accuracy: dict[str, float]
-    """Distances from the truth in mm and deg, by name; `_in_true_base`: with what the arm is off as a whole."""
 
 
 @dataclass(frozen=True)
@@ -313,171 +266,3 @@ class Photographs:
     @property
     def white_dn(self) -> int:
         return (1 << self.camera["bit_depth"]) - 1
-
-
-# -- calibrated and judged --------------------------------------------------------------------------------
-
-
-def prove_cell(seed: int, *, at: Postures, width_px: int, samples: int, absolute: bool) -> Proof:
-    """Render, find, adjust, and compare what the records say with the truth."""
-    cell = RandomCell(seed, width_px, samples, absolute)
-    wish = Wish(f"cell{seed}", datetime.now(UTC))
-    model: Arm | None = planning_arm(cell.cell.rig) if absolute else None
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        camera, hand_eye = _camera_and_hand_eye(cell, at, wish, model)
-        write_record(folder / "hand-eye.yaml", hand_eye)
-        prior = read_posed_camera(folder / "hand-eye.yaml", None, About(simulated=True), cell.size_px)
-        arm = None if model is None else read_arm(folder / "hand-eye.yaml", model)
-        proof = Proof([*_of_camera(cell, camera), *_of_hand_eye(cell, hand_eye)], {})
-        _far(proof, "camera_mm", cell, *_camera_centres_mm(cell, at, prior, arm))
-        _prove_leds(proof, cell, at, wish, prior, arm)
-        _prove_mesh(proof, cell, at, wish, prior, arm, folder)
-    return proof
-
-
-def _far(proof: Proof, name: str, cell: RandomCell, found_mm: Floats, true_mm: Floats) -> None:
-    """Median and largest distance of points [n, 3] in the base from where they are."""
-    own = cell.own_base(np.eye(4))
-    own_mm = true_mm @ own[:3, :3].T + own[:3, 3]
-    for suffix, there_mm in (("", own_mm), ("_in_true_base", true_mm)):
-        off_mm = np.linalg.norm(found_mm - there_mm, axis=1)
-        proof.accuracy[f"{name}{suffix}"] = float(np.median(off_mm))
-        proof.accuracy[f"{name}_worst{suffix}"] = float(off_mm.max())
-
-
-def _camera_centres_mm(
-    cell: RandomCell, at: Postures, prior: CameraPrior, arm: CalibratedArm | None
-) -> tuple[Floats, Floats]:
-    """Where the camera is at the board's postures, by the records and truly, but for the arm's repeatability."""
-    poses = np.stack([flange_pose(joints) for joints in at.board])
-    steady = replace(cell.arm_errors, repeatability_um=0.0, repeatability_deg=0.0)
-    true = np.stack([steady.true_flange_pose(joints, 0) for joints in at.board]) @ cell.flange_from_camera
-    if arm is not None:
-        poses, prior = calibrated_poses(poses, at.board, arm, prior)
-    return (poses @ prior.flange_from_camera)[:, :3, 3], true[:, :3, 3]
-
-
-def _camera_and_hand_eye(cell: RandomCell, at: Postures, wish: Wish, model: Arm | None) -> tuple[Record, Record]:
-    place = cell.place(0)
-    thing = {"kind": "charuco_board", "square_mm": SQUARE_MM, "marker_mm": MARKER_MM, "thickness_mm": THICKNESS_MM}
-    sources = Photographs(cell, at.board, 0, thing | place).sources()
-    board = Board(
-        kind="charuco", corners=(SQUARES[0] - 1, SQUARES[1] - 1), square_mm=SQUARE_MM, marker_mm=MARKER_MM
-    )
-    found = find_board(board, sources)
-    off = (0.3, 0.02) if cell.absolute else (0.0, 1e-5)
-    robot = RobotNoise(absolute_mm=off[0], absolute_deg=off[1])
-    camera = camera_from(found, sources, "brown4", wish)[1].record
-    return camera, hand_eye_from(found, sources, board, "brown4", wish, robot=robot, arm=model)[2].record
-
-
-def _of_camera(cell: RandomCell, record: Record) -> Iterator[Judged]:
-    for parameter in record.parameters:
-        assert parameter.value is not None
-        error = parameter.value - cell.true_lens[parameter.name]
-        yield _judged(f"camera.{parameter.name}", error, parameter.u, parameter.degrees_of_freedom)
-
-
-def _of_hand_eye(cell: RandomCell, record: Record) -> Iterator[Judged]:
-    place = cell.place(0)
-    corner_mm = (-0.5 * SQUARES[0] * SQUARE_MM, 0.5 * SQUARES[1] * SQUARE_MM, THICKNESS_MM)
-    in_support = transform(place["translation_mm"], place["abc_deg"]) @ transform(corner_mm, (0.0, 0.0, 180.0))
-    true = {
-        "flange_from_camera": cell.flange_from_camera,
-        "base_from_board": cell.own_base(cell.base_from_support @ in_support),
-    }
-    by_name = {parameter.name: parameter for parameter in record.parameters}
-    for name, pose in record.transforms.items():
-        found = transform(pose.translation_mm, pose.abc_deg)
-        for step, error in zip(STEPS, _error(found, true[name]), strict=True):
-            parameter = by_name[f"{name}.{step}"]
-            yield _judged(parameter.name, error, parameter.u, parameter.degrees_of_freedom)
-
-
-def _prove_leds(
-    proof: Proof, cell: RandomCell, at: Postures, wish: Wish, prior: CameraPrior, arm: CalibratedArm | None
-) -> None:
-    random = np.random.default_rng((cell.seed, 4))
-    some = at.boards_of_leds[int(random.integers(len(at.boards_of_leds)))]
-    boards = set(random.permutation(some)[:LED_BOARDS].tolist())
-    table = some_leds(cell.cell.leds, list(boards))
-    views = [number for number, lit in enumerate(at.boards_of_leds) if boards & set(lit)]
-    lit = [
-        (number, int(row))
-        for number, view in enumerate(views)
-        for row in np.flatnonzero(np.isin(table.boards, list(boards & set(at.boards_of_leds[view]))))
-    ]
-    photographs = Photographs(cell, at.leds[views], 1000)
-    truth = as_built(read_leds(photographs.truth.scene.leds), photographs.truth.settings.dome)
-    stated = StatedOfLeds(tolerance_mm=0.05)
-    found = leds_from(photographs.leds(table, lit), table, prior, wish, stated=stated, arm=arm).geometry
-    row_of = {int(led): row for row, led in enumerate(truth.ids)}
-    at_truth = [row_of[int(led)] for led in table.ids]
-    own = cell.own_base(np.eye(4))
-    true_mm = truth.positions_mm[at_truth] @ own[:3, :3].T + own[:3, 3]
-    normals = truth.normals[at_truth] @ own[:3, :3].T
-    _far(proof, "led_mm", cell, found.centres_mm, truth.positions_mm[at_truth])
-    for led, covariance in enumerate(found.centre_covariance):
-        u = np.sqrt(np.diag(covariance))
-        for axis, error in enumerate(found.centres_mm[led] - true_mm[led]):
-            proof.judged.append(_judged(f"leds.{'xyz'[axis]}_mm", error, u[axis]))
-    tilts_deg = []
-    for number, board in enumerate(np.unique(table.boards)):
-        mine = int(np.flatnonzero(table.boards == board)[0])
-        turned = found.state.base_from_board[number, :3, :3].T @ normals[mine]
-        u = np.sqrt(np.diag(found.normal_covariance[number]))
-        tilts_deg.append(float(np.degrees(np.linalg.norm(turned[:2]))))
-        for axis, error in enumerate(np.degrees([-turned[1], turned[0]])):
-            proof.judged.append(_judged(f"leds.normal_r{'xy'[axis]}_deg", float(error), u[axis]))
-    proof.accuracy["led_normal_deg"] = float(np.median(tilts_deg))
-    proof.accuracy["led_normal_deg_worst"] = max(tilts_deg)
-
-
-def _prove_mesh(
-    proof: Proof,
-    cell: RandomCell,
-    at: Postures,
-    wish: Wish,
-    prior: CameraPrior,
-    arm: CalibratedArm | None,
-    folder: Path,
-) -> None:
-    place = cell.place(1)
-    thing = {"kind": "sculpted_relief", "stickers": {"count": STICKERS, "seed": cell.seed}} | place
-    scan = _scanned(thing, cell.seed, folder)
-    sources = Photographs(cell, at.mesh, 2000, thing).sources()
-    depth_mm = (200.0, 900.0)
-    images = find_all_stickers(sources, prior.lens, diameter_mm=STICKER_MM, depth_mm=depth_mm)
-    stated = StatedOfMesh(scanner_mm=0.03, robot_mm=0.03, robot_deg=0.003)
-    found = mesh_from(images, sources, scan, prior, wish, stated=stated, depth_mm=depth_mm, arm=arm).pose
-    in_support = transform(place["translation_mm"], place["abc_deg"])
-    true = cell.base_from_support @ in_support @ inverse(scanner_from_thing(cell.seed))
-    u = np.sqrt(np.diag(found.covariance))
-    for step, error, one in zip(STEPS, _error(found.base_from_mesh, cell.own_base(true)), u, strict=True):
-        proof.judged.append(_judged(f"base_from_mesh.{step}", error, one))
-    _far(proof, "mesh_mm", cell, apply(found.base_from_mesh, scan.targets_mm), apply(true, scan.targets_mm))
-
-
-def _scanned(thing: dict[str, Any], seed: int, folder: Path) -> Scan:
-    mesh, targets = export_scan(thing, folder / "scanner", seed=seed)
-    import_scan(
-        mesh,
-        targets,
-        folder / "scan",
-        unit="mm",
-        targets_unit=None,
-        accept_defects=False,
-        progress=lambda what: None,
-    )
-    return read_scan(folder / "scan")
-
-
-def _error(found: Floats, true: Floats) -> Floats:
-    """[6] of a transform: mm along the left frame's axes, degrees about the right one's."""
-    turn = Rotation.from_matrix(true[:3, :3].T @ found[:3, :3]).as_rotvec(degrees=True)
-    return np.array([*(found[:3, 3] - true[:3, 3]), *turn])
-
-
-def _judged(name: str, error: float, u: float, degrees: float = np.inf) -> Judged:
-    return Judged(name, float(error), float(u), float(coverage_factor(min(degrees, 1e9))) * float(u))

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from replay_cell import ReplayCell, Touch, motion
 
 from coupole.itinerary import Itinerary, bodies_of, plan_itinerary
 from coupole.job import Job, read_job, schedule_of
 from coupole.kinematics import KR10_R1100_SIXX
 from coupole.plan import Plan
+from replay_cell import ReplayCell, Touch, motion
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "configs/plans/demo.yaml"

@@ -252,9 +252,9 @@ def _setting(
     emission: str,
 ) -> Setting:
     """What pictures of a tile are read with. Raises InputError for files that are none."""
-    from coupole.calibration.light.led_power import Positions
     from coupole.calibration.light.led_power_tile import Setting, calibrated_positions
     from coupole.calibration.light.spectralon import read_tile
+    from coupole.calibration.light.tile_views import Positions
     from coupole.job import read_cell
 
     cell = read_cell(rig)

@@ -16,8 +16,10 @@ if TYPE_CHECKING:
 
     from coupole.calibration.light.dark import Dark
     from coupole.calibration.light.flat_field import FlatField, Spot
-    from coupole.calibration.light.led_power import LedPower, Positions
-    from coupole.calibration.light.response import Linearity, PhotonTransfer
+    from coupole.calibration.light.led_power import LedPower
+    from coupole.calibration.light.linearity import Linearity
+    from coupole.calibration.light.photon_transfer import PhotonTransfer
+    from coupole.calibration.light.tile_views import Positions
     from coupole.calibration.record import Record
 
 CHANNEL_COLOURS = {"R": RED, "G": "#2d7d46", "B": BLUE}

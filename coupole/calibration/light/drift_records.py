@@ -14,10 +14,10 @@ import numpy as np
 from coupole.calibration.light.drift import NAMES, Drift, Reading, fit_drift
 from coupole.calibration.light.drift_drawing import draw_drift
 from coupole.calibration.light.frames import LightFrame, LightFrames
-from coupole.calibration.light.led_power import rows_of
 from coupole.calibration.light.led_power_tile import Setting, TileReader
 from coupole.calibration.light.limits import DRIFT
 from coupole.calibration.light.records import Progress, counter, record_input, sealed_outcome
+from coupole.calibration.light.tile_views import rows_of
 from coupole.calibration.limits import judged
 from coupole.calibration.record import Parameter, read_record
 from coupole.calibration.report import Outcome

@@ -10,10 +10,11 @@ import numpy as np
 
 from coupole.calibration.light import drawing as pictures
 from coupole.calibration.light.frames import LightFrame, LightFrames, channels_of
-from coupole.calibration.light.led_power import LedPower, TileView, calibrate_led_power, list_of
+from coupole.calibration.light.led_power import LedPower, calibrate_led_power
 from coupole.calibration.light.led_power_tile import Setting, TileReader
 from coupole.calibration.light.limits import LED_POWER
 from coupole.calibration.light.records import Progress, counter, sealed_outcome
+from coupole.calibration.light.tile_views import TileView, list_of
 from coupole.calibration.limits import judged
 from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from coupole.calibration import optics
 from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask, channels_of
 from coupole.calibration.light.irradiance import Emission
-from coupole.calibration.light.led_power import Positions, TileView
 from coupole.calibration.light.records import dark_signal, linearise, map_beside, record_input
 from coupole.calibration.light.spectralon import Tile
+from coupole.calibration.light.tile_views import Positions, TileView
 from coupole.calibration.record import read_record
 from coupole.calibration.rotations import Floats
 from coupole.dome import read_led_table

@@ -27,7 +27,9 @@ from coupole.calibration.light.frames import (
     temperatures_of,
 )
 from coupole.calibration.light.limits import DARK, RESPONSE
-from coupole.calibration.light.response import Linearity, Pair, PhotonTransfer, linearity, photon_transfer
+from coupole.calibration.light.linearity import Linearity, linearity
+from coupole.calibration.light.pairs import Pair
+from coupole.calibration.light.photon_transfer import PhotonTransfer, photon_transfer
 from coupole.calibration.limits import judged
 from coupole.calibration.record import (
     Input,

@@ -10,8 +10,9 @@ import pytest
 from light_synthesis import Array, coverage
 
 from coupole.calibration.light.irradiance import irradiance_per_flux, lambert_vector, led_corners_mm
-from coupole.calibration.light.led_power import LedPower, Positions, TileView, calibrate_led_power
+from coupole.calibration.light.led_power import LedPower, calibrate_led_power
 from coupole.calibration.light.spectralon import Tile
+from coupole.calibration.light.tile_views import Positions, TileView
 from coupole.errors import InputError
 
 TILE = Tile(reflectance=0.99, u_reflectance=0.005, minnaert=1.1, u_minnaert=0.03, u_tilt_deg=0.2)

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from light_synthesis import Array, TrueSensor, coverage
 
-from coupole.calibration.light.response import Pair, linearity, photon_transfer
+from coupole.calibration.light.linearity import linearity
+from coupole.calibration.light.pairs import Pair
+from coupole.calibration.light.photon_transfer import photon_transfer
 from coupole.errors import InputError
 
 SHAPE = (96, 128)

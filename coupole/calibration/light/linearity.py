@@ -1,0 +1,200 @@
+"""Linearity of a sensor, with uncertainty (EMVA 1288, release 4.0, section 8).
+
+Under constant light the signal of any pixel is its rate times the exposure time. Pixels of several brightnesses
+share one curve, y + c2 y^2/R + c3 y^3/R^2 = rate * (t + t0), so that an exposure time that is off and a curve that
+is bent are told apart; each exposure may have its own factor of light (flicker), which a bent curve could be taken
+for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from coupole.calibration.light.pairs import BLOCK, Estimate, Pair, refuse_all_clipped
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+
+_GROUPS = 12
+"""Of pixels of like brightness."""
+_CLIPPED_SHARE = 1e-3
+_CHANGED = 0.01
+"""Relative: groups of pixels that keep their ratio less well than this were not looking at the same scene."""
+_SCENE_SIGMA = 8.0
+
+
+@dataclass(frozen=True)
+class Linearity:
+    """How far the response is from a line, and the polynomial that makes it one."""
+
+    coefficients: Floats
+    """c2, c3 of y + c2 y^2/R + c3 y^3/R^2; zeros where a line will do."""
+    covariance: Floats
+    """[2, 2]."""
+    range_dn: float
+    """R, above dark."""
+    time_offset_us: Estimate
+    worst_deviation: float
+    """Largest deviation from a line between 5 and 95 % of the range, relative (EMVA 1288, 8.3)."""
+    u_deviation: float
+    exposures_us: Floats
+    deviations: Floats
+    """[groups, exposures] relative deviations of the uncorrected signal; NaN where saturated."""
+    signals_dn: Floats
+    """[groups, exposures]."""
+    flicker: float
+    """Relative scatter of the light from frame to frame."""
+
+    def linear(self, signal_dn: Floats) -> Floats:
+        """Signal made linear; same shape, DN above dark."""
+        x = signal_dn / self.range_dn
+        corrected: Floats = signal_dn * (1.0 + x * (self.coefficients[0] + x * self.coefficients[1]))
+        return corrected
+
+    def u_linear(self, signal_dn: Floats) -> Floats:
+        """Relative standard uncertainty that the curve adds to a signal."""
+        x = np.asarray(signal_dn) / self.range_dn
+        by = np.stack([x, x * x])
+        u: Floats = np.sqrt(np.maximum(np.einsum("i...,ij,j...->...", by, self.covariance, by), 0.0))
+        return u
+
+
+def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1e-3) -> Linearity:
+    """Deviation from a line; its correction if a straight one would look like this less often than `significance`.
+
+    Raises InputError with what is wrong: clipped, a scene that changed, flickering light, exposures that do not
+    make it brighter.
+    """
+    refuse_all_clipped(pairs)
+    ordered = sorted(pairs, key=lambda pair: pair.exposure_us)
+    signals, u_signals = _grouped(ordered)
+    seen = np.asarray(np.isfinite(signals).any(axis=0))
+    ordered = [pair for pair, use in zip(ordered, seen, strict=True) if use]
+    signals, u_signals = signals[:, seen], u_signals[:, seen]
+    exposures = np.array([pair.exposure_us for pair in ordered])
+    if len(np.unique(exposures)) < 4:
+        raise InputError(
+            f"response: expected four exposures or more, found {len(np.unique(exposures))}; use a bracket"
+        )
+    flicker = _flicker(ordered)
+    _refuse_contradictions(ordered, signals, flicker)
+    known = np.isfinite(signals)
+    start = np.nanmedian(signals / exposures, axis=1)
+    scatter = max(flicker / np.sqrt(2.0), 1e-6)
+
+    def residuals(p: Floats) -> Floats:
+        c2, c3, t0, rates, light = (
+            p[0],
+            p[1],
+            p[2] * 1e3,
+            start * np.exp(p[3 : 3 + len(start)]),
+            p[-len(exposures) :],
+        )
+        x = signals / range_dn
+        made_linear = signals * (1.0 + x * (c2 + x * c3))
+        expected = rates[:, None] * (exposures + t0) * (1.0 + light)
+        left = (made_linear - expected) / u_signals
+        return np.concatenate([left[known], light / scatter])
+
+    fit = least_squares(residuals, np.zeros(3 + len(start) + len(exposures)), method="trf", x_scale="jac")
+    degrees = max(1, len(fit.fun) - len(fit.x))
+    factor = max(1.0, 2.0 * fit.cost / degrees)  # Birge: never better than the data agree
+    covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * factor
+    coefficients, c_covariance = fit.x[:2], covariance[:2, :2]
+    x = np.linspace(0.05, 0.95, 91)
+    curve = x * coefficients[0] + x * x * coefficients[1]
+    deviation = _from_line(x, curve)
+    basis = np.stack([_from_line(x, x), _from_line(x, x * x)])
+    worst = int(np.argmax(np.abs(deviation)))
+    u_worst = float(np.sqrt(max(basis[:, worst] @ c_covariance @ basis[:, worst], 0.0)))
+    unlikely = float(chi2.sf(coefficients @ np.linalg.solve(c_covariance, coefficients), 2))
+    _refuse_other_scene(ordered, fit.fun[: known.sum()], known, signals, u_signals)
+    rates = start * np.exp(fit.x[3 : 3 + len(start)])
+    light = fit.x[-len(exposures) :]
+    deviations = signals / (rates[:, None] * (exposures + 1e3 * fit.x[2]) * (1.0 + light)) - 1.0
+    return Linearity(
+        coefficients if unlikely < significance else np.zeros(2),
+        c_covariance,
+        range_dn,
+        Estimate(float(1e3 * fit.x[2]), float(1e3 * np.sqrt(covariance[2, 2]))),
+        float(abs(deviation[worst])),
+        u_worst,
+        exposures,
+        deviations,
+        signals,
+        flicker,
+    )
+
+
+def _grouped(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
+    """[groups, exposures] mean signals of pixels of like brightness, and their standard uncertainties; NaN where
+    some pixel of the group is saturated."""
+    bright = max(pairs, key=lambda p: float(np.where(p.saturated.mean() < _CLIPPED_SHARE, p.first.mean(), -1.0)))
+    # Blocks of neighbours are sorted, not pixels: sorted by its noise a pixel would look brighter than it is.
+    blocks = np.arange(len(bright.first) // BLOCK * BLOCK).reshape(-1, BLOCK)
+    order = blocks[np.argsort((bright.first + bright.second)[blocks].mean(axis=1), kind="stable")]
+    signals, u = np.full((_GROUPS, len(pairs)), np.nan), np.ones((_GROUPS, len(pairs)))
+    for g, members in enumerate(map(np.ravel, np.array_split(order, _GROUPS))):
+        for i, pair in enumerate(pairs):
+            if pair.saturated[members].mean() > _CLIPPED_SHARE:
+                continue
+            mean = 0.5 * (pair.first[members] + pair.second[members])
+            noise = np.std(pair.first[members] - pair.second[members]) / 2.0
+            signals[g, i] = mean.mean()
+            u[g, i] = max(noise / np.sqrt(len(members)), 1e-3)
+    return signals, u
+
+
+def _flicker(pairs: Sequence[Pair]) -> float:
+    """Relative standard deviation of the light from frame to frame, from the two frames of each pair."""
+    found = []
+    for pair in pairs:
+        keep = ~pair.saturated
+        total = pair.first[keep].sum() + pair.second[keep].sum()
+        if total > 0:
+            found.append(2.0 * (pair.first[keep].sum() - pair.second[keep].sum()) / total)
+    return float(np.sqrt(np.mean(np.square(found)) / 2.0))
+
+
+def _refuse_contradictions(pairs: Sequence[Pair], signals: Floats, flicker: float) -> None:
+    if flicker > 0.01:
+        raise InputError(
+            f"response: the light flickers by {flicker:.1%} from frame to frame; at most 1 % can be told from a "
+            "bent response. Let it warm up, or take panels"
+        )
+    usable = np.isfinite(signals).sum(axis=0) >= _GROUPS // 3
+    exposures = np.array([pair.exposure_us for pair in pairs])
+    total = np.nanmean(np.where(np.isfinite(signals), signals, np.nan)[:, usable][: _GROUPS // 3], axis=0)
+    steps = np.diff(exposures[usable]) > 0
+    for place in np.flatnonzero(steps & (np.diff(total) <= 0)):
+        names = [pair.name for pair, use in zip(pairs, usable, strict=True) if use]
+        raise InputError(
+            f"response: {names[place + 1]} is exposed longer than {names[place]} and yet not brighter; was the "
+            "light off, or is the exposure time not what is written?"
+        )
+
+
+def _refuse_other_scene(
+    pairs: Sequence[Pair], left: Floats, known: NDArray[np.bool_], signals: Floats, u_signals: Floats
+) -> None:
+    """Raise InputError if one exposure's groups of pixels do not have the others' ratios."""
+    relative = np.full(known.shape, np.nan)
+    relative[known] = left * u_signals[known] / signals[known]
+    rms = np.sqrt(np.nanmean((relative - np.nanmean(relative, axis=0)) ** 2, axis=0))
+    noise = np.sqrt(np.nanmean((u_signals / signals) ** 2, axis=0))
+    worst = int(np.nanargmax(rms - _SCENE_SIGMA * noise))
+    if rms[worst] > _CHANGED + _SCENE_SIGMA * noise[worst]:
+        raise InputError(
+            f"response: the scene is another one in {pairs[worst].name}; nothing may move while it is photographed"
+        )
+
+
+def _from_line(x: Floats, relative: Floats) -> Floats:
+    """What is left of relative deviations after the best proportional line, in the middle of its extremes."""
+    left: Floats = relative - 0.5 * (relative.max() + relative.min())
+    return left

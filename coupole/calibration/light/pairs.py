@@ -1,0 +1,49 @@
+"""Pairs of frames of one scene, light and exposure: what the response of a sensor is told from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+
+BLOCK = 64
+"""Neighbouring pixels of the sample whose scene is a smooth curve."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two frames of one scene, light and exposure; [pixels] DN above the dark frame, of one channel."""
+
+    name: str
+    exposure_us: float
+    first: Floats
+    second: Floats
+    saturated: NDArray[np.bool_]
+    """[pixels] True where either frame reached the end of the scale."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure and its standard uncertainty."""
+
+    value: float
+    u: float
+
+
+def refuse_all_clipped(pairs: Sequence[Pair]) -> None:
+    clipped = [pair for pair in pairs if pair.saturated.mean() > 0.5]
+    if len(clipped) > len(pairs) - 4:
+        raise InputError(
+            f"response: more than half of the pixels are saturated in {named(clipped)}; expected four exposures "
+            "or more without. Add shorter ones"
+        )
+
+
+def named(pairs: Sequence[Pair]) -> str:
+    names = [pair.name for pair in pairs]
+    return ", ".join(names[:4]) + (" and others" if len(names) > 4 else "")

@@ -1,0 +1,194 @@
+"""Photon transfer: gain, read noise and full well of a sensor, with uncertainties (EMVA 1288, release 4.0, 6.5).
+
+The temporal variance of a pixel is read^2 + 1/12 + K * signal, with K in DN per electron; variance is half the
+mean square of the difference of two frames, in which fixed patterns cancel. Pixels of equal mean are looked at
+together, so the scene need not be even.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.light.pairs import BLOCK, Estimate, Pair, named, refuse_all_clipped
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+
+ROUNDING_VARIANCE = 1.0 / 12.0
+_LEVELS = 24
+_LEAST_PIXELS = 400
+"""Of one level: fewer say little of its variance."""
+_COLLAPSED = 0.7
+"""Variance over what the line says, below which a level counts as saturated."""
+_GROSS = 6.0
+
+
+@dataclass(frozen=True)
+class PhotonTransfer:
+    """Of one channel."""
+
+    gain_dn_per_e: Estimate
+    read_noise_dn: Estimate
+    """Of one frame, without rounding; row noise included."""
+    read_noise_e: Estimate
+    saturation_dn: float
+    """Signal above dark at which variance has its maximum (EMVA 1288, 6.6)."""
+    saturation_e: Estimate
+    saturated_seen: bool
+    """False if no frame came so far: then `saturation_dn` is only the highest level."""
+    prnu: Estimate | None
+    """Relative; None if the scene was not even enough."""
+    covariance: Floats
+    """[2, 2] of intercept (DN^2) and gain (DN)."""
+    chi2_per_degree: float
+    signal_dn: Floats
+    """[levels] and variance of each, with its standard uncertainty."""
+    variance_dn2: Floats
+    u_variance_dn2: Floats
+    used: NDArray[np.bool_]
+
+    @property
+    def electrons_per_dn(self) -> Estimate:
+        gain = self.gain_dn_per_e
+        return Estimate(1.0 / gain.value, gain.u / gain.value**2)
+
+
+def photon_transfer(pairs: Sequence[Pair]) -> PhotonTransfer:
+    """Gain, read noise and saturation of one channel, from pairs of frames at several levels.
+
+    Raises InputError: no pair, too few levels below saturation, variance that does not grow with the signal.
+    """
+    if not pairs:
+        raise InputError("response: expected two frames of each exposure; set `repeats: 2` in the plan")
+    refuse_all_clipped(pairs)
+    signal, squared = [], []
+    for pair in pairs:
+        keep = ~pair.saturated
+        if keep.sum() < _LEAST_PIXELS:
+            continue
+        mean = 0.5 * (pair.first[keep] + pair.second[keep])
+        difference = pair.first[keep] - pair.second[keep]
+        ratio = float(difference.sum() / max(mean.sum(), 1e-9))
+        difference = difference - ratio * mean  # flicker makes one frame of a pair brighter as a whole
+        signal.append(mean)
+        squared.append(difference**2 / 2.0)
+    if not signal:
+        raise InputError(f"response: {named(pairs)}: nearly all pixels are saturated; add shorter exposures")
+    levels, variances, counts = _levels(np.concatenate(signal), np.concatenate(squared))
+    used = np.ones(len(levels), np.bool_)
+    fit = _line(levels, variances, counts, used)
+    for _ in range(10):
+        predicted = fit.intercept + fit.slope * levels
+        # Near the end of the scale noise is cut off: levels above the first that falls short are left out.
+        short = (variances < _COLLAPSED * predicted) & (levels > np.median(levels))
+        beyond = levels >= levels[short].min() if short.any() else np.zeros(len(levels), np.bool_)
+        off = np.abs(variances - predicted) > _GROSS * predicted * np.sqrt(2.0 / counts)
+        # A level that is off by less than 3 % is no gross error: it counts in chi^2.
+        off &= np.abs(variances - predicted) > 0.03 * predicted
+        now = ~beyond & ~off
+        if now.sum() < 4 or (now == used).all():
+            break
+        used = now
+        fit = _line(levels, variances, counts, used)
+    if fit.slope <= 0.0 or fit.slope < 3.0 * np.sqrt(fit.covariance[1, 1]):
+        raise InputError(
+            "response: the variance of pixels does not grow with their signal; is the camera's picture processed, "
+            "or the light the same in all frames?"
+        )
+    read_var = fit.intercept - ROUNDING_VARIANCE
+    u_read_var = float(np.sqrt(fit.covariance[0, 0]))
+    read = float(np.sqrt(max(read_var, u_read_var**2 / max(read_var, u_read_var))))
+    gain = Estimate(fit.slope, float(np.sqrt(fit.covariance[1, 1])))
+    by_intercept, by_gain = 1.0 / (2 * read * fit.slope), -read / fit.slope**2
+    slopes = np.array([by_intercept, by_gain])
+    u_read_e = float(np.sqrt(slopes @ fit.covariance @ slopes))
+    peak = int(np.argmax(np.where(levels > 0, variances, 0.0)))
+    saturated_seen = any(pair.saturated.any() for pair in pairs)
+    saturation_dn = float(levels[peak])
+    saturation_e = saturation_dn / fit.slope
+    return PhotonTransfer(
+        gain,
+        Estimate(read, u_read_var / (2 * read)),
+        Estimate(read / fit.slope, u_read_e),
+        saturation_dn,
+        Estimate(saturation_e, saturation_e * gain.u / gain.value),
+        saturated_seen,
+        _prnu(pairs),
+        fit.covariance,
+        fit.chi2_per_degree,
+        levels,
+        variances,
+        variances * np.sqrt(2.0 / counts),
+        used,
+    )
+
+
+@dataclass(frozen=True)
+class _Line:
+    intercept: float
+    slope: float
+    covariance: Floats
+    chi2_per_degree: float
+
+
+def _levels(signal: Floats, squared: Floats) -> tuple[Floats, Floats, Floats]:
+    """Mean signal, mean squared difference over 2 and count, in levels of like signal."""
+    order = np.argsort(signal, kind="stable")
+    # Equal steps of signal, not of rank: a scene may have few bright pixels, and they say most of the gain.
+    edges = np.linspace(signal[order[len(order) // 500]], signal[order[-1 - len(order) // 2000]], _LEVELS + 1)
+    bins = np.clip(np.searchsorted(edges, signal, side="right") - 1, 0, _LEVELS - 1)
+    counts = np.bincount(bins, minlength=_LEVELS).astype(float)
+    keep = counts >= _LEAST_PIXELS
+    if keep.sum() < 4:
+        raise InputError(
+            f"response: expected four or more levels of signal, found {int(keep.sum())}; bracket the exposure"
+        )
+    mean = np.bincount(bins, signal, _LEVELS)[keep] / counts[keep]
+    variance = np.bincount(bins, squared, _LEVELS)[keep] / counts[keep]
+    return mean, variance, counts[keep]
+
+
+def _line(signal: Floats, variance: Floats, counts: Floats, used: NDArray[np.bool_]) -> _Line:
+    """Weighted line; weights from the line itself, as weights from single variances would pull it down."""
+    x, y, n = signal[used], variance[used], counts[used]
+    expected = np.maximum(y, 1e-6)
+    design = np.column_stack([np.ones_like(x), x])
+    found, covariance = np.zeros(2), np.eye(2)
+    for _ in range(6):
+        weight = n / (2.0 * expected**2)
+        covariance = np.asarray(np.linalg.inv(design.T @ (design * weight[:, None])), np.float64)
+        found = covariance @ (design.T @ (weight * y))
+        expected = np.maximum(design @ found, 0.05 * np.maximum(y, 1e-6))
+    left = (y - design @ found) ** 2 * n / (2.0 * expected**2)
+    per_degree = float(left.sum() / max(1, len(x) - 2))
+    return _Line(float(found[0]), float(found[1]), covariance * max(1.0, per_degree), per_degree)
+
+
+def _prnu(pairs: Sequence[Pair]) -> Estimate | None:
+    """Relative scatter of the pixels' responses (EMVA 1288, 6.8), from the brightest even pair without saturation.
+
+    In each block of neighbours a parabola stands for the scene; None where that is too poor for it.
+    """
+    clean = [pair for pair in pairs if not pair.saturated.any()]
+    if not clean:
+        return None
+    pair = max(clean, key=lambda p: float(p.first.mean()))
+    count = len(pair.first) // BLOCK * BLOCK
+    a, b = (values[:count].reshape(-1, BLOCK) for values in (pair.first, pair.second))
+    level = 0.5 * (a + b).mean(axis=1)
+    if (level <= 0).any():
+        return None
+    steps = np.linspace(-1.0, 1.0, BLOCK)
+    trend = np.linalg.qr(np.vander(steps, 3))[0]
+    a, b = (values - (values @ trend) @ trend.T for values in (a, b))
+    # The product of both frames' departures has no temporal noise in its mean.
+    relative = (a * b).sum(axis=1) / (BLOCK - 3) / level**2
+    if np.mean(np.abs(relative) > 25 * np.median(np.abs(relative))) > 0.05:
+        return None
+    variance, u = float(relative.mean()), float(relative.std() / np.sqrt(len(relative)))
+    if variance <= u:
+        return None
+    return Estimate(float(np.sqrt(variance)), u / (2 * float(np.sqrt(variance))))

@@ -1,0 +1,202 @@
+"""Views of the tile as observations of the LEDs' power: one row for each LED in each view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.light.irradiance import LED_SIDE_MM, Emission, irradiance_per_flux
+from coupole.calibration.light.spectralon import Tile
+from coupole.calibration.rotations import Floats
+
+_DEAD_SIGMA = 5.0
+_DEAD_SHARE = 0.01
+"""Of the median LED's power."""
+_SHADED = 0.03
+"""Relative departure of a part of the tile that noise does not explain."""
+_SHADED_SIGMA = 6.0
+_LOWEST_COSINE = 0.05
+"""Of incidence on the tile: LEDs nearer to its horizon (3 degrees) tell nothing but its tilt."""
+_STEP = 1e-4
+
+
+@dataclass(frozen=True)
+class TileView:
+    """The tile in one view, under many LEDs."""
+
+    name: str
+    place: int
+    """Views with the tile in the same place share its tilt."""
+    base_from_tile: Floats
+    """[4, 4] mm, as described."""
+    points_mm: Floats
+    """[m, 3] middles of the tile's patches, in the base frame."""
+    camera_mm: Floats
+    """[3] projection centre."""
+    leds: NDArray[np.int64]
+    """[n] ids."""
+    signal: Floats
+    """[n, m] DN/s over the flat field, of one channel; NaN where nothing was seen."""
+    u_signal: Floats
+    """[n, m] of each, from noise."""
+    saturated: NDArray[np.bool_]
+    """[n] True where pixels of the tile were saturated."""
+
+
+@dataclass(frozen=True)
+class Positions:
+    """LEDs' places and normals in the base frame, by id."""
+
+    ids: NDArray[np.int64]
+    centres_mm: Floats
+    normals: Floats
+
+    def of(self, ids: NDArray[np.int64]) -> tuple[Floats, Floats]:
+        row = {int(led): i for i, led in enumerate(self.ids)}
+        rows = [row[int(led)] for led in ids]
+        return self.centres_mm[rows], self.normals[rows]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One LED in one view."""
+
+    view: int
+    led: int
+    value: float
+    """S / h, before the logarithm: the power, if the tile lies as described."""
+    u: float
+    """Of the value, from noise."""
+    design: Floats
+    """Relative change of h by the figures that LEDs share: tilts of all places, ln reflectance, Minnaert's k."""
+
+
+def transfer(
+    view: TileView,
+    centres_mm: Floats,
+    normals: Floats,
+    tile: Tile,
+    *,
+    tilt_deg: Floats | None = None,
+    minnaert: float | None = None,
+    emission: Emission = "lambertian",
+    side_mm: float = LED_SIDE_MM,
+) -> tuple[Floats, Floats]:
+    """h [n, m] = f E/Phi of each patch under each LED, and the cosine of incidence [n, m]."""
+    x, y = np.radians(np.zeros(2) if tilt_deg is None else tilt_deg)
+    normal = view.base_from_tile[:3, :3] @ np.array([np.sin(y), -np.sin(x) * np.cos(y), np.cos(x) * np.cos(y)])
+    points = view.points_mm[None]
+    towards = centres_mm[:, None] - points
+    cos_in = (towards @ normal) / np.linalg.norm(towards, axis=-1)
+    away = view.camera_mm - view.points_mm
+    cos_out = (away @ normal) / np.linalg.norm(away, axis=-1)
+    lit = irradiance_per_flux(
+        points, normal, centres_mm[:, None], normals[:, None], side_mm=side_mm, emission=emission
+    )
+    h: Floats = tile.brdf(np.maximum(cos_in, 1e-6), cos_out[None], minnaert=minnaert) * lit
+    return h, cos_in
+
+
+def rows_of(
+    number: int,
+    view: TileView,
+    positions: Positions,
+    tile: Tile,
+    emission: Emission,
+    *,
+    side_mm: float = LED_SIDE_MM,
+    place: int = 0,
+    figures: int = 4,
+    remarks: list[str],
+) -> tuple[list[Row], set[int]]:
+    """Observations of view `number`, and LEDs that are lit there though their picture cannot be used.
+
+    `figures` are shared by all LEDs: two tilts for each place of the tile, of which the view's is number `place`,
+    ln reflectance, Minnaert's k. What cannot be used is added to `remarks`.
+    """
+    centres, normals = positions.of(view.leds)
+
+    def log_h(tilt_deg: Floats, minnaert: float) -> Floats:
+        h, _ = transfer(
+            view, centres, normals, tile,
+            tilt_deg=tilt_deg, minnaert=minnaert, emission=emission, side_mm=side_mm,
+        )  # fmt: skip
+        mean: Floats = np.log(np.maximum(h.mean(axis=1), 1e-300))
+        return mean
+
+    h, cos_in = transfer(view, centres, normals, tile, emission=emission, side_mm=side_mm)
+    slopes = np.zeros((len(view.leds), figures))
+    none, k = np.zeros(2), tile.minnaert
+    for axis in range(2):
+        step = _STEP * np.eye(2)[axis]
+        slopes[:, 2 * place + axis] = (log_h(step, k) - log_h(-step, k)) / (2 * _STEP)
+    slopes[:, -2] = 1.0
+    slopes[:, -1] = (log_h(none, k + _STEP) - log_h(none, k - _STEP)) / (2 * _STEP)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio, u_ratio = view.signal / h, view.u_signal / h
+    usable = (cos_in.min(axis=1) > _LOWEST_COSINE) & (h > 0).all(axis=1) & np.isfinite(view.signal).all(axis=1)
+    rows: list[Row] = []
+    shaded: list[int] = []
+    for n in np.flatnonzero(usable & ~view.saturated):
+        middle = float(np.median(ratio[n]))
+        # A shadow's edge across a part makes that part's own noise great: what the parts have in common counts.
+        limit = _SHADED * abs(middle) + _SHADED_SIGMA * float(np.median(u_ratio[n]))
+        if (np.abs(ratio[n] - middle) > limit).any():
+            shaded.append(int(view.leds[n]))
+            continue
+        total = float(h[n].sum())
+        u = float(np.sqrt(np.sum(view.u_signal[n] ** 2)) / total)
+        rows.append(Row(number, int(view.leds[n]), float(view.signal[n].sum() / total), u, slopes[n]))
+    if shaded:
+        remarks.append(f"view {view.name}: the tile is partly in shadow under {list_of(shaded)}; not used")
+    if (full := view.leds[view.saturated & usable]).size:
+        remarks.append(f"view {view.name}: the tile is saturated under {list_of(full)}; not used, expose less")
+    return rows, {*shaded, *map(int, full)}
+
+
+def arrays_of(
+    rows: Sequence[Row], ids: NDArray[np.int64], flash_noise: float
+) -> tuple[Floats, Floats, NDArray[np.intp], NDArray[np.intp], Floats]:
+    """Logarithms, weights, number of the LED, number of the view, derivatives."""
+    value = np.array([row.value for row in rows])
+    u = np.array([row.u for row in rows])
+    positive = np.maximum(value, 1e-300)
+    weight = 1.0 / ((u / positive) ** 2 + flash_noise**2)
+    led = np.searchsorted(ids, [row.led for row in rows])
+    return (
+        np.log(positive), weight, led, np.array([row.view for row in rows]), np.stack([row.design for row in rows])
+    )  # fmt: skip
+
+
+def without_dark(
+    rows: Sequence[Row],
+    views: Sequence[TileView],
+    ids: NDArray[np.int64],
+    lit_elsewhere: set[int],
+    remarks: list[str],
+) -> tuple[list[Row], NDArray[np.bool_]]:
+    """Rows in which the tile is lit, and which LEDs [n] are dead: dark in every view, so far as can be seen."""
+    bright = float(np.median([row.value for row in rows]))
+
+    def lit(row: Row) -> bool:
+        return row.value > max(_DEAD_SIGMA * row.u, _DEAD_SHARE * bright)
+
+    alive = {row.led for row in rows if lit(row)} | lit_elsewhere
+    seen = {row.led for row in rows}
+    dead = np.array([int(led) in seen - alive for led in ids])
+    if dead.any():
+        remarks.append(f"dead LEDs, or hidden in every view: {list_of(ids[dead])}")
+    for v, view in enumerate(views):
+        shadowed = [row.led for row in rows if row.view == v and row.led in alive and not lit(row)]
+        if shadowed:
+            remarks.append(f"view {view.name}: the tile is wholly in shadow under {list_of(shadowed)}; not used")
+    return [row for row in rows if lit(row)], dead
+
+
+def list_of(ids: Sequence[int] | NDArray[np.int64]) -> str:
+    """The first of them by number, for people."""
+    named = ", ".join(f"{int(led)}" for led in list(ids)[:8])
+    return f"LED {named}" + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")

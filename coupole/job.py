@@ -71,8 +71,8 @@ class Job:
     object_points_support_mm: NDArray[np.float64]
     """[n, 3] corners and centre of the object's bounding box, or the views' targets: where dose is reckoned."""
     schedule: Schedule
-    calibrations: tuple[InForce, ...] = ()
-    """The records that the plan names."""
+    calibrations: tuple[InForce, ...] | None = None
+    """The records that the plan names, or else its rig; None if they want none."""
     hidden_leds: Mapping[str, Sequence[int]] = field(default_factory=dict)
     """LEDs that were left out of views, by name of view."""
     pace: Pace = FASTEST
@@ -135,7 +135,7 @@ class Job:
     @property
     def inputs(self) -> Inputs:
         others = [self.cell.leds_path] + ([self.mesh_path] if self.mesh_path else [])
-        others += [item.path for item in self.calibrations]
+        others += [item.path for item in self.calibrations or ()]
         return Inputs(self.document.path, self.cell.document.path, tuple(others))
 
 
@@ -188,12 +188,8 @@ def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
     corners, mesh_problem = _object_corners(plan, mesh_path)
     if mesh_problem:
         problems.append(document.problem(("object", "mesh"), mesh_problem))
-    if isinstance(plan.calibrations, tuple):
-        problems += [
-            document.problem(("calibrations", i), f"expected a calibration record; there is no {path}")
-            for i, path in enumerate(plan.calibrations)
-            if not document.resolve(path).is_file()
-        ]
+    records, missing = _named_records(document, plan, cell)
+    problems += missing
     problems += _bad_exposures(document, plan, cell.rig)
     if problems:
         raise InputError(problems)
@@ -205,17 +201,32 @@ def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
         corners,
         _dose_points(plan, corners),
         schedule_of(plan, cell),
-        calibrations=_calibrations(document, plan),
+        calibrations=_in_force(records),
     )
 
 
-def _calibrations(document: Document, plan: Plan) -> tuple[InForce, ...]:
-    """The records that a plan names. Raises InputError."""
-    if plan.calibrations == "none":
-        return ()
+def _named_records(document: Document, plan: Plan, cell: Cell) -> tuple[list[Path] | None, list[Problem]]:
+    """Files of the records that the plan names, or else its rig, None if it wants none; and which are missing."""
+    named = plan.calibrations
+    if named is None:
+        document, named = cell.document, cell.rig.calibrations
+    if named == "none":
+        return None, []
+    paths = [document.resolve(path) for path in named]
+    return paths, [
+        document.problem(("calibrations", i), f"expected a calibration record; there is no {path}")
+        for i, path in enumerate(paths)
+        if not path.is_file()
+    ]
+
+
+def _in_force(paths: list[Path] | None) -> tuple[InForce, ...] | None:
+    """Raises InputError with the problems of all records."""
+    if paths is None:
+        return None
     from coupole.calibration.in_force import read_in_force
 
-    return read_in_force([document.resolve(path) for path in plan.calibrations])
+    return read_in_force(paths)
 
 
 def schedule_of(plan: Plan, cell: Cell, pace: Pace = FASTEST) -> Schedule:
@@ -336,9 +347,9 @@ def check_job(
 
 
 def calibration_refusals(job: Job, *, camera: str | None = None, temperature_c: float | None = None) -> list[str]:
-    """Why the records that the plan names do not hold here. Which camera there is and how warm the cell is, only
-    its devices know (`Situation`)."""
-    if job.plan.calibrations == "none":
+    """Why the records that plan or rig names do not hold here. Which camera there is and how warm the cell is,
+    only its devices know (`Situation`)."""
+    if job.calibrations is None:
         return []
     from coupole.calibration.in_force import Situation, refusals
 

@@ -188,7 +188,8 @@ class Plan(Model):
     rig: Path
     object: MeasuredObject | None = None
     optics: Optics = Optics()
-    calibrations: Literal["none"] | tuple[Path, ...] = "none"
+    calibrations: Literal["none"] | tuple[Path, ...] | None = None
+    """Records that must be in force; None: those that the rig names."""
     views: Annotated[tuple[View, ...], Field(min_length=1)]
     order: Literal["fastest", "as_written"] = "fastest"
     """In which order the views are visited: on the shortest way, or as they stand here."""

@@ -190,6 +190,8 @@ class Rig(Model):
     led_limits: LedLimits = LedLimits()
     motion: Motion = Motion()
     storage: Storage
+    calibrations: Literal["none"] | tuple[Path, ...] = "none"
+    """Records that must be in force for plans that do not say otherwise."""
     world: WorldSection | None = None
 
     @property

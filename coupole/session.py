@@ -145,7 +145,7 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
     return {
         "simulated": cell.simulated,
         "object": job.plan.object.id if job.plan.object else None,
-        "calibrations": {item.record.kind: item.record.sha256 for item in job.calibrations} or "none",
+        "calibrations": {item.record.kind: item.record.sha256 for item in job.calibrations or ()} or "none",
         "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
         "scaling": cell.world_endpoints["camera"]["scaling"] if cell.world_endpoints else None,
         "views": [view.name for view in job.schedule.views],

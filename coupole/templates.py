@@ -34,7 +34,7 @@ object:
   # mesh: ../objects/object.ply       # PLY, STL or OBJ
   # mesh_unit: mm                     # mm, m or um
   dose_budget_lux_h: 50
-calibrations: none
+# calibrations: none                  # or records that must be in force, in place of those that the rig names
 views:
   - {{kind: look_at, name: top, target_mm: [0, 0, 30], distance_mm: 335, azimuth_deg: -90, elevation_deg: 80}}
   - {{kind: grid, name: ring, target_mm: [0, 0, 30], distance_mm: 335, azimuths_deg: [0, 120, 240],
@@ -49,6 +49,7 @@ reshoot_limit: 3
 schema_version: 1
 name: {name}
 rig: {rig}
+calibrations: none
 views:
   - {{kind: look_at, name: dark, target_mm: [0, 0, 30], distance_mm: 335, azimuth_deg: -90, elevation_deg: 80}}
 lights: {{kind: none}}
@@ -60,6 +61,7 @@ darks_per_view: 20
 schema_version: 1
 name: {{name}}
 rig: {{rig}}
+calibrations: none
 views:
 {_board_views()}
 lights: {{{{kind: panels, panels: [1]}}}}
@@ -71,6 +73,7 @@ darks_per_view: 0
 schema_version: 1
 name: {name}
 rig: {rig}
+calibrations: none
 views:
   - {{kind: look_at, name: still, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: -90, elevation_deg: 80}}
 lights: {{kind: panels, panels: [1]}}
@@ -84,6 +87,7 @@ darks_per_view: 8
 schema_version: 1
 name: {name}
 rig: {rig}
+calibrations: none
 views:
   - {{kind: look_at, name: f1, target_mm: [0, 650, 450], distance_mm: 335, azimuth_deg: -90, elevation_deg: 0}}
   - {{kind: look_at, name: f2, target_mm: [60, 650, 450], distance_mm: 335, azimuth_deg: -90, elevation_deg: 0,
@@ -109,6 +113,7 @@ darks_per_view: 8
 schema_version: 1
 name: {name}
 rig: {rig}
+calibrations: none
 views:
   - {{kind: grid, name: low, target_mm: [0, 0, 15], distance_mm: 335,
      azimuths_deg: [-180, -135, -90, -45, 0, 45, 90, 135], elevations_deg: [48]}}
@@ -125,6 +130,7 @@ darks_per_view: 2
 schema_version: 1
 name: {name}
 rig: {rig}
+calibrations: none
 views:
   - {{kind: look_at, name: even-low, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: 45, elevation_deg: 45,
      lights: {{kind: every, every: 2}}}}

@@ -169,8 +169,10 @@ def _text(path: Path) -> str:
 
 def _compose(path: Path, text: str) -> Node | None:
     """The graph of YAML nodes, None when the file has no content."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.composer.warn_double_anchors = False  # YAML 1.2 (3.2.2.2) lets a later anchor take an earlier one's place
     try:
-        root: Node | None = YAML(typ="safe", pure=True).compose(text)
+        root: Node | None = yaml.compose(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place: Place = (mark.line + 1, mark.column + 1) if mark else (0, 0)

@@ -124,7 +124,9 @@ def _with_plan(given: tuple[InForce, ...], plan: Path | None) -> tuple[InForce, 
     if plan is None:
         return given
     kinds = {item.record.kind for item in given}
-    return given + tuple(item for item in of_use(read_job(plan).calibrations) if item.record.kind not in kinds)
+    return given + tuple(
+        item for item in of_use(read_job(plan).calibrations or ()) if item.record.kind not in kinds
+    )
 
 
 def _folder(records: tuple[InForce, ...]) -> str:

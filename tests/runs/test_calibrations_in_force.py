@@ -123,3 +123,24 @@ def test_the_temperature_of_the_room_stands_in_the_journal(calibrated: CellFolde
     assert calibrated.acquire().code == 0
     start = cells.events(calibrated.run_folder, "start")[0]
     assert 10.0 < start["room_c"] < 40.0
+
+
+def test_the_records_that_a_rig_names_are_in_force_for_plans_that_name_none(calibrated: CellFolder) -> None:
+    calibrated.rig_data["calibrations"] = calibrated.plan_data.pop("calibrations")
+    calibrated.write()
+    assert calibrated.acquire().code == 0
+    assert set(cells.about(calibrated.run_folder)["calibrations"]) == {"camera", "hand-eye"}
+    write_record(calibrated.folder / "hand-eye.yaml", record("hand-eye", days=-1.0))
+    assert "hand-eye.yaml: expired on" in refused(calibrated)
+    calibrated.write(calibrations="none")
+    assert cells.here("check", calibrated.plan, "--no-paths", "--json").code == 0
+
+
+def test_a_record_that_a_rig_names_and_is_not_there_is_shown_by_its_line(calibrated: CellFolder) -> None:
+    calibrated.plan_data.pop("calibrations")
+    calibrated.rig_data["calibrations"] = ["camera.yaml", "gone.yaml"]
+    calibrated.write()
+    ended = cells.here("check", calibrated.plan)
+    assert ended.code == 2
+    assert "rig.yaml" in ended.err
+    assert "gone.yaml" in ended.err

@@ -76,6 +76,10 @@ def test_anchors_aliases_and_merges_are_followed(tmp_path: Path) -> None:
     assert document(tmp_path, text).data["again"] == {"x": 1, "y": 2}
 
 
+def test_a_later_anchor_takes_the_place_of_one_of_the_same_name(tmp_path: Path) -> None:
+    assert document(tmp_path, "first: &a 1\nsecond: &a 2\nthird: *a\n").data["third"] == 2
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [

@@ -39,6 +39,7 @@ _HEAD = """\
 schema_version: 1
 name: {name}
 rig: {rig}
+calibrations: none
 views:
 """
 _TAIL = """\

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -68,3 +69,13 @@ def calibrate_all(
     else:
         for kind, record in campaign.found().items():
             console.print(f"[green]{kind}[/]: {record}")
+        console.print(
+            f"To put them in force for all plans of {rig}, write there:\n{_for_a_rig(rig, campaign.found())}"
+        )
+
+
+def _for_a_rig(rig: Path, records: dict[str, str]) -> str:
+    """The lines that name records of the cell, not of an object, in its rig."""
+    folder = rig.resolve().parent
+    paths = [os.path.relpath(path, folder) for kind, path in records.items() if kind != MESH]
+    return "\n".join(["calibrations:", *(f"  - {path}" for path in paths)])

@@ -95,7 +95,7 @@ def _figure(scene: Scene) -> Any:
             "title": {"text": titles[0], "font": {"size": 15}},
             "margin": {"l": 0, "r": 0, "t": 70, "b": 0},
             "showlegend": False,
-            "sliders": [{"steps": steps, "currentvalue": {"prefix": "view: "}, "pad": {"t": 10}}],
+            "sliders": [{"steps": steps, "currentvalue": {"prefix": "view: "}, "pad": {"t": 10, "b": 30}}],
             "scene": {
                 "aspectmode": "data",
                 "camera": {"eye": {"x": 0.7, "y": -1.2, "z": 0.5}, "center": {"x": 0, "y": 0, "z": -0.15}},

@@ -24,19 +24,27 @@ prepare() {
     ((status == 0)) || fail "the set-up failed; see the messages above"
 }
 
-# libaravis and its command line, for the tests of the GigE Vision camera: installed by root where there is
-# apt-get, tried once. Where it is missing, the wheel `aravis-python` may serve; without either they are skipped.
+# What some tests want of the system, installed by root where there is apt-get, tried once; without it they are
+# skipped. libaravis and its command line for the GigE Vision camera (the wheel `aravis-python` may serve in its
+# place), Chromium for the pages that operators look at.
 prepare_tests() {
-    local tried="$root/.tools/tried-libaravis"
-    if has_aravis || [[ -e $tried || $EUID -ne 0 ]] || ! command -v apt-get >/dev/null; then
+    prepare_packages aravis libaravis-0.8-0 aravis-tools-cli aravis-tools
+    prepare_packages chromium chromium chromium-driver
+}
+
+# prepare_packages NAME PACKAGE...: installs the packages unless `has_NAME`.
+prepare_packages() {
+    local name=$1 tried="$root/.tools/tried-$1"
+    shift
+    if "has_$name" || [[ -e $tried || $EUID -ne 0 ]] || ! command -v apt-get >/dev/null; then
         return 0
     fi
-    say "installing libaravis with apt-get, for the tests (once; needs the network)"
+    say "installing $name with apt-get, for the tests (once; needs the network)"
     (
         if command -v flock >/dev/null; then flock 9; fi
-        has_aravis || install_aravis || : >"$tried"
+        "has_$name" || install_packages "$@" || : >"$tried"
     ) 9>"$root/.tools/lock" >&2 </dev/null
-    has_aravis || say "apt-get could not install libaravis; remove $tried to try again"
+    "has_$name" || say "apt-get could not install $name; remove $tried to try again"
 }
 
 # ---- helpers ----
@@ -53,11 +61,14 @@ has_aravis() {
         [[ "$(ldconfig -p 2>/dev/null)" == *libaravis-0.8.so.0* ]]
 }
 
-install_aravis() {
-    local packages=(libaravis-0.8-0 aravis-tools-cli aravis-tools) options=(-y -qq --no-install-recommends)
+has_chromium() {
+    command -v chromium >/dev/null && command -v chromedriver >/dev/null
+}
+
+install_packages() {
+    local options=(-y -qq --no-install-recommends)
     export DEBIAN_FRONTEND=noninteractive
-    apt-get install "${options[@]}" "${packages[@]}" ||
-        { apt-get update -qq && apt-get install "${options[@]}" "${packages[@]}"; }
+    apt-get install "${options[@]}" "$@" || { apt-get update -qq && apt-get install "${options[@]}" "$@"; }
 }
 
 # What the environment was made from; virtual environments hold absolute paths, hence the folder.

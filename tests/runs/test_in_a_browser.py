@@ -1,0 +1,147 @@
+"""The pages that operators look at, in a real browser without a screen: Chromium, where it is installed."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cells
+import pytest
+from cells import CellFolder
+from selenium import webdriver
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.remote.webelement import WebElement
+from test_live import live
+
+CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+QUIET = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--window-size=1280,1000",
+)
+"""No screen, and no word to anybody but the page's own server."""
+
+pytestmark = pytest.mark.skipif(
+    not (CHROMIUM and DRIVER), reason="Chromium and its driver are not installed (see tools/bootstrap.sh)"
+)
+
+
+class Browser:
+    """One window."""
+
+    def __init__(self) -> None:
+        options = webdriver.ChromeOptions()
+        for option in QUIET:
+            options.add_argument(option)
+        options.binary_location = CHROMIUM or ""
+        options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+        self.driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
+        self.driver.set_page_load_timeout(cells.PATIENCE_S)
+
+    def open(self, url: str) -> None:
+        self.driver.get_log("browser")
+        self.driver.get(url)
+
+    def at(self, selector: str) -> WebElement:
+        found: WebElement = cells.wait_until(
+            lambda: next(iter(self.driver.find_elements(By.CSS_SELECTOR, selector)), None), selector
+        )
+        return found
+
+    def text(self, selector: str) -> str:
+        return str(self.at(selector).text)
+
+    def run(self, script: str) -> Any:
+        return self.driver.execute_script(f"return {script}")
+
+    def troubles(self) -> list[str]:
+        """What the page wrote to the console as an error: failed scripts and missing pictures."""
+        return [line["message"] for line in self.driver.get_log("browser") if line["level"] == "SEVERE"]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    opened = Browser()
+    yield opened
+    opened.driver.quit()
+
+
+@pytest.fixture(scope="module")
+def shown_cell(tmp_path_factory: pytest.TempPathFactory) -> CellFolder:
+    return CellFolder(tmp_path_factory.mktemp("shown"))
+
+
+def test_a_plan_is_drawn_and_its_slider_goes_from_view_to_view(browser: Browser, shown_cell: CellFolder) -> None:
+    ended = cells.here("view", shown_cell.plan, "--out", shown_cell.folder, "--json")
+    assert ended.code == 0, ended.err
+    browser.open(f"file://{ended.document['html']}")
+    browser.at(".gl-container canvas")
+    assert browser.text(".gtitle") == "all views"
+    rail = browser.at(".slider-rail-touch-rect")
+    end = rail.size["width"] // 2 - 8
+    ActionChains(browser.driver).move_to_element_with_offset(rail, end, 0).click().perform()
+    cells.wait_until(lambda: browser.text(".gtitle") != "all views", "the last view's title")
+    labels = browser.driver.find_elements(By.CSS_SELECTOR, ".slider-label")
+    figure = browser.at(".plotly-graph-div").rect
+    lowest = max(label.rect["y"] + label.rect["height"] for label in labels)
+    assert lowest <= figure["y"] + figure["height"], "labels are cut off"
+    assert browser.troubles() == []
+
+
+def test_the_operator_chooses_light_and_exposure(browser: Browser, shown_cell: CellFolder) -> None:
+    with live(shown_cell.plan, "--fps", "20") as (viewer, _):
+        browser.open(viewer.url)
+        led = browser.at("#led")
+        cells.wait_until(led.is_displayed, "the form")
+        led.send_keys("500", Keys.ENTER)
+        cells.wait_until(lambda: "500" in browser.text("#title"), "a frame under LED 500")
+        assert "8000 us" in browser.text("#table")
+        cells.wait_until(lambda: browser.run("document.getElementById('picture').naturalWidth") > 0, "a picture")
+        inked = (
+            "Array.from(document.getElementById('histogram').getContext('2d')"
+            ".getImageData(0, 0, 384, 160).data).some(value => value > 0)"
+        )
+        assert browser.run(inked)
+        led.clear()
+        led.send_keys("501")
+        exposure = browser.at("#exposure")
+        exposure.clear()
+        exposure.send_keys("99999990", Keys.ENTER)
+        cells.wait_until(lambda: "exposure" in browser.text("#error"), "why it is refused")
+        browser.at("#none").click()
+        exposure.clear()
+        exposure.send_keys("4000", Keys.ENTER)
+        cells.wait_until(lambda: "4000 us" in browser.text("#table"), "the shorter exposure")
+        assert browser.text("#error") == ""
+        refused = [line for line in browser.troubles() if "choose" not in line]
+        assert refused == []
+
+
+def test_the_page_says_when_the_live_view_has_ended(browser: Browser, shown_cell: CellFolder) -> None:
+    with live(shown_cell.plan, "--fps", "5") as (viewer, process):
+        browser.open(viewer.url)
+        cells.wait_until(lambda: browser.text("#title") != "waiting for a frame", "a frame")
+        process.send_signal(signal.SIGINT)
+        cells.wait_until(lambda: "ended" in browser.text("#error"), "word that it has ended")
+
+
+def test_all_pictures_of_a_run_s_report_are_there(browser: Browser, tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path)
+    assert cell.acquire().code == 0
+    browser.open(f"file://{cell.run_folder / 'report.html'}")
+    pictures = browser.driver.find_elements(By.TAG_NAME, "img")
+    assert pictures
+    assert all(int(picture.get_property("naturalWidth")) > 0 for picture in pictures)
+    assert browser.troubles() == []

@@ -114,6 +114,10 @@ def test_the_operator_chooses_light_and_exposure(browser: Browser, shown_cell: C
             ".getImageData(0, 0, 384, 160).data).some(value => value > 0)"
         )
         assert browser.run(inked)
+        picture, controls = browser.at("#picture").rect, browser.at("aside").rect
+        assert picture["x"] + picture["width"] <= controls["x"], "the controls stand beside the picture"
+        assert controls["y"] + controls["height"] <= browser.run("window.innerHeight"), "all can be seen at once"
+        assert browser.run("document.documentElement.scrollWidth <= window.innerWidth"), "nothing sticks out"
         led.clear()
         led.send_keys("501")
         exposure = browser.at("#exposure")

@@ -144,7 +144,7 @@ def _of_hand_eye(cell: RandomCell, record: Record) -> Iterator[Judged]:
     in_support = transform(place["translation_mm"], place["abc_deg"]) @ transform(corner_mm, (0.0, 0.0, 180.0))
     true = {
         "flange_from_camera": cell.flange_from_camera,
-        "base_from_board": cell.own_base(cell.base_from_support @ in_support),
+        "base_from_board": cell.shifted_base(cell.base_from_support @ in_support),  # A1's zero is in its interval
     }
     by_name = {parameter.name: parameter for parameter in record.parameters}
     for name, pose in record.transforms.items():

@@ -194,13 +194,16 @@ class RandomCell:
         }
         return config
 
+    def shifted_base(self, in_base: Floats) -> Floats:
+        """Poses [..., 4, 4] of the base in one that is shifted by what the arm is off in all poses alike, which no
+        image tells, and no record claims."""
+        return inverse(transform(tuple(self.arm_errors.base_error_mm()), (0.0, 0.0, 0.0))) @ in_base
+
     def own_base(self, in_base: Floats) -> Floats:
-        """Poses [..., 4, 4] of the base in the base that the arm itself has: what it is off by the same in all
-        poses (a shift, and a turn by its first axis) no image tells."""
-        shift = transform(tuple(self.arm_errors.base_error_mm()), (0.0, 0.0, 0.0))
+        """The same in the base that the arm itself has: turned by its first axis' zero besides."""
         zero_deg = float(self.arm_errors.axis_zero_error_deg()[0])
         first = flange_pose((zero_deg, 0, 0, 0, 0, 0)) @ inverse(flange_pose((0, 0, 0, 0, 0, 0)))
-        return inverse(shift @ first) @ in_base
+        return inverse(first) @ self.shifted_base(in_base)
 
     @property
     def base_from_support(self) -> Floats:

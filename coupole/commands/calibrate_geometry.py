@@ -11,8 +11,7 @@ import typer
 
 from coupole.calibration.leds.limits import LEDS
 from coupole.calibration.stickers.limits import MESH
-from coupole.commands.calibrating import DaysOption, NameOption, OutOption, bar, calibrate, limit_option
-from coupole.commands.common import JsonOption
+from coupole.commands.calibrating import Work, bar, calibration
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,6 +32,7 @@ RepeatabilityMm = Annotated[float, typer.Option("--repeatability-mm", min=1e-4, 
 RepeatabilityDeg = Annotated[float, typer.Option("--repeatability-deg", min=1e-5, help=_OF_THE_ROBOT)]
 
 
+@calibration("leds", limits=LEDS, lens=False)
 def leds(
     runs: Runs,
     hand_eye: HandEyeOption,
@@ -43,12 +43,7 @@ def leds(
     repeatability_mm: RepeatabilityMm = 0.03,
     repeatability_deg: RepeatabilityDeg = 0.003,
     tolerance_mm: Annotated[float, typer.Option(min=1e-4, help="Of LEDs on their boards, as stated.")] = 0.05,
-    out: OutOption = Path("calibrations"),
-    name: NameOption = None,
-    valid_days: DaysOption = 180,
-    limit: Annotated[list[str] | None, limit_option(LEDS)] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Work:
     """Where all LEDs are and face, from views of the lit LEDs themselves, each seen six times or more."""
     from coupole.calibration.leds.drawing import draw_leds
     from coupole.calibration.leds.equations import Stated
@@ -74,19 +69,10 @@ def leds(
             found = leds_from(images, table, prior, wish, stated=stated, arm=_arm(cell, hand_eye))
         return Outcome(found.record, partial(draw_leds, found), found.files)
 
-    calibrate(
-        "leds",
-        work,
-        out=out,
-        name=name,
-        lens=None,
-        valid_days=valid_days,
-        as_json=as_json,
-        limit=limit,
-        limits=LEDS,
-    )
+    return work
 
 
+@calibration("mesh", limits=MESH, lens=False)
 def mesh(
     runs: Runs,
     scan: Annotated[Path, typer.Option("--scan", help="Folder that `coupole scan` wrote, with targets.")],
@@ -103,12 +89,7 @@ def mesh(
     scanner_mm: Annotated[float, typer.Option(min=1e-4, help="Accuracy of the scanner, as stated.")] = 0.03,
     repeatability_mm: RepeatabilityMm = 0.03,
     repeatability_deg: RepeatabilityDeg = 0.003,
-    out: OutOption = Path("calibrations"),
-    name: NameOption = None,
-    valid_days: DaysOption = 180,
-    limit: Annotated[list[str] | None, limit_option(MESH)] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Work:
     """Where a scanned object lies in the base, by its stickers in six views or more."""
     from coupole.calibration.calibrated_arm import has_axis_zeros
     from coupole.calibration.posed_camera import read_posed_camera
@@ -152,17 +133,7 @@ def mesh(
         )
         return Outcome(found.record, partial(draw_mesh, found))
 
-    calibrate(
-        "mesh",
-        work,
-        out=out,
-        name=name,
-        lens=None,
-        valid_days=valid_days,
-        as_json=as_json,
-        limit=limit,
-        limits=MESH,
-    )
+    return work
 
 
 def _arm(cell: Cell, hand_eye: Path) -> CalibratedArm | None:

@@ -9,17 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coupole.calibration.lens.limits import CAMERA, CHROMATIC, HAND_EYE
-from coupole.commands.calibrating import (
-    DaysOption,
-    LensOption,
-    NameOption,
-    OutOption,
-    Paths,
-    bar,
-    calibrate,
-    limit_option,
-)
-from coupole.commands.common import JsonOption
+from coupole.commands.calibrating import Paths, Work, bar, calibration
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
@@ -43,17 +33,12 @@ PosesOption = Annotated[
 ModelOption = Annotated[str, typer.Option("--model", help="pinhole, radial (k1), brown4 or brown5 (with k3).")]
 
 
+@calibration("camera", limits=CAMERA)
 def camera(
     paths: Paths,
     board: BoardOption = None,
     model: ModelOption = "brown5",
-    limit: Annotated[list[str] | None, limit_option(CAMERA)] = None,
-    out: OutOption = Path("calibrations"),
-    name: NameOption = None,
-    lens: LensOption = None,
-    valid_days: DaysOption = 180,
-    as_json: JsonOption = False,
-) -> None:
+) -> Work:
     """Lens and distortion from 8 to 60 images of a board, tilted to all sides, corners over the whole field."""
     from coupole.calibration.lens.workflow import camera_from
 
@@ -62,30 +47,15 @@ def camera(
         sources, _, found = _look(paths, board, None, console)
         return _drawn(camera_from(found, sources, model, wish)[1])
 
-    calibrate(
-        "camera",
-        work,
-        out=out,
-        name=name,
-        lens=lens,
-        valid_days=valid_days,
-        as_json=as_json,
-        limit=limit,
-        limits=CAMERA,
-    )
+    return work
 
 
+@calibration("chromatic", limits=CHROMATIC)
 def chromatic(
     paths: Paths,
     board: BoardOption = None,
     model: ModelOption = "brown5",
-    limit: Annotated[list[str] | None, limit_option(CHROMATIC)] = None,
-    out: OutOption = Path("calibrations"),
-    name: NameOption = None,
-    lens: LensOption = None,
-    valid_days: DaysOption = 180,
-    as_json: JsonOption = False,
-) -> None:
+) -> Work:
     """How far red and blue are seen beside green, from the images that give the lens."""
     from coupole.calibration.lens.chromatic_workflow import chromatic_from, draw_chromatic
     from coupole.calibration.report import Outcome
@@ -97,19 +67,10 @@ def chromatic(
             found = chromatic_from(shown, sources, described, model, wish)
         return Outcome(found.record, partial(draw_chromatic, found))
 
-    calibrate(
-        "chromatic",
-        work,
-        out=out,
-        name=name,
-        lens=lens,
-        valid_days=valid_days,
-        as_json=as_json,
-        limit=limit,
-        limits=CHROMATIC,
-    )
+    return work
 
 
+@calibration("hand-eye", limits=HAND_EYE)
 def hand_eye(
     paths: Paths,
     board: BoardOption = None,
@@ -126,13 +87,7 @@ def hand_eye(
     absolute_mm: Annotated[float, typer.Option(min=0.0, help="The robot's absolute error, as stated.")] = 0.3,
     absolute_deg: Annotated[float, typer.Option(min=1e-5, help="Of orientation, or of each axis' zero.")] = 0.02,
     model: ModelOption = "brown5",
-    limit: Annotated[list[str] | None, limit_option(HAND_EYE)] = None,
-    out: OutOption = Path("calibrations"),
-    name: NameOption = None,
-    lens: LensOption = None,
-    valid_days: DaysOption = 180,
-    as_json: JsonOption = False,
-) -> None:
+) -> Work:
     """Where the camera sits on the flange, from 10 to 60 images of a board that stands still."""
     from coupole.calibration.lens.bundle import RobotNoise
     from coupole.calibration.lens.workflow import hand_eye_from
@@ -148,17 +103,7 @@ def hand_eye(
             shown = hand_eye_from(found, sources, described, model, wish, robot=robot, arm=arm, lens=earlier)[2]
         return _drawn(shown)
 
-    calibrate(
-        "hand-eye",
-        work,
-        out=out,
-        name=name,
-        lens=lens,
-        valid_days=valid_days,
-        as_json=as_json,
-        limit=limit,
-        limits=HAND_EYE,
-    )
+    return work
 
 
 def _drawn(shown: Shown) -> Outcome:

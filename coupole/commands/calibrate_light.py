@@ -8,18 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coupole.calibration.light.limits import DARK, DRIFT, LED_POWER, RESPONSE
-from coupole.commands.calibrating import (
-    DaysOption,
-    EmissionOption,
-    LensOption,
-    NameOption,
-    OutOption,
-    bar,
-    calibrate,
-    emission_of,
-    limit_option,
-)
-from coupole.commands.common import JsonOption
+from coupole.commands.calibrating import EmissionOption, Work, bar, calibration, emission_of
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
@@ -51,15 +40,10 @@ LedsOption = Annotated[
 ]
 
 
+@calibration("dark", limits=DARK, valid_days=90)
 def dark(
     runs: Runs,
-    out: OutOption = Path("calibrations"),
-    name: NameOption = None,
-    lens: LensOption = None,
-    valid_days: DaysOption = 90,
-    limit: Annotated[list[str] | None, limit_option(DARK)] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Work:
     """Offset, dark current and hot pixels from dark frames of two or more exposures."""
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.records import dark_outcome
@@ -68,29 +52,14 @@ def dark(
         with bar(console, "dark frames") as progress:
             return dark_outcome(open_light_frames(runs), wish, progress)
 
-    calibrate(
-        "dark",
-        work,
-        out=out,
-        name=name,
-        lens=lens,
-        valid_days=valid_days,
-        as_json=as_json,
-        limit=limit,
-        limits=DARK,
-    )
+    return work
 
 
+@calibration("response", limits=RESPONSE, valid_days=365)
 def response(
     runs: Runs,
     dark_record: DarkOption = None,
-    out: OutOption = Path("calibrations"),
-    name: NameOption = None,
-    lens: LensOption = None,
-    valid_days: DaysOption = 365,
-    limit: Annotated[list[str] | None, limit_option(RESPONSE)] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Work:
     """Gain, read noise, full well and linearity from a bracket of a scene that stands still, each frame twice."""
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.records import response_outcome
@@ -99,19 +68,10 @@ def response(
         with bar(console, "exposures") as progress:
             return response_outcome(open_light_frames(runs), wish, dark_record, progress)
 
-    calibrate(
-        "response",
-        work,
-        out=out,
-        name=name,
-        lens=lens,
-        valid_days=valid_days,
-        as_json=as_json,
-        limit=limit,
-        limits=RESPONSE,
-    )
+    return work
 
 
+@calibration("flat-field")
 def flat_field(
     runs: Runs,
     panel_mm: Annotated[
@@ -119,12 +79,7 @@ def flat_field(
     ] = 600.0,
     dark_record: DarkOption = None,
     response_record: ResponseOption = None,
-    out: OutOption = Path("calibrations"),
-    name: NameOption = None,
-    lens: LensOption = None,
-    valid_days: DaysOption = 180,
-    as_json: JsonOption = False,
-) -> None:
+) -> Work:
     """Fall-off of the lens, per channel, from views of a luminous panel, shifted and turned."""
     from coupole.calibration.light.flat_field_records import flat_field_outcome
     from coupole.calibration.light.frames import open_light_frames
@@ -134,9 +89,10 @@ def flat_field(
         with bar(console, "views of the panel") as progress:
             return flat_field_outcome(frames, wish, dark_record, response_record, panel_mm, progress)
 
-    calibrate("flat-field", work, out=out, name=name, lens=lens, valid_days=valid_days, as_json=as_json)
+    return work
 
 
+@calibration("led-power", limits=LED_POWER, valid_days=90)
 def led_power(
     runs: Runs,
     tile: TileOption,
@@ -148,13 +104,7 @@ def led_power(
     response_record: ResponseOption = None,
     flat: FlatOption = None,
     emission: EmissionOption = "lambertian",
-    out: OutOption = Path("calibrations"),
-    name: NameOption = None,
-    lens: LensOption = None,
-    valid_days: DaysOption = 90,
-    limit: Annotated[list[str] | None, limit_option(LED_POWER)] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Work:
     """Power of each LED from views of a white tile whose place is known."""
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.led_power_records import led_power_outcome
@@ -165,19 +115,10 @@ def led_power(
         with bar(console, "frames of the tile") as progress:
             return led_power_outcome(frames, setting, wish, progress)
 
-    calibrate(
-        "led-power",
-        work,
-        out=out,
-        name=name,
-        lens=lens,
-        valid_days=valid_days,
-        as_json=as_json,
-        limit=limit,
-        limits=LED_POWER,
-    )
+    return work
 
 
+@calibration("drift", limits=DRIFT, valid_days=3650)
 def drift(
     runs: Runs,
     led_power_record: Annotated[
@@ -192,13 +133,7 @@ def drift(
     response_record: ResponseOption = None,
     flat: FlatOption = None,
     emission: EmissionOption = "lambertian",
-    out: OutOption = Path("calibrations"),
-    name: NameOption = None,
-    lens: LensOption = None,
-    valid_days: DaysOption = 3650,
-    limit: Annotated[list[str] | None, limit_option(DRIFT)] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Work:
     """How LED power drifted from its calibration to a run, by temperature and age, on a tile seen in some views.
 
     Give the same records, and the same tile, as `led-power` had.
@@ -212,17 +147,7 @@ def drift(
         with bar(console, "frames with the tile") as progress:
             return drift_outcome(frames, setting, led_power_record, wish, progress)
 
-    calibrate(
-        "drift",
-        work,
-        out=out,
-        name=name,
-        lens=lens,
-        valid_days=valid_days,
-        as_json=as_json,
-        limit=limit,
-        limits=DRIFT,
-    )
+    return work
 
 
 # -- helpers --------------------------------------------------------------------------------------------------

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from coupole.calibration.limits import Allowed, asked, words_of
-from coupole.commands.common import fail
+from coupole.commands.common import JsonOption, fail
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -22,6 +24,11 @@ if TYPE_CHECKING:
     from coupole.calibration.record import Record
     from coupole.calibration.report import Outcome
     from coupole.calibration.wish import Wish
+
+    Work = Callable[[Console, Wish], Outcome]
+    """Of a calibration, once its options are known."""
+else:
+    Work = Callable
 
 Paths = Annotated[
     list[Path],
@@ -34,12 +41,6 @@ EmissionOption = Annotated[str, typer.Option("--emission", help="lambertian, or 
 DaysOption = Annotated[int, typer.Option("--valid-days", min=1, max=3650, help="When the record expires.")]
 
 
-def limit_option(limits: Sequence[Allowed]) -> Any:
-    """`--limit`, with a calibration's limits in its help."""
-    words = f"Set an acceptance limit; again for more. Usual are {words_of(limits)}."
-    return typer.Option("--limit", metavar="NAME=VALUE", help=words)
-
-
 def emission_of(name: str) -> Emission:
     """The profile of that name. Raises InputError if there is none."""
     if name == "lambertian":
@@ -49,17 +50,59 @@ def emission_of(name: str) -> Emission:
     raise InputError(f"--emission: expected lambertian or paper, found {name}")
 
 
-def calibrate(
+def calibration(
+    kind: str, *, limits: Sequence[Allowed] = (), valid_days: int = 180, lens: bool = True
+) -> Callable[[Callable[..., Work]], Callable[..., None]]:
+    """Make a command of a function that takes its own options and returns the work to be done with them.
+
+    All commands have `--out`, `--name`, `--valid-days` and `--json` besides; `--limit` where the calibration has
+    `limits`, and `--lens` where records are of one lens.
+    """
+    words = f"Set an acceptance limit; again for more. Usual are {words_of(limits)}."
+    common: list[tuple[str, Any, Any]] = [
+        ("out", OutOption, Path("calibrations")),
+        ("name", NameOption, None),
+        *([("lens", LensOption, None)] if lens else []),
+        ("valid_days", DaysOption, valid_days),
+        *([("limit", _limit_option(words), None)] if limits else []),
+        ("as_json", JsonOption, False),
+    ]
+
+    def command(work_with: Callable[..., Work]) -> Callable[..., None]:
+        @wraps(work_with)
+        def run(*arguments: Any, **options: Any) -> None:
+            shared = {name: options.pop(name, default) for name, _, default in common}
+            _calibrate(kind, work_with(*arguments, **options), limits=limits, **shared)
+
+        own = inspect.signature(work_with, eval_str=True)
+        added = [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind_of)
+            for name, kind_of, default in common
+        ]
+        run.__signature__ = own.replace(  # type: ignore[attr-defined]
+            parameters=[*own.parameters.values(), *added], return_annotation=None
+        )
+        run.__annotations__ = {one.name: one.annotation for one in (*own.parameters.values(), *added)}
+        return run
+
+    return command
+
+
+def _limit_option(words: str) -> Any:
+    return Annotated[list[str] | None, typer.Option("--limit", metavar="NAME=VALUE", help=words)]
+
+
+def _calibrate(
     kind: str,
-    work: Callable[[Console, Wish], Outcome],
+    work: Work,
     *,
     out: Path,
     name: str | None,
-    lens: str | None,
     valid_days: int,
     as_json: bool,
+    lens: str | None = None,
     limit: Sequence[str] | None = None,
-    limits: Sequence[Allowed] = (),
+    limits: Sequence[Allowed],
 ) -> None:
     """Do the work, write record, files and report, say what was found, refuse what misses its limits.
 

@@ -1,4 +1,4 @@
-"""What really happened in a burst, drawn at random: for the tests of matching.
+"""Takes of bursts, drawn at random: for the tests of matching.
 
 A *take* is what really happened in one burst: the real table of a schedule, run by a box with its own clock,
 seen by a camera with another clock, with frames lost and frames added. `match` is told the log, the ids and the

@@ -6,6 +6,10 @@ Each cell (`random_cells`) has a lens, a hand-eye, an arm, a dome and an object 
 parameter: how many of the stated 95 % intervals hold the truth, and the root mean square of error over standard
 uncertainty, about 1. Then how far camera, LEDs and mesh are from the truth, in the cells' median and 95th percent.
 What `--keep` names gets a line for each cell; called again, only missing cells are done.
+
+The exit code is 1 if a cell could not be calibrated, or a parameter's intervals are not what they should be: 90 to
+99 % hold the truth, and rms(error/u) lies between 0.8 and 1.25, but for what chance does to so many cells once in
+1000.
 """
 
 from __future__ import annotations
@@ -20,16 +24,22 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from scipy.stats import binom, chi2
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from cell_proof import Judged, Proof, prove_cell
 from coupole.errors import CoupoleError
 from random_cells import postures
+
+SETTINGS = ("width", "images", "samples", "led_boards", "absolute")
+"""Options that make cells what they are."""
+_CHANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -45,6 +55,19 @@ class Verdict:
     """Of its size, in the name's unit."""
     median_u: float
 
+    @property
+    def faults(self) -> list[str]:
+        """How the intervals are not what they should be. Values of one cell are alike: cells count, not values."""
+        found = []
+        if binom.cdf(round(self.covered * self.cells), self.cells, 0.90) < _CHANCE:
+            found.append(f"{self.name}: {self.covered:.1%} of the intervals hold the truth")
+        if binom.sf(round(self.covered * self.cells) - 1, self.cells, 0.99) < _CHANCE:
+            found.append(f"{self.name}: {self.covered:.1%} of the intervals hold the truth: they are too wide")
+        low, high = chi2.ppf((_CHANCE / 2, 1 - _CHANCE / 2), self.cells) / self.cells
+        if not 0.8**2 * low < self.rms_over_u**2 < 1.25**2 * high:
+            found.append(f"{self.name}: rms(error/u) is {self.rms_over_u:.2f}")
+        return found
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -59,7 +82,8 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="file of cells that are done, one line of JSON each")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    done, refused = kept(arguments.keep), list[str]()
+    settings = {name: getattr(arguments, name) for name in SETTINGS}
+    done, failed = kept(arguments.keep, settings), list[str]()
     wanted = range(arguments.first_seed, arguments.first_seed + arguments.cells)
     seeds = [seed for seed in wanted if seed not in done]
     if seeds:
@@ -78,14 +102,15 @@ def main() -> None:
                 try:
                     done[seed] = future.result()
                 except CoupoleError as error:
-                    refused.append(f"cell {seed}: {error}")
+                    failed.append(f"cell {seed}: {error}")
                 else:
-                    keep(arguments.keep, seed, done[seed])
+                    keep(arguments.keep, settings, seed, done[seed])
                 spent_s = time.monotonic() - started_s
                 print(f"\r{len(done)} of {len(wanted)} cells, {spent_s:.0f} s", end="", file=sys.stderr)
         print(file=sys.stderr)
     proofs = [done[seed] for seed in wanted if seed in done]
     for verdict in verdicts(proofs):
+        failed += verdict.faults
         if arguments.json:
             print(json.dumps(asdict(verdict)))
         else:
@@ -98,22 +123,24 @@ def main() -> None:
             print(json.dumps({"name": name, "median": median, "percent_95": most}))
         else:
             print(f"{name:32} median {median:.4f}, 95 % of cells below {most:.4f}")
-    if refused:
-        sys.exit("\n".join(["not calibrated:", *refused]))
+    if failed:
+        sys.exit("\n".join(failed))
 
 
-def kept(path: Path | None) -> dict[int, Proof]:
-    """Cells of an earlier call, by seed."""
+def kept(path: Path | None, settings: dict[str, Any]) -> dict[int, Proof]:
+    """Cells of an earlier call with the same settings, by seed."""
     if path is None or not path.exists():
         return {}
     cells = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    if others := [cell["settings"] for cell in cells if cell["settings"] != settings]:
+        sys.exit(f"{path}: its cells were made with {others[0]}, now it is {settings}; name another file")
     return {cell["seed"]: Proof([Judged(**one) for one in cell["judged"]], cell["accuracy"]) for cell in cells}
 
 
-def keep(path: Path | None, seed: int, proof: Proof) -> None:
+def keep(path: Path | None, settings: dict[str, Any], seed: int, proof: Proof) -> None:
     if path is not None:
         with path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"seed": seed, **asdict(proof)}) + "\n")
+            file.write(json.dumps({"seed": seed, "settings": settings, **asdict(proof)}) + "\n")
 
 
 def accuracies(proofs: Sequence[Proof]) -> dict[str, tuple[float, float]]:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from coupole.calibration.earlier import read_earlier
 from coupole.calibration.optics import Intrinsics
-from coupole.calibration.record import Record, intrinsics_of, read_record, step_names
+from coupole.calibration.record import Record, intrinsics_of, step_names
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import About
 from coupole.errors import InputError
@@ -17,7 +18,6 @@ from coupole.geometry import transform
 HAND_EYE = "flange_from_camera"
 MOST_APART = 5.0
 """Two records of one lens differ by no more of their joint standard uncertainty."""
-_SAME_FIGURE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -54,60 +54,12 @@ def read_posed_camera(hand_eye: Path, camera: Path | None, about: About, size_px
     `camera` may name that camera's record too, as a check. `about` and `size_px` say what took the images at hand.
     Raises InputError: a record of another kind, camera, focus, aperture or size; two records of different lenses.
     """
-    record = _of_kind(hand_eye, "hand-eye")
-    refuse_other_camera(hand_eye, record, about, size_px)
+    record = read_earlier(hand_eye, "hand-eye", about, size_px)
     prior = _prior(record)
     if camera is not None:
-        alone = _of_kind(camera, "camera")
-        refuse_other_camera(camera, alone, about, size_px)
+        alone = read_earlier(camera, "camera", about, size_px)
         _refuse_other_lens(hand_eye, prior, camera, alone)
     return prior
-
-
-def refuse_other_camera(path: Path, record: Record, about: About, size_px: tuple[int, int]) -> None:
-    """Raise InputError unless a record holds for these images: their time, camera, lens, focus, size, warmth."""
-    holds = record.validity
-    if about.begun is not None and about.begun >= holds.expires:
-        raise InputError(
-            f"{path}: expired on {holds.expires:%Y-%m-%d %H:%M} UTC, before these images were taken "
-            f"({about.begun:%Y-%m-%d %H:%M}). Calibrate camera and hand-eye anew"
-        )
-    if holds.focus_distance_mm is not None and about.focus_distance_mm is not None:
-        off_mm = abs(holds.focus_distance_mm - about.focus_distance_mm)
-        if off_mm > holds.focus_tolerance_mm:
-            raise InputError(
-                f"{path}: holds for a focus of {holds.focus_distance_mm:g} mm, within "
-                f"{holds.focus_tolerance_mm:g} mm; the images were taken at {about.focus_distance_mm:g} mm. "
-                "Name the record of this focus"
-            )
-    for what, valid, found in (
-        ("focal length", holds.focal_length_mm, about.focal_length_mm),
-        ("f-number", holds.f_number, about.f_number),
-    ):
-        if valid is not None and found is not None and abs(valid - found) > _SAME_FIGURE * valid:
-            raise InputError(f"{path}: holds for {what} {valid:g}; the images were taken with {found:g}")
-    if holds.size_px is not None and holds.size_px != size_px:
-        raise InputError(
-            f"{path}: holds for frames of {holds.size_px[0]} x {holds.size_px[1]} pixels; these have "
-            f"{size_px[0]} x {size_px[1]}"
-        )
-    if holds.temperature_c is not None and about.temperature_c is not None:
-        low, high = holds.temperature_c
-        room = about.temperature_c[0]  # of all LED boards the coolest, which is nearest to the room and the camera
-        if not low <= room <= high:
-            raise InputError(
-                f"{path}: holds from {low:g} to {high:g} C; the coolest LED board of these images had {room:g} C. "
-                "Let room, camera and boards come back to that temperature, or calibrate at this one"
-            )
-    if holds.camera is not None and about.camera is not None and holds.camera != about.camera:
-        raise InputError(f"{path}: holds for the camera {holds.camera}; the images are of {about.camera}")
-
-
-def _of_kind(path: Path, kind: str) -> Record:
-    record = read_record(path)
-    if record.kind != kind:
-        raise InputError(f"{path}: expected a record of the kind `{kind}`, found one of `{record.kind}`")
-    return record
 
 
 def _prior(record: Record) -> CameraPrior:

@@ -13,7 +13,7 @@ import typer
 
 from coupole.commands.calibrating import EmissionOption, emission_of
 from coupole.commands.common import JsonOption, fail
-from coupole.errors import CoupoleError, StorageError
+from coupole.errors import CoupoleError, InputError, StorageError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -74,6 +74,8 @@ def budget(
     console = make_console(quiet=as_json)
     start = Known(vertex_mm=vertex_um / 1e3, edge_mm=edge_um / 1e3, pixels=pixels, contrast_per_mm=contrast)
     try:
+        if out is not None:
+            _refuse_target(out)
         ours = _with_plan(read_records(records or []), plan)
         known = known_from(ours, start)
         with console.status("propagating distributions"):
@@ -141,6 +143,15 @@ def _spread(known: Known) -> Spread:
     steps = [(number + 0.5) / _SAMPLES for number in range(_SAMPLES)]
     cosines = [1.0 - step * (1.0 - math.cos(math.radians(70.0))) for step in steps]
     return spread_over(known, [Geometry(math.degrees(math.acos(cosine))) for cosine in cosines])
+
+
+def _refuse_target(out: Path) -> None:
+    """Raise InputError where a picture's name is none, or something stands there."""
+    if out.suffix != ".png":
+        raise InputError(f"--out {out}: expected the name of a picture, as budget.png")
+    for path in (out, out.with_suffix(".html"), out.with_suffix(".json")):
+        if path.exists():
+            raise InputError(f"{path}: stands here already; choose another --out")
 
 
 def _write(files: Mapping[Path, bytes]) -> None:

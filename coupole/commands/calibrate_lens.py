@@ -77,7 +77,9 @@ def hand_eye(
     poses: PosesOption = None,
     camera_record: Annotated[
         Path | None,
-        typer.Option("--camera", help="A camera's record, which counts as an observation of the lens."),
+        typer.Option(
+            "--camera", help="A camera's record from other images, which counts as an observation of the lens."
+        ),
     ] = None,
     rig: Annotated[
         Path | None, typer.Option("--rig", help="The rig, whose arm's axes may have zero errors (for runs).")
@@ -145,16 +147,14 @@ def _look(
 def _earlier_lens(path: Path | None, sources: Sources, found: Found) -> EarlierLens | None:
     """The lens of a camera's record, with its covariance. Raises InputError for a record that does not hold for
     these images."""
+    from coupole.calibration.earlier import read_earlier, refuse_same_images
     from coupole.calibration.lens.bundle import EarlierLens
-    from coupole.calibration.posed_camera import refuse_other_camera
-    from coupole.calibration.record import intrinsics_of, read_record
+    from coupole.calibration.record import intrinsics_of
 
     if path is None:
         return None
-    record = read_record(path)
-    if record.kind != "camera":
-        raise InputError(f"{path}: expected a camera's record, found one of the kind `{record.kind}`")
-    refuse_other_camera(path, record, sources.about, found.size_px)
+    record = read_earlier(path, "camera", sources.about, found.size_px)
+    refuse_same_images(path, record, sources.inputs)
     intrinsics, free = intrinsics_of(record)
     return EarlierLens(intrinsics, free, record.covariance_matrix)
 

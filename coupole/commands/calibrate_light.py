@@ -9,7 +9,6 @@ import typer
 
 from coupole.calibration.light.limits import DARK, DRIFT, LED_POWER, RESPONSE
 from coupole.commands.calibrating import EmissionOption, Work, bar, calibration, emission_of
-from coupole.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -159,8 +158,7 @@ def _posed(frames: LightFrames, hand_eye: Path | None) -> LightFrames:
 
     if hand_eye is None:
         return frames
-    height_px, width_px = frames.frames[0].read().shape
-    prior = read_posed_camera(hand_eye, None, frames.about, (width_px, height_px))
+    prior = read_posed_camera(hand_eye, None, frames.about, frames.size_px)
     return frames.seen_through(prior.flange_from_camera)
 
 
@@ -188,7 +186,7 @@ def _setting(
         read_tile(tile),
         cell.rig.support.base_from_support.matrix(),
         by_table if leds is None else calibrated_positions(leds),
-        _lens(camera, frames.focal_px, frames.frames[0].read().shape),
+        _lens(camera, frames),
         dark_record,
         response_record,
         flat,
@@ -197,13 +195,12 @@ def _setting(
     )
 
 
-def _lens(record_path: Path | None, focal_px: float, shape: tuple[int, ...]) -> Intrinsics:
+def _lens(record_path: Path | None, frames: LightFrames) -> Intrinsics:
+    from coupole.calibration.earlier import read_earlier
     from coupole.calibration.optics import Intrinsics
-    from coupole.calibration.record import intrinsics_of, read_record
+    from coupole.calibration.record import intrinsics_of
 
     if record_path is None:
-        return Intrinsics(focal_px, focal_px, (shape[1] - 1) / 2.0, (shape[0] - 1) / 2.0)
-    record = read_record(record_path)
-    if record.kind != "camera":
-        raise InputError(f"{record_path}: expected a camera's record, found one of the kind `{record.kind}`")
-    return intrinsics_of(record)[0]
+        width_px, height_px = frames.size_px
+        return Intrinsics(frames.focal_px, frames.focal_px, (width_px - 1) / 2.0, (height_px - 1) / 2.0)
+    return intrinsics_of(read_earlier(record_path, "camera", frames.about, frames.size_px))[0]

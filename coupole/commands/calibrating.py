@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 else:
     Work = Callable
 
+_SUFFIXES = (".yaml", ".html", ".png", ".csv", ".h5")
+"""Of a record and what stands beside it."""
 Paths = Annotated[
     list[Path],
     typer.Argument(help="Runs, or one folder of pictures.", show_default=False, metavar="RUN_OR_FOLDER..."),
@@ -115,10 +117,12 @@ def _calibrate(
     console = make_console(quiet=as_json)
     now = datetime.now(UTC)
     try:
+        _refuse_name(name)
         wish = Wish(name or f"{kind}-{now:%Y%m%d}", now, valid_days, lens, limits=asked(limit or (), limits))
         record_path = out / f"{wish.name}.yaml"
-        if record_path.exists():
-            raise InputError(f"{record_path}: a record stands here already. Choose another --name or --out.")
+        for path in (out / f"{wish.name}{suffix}" for suffix in _SUFFIXES):
+            if path.exists():
+                raise InputError(f"{path}: stands here already. Choose another --name or --out.")
         outcome = work(console, wish)
         page, picture = write_outcome(record_path, outcome)
     except CoupoleError as error:
@@ -143,6 +147,20 @@ def _calibrate(
                 if not limit.passed
             ]
         )
+
+
+def _refuse_name(name: str | None) -> None:
+    """Raise InputError for a name that no record may have."""
+    from pydantic import TypeAdapter, ValidationError
+
+    from coupole.plan import Name
+
+    try:
+        TypeAdapter(Name | None).validate_python(name)
+    except ValidationError as error:
+        raise InputError(
+            f"--name {name}: expected letters, digits, dots, dashes and underscores, as in camera-335mm"
+        ) from error
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from coupole.commands import calibrate_geometry, calibrate_lens, calibrate_light
-from coupole.errors import Interrupted
+from coupole.errors import CalibrationRefused, Interrupted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -111,6 +111,7 @@ class Campaign:
 
     def do(self, step: Step) -> None:
         """Acquire what is missing of a step, and calibrate what has no record yet."""
+        self._refuse_missed(step)
         todo = [kind for kind in step.records if not self._record(kind).is_file()]
         if not todo:
             self._console.print(f"{step.name}: its records stand already")
@@ -120,15 +121,34 @@ class Campaign:
             self._console.rule(f"calibrate {kind}")
             self._calibrations()[kind](run)
 
+    def _refuse_missed(self, step: Step) -> None:
+        """Raise CalibrationRefused if a record of an earlier call missed its limits: nothing is built on it."""
+        from coupole.calibration.record import read_record
+
+        for kind in step.records:
+            path = self._record(kind)
+            missed = [limit for limit in read_record(path).limits if not limit.passed] if path.is_file() else []
+            if missed:
+                raise CalibrationRefused(
+                    [
+                        *(f"{path}: not accepted: {one.what} is {one.found:.3g} {one.unit}" for one in missed),
+                        f"Read {path.with_suffix('.html')}; mend the cause, or calibrate by hand with --limit; "
+                        f"take {path.stem}.* away, and call this again",
+                    ]
+                )
+
     def _acquire(self, step: Step) -> Path:
         """The step's run, complete."""
         from coupole.job import read_job
-        from coupole.run import Run, status
+        from coupole.run import Run, sha256, status
         from coupole.session import acquire_plan
 
         plan = self._plan(step)
         begun = sorted((self._out / "runs").glob(f"*-{step.name}"))
         resumed = begun[-1] if begun and (begun[-1] / "run.json").is_file() else None
+        if resumed is not None and Run(resumed).about["plan"]["sha256"] != sha256(plan):
+            self._console.print(f"{plan} was changed since {resumed.name}: acquired anew")
+            resumed = None
         if resumed is not None and not status(Run(resumed)).missing:
             return resumed
         self._console.rule(f"acquire {step.name}")
@@ -218,7 +238,13 @@ class Campaign:
             ),
             "camera": lambda run: calibrate_lens.camera([run], board=board, name="camera", out=out),
             "hand-eye": lambda run: calibrate_lens.hand_eye(
-                [run], board=board, camera_record=camera, rig=self._rig, name="hand-eye", out=out
+                [run],
+                board=board,
+                rig=self._rig,
+                repeatability_mm=self._stated.mm,
+                repeatability_deg=self._stated.deg,
+                name="hand-eye",
+                out=out,
             ),
             "leds": lambda run: calibrate_geometry.leds(
                 [run],

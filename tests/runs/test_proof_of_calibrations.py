@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import cells
+import numpy as np
 import pytest
 
 COMMAND = (sys.executable, str(cells.REPO / "tools/prove_calibrations.py"), "--json")
@@ -57,13 +58,37 @@ def test_camera_leds_and_mesh_are_near_the_truth(proof: list[dict[str, Any]]) ->
     assert far["mesh_mm"] < 0.12
 
 
+def judge(folder: Path, errors: list[float], *options: str) -> subprocess.CompletedProcess[str]:
+    """The tool on cells that were done before: one parameter with u 0.1."""
+    settings = {"width": 1024, "images": 20, "samples": 8, "led_boards": None, "absolute": False}
+    kept = folder / "cells.jsonl"
+    with kept.open("w") as file:
+        for seed, error in enumerate(errors, start=1):
+            judged = [{"name": "camera.fx_px", "error": error, "u": 0.1, "half_width": 0.196}]
+            cell = {"seed": seed, "settings": settings, "judged": judged, "accuracy": {"camera_mm": 0.03}}
+            file.write(json.dumps(cell) + "\n")
+    command = [*COMMAND, "--cells", str(len(errors)), "--keep", str(kept), *options]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
 def test_cells_that_were_kept_are_not_done_again(tmp_path: Path) -> None:
-    judged = [{"name": "camera.fx_px", "error": 0.1, "u": 0.1, "half_width": 0.2}]
-    kept = tmp_path / "cells.jsonl"
-    kept.write_text(json.dumps({"seed": 1, "judged": judged, "accuracy": {"camera_mm": 0.03}}) + "\n")
-    ended = subprocess.run(
-        [*COMMAND, "--cells", "1", "--keep", str(kept)], capture_output=True, text=True, check=True
-    )
+    ended = judge(tmp_path, [0.1])
+    assert ended.returncode == 0
     first, second = map(json.loads, ended.stdout.splitlines())
     assert (first["name"], first["covered"], first["rms_over_u"]) == ("camera.fx_px", 1.0, 1.0)
     assert second == {"name": "camera_mm", "median": 0.03, "percent_95": 0.03}
+
+
+def test_intervals_that_are_not_true_are_a_failure(tmp_path: Path) -> None:
+    normal = np.random.default_rng(1).normal(0.0, 0.1, 100)
+    assert judge(tmp_path, normal.tolist()).returncode == 0
+    for factor, why in ((2.5, "of the intervals hold the truth"), (0.5, "rms(error/u) is 0.4")):
+        ended = judge(tmp_path, (factor * normal).tolist())
+        assert ended.returncode == 1
+        assert why in ended.stderr
+
+
+def test_cells_of_other_settings_are_not_taken_for_these(tmp_path: Path) -> None:
+    ended = judge(tmp_path, [0.1], "--absolute")
+    assert ended.returncode == 1
+    assert "name another file" in ended.stderr

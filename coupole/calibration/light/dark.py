@@ -79,7 +79,7 @@ class Dark:
     def _seconds(self, exposure_s: float, temperature_c: float | None) -> float:
         if self.reference_c is None or temperature_c is None:
             return exposure_s
-        return exposure_s * _warmth(temperature_c, self.reference_c, self.doubling_k)
+        return exposure_s * warmth_of(temperature_c, self.reference_c, self.doubling_k)
 
 
 def calibrate_dark(
@@ -104,7 +104,7 @@ def calibrate_dark(
     known = [f.temperature_c for f in listed if np.isfinite(f.temperature_c)]
     reference_c = float(np.mean(known)) if len(known) == len(listed) else None
     seconds = np.array(
-        [f.exposure_s * _warmth(f.temperature_c, reference_c, doubling_k) for f in listed], dtype=np.float64
+        [f.exposure_s * warmth_of(f.temperature_c, reference_c, doubling_k) for f in listed], dtype=np.float64
     )
     sums = _Sums()
     pairs: list[tuple[float, float, float]] = []
@@ -244,5 +244,6 @@ def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float,
     return slope, float(np.median(y - slope * x))
 
 
-def _warmth(temperature_c: float, reference_c: float | None, doubling_k: float) -> float:
+def warmth_of(temperature_c: float, reference_c: float | None, doubling_k: float) -> float:
+    """Dark current at a temperature over that at the reference; 1 where that is not known."""
     return 1.0 if reference_c is None else float(2.0 ** ((temperature_c - reference_c) / doubling_k))

@@ -11,15 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
+from coupole.calibration.earlier import read_accepted
 from coupole.calibration.light.drift import NAMES, Drift, Reading, fit_drift
 from coupole.calibration.light.drift_drawing import draw_drift
 from coupole.calibration.light.frames import LightFrame, LightFrames
+from coupole.calibration.light.led_power import prior_of
 from coupole.calibration.light.led_power_tile import Setting, TileReader
 from coupole.calibration.light.limits import DRIFT
 from coupole.calibration.light.records import Progress, counter, record_input, sealed_outcome
-from coupole.calibration.light.tile_views import rows_of
+from coupole.calibration.light.tile_views import OF_PLACE, rows_of
 from coupole.calibration.limits import judged
-from coupole.calibration.record import Parameter, read_record
+from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome
 from coupole.calibration.rotations import Floats
 from coupole.calibration.wish import Wish
@@ -54,9 +56,7 @@ class Powers:
 
 def read_powers(path: Path) -> Powers:
     """The table beside a record of the kind `led-power`. Raises InputError for another or an older record."""
-    record = read_record(path)
-    if record.kind != "led-power":
-        raise InputError(f"{path}: expected a record of the kind `led-power`, found `{record.kind}`")
+    record = read_accepted(path, "led-power")
     table = path.parent / record.files[0].name
     lines = [line for line in table.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
     columns = list(csv.DictReader(lines))
@@ -165,10 +165,10 @@ def _reading(frame: LightFrame, value: float, u: float, design: Floats, powers: 
     row = powers.row[int(frame.light[3:])]
     ratio, u_own = value / powers.power[row], float(powers.u_own[row])
     # The figures of the tile itself are those that the powers were calibrated with.
-    ratio *= np.exp(-design[2] * powers.found["ln_reflectance"] - design[3] * powers.found["minnaert"])
+    ratio *= np.exp(-design[3] * powers.found["ln_reflectance"] - design[4] * powers.found["minnaert"])
     common = powers.common[row].copy()
-    common[powers.names.index("ln_reflectance")] += design[2]
-    common[powers.names.index("minnaert")] += design[3]
+    common[powers.names.index("ln_reflectance")] += design[3]
+    common[powers.names.index("minnaert")] += design[4]
     noise = np.sqrt((u / value) ** 2 + u_own**2 + _FLASH**2) if value > 0 else 1.0
     return Reading(
         frame.shot,
@@ -176,16 +176,16 @@ def _reading(frame: LightFrame, value: float, u: float, design: Floats, powers: 
         _warmer_k(frame, powers),
         float(ratio),
         float(abs(ratio) * noise),
-        tuple(map(float, (*design[:2], *common))),
+        tuple(map(float, (*design[:3], *common))),
     )
 
 
 def _shared_covariance(setting: Setting, powers: Powers) -> Floats:
-    """Of the tile's tilt in this run, then of what the powers' calibration shared."""
+    """Of the tile's tilt and height in this run, then of what the powers' calibration shared."""
     from scipy.linalg import block_diag
 
-    tilt = setting.tile.u_tilt_deg**2 * np.eye(2)
-    return np.asarray(block_diag(tilt, powers.covariance))
+    place = np.diag(prior_of(setting.tile)[:OF_PLACE] ** 2)
+    return np.asarray(block_diag(place, powers.covariance))
 
 
 def _warmer_k(frame: LightFrame, powers: Powers) -> float:

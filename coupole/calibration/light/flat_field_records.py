@@ -63,7 +63,7 @@ def flat_field_outcome(
     base_from_panel = _plane_before([found[0].base_from_camera for found in by_view.values()], panel_mm)
     dark = dark_signal(frames, dark_record)
     channels = channels_of(frames.pattern)
-    straight = {channel: linearise(response_record, channel) for channel in channels}
+    straight = {channel: linearise(response_record, channel, frames) for channel in channels}
     height, width = frames.lit[0].read().shape
     size_px = (width, height)
     block_px = max(8, 2 * round(width / _BLOCKS / 2))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,12 @@ class LightFrames:
     @property
     def dark(self) -> tuple[LightFrame, ...]:
         return tuple(frame for frame in self.frames if not frame.light)
+
+    @cached_property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height."""
+        height_px, width_px = self.frames[0].read().shape
+        return width_px, height_px
 
     def seen_through(self, flange_from_camera: Floats) -> LightFrames:
         """The same frames, of a camera that sits on the flange as this [4, 4] says."""

@@ -6,10 +6,10 @@ Taken as logarithms the problem is linear,
 
     ln S_kv - ln h_kv = ln Phi_k + J_kv . theta + noise,
 
-theta being what all LEDs share: the tile's tilt about two axes in each place that it lay, the logarithm of its
-reflectance, its departure from Lambert's law. They have priors from the tile's description; where the tile was
-photographed in several places the data add to them. So the covariance of all powers is a diagonal (each LED's own
-noise) and a few common directions, and 1080 LEDs need no matrix of 1080 by 1080.
+theta being what all LEDs share: the tile's tilt about two axes and its height in each place that it lay, the
+logarithm of its reflectance, its departure from Lambert's law. They have priors from the tile's description; where
+the tile was photographed in several places the data add to them. So the covariance of all powers is a diagonal
+(each LED's own noise) and a few common directions, and 1080 LEDs need no matrix of 1080 by 1080.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from scipy.stats import chi2 as chi2_distribution
 from coupole.calibration.light.irradiance import LED_SIDE_MM, Emission
 from coupole.calibration.light.spectralon import Tile
 from coupole.calibration.light.tile_views import (
+    OF_PLACE,
     Positions,
     Row,
     TileView,
@@ -36,6 +37,8 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 _UNLIKELY = 1e-6
+LEAST_PRIOR = 1e-12
+"""A figure that is said to be exact."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,12 @@ class LedPower:
         return float(np.sqrt(mean @ self.common_covariance @ mean))
 
 
+def prior_of(tile: Tile, places: int = 1) -> Floats:
+    """[c] standard uncertainties of what LEDs share, by the tile's description."""
+    of_place = [tile.u_tilt_deg, tile.u_tilt_deg, tile.u_height_mm]
+    return np.array([*of_place * places, tile.u_reflectance / tile.reflectance, tile.u_minnaert])
+
+
 def calibrate_led_power(
     views: Sequence[TileView],
     positions: Positions,
@@ -100,10 +109,9 @@ def calibrate_led_power(
         raise InputError("LED power: expected views of the tile, found none")
     ids = np.unique(np.concatenate([view.leds for view in views]))
     places = sorted({view.place for view in views})
-    names = (*(f"tilt{p}.{axis}_deg" for p in places for axis in "xy"), "ln_reflectance", "minnaert")
-    prior = np.array(
-        [tile.u_tilt_deg] * (2 * len(places)) + [tile.u_reflectance / tile.reflectance, tile.u_minnaert]
-    )
+    of_places = [f"place{p}.{what}" for p in places for what in ("tilt_x_deg", "tilt_y_deg", "height_mm")]
+    names = (*of_places, "ln_reflectance", "minnaert")
+    prior = prior_of(tile, len(places))
     remarks: list[str] = []
     rows: list[Row] = []
     lit_elsewhere: set[int] = set()
@@ -179,7 +187,7 @@ def _solve(y: Floats, w: Floats, led: NDArray[np.intp], design: Floats, leds: in
     mean_y = np.bincount(led, w * y, leds) / safe
     mean_design: Floats = np.column_stack([np.bincount(led, w * column, leds) / safe for column in design.T])
     off_y, off = y - mean_y[led], design - mean_design[led]
-    believed = np.maximum(prior, 1e-12)
+    believed = np.maximum(prior, LEAST_PRIOR)
     normal = np.diag(believed**-2.0) + off.T @ (off * w[:, None])
     covariance: Floats = np.asarray(np.linalg.inv(normal), np.float64)
     theta: Floats = covariance @ (off.T @ (w * off_y))
@@ -202,7 +210,7 @@ def _refuse_moved(
         best: tuple[float, int, float] = (0.0, -1, 0.0)
         for v in mine:
             at = view_of == v
-            columns = [c for c in range(design.shape[1] - 2) if np.any(design[at][:, c])]
+            columns = [c for c in range(design.shape[1] - 2) if c % OF_PLACE < 2 and np.any(design[at][:, c])]
             if at.sum() < 10 or not columns:
                 continue
             part = np.column_stack([design[at][:, columns], np.ones(int(at.sum()))])

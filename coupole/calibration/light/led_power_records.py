@@ -10,7 +10,7 @@ import numpy as np
 
 from coupole.calibration.light import drawing as pictures
 from coupole.calibration.light.frames import LightFrame, LightFrames, channels_of
-from coupole.calibration.light.led_power import LedPower, calibrate_led_power
+from coupole.calibration.light.led_power import LEAST_PRIOR, LedPower, calibrate_led_power, prior_of
 from coupole.calibration.light.led_power_tile import Setting, TileReader
 from coupole.calibration.light.limits import LED_POWER
 from coupole.calibration.light.records import Progress, counter, sealed_outcome
@@ -43,7 +43,8 @@ def led_power_outcome(frames: LightFrames, setting: Setting, wish: Wish, progres
         for channel in channels
     }
     warm = board_temperatures(lit)
-    parameters = _parameters(powers)
+    covariance = _covariance(powers, prior_of(setting.tile))
+    parameters = _parameters(powers, covariance)
     height, width = read.shape
     green = powers["G"]
     good = np.isfinite(green.power) & (green.power > 0)
@@ -58,7 +59,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, wish: Wish, progres
         frames,
         (width, height),
         parameters,
-        _covariance(powers),
+        covariance,
         partial(pictures.draw_led_power, powers, setting.positions),
         limits=judged(LED_POWER, wish.limits, {"power": typical, "unusable": unusable}),
         files={f"{wish.name}.csv": power_table(powers, warm).encode()},
@@ -99,41 +100,50 @@ def power_table(powers: Mapping[str, LedPower], board_c: Mapping[int, float]) ->
     return text.getvalue()
 
 
-def _parameters(powers: Mapping[str, LedPower]) -> list[Parameter]:
-    """What all LEDs share, by channel; their own powers stand in the table."""
+def _parameters(powers: Mapping[str, LedPower], covariance: Floats) -> list[Parameter]:
+    """The mean power and what all LEDs share, by channel; the LEDs' own powers stand in the table."""
     found = []
+    u = iter(np.sqrt(np.diag(covariance)))
     for channel, power in powers.items():
-        good = np.isfinite(power.power) & (power.power > 0)
-        u = np.sqrt(np.diag(power.common_covariance))
-        freedom = power.degrees_of_freedom
-        mean = float(np.mean(power.power[good]))
-        found.append(
-            Parameter(
-                name=f"mean_power.{channel}",
-                value=mean,
-                u=mean * float(np.sqrt(np.mean(power.u_own[good] ** 2) / good.sum())),
-                degrees_of_freedom=freedom,
-                dominated_by="noise; what LEDs share stands below",
-            )
-        )
+        names = ["mean_power", *power.common_names]
+        values = [_mean_and_slopes(power)[0], *power.found]
         found += [
             Parameter(
                 name=f"{name}.{channel}",
                 value=float(value),
-                u=float(one),
-                degrees_of_freedom=freedom,
+                u=float(next(u)),
+                degrees_of_freedom=power.degrees_of_freedom,
                 dominated_by="the tile's description",
             )
-            for name, value, one in zip(power.common_names, power.found, u, strict=True)
+            for name, value in zip(names, values, strict=True)
         ]
     return found
 
 
-def _covariance(powers: Mapping[str, LedPower]) -> Floats:
-    from scipy.linalg import block_diag
+def _mean_and_slopes(power: LedPower) -> tuple[float, Floats]:
+    """The mean power of all LEDs, and its change [c] by what they share."""
+    good = np.isfinite(power.power) & (power.power > 0)
+    return float(power.power[good].mean()), np.asarray((power.power[good, None] * power.common[good]).mean(axis=0))
 
-    blocks = []
-    for channel, power in powers.items():
-        mean = next(p for p in _parameters({channel: power}) if p.name.startswith("mean_power"))
-        blocks += [np.array([[mean.u**2]]), power.common_covariance]
-    return np.asarray(block_diag(*blocks))
+
+def _covariance(powers: Mapping[str, LedPower], prior: Floats) -> Floats:
+    """Of `_parameters`, [channels (1 + c)] squared.
+
+    All channels see one tile. With the prior S and posteriors C_a, C_b the errors of channels a and b have the
+    covariance C_a S^-1 C_b: what of the prior's error is left in both; noise is each one's own.
+    """
+    size = 1 + len(prior)
+    whole = np.zeros((size * len(powers), size * len(powers)))
+    believed = np.diag(np.maximum(prior, LEAST_PRIOR) ** -2.0)
+    by_common = [np.vstack([_mean_and_slopes(power)[1], np.eye(len(prior))]) for power in powers.values()]
+    for i, one in enumerate(powers.values()):
+        for j, other in enumerate(powers.values()):
+            between = one.common_covariance
+            if i != j:
+                between = between @ believed @ other.common_covariance
+            block = by_common[i] @ between @ by_common[j].T
+            if i == j:
+                good = np.isfinite(one.power) & (one.power > 0)
+                block[0, 0] += float(np.sum((one.power[good] * one.u_own[good]) ** 2)) / good.sum() ** 2
+            whole[i * size : (i + 1) * size, j * size : (j + 1) * size] = block
+    return whole

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration import optics
+from coupole.calibration.earlier import read_accepted
 from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask, channels_of
 from coupole.calibration.light.irradiance import Emission
 from coupole.calibration.light.records import dark_signal, linearise, map_beside, record_input
 from coupole.calibration.light.spectralon import Tile
 from coupole.calibration.light.tile_views import Positions, TileView
-from coupole.calibration.record import read_record
 from coupole.calibration.rotations import Floats
 from coupole.dome import read_led_table
 from coupole.errors import InputError
@@ -56,9 +56,7 @@ def calibrated_positions(leds: Path) -> Positions:
 
     Its uncertainties go no further: 0.05 mm at 1.5 m change an irradiance by a tenth of what flashes differ by.
     """
-    record = read_record(leds)
-    if record.kind != "leds":
-        raise InputError(f"{leds}: expected a record of the kind `leds`, found `{record.kind}`")
+    record = read_accepted(leds, "leds")
     table = read_led_table(leds.parent / next(file.name for file in record.files if file.name.endswith(".csv")))
     return Positions(table.ids, table.positions_mm, table.normals)
 
@@ -72,10 +70,10 @@ class TileReader:
         self._dark = dark_signal(frames, setting.dark)
         channels = channels_of(frames.pattern)
         self._straight: dict[str, Callable[[Floats], Floats]] = {
-            channel: linearise(setting.response, channel) for channel in channels
+            channel: linearise(setting.response, channel, frames) for channel in channels
         }
         self._masks = {channel: channel_mask(self.shape, frames.pattern, channel) for channel in channels}
-        self._flat = None if setting.flat is None else map_beside(setting.flat, "flat-field", "g")
+        self._flat = None if setting.flat is None else map_beside(setting.flat, "flat-field", "g", frames)
 
     def view(self, found: Sequence[LightFrame], tell: Callable[[], None]) -> dict[str, TileView]:
         """What the frames of one view, each under one LED, show of the tile, by channel; `tell` is called

@@ -17,8 +17,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.calibration.earlier import read_accepted, read_earlier
 from coupole.calibration.light import drawing as pictures
-from coupole.calibration.light.dark import DarkFrame, calibrate_dark
+from coupole.calibration.light.dark import Dark, DarkFrame, calibrate_dark, warmth_of
 from coupole.calibration.light.frames import (
     LightFrame,
     LightFrames,
@@ -33,11 +34,11 @@ from coupole.calibration.light.photon_transfer import PhotonTransfer, photon_tra
 from coupole.calibration.limits import judged
 from coupole.calibration.record import (
     Input,
+    Kind,
     Limit,
     Noise,
     Parameter,
     Record,
-    read_record,
     rows_of,
     sealed,
 )
@@ -131,7 +132,7 @@ def dark_outcome(frames: LightFrames, wish: Wish, progress: Progress) -> Outcome
         frames,
         (width, height),
         parameters,
-        np.diag([p.u**2 for p in parameters]),
+        _of_means(dark, np.array([p.u for p in parameters])),
         partial(pictures.draw_dark, dark),
         limits=judged(DARK, wish.limits, {"hot": len(dark.hot) / pixels}),
         files={f"{wish.name}.h5": content},
@@ -140,13 +141,25 @@ def dark_outcome(frames: LightFrames, wish: Wish, progress: Progress) -> Outcome
     )
 
 
+def _of_means(dark: Dark, u: Floats) -> Floats:
+    """[4, 4] covariance of the noises, which are apart, and of mean offset and current, which one line gave."""
+    covariance = np.diag(u**2)
+    together = float(dark.cofactor[0, 1] / np.sqrt(dark.cofactor[0, 0] * dark.cofactor[1, 1]))
+    covariance[2, 3] = covariance[3, 2] = together * u[2] * u[3]
+    return covariance
+
+
 def dark_signal(frames: LightFrames, record_path: Path | None) -> Callable[[LightFrame], NDArray[np.float32]]:
     """What a frame holds without light [H, W], DN: from a dark record, else from the view's own dark frames of
     the same exposure, else from any of that exposure, else the camera's black level."""
     if record_path is not None:
-        offset = map_beside(record_path, "dark", "offset_dn")
-        current = map_beside(record_path, "dark", "current_dn_per_s")
-        return lambda frame: offset + current * np.float32(frame.exposure_us * 1e-6)
+        offset = map_beside(record_path, "dark", "offset_dn", frames)
+        current = map_beside(record_path, "dark", "current_dn_per_s", frames)
+        record = read_accepted(record_path, "dark")
+        warm, reference_c = temperatures_of(frames.frames), record.fixed.get("reference_c")
+        # LED boards are warmed by their own light, the camera is not: the coolest is nearest to the camera.
+        warmth = 1.0 if warm is None else warmth_of(warm[0], reference_c, record.value("doubling_k"))
+        return lambda frame: offset + current * np.float32(warmth * frame.exposure_us * 1e-6)
     kept: dict[float, NDArray[np.float32]] = {}
 
     def of_frames(frame: LightFrame) -> NDArray[np.float32]:
@@ -161,11 +174,9 @@ def dark_signal(frames: LightFrames, record_path: Path | None) -> Callable[[Ligh
     return of_frames
 
 
-def map_beside(path: Path, kind: str, name: str) -> NDArray[np.float32]:
-    """[H, W] a map that stands beside a record. Raises InputError for a record of another kind."""
-    record = read_record(path)
-    if record.kind != kind:
-        raise InputError(f"{path}: expected a record of the kind `{kind}`, found `{record.kind}`")
+def map_beside(path: Path, kind: Kind, name: str, frames: LightFrames) -> NDArray[np.float32]:
+    """[H, W] a map that stands beside a record that holds for these frames. Raises InputError for another."""
+    record = read_earlier(path, kind, frames.about, frames.size_px)
     with h5py.File(path.parent / record.files[0].name, "r") as file:
         values: NDArray[np.float32] = file[name][()]
         return values
@@ -298,13 +309,16 @@ def _linear_remark(channel: str, line: Linearity) -> str:
     return f"{channel}: off a straight line by {line.worst_deviation:.2%} ({line.u_deviation:.2%}), {how}"
 
 
-def linearise(record_path: Path | None, channel: str) -> Callable[[Floats], Floats]:
-    """Signal above dark to linear signal, from a record of the kind `response`; the signal itself without one."""
+def linearise(record_path: Path | None, channel: str, frames: LightFrames) -> Callable[[Floats], Floats]:
+    """Signal above dark to linear signal, from a record of the kind `response`; the signal itself without one.
+
+    Raises InputError for a record of another kind, camera or sensor's pattern.
+    """
     if record_path is None:
         return lambda signal: signal
-    record = read_record(record_path)
-    if record.kind != "response":
-        raise InputError(f"{record_path}: expected a record of the kind `response`, found `{record.kind}`")
+    record = read_earlier(record_path, "response", frames.about, frames.size_px)
+    if f"c2.{channel}" not in {parameter.name for parameter in record.parameters}:
+        raise InputError(f"{record_path}: has no response of the channel {channel}; calibrate this camera's anew")
     c2, c3 = record.value(f"c2.{channel}"), record.value(f"c3.{channel}")
     range_dn = record.value("range_dn")
 

@@ -37,6 +37,8 @@ class Tile(Model):
     support_from_tile: Pose = Pose(translation_mm=(0.0, 0.0, 10.0))
     u_tilt_deg: Annotated[float, Field(gt=0)] = 0.1
     """Of its normal, about each of two axes: what the pose above is not known better than."""
+    u_height_mm: Annotated[float, Field(gt=0)] = 0.5
+    """Of its white face along its normal; shifts within the face change nothing that is seen of it."""
 
     def brdf(self, cos_in: Floats, cos_out: Floats, *, minnaert: float | None = None) -> Floats:
         """f in 1/sr, for cosines of incidence and observation above 0."""

@@ -20,7 +20,9 @@ _SHADED = 0.03
 _SHADED_SIGMA = 6.0
 _LOWEST_COSINE = 0.05
 """Of incidence on the tile: LEDs nearer to its horizon (3 degrees) tell nothing but its tilt."""
-_STEP = 1e-4
+_STEP, _STEP_MM = 1e-4, 0.05
+OF_PLACE = 3
+"""Figures of each place of the tile: two tilts, its height."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ class Row:
     u: float
     """Of the value, from noise."""
     design: Floats
-    """Relative change of h by the figures that LEDs share: tilts of all places, ln reflectance, Minnaert's k."""
+    """Relative change of h by the figures that LEDs share: two tilts and the height of all places, then ln
+    reflectance and Minnaert's k."""
 
 
 def transfer(
@@ -81,17 +84,22 @@ def transfer(
     tile: Tile,
     *,
     tilt_deg: Floats | None = None,
+    height_mm: float = 0.0,
     minnaert: float | None = None,
     emission: Emission = "lambertian",
     side_mm: float = LED_SIDE_MM,
 ) -> tuple[Floats, Floats]:
-    """h [n, m] = f E/Phi of each patch under each LED, and the cosine of incidence [n, m]."""
+    """h [n, m] = f E/Phi of each patch under each LED, and the cosine of incidence [n, m].
+
+    A patch is what some pixels see: of a tile that lies higher, another part of it, nearer to the camera.
+    """
     x, y = np.radians(np.zeros(2) if tilt_deg is None else tilt_deg)
     normal = view.base_from_tile[:3, :3] @ np.array([np.sin(y), -np.sin(x) * np.cos(y), np.cos(x) * np.cos(y)])
-    points = view.points_mm[None]
+    rays = view.points_mm - view.camera_mm
+    points = (view.points_mm + rays * (height_mm / (rays @ view.base_from_tile[:3, 2]))[:, None])[None]
     towards = centres_mm[:, None] - points
     cos_in = (towards @ normal) / np.linalg.norm(towards, axis=-1)
-    away = view.camera_mm - view.points_mm
+    away = view.camera_mm - points[0]
     cos_out = (away @ normal) / np.linalg.norm(away, axis=-1)
     lit = irradiance_per_flux(
         points, normal, centres_mm[:, None], normals[:, None], side_mm=side_mm, emission=emission
@@ -109,32 +117,41 @@ def rows_of(
     *,
     side_mm: float = LED_SIDE_MM,
     place: int = 0,
-    figures: int = 4,
+    figures: int = 5,
     remarks: list[str],
 ) -> tuple[list[Row], set[int]]:
     """Observations of view `number`, and LEDs that are lit there though their picture cannot be used.
 
-    `figures` are shared by all LEDs: two tilts for each place of the tile, of which the view's is number `place`,
-    ln reflectance, Minnaert's k. What cannot be used is added to `remarks`.
+    `figures` are shared by all LEDs: two tilts and the height for each place of the tile, of which the view's is
+    number `place`, ln reflectance, Minnaert's k. What cannot be used is added to `remarks`.
     """
     centres, normals = positions.of(view.leds)
 
-    def log_h(tilt_deg: Floats, minnaert: float) -> Floats:
+    def log_h(tilt_deg: Floats | None = None, height_mm: float = 0.0, minnaert: float | None = None) -> Floats:
         h, _ = transfer(
-            view, centres, normals, tile,
-            tilt_deg=tilt_deg, minnaert=minnaert, emission=emission, side_mm=side_mm,
-        )  # fmt: skip
+            view,
+            centres,
+            normals,
+            tile,
+            tilt_deg=tilt_deg,
+            height_mm=height_mm,
+            minnaert=minnaert,
+            emission=emission,
+            side_mm=side_mm,
+        )
         mean: Floats = np.log(np.maximum(h.mean(axis=1), 1e-300))
         return mean
 
     h, cos_in = transfer(view, centres, normals, tile, emission=emission, side_mm=side_mm)
     slopes = np.zeros((len(view.leds), figures))
-    none, k = np.zeros(2), tile.minnaert
     for axis in range(2):
-        step = _STEP * np.eye(2)[axis]
-        slopes[:, 2 * place + axis] = (log_h(step, k) - log_h(-step, k)) / (2 * _STEP)
+        tilt = _STEP * np.eye(2)[axis]
+        slopes[:, OF_PLACE * place + axis] = (log_h(tilt) - log_h(-tilt)) / (2 * _STEP)
+    up, down = log_h(height_mm=_STEP_MM), log_h(height_mm=-_STEP_MM)
+    slopes[:, OF_PLACE * place + 2] = (up - down) / (2 * _STEP_MM)
     slopes[:, -2] = 1.0
-    slopes[:, -1] = (log_h(none, k + _STEP) - log_h(none, k - _STEP)) / (2 * _STEP)
+    more, less = (log_h(minnaert=tile.minnaert + step) for step in (_STEP, -_STEP))
+    slopes[:, -1] = (more - less) / (2 * _STEP)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio, u_ratio = view.signal / h, view.u_signal / h
     usable = (cos_in.min(axis=1) > _LOWEST_COSINE) & (h > 0).all(axis=1) & np.isfinite(view.signal).all(axis=1)

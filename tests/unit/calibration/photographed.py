@@ -59,13 +59,15 @@ def shoot(count: int = 9, seed: int = 3) -> Shoot:
     return Shoot(tuple(pictures), tuple(poses))
 
 
-def write_folder(folder: Path, *, metres_said_mm: bool = False, radians_said_deg: bool = False) -> Path:
+def write_folder(
+    folder: Path, made: Shoot | None = None, *, metres_said_mm: bool = False, radians_said_deg: bool = False
+) -> Path:
     """Pictures of 8 bits, `poses.yaml` and `board.yaml`; in metres that are said to be mm, with Euler angles in
     radians that are said to be degrees, if so wanted."""
     import cv2
 
     folder.mkdir(parents=True)
-    made = shoot()
+    made = made or shoot()
     lines = ["schema_version: 1", f"length_unit: {'mm' if metres_said_mm else 'm'}"]
     lines += [f"angle_unit: {'deg' if radians_said_deg else 'rad'}"]
     lines += [f"rotation: {'abc' if radians_said_deg else 'rotation_vector'}", "poses:"]

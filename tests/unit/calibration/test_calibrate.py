@@ -103,10 +103,37 @@ def test_a_run_gives_the_hand_eye_and_what_its_record_holds_for(run: Path, tmp_p
 
 
 def test_the_record_of_a_camera_counts_as_an_observation(folder: Path, tmp_path: Path) -> None:
-    found(calibrate("camera", folder, "--model", "brown4", "--out", tmp_path, "--name", "lens"))
+    others = write_folder(tmp_path / "others", shoot(seed=4))
+    found(calibrate("camera", others, "--model", "brown4", "--out", tmp_path, "--name", "lens"))
     earlier = tmp_path / "lens.yaml"
     document = found(calibrate("hand-eye", folder, "--camera", earlier, "--model", "brown4", "--out", tmp_path))
     assert document["parameters"]["fx_px"]["u"] < read_record(earlier).parameters[0].u
+
+
+def test_the_record_of_a_camera_from_the_same_images_would_count_twice(folder: Path, tmp_path: Path) -> None:
+    found(calibrate("camera", folder, "--model", "brown4", "--out", tmp_path, "--name", "lens"))
+    message = refused("hand-eye", folder, "--camera", tmp_path / "lens.yaml", "--out", tmp_path)
+    assert "was made from the same images" in message
+
+
+def test_a_record_that_was_not_accepted_is_built_on_by_none(folder: Path, tmp_path: Path) -> None:
+    strict = ("--model", "brown4", "--out", tmp_path, "--limit", "pixel_px=0.00001")
+    assert error_of(calibrate("camera", folder, *strict, "--name", "lens")).exit_code == 3
+    message = refused("hand-eye", folder, "--camera", tmp_path / "lens.yaml", "--out", tmp_path)
+    assert "lens.yaml: not accepted: noise of corners is" in message
+
+
+def test_a_name_that_no_record_may_have_is_refused_before_the_work(folder: Path, tmp_path: Path) -> None:
+    assert "--name my record: expected letters" in refused(
+        "camera", folder, "--out", tmp_path, "--name", "my record"
+    )
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".h5", ".png", ".html"])
+def test_nothing_that_stands_beside_is_written_over(folder: Path, tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"dome{suffix}").write_text("precious")
+    assert "stands here already" in refused("camera", folder, "--out", tmp_path, "--name", "dome")
+    assert (tmp_path / f"dome{suffix}").read_text() == "precious"
 
 
 def test_what_misses_its_limits_is_kept_and_refused(folder: Path, tmp_path: Path) -> None:

@@ -60,5 +60,5 @@ def test_leds_stand_where_their_record_has_them(tmp_path: Path) -> None:
 
 
 def test_a_record_of_something_else_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected a record of the kind `leds`, found `led-power`"):
+    with pytest.raises(InputError, match="expected a record of the kind `leds`, found one of `led-power`"):
         calibrated_positions(record(tmp_path, "led-power"))

@@ -1,0 +1,87 @@
+"""Records that a calibration is made with: they must be accepted, and hold for the images at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from coupole.calibration.record import Kind, Record, read_record
+from coupole.calibration.sources import About
+from coupole.errors import InputError
+
+_SAME_FIGURE = 1e-3
+
+
+def read_earlier(path: Path, kind: Kind, about: About, size_px: tuple[int, int]) -> Record:
+    """A record of this kind for images that `about` and `size_px` (width, height) describe.
+
+    Raises InputError: another kind, one that missed its limits or had expired, another camera, focus, aperture,
+    size or warmth, a simulated one for a real cell.
+    """
+    record = read_accepted(path, kind)
+    _refuse_other(path, record, about, size_px)
+    return record
+
+
+def read_accepted(path: Path, kind: Kind) -> Record:
+    """A record of this kind that met its limits. Raises InputError."""
+    record = read_record(path)
+    if record.kind != kind:
+        raise InputError(f"{path}: expected a record of the kind `{kind}`, found one of `{record.kind}`")
+    missed = [limit for limit in record.limits if not limit.passed]
+    if missed:
+        why = "; ".join(f"{one.what} is {one.found:.3g} {one.unit}, at most {one.limit:.3g}" for one in missed)
+        raise InputError(f"{path}: not accepted: {why}. Calibrate anew, or allow more with --limit there")
+    return record
+
+
+def refuse_same_images(path: Path, record: Record, inputs: Sequence[tuple[str, str]]) -> None:
+    """Raise InputError if a record was made from some of these images: they would count twice."""
+    own = {line.sha256 for line in record.inputs if "/" in line.name}
+    if shared := [name for name, sha256 in inputs if "/" in name and sha256 in own]:
+        raise InputError(
+            f"{path}: was made from the same images ({shared[0]}), which would count twice. Leave it out: the "
+            "lens is estimated from these images anyway"
+        )
+
+
+def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, int]) -> None:
+    """Raise InputError unless a record holds for these images: their time, camera, lens, focus, size, warmth."""
+    holds = record.validity
+    if about.begun is not None and record.simulated != about.simulated:
+        made, taken = ("a simulated cell" if one.simulated else "a real cell" for one in (record, about))
+        raise InputError(f"{path}: was made in {made}; the images are of {taken}")
+    if about.begun is not None and about.begun >= holds.expires:
+        raise InputError(
+            f"{path}: expired on {holds.expires:%Y-%m-%d %H:%M} UTC, before these images were taken "
+            f"({about.begun:%Y-%m-%d %H:%M}). Calibrate camera and hand-eye anew"
+        )
+    if holds.focus_distance_mm is not None and about.focus_distance_mm is not None:
+        off_mm = abs(holds.focus_distance_mm - about.focus_distance_mm)
+        if off_mm > holds.focus_tolerance_mm:
+            raise InputError(
+                f"{path}: holds for a focus of {holds.focus_distance_mm:g} mm, within "
+                f"{holds.focus_tolerance_mm:g} mm; the images were taken at {about.focus_distance_mm:g} mm. "
+                "Name the record of this focus"
+            )
+    for what, valid, found in (
+        ("focal length", holds.focal_length_mm, about.focal_length_mm),
+        ("f-number", holds.f_number, about.f_number),
+    ):
+        if valid is not None and found is not None and abs(valid - found) > _SAME_FIGURE * valid:
+            raise InputError(f"{path}: holds for {what} {valid:g}; the images were taken with {found:g}")
+    if holds.size_px is not None and holds.size_px != size_px:
+        raise InputError(
+            f"{path}: holds for frames of {holds.size_px[0]} x {holds.size_px[1]} pixels; these have "
+            f"{size_px[0]} x {size_px[1]}"
+        )
+    if holds.temperature_c is not None and about.temperature_c is not None:
+        low, high = holds.temperature_c
+        room = about.temperature_c[0]  # of all LED boards the coolest, which is nearest to the room and the camera
+        if not low <= room <= high:
+            raise InputError(
+                f"{path}: holds from {low:g} to {high:g} C; the coolest LED board of these images had {room:g} C. "
+                "Let room, camera and boards come back to that temperature, or calibrate at this one"
+            )
+    if holds.camera is not None and about.camera is not None and holds.camera != about.camera:
+        raise InputError(f"{path}: holds for the camera {holds.camera}; the images are of {about.camera}")

@@ -45,11 +45,32 @@ def test_records_are_made_from_nothing_and_not_made_twice(rig: Path, tmp_path: P
     runs = sorted((out / "runs").glob("2*"))
     assert len(runs) == 2
 
-    (out / "response.yaml").unlink()
+    take_away(out, "response")
     again = cells.here("calibrate", "all", "--rig", rig, "--out", out, *STEPS, "--json")
     assert again.code == 0, again.err
     assert again.document["records"] == first.document["records"]
     assert sorted((out / "runs").glob("2*")) == runs  # its run was there: only the record was made again
+
+    take_away(out, "response")
+    strict = ("--limit", "linearity=1e-9", "--name", "response", "--out", out)
+    assert cells.here("calibrate", "response", runs[1], *strict).code == 3
+    refused = cells.here("calibrate", "all", "--rig", rig, "--out", out, *STEPS, "--json")
+    assert refused.code == 3
+    assert "response.yaml: not accepted" in refused.err
+    assert "take response.* away" in refused.err
+
+    take_away(out, "response")
+    plan = out / "plans" / "response.yaml"
+    plan.write_text(plan.read_text().replace("[500, 1000,", "[750, 1000,"))
+    anew = cells.here("calibrate", "all", "--rig", rig, "--out", out, *STEPS, "--json")
+    assert anew.code == 0, anew.err
+    assert len(list((out / "runs").glob("2*"))) == 3  # the plan was changed: its run is another one
+
+
+def take_away(folder: Path, record: str) -> None:
+    """A record and all that stands beside it."""
+    for path in folder.glob(f"{record}.*"):
+        path.unlink()
 
 
 def test_a_plan_that_was_changed_by_hand_is_kept(rig: Path, tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, wish: Wish, progres
         for channel in channels
     }
     warm = board_temperatures(lit)
-    covariance = _covariance(powers, prior_of(setting.tile))
+    covariance = covariance_of(powers, prior_of(setting.tile))
     parameters = _parameters(powers, covariance)
     height, width = read.shape
     green = powers["G"]
@@ -126,7 +126,7 @@ def _mean_and_slopes(power: LedPower) -> tuple[float, Floats]:
     return float(power.power[good].mean()), np.asarray((power.power[good, None] * power.common[good]).mean(axis=0))
 
 
-def _covariance(powers: Mapping[str, LedPower], prior: Floats) -> Floats:
+def covariance_of(powers: Mapping[str, LedPower], prior: Floats) -> Floats:
     """Of `_parameters`, [channels (1 + c)] squared.
 
     All channels see one tile. With the prior S and posteriors C_a, C_b the errors of channels a and b have the

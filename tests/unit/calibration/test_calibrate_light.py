@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 
 import h5py
@@ -13,13 +14,15 @@ from light_runs import FOCAL_PX, SIZE_PX, Taken, write_light_run
 from light_synthesis import Array, TrueSensor
 from typer.testing import CliRunner, Result
 
-from coupole.calibration.record import Record, read_record
+from coupole.calibration.record import Record, read_record, sealed, write_record
 from coupole.commands import calibrate_light
 from coupole.commands.budget import budget
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
 
 SHAPE = (SIZE_PX[1], SIZE_PX[0])
 SENSOR = TrueSensor(SHAPE, hot=5, dark_e_per_s=300.0)
+LIMIT = ("--limit", "linearity=0.01")
+"""128 x 96 pixels tell less of a curve than a camera's."""
 EXPOSURES_US = (2000, 50_000, 200_000)
 
 
@@ -91,7 +94,7 @@ def dark_record(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def response_record(tmp_path_factory: pytest.TempPathFactory, dark_record: Path) -> Path:
     folder = tmp_path_factory.mktemp("response")
-    record_of(calibrate_light.response, folder, bracket(folder / "run"), "--dark", dark_record)
+    record_of(calibrate_light.response, folder, bracket(folder / "run"), "--dark", dark_record, *LIMIT)
     return folder / "x.yaml"
 
 
@@ -136,6 +139,27 @@ def test_the_budget_takes_what_records_say(tmp_path: Path, response_record: Path
     assert {s["said_by"] for s in document["sources"]} >= {"response x", "seed 003"}
     assert (tmp_path / "budget.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "budget.json").read_text()) == document
+
+
+@pytest.mark.parametrize(("option", "kind"), [("--dark", "dark"), ("--response", "response")])
+def test_a_record_of_another_camera_is_refused(
+    tmp_path: Path, dark_record: Path, response_record: Path, option: str, kind: str
+) -> None:
+    path = {"dark": dark_record, "response": response_record}[kind]
+    record = read_record(path)
+    content = dict(record)
+    del content["sha256"], content["schema_version"]
+    for name, validity, why in (
+        ("larger", {"size_px": (1024, 768)}, "holds for frames of 1024 x 768 pixels"),
+        ("other", {"camera": "Other 7"}, "holds for the camera Other 7"),
+        ("old", {"expires": datetime(2020, 1, 1, tzinfo=UTC)}, "expired on 2020-01-01"),
+    ):
+        other = sealed(**content | {"validity": record.validity.model_copy(update=validity)})
+        write_record(path.with_name(f"{name}.yaml"), other)
+        folder, _ = panel_views(tmp_path / name)
+        result = run(calibrate_light.flat_field, folder, option, path.with_name(f"{name}.yaml"), "--out", tmp_path)
+        assert isinstance(result.exception, InputError)
+        assert why in str(result.exception)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ import pytest
 from light_synthesis import Array, coverage
 
 from coupole.calibration.light.irradiance import irradiance_per_flux, lambert_vector, led_corners_mm
-from coupole.calibration.light.led_power import LedPower, calibrate_led_power
+from coupole.calibration.light.led_power import LedPower, calibrate_led_power, prior_of
+from coupole.calibration.light.led_power_records import covariance_of
 from coupole.calibration.light.spectralon import Tile
 from coupole.calibration.light.tile_views import Positions, TileView
 from coupole.errors import InputError
@@ -153,6 +154,31 @@ def replace_tile(random: np.random.Generator) -> Tile:
             "minnaert": TILE.minnaert + TILE.u_minnaert * random.standard_normal(),
         }
     )
+
+
+def test_what_channels_share_of_one_tile_is_known_to_be_shared(scale: Callable[[int, int], int]) -> None:
+    z: list[float] = []
+    for seed in range(scale(8, 100)):
+        positions, power, random = small_dome(seed, 30)
+        truth, tilt = replace_tile(random), tuple(map(float, random.normal(0, TILE.u_tilt_deg, 2)))
+        height_mm = float(random.normal(0, TILE.u_height_mm))
+        found = {
+            channel: calibrate_led_power(
+                views_of(positions, power, random, tilts_deg=(tilt,), height_mm=height_mm, truth=truth),
+                positions,
+                TILE,
+            )
+            for channel in "RGB"
+        }
+        covariance = covariance_of(found, prior_of(TILE))
+        means = np.array([one.power.mean() for one in found.values()])
+        at = np.arange(3) * len(covariance) // 3
+        u = np.sqrt(covariance[at, at])
+        assert np.allclose(u / means, [one.u_scale for one in found.values()], rtol=0.05)
+        assert (covariance[np.ix_(at, at)] / np.outer(u, u) > 0.9).all()
+        assert np.linalg.eigvalsh(covariance / np.outer(*[np.sqrt(np.diag(covariance))] * 2)).min() > -1e-9
+        z.append(float((means.sum() - 3 * power.mean()) / np.sqrt(covariance[np.ix_(at, at)].sum())))
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.6
 
 
 def test_a_tile_in_several_places_tells_its_tilt() -> None:

@@ -193,6 +193,10 @@ def _h5(
         put("normal_covariance", normal, "deg^2", "[leds, 2, 2] of turns about the board's x and y")
         axes = geometry.state.base_from_board[boards.board_of[where], :3, :2]
         put("board_axes", axes, "", "[leds, 3, 2] x and y of its board in the base")
+        shared = (
+            "[leds] of the centre's variance that comes from poses, lens and hand-eye, as its neighbours' does"
+        )
+        put("shared_part", geometry.shared_part[where], "", shared)
         put("offset_mm", geometry.state.offsets_mm[where], "mm", "[leds, 3] off its place on the board")
         put("views", views[where], "", "[leds] that it was found in")
         put("residual_rms", np.sqrt(square / np.maximum(views, 1))[where], "px", "[leds]")

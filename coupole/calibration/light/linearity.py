@@ -36,6 +36,8 @@ class Linearity:
     """c2, c3 of y + c2 y^2/R + c3 y^3/R^2; zeros where a line will do."""
     covariance: Floats
     """[2, 2]."""
+    with_offset: Floats
+    """[2] covariance of c2 and c3 with the time offset."""
     range_dn: float
     """R, above dark."""
     time_offset_us: Estimate
@@ -120,6 +122,7 @@ def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1
     return Linearity(
         coefficients if unlikely < significance else np.zeros(2),
         c_covariance,
+        1e3 * covariance[:2, 2],
         range_dn,
         Estimate(float(1e3 * fit.x[2]), float(1e3 * np.sqrt(covariance[2, 2]))),
         float(abs(deviation[worst])),

@@ -300,7 +300,9 @@ def _response_parameters(
             Parameter(name=f"{name}.{channel}", value=value, u=u, degrees_of_freedom=freedom, dominated_by=by)
             for name, value, u, by in values
         ]
-        blocks += [found.covariance, line.covariance, np.array([[line.time_offset_us.u**2]])]
+        offset = np.array([[line.time_offset_us.u**2]])
+        curve = np.block([[line.covariance, line.with_offset[:, None]], [line.with_offset[None], offset]])
+        blocks += [found.covariance, curve]
     return parameters, block_diagonal(blocks)
 
 

@@ -60,6 +60,8 @@ class MeshPose:
     """Points found in space that are none of the table's."""
     views_of: dict[str, int]
     residual_px: float
+    residuals_of: tuple[tuple[int, int, float], ...]
+    """By view: stickers used, left out as gross errors, and the rms distance of those used, px."""
     point_rms_mm: float
     """Of the points found in space, before the adjustment, from the table's."""
     noise: dict[str, float]
@@ -127,12 +129,26 @@ def mesh_to_robot(
         len(points) - len(seen),
         {name: len(point.views) for name, point in zip(recognised, seen, strict=True)},
         float(np.sqrt(np.mean(residuals**2)) * stated.sticker_px),
+        _by_view(adjusted, seen, len(views), stated.sticker_px),
         match.rms_mm,
         {component.name: component.factor for component in adjusted.components},
         {component.name: component.redundancy for component in adjusted.components},
         adjusted.degrees[:6],
         tuple(adjusted.components[int(row)].name for row in adjusted.contributions[:, :6].argmax(axis=0)),
     )
+
+
+def _by_view(
+    adjusted: Adjusted[_State], seen: Sequence[SeenPoint], views: int, sticker_px: float
+) -> tuple[tuple[int, int, float], ...]:
+    view_of = np.concatenate([point.views for point in seen])
+    found = []
+    for view in range(views):
+        rows = np.flatnonzero(view_of == view)
+        good = [row for row in rows if adjusted.kept[row].all()]
+        square = sum(float(np.sum(adjusted.residuals[row] ** 2)) for row in good)
+        found.append((len(good), len(rows) - len(good), sticker_px * float(np.sqrt(square / max(len(good), 1)))))
+    return tuple(found)
 
 
 def _adjust(

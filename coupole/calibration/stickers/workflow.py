@@ -105,8 +105,8 @@ def mesh_from(
         covariance=rows_of(pose.covariance),
         noise=_noise(pose, stated),
         images=tuple(
-            ImageResidual(name=name, corners=len(seen), rejected=0, rms_px=pose.residual_px)
-            for name, seen in zip(images.names, images.stickers, strict=True)
+            ImageResidual(name=name, corners=used, rejected=rejected, rms_px=rms_px)
+            for name, (used, rejected, rms_px) in zip(images.names, pose.residuals_of, strict=True)
         ),
         limits=judged(MESH, wish.limits, _figures(pose, scan, u_mm)),
         remarks=(*_remarks(pose), *(() if arm is None else (_of_the_arm(arm),))),

@@ -50,6 +50,9 @@ def test_the_mesh_is_found_to_sixty_micrometres_and_its_record_is_whole(tmp_path
     record = read_record(path)
     assert record.passed
     assert len(result.pose.matched) >= 12
+    assert sum(image.corners + image.rejected for image in record.images) == sum(result.pose.views_of.values())
+    rms_px = [image.rms_px for image in record.images]
+    assert 0.0 < min(rms_px) < max(rms_px) < 1.0
     middle = made.targets_mm.mean(axis=0)
     off = (result.pose.base_from_mesh - made.base_from_mesh) @ np.append(middle, 1.0)
     assert np.linalg.norm(off) < 0.06

@@ -27,37 +27,25 @@ HOME_DEG = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
 AWAY_DEG = np.array([50.0, -50.0, 40.0, 30.0, 60.0, -70.0])
 
 
-class KukaCell:
-    """A KUKA controller in a world of its own, and drivers that talk to it."""
+class RobotCell:
+    """A controller in a world of its own, and drivers that talk to it."""
 
-    def __init__(
-        self, folder: Path, cycle_ms: int = 4, *, speed: float = 10.0, lock_step: bool = True, **controller: Any
-    ) -> None:
-        """`controller` are more settings of the stand-in; the driver's are made to fit."""
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.address = f"127.0.0.1:{probe.getsockname()[1]}"
-        self.cycle_ms, self.lock_step = cycle_ms, lock_step
-        self.clock_path = folder / "clock"
-        self.reactor = Reactor(ClockWriter(self.clock_path, speed=speed))
-        # In real time a busy machine is late now and then: that is counted, but must not fail a test.
-        delay = {} if lock_step else {"delay_limit": 1_000_000}
-        theirs = {"sends_to": self.address, "cycle_ms": cycle_ms, "lock_step": lock_step, "answer_limit_s": 0.5}
-        self.controller = KukaController(
-            self.reactor, ControllerSettings.model_validate(theirs | delay | controller)
-        )
+    settings: Any
+    """Of the driver."""
+
+    def __init__(self, clock_path: Path, reactor: Reactor, controller: Any, cycle_ms: float) -> None:
+        self.clock_path, self.reactor, self.controller = clock_path, reactor, controller
+        self.cycle_ms = cycle_ms
         self.trace_deg: list[tuple[float, ...]] = []
-        ours = {"listen": self.address, "cycle_ms": cycle_ms, "link_timeout_s": 0.5, "connect_timeout_s": 20.0}
-        alike = {name: value for name, value in controller.items() if name in ALIKE}
-        self.settings = Settings.model_validate(ours | delay | alike)
         self.reactor.after(0.5 * cycle_ms / 1e3, self._sample)
         self._thread = threading.Thread(target=self.reactor.run)
         self._thread.start()
         self.clock = SharedClock(self.clock_path)
         self._drivers = ExitStack()
 
-    def open(self, **settings: object) -> KukaRsi:
-        return self._drivers.enter_context(closing(KukaRsi(self.settings.model_copy(update=settings), self.clock)))
+    def open(self) -> Robot:
+        """A driver, closed with the cell."""
+        raise NotImplementedError
 
     def in_world(self, action: Callable[[], object]) -> None:
         """Do something on the world's thread and wait until it is done."""
@@ -114,36 +102,61 @@ class KukaCell:
         assert np.abs(self.joints_deg() - before).max() < 1e-4  # the last cycle's correction may still arrive
 
 
+class KukaCell(RobotCell):
+    """A KUKA controller and its RSI driver."""
+
+    def __init__(
+        self, folder: Path, cycle_ms: int = 4, *, speed: float = 10.0, lock_step: bool = True, **controller: Any
+    ) -> None:
+        """`controller` are more settings of the stand-in; the driver's are made to fit."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.address = f"127.0.0.1:{probe.getsockname()[1]}"
+        self.lock_step = lock_step
+        reactor = Reactor(ClockWriter(folder / "clock", speed=speed))
+        # In real time a busy machine is late now and then: that is counted, but must not fail a test.
+        delay = {} if lock_step else {"delay_limit": 1_000_000}
+        theirs = {"sends_to": self.address, "cycle_ms": cycle_ms, "lock_step": lock_step, "answer_limit_s": 0.5}
+        arm = KukaController(reactor, ControllerSettings.model_validate(theirs | delay | controller))
+        ours = {"listen": self.address, "cycle_ms": cycle_ms, "link_timeout_s": 0.5, "connect_timeout_s": 20.0}
+        alike = {name: value for name, value in controller.items() if name in ALIKE}
+        self.settings = Settings.model_validate(ours | delay | alike)
+        super().__init__(folder / "clock", reactor, arm, cycle_ms)
+
+    def open(self, **settings: object) -> KukaRsi:
+        return self._drivers.enter_context(closing(KukaRsi(self.settings.model_copy(update=settings), self.clock)))
+
+
 class RobotConformance:
     """Any driver passes that satisfies `coupole.devices.Robot`; `cell` is the arm it talks to."""
 
-    def range_deg(self, cell: KukaCell) -> NDArray[np.float64]:
+    def range_deg(self, cell: RobotCell) -> NDArray[np.float64]:
         """Lowest and highest angles [6, 2] that tests draw targets from."""
         return 0.6 * np.array(KR10_R1100_SIXX.limits_deg)
 
-    def targets_deg(self, cell: KukaCell, count: int, seed: int) -> NDArray[np.float64]:
+    def targets_deg(self, cell: RobotCell, count: int, seed: int) -> NDArray[np.float64]:
         """Random joint angles [count, 6]."""
         low, high = self.range_deg(cell).T
         return np.random.default_rng(seed).uniform(low, high, (count, 6))
 
     @pytest.fixture
-    def robot(self, cell: KukaCell) -> Robot:
+    def robot(self, cell: RobotCell) -> Robot:
         return cell.open()
 
-    def test_opening_moves_nothing(self, cell: KukaCell, robot: Robot) -> None:
+    def test_opening_moves_nothing(self, cell: RobotCell, robot: Robot) -> None:
         cell.clock.sleep(0.2)
         assert robot.measured().fault == ""
         assert not robot.measured().moving
         assert set(cell.trace_deg) == {tuple(HOME_DEG)}
 
-    def test_it_says_who_it_is_and_that_it_is_simulated(self, cell: KukaCell, robot: Robot) -> None:
+    def test_it_says_who_it_is_and_that_it_is_simulated(self, cell: RobotCell, robot: Robot) -> None:
         assert robot.identify().model == "KR10 R1100 sixx"
         assert robot.identify().simulated
         assert robot.self_test()
 
     @pytest.mark.timeout(1800)
     def test_it_reaches_poses_and_measures_them_right(
-        self, cell: KukaCell, robot: Robot, scale: Callable[[int, int], int]
+        self, cell: RobotCell, robot: Robot, scale: Callable[[int, int], int]
     ) -> None:
         errors = cell.controller.errors
         for target_deg in self.targets_deg(cell, scale(8, 200), seed=5):
@@ -158,19 +171,19 @@ class RobotConformance:
             # what is measured is rounded to 1e-4 deg, some 2 um at the flange
             assert np.all(off_mm <= 5.0 * errors.repeatability_um / 1e3 + settled_mm + 0.01)
 
-    def test_motion_is_jerk_limited(self, cell: KukaCell, robot: Robot) -> None:
+    def test_motion_is_jerk_limited(self, cell: RobotCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)
         robot.wait_settled()
         cell.assert_smooth()
 
-    def test_a_new_target_in_mid_motion_is_reached_smoothly(self, cell: KukaCell, robot: Robot) -> None:
+    def test_a_new_target_in_mid_motion_is_reached_smoothly(self, cell: RobotCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)
         cell.wait_until_under_way()
         robot.move_to(HOME_DEG)
         assert np.allclose(robot.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
         cell.assert_smooth()
 
-    def test_stop_in_mid_motion_brings_it_to_rest_smoothly(self, cell: KukaCell, robot: Robot) -> None:
+    def test_stop_in_mid_motion_brings_it_to_rest_smoothly(self, cell: RobotCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)
         cell.wait_until_under_way()
         robot.stop()
@@ -181,7 +194,7 @@ class RobotConformance:
 
     @pytest.mark.timeout(600)
     def test_after_stop_no_axis_turns_farther_than_it_says(
-        self, cell: KukaCell, robot: Robot, scale: Callable[[int, int], int]
+        self, cell: RobotCell, robot: Robot, scale: Callable[[int, int], int]
     ) -> None:
         random = np.random.default_rng(11)
         allowed_deg = robot.stopping_deg()
@@ -192,27 +205,29 @@ class RobotConformance:
             called_deg = _stop_while_the_world_waits(cell, robot)
             assert np.all(np.abs(cell.joints_deg() - called_deg) <= allowed_deg + 1e-3)
 
-    def test_it_moves_again_after_a_stop(self, cell: KukaCell, robot: Robot) -> None:
+    def test_it_moves_again_after_a_stop(self, cell: RobotCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)
         cell.wait_until_under_way()
         robot.stop()
         robot.move_to(HOME_DEG)
         assert np.allclose(robot.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
 
-    def test_closing_in_mid_motion_brings_it_to_rest_smoothly(self, cell: KukaCell, robot: Robot) -> None:
+    def test_closing_in_mid_motion_brings_it_to_rest_smoothly(self, cell: RobotCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)
         cell.wait_until_under_way()
         robot.close()
         cell.assert_stands()
         cell.assert_smooth()
 
-    def test_a_target_out_of_limits_is_refused_by_the_name_of_its_axis(self, cell: KukaCell, robot: Robot) -> None:
+    def test_a_target_out_of_limits_is_refused_by_the_name_of_its_axis(
+        self, cell: RobotCell, robot: Robot
+    ) -> None:
         with pytest.raises(DeviceRefused, match="A5 would be 121"):
             robot.move_to(np.array([0.0, -90.0, 90.0, 0.0, 121.0, 0.0]))
         cell.assert_stands()
 
     def test_an_emergency_stop_is_a_fault_that_only_a_new_driver_leaves_behind(
-        self, cell: KukaCell, robot: Robot
+        self, cell: RobotCell, robot: Robot
     ) -> None:
         robot.move_to(AWAY_DEG)
         cell.wait_until_under_way()
@@ -230,7 +245,7 @@ class RobotConformance:
         again.move_to(HOME_DEG)
         assert np.allclose(again.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
 
-    def test_a_lost_link_ends_all_motion(self, cell: KukaCell, robot: Robot) -> None:
+    def test_a_lost_link_ends_all_motion(self, cell: RobotCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)
         cell.wait_until_under_way()
         cell.in_world(lambda: cell.controller.lose_link(1.0))
@@ -242,7 +257,7 @@ class RobotConformance:
         cell.assert_stands()
 
     def test_a_driver_opened_after_a_lost_link_starts_where_the_arm_stands(
-        self, cell: KukaCell, robot: Robot
+        self, cell: RobotCell, robot: Robot
     ) -> None:
         robot.move_to(AWAY_DEG)
         cell.wait_until_under_way()
@@ -257,13 +272,13 @@ class RobotConformance:
         assert np.allclose(again.wait_settled().joints_deg, AWAY_DEG, atol=1e-3)
         cell.assert_smooth()
 
-    def test_an_arm_pushed_aside_is_a_fault(self, cell: KukaCell, robot: Robot) -> None:
+    def test_an_arm_pushed_aside_is_a_fault(self, cell: RobotCell, robot: Robot) -> None:
         cell.in_world(lambda: cell.controller.nudge((0.0, 2.0, 0.0, 0.0, 0.0, 0.0)))
         with pytest.raises(DeviceFault, match="does not follow"):
             robot.wait_settled()
 
 
-def _stop_while_the_world_waits(cell: KukaCell, robot: Robot) -> NDArray[np.float64]:
+def _stop_while_the_world_waits(cell: RobotCell, robot: Robot) -> NDArray[np.float64]:
     """Where the axes [6] are when `stop` is called: the world stands still until the command has left."""
     called_deg: list[NDArray[np.float64]] = []
     stopper = threading.Thread(target=robot.stop)

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from robot_conformance import AWAY_DEG, HOME_DEG, KukaCell, RobotConformance
+from robot_conformance import AWAY_DEG, HOME_DEG, RobotCell, RobotConformance
 
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from coupole.kinematics import move_duration_s
 from drivers.kuka_eki import KukaEki, Settings
-from sim.clock import ClockWriter, SharedClock
+from sim.clock import ClockWriter
 from sim.kuka_eki_controller import KukaEkiController
 from sim.kuka_eki_controller import Settings as ControllerSettings
 from sim.reactor import Reactor
@@ -52,37 +52,22 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("kind", [kind for kind in KINDS if full or name in ALSO_ON.get(kind, (name,))])
 
 
-class EkiCell:
-    """A KUKA controller with EthernetKRL in a world of its own, and drivers that talk to it."""
-
-    cycle_ms = SAMPLE_MS
-    in_world = KukaCell.in_world
-    joints_deg = KukaCell.joints_deg
-    wait_until = KukaCell.wait_until
-    wait_until_under_way = KukaCell.wait_until_under_way
-    assert_smooth = KukaCell.assert_smooth
-    assert_stands = KukaCell.assert_stands
-    _sample = KukaCell._sample
+class EkiCell(RobotCell):
+    """A KUKA controller with EthernetKRL, and its driver."""
 
     def __init__(self, folder: Path, *, speed: float = 10.0, **controller: Any) -> None:
-        self.clock_path = folder / "clock"
-        self.reactor = Reactor(ClockWriter(self.clock_path, speed=speed))
-        self.controller = KukaEkiController(
-            self.reactor, ControllerSettings.model_validate({"address": "127.0.0.1:0", **controller})
+        reactor = Reactor(ClockWriter(folder / "clock", speed=speed))
+        arm = KukaEkiController(
+            reactor, ControllerSettings.model_validate({"address": "127.0.0.1:0", **controller})
         )
         self.settings = Settings.model_validate(
             {
-                "address": self.controller.address,
+                "address": arm.address,
                 "controller_is": controller.get("controller_is", "server"),
                 "link_timeout_s": 3.0 if speed == 1.0 else 1.0,
             }
         )
-        self.trace_deg: list[tuple[float, ...]] = []
-        self.reactor.after(0.5 * SAMPLE_MS / 1e3, self._sample)
-        self._thread = threading.Thread(target=self.reactor.run)
-        self._thread.start()
-        self.clock = SharedClock(self.clock_path)
-        self._drivers = ExitStack()
+        super().__init__(folder / "clock", reactor, arm, SAMPLE_MS)
 
     def open(self, **settings: object) -> KukaEki:
         return self._drivers.enter_context(closing(KukaEki(self.settings.model_copy(update=settings), self.clock)))
@@ -99,12 +84,6 @@ class EkiCell:
 
         self.in_world(hold)
         return called_deg[0]
-
-    def close(self) -> None:
-        self._drivers.close()
-        self.reactor.stop()
-        self._thread.join()
-        self.controller.close()
 
 
 class TestKukaEki(RobotConformance):

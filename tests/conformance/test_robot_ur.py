@@ -9,20 +9,19 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from robot_conformance import AWAY_DEG, HOME_DEG, RobotConformance
+from robot_conformance import AWAY_DEG, HOME_DEG, RobotCell, RobotConformance
 
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout, InputError
 from drivers.ur import Settings, UrRobot
-from sim.clock import ClockWriter, SharedClock
+from sim.clock import ClockWriter
 from sim.reactor import Reactor
 from sim.ur_arm import flange_pose, rotation_vector
 from sim.ur_controller import Settings as ControllerSettings
@@ -33,17 +32,15 @@ pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
 _CYCLE_S = 0.002
 
 
-class UrCell:
-    """A UR controller in a world of its own, and drivers that talk to it."""
+class UrCell(RobotCell):
+    """A UR controller and its driver."""
 
     def __init__(self, folder: Path) -> None:
-        self.clock_path = folder / "clock"
-        self.reactor = Reactor(ClockWriter(self.clock_path, speed=1.0))
-        self.controller = UrController(self.reactor, ControllerSettings())
-        self.trace_deg: list[tuple[float, ...]] = []
+        reactor = Reactor(ClockWriter(folder / "clock", speed=1.0))
+        arm = UrController(reactor, ControllerSettings())
         self.settings = Settings.model_validate(
             {
-                "host": self.controller.address,
+                "host": arm.address,
                 "limits_deg": [(-170, 170), (-190, 45), (-120, 156), (-185, 185), (-120, 120), (-350, 350)],
                 "speed_fraction": 0.75,
                 "acceleration_deg_s2": 300.0,
@@ -51,47 +48,10 @@ class UrCell:
                 "link_timeout_s": 1.5,
             }
         )
-        self.reactor.after(0.5 * _CYCLE_S, self._sample)
-        self._thread = threading.Thread(target=self.reactor.run)
-        self._thread.start()
-        self.clock = SharedClock(self.clock_path)
-        self._drivers = ExitStack()
+        super().__init__(folder / "clock", reactor, arm, 1e3 * _CYCLE_S)
 
     def open(self) -> UrRobot:
         return self._drivers.enter_context(closing(UrRobot(self.settings, self.clock)))
-
-    def in_world(self, action: Callable[[], object]) -> None:
-        """Do something on the world's thread and wait until it is done."""
-        done = threading.Event()
-
-        def act() -> None:
-            action()
-            done.set()
-
-        self.reactor.call_threadsafe(act)
-        assert done.wait(30.0)
-
-    def joints_deg(self) -> NDArray[np.float64]:
-        return np.array(self.controller.joints_deg)
-
-    def wait_until(self, condition: Callable[[], bool]) -> None:
-        give_up = time.monotonic() + 30.0
-        while not condition():
-            assert time.monotonic() < give_up
-            time.sleep(0.001)
-
-    def wait_until_under_way(self) -> None:
-        self.wait_until(lambda: bool(np.max(np.abs(self.joints_deg() - HOME_DEG)) > 8.0))
-
-    def close(self) -> None:
-        self._drivers.close()
-        self.reactor.stop()
-        self._thread.join()
-        self.controller.close()
-
-    def _sample(self) -> None:
-        self.trace_deg.append(self.controller.joints_deg)
-        self.reactor.after(_CYCLE_S, self._sample)
 
     def assert_smooth(self) -> None:
         """Speed and acceleration of all that was sampled are within the driver's limits."""

@@ -54,7 +54,7 @@ def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, 
     if about.begun is not None and about.begun >= holds.expires:
         raise InputError(
             f"{path}: expired on {holds.expires:%Y-%m-%d %H:%M} UTC, before these images were taken "
-            f"({about.begun:%Y-%m-%d %H:%M}). Calibrate camera and hand-eye anew"
+            f"({about.begun:%Y-%m-%d %H:%M}). Calibrate anew"
         )
     if holds.focus_distance_mm is not None and about.focus_distance_mm is not None:
         off_mm = abs(holds.focus_distance_mm - about.focus_distance_mm)

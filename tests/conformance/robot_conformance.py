@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -27,7 +28,7 @@ HOME_DEG = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
 AWAY_DEG = np.array([50.0, -50.0, 40.0, 30.0, 60.0, -70.0])
 
 
-class RobotCell:
+class RobotCell(ABC):
     """A controller in a world of its own, and drivers that talk to it."""
 
     settings: Any
@@ -43,9 +44,9 @@ class RobotCell:
         self.clock = SharedClock(self.clock_path)
         self._drivers = ExitStack()
 
+    @abstractmethod
     def open(self) -> Robot:
         """A driver, closed with the cell."""
-        raise NotImplementedError
 
     def in_world(self, action: Callable[[], object]) -> None:
         """Do something on the world's thread and wait until it is done."""

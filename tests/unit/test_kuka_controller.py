@@ -5,7 +5,7 @@ from __future__ import annotations
 import select
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -45,6 +45,18 @@ def controller_and_client(folder: Path, **settings: object) -> Iterator[tuple[Ku
             reactor.stop()
             world.join()
             controller.close()
+
+
+def in_world(controller: KukaController, action: Callable[[], object]) -> None:
+    """Do something on the world's thread, whose timers no other may touch, and wait until it is done."""
+    done = threading.Event()
+
+    def act() -> None:
+        action()
+        done.set()
+
+    controller._reactor.call_threadsafe(act)
+    assert done.wait(30.0)
 
 
 def answer_with(client: socket.socket, correction_a1_deg: float) -> None:
@@ -284,12 +296,12 @@ def test_after_an_emergency_stop_the_brakes_hold_the_arm_whatever_corrections_co
         for correction_deg in (0.0, 0.05, 0.1):
             answer_with(client, correction_deg)
         assert not controller.brakes_closed
-        controller.estop()
+        in_world(controller, controller.estop)
         answer_until_silent(client, 5.0)
         assert controller.brakes_closed
         held_deg = controller.joints_deg
         assert held_deg[0] < 0.3
-        controller.reset()
+        in_world(controller, controller.reset)
         assert not controller.brakes_closed
         assert controller.joints_deg == held_deg
 
@@ -298,7 +310,7 @@ def test_a_nudge_for_a_while_springs_back(tmp_path: Path) -> None:
     with controller_and_client(tmp_path, answer_limit_s=0.2) as (controller, client):
         answer_with(client, 0.0)
         answer_with(client, 0.0)
-        controller.nudge([0.5] * 6, 0.02)
+        in_world(controller, lambda: controller.nudge([0.5] * 6, 0.02))
         pushed = [round(controller.joints_deg[0], 6)]
         true_mm = controller.true_base_from_flange()[:3, 3]
         assert np.linalg.norm(true_mm - flange_pose(HOME_DEG)[:3, 3]) > 1.0

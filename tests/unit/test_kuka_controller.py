@@ -296,12 +296,12 @@ def test_after_an_emergency_stop_the_brakes_hold_the_arm_whatever_corrections_co
         for correction_deg in (0.0, 0.05, 0.1):
             answer_with(client, correction_deg)
         assert not controller.brakes_closed
-        in_world(controller, controller.estop)
+        controller.estop()
         answer_until_silent(client, 5.0)
         assert controller.brakes_closed
         held_deg = controller.joints_deg
         assert held_deg[0] < 0.3
-        in_world(controller, controller.reset)
+        controller.reset()
         assert not controller.brakes_closed
         assert controller.joints_deg == held_deg
 
@@ -310,10 +310,15 @@ def test_a_nudge_for_a_while_springs_back(tmp_path: Path) -> None:
     with controller_and_client(tmp_path, answer_limit_s=0.2) as (controller, client):
         answer_with(client, 0.0)
         answer_with(client, 0.0)
-        in_world(controller, lambda: controller.nudge([0.5] * 6, 0.02))
-        pushed = [round(controller.joints_deg[0], 6)]
-        true_mm = controller.true_base_from_flange()[:3, 3]
-        assert np.linalg.norm(true_mm - flange_pose(HOME_DEG)[:3, 3]) > 1.0
+        pushed, true_mm = [], []
+
+        def push() -> None:
+            controller.nudge([0.5] * 6, 0.02)
+            pushed.append(round(controller.joints_deg[0], 6))
+            true_mm.append(controller.true_base_from_flange()[:3, 3])
+
+        in_world(controller, push)
+        assert np.linalg.norm(true_mm[0] - flange_pose(HOME_DEG)[:3, 3]) > 1.0
         for _ in range(10):
             answer_with(client, 0.0)
             pushed.append(round(controller.joints_deg[0], 6))

@@ -9,9 +9,9 @@ from typing import Any
 import typer
 
 from coupole.commands import keeping, planning, running
-from coupole.commands.budget import budget
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.render import render
+from coupole.commands.uncertainty import budget
 from coupole.errors import CoupoleError, InputError, Interrupted
 
 app = typer.Typer(

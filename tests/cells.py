@@ -27,10 +27,11 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from coupole import cli, journal
-from coupole.cell import world_config
-from coupole.job import read_job
-from sim.client import World
+from coupole import cli
+from coupole.acquisition.cell import world_config
+from coupole.preflight.job import read_job
+from coupole.storage import journal
+from sim.world.client import World
 
 REPO = Path(__file__).resolve().parent.parent
 BLACK_DN = 64

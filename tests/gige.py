@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers import aravis_library
+from drivers.camera.aravis import library
 
 needs_aravis = pytest.mark.skipif(
-    aravis_library.load() is None, reason="libaravis-0.8 is not installed (see tools/bootstrap.sh)"
+    library.load() is None, reason="libaravis-0.8 is not installed (see tools/bootstrap.sh)"
 )
 
 

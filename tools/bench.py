@@ -61,12 +61,12 @@ def bench_check(rounds: int) -> None:
 def bench_sequencing(rounds: int) -> None:
     """A burst of 1080 LEDs at 100 frames/s, from INITiate to the last proven frame, against the table's own
     time; on the world's clock and on the machine's."""
-    from coupole.cell import open_cell
-    from coupole.job import read_job
-    from coupole.recorder import RunRecorder
-    from coupole.run import Run
-    from coupole.sequencer import Sequencer
-    from coupole.session import about_run, metadata_of_views
+    from coupole.acquisition.cell import open_cell
+    from coupole.acquisition.recorder import RunRecorder
+    from coupole.acquisition.sequencer import Sequencer
+    from coupole.acquisition.session import about_run, metadata_of_views
+    from coupole.preflight.job import read_job
+    from coupole.storage.run import Run
 
     job = read_job(ROOT / "configs/plans/demo.yaml")
     table_s = job.schedule.bursts[0][0].duration_s
@@ -113,9 +113,9 @@ def bench_store(rounds: int) -> None:
 def bench_matching(rounds: int) -> None:
     """Proof of a whole burst of 1092 frames, 2 % of them lost, against numpy's nearest-neighbour pairing, which
     is told the clocks' offset and proves nothing; and against the 10 ms that a frame takes at 100 frames/s."""
+    from coupole.acquisition.frame_matching import compile_now, match
     from coupole.devices import STEP_RECORD_DTYPE
-    from coupole.job import read_job
-    from coupole.matching import compile_now, match
+    from coupole.preflight.job import read_job
 
     compile_now()
     table = read_job(ROOT / "configs/plans/demo.yaml").schedule.bursts[0][0].table

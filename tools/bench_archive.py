@@ -34,7 +34,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
     """For each codec ratio, speed, and two readings; peers: plain h5py, and the file before."""
     import hdf5plugin  # noqa: F401  # registers the filter
 
-    from coupole.bitshuffle import CODECS
+    from coupole.storage.bitshuffle import CODECS
 
     frames = min(FRAMES, int(shutil.disk_usage(root).free * 0.4 / FRAME_BYTES))
     pictures = _pictures()
@@ -80,7 +80,7 @@ def _speeds(
 
 
 def _archive(path: Path, proven: list[Any], codec: Any, kept: Path) -> Any:
-    from coupole.archive_view import archive_view
+    from coupole.storage.archive_view import archive_view
 
     return archive_view(path, proven, codec, lambda what, done, total: None, keep_in=kept)
 
@@ -117,8 +117,8 @@ def _pictures() -> NDArray[np.uint16]:
 def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[Any]:
     """A view whose frames are all proven; returns what its journal would say of them."""
     from coupole.devices import FrameFormat
-    from coupole.run import ProvenFrame
-    from coupole.store import ViewWriter, create
+    from coupole.storage.frame_file import ViewWriter, create
+    from coupole.storage.run import ProvenFrame
 
     metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}
     create(path, frames, FrameFormat(HEIGHT_PX, WIDTH_PX, 12, "GBRG", 64, 4095), metadata)
@@ -135,7 +135,7 @@ def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[A
 def _plain_h5py_mb_s(path: Path, before: Path, codec: Any) -> float:
     """Speed of plain h5py: one frame after the other read and assigned to a dataset of the same chunks and filter,
     then synced. Nothing is compared."""
-    from coupole.bitshuffle import tile_shape
+    from coupole.storage.bitshuffle import tile_shape
 
     chunks = (1, *tile_shape(HEIGHT_PX, WIDTH_PX))
     _forget(before)

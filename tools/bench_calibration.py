@@ -40,8 +40,8 @@ def _detection(rounds: int) -> dict[str, Any]:
     """One 12-megapixel image of a ChArUco board, to corners refined in 12 bits."""
     import cv2
 
+    from coupole.calibration.grey_image import Picture
     from coupole.calibration.lens.board import Board, detect
-    from coupole.calibration.picture import Picture
 
     board = Board(kind="charuco", corners=(11, 8), square_mm=16.0, marker_mm=12.0)
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))

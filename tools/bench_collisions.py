@@ -19,7 +19,7 @@ _POSES = 100
 
 def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
     """Microseconds a pose, of random ones in the demo's cell."""
-    from coupole.job import read_job
+    from coupole.preflight.job import read_job
 
     job = read_job(root / "configs/plans/demo.yaml")
     home_deg = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
@@ -56,8 +56,8 @@ def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | 
         return None
     import trimesh
 
-    from coupole.collisions import ARM_CAPSULES, Capsule
     from coupole.kinematics import KR10_R1100_SIXX, link_frames
+    from coupole.motion.collisions import ARM_CAPSULES, Capsule
 
     rig = job.cell.rig
     tool = tuple(Capsule(t.name, 7, tuple(t.from_mm), tuple(t.to_mm), t.radius_mm) for t in rig.tool)

@@ -21,8 +21,8 @@ _FACE = np.dtype([("corners", "u1"), ("indices", "<i4", (3,))])
 
 
 def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
-    from drivers.mesh_files import read_mesh
-    from drivers.vxelements import read_scan
+    from coupole.scan.mesh_files import read_mesh
+    from coupole.scan.scanner_export import read_scan
 
     with tempfile.TemporaryDirectory(dir=root) as folder:
         path = Path(folder) / "sheet.ply"
@@ -139,7 +139,8 @@ def _trimesh(path: Path) -> Any:
 def _in_a_process(path: Path) -> tuple[float, float]:
     """Seconds and peak memory (GB) of reading and checking a scan in a process of its own."""
     code = (
-        "import json, resource, sys, time; from pathlib import Path; from drivers.vxelements import read_scan; "
+        "import json, resource, sys, time; from pathlib import Path; "
+        "from coupole.scan.scanner_export import read_scan; "
         "start = time.perf_counter(); read_scan(Path(sys.argv[1])); took = time.perf_counter() - start; "
         "peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; print(json.dumps([took, peak * 1024 / 1e9]))"
     )

@@ -143,10 +143,10 @@ def ray_tracers(
 
 def photographer(root: Path, mesh: Path, size: tuple[int, int]) -> Any:
     """The demo's dome around one mesh, and the flange pose that looks straight down at it."""
-    from coupole.cell import world_config
-    from coupole.job import read_job
-    from sim.config import Config
-    from sim.picture import Photographer
+    from coupole.acquisition.cell import world_config
+    from coupole.preflight.job import read_job
+    from sim.optics.photographer import Photographer
+    from sim.world.config import Config
 
     job = read_job(root / "configs/plans/demo.yaml")
     told = world_config(job.cell, job, job.cell.rig.sensor)
@@ -164,7 +164,7 @@ def photographer(root: Path, mesh: Path, size: tuple[int, int]) -> Any:
 
 
 def render_leds(by: Any, pose: NDArray[np.float64], out: NDArray[np.uint16], leds: range) -> None:
-    from sim.camera_body import Exposed
+    from sim.devices.camera_body import Exposed
 
     for led in leds:
         by.render(out, Exposed({led: 0.008}, [], 0.008, 1.0, led, pose))

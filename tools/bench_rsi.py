@@ -89,7 +89,7 @@ def free_port() -> int:
 def our_responder() -> Iterator[tuple[Controller, bool]]:
     """The driver's process with a session, and whether it runs under SCHED_FIFO."""
     from coupole.devices import SystemClock
-    from drivers.kuka_rsi import KukaRsi, Settings
+    from drivers.kuka.rsi.driver import KukaRsi, Settings
 
     port = free_port()
     settings = Settings(listen=f"127.0.0.1:{port}", delay_limit=10**9, link_timeout_s=1e6)

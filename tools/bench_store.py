@@ -102,14 +102,14 @@ def _cpu_s() -> float:
 
 def _coupole(folder: Path, pixels: NDArray[np.uint16], frames: int, *, packed: bool = False) -> None:
     from coupole.devices import FrameFormat
-    from coupole.store import ViewWriter, create
+    from coupole.storage.frame_file import ViewWriter, create
 
     view = folder / "view.h5"
     metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}
     create(view, frames, FrameFormat(HEIGHT_PX, WIDTH_PX, 12, "GBRG", 64, 4095), metadata, packed=packed)
     writer = ViewWriter(view, {})
     keep = partial(writer.put, camera_ns=0, exposure_us=8000)
-    with ThreadPoolExecutor(3) as pool:  # as `coupole.intake` does
+    with ThreadPoolExecutor(3) as pool:  # as `coupole.acquisition.frame_grabber` does
         slots = [pool.submit(keep, pixels[k % len(pixels)], frame_id=k) for k in range(frames)]
         for k, slot in enumerate(slots):
             writer.prove(slot.result(), f"view/led{k:04d}/e0", led=k)
@@ -246,13 +246,13 @@ def _burst(root: Path, folder: Path) -> dict[str, float]:
     """Figures of the second burst of a run, the first having filled the camera's memory with pictures."""
     from ruamel.yaml import YAML
 
-    from coupole.cell import open_cell
-    from coupole.job import read_job
-    from coupole.observer import Observer, Progress
-    from coupole.recorder import RunRecorder
-    from coupole.run import Run
-    from coupole.sequencer import Sequencer
-    from coupole.session import about_run, metadata_of_views
+    from coupole.acquisition.cell import open_cell
+    from coupole.acquisition.observer import Observer, Progress
+    from coupole.acquisition.recorder import RunRecorder
+    from coupole.acquisition.sequencer import Sequencer
+    from coupole.acquisition.session import about_run, metadata_of_views
+    from coupole.preflight.job import read_job
+    from coupole.storage.run import Run
 
     rig = YAML(typ="safe").load(root / "configs/rigs/sim.yaml")
     rig["sensor"] = {

@@ -26,15 +26,15 @@ from coupole.calibration.lens.images import find_board
 from coupole.calibration.lens.workflow import camera_from, hand_eye_from
 from coupole.calibration.posed_camera import CameraPrior, read_posed_camera
 from coupole.calibration.record import Record, write_record
+from coupole.calibration.request import Wish
 from coupole.calibration.sources import About
 from coupole.calibration.stickers.mesh_to_robot import Stated as StatedOfMesh
 from coupole.calibration.stickers.sources import Scan, find_all_stickers, read_scan
 from coupole.calibration.stickers.workflow import mesh_from
-from coupole.calibration.wish import Wish
 from coupole.geometry import apply, inverse, transform
 from coupole.kinematics import Arm
-from coupole.rig import planning_arm
-from coupole.scan import import_scan
+from coupole.plan.rig import planning_arm
+from coupole.scan.scan import import_scan
 from random_cells import (
     LED_BOARDS,
     MARKER_MM,
@@ -49,10 +49,10 @@ from random_cells import (
     RandomCell,
     some_leds,
 )
-from sim.dome import as_built
-from sim.kuka_kinematics import flange_pose
-from sim.scanner import export_scan, scanner_from_thing
-from sim.scene import read_leds
+from sim.devices.kuka_kinematics import flange_pose
+from sim.devices.scanner import export_scan, scanner_from_thing
+from sim.optics.dome import as_built
+from sim.scene.scene import read_leds
 
 STEPS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
 

@@ -15,8 +15,8 @@ from typing import Any
 from PIL import Image
 from ruamel.yaml import YAML
 
-from coupole.job import read_job
-from coupole.simulate import simulate
+from coupole.preflight.job import read_job
+from coupole.viewing.simulated_frames import simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = ROOT / "docs/pictures/gallery"

@@ -15,9 +15,10 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from drivers import kuka_eki, kuka_rsi
-from drivers import kuka_eki_wire as wire
-from drivers.kuka_rsi_corrections import NAMES
+from drivers.kuka import eki as kuka_eki
+from drivers.kuka import rsi as kuka_rsi
+from drivers.kuka.eki import wire
+from drivers.kuka.rsi.corrections import NAMES
 
 ROOT = Path(__file__).resolve().parents[1]
 TEMPLATES = ROOT / "tools" / "kuka"
@@ -225,8 +226,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=ROOT / "configs" / "kuka")
     parser.add_argument("--pc-address", default="192.168.1.10", help="the PC's address in the RSI network")
-    parser.add_argument("--rsi", default="{}", help="settings of drivers.kuka_rsi, JSON")
-    parser.add_argument("--eki", default="{}", help="settings of drivers.kuka_eki, JSON")
+    parser.add_argument("--rsi", default="{}", help="settings of drivers.kuka.rsi, JSON")
+    parser.add_argument("--eki", default="{}", help="settings of drivers.kuka.eki, JSON")
     parser.add_argument("--load", type=int, default=1, help="number of the camera's LOAD_DATA")
     options = parser.parse_args(arguments)
     rsi = kuka_rsi.Settings.model_validate_json(options.rsi)

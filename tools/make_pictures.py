@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole import kinematics
-from coupole.cell import world_config
+from coupole.acquisition.cell import world_config
 from coupole.geometry import apply, inverse, transform
-from coupole.itinerary import plan_itinerary
-from coupole.job import Job, read_job
-from coupole.picture import develop, png
-from sim.camera_body import Exposed
-from sim.config import Config
-from sim.picture import Photographer
+from coupole.motion.itinerary import plan_itinerary
+from coupole.preflight.job import Job, read_job
+from coupole.viewing.raw_preview import develop, png
+from sim.devices.camera_body import Exposed
+from sim.optics.photographer import Photographer
+from sim.world.config import Config
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURES = ROOT / "docs/pictures"

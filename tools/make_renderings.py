@@ -10,8 +10,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from coupole.render_scene import STUDIO, read_scene, render_scene
-from coupole.rig import load_class
+from coupole.commands.render_scene import STUDIO, read_scene, render_scene
+from coupole.plan.rig import load_class
 
 ROOT = Path(__file__).parent.parent
 PICTURES = ROOT / "docs" / "pictures" / "renderings"

@@ -12,22 +12,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.acquisition.cell import world_config
+from coupole.calibration.grey_image import Picture
+from coupole.calibration.leds.led_plan import led_plan
 from coupole.calibration.leds.matching import LedSightings
-from coupole.calibration.leds.plan import led_plan
 from coupole.calibration.leds.sources import LedImages
 from coupole.calibration.leds.spots import find_spots
-from coupole.calibration.picture import Picture
 from coupole.calibration.poses import reported
 from coupole.calibration.sources import About, Source, Sources
-from coupole.cell import world_config
-from coupole.dome import LedTable
 from coupole.geometry import apply, inverse, transform
-from coupole.itinerary import plan_itinerary
-from coupole.job import Cell, read_cell, read_job
-from coupole.templates import TEMPLATES
-from sim.config import Config
-from sim.kuka_kinematics import PoseErrors, flange_pose
-from sim.stills import Stills
+from coupole.motion.itinerary import plan_itinerary
+from coupole.plan.led_table import LedTable
+from coupole.plan.templates import TEMPLATES
+from coupole.preflight.job import Cell, read_cell, read_job
+from sim.devices.kuka_kinematics import PoseErrors, flange_pose
+from sim.world.config import Config
+from sim.world.stills import Stills
 
 ROOT = Path(__file__).resolve().parents[1]
 RIG = ROOT / "configs/rigs/sim-imperfect.yaml"

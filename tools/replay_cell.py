@@ -1,6 +1,6 @@
 """The cell as python-fcl sees it: an independent check of motions that Coupole's own checker has called clear.
 
-Nothing of `coupole.kinematics`, `coupole.collisions` or `coupole.paths` is used (but the sizes of the arm's
+Nothing of `coupole.kinematics`, `motion.collisions` or `motion.path_planner` is used (but the sizes of the arm's
 capsules, where its meshes are not at hand): the chain of joints is the data sheet's, profiles are ruckig's, bodies
 are triangle meshes and fcl's own shapes.
 """
@@ -18,9 +18,9 @@ import trimesh
 from numpy.typing import NDArray
 from ruckig import InputParameter, Ruckig, Trajectory
 
-from coupole.bodies import ARM_CAPSULES, Capsule
-from coupole.job import Job
-from coupole.rig import KeepOutSphere
+from coupole.motion.bodies import ARM_CAPSULES, Capsule
+from coupole.plan.rig import KeepOutSphere
+from coupole.preflight.job import Job
 
 STEP_S = 0.004
 JOINTS_MM = ((0, 0, 400), (25, 0, 0), (560, 0, 0), (0, 0, 35), (515, 0, 0), (80, 0, 0))

@@ -23,10 +23,10 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from coupole.itinerary import Itinerary, bodies_of, plan_itinerary
-from coupole.job import Job, read_job, schedule_of
 from coupole.kinematics import KR10_R1100_SIXX
-from coupole.plan import Plan
+from coupole.motion.itinerary import Itinerary, bodies_of, plan_itinerary
+from coupole.plan.plan import Plan
+from coupole.preflight.job import Job, read_job, schedule_of
 from replay_cell import ReplayCell, Touch, motion
 
 ROOT = Path(__file__).resolve().parents[1]

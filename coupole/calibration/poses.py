@@ -20,11 +20,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from coupole import yamlfile
 from coupole.calibration.rotations import Floats, inverses, rotation
 from coupole.errors import InputError
 from coupole.geometry import abc_from_rotation
-from coupole.plan import Model
+from coupole.plan import yamlfile
+from coupole.plan.plan import Model
 
 Rotation = Literal["abc", "xyz", "rotation_vector", "quaternion_wxyz"]
 _AXES = np.eye(3)

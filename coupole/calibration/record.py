@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AwareDatetime, Field
 
-from coupole import yamlfile
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.errors import InputError, StorageError
 from coupole.geometry import abc_from_rotation
-from coupole.plan import Model, Name, Pose
+from coupole.plan import yamlfile
+from coupole.plan.plan import Model, Name, Pose
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Positive = Annotated[float, Field(gt=0)]

@@ -20,12 +20,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole import store
-from coupole.calibration.picture import COLOUR, Picture
+from coupole.calibration.grey_image import COLOUR, Picture
 from coupole.calibration.poses import PoseFile, ReportedPoses, read_poses, reported
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError, StorageError
-from coupole.run import ProvenFrame, Run, is_shot, sha256
+from coupole.storage import frame_file
+from coupole.storage.run import ProvenFrame, Run, is_shot, sha256
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
 POSES_NAME, BOARD_NAME = "poses.yaml", "board.yaml"
@@ -138,7 +138,7 @@ def _of_run(run: Run) -> Sources:
     temperatures: list[float] = []
     for view, frames in by_view.items():
         path = run.view_path(view)
-        table = store.read_frames(path)
+        table = frame_file.read_frames(path)
         poses, attributes = poses_and_attributes(path)
         lit = _at_one_pose([frame for frame in frames if is_shot(frame.shot)], table)
         if not lit:
@@ -168,11 +168,11 @@ def _mean_frame(
     name: str, path: Path, lit: Sequence[ProvenFrame], dark: Sequence[ProvenFrame], table: NDArray[np.void]
 ) -> Picture:
     """Mean of the frames at the longest exposure that clips little, dark frames subtracted."""
-    layout, facts = store.read_layout(path), store.read_facts(path)
+    layout, facts = frame_file.read_layout(path), frame_file.read_facts(path)
     exposures = {frame.shot: int(table[frame.index]["exposure_us"]) for frame in (*lit, *dark)}
     for exposure_us in sorted({exposures[frame.shot] for frame in lit}, reverse=True):
         mine = [frame for frame in lit if exposures[frame.shot] == exposure_us]
-        frames = [store.read_frame(path, layout, frame.index) for frame in _spread(mine)]
+        frames = [frame_file.read_frame(path, layout, frame.index) for frame in _spread(mine)]
         clipped = np.mean([np.mean(frame >= facts["white_dn"]) for frame in frames])
         if clipped < _CLIPPED:
             break
@@ -180,7 +180,7 @@ def _mean_frame(
     darks = [frame for frame in dark if exposures[frame.shot] == exposure_us]
     if darks:
         black = np.mean(
-            [store.read_frame(path, layout, f.index) for f in _spread(darks)], axis=0, dtype=np.float64
+            [frame_file.read_frame(path, layout, f.index) for f in _spread(darks)], axis=0, dtype=np.float64
         )
     else:
         black = np.full(mean.shape, float(facts["black_dn"]))
@@ -212,7 +212,7 @@ def poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
     """The table of poses and the attributes of a view's file. Raises StorageError."""
     try:
         with h5py.File(path, "r") as file:
-            return file[store.POSES][:], dict(file["entry"].attrs)
+            return file[frame_file.POSES][:], dict(file["entry"].attrs)
     except (OSError, KeyError) as error:
         raise StorageError(f"{path}: not a view file of a run: {error}") from error
 

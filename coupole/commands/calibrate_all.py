@@ -39,9 +39,9 @@ def calibrate_all(
     again to finish. For a real cell it says what must stand on the support, and waits; a simulated one has its own
     object and scanner.
     """
-    from coupole.console import make_console
-    from coupole.job import read_cell
-    from coupole.rig import in_world
+    from coupole.plan.rig import in_world
+    from coupole.preflight.job import read_cell
+    from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     known = [step.name for step in STEPS]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.calibration.leds.limits import LEDS
-from coupole.calibration.stickers.limits import MESH
+from coupole.calibration.leds.acceptance import LEDS
+from coupole.calibration.stickers.acceptance import MESH
 from coupole.commands.calibrating import Work, bar, calibration
 from coupole.errors import InputError
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from coupole.calibration.calibrated_arm import CalibratedArm
     from coupole.calibration.report import Outcome
-    from coupole.calibration.wish import Wish
-    from coupole.job import Cell
+    from coupole.calibration.request import Wish
+    from coupole.preflight.job import Cell
 
 Runs = Annotated[list[Path], typer.Argument(help="Runs.", show_default=False, metavar="RUN...")]
 HandEyeOption = Annotated[Path, typer.Option("--hand-eye", help="The hand-eye record, which has the lens too.")]
@@ -51,7 +51,7 @@ def leds(
     from coupole.calibration.leds.workflow import leds_from
     from coupole.calibration.posed_camera import read_posed_camera
     from coupole.calibration.report import Outcome
-    from coupole.run import sha256
+    from coupole.storage.run import sha256
 
     def work(console: Console, wish: Wish) -> Outcome:
         cell = _cell(rig, runs)
@@ -140,7 +140,7 @@ def _arm(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
     """The rig's arm by a hand-eye record; None for a record without axis zeros. Raises InputError where the rig's
     driver knows no model of the arm."""
     from coupole.calibration.calibrated_arm import has_axis_zeros, read_arm
-    from coupole.rig import planning_arm
+    from coupole.plan.rig import planning_arm
 
     if not has_axis_zeros(hand_eye):
         return None
@@ -155,8 +155,8 @@ def _arm(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
 
 def _cell(rig: Path | None, runs: list[Path]) -> Cell:
     """The rig that is named, or that of the first run if it is still what it was."""
-    from coupole.job import read_cell
-    from coupole.run import Run, sha256
+    from coupole.preflight.job import read_cell
+    from coupole.storage.run import Run, sha256
 
     if rig is not None:
         return read_cell(rig)

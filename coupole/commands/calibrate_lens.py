@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.calibration.lens.limits import CAMERA, CHROMATIC, HAND_EYE
+from coupole.calibration.lens.acceptance import CAMERA, CHROMATIC, HAND_EYE
 from coupole.commands.calibrating import Paths, Work, bar, calibration
 from coupole.errors import InputError
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from coupole.calibration.lens.images import Found
     from coupole.calibration.lens.workflow import Shown
     from coupole.calibration.report import Outcome
+    from coupole.calibration.request import Wish
     from coupole.calibration.sources import Sources
-    from coupole.calibration.wish import Wish
     from coupole.kinematics import Arm
 
 BoardOption = Annotated[
@@ -160,8 +160,8 @@ def _earlier_lens(path: Path | None, sources: Sources, found: Found) -> EarlierL
 
 
 def _arm(rig: Path | None) -> Arm | None:
-    from coupole.job import read_cell
-    from coupole.rig import planning_arm
+    from coupole.plan.rig import planning_arm
+    from coupole.preflight.job import read_cell
 
     if rig is None:
         return None

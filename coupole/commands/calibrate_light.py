@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.calibration.light.limits import DARK, DRIFT, LED_POWER, RESPONSE
+from coupole.calibration.light.acceptance import DARK, DRIFT, LED_POWER, RESPONSE
 from coupole.commands.calibrating import EmissionOption, Work, bar, calibration, emission_of
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from coupole.calibration.light.led_power_tile import Setting
     from coupole.calibration.optics import Intrinsics
     from coupole.calibration.report import Outcome
-    from coupole.calibration.wish import Wish
+    from coupole.calibration.request import Wish
 
 Runs = Annotated[list[Path], typer.Argument(help="Runs.", show_default=False, metavar="RUN...")]
 DarkOption = Annotated[
@@ -178,7 +178,7 @@ def _setting(
     from coupole.calibration.light.led_power_tile import Setting, calibrated_positions
     from coupole.calibration.light.spectralon import read_tile
     from coupole.calibration.light.tile_views import Positions
-    from coupole.job import read_cell
+    from coupole.preflight.job import read_cell
 
     cell = read_cell(rig)
     by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from coupole.calibration.limits import Allowed, asked, words_of
+from coupole.calibration.acceptance import Allowed, asked, words_of
 from coupole.commands.common import JsonOption, fail
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from coupole.calibration.light.irradiance import Emission
     from coupole.calibration.record import Record
     from coupole.calibration.report import Outcome
-    from coupole.calibration.wish import Wish
+    from coupole.calibration.request import Wish
 
     Work = Callable[[Console, Wish], Outcome]
     """Of a calibration, once its options are known."""
@@ -111,8 +111,8 @@ def _calibrate(
     `limit` is what the operator said of the calibration's `limits`.
     """
     from coupole.calibration.report import write_outcome
-    from coupole.calibration.wish import Wish
-    from coupole.console import make_console
+    from coupole.calibration.request import Wish
+    from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     now = datetime.now(UTC)
@@ -153,7 +153,7 @@ def _refuse_name(name: str | None) -> None:
     """Raise InputError for a name that no record may have."""
     from pydantic import TypeAdapter, ValidationError
 
-    from coupole.plan import Name
+    from coupole.plan.plan import Name
 
     try:
         TypeAdapter(Name | None).validate_python(name)

@@ -36,7 +36,7 @@ OBJECT: Mapping[str, Any] = {
     "stickers": {"count": 24},
 }
 """What a simulated cell has on its support for the mesh, and its scanner scans."""
-SCANNER = "sim.scanner:export_scan"
+SCANNER = "sim.devices.scanner:export_scan"
 MESH = "mesh"
 
 
@@ -139,9 +139,9 @@ class Campaign:
 
     def _acquire(self, step: Step) -> Path:
         """The step's run, complete."""
-        from coupole.job import read_job
-        from coupole.run import Run, sha256, status
-        from coupole.session import acquire_plan
+        from coupole.acquisition.session import acquire_plan
+        from coupole.preflight.job import read_job
+        from coupole.storage.run import Run, sha256, status
 
         plan = self._plan(step)
         begun = sorted((self._out / "runs").glob(f"*-{step.name}"))
@@ -163,9 +163,9 @@ class Campaign:
 
     def _plan(self, step: Step) -> Path:
         """The step's plan; one that stands there, and may have been changed by hand, is kept."""
-        from coupole.calibration.leds.plan import led_plan
-        from coupole.job import read_cell
-        from coupole.templates import LEDS, TEMPLATES
+        from coupole.calibration.leds.led_plan import led_plan
+        from coupole.plan.templates import LEDS, TEMPLATES
+        from coupole.preflight.job import read_cell
 
         path, rig = self._out / "plans" / f"{step.name}.yaml", self._rig_of(step)
         if path.exists():
@@ -200,8 +200,8 @@ class Campaign:
 
     def _scan(self) -> Path:
         """The object's scan; a simulated cell's scanner makes one, which is taken in like any other."""
-        from coupole.rig import load_class
-        from coupole.scan import import_scan
+        from coupole.plan.rig import load_class
+        from coupole.scan.scan import import_scan
 
         if self._given_scan is not None:
             return self._given_scan

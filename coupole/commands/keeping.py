@@ -14,9 +14,9 @@ from coupole.errors import CoupoleError, InputError
 
 def status(run: RunPath, as_json: JsonOption = False) -> None:
     """How far a run is; works while it goes on."""
-    from coupole.console import make_console, show_status
-    from coupole.run import Run
-    from coupole.run import status as status_of
+    from coupole.storage.run import Run
+    from coupole.storage.run import status as status_of
+    from coupole.viewing.terminal import make_console, show_status
 
     found = status_of(Run(run))
     show_status(make_console(quiet=as_json), found)
@@ -28,10 +28,10 @@ def verify(run: RunPath, as_json: JsonOption = False) -> None:
     """Read every frame of a run back: completeness and every checksum."""
     from rich.progress import Progress
 
-    from coupole.console import make_console
     from coupole.errors import ChecksumMismatch, UnprovenError
-    from coupole.run import Run
-    from coupole.run import verify as verify_run
+    from coupole.storage.run import Run
+    from coupole.storage.run import verify as verify_run
+    from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     opened = Run(run)
@@ -63,10 +63,10 @@ def archive(
     """Compress a run's frames, bit for bit; a view is read back and compared before it replaces the old file."""
     from rich.progress import Progress
 
-    from coupole.archive import archive_run
-    from coupole.bitshuffle import codec_of
-    from coupole.console import bytes_text, make_console
-    from coupole.run import Run
+    from coupole.storage.archive import archive_run
+    from coupole.storage.bitshuffle import codec_of
+    from coupole.storage.run import Run
+    from coupole.viewing.terminal import bytes_text, make_console
 
     console = make_console(quiet=as_json)
     try:
@@ -112,9 +112,9 @@ def export(
     """Write proven frames as files of another format, one for each, named after its shot."""
     from rich.progress import Progress
 
-    from coupole.console import bytes_text, make_console
-    from coupole.export import export_run
-    from coupole.run import Run
+    from coupole.exchange.export import export_run
+    from coupole.storage.run import Run
+    from coupole.viewing.terminal import bytes_text, make_console
 
     console = make_console(quiet=as_json)
     folder = out or run / "export"
@@ -152,8 +152,8 @@ def scan(
     as_json: JsonOption = False,
 ) -> None:
     """Take a scanned mesh and its targets in: check them, bring them to mm, draw them."""
-    from coupole.console import make_console
-    from coupole.scan import UNITS, import_scan
+    from coupole.scan.scan import UNITS, import_scan
+    from coupole.viewing.terminal import make_console
 
     for option, given in (("--unit", unit), ("--targets-unit", targets_unit)):
         if given is not None and given not in UNITS:

@@ -22,8 +22,8 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Say everything that can be known of a plan before a device is touched."""
-    from coupole.console import make_console, show_preflight, show_views
-    from coupole.job import preflight_of, read_job
+    from coupole.preflight.job import preflight_of, read_job
+    from coupole.viewing.terminal import make_console, show_preflight, show_views
 
     console = make_console(quiet=as_json)
     try:
@@ -74,9 +74,9 @@ def view(
     as_json: JsonOption = False,
 ) -> None:
     """Draw a plan, refused or not: a picture (PNG) and a page to turn round (HTML)."""
-    from coupole.console import make_console
-    from coupole.job import read_job
-    from coupole.view import look_at_plan
+    from coupole.preflight.job import read_job
+    from coupole.viewing.terminal import make_console
+    from coupole.viewing.view import look_at_plan
 
     try:
         png, html = look_at_plan(read_job(plan, rig), out, make_console(quiet=as_json), paths=not no_paths)
@@ -102,9 +102,9 @@ def simulate(
     """Render some frames of a plan, without devices, for a look: a PNG each, and all on one sheet."""
     from rich.progress import Progress
 
-    from coupole.console import make_console
-    from coupole.job import read_job
-    from coupole.simulate import simulate as render
+    from coupole.preflight.job import read_job
+    from coupole.viewing.simulated_frames import simulate as render
+    from coupole.viewing.terminal import make_console
 
     try:
         job = read_job(plan, rig)
@@ -132,8 +132,8 @@ def simulate(
 
 def schema(what: Annotated[str, typer.Argument(help="plan or rig")]) -> None:
     """JSON schema of plans or rigs, for editors."""
-    from coupole.plan import Plan
-    from coupole.rig import Rig
+    from coupole.plan.plan import Plan
+    from coupole.plan.rig import Rig
 
     models: dict[str, type[Plan] | type[Rig]] = {"plan": Plan, "rig": Rig}
     if what not in models:
@@ -150,8 +150,8 @@ def plan_new(
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the views of `leds`, which are drawn.")] = 1,
 ) -> None:
     """Write a plan to start from. The views of `leds` are chosen for the rig's dome: a minute or two."""
-    from coupole.console import make_console
-    from coupole.templates import LEDS, TEMPLATES
+    from coupole.plan.templates import LEDS, TEMPLATES
+    from coupole.viewing.terminal import make_console
 
     known = sorted([*TEMPLATES, LEDS])
     template = template or (name if name in known else "views")
@@ -161,8 +161,8 @@ def plan_new(
     if path.exists():
         raise InputError(f"{path}: stands here already; choose another name")
     if template == LEDS:
-        from coupole.calibration.leds.plan import led_plan
-        from coupole.job import read_cell
+        from coupole.calibration.leds.led_plan import led_plan
+        from coupole.preflight.job import read_cell
 
         with make_console(quiet=False).status("reading the rig") as status:
             text = led_plan(read_cell(path.parent / rig), name=name, rig=rig, seed=seed, tell=status.update)

@@ -25,9 +25,9 @@ def render(
     """Render a scene in spectral bands: an EXR of all bands and a PNG for each camera, and a summary."""
     from rich.progress import Progress, TaskID
 
-    from coupole.console import make_console
-    from coupole.render_scene import STUDIO, read_scene, render_scene
-    from coupole.rig import load_class
+    from coupole.commands.render_scene import STUDIO, read_scene, render_scene
+    from coupole.plan.rig import load_class
+    from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     try:

@@ -28,9 +28,9 @@ def acquire(
     Ctrl-C stops safely (lights off, arm still) and the run can be resumed. SIGUSR1 pauses between bursts, and
     goes on when sent again.
     """
-    from coupole.console import make_console
-    from coupole.job import read_job
-    from coupole.session import acquire_plan, rehearse
+    from coupole.acquisition.session import acquire_plan, rehearse
+    from coupole.preflight.job import read_job
+    from coupole.viewing.terminal import make_console
 
     if dry_run and (resume or output):
         raise typer.BadParameter("a dry run keeps nothing: --resume and --output do not go with --dry-run")
@@ -58,9 +58,9 @@ def devices(
     """Open each device of a rig, let it say who it is and test itself, close it."""
     from rich.table import Table
 
-    from coupole.cell import open_cell
-    from coupole.console import make_console
-    from coupole.job import read_cell
+    from coupole.acquisition.cell import open_cell
+    from coupole.preflight.job import read_cell
+    from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     cell = read_cell(rig)
@@ -98,10 +98,10 @@ def meter(
     as_json: JsonOption = False,
 ) -> None:
     """Advise on a plan's exposure: a few pictures of each view, under a few lights, none of them kept."""
-    from coupole.console import make_console, show_advice
-    from coupole.job import read_job
-    from coupole.looking import meter as meter_plan
-    from coupole.metering import Wish, write_plan
+    from coupole.acquisition.looking import meter as meter_plan
+    from coupole.preflight.exposure_advice import Wish, write_plan
+    from coupole.preflight.job import read_job
+    from coupole.viewing.terminal import make_console, show_advice
 
     console = make_console(quiet=as_json)
     try:
@@ -141,11 +141,11 @@ def live(
     Of a run the folder alone is read, so it is never slowed. Of a rig or a plan (then its object's light is
     entered in the ledger) the camera is taken; the arm is held where it stands.
     """
-    from coupole.console import make_console
-    from coupole.job import read_cell, read_job
-    from coupole.live import Choice
-    from coupole.looking import watch_cell, watch_run
-    from coupole.yamlfile import read
+    from coupole.acquisition.looking import watch_cell, watch_run
+    from coupole.plan.yamlfile import read
+    from coupole.preflight.job import read_cell, read_job
+    from coupole.viewing.live import Choice
+    from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=False)
     if what.is_dir():
@@ -162,13 +162,13 @@ def sim(
     speed: Annotated[float | None, typer.Option("--speed", min=0.01, help="Pace of the world.")] = None,
 ) -> None:
     """Serve a rig's stand-ins for other clients; prints one JSON line with their endpoints, until Ctrl-C."""
-    from coupole.cell import world_config
-    from coupole.job import read_cell, read_job
-    from coupole.rig import load_class
+    from coupole.acquisition.cell import world_config
+    from coupole.plan.rig import load_class
+    from coupole.preflight.job import read_cell, read_job
 
     job = read_job(plan, rig) if plan else None
     cell = job.cell if job else read_cell(rig)
-    driver = cell.rig.world.driver if cell.rig.world else "sim.client:World"
+    driver = cell.rig.world.driver if cell.rig.world else "sim.world.client:World"
     world = load_class(driver).start(world_config(cell, job, cell.rig.sensor, speed=speed))
     try:
         print(json.dumps(world.endpoints), flush=True)

@@ -1,7 +1,7 @@
-"""What virtual objects are made of: spectra of `sim.materials` as the camera sees them under the dome's LEDs.
+"""What virtual objects are made of: spectra of `appearance.matter` as the camera sees them under the dome's LEDs.
 
 Each material is reduced to a diffuse reflectance, a reflectance at normal incidence and a roughness per channel
-(`sim.surface.Material`). White is a perfect diffuser: Spectralon itself has 0.99.
+(`sim.scene.surface.Material`). White is a perfect diffuser: Spectralon itself has 0.99.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sim.led_light import LedModel, camera_weights
-from sim.materials import channels, fresnel, gilding, indices, kubelka_munk, lacquer, light, typical
-from sim.materials.grid import BANDS, Array, Complex
-from sim.surface import Material, Rgb
+from coupole.appearance.matter import gilding, kubelka_munk, lacquer, typical
+from coupole.appearance.optics import fresnel, indices
+from coupole.appearance.spectra import channels, light
+from coupole.appearance.spectra.grid import BANDS, Array, Complex
+from sim.optics.led_light import LedModel, camera_weights
+from sim.scene.surface import Material, Rgb
 
 SPECTRALON = Material("Spectralon", (0.99, 0.99, 0.99))
 """Labsphere's SRS-99: 99 % over the whole visible range."""
@@ -56,7 +58,7 @@ def paint(
 
 
 def gilt(thickness_nm: float, *, uncovered: float = 0.0, roughness: float = 0.12) -> Material:
-    """Gold leaf on bole (`sim.materials.gilding`): the leaf's mirror part, and the bole that shines through it.
+    """Gold leaf on bole (`appearance.matter.gilding`): its mirror part, and the bole that shines through.
 
     `uncovered` is the share that holes and cracks leave bare; a roughness of 0.12 is well burnished (assumed).
     """

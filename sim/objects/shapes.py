@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from sim.objects import appearance
-from sim.objects.mesh import Array, cells_for, disk, heightfield, of_material, rectangle, skirt
-from sim.surface import Material, Surface
+from sim.objects.patchwork import Array, cells_for, disk, heightfield, of_material, rectangle, skirt
+from sim.scene.surface import Material, Surface
 
 _ICOSAHEDRON_FACES = 20
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.materials import indices, nashiji
+from coupole.appearance.matter import nashiji
+from coupole.appearance.optics import indices
 from sim.objects import appearance
-from sim.objects.mesh import Array, cells_for, joined, of_material, rectangle, skirt, slab
-from sim.surface import Surface
+from sim.objects.patchwork import Array, cells_for, joined, of_material, rectangle, skirt, slab
+from sim.scene.surface import Surface
 
 _BODY_MM = 6.0
 _LEVELS = 6

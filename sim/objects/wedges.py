@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim.objects import appearance
-from sim.objects.mesh import Array, joined, of_material, rectangle, skirt
-from sim.surface import Material, Surface
+from sim.objects.patchwork import Array, joined, of_material, rectangle, skirt
+from sim.scene.surface import Material, Surface
 
 GILT_NM = (0.0, 10.0, 20.0, 40.0, 70.0, 100.0, 150.0, 250.0)
 """From bare bole to bulk gold; a beaten leaf has some 100 nm."""

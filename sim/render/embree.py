@@ -73,7 +73,7 @@ class Obstacles:
     _scene: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Build the tree. `corners_mm` must have 4 bytes to spare behind its end (`sim.scene.spacious`)."""
+        """Build the tree. `corners_mm` must have 4 bytes to spare behind its end (`sim.scene.scene.spacious`)."""
         call, count = self._library, len(self.corners_mm)
         self._indices = np.arange(3 * count, dtype=np.uint32)
         self._device = call.new_device(b"")

@@ -1,7 +1,7 @@
 """Radiance that visible triangles send to the camera under one LED, or under a panel.
 
 L = f E with f = diffuse / pi + D G F / (4 n.l n.v): Lambert and GGX with Smith's separable G (Walter et al. 2007,
-Eqs. 33 and 34) and Schlick's F, as `sim.surface.Material` says. E comes from the whole square emitter; f is taken
+Eqs. 33 and 34) and Schlick's F, as `surface.Material` says. E comes from the whole square emitter; f is taken
 towards its centre where the lobe is wide, towards four Gauss points of it, weighted by their light, where the
 roughness is below `FINE_ROUGHNESS`. Below 0.01 or so, where the lobe is as narrow as the emitter looks (0.4 deg
 at 1 m), four points are too few. A side whose plane has the emitter's centre behind it is dark.
@@ -13,8 +13,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.render.camera_view import View
 from sim.render.emitter import Emitter, packed, per_lumen
-from sim.render.view import View
 
 FINE_ROUGHNESS = 0.3
 _CHUNK = 2048

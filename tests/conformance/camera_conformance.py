@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from coupole.devices import Camera, Exposure, Frame
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused
-from sim.camera_body import Exposed
-from sim.lighting import Lighting
-from sim.reactor import Reactor
+from sim.devices.camera_body import Exposed
+from sim.world.lighting import Lighting
+from sim.world.reactor import Reactor
 
 HEIGHT_PX, WIDTH_PX = 24, 40
 EXPOSURE = Exposure(exposure_us=2_000)

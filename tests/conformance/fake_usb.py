@@ -13,7 +13,7 @@ from typing import Any
 import usb.backend
 import usb.core
 
-from sim.reactor import Reactor
+from sim.world.reactor import Reactor
 
 VENDOR, PRODUCT, SERIAL = 0x1209, 0xC0DE, "SIM-0001"
 OUT, IN = 0x02, 0x81

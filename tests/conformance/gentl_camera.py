@@ -20,12 +20,12 @@ from camera_conformance import fire, in_world, sensor
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform
-from sim import camera_body
-from sim.camera_body import CameraBody, Render, Shot
-from sim.clock import ClockWriter
-from sim.gige_pixels import encode
-from sim.lighting import Lighting
-from sim.reactor import Reactor
+from sim.devices import camera_body
+from sim.devices.camera_body import CameraBody, Render, Shot
+from sim.devices.gige_pixels import encode
+from sim.world.clock import ClockWriter
+from sim.world.lighting import Lighting
+from sim.world.reactor import Reactor
 
 DESCRIPTION_FILE = Path(__file__).with_name("gentl_producer") / "camera.xml"
 TEXT_BYTES, TEXTS_BYTES = 32, 160
@@ -154,7 +154,7 @@ class StandIn:
         if on:
             self.body.arm()
 
-    # -- the wire (see sim.camera_body.Wire) --------------------------------------------------------------
+    # -- the wire (see sim.devices.camera_body.Wire) --------------------------------------------------------------
 
     def claim(self) -> int | None:
         return self._free.popleft() if self._free else None

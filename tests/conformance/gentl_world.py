@@ -15,9 +15,9 @@ import pytest
 from gentl_camera import serve
 
 from coupole.devices import Camera
-from drivers.gentl import GenTLCamera
-from drivers.gentl_settings import Settings
-from sim.clock import SharedClock
+from drivers.camera.gentl.driver import GenTLCamera
+from drivers.camera.gentl.settings import Settings
+from sim.world.clock import SharedClock
 
 SOURCES = Path(__file__).with_name("gentl_producer")
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")

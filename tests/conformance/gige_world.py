@@ -11,10 +11,10 @@ from typing import Any
 from camera_conformance import fire, in_world, sensor
 from gige import gige_port
 
-from drivers.aravis import AravisCamera, Settings
-from sim import gige_camera
-from sim.clock import ClockWriter, SharedClock
-from sim.reactor import Reactor
+from drivers.camera.aravis.driver import AravisCamera, Settings
+from sim.devices import gige_camera
+from sim.world.clock import ClockWriter, SharedClock
+from sim.world.reactor import Reactor
 
 SETTINGS: dict[str, Any] = {
     "address": "127.0.0.1",

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from coupole.devices import NO_LIGHT, STEP_DTYPE
-from drivers import ledbox
-from sim import ledbox_firmware
-from sim.clock import ClockWriter, SharedClock
-from sim.reactor import Reactor
+from drivers.ledbox import LedBox, Settings
+from sim.devices import ledbox_firmware
+from sim.world.clock import ClockWriter, SharedClock
+from sim.world.reactor import Reactor
 
 SPEED = 8.0
 
@@ -74,10 +74,10 @@ def ledbox_world(
 
 
 @contextmanager
-def opened(world: LedBoxWorld, **settings: Any) -> Iterator[ledbox.LedBox]:
+def opened(world: LedBoxWorld, **settings: Any) -> Iterator[LedBox]:
     """The driver, opened on the world's box. The watchdog is slow: the tests' machine may stall."""
     values = {"port": world.box.port, "watchdog_s": 20.0, **settings}
-    driver = ledbox.LedBox(ledbox.Settings(**values), world.clock)
+    driver = LedBox(Settings(**values), world.clock)
     try:
         yield driver
     finally:
@@ -100,7 +100,7 @@ def dark_table(count: int = 4) -> Any:
     return steps
 
 
-def run_to_end(driver: ledbox.LedBox, world: LedBoxWorld, wait_s: float = 30.0) -> Any:
+def run_to_end(driver: LedBox, world: LedBoxWorld, wait_s: float = 30.0) -> Any:
     """Poll until the burst has ended; all records of the log."""
     end_ns = world.clock.now_ns() + int(wait_s * 1e9)
     parts = [driver.poll_log()]

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from coupole.devices import Robot
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused
 from coupole.kinematics import KR10_R1100_SIXX, forward
-from drivers.kuka_rsi import KukaRsi, Settings
-from sim.clock import ClockWriter, SharedClock
-from sim.kuka_controller import ALIKE, KukaController
-from sim.kuka_controller import Settings as ControllerSettings
-from sim.reactor import Reactor
+from drivers.kuka.rsi.driver import KukaRsi, Settings
+from sim.devices.kuka_controller import ALIKE, KukaController
+from sim.devices.kuka_controller import Settings as ControllerSettings
+from sim.world.clock import ClockWriter, SharedClock
+from sim.world.reactor import Reactor
 
 HOME_DEG = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
 AWAY_DEG = np.array([50.0, -50.0, 40.0, 30.0, 60.0, -70.0])

@@ -21,8 +21,8 @@ from gige import needs_aravis
 from gige_world import SETTINGS, GigeWorld, gige_world
 
 from coupole.errors import DeviceLost, DeviceRefused
-from drivers.aravis import AravisCamera
-from drivers.aravis_discovery import discover
+from drivers.camera.aravis.discovery import discover
+from drivers.camera.aravis.driver import AravisCamera
 
 pytestmark = needs_aravis
 
@@ -196,7 +196,7 @@ def test_a_camera_that_forgets_its_client_in_a_burst_is_lost(world: GigeWorld) -
 
 def test_a_camera_whose_client_was_killed_is_had_after_its_heartbeat(world: GigeWorld) -> None:
     script = (
-        "import os, sys; from drivers.aravis import AravisCamera, Settings; from coupole.devices import *;"
+        "import os, sys; from drivers.camera.aravis import AravisCamera, Settings; from coupole.devices import *;"
         "camera = AravisCamera(Settings.model_validate_json(sys.argv[1]), SystemClock());"
         "camera.configure(Exposure(2000)); camera.arm(8); os.kill(os.getpid(), 9)"
     )

@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 
 from coupole.devices import Exposure
 from coupole.errors import DeviceLost, DeviceRefused
-from drivers.gentl import GenTLCamera
-from drivers.gentl_producer import Gaps
+from drivers.camera.gentl.driver import GenTLCamera
+from drivers.camera.gentl.producer import Gaps
 
 pytest.importorskip("genicam", reason="the extra `gentl` is not installed")
 pytest.importorskip("harvesters", reason="the extra `gentl` is not installed")

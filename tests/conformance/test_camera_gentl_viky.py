@@ -19,8 +19,8 @@ from camera_conformance import A_MOMENT_S, BY_SOFTWARE, EXPOSURE, take
 
 from coupole.devices import SystemClock
 from coupole.errors import DeviceLost, DeviceRefused
-from drivers.gentl import GenTLCamera
-from drivers.gentl_settings import Settings
+from drivers.camera.gentl.driver import GenTLCamera
+from drivers.camera.gentl.settings import Settings
 
 genicam = pytest.importorskip("genicam", reason="the extra `gentl` is not installed")
 pytest.importorskip("harvesters", reason="the extra `gentl` is not installed")

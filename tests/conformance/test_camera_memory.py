@@ -11,11 +11,11 @@ import pytest
 from camera_conformance import CameraConformance, fire, in_world, sensor
 
 from coupole.devices import Camera
-from sim.camera_server import CameraServer
-from sim.camera_server import Settings as ServerSettings
-from sim.clock import ClockWriter, SharedClock
-from sim.memory_camera import MemoryCamera, Settings
-from sim.reactor import Reactor
+from sim.devices.camera_server import CameraServer
+from sim.devices.camera_server import Settings as ServerSettings
+from sim.devices.memory_camera import MemoryCamera, Settings
+from sim.world.clock import ClockWriter, SharedClock
+from sim.world.reactor import Reactor
 
 
 class MemoryWorld:

@@ -14,7 +14,7 @@ from xiapi_world import XiWorld, compile_stub, needs_compiler
 
 from coupole.devices import Exposure
 from coupole.errors import DeviceLost, DeviceRefused
-from drivers.xiapi_library import Image, code_name
+from drivers.camera.xiapi.library import Image, code_name
 
 pytestmark = needs_compiler
 PERIOD_NS = 10_000_000

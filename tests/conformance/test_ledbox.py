@@ -16,8 +16,8 @@ from ledbox_world import LedBoxWorld, dark_table, ledbox_world, opened, run_to_e
 
 from coupole.devices import FLAG_NO_TRIGGER, NO_LIGHT, STATUS_NO_EDGE
 from coupole.errors import DeviceLost, DeviceRefused, DeviceTimeout
-from drivers.ledbox import LedBox
-from sim.reactor import Reactor
+from drivers.ledbox.driver import LedBox
+from sim.world.reactor import Reactor
 
 
 def usb_world(folder: Path, monkeypatch: pytest.MonkeyPatch) -> AbstractContextManager[LedBoxWorld]:

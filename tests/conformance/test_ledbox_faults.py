@@ -13,8 +13,8 @@ from ledbox_world import LedBoxWorld, ledbox_world, opened, run_to_end, table
 
 from coupole.devices import NO_LIGHT, STATUS_LED_OPEN, STATUS_OVER_TEMPERATURE
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused
-from drivers.ledbox import LedBox
-from sim import ledbox_firmware
+from drivers.ledbox.driver import LedBox
+from sim.devices import ledbox_firmware
 
 
 @pytest.fixture

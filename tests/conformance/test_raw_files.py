@@ -22,16 +22,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tiny_dng import BLACK_DN, WHITE_DN, write_dng
 
+from coupole.acquisition.frame_matching import FaultModel, match
 from coupole.devices import STEP_RECORD_DTYPE, Exposure, Frame, FrameFormat, SystemClock
-from coupole.dome import LedTable
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused
-from coupole.matching import FaultModel, match
-from coupole.plan import Plan
-from coupole.shots import build_schedule
-from drivers.raw_exif import read_exif
-from drivers.raw_files import RawFiles, Settings
-from drivers.raw_order import proven_order
-from drivers.raw_picture import decode
+from coupole.plan.led_table import LedTable
+from coupole.plan.plan import Plan
+from coupole.plan.shots import build_schedule
+from drivers.camera.raw.driver import RawFiles, Settings
+from drivers.camera.raw.exif import read_exif
+from drivers.camera.raw.order import proven_order
+from drivers.camera.raw.picture import decode
 
 pytest.importorskip("rawpy", reason="the extra `real-data` is not installed")
 

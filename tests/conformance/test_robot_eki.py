@@ -20,11 +20,11 @@ from robot_conformance import AWAY_DEG, HOME_DEG, RobotCell, RobotConformance
 
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from coupole.kinematics import move_duration_s
-from drivers.kuka_eki import KukaEki, Settings
-from sim.clock import ClockWriter
-from sim.kuka_eki_controller import KukaEkiController
-from sim.kuka_eki_controller import Settings as ControllerSettings
-from sim.reactor import Reactor
+from drivers.kuka.eki.driver import KukaEki, Settings
+from sim.devices.kuka_eki_controller import KukaEkiController
+from sim.devices.kuka_eki_controller import Settings as ControllerSettings
+from sim.world.clock import ClockWriter
+from sim.world.reactor import Reactor
 
 SAMPLE_MS = 4
 KINDS: dict[str, dict[str, Any]] = {
@@ -269,7 +269,7 @@ def test_a_server_that_says_nothing_is_no_controller(cell: EkiCell) -> None:
 def test_a_killed_driver_leaves_the_arm_at_rest_and_another_may_come(cell: EkiCell) -> None:
     script = (
         "import sys, time, numpy; from pathlib import Path\n"
-        "from sim.clock import SharedClock; from drivers.kuka_eki import KukaEki, Settings\n"
+        "from sim.world.clock import SharedClock; from drivers.kuka.eki.driver import KukaEki, Settings\n"
         "robot = KukaEki(Settings.model_validate_json(sys.argv[1]), SharedClock(Path(sys.argv[2])))\n"
         f"robot.move_to(numpy.array({AWAY_DEG.tolist()}))\n"
         "time.sleep(60)\n"
@@ -315,7 +315,7 @@ def test_the_self_test_compares_the_poses_of_both_sides(
     assert "as computed from the axes" in robot.self_test()["pose"]
     off = np.eye(4)
     off[0, 3] = 5.0
-    monkeypatch.setattr("drivers.kuka_eki.forward", lambda *_: off)
+    monkeypatch.setattr("drivers.kuka.eki.driver.forward", lambda *_: off)
     with pytest.raises(DeviceError, match="NULLFRAME"):
         robot.self_test()
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from robot_conformance import AWAY_DEG, HOME_DEG, KukaCell, RobotConformance
 
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
-from drivers.kuka_rsi import KukaRsi
+from drivers.kuka.rsi.driver import KukaRsi
 
 KINDS: dict[str, dict[str, Any]] = {
     "4ms": {},
@@ -121,7 +121,7 @@ class TestKukaRsi(RobotConformance):
     def test_a_killed_parent_leaves_no_process_and_the_arm_at_rest(self, cell: KukaCell) -> None:
         script = (
             "import sys, time, numpy; from pathlib import Path\n"
-            "from sim.clock import SharedClock; from drivers.kuka_rsi import KukaRsi, Settings\n"
+            "from sim.world.clock import SharedClock; from drivers.kuka.rsi.driver import KukaRsi, Settings\n"
             "robot = KukaRsi(Settings.model_validate_json(sys.argv[1]), SharedClock(Path(sys.argv[2])))\n"
             f"robot.move_to(numpy.array({AWAY_DEG.tolist()}))\n"
             "print(robot._process.pid, flush=True)\n"

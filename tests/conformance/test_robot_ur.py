@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from robot_conformance import AWAY_DEG, HOME_DEG, RobotCell, RobotConformance
 
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout, InputError
-from drivers.ur import Settings, UrRobot
-from sim.clock import ClockWriter
-from sim.reactor import Reactor
-from sim.ur_arm import flange_pose, rotation_vector
-from sim.ur_controller import Settings as ControllerSettings
-from sim.ur_controller import UrController
+from drivers.ur.driver import Settings, UrRobot
+from sim.devices.ur_arm import flange_pose, rotation_vector
+from sim.devices.ur_controller import Settings as ControllerSettings
+from sim.devices.ur_controller import UrController
+from sim.world.clock import ClockWriter
+from sim.world.reactor import Reactor
 
 pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
 
@@ -259,7 +259,7 @@ def test_closing_twice_or_with_a_dead_process_raises_nothing(cell: UrCell, robot
 def test_a_killed_parent_leaves_no_process_and_the_arm_at_rest(cell: UrCell) -> None:
     script = (
         "import sys, time, numpy; from pathlib import Path\n"
-        "from sim.clock import SharedClock; from drivers.ur import UrRobot, Settings\n"
+        "from sim.world.clock import SharedClock; from drivers.ur.driver import UrRobot, Settings\n"
         "robot = UrRobot(Settings.model_validate_json(sys.argv[1]), SharedClock(Path(sys.argv[2])))\n"
         f"robot.move_to(numpy.array({AWAY_DEG.tolist()}))\n"
         "print(robot._process.pid, flush=True)\n"

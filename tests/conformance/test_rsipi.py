@@ -24,7 +24,7 @@ from cells import REPO, CellFolder, wait_until
 
 from coupole.devices import SystemClock
 from coupole.kinematics import KR10_R1100_SIXX, forward
-from drivers.kuka_rsi import KukaRsi, Settings
+from drivers.kuka.rsi.driver import KukaRsi, Settings
 
 if importlib.util.find_spec("RSIPI") is None:
     pytest.skip("RSIPI is not installed", allow_module_level=True)

@@ -1,4 +1,4 @@
-/* A camera behind xiAPI's functions: what drivers/xiapi.py talks to in the tests.
+/* A camera behind xiAPI's functions: what drivers/camera/xiapi/driver.py talks to in the tests.
  *
  * Written from xiApi.h (XIMEA), not from the library: functions, structure and numbers are that header's. How
  * the real library behaves where the header says nothing is this file's guess; each guess is marked so.

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from coupole.devices import Camera, SystemClock
-from drivers.xiapi import Settings, XiCamera
+from drivers.camera.xiapi.driver import Settings, XiCamera
 
 SOURCE = Path(__file__).with_name("xiapi_stub.c")
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")

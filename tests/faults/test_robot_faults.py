@@ -13,7 +13,7 @@ import pytest
 from cells import SIDE, TOP, CellFolder
 from failures import MORE_LIGHTS, assert_complete_once_mended, assert_told, fail_in_a_burst
 
-from sim.client import World
+from sim.world.client import World
 
 ROBOT_FAULTS = pytest.mark.parametrize(
     "fault",

@@ -14,8 +14,8 @@ import pytest
 from archives import MadeRun, make_run
 from cells import SIDE, TOP, CellFolder
 
-from coupole import store
 from coupole.devices import FrameFormat
+from coupole.storage import frame_file
 
 LARGE = FrameFormat(height_px=512, width_px=768, bit_depth=12, bayer_pattern="GBRG", black_dn=64, white_dn=4095)
 VIEWS = ("a", "b", "c")
@@ -23,17 +23,17 @@ VIEWS = ("a", "b", "c")
 
 def archived(run: Path) -> list[str]:
     """Views of a run that are archived."""
-    return [path.stem for path in sorted((run / "views").glob("*.h5")) if store.read_layout(path).archived]
+    return [path.stem for path in sorted((run / "views").glob("*.h5")) if frame_file.read_layout(path).archived]
 
 
 def assert_frames_are_there(made: MadeRun) -> None:
-    """All proven frames are read back, bit for bit; with the command, and with nothing but the store."""
+    """All proven frames are read back, bit for bit; with the command, and with nothing but the frame_file."""
     verified = cells.here("verify", made.run.folder, "--json")
     assert verified.code == 0, verified
     assert verified.document["frames"] == len(made.frames)
     for shot, frame in made.run.proven().items():
         path = made.run.folder / frame.file
-        pixels = store.read_frame(path, store.read_layout(path), frame.index)
+        pixels = frame_file.read_frame(path, frame_file.read_layout(path), frame.index)
         assert pixels.tobytes() == made.frames[shot].tobytes(), shot
 
 
@@ -73,7 +73,7 @@ def test_archiving_what_is_wrong_on_the_disk_ends_with_six(tmp_path: Path) -> No
     made = make_run(tmp_path)
     path = made.run.view_path("side")
     with path.open("r+b") as file:
-        file.seek(store.read_layout(path).data_offset + made.run.proven()["side/led0001/e0"].index * 24576)
+        file.seek(frame_file.read_layout(path).data_offset + made.run.proven()["side/led0001/e0"].index * 24576)
         file.write(b"\xff\xff")
     ended = cells.here("archive", made.run.folder, "--json")
     assert (ended.code, ended.document["kind"]) == (6, "ChecksumMismatch")

@@ -11,8 +11,8 @@ from ruamel.yaml import YAML
 
 from coupole.calibration.record import read_record
 from coupole.commands.campaign import Campaign, Repeatability
-from coupole.console import make_console
-from coupole.templates import TEMPLATES
+from coupole.plan.templates import TEMPLATES
+from coupole.viewing.terminal import make_console
 
 STEPS = ("--only", "darks", "--only", "response")
 

@@ -16,7 +16,7 @@ from ruamel.yaml import YAML
 
 from coupole.calibration.light.frames import LightFrame, open_light_frames
 from coupole.calibration.record import Record, read_record
-from sim.led_light import LedModel, led_flux_factor
+from sim.optics.led_light import LedModel, led_flux_factor
 
 LEDS = {"kind": "every", "every": 24}
 """45 of them, all round the dome."""

@@ -17,8 +17,8 @@ from coupole.calibration.record import Input, Parameter, Record, Validity, read_
 from coupole.commands.campaign import OBJECT
 from coupole.errors import InputError
 from coupole.geometry import transform
-from coupole.plan import Pose
-from sim.scanner import export_scan, scanner_from_thing
+from coupole.plan.plan import Pose
+from sim.devices.scanner import export_scan, scanner_from_thing
 
 BASE_FROM_SUPPORT = transform((200.0, 0.0, 1450.0), (0.0, 0.0, 180.0))
 LENS_U = {"fx_px": 0.05, "fy_px": 0.05, "cx_px": 0.05, "cy_px": 0.05, "k1": 2e-4, "p1": 1e-5, "p2": 1e-5}

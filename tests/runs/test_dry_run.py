@@ -16,7 +16,7 @@ def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellFolder, End
     cell = CellFolder(tmp_path_factory.mktemp("dry"))
     cell.rig_data["ledbox"] = {"driver": "drivers.ledbox:LedBox", "settings": {"port": "/dev/ttyNOPE"}}
     cell.rig_data["camera"]["settings"] = {"address": "/nowhere"}
-    cell.rig_data["robot"] = {"driver": "drivers.kuka_rsi:KukaRsi", "settings": {"listen": "192.0.2.1:49152"}}
+    cell.rig_data["robot"] = {"driver": "drivers.kuka.rsi:KukaRsi", "settings": {"listen": "192.0.2.1:49152"}}
     cell.rig_data["world"] = {"serves": "dry_run"}
     cell.write(views=[TOP, SIDE, LOW], lights={"kind": "all"})
     return cell, cell.acquire("--dry-run", "--speed", "10")

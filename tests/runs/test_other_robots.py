@@ -11,10 +11,10 @@ import pytest
 from cells import SIDE, TOP, CellFolder
 from gige import gige_port, needs_aravis
 
-from coupole.job import read_cell
-from coupole.rig import planning_arm
+from coupole.plan.rig import planning_arm
+from coupole.preflight.job import read_cell
 
-EKI = "drivers.kuka_eki:KukaEki"
+EKI = "drivers.kuka.eki:KukaEki"
 UR = "drivers.ur:UrRobot"
 
 

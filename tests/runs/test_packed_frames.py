@@ -12,9 +12,9 @@ import tifffile
 from archives import DATA, FORMAT, METADATA, MadeRun, make_run, noisy_frame
 from cells import CellFolder
 
-from coupole import store
 from coupole.errors import StorageError
-from coupole.store import ViewWriter
+from coupole.storage import frame_file
+from coupole.storage.frame_file import ViewWriter
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def test_a_run_that_packs_its_frames_proves_and_keeps_the_same_pictures(tmp_path
 
 def test_packed_frames_take_three_quarters_of_the_space(made: MadeRun, tmp_path: Path) -> None:
     whole = make_run(tmp_path / "whole")
-    packed_px, whole_px = (store.read_layout(run.run.view_path("top")).frame_bytes for run in (made, whole))
+    packed_px, whole_px = (frame_file.read_layout(run.run.view_path("top")).frame_bytes for run in (made, whole))
     assert packed_px * 4 == whole_px * 3
 
 
@@ -50,7 +50,9 @@ def test_packed_frames_are_read_with_numpy_as_the_file_says(made: MadeRun) -> No
 def test_the_store_and_verify_read_packed_frames(made: MadeRun) -> None:
     for shot, frame in made.run.proven().items():
         path = made.run.folder / frame.file
-        assert np.array_equal(store.read_frame(path, store.read_layout(path), frame.index), made.frames[shot])
+        assert np.array_equal(
+            frame_file.read_frame(path, frame_file.read_layout(path), frame.index), made.frames[shot]
+        )
     assert cells.here("verify", made.run.folder).code == 0
 
 
@@ -75,7 +77,7 @@ def test_packed_frames_are_exported(made: MadeRun, tmp_path: Path) -> None:
 
 def test_a_frame_that_has_more_bits_is_not_packed_and_not_cut(tmp_path: Path) -> None:
     path = tmp_path / "view.h5"
-    store.create(path, 2, FORMAT, {**METADATA, "title": "view"}, packed=True)
+    frame_file.create(path, 2, FORMAT, {**METADATA, "title": "view"}, packed=True)
     writer = ViewWriter(path, {})
     pixels = noisy_frame(1, FORMAT)
     pixels[0, 0] = 4096

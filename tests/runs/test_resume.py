@@ -16,7 +16,7 @@ import cells
 import pytest
 from cells import SIDE, TOP, CellFolder, Ended, Stored
 
-from sim.client import World
+from sim.world.client import World
 
 MANY_LIGHTS = {"kind": "every", "every": 4}
 """270 LEDs: a burst of 2.8 s."""

@@ -10,8 +10,8 @@ import pytest
 from cells import SIDE, TOP, CellFolder
 from PIL import Image
 
-from coupole import store
-from coupole.picture import develop
+from coupole.storage import frame_file
+from coupole.viewing.raw_preview import develop
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_a_simulated_picture_is_what_the_run_takes_but_for_noise_and_the_arms_er
 ) -> None:
     assert cell.acquire().code == 0
     frame = cells.stored(cell.run_folder)["top/led0520/e0"]
-    facts = store.read_facts(cell.run_folder / "views/top.h5")
+    facts = frame_file.read_facts(cell.run_folder / "views/top.h5")
     taken = develop(frame.pixels, **facts).astype(float)
     with Image.open(rendered / "top-led0520-e0.png") as picture:
         simulated = np.asarray(picture).astype(float)

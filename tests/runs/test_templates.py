@@ -7,7 +7,7 @@ from pathlib import Path
 import cells
 import pytest
 
-from coupole.templates import TEMPLATES
+from coupole.plan.templates import TEMPLATES
 
 RIG = cells.REPO / "configs/rigs/sim.yaml"
 

@@ -15,11 +15,11 @@ from cells import SIDE, TOP, CellFolder
 from numpy.typing import NDArray
 from PIL import Image
 
-from coupole import singularities
-from coupole.itinerary import Itinerary, arm_of
-from coupole.job import Job, read_job
-from coupole.view_picture import write_picture
-from coupole.view_scene import scene_of
+from coupole.motion import singularities
+from coupole.motion.itinerary import Itinerary, arm_of
+from coupole.preflight.job import Job, read_job
+from coupole.viewing.view_picture import write_picture
+from coupole.viewing.view_scene import scene_of
 
 CLOSE = {**TOP, "name": "close", "distance_mm": 60}
 FAR = {**SIDE, "name": "far", "distance_mm": 1200, "elevation_deg": 20}

@@ -15,11 +15,11 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from coupole.acquisition.frame_matching import FaultModel, Match, match
 from coupole.devices import STEP_RECORD_DTYPE
-from coupole.dome import LedTable
-from coupole.matching import FaultModel, Match, match
-from coupole.plan import Plan
-from coupole.shots import END_MARK_EXTRA, START_MARK_EXTRA, Burst, build_schedule
+from coupole.plan.led_table import LedTable
+from coupole.plan.plan import Plan
+from coupole.plan.shots import END_MARK_EXTRA, START_MARK_EXTRA, Burst, build_schedule
 
 MODEL = FaultModel()
 START, END = len(START_MARK_EXTRA), len(END_MARK_EXTRA)

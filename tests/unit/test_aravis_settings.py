@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from coupole.job import read_cell
-from coupole.rig import camera_kind
-from drivers.aravis import Settings
-from sim.gige_registers import DESCRIPTION
+from coupole.plan.rig import camera_kind
+from coupole.preflight.job import read_cell
+from drivers.camera.aravis.driver import Settings
+from sim.devices.gige_registers import DESCRIPTION
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -23,7 +23,7 @@ def test_the_reference_names_every_key() -> None:
 
 def test_the_shipped_rig_has_a_gige_camera_and_rehearses_without_one() -> None:
     rig = read_cell(ROOT / "configs/rigs/sim-gige.yaml").rig
-    assert rig.camera.driver == "drivers.aravis:AravisCamera"
+    assert rig.camera.driver == "drivers.camera.aravis:AravisCamera"
     assert (camera_kind(rig, dry_run=False), camera_kind(rig, dry_run=True)) == ("gige", "memory")
 
 

@@ -18,14 +18,14 @@ from archives import DATA, FRAMES, Frame, MadeRun, make_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coupole import run as run_module
-from coupole import store
-from coupole.archive import KEPT_FOLDER, Archived, archive_run
-from coupole.bitshuffle import CODECS, FILL_DN, codec_of, compressed_tiles, tile_shape
 from coupole.devices import FrameFormat
 from coupole.errors import ChecksumMismatch, InputError, StorageError, UnprovenError
-from coupole.run import Run
-from coupole.store import ViewWriter
+from coupole.storage import frame_file
+from coupole.storage import run as run_module
+from coupole.storage.archive import KEPT_FOLDER, Archived, archive_run
+from coupole.storage.bitshuffle import CODECS, FILL_DN, codec_of, compressed_tiles, tile_shape
+from coupole.storage.frame_file import ViewWriter
+from coupole.storage.run import Run
 
 LZ4 = CODECS["lz4"]
 
@@ -112,7 +112,7 @@ def test_archived_frames_are_read_bit_exact_by_plain_h5py(archived: MadeRun) -> 
 def test_archived_frames_are_read_bit_exact_by_the_store(archived: MadeRun) -> None:
     for shot, frame in archived.run.proven().items():
         path = archived.run.folder / frame.file
-        pixels = store.read_frame(path, store.read_layout(path), frame.index)
+        pixels = frame_file.read_frame(path, frame_file.read_layout(path), frame.index)
         assert np.array_equal(pixels, archived.frames[shot])
 
 
@@ -123,7 +123,7 @@ def contents(path: Path) -> dict[str, Any]:
     def look(name: str, of: h5py.HLObject) -> None:
         value = of[()] if isinstance(of, h5py.Dataset) and of.name != f"/{DATA}" else None
         if name == FRAMES:
-            value = value[value["state"] == store.PROVEN]
+            value = value[value["state"] == frame_file.PROVEN]
         attributes = {
             k: np.asarray(v).tolist() for k, v in of.attrs.items() if k not in ("archived", "not_stored")
         }
@@ -140,10 +140,10 @@ def contents(path: Path) -> dict[str, Any]:
 def test_frames_are_read_right_while_the_run_is_being_archived(made: MadeRun) -> None:
     """A reader knows a view's layout when another file comes to its place."""
     proven = made.run.proven()
-    layouts = {frame.file: store.read_layout(made.run.folder / frame.file) for frame in proven.values()}
+    layouts = {frame.file: frame_file.read_layout(made.run.folder / frame.file) for frame in proven.values()}
     archive_run(made.run, LZ4)
     for shot, frame in proven.items():
-        pixels = store.read_frame(made.run.folder / frame.file, layouts[frame.file], frame.index)
+        pixels = frame_file.read_frame(made.run.folder / frame.file, layouts[frame.file], frame.index)
         assert np.array_equal(pixels, made.frames[shot])
 
 
@@ -162,9 +162,9 @@ def test_an_archive_says_that_it_is_one(archived: MadeRun) -> None:
 def test_slots_without_a_proven_frame_are_free_and_read_as_65535(archived: MadeRun) -> None:
     with h5py.File(archived.run.view_path("top")) as file:
         table, data = file[FRAMES][:], file[DATA]
-        free = np.flatnonzero(table["state"] != store.PROVEN)
+        free = np.flatnonzero(table["state"] != frame_file.PROVEN)
         assert free.tolist() == [0, 5, 6]
-        assert table[free].tobytes() == bytes(3 * store.FRAME_DTYPE.itemsize)
+        assert table[free].tobytes() == bytes(3 * frame_file.FRAME_DTYPE.itemsize)
         assert all((data[slot] == FILL_DN).all() for slot in free)
 
 
@@ -297,14 +297,14 @@ def archive_is_refused(made: MadeRun, match: str, **options: Any) -> None:
 
 def test_a_frame_that_changed_on_the_disk_is_not_archived(made: MadeRun) -> None:
     path, slot = made.run.view_path("top"), made.run.proven()["top/led0001/e0"].index
-    layout = store.read_layout(path)
+    layout = frame_file.read_layout(path)
     flip_byte(path, layout.data_offset + slot * layout.frame_bytes + 777)
     archive_is_refused(made, "top/led0001/e0 is not what was proven")
 
 
 def test_a_record_that_contradicts_the_journal_is_not_archived(made: MadeRun) -> None:
     path, slot = made.run.view_path("top"), made.run.proven()["top/led0001/e0"].index
-    flip_byte(path, store.read_layout(path).table_offset + slot * store.FRAME_DTYPE.itemsize + 12)
+    flip_byte(path, frame_file.read_layout(path).table_offset + slot * frame_file.FRAME_DTYPE.itemsize + 12)
     archive_is_refused(made, f"slot {slot} is not recorded as top/led0001/e0")
 
 

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from coupole.balls import MESH_STEP_MM, balls_of, surface_points
-from coupole.bodies import ARM_CAPSULES, Capsule
-from coupole.collisions import CellBodies, Clearances, Surroundings
 from coupole.geometry import apply, inverse, transform
 from coupole.kinematics import KR10_R1100_SIXX, forward, link_frames
+from coupole.motion.bodies import ARM_CAPSULES, Capsule
+from coupole.motion.collisions import CellBodies, Clearances, Surroundings
+from coupole.motion.sphere_tree import MESH_STEP_MM, balls_of, surface_points
 
 LINK_MESHES = Path(__file__).parents[3] / "shared/data/robot/kr10r1100sixx"
 BASE_FROM_SUPPORT = transform((200, 0, 1450), (0, 0, 180))
@@ -195,7 +195,7 @@ def test_solids_are_as_far_as_an_independent_reckoning_says(joints: NDArray[np.f
 
 @given(st.integers(0, 2**32 - 1))
 def test_the_dome_and_the_support_never_jump(seed: int) -> None:
-    from coupole.distances import DISK, DOME, _to_solid
+    from coupole.motion.distances import DISK, DOME, _to_solid
 
     random = np.random.default_rng(seed)
     figures = np.zeros((1, 13))

@@ -13,12 +13,13 @@ from archives import Frame, MadeRun, make_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coupole import store
-from coupole.archive import archive_run
-from coupole.bitshuffle import CODECS
 from coupole.devices import FrameFormat
 from coupole.errors import ChecksumMismatch, InputError
-from coupole.export import Picture, dng, export_run, tiff
+from coupole.exchange import dng, tiff
+from coupole.exchange.export import Picture, export_run
+from coupole.storage import frame_file
+from coupole.storage.archive import archive_run
+from coupole.storage.bitshuffle import CODECS
 
 PATTERNS = ("GBRG", "GRBG", "RGGB", "BGGR")
 REFERENCE = Path(__file__).parents[3] / "shared/data/raw/colorchart.dng"
@@ -251,7 +252,7 @@ def test_nothing_is_written_over_unless_that_is_asked(made: MadeRun, out: Path) 
 
 def test_a_frame_that_changed_on_the_disk_is_not_exported(made: MadeRun, out: Path) -> None:
     path, frame = made.run.view_path("top"), made.run.proven()["top/led0001/e0"]
-    layout = store.read_layout(path)
+    layout = frame_file.read_layout(path)
     with path.open("r+b") as file:
         file.seek(layout.data_offset + frame.index * layout.frame_bytes)
         file.write(b"\xff\xff")

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from view_files import FORMAT, METADATA, SLOTS, frame
 
-from coupole import journal, store
 from coupole.errors import DiskFull
-from coupole.journal import Journal
-from coupole.store import ViewWriter
+from coupole.storage import frame_file, journal
+from coupole.storage.frame_file import ViewWriter
+from coupole.storage.journal import Journal
 
 
 @pytest.fixture
@@ -42,12 +42,12 @@ def fill(disk: Path, leave_bytes: int) -> None:
 
 def test_a_view_for_which_there_is_no_room_is_refused_and_leaves_no_file(small_disk: Path) -> None:
     with pytest.raises(DiskFull, match="the disk is full"):
-        store.create(small_disk / "top.h5", 200, FORMAT, METADATA)
+        frame_file.create(small_disk / "top.h5", 200, FORMAT, METADATA)
     assert list(small_disk.iterdir()) == []
 
 
 def test_the_space_of_a_view_is_its_own_though_the_disk_fills_up(small_disk: Path) -> None:
-    store.create(small_disk / "top.h5", SLOTS, FORMAT, METADATA)
+    frame_file.create(small_disk / "top.h5", SLOTS, FORMAT, METADATA)
     fill(small_disk, 0)
     writer = ViewWriter(small_disk / "top.h5", {})
     for number in range(SLOTS):
@@ -88,7 +88,7 @@ def test_a_journal_over_a_limit_of_the_system_leaves_no_half_line(tmp_path: Path
     path = tmp_path / "journal.jsonl"
     code = (
         "import sys; from pathlib import Path\n"
-        "from coupole.journal import Journal; from coupole.errors import StorageError\n"
+        "from coupole.storage.journal import Journal; from coupole.errors import StorageError\n"
         "diary = Journal(Path(sys.argv[1])); diary.write('start'); diary.commit()\n"
         "diary.write('fault', message='x' * 50_000)\n"
         "try: diary.commit()\n"

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coupole.bodies import link_corners
-from coupole.collisions import REACH_MM, CellBodies
-from coupole.dome import read_led_table
 from coupole.errors import InputError
 from coupole.geometry import look_at
-from coupole.itinerary import ELBOW_LIMITS_DEG, Itinerary, arm_of, bodies_of, plan_itinerary
-from coupole.job import read_job
-from coupole.rig import Rig
-from coupole.shots import ViewPose
-from coupole.singularities import KEPT_FROM
-from coupole.tube import TUBE_MM
-from coupole.yamlfile import read
+from coupole.motion.bodies import link_corners
+from coupole.motion.collisions import REACH_MM, CellBodies
+from coupole.motion.itinerary import ELBOW_LIMITS_DEG, Itinerary, arm_of, bodies_of, plan_itinerary
+from coupole.motion.path_deviation import TUBE_MM
+from coupole.motion.singularities import KEPT_FROM
+from coupole.plan.led_table import read_led_table
+from coupole.plan.rig import Rig
+from coupole.plan.shots import ViewPose
+from coupole.plan.yamlfile import read
+from coupole.preflight.job import read_job
 
 ROOT = Path(__file__).parents[2]
 LINK_MESHES = ROOT.parent / "shared/data/robot/kr10r1100sixx"

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from coupole import journal, ledger
-from coupole.journal import Journal
+from coupole.preflight import ledger
+from coupole.storage import journal
+from coupole.storage.journal import Journal
 
 
 def test_lines_reach_the_file_with_the_commit_and_not_before(tmp_path: Path) -> None:

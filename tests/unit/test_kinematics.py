@@ -22,8 +22,8 @@ from coupole.kinematics import (
     unreachable_reason,
     within_limits,
 )
-from coupole.singularities import distances, margin, reason, unease
-from sim.kuka_kinematics import flange_pose
+from coupole.motion.singularities import distances, margin, reason, unease
+from sim.devices.kuka_kinematics import flange_pose
 
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
 

@@ -15,13 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coupole.geometry import rotation_from_abc
-from drivers.kuka_rsi_wire import packet_parser
-from sim.clock import ClockWriter, SharedClock
-from sim.kuka_axes import Axes
-from sim.kuka_controller import KukaController, Settings
-from sim.kuka_corrections import Corrections
-from sim.kuka_kinematics import PoseErrors, flange_pose, joints_near
-from sim.reactor import Reactor
+from drivers.kuka.rsi.wire import packet_parser
+from sim.devices.kuka_axes import Axes
+from sim.devices.kuka_controller import KukaController, Settings
+from sim.devices.kuka_corrections import Corrections
+from sim.devices.kuka_kinematics import PoseErrors, flange_pose, joints_near
+from sim.world.clock import ClockWriter, SharedClock
+from sim.world.reactor import Reactor
 
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
 CYCLE_NS = 4_000_000

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused
 from coupole.kinematics import KR10_R1100_SIXX, move_duration_s, slowed
-from drivers import kuka_eki_wire as wire
 from drivers.arm_motion import farthest_stop_deg
-from drivers.kuka_eki_watch import Tolerances, Watch
-from drivers.kuka_eki_wire import Status, StatusReader
-from sim.kuka_kinematics import AXIS_SPEEDS_DEG_S
-from sim.kuka_ptp import Motion, braked, point_to_point
+from drivers.kuka.eki import wire
+from drivers.kuka.eki.watch import Tolerances, Watch
+from drivers.kuka.eki.wire import Status, StatusReader
+from sim.devices.kuka_kinematics import AXIS_SPEEDS_DEG_S
+from sim.devices.kuka_ptp import Motion, braked, point_to_point
 
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
 TOLERANCES = Tolerances(settle_deg=0.003, settle_deg_s=0.1, follow_deg=1.0, follow_cycles=3)

@@ -10,11 +10,12 @@ from xml.etree import ElementTree
 
 import pytest
 
-from drivers import kuka_eki, kuka_rsi
-from drivers import kuka_eki_wire as wire
-from drivers.kuka_rsi_corrections import NAMES
-from drivers.kuka_rsi_wire import answer_template
-from sim.kuka_settings import Limits
+from drivers.kuka import eki as kuka_eki
+from drivers.kuka import rsi as kuka_rsi
+from drivers.kuka.eki import wire
+from drivers.kuka.rsi.corrections import NAMES
+from drivers.kuka.rsi.wire import answer_template
+from sim.devices.kuka_settings import Limits
 
 ROOT = Path(__file__).resolve().parents[2]
 KUKA = ROOT / "configs" / "kuka"

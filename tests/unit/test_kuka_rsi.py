@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coupole.kinematics import KR10_R1100_SIXX
-from drivers import kuka_rsi_block as block
-from drivers.kuka_rsi_pose import Geometry
-from drivers.kuka_rsi_responder import Config, Responder
-from drivers.kuka_rsi_wire import controller_type, packet_parser
-from sim.kuka_controller import Settings as ControllerSettings
-from sim.kuka_corrections import Corrections
+from drivers.kuka.rsi import shared_state as block
+from drivers.kuka.rsi.pose import Geometry
+from drivers.kuka.rsi.rsi_session import Config, Responder
+from drivers.kuka.rsi.wire import controller_type, packet_parser
+from sim.devices.kuka_controller import Settings as ControllerSettings
+from sim.devices.kuka_corrections import Corrections
 
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
 CONFIG = Config(

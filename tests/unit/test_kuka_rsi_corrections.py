@@ -10,12 +10,12 @@ from pydantic import ValidationError
 
 from coupole.geometry import rotation_from_abc
 from coupole.kinematics import KR10_R1100_SIXX, forward
-from drivers import kuka_rsi_block as block
-from drivers.kuka_rsi import Settings
-from drivers.kuka_rsi_corrections import Corrections
-from drivers.kuka_rsi_limits import correction_violations
-from drivers.kuka_rsi_motion import Motion
-from drivers.kuka_rsi_pose import Geometry, Pose, corrected, correction, flange_pose
+from drivers.kuka.rsi import shared_state as block
+from drivers.kuka.rsi.corrections import Corrections
+from drivers.kuka.rsi.driver import Settings
+from drivers.kuka.rsi.limits import correction_violations
+from drivers.kuka.rsi.pose import Geometry, Pose, corrected, correction, flange_pose
+from drivers.kuka.rsi.trajectory import Motion
 
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
 GEOMETRY = Geometry(*(getattr(KR10_R1100_SIXX, name) for name in Geometry._fields))

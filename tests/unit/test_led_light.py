@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim.led_light import (
+from coupole.appearance.spectra import light
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM
+from sim.optics.led_light import (
     STEADY,
     Flashes,
     LedModel,
@@ -19,8 +21,6 @@ from sim.led_light import (
     own_flux_factor,
     spectral_power,
 )
-from sim.materials import light
-from sim.materials.grid import WAVELENGTHS_NM
 
 MODEL = LedModel(seed=5)
 

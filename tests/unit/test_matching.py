@@ -18,7 +18,7 @@ from matching_takes import (
 )
 from numpy.typing import NDArray
 
-from coupole.matching import UNLABELLED
+from coupole.acquisition.frame_matching import UNLABELLED
 
 
 @examples(4000)

@@ -18,8 +18,8 @@ from matching_takes import (
     whole_burst,
 )
 
+from coupole.acquisition.frame_matching import UNLABELLED
 from coupole.devices import STATUS_NO_EDGE
-from coupole.matching import UNLABELLED
 
 LIGHT = START + 2 + 3  # a step in the middle of the lights, behind two dark frames
 

@@ -21,7 +21,7 @@ from matching_takes import (
     whole_burst,
 )
 
-from coupole.shots import Burst
+from coupole.plan.shots import Burst
 
 clocks = {
     "box_ppm": st.floats(-60, 60),

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from coupole.devices import FrameFormat
 from coupole.errors import InputError
-from coupole.metering import Metered, Noise, Wish, advise, advise_view, noise_of, write_plan
-from coupole.plan import FixedExposure
-from coupole.yamlfile import read
+from coupole.plan.plan import FixedExposure
+from coupole.plan.yamlfile import read
+from coupole.preflight.exposure_advice import Metered, Noise, Wish, advise, advise_view, noise_of, write_plan
 
 BLACK, WHITE = 64, 4095
 FORMAT = FrameFormat(64, 96, 12, "GBRG", BLACK, WHITE)

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coupole.collisions import CellBodies
 from coupole.geometry import look_at
-from coupole.itinerary import arm_of, base_from_flange, bodies_of
-from coupole.job import read_job
 from coupole.kinematics import inverse
-from coupole.ordering import shortest_tour
-from coupole.paths import PathPlanner
-from coupole.shots import ViewPose
-from coupole.singularities import margin
+from coupole.motion.collisions import CellBodies
+from coupole.motion.itinerary import arm_of, base_from_flange, bodies_of
+from coupole.motion.ordering import shortest_tour
+from coupole.motion.path_planner import PathPlanner
+from coupole.motion.singularities import margin
+from coupole.plan.shots import ViewPose
+from coupole.preflight.job import read_job
 
 Floats = NDArray[np.float64]
 ROOT = Path(__file__).parents[2]

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from coupole.devices import NO_LIGHT
-from coupole.job import Job, check_job, read_job
-from coupole.preflight import DISK_SHARE, StorageFacts
-from coupole.rig import BoardThermal, LedLimits
-from coupole.shots import FASTEST, Pace
+from coupole.plan.rig import BoardThermal, LedLimits
+from coupole.plan.shots import FASTEST, Pace
+from coupole.preflight.job import Job, check_job, read_job
+from coupole.preflight.preflight import DISK_SHARE, StorageFacts
 
 ROOT = Path(__file__).parents[2]
 ROOMY = 10**15

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from coupole.packing import Order, pack12, unpack12
+from coupole.storage.packing import Order, pack12, unpack12
 
 ORDERS: tuple[Order, ...] = ("lsb", "msb")
 Pixels = np.ndarray[Any, np.dtype[np.uint16]]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coupole.bodies import Capsule
-from coupole.collisions import CellBodies, Clearances, Surroundings
 from coupole.geometry import transform
 from coupole.kinematics import KR10_R1100_SIXX, move_duration_s, slowed
-from coupole.paths import PathPlanner
+from coupole.motion.bodies import Capsule
+from coupole.motion.collisions import CellBodies, Clearances, Surroundings
+from coupole.motion.path_planner import PathPlanner
 
 ARM = slowed(KR10_R1100_SIXX, speed_fraction=0.3, acceleration_deg_s2=300.0, jerk_deg_s3=3000.0)
 HOME = np.array((0.0, -170.0, 150.0, 0.0, -70.0, 0.0))

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from drivers.pixel_formats import FORMATS, pixels_in_a_group, widen
-from sim import gige_pixels
+from drivers.camera.pixel_formats import FORMATS, pixels_in_a_group, widen
+from sim.devices import gige_pixels
 
 COUNT = 40
 

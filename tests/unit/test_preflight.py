@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coupole import ledger
 from coupole.devices import NO_LIGHT
-from coupole.dome import LedTable, read_led_table
-from coupole.itinerary import bodies_of, plan_itinerary
-from coupole.plan import Plan
-from coupole.preflight import BURST_OVERHEAD_S, SETTLE_CHECK_S, Report, StorageFacts, check, upload_s
-from coupole.rig import Rig
-from coupole.shots import MARKS, Schedule, build_schedule
-from coupole.yamlfile import read
+from coupole.motion.itinerary import bodies_of, plan_itinerary
+from coupole.plan.led_table import LedTable, read_led_table
+from coupole.plan.plan import Plan
+from coupole.plan.rig import Rig
+from coupole.plan.shots import MARKS, Schedule, build_schedule
+from coupole.plan.yamlfile import read
+from coupole.preflight import ledger
+from coupole.preflight.preflight import BURST_OVERHEAD_S, SETTLE_CHECK_S, Report, StorageFacts, check, upload_s
 
 ROOT = Path(__file__).parents[2]
 RIG, _ = read(ROOT / "configs/rigs/sim.yaml").problems(Rig)

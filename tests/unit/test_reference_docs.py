@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from coupole import plan, rig
+from coupole.plan import plan, rig
 
 REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
 

@@ -40,7 +40,7 @@ def test_the_checkers_chain_of_joints_agrees_with_ours() -> None:
 
 
 def test_the_checker_sees_an_arm_in_the_object_the_support_and_the_dome() -> None:
-    from coupole.job import read_job
+    from coupole.preflight.job import read_job
     from replay_cell import ReplayCell
 
     cell = ReplayCell(read_job(ROOT / "configs/plans/demo.yaml"), None)

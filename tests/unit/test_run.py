@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from view_files import frame, write_view
 
-from coupole import run, store
 from coupole.errors import InputError
-from coupole.journal import Journal
-from coupole.run import Inputs, Run
-from coupole.store import ViewWriter
+from coupole.storage import frame_file, run
+from coupole.storage.frame_file import ViewWriter
+from coupole.storage.journal import Journal
+from coupole.storage.run import Inputs, Run
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_a_whole_run_verifies(finished: Run) -> None:
 
 def test_verify_finds_a_flipped_byte(finished: Run) -> None:
     path = finished.view_path("top")
-    layout = store.read_layout(path)
+    layout = frame_file.read_layout(path)
     with path.open("r+b") as file:
         file.seek(layout.data_offset + layout.frame_bytes + 777)
         byte = file.read(1)
@@ -88,9 +88,9 @@ def test_verify_finds_a_shot_that_was_proven_twice(finished: Run) -> None:
 
 def test_verify_finds_a_record_that_names_another_shot(finished: Run) -> None:
     path = finished.view_path("top")
-    layout = store.read_layout(path)
+    layout = frame_file.read_layout(path)
     with path.open("r+b") as file:
-        file.seek(layout.table_offset + store.FRAME_DTYPE.fields["shot"][1])  # type: ignore[index]
+        file.seek(layout.table_offset + frame_file.FRAME_DTYPE.fields["shot"][1])  # type: ignore[index]
         file.write(b"top/led0007/e0")
     assert run.verify(finished).bad == ["top/led0000/e0: slot 0 of top.h5 is recorded as `top/led0007/e0`"]
 

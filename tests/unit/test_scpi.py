@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.scpi import QUEUE_LENGTH, Argument, Command, Interpreter, block, boolean, integer
+from sim.devices.scpi_parser import QUEUE_LENGTH, Argument, Command, Interpreter, block, boolean, integer
 
 SESSION = (
     b'*idn?\nECHO #15a\nb;c,3;:ECHO #10,4;*IDN?\r\n  :TEST:NUMBer 2.0e1 ; NUMB?;:SYST:ERR?\n"quoted;"\n'

@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from coupole.geometry import apply, inverse, look_at
-from coupole.itinerary import plan_itinerary
-from coupole.job import Job, read_job
-from coupole.patches import patches_at, patches_of
-from coupole.shadow import (
+from coupole.motion.itinerary import plan_itinerary
+from coupole.motion.patches import patches_at, patches_of
+from coupole.motion.shadow import (
     AWAY,
     BY_ARM,
     BY_OBJECT,
@@ -37,6 +36,7 @@ from coupole.shadow import (
     segment_distance_mm,
     shadows_of,
 )
+from coupole.preflight.job import Job, read_job
 
 Points = NDArray[np.float64]
 POINT = st.tuples(*[st.floats(-1000, 1000)] * 3).map(np.array)
@@ -212,8 +212,8 @@ def test_shadows_are_those_that_an_independent_checker_finds(
 ) -> None:
     import fcl
 
-    from coupole.bodies import ARM_CAPSULES
     from coupole.kinematics import KR10_R1100_SIXX, link_frames
+    from coupole.motion.bodies import ARM_CAPSULES
 
     rig, patches, leds_mm = demo.cell.rig, demo_shadows.patches, demo_shadows.leds_mm
     view = demo.schedule.views[1]

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coupole.devices import FLAG_NO_TRIGGER, NO_LIGHT
-from coupole.dome import LedTable, read_led_table
 from coupole.geometry import transform
-from coupole.plan import Plan
-from coupole.shots import (
+from coupole.plan.led_table import LedTable, read_led_table
+from coupole.plan.plan import Plan
+from coupole.plan.shots import (
     MARKS,
     START_MARK_EXTRA,
     Burst,

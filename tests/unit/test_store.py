@@ -10,10 +10,10 @@ import pytest
 import xxhash
 from view_files import DATA, FORMAT, FRAMES, METADATA, ODD, SLOTS, frame, write_view
 
-from coupole import store
 from coupole.devices import ArmState
 from coupole.errors import StorageError
-from coupole.store import ViewWriter
+from coupole.storage import frame_file
+from coupole.storage.frame_file import ViewWriter
 
 
 def test_frames_are_read_by_plain_h5py(tmp_path: Path) -> None:
@@ -33,7 +33,7 @@ def test_the_frame_table_is_read_by_plain_h5py(tmp_path: Path) -> None:
 
 
 def test_measured_poses_are_read_by_plain_h5py(tmp_path: Path) -> None:
-    store.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
+    frame_file.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
     writer = ViewWriter(tmp_path / "top.h5", {})
     flange, camera = np.diag([1.0, 2.0, 3.0, 1.0]), np.diag([4.0, 5.0, 6.0, 1.0])
     assert writer.add_pose(ArmState((1, 2, 3, 4, 5, 6), flange, 77, moving=False), camera) == 0
@@ -47,7 +47,7 @@ def test_measured_poses_are_read_by_plain_h5py(tmp_path: Path) -> None:
 
 
 def test_poses_of_a_reopened_view_are_added_behind_those_it_has(tmp_path: Path) -> None:
-    store.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
+    frame_file.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
     for number in range(2):
         writer = ViewWriter(tmp_path / "top.h5", {})
         assert writer.add_pose(ArmState((0,) * 6, np.eye(4), 5, moving=False), np.eye(4)) == number
@@ -81,7 +81,7 @@ def test_the_default_plot_leads_to_the_frames(tmp_path: Path) -> None:
 
 def test_levels_and_pattern_stand_in_the_file(tmp_path: Path) -> None:
     write_view(tmp_path / "top.h5")
-    assert store.read_facts(tmp_path / "top.h5") == {"pattern": "GBRG", "black_dn": 64, "white_dn": 4095}
+    assert frame_file.read_facts(tmp_path / "top.h5") == {"pattern": "GBRG", "black_dn": 64, "white_dn": 4095}
 
 
 def test_frames_lie_contiguous_on_a_4096_byte_boundary(tmp_path: Path) -> None:
@@ -106,8 +106,8 @@ def test_checksums_are_xxh3_of_the_bytes_on_disk(tmp_path: Path) -> None:
 
 def test_slots_are_free_stored_or_proven(tmp_path: Path) -> None:
     write_view(tmp_path / "top.h5", proven=3, stored=1)
-    states = store.read_frames(tmp_path / "top.h5")["state"].tolist()
-    assert states == [store.PROVEN] * 3 + [store.STORED] + [store.FREE] * 2
+    states = frame_file.read_frames(tmp_path / "top.h5")["state"].tolist()
+    assert states == [frame_file.PROVEN] * 3 + [frame_file.STORED] + [frame_file.FREE] * 2
 
 
 def test_reopening_keeps_proven_slots_and_frees_all_others(tmp_path: Path) -> None:
@@ -116,8 +116,8 @@ def test_reopening_keeps_proven_slots_and_frees_all_others(tmp_path: Path) -> No
     writer = ViewWriter(path, {"top/led0000/e0": 0, "top/led0002/e0": 2})
     assert writer.free_slots == 4
     writer.close()
-    states = store.read_frames(path)["state"].tolist()
-    assert states == [store.PROVEN, store.FREE, store.PROVEN] + [store.FREE] * 3
+    states = frame_file.read_frames(path)["state"].tolist()
+    assert states == [frame_file.PROVEN, frame_file.FREE, frame_file.PROVEN] + [frame_file.FREE] * 3
 
 
 def test_frames_written_after_reopening_overwrite_nothing_proven(tmp_path: Path) -> None:
@@ -129,11 +129,11 @@ def test_frames_written_after_reopening_overwrite_nothing_proven(tmp_path: Path)
     }
     writer.close()
     assert slots == {0, 2, 3, 4, 5}
-    assert np.array_equal(store.read_frame(path, store.read_layout(path), 1), frame(1))
+    assert np.array_equal(frame_file.read_frame(path, frame_file.read_layout(path), 1), frame(1))
 
 
 def test_a_freed_slot_is_used_again(tmp_path: Path) -> None:
-    store.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
+    frame_file.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
     writer = ViewWriter(tmp_path / "top.h5", {})
     slot = writer.put(frame(0), frame_id=1, camera_ns=1, exposure_us=8000)
     writer.free(slot)
@@ -142,7 +142,7 @@ def test_a_freed_slot_is_used_again(tmp_path: Path) -> None:
 
 
 def test_more_frames_than_slots_are_an_error_that_says_so(tmp_path: Path) -> None:
-    store.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
+    frame_file.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
     writer = ViewWriter(tmp_path / "top.h5", {})
     writer.put(frame(0), frame_id=1, camera_ns=1, exposure_us=8000)
     with pytest.raises(StorageError, match="no slot is free"):
@@ -164,4 +164,4 @@ def test_frames_of_an_odd_size_are_written_buffered_and_right(tmp_path: Path) ->
 def test_a_file_that_is_no_view_is_a_storage_error(tmp_path: Path) -> None:
     (tmp_path / "top.h5").write_bytes(b"not hdf5")
     with pytest.raises(StorageError, match="not a view file"):
-        store.read_layout(tmp_path / "top.h5")
+        frame_file.read_layout(tmp_path / "top.h5")

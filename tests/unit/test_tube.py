@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from coupole.collisions import ARM_CAPSULES
 from coupole.kinematics import KR10_R1100_SIXX, link_frames
-from coupole.tube import off_the_way_mm
+from coupole.motion.collisions import ARM_CAPSULES
+from coupole.motion.path_deviation import off_the_way_mm
 
 LOW, HIGH = np.array(KR10_R1100_SIXX.limits_deg).T
 places = st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).uniform(LOW, HIGH))

@@ -7,11 +7,11 @@ import pytest
 import trimesh
 
 from coupole.geometry import look_at
-from coupole.shadow import Sight, ray_mesh
-from coupole.view_canvas import Canvas, Lookout
-from coupole.view_colours import of_share
-from coupole.view_sight import footprint
-from coupole.view_solids import Solid, ball, box, capsule, disk, joined, simplified
+from coupole.motion.shadow import Sight, ray_mesh
+from coupole.viewing.view_canvas import Canvas, Lookout
+from coupole.viewing.view_colours import of_share
+from coupole.viewing.view_sight import footprint
+from coupole.viewing.view_solids import Solid, ball, box, capsule, disk, joined, simplified
 
 BLUE, GREEN = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
 

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coupole.errors import InputError, Problem
-from coupole.plan import Model, Plan
-from coupole.rig import Rig
-from coupole.yamlfile import read
+from coupole.plan.plan import Model, Plan
+from coupole.plan.rig import Rig
+from coupole.plan.yamlfile import read
 
 PLAN = """\
 schema_version: 1
@@ -104,8 +104,8 @@ RIG = """\
 schema_version: 1
 name: cell
 ledbox: {driver: "drivers.ledbox:LedBox", settings: {port: COM3}}
-camera: {driver: "sim.memory_camera:MemoryCamera"}
-robot: {driver: "drivers.kuka_rsi:KukaRsi"}
+camera: {driver: "sim.devices.memory_camera:MemoryCamera"}
+robot: {driver: "drivers.kuka.rsi:KukaRsi"}
 sensor: {width_px: 512, height_px: 384, pixel_pitch_um: 3.2}
 lens: {focal_length_mm: 50, f_number: 8, focus_distance_mm: 335}
 flange_from_camera: {translation_mm: [0, 0, 100]}
@@ -119,7 +119,7 @@ storage: {folder: ../../runs}
 """
 
 WRONG_RIGS = [
-    ('"drivers.ledbox:LedBox"', "§drivers.ledbox", "ledbox.driver", "found text `drivers.ledbox`"),
+    ('"drivers.ledbox:LedBox"', "§drivers.ledbox.driver", "ledbox.driver", "found text `drivers.ledbox.driver`"),
     ('driver: "drivers.ledbox:LedBox"', "§drivr: a:B", "ledbox.drivr", "did you mean `driver`?"),
     ("camera: {", "§camra: {", "camra", "did you mean `camera`?"),
     ("settings: {port: COM3}", "settings: §COM3", "ledbox.settings", "expected a mapping, found text `COM3`"),

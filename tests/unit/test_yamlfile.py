@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from coupole.errors import InputError
-from coupole.yamlfile import Document, read
+from coupole.plan.yamlfile import Document, read
 
 
 class Port(BaseModel):

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from coupole.calibration.point_sets import Indices, rigid_motion
 from coupole.calibration.rotations import Floats
-from coupole.dome import LedTable
 from coupole.errors import InputError
+from coupole.plan.led_table import LedTable
 
 _PLANE = 2
 """Rank of points that do not stand in one line."""

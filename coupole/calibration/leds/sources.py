@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from coupole import store
 from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.leds.spots import find_spots
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import About, about_of, frames_sha256, poses_and_attributes
-from coupole.dome import LedTable
 from coupole.errors import InputError
-from coupole.run import ProvenFrame, Run, sha256
+from coupole.plan.led_table import LedTable
+from coupole.storage import frame_file
+from coupole.storage.run import ProvenFrame, Run, sha256
 
 _LED = "led"
 
@@ -85,7 +85,7 @@ def find_leds(
     done = 0
     for run, view, proven in work:
         path = run.view_path(view)
-        layout, records = store.read_layout(path), store.read_frames(path)
+        layout, records = frame_file.read_layout(path), frame_file.read_frames(path)
         reported, attributes = poses_and_attributes(path)
         here, size = about_of(run, attributes), (layout.width_px, layout.height_px)
         if about is not None and (here != about or size != size_px):
@@ -104,9 +104,9 @@ def find_leds(
             poses.append(np.array(reported[pose]["base_from_flange"], dtype=np.float64))
             joints.append(np.array(reported[pose]["joints_deg"], dtype=np.float64))
         temperatures += (records["board_temperature_dc"][[f.frame.index for f in lit]] / 10.0).tolist()
-        facts, darks = store.read_facts(path), _darks(path, layout, proven, records)
+        facts, darks = frame_file.read_facts(path), _darks(path, layout, proven, records)
         for frame in lit:
-            pixels = store.read_frame(path, layout, frame.frame.index)
+            pixels = frame_file.read_frame(path, layout, frame.frame.index)
             dark = darks.get(frame.exposure_us, float(facts["black_dn"]))
             spots = find_spots(pixels, dark, facts["pattern"], facts["white_dn"])
             key = number_of[frame.pose[1]], row_of[frame.led]
@@ -182,11 +182,13 @@ def _dark_frames(proven: Sequence[ProvenFrame]) -> list[ProvenFrame]:
     return [frame for frame in proven if frame.shot.split("/")[1].startswith("dark")]
 
 
-def _darks(path: Path, layout: store.Layout, proven: Sequence[ProvenFrame], records: Any) -> dict[int, Floats]:
+def _darks(
+    path: Path, layout: frame_file.Layout, proven: Sequence[ProvenFrame], records: Any
+) -> dict[int, Floats]:
     """Mean dark frame [H, W] for each exposure that has some, DN."""
     sums: dict[int, tuple[Floats, int]] = {}
     for frame in _dark_frames(proven):
         exposure_us = int(records[frame.index]["exposure_us"])
         before, count = sums.get(exposure_us, (np.zeros((layout.height_px, layout.width_px)), 0))
-        sums[exposure_us] = before + store.read_frame(path, layout, frame.index), count + 1
+        sums[exposure_us] = before + frame_file.read_frame(path, layout, frame.index), count + 1
     return {exposure_us: total / count for exposure_us, (total, count) in sums.items()}

@@ -11,20 +11,20 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.calibration.acceptance import judged
 from coupole.calibration.calibrated_arm import ZEROS, CalibratedArm, calibrated_poses
+from coupole.calibration.leds.acceptance import LEDS
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
 from coupole.calibration.leds.boards import Boards, boards_of, placed
 from coupole.calibration.leds.equations import GROUPS, ORIENTATION, POSITION, SPOTS, TOLERANCE, Stated
-from coupole.calibration.leds.limits import LEDS
 from coupole.calibration.leds.matching import Fault, Matching, fault_lines, match_leds
 from coupole.calibration.leds.sources import LedImages
-from coupole.calibration.limits import judged
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.record import ImageResidual, Input, Limit, Noise, Parameter, Record, Validity, sealed
+from coupole.calibration.request import Wish
 from coupole.calibration.rotations import Floats, rotation_vector
-from coupole.calibration.wish import Wish
-from coupole.dome import COLUMNS, LedTable
 from coupole.errors import InputError
+from coupole.plan.led_table import COLUMNS, LedTable
 
 MOVED_MM, MOVED_DEG = 5.0, 1.0
 """A board farther from its table than this is named: it was mounted anew, or pushed."""

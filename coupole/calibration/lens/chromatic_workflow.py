@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coupole.calibration import optics
+from coupole.calibration.acceptance import judged
+from coupole.calibration.grey_image import CHANNELS, Channel
+from coupole.calibration.lens.acceptance import CHROMATIC
 from coupole.calibration.lens.board import Board, Sighting, in_channel
 from coupole.calibration.lens.camera import calibrate_camera, without_gross_errors
 from coupole.calibration.lens.chromatic import SHARED, ChannelLenses, calibrate_channels
 from coupole.calibration.lens.images import Found
-from coupole.calibration.lens.limits import CHROMATIC
 from coupole.calibration.lens.workflow import content_of, image_figures, image_lines, unit_name
-from coupole.calibration.limits import judged
-from coupole.calibration.picture import CHANNELS, Channel
 from coupole.calibration.record import Noise, Parameter, Record, rows_of, sealed
 from coupole.calibration.report import BLUE, DARK, RED
+from coupole.calibration.request import Wish
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import Sources
-from coupole.calibration.wish import Wish
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,8 +13,10 @@ from typing import Literal
 import numpy as np
 
 from coupole.calibration import optics
+from coupole.calibration.acceptance import judged
 from coupole.calibration.adjustment import Component
 from coupole.calibration.arm_errors import axis_sensitivity
+from coupole.calibration.lens.acceptance import CAMERA, HAND_EYE
 from coupole.calibration.lens.board import Board, Sighting
 from coupole.calibration.lens.bundle import (
     EarlierLens,
@@ -26,8 +28,6 @@ from coupole.calibration.lens.bundle import (
 from coupole.calibration.lens.camera import CameraCalibration, calibrate_camera, without_gross_errors
 from coupole.calibration.lens.diagnosis import Diagnosis, diagnose, expected_scatter
 from coupole.calibration.lens.images import Found
-from coupole.calibration.lens.limits import CAMERA, HAND_EYE
-from coupole.calibration.limits import judged
 from coupole.calibration.poses import ReportedPoses
 from coupole.calibration.record import (
     ImageResidual,
@@ -39,9 +39,9 @@ from coupole.calibration.record import (
     rows_of,
     sealed,
 )
+from coupole.calibration.request import Wish
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import Sources
-from coupole.calibration.wish import Wish
 from coupole.errors import InputError
 from coupole.kinematics import Arm
 

@@ -11,20 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
+from coupole.calibration.acceptance import judged
 from coupole.calibration.earlier import read_accepted
+from coupole.calibration.light.acceptance import DRIFT
 from coupole.calibration.light.drift import NAMES, Drift, Reading, fit_drift
 from coupole.calibration.light.drift_drawing import draw_drift
 from coupole.calibration.light.frames import LightFrame, LightFrames
 from coupole.calibration.light.led_power import prior_of
 from coupole.calibration.light.led_power_tile import Setting, TileReader
-from coupole.calibration.light.limits import DRIFT
 from coupole.calibration.light.records import Progress, counter, record_input, sealed_outcome
 from coupole.calibration.light.tile_views import OF_PLACE, rows_of
-from coupole.calibration.limits import judged
 from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome
+from coupole.calibration.request import Wish
 from coupole.calibration.rotations import Floats
-from coupole.calibration.wish import Wish
 from coupole.errors import InputError
 
 CHANNEL = "G"

@@ -34,8 +34,8 @@ from coupole.calibration.light.records import (
 )
 from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome
+from coupole.calibration.request import Wish
 from coupole.calibration.rotations import Floats
-from coupole.calibration.wish import Wish
 from coupole.errors import InputError
 
 _BLOCKS = 64

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole import store
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import About, about_of, frames_sha256, poses_and_attributes
 from coupole.errors import InputError
-from coupole.run import ProvenFrame, Run, is_shot, sha256
+from coupole.storage import frame_file
+from coupole.storage.run import ProvenFrame, Run, is_shot, sha256
 
 CHANNELS = ("R", "G", "B")
 
@@ -141,7 +141,7 @@ def _by_view(run: Run) -> dict[Path, list[ProvenFrame]]:
 def _of_view(
     run: Run, path: Path, proven: Sequence[ProvenFrame]
 ) -> tuple[list[LightFrame], tuple[str, int, int, float, float, About]]:
-    layout, table, facts = store.read_layout(path), store.read_frames(path), store.read_facts(path)
+    layout, table, facts = frame_file.read_layout(path), frame_file.read_frames(path), frame_file.read_facts(path)
     poses, attributes = poses_and_attributes(path)
     frames = []
     for frame in proven:
@@ -156,7 +156,7 @@ def _of_view(
                 decicelsius / 10.0 if decicelsius else float("nan"),
                 np.array(poses[int(record["pose"])]["base_from_flange"], dtype=np.float64),
                 np.array(poses[int(record["pose"])]["base_from_camera"], dtype=np.float64),
-                partial(store.read_frame, path, layout, frame.index),
+                partial(frame_file.read_frame, path, layout, frame.index),
             )
         )
     focal_mm, focus_mm = float(attributes["focal_length_mm"]), float(attributes["focus_distance_mm"])

@@ -8,18 +8,18 @@ from functools import partial
 
 import numpy as np
 
+from coupole.calibration.acceptance import judged
 from coupole.calibration.light import drawing as pictures
+from coupole.calibration.light.acceptance import LED_POWER
 from coupole.calibration.light.frames import LightFrame, LightFrames, channels_of
 from coupole.calibration.light.led_power import LEAST_PRIOR, LedPower, calibrate_led_power, prior_of
 from coupole.calibration.light.led_power_tile import Setting, TileReader
-from coupole.calibration.light.limits import LED_POWER
 from coupole.calibration.light.records import Progress, counter, sealed_outcome
 from coupole.calibration.light.tile_views import TileView, list_of
-from coupole.calibration.limits import judged
 from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome
+from coupole.calibration.request import Wish
 from coupole.calibration.rotations import Floats
-from coupole.calibration.wish import Wish
 from coupole.errors import InputError
 
 

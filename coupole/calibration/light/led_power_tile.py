@@ -17,8 +17,8 @@ from coupole.calibration.light.records import dark_signal, linearise, map_beside
 from coupole.calibration.light.spectralon import Tile
 from coupole.calibration.light.tile_views import Positions, TileView
 from coupole.calibration.rotations import Floats
-from coupole.dome import read_led_table
 from coupole.errors import InputError
+from coupole.plan.led_table import read_led_table
 
 _PATCHES = 4
 """Along each side of the tile."""

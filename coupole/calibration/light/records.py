@@ -17,8 +17,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.calibration.acceptance import judged
 from coupole.calibration.earlier import read_accepted, read_earlier
 from coupole.calibration.light import drawing as pictures
+from coupole.calibration.light.acceptance import DARK, RESPONSE
 from coupole.calibration.light.dark import Dark, DarkFrame, calibrate_dark, warmth_of
 from coupole.calibration.light.frames import (
     LightFrame,
@@ -27,11 +29,9 @@ from coupole.calibration.light.frames import (
     channels_of,
     temperatures_of,
 )
-from coupole.calibration.light.limits import DARK, RESPONSE
 from coupole.calibration.light.linearity import Linearity, linearity
 from coupole.calibration.light.pairs import Pair
 from coupole.calibration.light.photon_transfer import PhotonTransfer, photon_transfer
-from coupole.calibration.limits import judged
 from coupole.calibration.record import (
     Input,
     Kind,
@@ -43,8 +43,8 @@ from coupole.calibration.record import (
     sealed,
 )
 from coupole.calibration.report import Outcome
+from coupole.calibration.request import Wish
 from coupole.calibration.rotations import Floats
-from coupole.calibration.wish import Wish
 from coupole.errors import InputError
 
 Progress = Callable[[int, int], None]

@@ -16,9 +16,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from coupole import yamlfile
 from coupole.calibration.rotations import Floats
-from coupole.plan import Model, Pose
+from coupole.plan import yamlfile
+from coupole.plan.plan import Model, Pose
 
 
 class Tile(Model):

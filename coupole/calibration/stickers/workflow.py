@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from coupole.calibration import optics
+from coupole.calibration.acceptance import judged
 from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
-from coupole.calibration.limits import judged
 from coupole.calibration.multi_view import seen_points
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.record import (
@@ -24,9 +24,10 @@ from coupole.calibration.record import (
     sealed,
     step_names,
 )
+from coupole.calibration.request import Wish
 from coupole.calibration.rotations import Floats, inverses
 from coupole.calibration.sources import Sources
-from coupole.calibration.stickers.limits import MESH
+from coupole.calibration.stickers.acceptance import MESH
 from coupole.calibration.stickers.mesh_to_robot import (
     ORIENTATION,
     POSITION,
@@ -37,7 +38,6 @@ from coupole.calibration.stickers.mesh_to_robot import (
 )
 from coupole.calibration.stickers.points import corrected, views_of
 from coupole.calibration.stickers.sources import Scan, StickerImages
-from coupole.calibration.wish import Wish
 from coupole.errors import InputError
 from coupole.geometry import Transform, inverse
 
@@ -127,7 +127,7 @@ def outline_px(found: MeshFound, mesh: Path) -> Floats:
     that do not: its outline, and that of what stands out of it."""
     import trimesh
 
-    from coupole.view_solids import Solid, simplified
+    from coupole.viewing.view_solids import Solid, simplified
 
     whole = trimesh.load_mesh(mesh, process=False)
     coarse = simplified(Solid("mesh", np.asarray(whole.vertices), np.asarray(whole.faces)), _MOST_FACES)

@@ -11,7 +11,7 @@ from synthesis import Array, TrueLens, frame
 from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.calibration.posed_camera import CameraPrior
-from coupole.dome import LedTable
+from coupole.plan.led_table import LedTable
 
 LENS = TrueLens((7120.0, 7121.0), (2049.3, 1533.8), (-0.05, 0.02, 2e-4, -3e-4, 0.0))
 SIZE_PX = (4096, 3072)

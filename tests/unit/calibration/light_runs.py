@@ -11,11 +11,11 @@ import numpy as np
 from archives import METADATA
 from numpy.typing import NDArray
 
-from coupole import store
 from coupole.devices import ArmState, FrameFormat
-from coupole.journal import Journal
-from coupole.run import Inputs, Run
-from coupole.store import ViewWriter
+from coupole.storage import frame_file
+from coupole.storage.frame_file import ViewWriter
+from coupole.storage.journal import Journal
+from coupole.storage.run import Inputs, Run
 
 SIZE_PX = (128, 96)
 FORMAT = FrameFormat(
@@ -51,7 +51,7 @@ def write_light_run(folder: Path, frames: Sequence[Taken]) -> Path:
         mine = [frame for frame in frames if frame.shot.split("/")[0] == view]
         path = run.view_path(view)
         metadata = {**METADATA, "title": view, "focus_distance_mm": 335.0, "pixel_pitch_um": PITCH_UM}
-        store.create(path, len(mine), FORMAT, metadata)
+        frame_file.create(path, len(mine), FORMAT, metadata)
         writer = ViewWriter(path, {})
         arm = ArmState((0, -90, 90, 0, 90, 0), np.eye(4), 7, moving=False)
         pose = writer.add_pose(arm, mine[0].base_from_camera)

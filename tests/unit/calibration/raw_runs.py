@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 from sticker_scenes import LENS, SIZE_PX, Scene
 from synthesis import Array, frame
 
-from coupole import store
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.record import Input, Noise, Parameter, Validity, sealed, step_names, write_record
 from coupole.devices import ArmState, FrameFormat
-from coupole.dome import COLUMNS, LedTable
 from coupole.geometry import abc_from_rotation
-from coupole.journal import Journal
-from coupole.plan import Pose
-from coupole.run import Inputs, Run
-from coupole.store import ViewWriter
+from coupole.plan.led_table import COLUMNS, LedTable
+from coupole.plan.plan import Pose
+from coupole.storage import frame_file
+from coupole.storage.frame_file import ViewWriter
+from coupole.storage.journal import Journal
+from coupole.storage.run import Inputs, Run
 
 FLANGE_FROM_CAMERA = frame(np.array([31.0, -42.0, 118.0]), np.array([4.0, -3.0, 60.0]))
 
@@ -69,7 +69,7 @@ def write_raw_run(folder: Path, frames: Sequence[Frame], *, pattern: str = "GBRG
     for view in views:
         mine = [one for one in frames if one.view == view]
         path = run.view_path(view)
-        store.create(path, len(mine), of, {**METADATA, "title": view, "focus_distance_mm": 335.0})
+        frame_file.create(path, len(mine), of, {**METADATA, "title": view, "focus_distance_mm": 335.0})
         writer = ViewWriter(path, {})
         flange = mine[0].base_from_flange
         arm = ArmState((0, -90, 90, 0, 90, 0), flange, 7, moving=False)

@@ -10,8 +10,8 @@ from bright_squares import BLACK_DN, covered, raw
 from scipy.spatial.transform import Rotation
 from synthesis import Array, TrueLens, frame
 
+from coupole.calibration.grey_image import Picture
 from coupole.calibration.optics import NAMES, Intrinsics
-from coupole.calibration.picture import Picture
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.poses import reported
 from coupole.calibration.sources import About, Source, Sources

@@ -13,7 +13,7 @@ from coupole.calibration.lens.bundle import HandEyeCalibration, Poses, RobotNois
 from coupole.calibration.lens.camera import calibrate_camera
 from coupole.calibration.rotations import between
 from coupole.kinematics import KR10_R1100_SIXX, forward, inverse, nearest
-from sim.kuka_kinematics import PoseErrors
+from sim.devices.kuka_kinematics import PoseErrors
 
 ABSOLUTE_DEG = 0.02
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)

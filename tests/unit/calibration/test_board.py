@@ -9,8 +9,8 @@ import pytest
 from boards import CHARUCO, CHESS, LENS, as_dn, magnified, picture_of
 from synthesis import Array
 
+from coupole.calibration.grey_image import Picture
 from coupole.calibration.lens.board import Board, Sighting, detect, in_channel, read_board
-from coupole.calibration.picture import Picture
 from coupole.errors import InputError
 
 PATTERNS = ("GBRG", "GRBG", "RGGB", "BGGR")

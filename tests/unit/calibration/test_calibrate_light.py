@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 
 from coupole.calibration.record import Record, read_record, sealed, write_record
 from coupole.commands import calibrate_light
-from coupole.commands.budget import budget
+from coupole.commands.uncertainty import budget
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
 
 SHAPE = (SIZE_PX[1], SIZE_PX[0])

@@ -16,8 +16,8 @@ from coupole.calibration.lens.images import find_board
 from coupole.calibration.lens.workflow import hand_eye_from
 from coupole.calibration.posed_camera import read_posed_camera
 from coupole.calibration.record import write_record
+from coupole.calibration.request import Wish
 from coupole.calibration.sources import Sources, open_sources
-from coupole.calibration.wish import Wish
 from coupole.errors import InputError
 
 NOW = datetime.now(UTC)

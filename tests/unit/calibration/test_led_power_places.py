@@ -12,8 +12,8 @@ import pytest
 from coupole.calibration.leds.workflow import led_csv
 from coupole.calibration.light.led_power_tile import calibrated_positions
 from coupole.calibration.record import Input, Parameter, Validity, sealed, write_record
-from coupole.dome import LedTable
 from coupole.errors import InputError
+from coupole.plan.led_table import LedTable
 
 TABLE = LedTable(
     np.array([3, 7]),

@@ -21,10 +21,10 @@ from coupole.calibration.leds.workflow import LedsFound, leds_from
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.record import read_record
 from coupole.calibration.report import Outcome, write_outcome
+from coupole.calibration.request import Wish
 from coupole.calibration.sources import About
-from coupole.calibration.wish import Wish
-from coupole.dome import read_led_table
 from coupole.errors import InputError
+from coupole.plan.led_table import read_led_table
 
 WISH = Wish("leds-test", datetime(2026, 5, 1, tzinfo=UTC))
 

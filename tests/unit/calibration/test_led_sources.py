@@ -11,14 +11,14 @@ from archives import METADATA
 from bright_squares import covered, raw, square
 from synthesis import Array
 
-from coupole import store
 from coupole.calibration.leds.sources import find_leds
 from coupole.devices import ArmState, FrameFormat
-from coupole.dome import LedTable
 from coupole.errors import InputError
-from coupole.journal import Journal
-from coupole.run import Inputs, Run
-from coupole.store import ViewWriter
+from coupole.plan.led_table import LedTable
+from coupole.storage import frame_file
+from coupole.storage.frame_file import ViewWriter
+from coupole.storage.journal import Journal
+from coupole.storage.run import Inputs, Run
 
 SHAPE = (96, 128)
 FORMAT = FrameFormat(
@@ -40,7 +40,7 @@ def write_run(folder: Path, labels: tuple[str, ...], *, hot: bool = False) -> Ru
     diary.write("start")
     for number, view in enumerate(views):
         path = run.view_path(view)
-        store.create(path, len(labels), FORMAT, {**METADATA, "title": view, "focus_distance_mm": 335.0})
+        frame_file.create(path, len(labels), FORMAT, {**METADATA, "title": view, "focus_distance_mm": 335.0})
         writer = ViewWriter(path, {})
         pose = np.eye(4)
         pose[0, 3] = 100.0 * number

@@ -9,9 +9,9 @@ import cells
 import pytest
 from photographed import write_folder
 
-from coupole.calibration.leds.limits import LEDS
-from coupole.calibration.lens.limits import CAMERA, CHROMATIC, HAND_EYE
-from coupole.calibration.limits import Allowed, asked, judged, words_of
+from coupole.calibration.acceptance import Allowed, asked, judged, words_of
+from coupole.calibration.leds.acceptance import LEDS
+from coupole.calibration.lens.acceptance import CAMERA, CHROMATIC, HAND_EYE
 from coupole.calibration.record import read_record
 from coupole.errors import InputError
 

@@ -14,11 +14,11 @@ from sticker_scenes import Scene, scene, write_scan
 
 from coupole.calibration.record import read_record
 from coupole.calibration.report import Outcome, write_outcome
+from coupole.calibration.request import Wish
 from coupole.calibration.stickers.drawing import draw_mesh
 from coupole.calibration.stickers.mesh_to_robot import Stated
 from coupole.calibration.stickers.sources import find_all_stickers, read_scan
 from coupole.calibration.stickers.workflow import MeshFound, mesh_from
-from coupole.calibration.wish import Wish
 from coupole.errors import InputError
 from coupole.geometry import transform
 

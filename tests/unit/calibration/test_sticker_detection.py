@@ -8,8 +8,8 @@ from bright_squares import BLACK_DN, covered, raw
 from scipy.spatial.transform import Rotation
 from synthesis import Array, TrueLens
 
+from coupole.calibration.grey_image import plane
 from coupole.calibration.optics import Intrinsics
-from coupole.calibration.picture import plane
 from coupole.calibration.stickers.detection import Sticker, find_stickers
 
 SHAPE = (240, 320)

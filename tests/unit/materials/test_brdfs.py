@@ -7,9 +7,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from sim.materials import brdf, fresnel, gilding, hemisphere, indices, kubelka_munk, layered, makie, tabulated
-from sim.materials.brdf import Brdf
-from sim.materials.grid import BANDS, Array
+from coupole.appearance.matter import brdf, gilding, hemisphere, kubelka_munk, layered, makie, tabulated
+from coupole.appearance.matter.brdf import Brdf
+from coupole.appearance.optics import fresnel, indices
+from coupole.appearance.spectra.grid import BANDS, Array
 
 GOLD = indices.gold()
 COSINES = np.array([0.05, 0.2, 0.5, 0.8, 1.0])

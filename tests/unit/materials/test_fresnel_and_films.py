@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.materials import fresnel, indices
-from sim.materials.grid import BANDS, WAVELENGTHS_NM
-from sim.materials.thin_film import Film, stack_power
+from coupole.appearance.optics import fresnel, indices
+from coupole.appearance.optics.thin_film import Film, stack_power
+from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM
 
 ANY_INDEX = st.builds(complex, st.floats(0.05, 4.0), st.floats(0.0, 6.0))
 COSINE = st.floats(0.01, 1.0)

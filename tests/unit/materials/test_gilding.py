@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
+from coupole.appearance.matter import gilding, kubelka_munk, layered, typical
+from coupole.appearance.optics import effective_medium, fresnel, indices
+from coupole.appearance.optics.thin_film import Film, stack_power
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.errors import InputError
-from sim.materials import effective_medium, fresnel, gilding, indices, kubelka_munk, layered, typical
-from sim.materials.grid import WAVELENGTHS_NM
-from sim.materials.thin_film import Film, stack_power
 
 GOLD = indices.gold()
 BOLE = kubelka_munk.saunderson(

@@ -7,10 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coupole.appearance.matter import kubelka_munk, pigments, typical
+from coupole.appearance.spectra import light, resampling
+from coupole.appearance.spectra.grid import Array
+from coupole.appearance.spectra.measured import Measured
 from coupole.errors import InputError
-from sim.materials import identification, kubelka_munk, light, pigments, resampling, typical
-from sim.materials.grid import Array
-from sim.materials.measured import Measured
+from coupole.heritage.analysis import identification
 
 REFERENCES = {name: typical.reflectance(name) for name in typical.SHAPES if name != "vine black"}
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coupole.appearance.spectra import channels, light
+from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM
 from coupole.errors import InputError
-from sim.materials import channels, light
-from sim.materials.grid import BANDS, WAVELENGTHS_NM
 
 WHITE = np.ones(BANDS)
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coupole.appearance.spectra import resampling
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM
+from coupole.appearance.spectra.measured import Measured, Unit, parse_spectrum, read_spectrum
 from coupole.errors import InputError
-from sim.materials import resampling
-from sim.materials.grid import WAVELENGTHS_NM
-from sim.materials.measured import Measured, Unit, parse_spectrum, read_spectrum
 
 NM = np.arange(360.0, 801.0, 10.0)
 

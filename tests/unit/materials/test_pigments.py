@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coupole.appearance.matter import kubelka_munk, pigments, typical
 from coupole.errors import InputError
-from sim.materials import kubelka_munk, pigments, typical
 
 WHITE = pigments.from_opaque("white lead", typical.reflectance("white lead"), 1.0)
 RED = pigments.from_opaque("vermilion", typical.reflectance("vermilion"), 0.7)

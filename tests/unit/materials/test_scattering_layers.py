@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_bvp
 from scipy.linalg import expm
 
+from coupole.appearance.matter import four_flux, kubelka_munk
+from coupole.appearance.matter.four_flux import Background, Layer
+from coupole.appearance.optics import fresnel
 from coupole.errors import InputError
-from sim.materials import four_flux, fresnel, kubelka_munk
-from sim.materials.four_flux import Background, Layer
 
 PER_MM = st.floats(0.0, 40.0)
 SHARE = st.floats(0.0, 0.98)

@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
+from coupole.appearance.matter import brdf, hemisphere, tabulated
+from coupole.appearance.matter.brdf import Brdf
+from coupole.appearance.optics import fresnel, indices
+from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
-from sim.materials import brdf, fresnel, hemisphere, indices, tabulated
-from sim.materials.brdf import Brdf
-from sim.materials.grid import Array
 
 GOLD = indices.gold()[[14, 34, 54]]
 

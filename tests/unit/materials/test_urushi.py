@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coupole.appearance.matter import lacquer, makie, nashiji
+from coupole.appearance.matter.nashiji import Slab
 from coupole.errors import InputError
-from sim.materials import lacquer, makie, nashiji
-from sim.materials.nashiji import Slab
 
 METAL = np.array([0.55, 0.42, 0.16])
 LACQUERS = np.array([[0.45, 0.05, 0.04], [0.03, 0.30, 0.06], [0.60, 0.62, 0.58]])

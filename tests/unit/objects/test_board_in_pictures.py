@@ -7,14 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from coupole.geometry import inverse
-from sim import blur
-from sim.objective import Objective, vignetting
-from sim.objects.board import Charuco, charuco_board, inner_corners_mm, opencv_board
+from sim.objects.charuco import Charuco, charuco_board, inner_corners_mm, opencv_board
+from sim.optics import blur
+from sim.optics.objective import Objective, vignetting
+from sim.optics.sensor import electrons, expose, expose_electrons, mosaic
+from sim.optics.sensor_model import SensorModel
+from sim.render.camera_view import View, Viewer, tangents
 from sim.render.lens import Lens, sight
-from sim.render.view import View, Viewer, tangents
-from sim.scene import build_scene
-from sim.sensor import electrons, expose, expose_electrons, mosaic
-from sim.sensor_model import SensorModel
+from sim.scene.scene import build_scene
 
 cv2 = pytest.importorskip("cv2")
 pytest.importorskip("colour")

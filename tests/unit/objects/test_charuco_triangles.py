@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from sim.objects.board import Charuco, charuco_board, inner_corners_mm, opencv_board
-from sim.objects.mesh import flat_normals
-from sim.surface import Surface
+from sim.objects.charuco import Charuco, charuco_board, inner_corners_mm, opencv_board
+from sim.objects.patchwork import flat_normals
+from sim.scene.surface import Surface
 
 cv2 = pytest.importorskip("cv2")
 

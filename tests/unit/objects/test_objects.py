@@ -11,11 +11,11 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coupole.appearance.matter import nashiji
 from coupole.errors import InputError
-from sim.materials import nashiji
 from sim.objects import fabric, mesh, shapes, targets, urushi, wedges
-from sim.objects.board import Charuco, charuco_board
-from sim.surface import Surface
+from sim.objects.charuco import Charuco, charuco_board
+from sim.scene.surface import Surface
 
 SMALL_SLAB = nashiji.Slab(size_mm=(5.0, 5.0), seed=2)
 BODIES: dict[str, Callable[[], Surface]] = {

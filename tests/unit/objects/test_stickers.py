@@ -7,8 +7,8 @@ import pytest
 
 from coupole.errors import InputError
 from sim.objects import mesh, shapes, targets
-from sim.objects.board import Charuco, charuco_board
-from sim.surface import Surface
+from sim.objects.charuco import Charuco, charuco_board
+from sim.scene.surface import Surface
 
 STONE = shapes.sculpted_relief(150.0, triangles=8_000)
 

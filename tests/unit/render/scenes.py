@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from coupole.geometry import Transform
 from sim.render.lens import Lens, distorted
-from sim.scene import Scene, build_scene
-from sim.surface import Material, Surface
+from sim.scene.scene import Scene, build_scene
+from sim.scene.surface import Material, Surface
 
 GREY = Material("grey", (0.5, 0.5, 0.5))
 BENT = (-0.12, 0.05, 8e-4, -5e-4, 0.02)

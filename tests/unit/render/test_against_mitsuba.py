@@ -16,13 +16,13 @@ import pytest
 from numpy.typing import NDArray
 from scenes import camera_above, quad, relief, scene_of, sphere
 
+from sim.render.camera_view import Viewer
 from sim.render.embree import Obstacles
 from sim.render.emitter import square
 from sim.render.lens import Lens
 from sim.render.radiance import led_radiance
 from sim.render.shadows import Shadows
-from sim.render.view import Viewer
-from sim.surface import Material
+from sim.scene.surface import Material
 
 mi = pytest.importorskip("mitsuba")
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_picture import ABOVE, photographer
 
-from sim.arm_bodies import NONE, Capsules, ToolBody, arm_capsules, tool_capsules
-from sim.camera_body import Exposed
-from sim.kuka_kinematics import flange_pose
+from sim.devices.arm_bodies import NONE, Capsules, ToolBody, arm_capsules, tool_capsules
+from sim.devices.camera_body import Exposed
+from sim.devices.kuka_kinematics import flange_pose
 from sim.render.arm_shadow import cast, distance_mm
 
 points = st.tuples(*[st.floats(-500, 500)] * 3).map(np.array)

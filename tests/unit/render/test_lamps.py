@@ -10,16 +10,16 @@ from scenes import BENT, camera_above
 from test_picture import ABOVE, frame, photographer
 
 from coupole.geometry import Transform
-from sim import panels
-from sim.camera_body import Exposed
-from sim.dome import DomeErrors, as_built
-from sim.glow import glow
-from sim.objective import Objective, defocus_px
-from sim.panels import Panel
-from sim.picture import Photographer
+from sim.devices.camera_body import Exposed
+from sim.optics import panels
+from sim.optics.dome import DomeErrors, as_built
+from sim.optics.glow import glow
+from sim.optics.objective import Objective, defocus_px
+from sim.optics.panels import Panel
+from sim.optics.photographer import Photographer
 from sim.render.emitter import irradiance, square
 from sim.render.lens import Lens, distorted, sight
-from sim.scene import Leds
+from sim.scene.scene import Leds
 
 SIZE = (192, 256)
 FLAT, CURVED = (sight(Lens(SIZE[1], SIZE[0], 400.0, d)) for d in ((0.0,) * 5, BENT))

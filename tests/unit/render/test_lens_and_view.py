@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from scenes import BENT, camera_above, quad, scene_of
 
 from coupole.errors import InputError
-from sim.objective import Objective, vignetting
+from sim.optics.objective import Objective, vignetting
+from sim.render.camera_view import Viewer, tangents
 from sim.render.lens import Lens, distorted, sight
-from sim.render.view import Viewer, tangents
-from sim.scene import build_scene
-from sim.surface import Material, Surface
+from sim.scene.scene import build_scene
+from sim.scene.surface import Material, Surface
 
 LENS = Lens(160, 120, 200.0)
 BENT_SIGHT = sight(Lens(160, 120, 200.0, BENT))

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scenes import camera_above, quad
 
 from coupole.geometry import Transform
-from sim.camera_body import Exposed
-from sim.config import CameraConfig, SceneConfig, Settings
-from sim.picture import Photographer
+from sim.devices.camera_body import Exposed
+from sim.optics.photographer import Photographer
+from sim.world.config import CameraConfig, SceneConfig, Settings
 
 ABOVE = camera_above(335.0)
 LEDS = """id,board,x_mm,y_mm,z_mm,nx,ny,nz,flux_lm
@@ -98,8 +98,8 @@ def test_without_memory_for_radiance_and_shadows_frames_stay_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = frame(photographer(tmp_path), {7: 0.004})
-    monkeypatch.setattr("sim.picture._RADIANCE_BYTES", 0)
-    monkeypatch.setattr("sim.picture._SHADOW_BYTES", 0)
+    monkeypatch.setattr("sim.optics.photographer._RADIANCE_BYTES", 0)
+    monkeypatch.setattr("sim.optics.photographer._SHADOW_BYTES", 0)
     by = photographer(tmp_path)
     assert np.array_equal(frame(by, {7: 0.004}), expected)
     assert np.array_equal(frame(by, {7: 0.004}), expected)

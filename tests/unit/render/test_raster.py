@@ -133,7 +133,7 @@ from sim.render.emitter import square
 from sim.render.lens import sight
 from sim.render.radiance import led_radiance
 from sim.render.shadows import Shadows
-from sim.render.view import Viewer
+from sim.render.camera_view import Viewer
 scene = scene_of(np.concatenate([quad((0, 0, -20), 2000.0), relief(120, 60, 5.0), sphere(30.0, 4)]),
                  Material("glossy", (0.3, 0.2, 0.1), (0.04, 0.05, 0.06), 0.2))
 light = np.array([[300.0, 200.0, 900.0]])

@@ -10,8 +10,8 @@ from scenes import GREY, quad, sphere
 
 from coupole.errors import InputError
 from coupole.geometry import transform
-from sim.scene import PAINTED, STONE, build_scene, load_surface, support_disk
-from sim.surface import Material, Surface
+from sim.scene.scene import PAINTED, STONE, build_scene, load_surface, support_disk
+from sim.scene.surface import Material, Surface
 
 
 def test_the_support_is_a_whole_disk_of_small_triangles_that_look_up() -> None:

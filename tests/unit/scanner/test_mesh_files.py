@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coupole.errors import InputError
-from drivers import mesh_text
-from drivers.mesh import Mesh
-from drivers.mesh_defects import find_defects
-from drivers.mesh_files import read_mesh
-from drivers.vxelements import read_scan
+from coupole.scan import mesh_text
+from coupole.scan.mesh import Mesh
+from coupole.scan.mesh_defects import find_defects
+from coupole.scan.mesh_files import read_mesh
+from coupole.scan.scanner_export import read_scan
 
 BUNNY = Path(__file__).parents[3].parent / "shared/data/bunny/bun_zipper.ply"
 SPHERE = trimesh.creation.icosphere(subdivisions=3, radius=40.0)

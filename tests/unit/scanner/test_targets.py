@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coupole.errors import InputError
-from drivers.targets import Targets, read_targets
-from drivers.vxelements import read_scan
+from coupole.scan.scanner_export import read_scan
+from coupole.scan.targets import Targets, read_targets
 
 POINTS = [[1.5, -2.25, 3.0], [10.0, 20.5, -30.125]]
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from sim import noise
+from sim.optics import noise
 
 FRAME = 3
 TABLES = (noise.INVERSE_NORMAL, noise.SMALL_MEANS, noise.SMALL_STARTS)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from sim import blur
-from sim.objective import (
+from sim.optics import blur
+from sim.optics.objective import (
     Objective,
     blur_px,
     defocus_px,

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from sim.sensor import SensorModel, electrons, expose, expose_electrons, fixed_pattern, mosaic
+from sim.optics.sensor import SensorModel, electrons, expose, expose_electrons, fixed_pattern, mosaic
 
 QUIET = SensorModel(read_noise_e=0.0, row_noise_e=0.0, prnu=0.0, dsnu_e=0.0, dark_e_per_s=0.0)
 """Shot noise alone."""
@@ -198,7 +198,7 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
 
 SCRIPT = """
 import hashlib, numba, numpy as np
-from sim.sensor import SensorModel, expose
+from sim.optics.sensor import SensorModel, expose
 assert numba.get_num_threads() == {threads}
 out = np.empty((301, 403), np.uint16)
 triangle = (np.arange(out.size, dtype=np.int32) % 997 - 1).reshape(out.shape)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sim.spectral.render import Spectral, opened
-from sim.spectral.scene import Scene
+from coupole.appearance.render.rendering import Spectral, opened
+from coupole.appearance.render.scene_file import Scene
 
 HERE = Path()
 

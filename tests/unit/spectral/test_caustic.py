@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from spectral_scenes import constant, illuminant, rendered, scene
 
-from sim.materials import indices, layered, light
-from sim.materials.grid import BANDS, Array
-from sim.materials.thin_film import Film
-from sim.objects.mesh import flat_normals
-from sim.spectral.arcature import arcature, nephroid
-from sim.spectral.caustic import Niche, Sun, irradiance, photons
-from sim.spectral.spectra import scaled
+from coupole.appearance.matter import layered
+from coupole.appearance.optics import indices
+from coupole.appearance.optics.thin_film import Film
+from coupole.appearance.render.arcature import arcature, nephroid
+from coupole.appearance.render.caustic import Niche, Sun, irradiance, photons
+from coupole.appearance.render.spectra import scaled
+from coupole.appearance.spectra import light
+from coupole.appearance.spectra.grid import BANDS, Array
+from sim.objects.patchwork import flat_normals
 
 Scale = Callable[[int, int], int]
 RADIUS_MM, HEIGHT_MM, DEPTH_MM = 400.0, 600.0, 300.0

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim.objects.mesh import flat_normals, rectangle
+from sim.objects.patchwork import flat_normals, rectangle
 from sim.objects.shapes import unit_sphere
 from sim.render.emitter import irradiance, square
-from sim.scene import Scene, build_scene
-from sim.spectral.interreflection import indirect_radiance, prepare
-from sim.surface import Material, Surface
+from sim.render.interreflection import indirect_radiance, prepare
+from sim.scene.scene import Scene, build_scene
+from sim.scene.surface import Material, Surface
 
 pytest.importorskip("mitsuba")
 

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from spectral_scenes import constant, everywhere, illuminant, plane, rendered, scene
 
+from coupole.appearance.optics import fresnel, indices
+from coupole.appearance.optics.thin_film import Film, stack_power
+from coupole.appearance.render.equivalent import equivalent_index
+from coupole.appearance.render.spectra import LowSun, Measured, air_mass, luminous, power, scaled
+from coupole.appearance.spectra import light
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.errors import InputError
-from sim.materials import fresnel, indices, light
-from sim.materials.grid import WAVELENGTHS_NM
-from sim.materials.thin_film import Film, stack_power
 from sim.render.emitter import irradiance, square
-from sim.scene import read_leds
-from sim.spectral.equivalent import equivalent_index
-from sim.spectral.spectra import LowSun, Measured, air_mass, luminous, power, scaled
+from sim.scene.scene import read_leds
 
 pytest.importorskip("mitsuba")
 pytest.importorskip("colour")

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coupole.appearance.render.rendering import opened
 from coupole.commands.render import render
+from coupole.commands.render_scene import STUDIO, read_scene, render_scene
 from coupole.errors import InputError, StorageError
-from coupole.render_scene import STUDIO, read_scene, render_scene
-from coupole.rig import load_class
-from sim.spectral.render import opened
+from coupole.plan.rig import load_class
 
 pytest.importorskip("mitsuba")
 pytest.importorskip("colour")

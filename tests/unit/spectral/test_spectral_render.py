@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from spectral_scenes import camera, constant, everywhere, illuminant, plane, rendered, scene
 
-from sim.materials import fresnel, gilding, indices, kubelka_munk, light, typical
-from sim.materials.grid import WAVELENGTHS_NM
-from sim.spectral import bands, colour
-from sim.spectral.render import Spectral, degree_of_linear_polarisation
-from sim.spectral.spectra import luminous, scaled
+from coupole.appearance.matter import gilding, kubelka_munk, typical
+from coupole.appearance.optics import fresnel, indices
+from coupole.appearance.render import bands, colour
+from coupole.appearance.render.rendering import Spectral, degree_of_linear_polarisation
+from coupole.appearance.render.spectra import luminous, scaled
+from coupole.appearance.spectra import light
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 
 pytest.importorskip("mitsuba")
 colour_science = pytest.importorskip("colour")

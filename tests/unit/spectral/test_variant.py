@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.spectral.variant import LEAST_LLVM, llvm_version, spectral
+from coupole.appearance.render.variant import LEAST_LLVM, llvm_version, spectral
 
 
 @pytest.mark.parametrize(

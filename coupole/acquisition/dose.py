@@ -1,0 +1,37 @@
+"""The light dose that a run really gives, reckoned from the box's log."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.devices import NO_LIGHT
+from coupole.geometry import apply
+from coupole.plan.shots import Burst
+from coupole.preflight.job import Job
+
+
+class DoseMeter:
+    """Adds up lux hours at the job's points on the object; the worst of them counts."""
+
+    def __init__(self, job: Job) -> None:
+        rig = job.cell.rig
+        points_base = apply(rig.support.base_from_support.matrix(), job.object_points_support_mm)
+        self._lux = job.cell.leds.illuminance_lux(points_base, emission=rig.dome.emission)
+        self._row_of_led = {int(led): row for row, led in enumerate(job.cell.leds.ids)}
+        self._panel_lux = rig.dome.panel_lux
+        self._given_lux_h = np.zeros(len(points_base))
+
+    @property
+    def lux_h(self) -> float:
+        """At the point that got most."""
+        return float(self._given_lux_h.max())
+
+    def add(self, burst: Burst, log: NDArray[np.void]) -> float:
+        """Add what a burst gave, of which `log` (STEP_RECORD_DTYPE [n]) tells; returns seconds of LED light."""
+        rows = [self._row_of_led[int(led)] for led in log["led"][log["led"] != NO_LIGHT]]
+        on_s = burst.timing.on_us * 1e-6
+        self._given_lux_h += self._lux[:, rows].sum(axis=1) * on_s / 3600.0
+        if burst.panel:
+            self._given_lux_h += self._panel_lux * burst.duration_s / 3600.0
+        return round(len(rows) * on_s, 6)

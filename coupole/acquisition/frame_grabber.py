@@ -1,0 +1,105 @@
+"""Takes frames from the armed camera and keeps them, on threads of its own, while the burst runs."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.devices import Camera, Frame
+from coupole.storage.frame_file import WRITERS
+
+_TAKE_TIMEOUT_S = 0.05
+_STALL_S = 2.0
+"""A pause of disk or host that the camera's buffers bridge, where memory allows."""
+_FEWEST_BUFFERS = 16
+_MEMORY_SHARE = 0.25
+"""Of the memory that is free when a run begins, for buffers."""
+
+
+def memory_for_buffers() -> int:
+    """Bytes that a camera's buffers may take on this machine, as it is now."""
+    return int(_MEMORY_SHARE * os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+
+
+def buffers_for(frames: int, frame_bytes: int, period_s: float, memory_bytes: int) -> int:
+    """How many buffers to arm a camera with, for a burst of so many frames: enough for a stall, within memory."""
+    return max(_FEWEST_BUFFERS, min(frames, math.ceil(_STALL_S / period_s), memory_bytes // frame_bytes))
+
+
+class Intake:
+    """From `start()` to `stop()`: every frame that the camera gives is put away and its buffer handed back.
+
+    `keep(frame)` runs on `writers` threads and returns the slot. Frames are listed in order of arrival.
+    """
+
+    def __init__(self, camera: Camera, keep: Callable[[Frame], int], *, writers: int = WRITERS) -> None:
+        self._camera, self._keep = camera, keep
+        self._pool = ThreadPoolExecutor(writers, "keep")
+        self._frame_ids: list[int] = []
+        self._timestamps_ns: list[int] = []
+        self._slots: list[Future[int]] = []
+        self._error: BaseException | None = None
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._take, name="intake")
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def _take(self) -> None:
+        try:
+            while not self._stopping.is_set():
+                frame = self._camera.next_frame(_TAKE_TIMEOUT_S)
+                if frame is not None:
+                    self._slots.append(self._pool.submit(self._put, frame))
+                    self._timestamps_ns.append(frame.timestamp_ns)
+                    self._frame_ids.append(frame.frame_id)
+        except BaseException as error:  # noqa: BLE001  handed to the thread that asks for frames
+            self._error = error
+
+    def _put(self, frame: Frame) -> int:
+        try:
+            return self._keep(frame)
+        finally:
+            frame.release()
+
+    def __len__(self) -> int:
+        """Frames taken so far. Raises what the camera raised on the taking thread."""
+        if self._error is not None:
+            raise self._error
+        return len(self._frame_ids)
+
+    @property
+    def count(self) -> int:
+        """Frames taken so far; does not raise."""
+        return len(self._frame_ids)
+
+    def frames(self, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Ids and timestamps of the first `count` frames."""
+        return (
+            np.array(self._frame_ids[:count], np.int64),
+            np.array(self._timestamps_ns[:count], np.int64),
+        )
+
+    def kept(self, frame: int) -> bool:
+        """True if the frame's bytes are written. Raises what writing raised."""
+        if not self._slots[frame].done():
+            return False
+        self._slots[frame].result()
+        return True
+
+    def slot(self, frame: int) -> int:
+        """The frame's slot; waits for its bytes to be written. Raises what writing raised."""
+        return self._slots[frame].result()
+
+    def stop(self) -> None:
+        """Take no more; what was taken gets written. Never raises."""
+        self._stopping.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._pool.shutdown(wait=True)

@@ -1,0 +1,251 @@
+"""Where a run's frames and events go: into a run folder, or nowhere but into figures (dry run)."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from coupole.devices import ArmState, Frame, FrameFormat
+from coupole.errors import StorageError
+from coupole.geometry import Transform
+from coupole.storage.frame_file import Collections, ViewWriter, create
+from coupole.storage.journal import Journal
+from coupole.storage.run import Run
+
+COMMIT_EVERY_S = 0.5
+SPARE_SLOTS = 32
+"""Slots beyond the planned ones: surplus frames stand there until their burst is judged."""
+
+
+class Recorder(Protocol):
+    """What the sequencer needs of it. `put` may come from several threads, all else from one."""
+
+    def proven(self) -> set[str]:
+        """Shots proven so far, also in an earlier session of the run."""
+        ...
+
+    def begin_view(
+        self,
+        view: str,
+        frames: int,
+        frame_format: FrameFormat,
+        arm: ArmState,
+        base_from_camera: Transform,
+        collections: Collections,
+    ) -> None:
+        """Frames of this view come next; may be called again when the pose was measured anew.
+
+        `collections` are arrays by name that stand beside the frames, by name of their group.
+        """
+        ...
+
+    def put(self, frame: Frame, exposure_us: int) -> int:
+        """Keep a frame that is not proven yet; returns its slot."""
+        ...
+
+    def prove(self, slot: int, shot: str, fields: Mapping[str, int]) -> None: ...
+
+    def free(self, slot: int) -> None: ...
+
+    def event(self, event: str, **fields: Any) -> None: ...
+
+    def commit(self, *, now: bool) -> None:
+        """Make what was proven and noted last; with `now=False` only if the last time was a while ago."""
+        ...
+
+    def end_view(self) -> None: ...
+
+
+class RunRecorder:
+    """Into a run folder."""
+
+    def __init__(self, run: Run, metadata: Mapping[str, Any], *, packed: bool = False) -> None:
+        """Frames may be stored `packed`, two pixels in three bytes."""
+        self._run, self._metadata, self._packed = run, dict(metadata), packed
+        self._journal = Journal(run.journal_path)
+        self._proven = {shot: frame.index for shot, frame in run.proven().items()}
+        self._writer: ViewWriter | None = None
+        self._file = ""
+        self._pose = 0
+        self._committed_s = time.monotonic()
+        self._committer = ThreadPoolExecutor(1, "commit")
+        self._committing: Future[None] | None = None
+
+    def proven(self) -> set[str]:
+        return set(self._proven)
+
+    def begin_view(
+        self,
+        view: str,
+        frames: int,
+        frame_format: FrameFormat,
+        arm: ArmState,
+        base_from_camera: Transform,
+        collections: Collections,
+    ) -> None:
+        path = self._run.view_path(view)
+        self._file = str(path.relative_to(self._run.folder))
+        if self._writer is None:
+            mine = {s: i for s, i in self._proven.items() if s.startswith(f"{view}/")}
+            if not path.exists():
+                if mine:
+                    raise StorageError(f"{path}: the journal knows proven frames of it, but it is gone")
+                metadata = {**self._metadata, "title": view}
+                create(path, frames + SPARE_SLOTS, frame_format, metadata, collections, packed=self._packed)
+            self._writer = ViewWriter(path, mine)
+        self._pose = self._writer.add_pose(arm, base_from_camera)
+
+    @property
+    def _view(self) -> ViewWriter:
+        assert self._writer is not None, "begin_view() comes before frames"
+        return self._writer
+
+    @property
+    def direct(self) -> bool:
+        """True if the present view is written past the page cache."""
+        return self._view.direct
+
+    def put(self, frame: Frame, exposure_us: int) -> int:
+        return self._view.put(
+            frame.pixels, frame_id=frame.frame_id, camera_ns=frame.timestamp_ns, exposure_us=exposure_us
+        )
+
+    def prove(self, slot: int, shot: str, fields: Mapping[str, int]) -> None:
+        if shot in self._proven:
+            raise StorageError(f"{self._file}: {shot} is proven already in slot {self._proven[shot]}")
+        frame_id = self._view.frame_id(slot)
+        digest = self._view.prove(slot, shot, pose=self._pose, **fields)
+        self._proven[shot] = slot
+        self._journal.write(
+            "frame", shot=shot, file=self._file, index=slot, frame_id=frame_id, xxh3=f"{digest:016x}"
+        )
+
+    def free(self, slot: int) -> None:
+        self._view.free(slot)
+
+    def event(self, event: str, **fields: Any) -> None:
+        self._journal.write(event, **fields)
+
+    def commit(self, *, now: bool) -> None:
+        """A disk may take seconds to sync, so this happens on another thread unless it must be `now`: while a
+        burst runs, nobody waits for the disk. What went wrong there is raised by the next call."""
+        if self._committing is not None and (now or self._committing.done()):
+            committing, self._committing = self._committing, None
+            committing.result()
+        if now:
+            self._commit(self._writer, self._journal.take())
+        elif self._committing is None and time.monotonic() - self._committed_s > COMMIT_EVERY_S:
+            self._committed_s = time.monotonic()
+            self._committing = self._committer.submit(self._commit, self._writer, self._journal.take())
+
+    def _commit(self, writer: ViewWriter | None, lines: list[str]) -> None:
+        """Frames first, then the lines that speak of them."""
+        if writer is not None:
+            writer.sync()
+        self._journal.append(lines)
+
+    def end_view(self) -> None:
+        if self._writer is not None:
+            try:
+                self.commit(now=True)
+            finally:
+                self._writer.close()
+                self._writer = None
+
+    def close_quietly(self) -> None:
+        """Commit the last events if the disk still lets us; the error that ended the run matters more."""
+        with contextlib.suppress(StorageError):
+            self.commit(now=True)
+
+    def close(self) -> None:
+        """Give everything back; what was not committed is not lost, it is unproven."""
+        self._committer.shutdown(wait=True)
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+        self._journal.close()
+
+
+@dataclass
+class ViewExposure:
+    """How well a view is exposed, on the frames of a sample of its lights."""
+
+    pictures: int = 0
+    saturated: float = 0.0
+    """Largest share of saturated pixels of any sampled frame."""
+    brightest: float = 0.0
+    """Highest 99.9 % quantile of any sampled frame, share of full scale above black."""
+    median_bright: float = 0.0
+    """Median over the sampled frames of that quantile."""
+    quantiles: list[float] = field(default_factory=list)
+
+    def verdict(self) -> str:
+        """`over`, `under` or `good`."""
+        if self.saturated > 1e-3:
+            return "over-exposed"
+        return "under-exposed" if self.median_bright < 0.05 else "well exposed"
+
+
+class DryRecorder:
+    """Into figures: counts what is proven, judges the exposure of frames that hold a picture."""
+
+    def __init__(self) -> None:
+        self._proven: set[str] = set()
+        self.events: list[dict[str, Any]] = []
+        self.exposures: dict[str, ViewExposure] = {}
+        self._format: FrameFormat | None = None
+        self._slots: list[tuple[float, float] | None] = []
+        self._view = ""
+
+    def proven(self) -> set[str]:
+        return self._proven
+
+    def begin_view(
+        self,
+        view: str,
+        frames: int,
+        frame_format: FrameFormat,
+        arm: ArmState,
+        base_from_camera: Transform,
+        collections: Collections,
+    ) -> None:
+        self._view, self._format = view, frame_format
+
+    def put(self, frame: Frame, exposure_us: int) -> int:
+        assert self._format is not None
+        if not frame.rendered:
+            self._slots.append(None)
+        else:
+            black, white = self._format.black_dn, self._format.white_dn
+            bright = (float(np.quantile(frame.pixels, 0.999)) - black) / (white - black)
+            self._slots.append((bright, float(np.mean(frame.pixels >= white))))
+        return len(self._slots) - 1
+
+    def prove(self, slot: int, shot: str, fields: Mapping[str, int]) -> None:
+        self._proven.add(shot)
+        judged = self._slots[slot]
+        if judged is not None and "/dark" not in shot and "mark" not in shot:
+            seen = self.exposures.setdefault(self._view, ViewExposure())
+            seen.pictures += 1
+            seen.quantiles.append(judged[0])
+            seen.brightest = max(seen.brightest, judged[0])
+            seen.median_bright = float(np.median(seen.quantiles))
+            seen.saturated = max(seen.saturated, judged[1])
+
+    def free(self, slot: int) -> None:
+        self._slots[slot] = None
+
+    def event(self, event: str, **fields: Any) -> None:
+        self.events.append({"event": event, **fields})
+
+    def commit(self, *, now: bool) -> None:
+        """Nothing lasts in a dry run."""
+
+    def end_view(self) -> None:
+        self._slots.clear()

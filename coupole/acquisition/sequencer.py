@@ -1,0 +1,229 @@
+"""Runs a schedule: moves the arm, fires bursts, shoots again what is missing.
+
+Only this module and its two hands, `posing` and `firing`, command devices. They keep to one order at all times:
+arm at rest and measured, camera armed, then lights; and backwards. On the way out, whatever the reason,
+`coupole.acquisition.cell` makes the devices safe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from coupole.acquisition.arm_supervisor import ArmMovedError, Posing, Stand
+from coupole.acquisition.burst_runner import NOTHING_TO_MATCH, Firing, Verdict
+from coupole.acquisition.cell import OpenedCell
+from coupole.acquisition.dose import DoseMeter
+from coupole.acquisition.frame_matching import compile_now
+from coupole.acquisition.observer import Control, Observer, Outcome, Progress
+from coupole.acquisition.recorder import Recorder
+from coupole.devices import FrameFormat
+from coupole.errors import DeviceError, UnprovenError
+from coupole.motion.itinerary import Visit
+from coupole.plan.shots import Burst, ViewPose
+from coupole.preflight.job import Job
+from coupole.storage.run import is_shot
+
+_PAUSE_NAP_S = 0.1
+
+
+class Sequencer:
+    """One session of a run. `acquire()` either returns or raises; the caller makes the cell safe."""
+
+    def __init__(
+        self,
+        job: Job,
+        cell: OpenedCell,
+        recorder: Recorder,
+        *,
+        observer: Observer | None = None,
+        control: Control | None = None,
+    ) -> None:
+        self._job, self._cell, self._recorder = job, cell, recorder
+        self._observer, self._control = observer or Observer(), control or Control()
+        self._dose = DoseMeter(job)
+        self._view_number = 0
+        self._view_name = ""
+        self.outcome = Outcome(shots=job.schedule.shots)
+        self._posing = Posing(job, cell, self._control)
+        self._firing = Firing(
+            cell,
+            recorder,
+            self._posing,
+            self._dose,
+            self.outcome,
+            gain_db=job.plan.gain_db,
+            max_frames_per_s=job.cell.rig.sensor.max_frames_per_s,
+            tell=self._tell,
+            wait_while_paused=self._wait_while_paused,
+        )
+        compile_now()
+
+    @property
+    def burst_times_s(self) -> list[float]:
+        """From start to last proof of each burst, on the rig's clock."""
+        return self._firing.times_s
+
+    # -- the run ------------------------------------------------------------------------------------------
+
+    def acquire(self) -> Outcome:
+        """Do all that is not proven yet. Raises UnprovenError if shots stay missing, or a CoupoleError."""
+        schedule = self._job.schedule
+        left = {n: found for n, bursts in enumerate(schedule.bursts) if (found := self._left_of(bursts))}
+        numbers = list(left)
+        itinerary = self._posing.itinerary([schedule.views[n] for n in numbers])
+        start_ns = self._cell.clock.now_ns()
+        try:
+            for count, index in enumerate(itinerary.order):
+                number, visit = numbers[index], itinerary.visits[index]
+                assert visit is not None
+                view = schedule.views[number]
+                self._view_number, self._view_name = len(schedule.views) - len(left) + count, view.name
+                self._acquire_view(view, visit, left[number], schedule.bursts[number])
+        finally:
+            self.outcome.duration_s = (self._cell.clock.now_ns() - start_ns) / 1e9
+            self.outcome.dose_lux_h = self._dose.lux_h
+            done = self._recorder.proven()
+            self.outcome.proven = sum(map(is_shot, done))
+            expected = [s for bursts in schedule.bursts for b in bursts for s in b.shot_ids]
+            self.outcome.missing = [s for s in expected if is_shot(s) and s not in done]
+        if self.outcome.missing:
+            raise UnprovenError(self._say_missing())
+        return self.outcome
+
+    def _left_of(self, bursts: Sequence[Burst]) -> list[Burst]:
+        """Bursts of which something is not proven yet, cut down to that."""
+        done = self._recorder.proven()
+        left = []
+        for burst in bursts:
+            wanted = {label for label in burst.labels if f"{burst.view}/{label}" not in done}
+            if wanted:
+                left.append(burst if len(wanted) == len(burst.labels) else burst.only(wanted))
+        return left
+
+    def _acquire_view(self, view: ViewPose, visit: Visit, left: list[Burst], all_bursts: Sequence[Burst]) -> None:
+        shadow = self._job.shadows.at(visit.joints_deg)
+        self._recorder.event("view", view=view.name, hidden_leds=self._job.useless_leds(shadow))
+        collections = {"shadow": {**shadow.arrays(self._job.shadows.patches), "leds": self._job.cell.leds.ids}}
+        motion_s = visit.leg.duration_s + self._job.cell.rig.motion.settle_dwell_s
+        self.outcome.ideal_s += motion_s + sum(burst.duration_s for burst in left)
+        waypoints_deg = [np.round(place, 6).tolist() for place in visit.leg.waypoints]
+        self._recorder.event("move", view=view.name, joints_deg=waypoints_deg)
+        stand = self._posing.go(visit, lambda: self._cell.ledbox.load(left[0].table))
+        frame_format = self._cell.camera.configure(self._firing.exposure(left[0]))
+        self._check_format(frame_format)
+        frames = sum(len(burst.labels) for burst in all_bursts)
+
+        def begin(stand: Stand) -> None:
+            self._recorder.event(
+                "settled",
+                view=view.name,
+                joints_deg=[round(j, 6) for j in stand.arm.joints_deg],
+                base_from_camera=np.round(stand.base_from_camera, 6).tolist(),
+            )
+            self._recorder.begin_view(
+                view.name, frames, frame_format, stand.arm, stand.base_from_camera, collections
+            )
+
+        begin(stand)
+        try:
+            for index, burst in enumerate(left):
+                following = left[index + 1] if index + 1 < len(left) else None
+                self._acquire_burst(burst, following, begin)
+            self._recorder.event("seal", view=view.name)
+        finally:
+            self._recorder.end_view()
+
+    def _check_format(self, frame_format: FrameFormat) -> None:
+        sensor = self._cell.sensor
+        if (frame_format.height_px, frame_format.width_px) != (sensor.height_px, sensor.width_px):
+            raise DeviceError(
+                "camera",
+                expected=f"frames of {sensor.width_px} x {sensor.height_px}, as the rig's `sensor:` says",
+                happened=f"the camera makes {frame_format.width_px} x {frame_format.height_px}",
+                remedy="Correct the rig, or the camera's region of interest.",
+            )
+
+    def _acquire_burst(self, burst: Burst, following: Burst | None, begin: Callable[[Stand], None]) -> None:
+        """Fire a burst, and what it left unproven again, up to the plan's limit.
+
+        An arm that was pushed is brought back, and frames taken from there on `begin` anew.
+        """
+        todo = burst
+        for attempt in range(self._job.plan.reshoot_limit + 1):
+            self._wait_while_paused()
+            if attempt:
+                shots = [s for s in todo.shot_ids if s and is_shot(s)]
+                self.outcome.reshot += len(shots)
+                self._recorder.event("reshoot", view=burst.view, attempt=attempt, shots=shots)
+            try:
+                verdict = self._firing.fire(todo, following if attempt == 0 else None)
+            except ArmMovedError as moved:
+                self._cell.ledbox.lights_off()
+                self._observer.note(f"{burst.view}: {moved}; back to the view")
+                self._recorder.event("fault", kind="ArmMoved", message=f"{burst.view}: {moved}")
+                begin(self._posing.stand_again())
+                verdict = Verdict(NOTHING_TO_MATCH, [])
+            done = self._recorder.proven()
+            left = {label for label in todo.labels if label and f"{burst.view}/{label}" not in done}
+            if not left:
+                return
+            self._note_gap(burst, verdict, left)
+            self.outcome.bad = sorted(set(self.outcome.bad) | set(verdict.dead))
+            todo = burst.only(left)
+
+    # -- small things -------------------------------------------------------------------------------------
+
+    def _note_gap(self, burst: Burst, verdict: Verdict, left: set[str]) -> None:
+        judged = verdict.match
+        missing = int(judged.missing.sum())
+        lost = int(judged.lost_in_transfer.sum())
+        self._recorder.event(
+            "gap",
+            view=burst.view,
+            shots=[f"{burst.view}/{label}" for label in sorted(left)],
+            missing=missing,
+            lost_in_transfer=lost,
+            surplus=int(judged.surplus.sum()),
+            dead_leds=verdict.dead,
+            reason=judged.reason,
+        )
+        why = [f"{lost} lost in transfer"] if lost else []
+        why += [f"{missing - lost} never exposed"] if missing > lost else []
+        why += [f"{len(verdict.dead)} with an LED that draws no current"] if verdict.dead else []
+        why += [judged.reason] if judged.reason else []
+        self._observer.note(f"{burst.view}: {len(left)} frames not proven ({'; '.join(why) or 'aborted'})")
+
+    def _say_missing(self) -> str:
+        missing, bad = self.outcome.missing, self.outcome.bad
+        text = f"{len(missing)} shots are not proven after {self._job.plan.reshoot_limit} re-shoots: "
+        text += ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
+        if bad:
+            text += f". In {len(bad)} of them the LED drew no current: repair it or leave it out of `lights:`"
+        return text + ". Resume the run to try again."
+
+    def _tell(self, burst: Burst, step: int) -> None:
+        label = burst.labels[min(step, len(burst.labels) - 1)]
+        self._observer.progress(
+            Progress(
+                self._view_name,
+                self._view_number,
+                len(self._job.schedule.views),
+                len(self._recorder.proven()),
+                self._job.schedule.frames,
+                label.split("/")[0],
+                self._dose.lux_h,
+            )
+        )
+
+    def _wait_while_paused(self) -> None:
+        if not self._control.pause.is_set():
+            return
+        self._recorder.event("pause")
+        self._recorder.commit(now=True)
+        self._observer.note("paused; lights are off")
+        while self._control.pause.is_set():
+            self._posing.attend()
+            self._cell.clock.sleep(_PAUSE_NAP_S)
+        self._recorder.event("resume", after="pause")

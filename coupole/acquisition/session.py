@@ -1,0 +1,290 @@
+"""One `coupole acquire` from reading the plan to the last journal line, for real or as a rehearsal."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from coupole.acquisition.cell import OpenedCell, open_cell
+from coupole.acquisition.observer import Control, Outcome
+from coupole.acquisition.operator import UNLIMITED_BYTES, ask_to_begin, enter_dose, operator_at, refuse, teller
+from coupole.acquisition.recorder import DryRecorder, RunRecorder
+from coupole.acquisition.sequencer import Sequencer
+from coupole.errors import (
+    CoupoleError,
+    DeviceError,
+    DeviceFault,
+    Interrupted,
+    PreflightRefused,
+    StorageError,
+)
+from coupole.plan.shots import Schedule
+from coupole.preflight.job import Job, calibration_refusals, check_job, preflight_of
+from coupole.preflight.preflight import StorageFacts
+from coupole.storage.run import Run, is_shot
+from coupole.viewing import report
+from coupole.viewing.terminal import RunObserver, ask, show_dry_run, show_preflight
+
+_ASKED_BOARDS = 12
+"""So many boards, all over the dome, are asked for their temperature."""
+
+
+# -- the run ----------------------------------------------------------------------------------------------
+
+
+def acquire_plan(
+    job: Job,
+    console: Console,
+    *,
+    parent: Path | None,
+    resume: Path | None,
+    confirm: bool,
+    found: dict[str, Any],
+) -> None:
+    """Run a plan into a run folder; `found` is filled with the figures of `--json`, also when this raises."""
+    with contextlib.ExitStack() as held:
+        run = Run(resume) if resume else None
+        if run is not None:
+            held.callback(os.close, run.lock())
+            run.refuse_changes(job.inputs)
+        job = job.without_hidden(run.hidden_leds if run else None)
+        _acquire_into(run, job, console, parent=parent, confirm=confirm, found=found, held=held)
+
+
+def _acquire_into(
+    run: Run | None,
+    job: Job,
+    console: Console,
+    *,
+    parent: Path | None,
+    confirm: bool,
+    found: dict[str, Any],
+    held: contextlib.ExitStack,
+) -> None:
+    resumed = run is not None
+    folder = (run.folder if run else parent or job.cell.storage_folder).resolve()
+    job, preflight = preflight_of(
+        job,
+        folder,
+        allocated_bytes=run.allocated_bytes() if run else 0,
+        share_left=1.0 - len(run.proven()) / job.schedule.frames if run else 1.0,
+    )
+    show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
+    refuse(preflight)
+    acknowledged = _ask_whether_clear(run.robot_fault()) if run else ""
+    ask_to_begin(job.cell, confirm=confirm)
+    console.print("opening the devices ...")
+    with open_cell(job.cell, job=job, on_opened=teller(console)) as cell:
+        room_c = _refuse_other_calibrations(job, cell)
+        if run is None:
+            run = Run.create(folder, job.plan.name, job.inputs, about_run(job, cell))
+            held.callback(os.close, run.lock())
+        console.print(f"run {run.folder}")
+        packed = job.cell.rig.storage.pixels == "packed12"
+        recorder = RunRecorder(run, metadata_of_views(job, cell), packed=packed)
+        try:
+            how: dict[str, Any] = {"simulated": cell.simulated, "room_c": room_c}
+            how |= {"acknowledged": acknowledged} if acknowledged else {}
+            recorder.event("resume" if resumed else "start", **how)
+            _acquire(job, cell, run, recorder, console, found=found)
+        except CoupoleError:
+            with contextlib.suppress(StorageError):  # what ended the run matters more than its report
+                report.write(run)
+            raise
+        else:
+            report.write(run)
+        finally:
+            recorder.close()
+
+
+def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float:
+    """What only devices can tell of the records in force: whose camera they are of, and how warm it may be.
+
+    Returns the temperature of the coolest LED board, which is nearest to the room's.
+    """
+    boards = np.unique(job.cell.leds.boards)
+    some = boards[np.unique(np.linspace(0, len(boards) - 1, _ASKED_BOARDS).astype(int))]
+    room_c = min(cell.ledbox.board_temperature_c(int(board)) for board in some)
+    if reasons := calibration_refusals(job, camera=_camera_name(cell), temperature_c=room_c):
+        raise PreflightRefused(reasons)
+    return room_c
+
+
+def _camera_name(cell: OpenedCell) -> str:
+    """As records of its calibration call it."""
+    return " ".join((cell.identities["camera"].model, cell.identities["camera"].serial))
+
+
+def _ask_whether_clear(fault: str) -> str:
+    """After a fault of the arm a person must say that it may move again; `--yes` does not say it.
+
+    Returns the fault that was acknowledged, empty if there was none. Raises DeviceFault without that word.
+    """
+    if not fault:
+        return ""
+    if not ask(
+        f"The arm stopped in a fault: {fault}\nIs the cause found, the cell clear, and may the arm move again?"
+    ):
+        raise DeviceFault(
+            "robot",
+            expected="the word of a person who has been to the cell",
+            happened="nobody said that the arm may move again",
+            remedy="See to the cell, then resume from a terminal and answer the question (`--yes` does not).",
+        )
+    return fault
+
+
+def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
+    """What stands in run.json beside the inputs."""
+    return {
+        "simulated": cell.simulated,
+        "object": job.plan.object.id if job.plan.object else None,
+        "calibrations": {item.record.kind: item.record.sha256 for item in job.calibrations or ()} or "none",
+        "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
+        "scaling": cell.world_endpoints["camera"]["scaling"] if cell.world_endpoints else None,
+        "views": [view.name for view in job.schedule.views],
+        "labels": _labels(job.schedule),
+        "hidden_leds": job.hidden_leds,
+        "expected": {"shots": job.schedule.shots, "frames": job.schedule.frames},
+    }
+
+
+def _labels(schedule: Schedule) -> list[str] | dict[str, list[str]]:
+    """One list where all views have the same frames; else one for each view, by its name."""
+    if len(set(schedule.labels)) == 1:
+        return list(schedule.labels[0])
+    return {view.name: list(labels) for view, labels in zip(schedule.views, schedule.labels, strict=True)}
+
+
+def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
+    """Attributes of every view's file."""
+    rig = job.cell.rig
+    return {
+        "program_name": "coupole",
+        "sample": job.plan.object.id if job.plan.object else "none",
+        "simulated": cell.simulated,
+        "pixel_pitch_um": cell.sensor.pixel_pitch_um,
+        "focal_length_mm": rig.lens.focal_length_mm,
+        "f_number": rig.lens.f_number,
+        "focus_distance_mm": rig.lens.focus_distance_mm,
+        "base_from_support": rig.support.base_from_support.matrix(),
+        "camera": _camera_name(cell),
+        "gain_db": job.plan.gain_db,
+    }
+
+
+def _acquire(
+    job: Job,
+    cell: OpenedCell,
+    run: Run,
+    recorder: RunRecorder,
+    console: Console,
+    *,
+    found: dict[str, Any],
+) -> None:
+    control = Control()
+    observer = RunObserver(console, job.cell.rig.frame_bytes, len(recorder.proven()))
+    sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
+    outcome = sequencer.outcome
+    ended = "done"
+    try:
+        with operator_at(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
+            sequencer.acquire()
+    except CoupoleError as error:
+        ended = "interrupted" if isinstance(error, Interrupted) else "failed"
+        whose = {"device": error.device} if isinstance(error, DeviceError) else {}
+        recorder.event("fault", kind=type(error).__name__, message=str(error), **whose)
+        raise
+    finally:
+        cell.make_safe()
+        for trouble in cell.trouble:
+            recorder.event("fault", kind="unsafe", message=trouble)
+            console.print(f"[red]{trouble}[/]")
+        recorder.event("stop", outcome=ended, robot=dict(cell.robot.statistics()))
+        recorder.close_quietly()
+        enter_dose(job, cell, outcome.dose_lux_h, run.folder.name)
+        found.update(_figures(run, job, outcome))
+        _say_outcome(console, run, outcome, ended)
+
+
+def _figures(run: Run, job: Job, outcome: Outcome) -> dict[str, Any]:
+    """The figures of `--json`."""
+    frames = len(run.proven())
+    return {
+        "run": str(run.folder),
+        "shots": outcome.shots,
+        "proven": sum(map(is_shot, run.proven())),
+        "missing": len(outcome.missing),
+        "reshot": outcome.reshot,
+        "bad": len(outcome.bad),
+        "frames": frames,
+        "bytes": frames * job.cell.rig.frame_bytes,
+        "duration_s": round(outcome.duration_s, 3),
+        "ideal_s": round(outcome.ideal_s, 3),
+        "efficiency": round(outcome.ideal_s / outcome.duration_s, 4) if outcome.duration_s else 1.0,
+        "dose_lux_h": outcome.dose_lux_h,
+    }
+
+
+def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> None:
+    console.print(
+        f"{ended}: {outcome.proven} of {outcome.shots} shots proven, {outcome.reshot} re-shot, "
+        f"{outcome.duration_s:.1f} s (at best {outcome.ideal_s:.1f} s), {outcome.dose_lux_h:.3f} lux.h"
+    )
+    console.print(f"  frames  {run.folder / 'views'}\n  report  {run.folder / 'report.html'}")
+    if ended != "done":
+        console.print(f"  go on with --resume {run.folder}")
+
+
+# -- the rehearsal ----------------------------------------------------------------------------------------
+
+
+def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any]) -> None:
+    """Run a whole plan on the rig's twin, faster than life, and say what preflight could not know."""
+    job = job.without_hidden()
+    job, preflight = check_job(job, StorageFacts(UNLIMITED_BYTES))
+    show_preflight(console, preflight, name=job.plan.name, rig=f"the twin of {job.cell.rig.name}")
+    refuse(preflight)
+    recorder, control = DryRecorder(), Control()
+    with open_cell(job.cell, job=job, dry_run=True, speed=speed, on_opened=teller(console)) as cell:
+        observer = RunObserver(console, cell.sensor.width_px * cell.sensor.height_px * 2, 0)
+        sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
+        outcome = sequencer.outcome
+        started_s = time.monotonic()
+        try:
+            with operator_at(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
+                sequencer.acquire()
+        finally:
+            machine_s = time.monotonic() - started_s
+            found.update(
+                {
+                    "dry_run": True,
+                    "shots": outcome.shots,
+                    "proven": outcome.proven,
+                    "missing": len(outcome.missing),
+                    "reshot": outcome.reshot,
+                    "duration_s": round(outcome.duration_s, 3),
+                    "preflight_s": round(preflight.duration_s, 3),
+                    "ideal_s": round(outcome.ideal_s, 3),
+                    "machine_s": round(machine_s, 3),
+                    "speed": round(outcome.duration_s / machine_s, 2),
+                    "speed_asked": speed,
+                    "over_triggers": outcome.over_triggers,
+                    "exposure": {
+                        view: {
+                            "pictures": seen.pictures,
+                            "brightest": round(seen.brightest, 4),
+                            "saturated": round(seen.saturated, 6),
+                            "verdict": seen.verdict(),
+                        }
+                        for view, seen in recorder.exposures.items()
+                    },
+                }
+            )
+            show_dry_run(console, recorder, outcome, found)

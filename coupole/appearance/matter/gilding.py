@@ -1,0 +1,112 @@
+"""Gold leaf on bole (seed 001, section 5): Eq. 7, made definite.
+
+    R = f R_bole + (1 - f) (R(d) + T_in T_out R_b/(1 - R_int R_b))
+
+f is the share of the surface that holes and cracks leave bare, R(d) the reflectance of a leaf of thickness d,
+T_in its transmittance, T_out and R_int its transmittance and reflectance for the bole's diffuse light from
+below, and R_b the bole's reflectance inside its binder. The paper's "R_gold - T_p + R_plasmon" has no definition
+of R_plasmon; a thin film has all three in it (docs/decisions/0010). Towards thickness 0 the result is the bole
+as measured, towards thick leaves it is bulk gold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from coupole.appearance.matter import kubelka_munk, layered
+from coupole.appearance.optics import effective_medium, fresnel, indices
+from coupole.appearance.optics.thin_film import Film
+from coupole.appearance.spectra.grid import Array, Complex, within
+
+
+@dataclass(frozen=True)
+class Gilt:
+    """A gilded surface, ready for `reflectances` and `gilt_brdf`."""
+
+    leaf: layered.Sheet
+    bare: layered.Sheet
+    """Where no leaf is: the bole's binder against the air."""
+    bole_inside: Array
+    """[bands], inside the binder."""
+    uncovered: float
+    """f."""
+
+
+def leaf_index(
+    metal: Complex, holes_share: float, *, flatness: float = 20.0, filling: float = indices.EGG_WHITE
+) -> Complex:
+    """Effective index of a leaf of `metal` with a share of nanoscopic lens-shaped holes full of egg white, seen
+    along its normal (Eqs 2-5). `flatness` is a hole's width over its height."""
+    depolarisation = effective_medium.depolarisation_in_plane(flatness)
+    return effective_medium.maxwell_garnett(metal, filling, holes_share, depolarisation)
+
+
+def uncovered(holes: float, crack_width_um: float, crack_length_mm_per_mm2: float) -> float:
+    """Share of the surface that neither holes (share of area) nor cracks of burnishing leave covered; they overlap
+    by chance."""
+    cracks = within("cracks", crack_width_um * 1e-3 * crack_length_mm_per_mm2, 0.0, 1.0)
+    return float(1.0 - (1.0 - within("holes", holes, 0.0, 1.0)) * (1.0 - cracks))
+
+
+def gilt(
+    index: Complex,
+    thickness_nm: float,
+    bole_seen: Array,
+    *,
+    uncovered: float = 0.0,
+    binder_index: float = indices.EGG_WHITE,
+) -> Gilt:
+    """A leaf of `index` and thickness on a bole whose reflectance in air, gloss excluded, is `bole_seen` [bands].
+
+    Under the leaf there is no air: the bole's reflectance inside its binder is calculated with Saunderson.
+    """
+    inside = kubelka_munk.saunderson_inverse(
+        bole_seen, fresnel.reflectance(1.0, binder_index), fresnel.diffuse_internal(binder_index)
+    )
+    return Gilt(
+        leaf=layered.sheet([Film(index, thickness_nm)], binder_index),
+        bare=layered.sheet([], binder_index),
+        bole_inside=inside,
+        uncovered=float(within("uncovered", uncovered, 0.0, 1.0)),
+    )
+
+
+def reflectances(gilded: Gilt) -> tuple[Array, Array]:
+    """Specular and diffuse reflectance [bands] of a smooth gilt for light along the normal."""
+    parts = []
+    for share, sheet in ((1.0 - gilded.uncovered, gilded.leaf), (gilded.uncovered, gilded.bare)):
+        entering = sheet.transmittance[-1]
+        diffuse = entering * layered.emerging(sheet, gilded.bole_inside)
+        parts.append(share * np.stack([sheet.normal_reflectance, diffuse]))
+    specular, diffuse = parts[0] + parts[1]
+    return specular, diffuse
+
+
+def step_wedge(index: Complex, thicknesses_nm: Sequence[float], bole_seen: Array) -> Array:
+    """Specular and diffuse reflectance [steps, 2, bands] of leaves of several thicknesses: a gilt step wedge."""
+    return np.stack([np.stack(reflectances(gilt(index, d, bole_seen))) for d in thicknesses_nm])
+
+
+@dataclass(frozen=True)
+class GiltCoats:
+    """A gilt's two kinds of surface with their roughness."""
+
+    gilded: Gilt
+    leaf: layered.Coat
+    bare: layered.Coat
+
+
+def coats(gilded: Gilt, *, leaf_roughness: float, bole_roughness: float) -> GiltCoats:
+    """Burnished gold has GGX roughness of some 0.05 to 0.2, bare bole 0.3 and more (assumed)."""
+    return GiltCoats(gilded, layered.coat(gilded.leaf, leaf_roughness), layered.coat(gilded.bare, bole_roughness))
+
+
+def gilt_brdf(wi: Array, wo: Array, *, coats: GiltCoats) -> Array:
+    """BRDF of the gilt: leaf and bare bole by their shares of the surface."""
+    f = coats.gilded.uncovered
+    leaf = layered.layered(wi, wo, coat=coats.leaf, body=coats.gilded.bole_inside)
+    bare = layered.layered(wi, wo, coat=coats.bare, body=coats.gilded.bole_inside)
+    return (1.0 - f) * leaf + f * bare

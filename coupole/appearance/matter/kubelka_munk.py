@@ -1,0 +1,88 @@
+"""Two diffuse fluxes in a scattering layer (Kubelka and Munk 1931; seed 000, Eqs 5-7), and its glossy surface.
+
+K and S are absorption and scattering per mm, h is the thickness in mm; all arguments broadcast. With a = 1 +
+K/S, b = sqrt(a^2 - 1) and x = b S h, a layer reflects rho = sinh x/A and passes tau = b/A, where A = a sinh x +
+b cosh x. Here A is divided by b exp(x), and K/S never formed: then thick layers, layers that do not absorb and
+layers that do not scatter need no cases of their own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coupole.appearance.spectra.grid import Array, within
+
+
+def decay(x: ArrayLike) -> Array:
+    """(1 - exp(-x))/x, which is 1 at 0: the mean of exp(-z) over 0 < z < x."""
+    values = np.asarray(x, dtype=float)
+    return np.where(values == 0.0, 1.0, -np.expm1(-values) / np.where(values == 0.0, 1.0, values))
+
+
+def layer(absorption: ArrayLike, scattering: ArrayLike, thickness_mm: ArrayLike) -> tuple[Array, Array]:
+    """Reflectance rho and transmittance tau of the layer alone, for diffuse light."""
+    k, s, h = (within(*item, 0.0, 1e12) for item in (("K", absorption), ("S", scattering), ("h", thickness_mm)))
+    x = np.sqrt(k * (k + 2.0 * s)) * h
+    sinh = s * h * decay(2.0 * x)
+    a_over_b = (k + s) * h * decay(2.0 * x) + 0.5 * (1.0 + np.exp(-2.0 * x))
+    return sinh / a_over_b, np.exp(-x) / a_over_b
+
+
+def over(rho: ArrayLike, tau: ArrayLike, background: ArrayLike) -> Array:
+    """Reflectance of a layer (rho, tau) on a background of reflectance `background`."""
+    rho, tau, ground = (
+        np.asarray(rho, dtype=float),
+        np.asarray(tau, dtype=float),
+        np.asarray(background, dtype=float),
+    )
+    return np.asarray(rho + tau**2 * ground / (1.0 - rho * ground))
+
+
+def opaque(k_over_s: ArrayLike) -> Array:
+    """R_inf, the reflectance of a layer so thick that nothing below it shows.
+
+    1/(a + b), which equals a - b but loses no digits for dark layers.
+    """
+    ratio = within("K/S", k_over_s, 0.0, 1e12)
+    return np.asarray(1.0 / (1.0 + ratio + np.sqrt(ratio * (ratio + 2.0))))
+
+
+def k_over_s(r_inf: ArrayLike) -> Array:
+    """K/S of an opaque layer from its (internal) reflectance in 0 < R <= 1 (seed 001, Eq. 6)."""
+    r = within("R_inf", r_inf, np.finfo(float).tiny, 1.0)
+    return np.asarray((1.0 - r) ** 2 / (2.0 * r))
+
+
+def coefficients(
+    r_inf: ArrayLike, reflectance: ArrayLike, background: ArrayLike, thickness_mm: ArrayLike
+) -> tuple[Array, Array]:
+    """K and S per mm from an opaque layer and one of known thickness on a known background (seed 000, Eqs 5-7).
+
+    The thin layer must show its background: R strictly between the background's reflectance and R_inf.
+    """
+    r_inf = within("R_inf", r_inf, 1e-9, 1.0 - 1e-9)
+    r, ground = within("R", reflectance, 0.0, 1.0), within("Rg", background, 0.0, 1.0)
+    r0 = r_inf * (ground - r) / (ground - r_inf * (1.0 - ground * r_inf + ground * r))
+    left = within("R_inf - R0 of one paint's opaque and thin samples", r_inf - r0, 1e-12, 1.0)
+    logarithm = np.log(r_inf * (1.0 - r0 * r_inf) / left)
+    s = r_inf / (1.0 - r_inf**2) * logarithm / within("h", thickness_mm, 1e-9, 1e12)
+    return s * (1.0 - r_inf) ** 2 / (2.0 * r_inf), s
+
+
+def saunderson(internal: ArrayLike, external_k1: ArrayLike, internal_k2: ArrayLike) -> Array:
+    """What is seen from air of a layer with reflectance `internal` under a glossy surface, gloss excluded.
+
+    Saunderson, J. Opt. Soc. Am. 32, 727 (1942). `external_k1` is the surface's reflectance for the light that
+    comes (`fresnel.reflectance`), `internal_k2` for diffuse light from within (`fresnel.diffuse_internal`). An
+    instrument that includes the gloss sees `external_k1` more.
+    """
+    r, k1, k2 = (np.asarray(v, dtype=float) for v in (internal, external_k1, internal_k2))
+    return np.asarray((1.0 - k1) * (1.0 - k2) * r / (1.0 - k2 * r))
+
+
+def saunderson_inverse(seen: ArrayLike, external_k1: ArrayLike, internal_k2: ArrayLike) -> Array:
+    """The layer's own reflectance from what is seen of it, gloss excluded: the inverse of `saunderson`."""
+    k1, k2 = (np.asarray(v, dtype=float) for v in (external_k1, internal_k2))
+    r = np.asarray(seen, dtype=float)
+    return within("R inside the binder", r / ((1.0 - k1) * (1.0 - k2) + k2 * r), 0.0, 1.0)

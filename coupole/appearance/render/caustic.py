@@ -1,0 +1,216 @@
+"""The caustic that gilding throws on stone, by photons: sunlight through a niche's opening (seed 001, figure 9).
+
+Photons start evenly over the opening, are thrown on by gold as often as they meet it, and stay where they meet
+stone: this is the first pass of photon mapping (Jensen 1999). A photon carries all 81 bands, as metal bends none
+of them apart. It meets microfacets of GGX, drawn as it sees them (Heitz, JCGT 7(4), 2018), and Fresnel's share of
+it goes on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.spectra.grid import BANDS, Array
+from sim.objects.patchwork import flat_normals, welded
+
+Reflectance = Callable[[Array], Array]
+"""Cosines [n] to reflectances [n, 81]."""
+_MOST_BOUNCES = 64
+_CHUNK = 100_000
+_OFFSET_MM = 0.05
+
+
+@dataclass(frozen=True)
+class Niche:
+    """What photons meet: gold, and stone that stops them; corners [triangles, 3, 3], mm."""
+
+    gilded_mm: Array
+    stone_mm: Array
+    reflectance: Reflectance
+    """Of the gold."""
+    roughness: float
+    """0 is a mirror."""
+
+
+@dataclass(frozen=True)
+class Sun:
+    direction: Array
+    """[3] unit, in which light travels: into the opening, towards +y."""
+    width_deg: float
+    irradiance: Array
+    """[81], W/(m^2 nm) on a surface that faces it."""
+
+
+@dataclass(frozen=True)
+class Photons:
+    """n photons that stone stopped, and what became of all."""
+
+    places_mm: Array
+    """[n, 3]."""
+    power: NDArray[np.float32]
+    """[n, 81], W/nm."""
+    bounces: NDArray[np.int64]
+    """[n], how often each met gold."""
+    started: Array
+    """[81], W/nm, of all photons together."""
+    escaped: Array
+    """[81], W/nm, that left the niche again; what is missing then was absorbed by gold."""
+
+
+def photons(
+    niche: Niche, sun: Sun, opening_mm: tuple[float, float, float], count: int, seed: int | tuple[int, ...]
+) -> Photons:
+    """Trace `count` photons that pass the rectangle x from `opening_mm[0]` to [1], z from 0 to [2] in y = 0."""
+    met = _Met(niche)
+    left, right, top = opening_mm
+    area_m2 = (right - left) * top * 1e-6
+    facing = sun.irradiance * area_m2 / count
+    random = np.random.default_rng(seed)
+    parts, started, escaped = [], np.zeros(BANDS), np.zeros(BANDS)
+    for first in range(0, count, _CHUNK):
+        n = min(_CHUNK, count - first)
+        starts = np.stack([random.uniform(left, right, n), np.zeros(n), random.uniform(0.0, top, n)], axis=1)
+        ways = _blurred(sun, random, n)
+        # Drawn evenly as the sun's own direction sees its disk, each part of which meets the opening differently.
+        shares = np.maximum(0.0, ways[:, 1]) / (ways @ sun.direction)
+        power = (shares[:, None] * facing).astype(np.float32)
+        started += power.sum(axis=0, dtype=float)
+        # From a little outside, so that the wall round the opening can stop them.
+        part, lost = _traced(met, starts - ways, ways, power, random)
+        parts.append(part)
+        escaped += lost
+    places, kept, bounces = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Photons(places, kept, bounces, started, escaped)
+
+
+def irradiance(
+    found: Photons, width_mm: tuple[float, float], height_mm: float, cell_mm: float, y_mm: float
+) -> Array:
+    """[rows, columns, 81] W/(m^2 nm) on the plane y = `y_mm`: x over `width_mm`, z from 0 to `height_mm`, top
+    first."""
+    from scipy.sparse import csr_matrix
+
+    columns, rows = round((width_mm[1] - width_mm[0]) / cell_mm), round(height_mm / cell_mm)
+    place = np.floor((found.places_mm[:, [0, 2]] - [width_mm[0], 0.0]) / cell_mm).astype(int)
+    inside = (np.abs(found.places_mm[:, 1] - y_mm) < 0.5) & np.all(
+        (place >= 0) & (place < [columns, rows]), axis=1
+    )
+    cell = (rows - 1 - place[inside, 1]) * columns + place[inside, 0]
+    here = np.flatnonzero(inside)
+    gather = csr_matrix((np.ones(len(here), np.float32), (cell, here)), (rows * columns, len(inside)))
+    total = np.asarray(gather @ found.power, dtype=float)
+    return total.reshape(rows, columns, BANDS) / (cell_mm**2 * 1e-6)
+
+
+class _Met:
+    """Embree's tree of the niche, and gold's smooth normals."""
+
+    def __init__(self, niche: Niche) -> None:
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+
+        self.niche = niche
+        self._tree: Any = rtcore_scene.EmbreeScene()
+        self._corners = np.concatenate([niche.gilded_mm, niche.stone_mm]).astype(np.float32)
+        self._mesh = TriangleMesh(self._tree, self._corners)
+        points, faces = welded(niche.gilded_mm)
+        flat = np.repeat(flat_normals(niche.gilded_mm), 3, axis=0)
+        sums = np.zeros_like(points)
+        np.add.at(sums, faces.ravel(), flat)
+        self._normals: Array = (sums / np.linalg.norm(sums, axis=1, keepdims=True))[faces]
+
+    def first(self, starts: Array, ways: Array) -> tuple[NDArray[np.int64], Array, Array]:
+        """Triangle [n] (-1: none), distance [n] and smooth normal [n, 3] of the gold that each ray meets first."""
+        hit = self._tree.run(starts.astype(np.float32), ways.astype(np.float32), output=True)
+        triangle = np.where(hit["primID"] == -1, -1, hit["primID"]).astype(np.int64)
+        normals = np.zeros_like(starts)
+        gold = (triangle >= 0) & (triangle < len(self._normals))
+        u, v = (np.asarray(hit[name], dtype=float)[gold, None] for name in "uv")
+        corners = self._normals[triangle[gold]]
+        smooth = (1.0 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
+        normals[gold] = smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
+        return triangle, np.asarray(hit["tfar"], dtype=float), normals
+
+
+def _traced(
+    met: _Met, starts: Array, ways: Array, power: NDArray[np.float32], random: np.random.Generator
+) -> tuple[tuple[Array, NDArray[np.float32], NDArray[np.int64]], Array]:
+    places, kept, bounces = [], [], []
+    escaped = np.zeros(BANDS)
+    gold_count = len(met.niche.gilded_mm)
+    for bounce in range(_MOST_BOUNCES):
+        triangle, distance, normals = met.first(starts, ways)
+        here = starts + distance[:, None] * ways
+        escaped += power[triangle < 0].sum(axis=0, dtype=float)
+        stone, gold = triangle >= gold_count, (triangle >= 0) & (triangle < gold_count)
+        places.append(here[stone])
+        kept.append(power[stone])
+        bounces.append(np.full(np.count_nonzero(stone), bounce))
+        if not gold.any():
+            break
+        facing = np.where(np.sum(normals[gold] * ways[gold], axis=1) > 0.0, -1.0, 1.0)[:, None] * normals[gold]
+        turned, share = _reflected(ways[gold], facing, met.niche, random)
+        alive = np.sum(turned * facing, axis=1) > 0.0
+        power = (power[gold] * share)[alive].astype(np.float32)
+        starts, ways = (here[gold] + _OFFSET_MM * facing)[alive], turned[alive]
+    return (np.concatenate(places), np.concatenate(kept), np.concatenate(bounces)), escaped
+
+
+def _reflected(ways: Array, normals: Array, niche: Niche, random: np.random.Generator) -> tuple[Array, Array]:
+    """Directions [n, 3] after gold, and shares [n, 81] that it leaves."""
+    facets = normals
+    if niche.roughness > 0.0:
+        facets = _facets(-ways, normals, niche.roughness, random)
+    cosines = np.clip(-np.sum(ways * facets, axis=1), 0.0, 1.0)
+    turned = ways + 2.0 * cosines[:, None] * facets
+    share = niche.reflectance(cosines)
+    if niche.roughness > 0.0:
+        share = share * _unmasked(np.sum(turned * normals, axis=1), niche.roughness)[:, None]
+    return turned, share
+
+
+def _facets(towards: Array, normals: Array, alpha: float, random: np.random.Generator) -> Array:
+    """Normals [n, 3] of facets as seen from `towards` [n, 3]: uniform on the disk of Heitz 2018, listing 1."""
+    helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    t1 = np.cross(helper, normals)
+    t1 /= np.linalg.norm(t1, axis=1, keepdims=True)
+    t2 = np.cross(normals, t1)
+    local = np.stack([np.sum(towards * axis, axis=1) for axis in (t1, t2, normals)], axis=1)
+    view = local * [alpha, alpha, 1.0]
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    flat = np.hypot(view[:, 0], view[:, 1])
+    flat_or_one = np.where(flat > 0.0, flat, 1.0)
+    e1 = np.stack([-view[:, 1] / flat_or_one, view[:, 0] / flat_or_one, 0.0 * flat], axis=1)
+    e1[flat == 0.0] = [1.0, 0.0, 0.0]
+    e2 = np.cross(view, e1)
+    radius, phi = np.sqrt(random.random(len(view))), 2.0 * np.pi * random.random(len(view))
+    p1, p2 = radius * np.cos(phi), radius * np.sin(phi)
+    s = 0.5 * (1.0 + view[:, 2])
+    p2 = (1.0 - s) * np.sqrt(np.maximum(0.0, 1.0 - p1**2)) + s * p2
+    p3 = np.sqrt(np.maximum(0.0, 1.0 - p1**2 - p2**2))
+    h = p1[:, None] * e1 + p2[:, None] * e2 + p3[:, None] * view
+    h *= [alpha, alpha, 1.0]
+    h /= np.linalg.norm(h, axis=1, keepdims=True)
+    return np.asarray(h[:, :1] * t1 + h[:, 1:2] * t2 + h[:, 2:] * normals)
+
+
+def _unmasked(cosine: Array, alpha: float) -> Array:
+    """Smith's G1 of GGX: G2/G1 of separable masking."""
+    c = np.maximum(cosine, 0.0)
+    return np.asarray(2.0 * c / np.maximum(c + np.sqrt(alpha**2 + (1.0 - alpha**2) * c**2), 1e-12))
+
+
+def _blurred(sun: Sun, random: np.random.Generator, count: int) -> Array:
+    """Directions [count, 3] of light from the sun's disk."""
+    sine = np.sin(np.radians(sun.width_deg / 2)) * np.sqrt(random.random(count))
+    phi = 2.0 * np.pi * random.random(count)
+    t1 = np.cross(sun.direction, [0.0, 0.0, 1.0])
+    t1 /= np.linalg.norm(t1)
+    t2 = np.cross(sun.direction, t1)
+    across = sine[:, None] * (np.cos(phi)[:, None] * t1 + np.sin(phi)[:, None] * t2)
+    return np.asarray(across + np.sqrt(1.0 - sine**2)[:, None] * sun.direction)

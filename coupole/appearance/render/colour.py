@@ -1,0 +1,49 @@
+"""From spectra to a picture on a screen: observer, chromatic adaptation, sRGB."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.render.spectra import LM_PER_W
+from coupole.appearance.spectra import light
+from coupole.appearance.spectra.grid import Array
+
+_CONES = {
+    # Li et al., "Comprehensive color solutions: CAM16, CAT16, and CAM16-UCS", Color Res. Appl. 42, 703 (2017).
+    "CAT16": [[0.401288, 0.650173, -0.051461], [-0.250268, 1.204414, 0.045854], [-0.002079, 0.048952, 0.953127]],
+    # ICC.1:2022, annex E.
+    "Bradford": [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]],
+}
+_D65 = np.array([0.95047, 1.0, 1.08883])
+"""White of sRGB (IEC 61966-2-1), 2 degrees."""
+
+
+def tristimulus(radiance: NDArray[np.floating], bands: Sequence[int], step_nm: float, observer: str) -> Array:
+    """XYZ [..., 3], in cd/m^2 with the 2-degree observer, of radiance [..., bands] in W/(m^2 sr nm)."""
+    functions = light.observer("2 deg" if observer == "2 deg" else "10 deg")[:, list(bands)]
+    return np.asarray(LM_PER_W * step_nm * (np.asarray(radiance, dtype=float) @ functions.T))
+
+
+def adapted(xyz: Array, white: Array, transform: str) -> Array:
+    """XYZ [..., 3] as they would have to be under D65 to look as they do under `white` [3] (von Kries)."""
+    if transform == "none":
+        return xyz
+    cones = np.array(_CONES[transform])
+    gains = (cones @ _D65) / (cones @ (white / white[1]))
+    return np.asarray(xyz @ (np.linalg.inv(cones) @ np.diag(gains) @ cones).T)
+
+
+def displayed(xyz: Array) -> tuple[NDArray[np.uint8], float]:
+    """sRGB [h, w, 3] of XYZ with white at Y = 1, and the share of pixels that the screen cannot show.
+
+    What is too bright is scaled down in its own hue; what is too saturated is cut at 0.
+    """
+    linear = light.linear_srgb(xyz)
+    brightest = linear.max(axis=-1, keepdims=True)
+    outside = (brightest[..., 0] > 1.0 + 1e-6) | (linear.min(axis=-1) < -0.01)
+    shown = np.clip(linear / np.maximum(1.0, brightest), 0.0, 1.0)
+    coded = np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown ** (1.0 / 2.4) - 0.055)
+    return np.round(255.0 * coded).astype(np.uint8), float(outside.mean())

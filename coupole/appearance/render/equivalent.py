@@ -1,0 +1,44 @@
+"""A stack of films as one metal: Mitsuba's rough conductor knows complex indices, but no films.
+
+At each wavelength the index n + i k of bulk is sought that reflects as the stack does: exactly along the normal,
+and as well as it can at other angles. A metal leaf finds itself nearly unchanged; a film that interferes finds an
+index that is no substance's, and where its hues shift much with the angle none serves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from coupole.appearance.optics import fresnel
+from coupole.appearance.spectra.grid import BANDS, Array, Complex
+from coupole.errors import InputError
+
+_COSINES: Array = np.cos(np.radians([0.0, 20.0, 35.0, 50.0, 60.0, 70.0, 78.0]))
+_TRIED = 400
+MOST_OFF = 0.05
+
+
+def equivalent_index(reflectance: Callable[[Array], Array]) -> Complex:
+    """n + i k [81] of bulk whose unpolarised reflectance comes nearest `reflectance`(cosines) -> [angles, 81].
+
+    Raises InputError where they differ by more than `MOST_OFF` at some wavelength and angle up to 78 degrees.
+    """
+    wanted = reflectance(_COSINES)
+    normal = np.clip(wanted[0], 1e-6, 1.0 - 1e-6)
+    # R = ((n-1)^2 + k^2)/((n+1)^2 + k^2) along the normal: k follows from n, between the two n that need no k.
+    root = np.sqrt(normal)
+    least, most = (1.0 - root) / (1.0 + root), (1.0 + root) / (1.0 - root)
+    n = least * (most / least) ** np.linspace(0.0, 1.0, _TRIED)[:, None]
+    k = np.sqrt(np.maximum(0.0, (normal * (n + 1.0) ** 2 - (n - 1.0) ** 2) / (1.0 - normal)))
+    tried = np.stack([fresnel.reflectance(c, n + 1j * k) for c in _COSINES])
+    best = np.argmin(np.sum((tried - wanted[:, None, :]) ** 2, axis=0), axis=0)
+    off = float(np.abs(tried[:, best, np.arange(BANDS)] - wanted).max())
+    if off > MOST_OFF:
+        raise InputError(
+            f"films: expected a stack that reflects like some bulk within {MOST_OFF} at all angles; the nearest "
+            f"is off by {off:.2f}. Take thinner films, or fewer"
+        )
+    chosen: Complex = n[best, np.arange(BANDS)] + 1j * k[best, np.arange(BANDS)]
+    return chosen

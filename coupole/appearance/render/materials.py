@@ -1,0 +1,235 @@
+"""Materials of a scene file, and what each is in Mitsuba: its own plugins, with spectra of `appearance.matter`.
+
+Kept: complex indices of metals, interference in films by reflectance at every angle, Kubelka and Munk's layers,
+Fresnel's surface with all inner reflections (Saunderson), GGX facets, polarisation by surfaces. Simplified: bodies
+under films scatter as Lambert says, metals under lacquer are dimmed as along the normal, facets bounce light once
+(docs/decisions/0013).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from coupole.appearance.matter import gilding, kubelka_munk, lacquer, layered
+from coupole.appearance.optics import fresnel, indices
+from coupole.appearance.optics.thin_film import Film, stack_power
+from coupole.appearance.render.bands import Description
+from coupole.appearance.render.equivalent import equivalent_index
+from coupole.appearance.render.model import Index, Model, Positive, Roughness, Share
+from coupole.appearance.render.spectra import Bole, Constant, Reflectance, reflectance
+from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex
+
+_THINNEST_NM = 1e-3
+_LEAST_SHARE = 0.1
+"""Each part of a sum gets so many of the paths at least."""
+
+
+class Diffuse(Model):
+    """Lambert."""
+
+    kind: Literal["diffuse"]
+    reflectance: Reflectance
+
+
+class Paint(Model):
+    """A pigment in a glossy binder; with a thickness, as a layer over a ground (Kubelka-Munk, Saunderson)."""
+
+    kind: Literal["paint"]
+    pigment: Reflectance
+    """Of an opaque layer, inside the binder."""
+    thickness_mm: Positive | None = None
+    ground: Reflectance = Constant(kind="constant", value=0.0)
+    """Inside the binder."""
+    scattering_per_mm: Positive = 30.0
+    index: Index = indices.BINDER
+    roughness: Roughness = 0.25
+
+
+class Lacquer(Model):
+    """A clear glossy coat over a body: varnish, polished urushi."""
+
+    kind: Literal["lacquer"]
+    body: Reflectance = Constant(kind="constant", value=0.006)
+    """Inside the lacquer."""
+    index: Index = indices.URUSHI
+    roughness: Roughness = 0.04
+
+
+class Metal(Model):
+    """A bare metal, or one at a depth in clear urushi."""
+
+    kind: Literal["metal"]
+    gold: Share = 1.0
+    """Share of gold by atoms; the rest is silver."""
+    roughness: Roughness = 0.1
+    depth_mm: Annotated[float, Field(ge=0)] | None = None
+    """Under the lacquer's face. None: in air."""
+
+
+class Gilt(Model):
+    """Gold leaf on bole (seed 001, Eq. 7, as `coupole.appearance.matter.gilding` makes it definite)."""
+
+    kind: Literal["gilt"]
+    thickness_nm: Annotated[float, Field(ge=0)] = 100.0
+    gold: Share = 1.0
+    holes: Annotated[float, Field(ge=0, le=0.3)] = 0.0
+    """Nanoscopic, by volume (Maxwell Garnett)."""
+    uncovered: Share = 0.0
+    """Share of the surface that cracks and large holes leave bare."""
+    bole: Reflectance = Bole(kind="bole")
+    """In air, gloss excluded."""
+    roughness: Roughness = 0.12
+    bole_roughness: Roughness = 0.35
+
+
+class OneFilm(Model):
+    index: Index
+    thickness_nm: Positive
+
+
+class Films(Model):
+    """Transparent films over a metal or a dark glass: interference colours of patina, varnish, oxide."""
+
+    kind: Literal["films"]
+    films: Annotated[tuple[OneFilm, ...], Field(min_length=1, max_length=20)]
+    gold: Share | None = 1.0
+    """The metal underneath; None: a dark glass of `index`."""
+    index: Index = indices.BINDER
+    roughness: Roughness = 0.05
+
+
+class Glass(Model):
+    """Transparent, smooth, without absorption: a closed body of it refracts."""
+
+    kind: Literal["glass"]
+    index: Index = indices.BINDER
+
+
+Material = Annotated[Diffuse | Paint | Lacquer | Metal | Gilt | Films | Glass, Field(discriminator="kind")]
+
+
+def bsdf(material: Material, folder: Path) -> Description:
+    """The material for Mitsuba, arrays [81] for spectra; paths of spectra are relative to `folder`."""
+    if isinstance(material, Glass):
+        return {"type": "dielectric", "int_ior": material.index, "ext_ior": 1.0}
+    return {"type": "twosided", "material": _one_side(material, folder)}
+
+
+def diffuse(spectral: Array) -> Description:
+    return {"type": "diffuse", "reflectance": spectral}
+
+
+def metal(index: Complex, roughness: float, factor: Array | float = 1.0) -> Description:
+    """A rough conductor of complex index [81] (relative to its surroundings) times `factor`."""
+    return {
+        "type": "roughconductor",
+        "distribution": "ggx",
+        "alpha": roughness,
+        "eta": np.asarray(index.real),
+        "k": np.asarray(index.imag),
+        "specular_reflectance": np.broadcast_to(np.asarray(factor, dtype=float), BANDS).copy(),
+    }
+
+
+def coated(body: Array, index: float, roughness: float) -> Description:
+    """A body of reflectance `body` [81] inside a medium with a glossy face.
+
+    Mitsuba's polarised plastic (Baek et al. 2020) lets light in and out once. All inner reflections together make
+    it body/(n^2 (1 - k2 body)), with k2 the face's reflectance for diffuse light from within: then light that
+    comes along the normal is returned as Saunderson says.
+    """
+    return {
+        "type": "pplastic",
+        "distribution": "ggx",
+        "alpha": roughness,
+        "int_ior": index,
+        "ext_ior": 1.0,
+        "diffuse_reflectance": body / (index**2 * (1.0 - fresnel.diffuse_internal(index) * body)),
+    }
+
+
+def paint_inside(paint: Paint, folder: Path) -> Array:
+    """Reflectance [81] of the paint inside its binder."""
+    opaque = reflectance(paint.pigment, folder)
+    if paint.thickness_mm is None:
+        return opaque
+    absorption = kubelka_munk.k_over_s(opaque) * paint.scattering_per_mm
+    rho, tau = kubelka_munk.layer(absorption, paint.scattering_per_mm, paint.thickness_mm)
+    return kubelka_munk.over(rho, tau, reflectance(paint.ground, folder))
+
+
+def metal_index(gold: float) -> Complex:
+    """Johnson and Christy's gold or silver, Rioux's alloys between."""
+    pure = {1.0: indices.gold, 0.0: indices.silver}
+    return pure[gold]() if gold in pure else indices.gold_silver(gold)
+
+
+def _one_side(material: Material, folder: Path) -> Description:
+    if isinstance(material, Diffuse):
+        return diffuse(reflectance(material.reflectance, folder))
+    if isinstance(material, Paint):
+        return coated(paint_inside(material, folder), material.index, material.roughness)
+    if isinstance(material, Lacquer):
+        return coated(reflectance(material.body, folder), material.index, material.roughness)
+    if isinstance(material, Metal):
+        return _metal(material)
+    if isinstance(material, Films):
+        return _films(material)
+    assert isinstance(material, Gilt)
+    return _gilt(material, folder)
+
+
+def _metal(material: Metal) -> Description:
+    index = metal_index(material.gold)
+    if material.depth_mm is None:
+        return metal(index, material.roughness)
+    inward = 1.0 - float(fresnel.reflectance(1.0, indices.URUSHI))
+    left = lacquer.transmittance(material.depth_mm, 1.0, lacquer.urushi_absorption())
+    return metal(index / indices.URUSHI, material.roughness, (inward * left) ** 2)
+
+
+def _films(material: Films) -> Description:
+    films = [Film(indices.constant(film.index), film.thickness_nm) for film in material.films]
+    base = indices.constant(material.index) if material.gold is None else metal_index(material.gold)
+    return metal(_equivalent(films, base), material.roughness)
+
+
+def _gilt(material: Gilt, folder: Path) -> Description:
+    index = metal_index(material.gold)
+    if material.holes > 0.0:
+        index = gilding.leaf_index(index, material.holes)
+    bole = reflectance(material.bole, folder)
+    gilded = gilding.gilt(index, material.thickness_nm, bole, uncovered=material.uncovered)
+    bare = coated(gilded.bole_inside, indices.EGG_WHITE, material.bole_roughness)
+    if material.thickness_nm < _THINNEST_NM or material.uncovered == 1.0:
+        return bare
+    films = [Film(index, material.thickness_nm)]
+    leaf = metal(_equivalent(films, indices.constant(indices.EGG_WHITE)), material.roughness)
+    through = gilded.leaf.transmittance[-1] * layered.emerging(gilded.leaf, gilded.bole_inside)
+    if through.max() > 1e-5:
+        leaf = _sum(leaf, gilded.leaf.normal_reflectance, through)
+    if material.uncovered == 0.0:
+        return leaf
+    return {"type": "blendbsdf", "weight": material.uncovered, "leaf": leaf, "bare": bare}
+
+
+def _sum(mirror: Description, mirror_share: Array, through: Array) -> Description:
+    """A metal and a Lambertian part together.
+
+    Mitsuba blends, w of one and 1 - w of the other; each is divided by its weight first. The weight is the same
+    for all bands, so that they share their paths.
+    """
+    weight = float(np.clip(through.mean() / (through + mirror_share).mean(), _LEAST_SHARE, 1.0 - _LEAST_SHARE))
+    stronger = {**mirror, "specular_reflectance": mirror["specular_reflectance"] / (1.0 - weight)}
+    return {"type": "blendbsdf", "weight": weight, "mirror": stronger, "through": diffuse(through / weight)}
+
+
+def _equivalent(films: Sequence[Film], substrate: Complex) -> Complex:
+    return equivalent_index(
+        lambda cosines: stack_power(cosines, WAVELENGTHS_NM, films, substrate=substrate)[0],
+    )

@@ -1,0 +1,255 @@
+"""Objects of a scene file: triangles of `sim.objects`, each with a spectral material in place of its RGB one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from coupole.appearance.render import arcature
+from coupole.appearance.render.materials import Diffuse, Gilt, Glass, Lacquer, Material, Metal, Paint
+from coupole.appearance.render.model import Pose, Positive, Roughness, Share
+from coupole.appearance.render.spectra import Constant, Pigment
+from coupole.appearance.spectra.grid import Array
+from sim.objects import shapes, urushi, wedges
+from sim.scene.scene import load_surface
+from sim.scene.surface import Surface
+
+_PRINT = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.035))
+"""The black body of the wedges."""
+_NASHIJI_BODY_MM = 6.0
+_NASHIJI_LEVELS = 6
+_DIP_MM = 0.01
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Triangles of one material."""
+
+    corners_mm: Array
+    """[triangles, 3, 3] in the scene's frame, counter-clockwise seen from outside."""
+    material: Material
+    smooth: bool = False
+    """Shaded as if it were curved."""
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A sphere, exactly."""
+
+    centre_mm: Array
+    radius_mm: float
+    material: Material
+
+
+class Mesh(Pose):
+    """Any mesh that trimesh reads; its colours are not used."""
+
+    kind: Literal["mesh"]
+    path: Path
+    unit: Literal["mm", "m", "um"] = "mm"
+    smooth: bool = False
+    material: Material
+
+
+class Plane(Pose):
+    """A sheet in z = 0 about the origin, facing up."""
+
+    kind: Literal["plane"]
+    width_mm: Positive
+    depth_mm: Positive
+    material: Material
+
+
+class Sphere(Pose):
+    """It stands on z = 0."""
+
+    kind: Literal["sphere"]
+    radius_mm: Positive
+    material: Material
+
+
+class SculptedRelief(Pose):
+    kind: Literal["sculpted_relief"]
+    size_mm: Positive = 120.0
+    triangles: Annotated[int, Field(ge=100, le=5_000_000)] = 100_000
+    seed: int = 1
+    material: Material
+
+
+class GiltStepWedge(Pose):
+    """Gold leaf of rising thickness on bole, along x (seed 001, section 5)."""
+
+    kind: Literal["gilt_step_wedge"]
+    thicknesses_nm: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)] = wedges.GILT_NM
+    gold: Share = 1.0
+    roughness: Roughness = 0.12
+
+
+class PaintWedge(Pose):
+    """A paint of rising thickness along x, over white towards +y and over black towards -y."""
+
+    kind: Literal["paint_wedge"]
+    pigment: str = "azurite"
+    thicknesses_mm: Annotated[tuple[Positive, ...], Field(min_length=1)] = wedges.PAINT_MM
+    scattering_per_mm: Positive = 8.0
+
+
+class MakieTile(Pose):
+    """Polished black urushi with a flower of sprinkled gold (seed 002, section 4)."""
+
+    kind: Literal["makie_tile"]
+    side_mm: Positive = 60.0
+    triangles: Annotated[int, Field(ge=100, le=2_000_000)] = 60_000
+    petals: Annotated[int, Field(ge=1, le=64)] = 8
+    seed: int = 1
+    roughness: Roughness = 0.25
+
+
+class NashijiSlab(Pose):
+    """Gold flakes in clear lacquer over black (seed 002, section 5); x and y go from 0 to the slab's size.
+
+    Rays are bent at the lacquer's face, which mirrors the lights, and meet the flakes where they are. What the
+    lacquer absorbs is taken as along the normal, in `_NASHIJI_LEVELS` depths.
+    """
+
+    kind: Literal["nashiji_slab"]
+    size_mm: tuple[Positive, Positive] = (20.0, 20.0)
+    depth_mm: Positive = 0.4
+    """Of the lacquer."""
+    flakes_per_mm2: Positive = 6.0
+    flake_radius_mm: Positive = 0.12
+    tilt_deg: Annotated[float, Field(ge=0, lt=45)] = 8.0
+    roughness: Roughness = 0.08
+    seed: int = 1
+
+
+class Arcature(Pose):
+    """A gilded niche on a stone wall (`coupole.appearance.render.arcature`)."""
+
+    kind: Literal["arcature"]
+    radius_mm: Positive = 400.0
+    height_mm: Positive = 600.0
+    """From the sill to where the arch begins."""
+    depth_mm: Positive = 300.0
+    gilt: Gilt = Gilt(kind="gilt")
+    stone: Material = Diffuse(kind="diffuse", reflectance=Pigment(kind="pigment", name="yellow ochre"))
+
+
+Object = Annotated[
+    Mesh | Plane | Sphere | SculptedRelief | GiltStepWedge | PaintWedge | MakieTile | NashijiSlab | Arcature,
+    Field(discriminator="kind"),
+]
+
+
+def pieces(thing: Object, folder: Path) -> list[Piece | Ball]:
+    """What the object is made of, in the scene's frame; paths are relative to `folder`."""
+    if isinstance(thing, Sphere):
+        centre = thing.scene_from_thing() @ [0.0, 0.0, thing.radius_mm, 1.0]
+        return [Ball(centre[:3], thing.radius_mm, thing.material)]
+    return [_placed(piece, thing) for piece in _local(thing, folder)]
+
+
+def _local(thing: Object, folder: Path) -> list[Piece]:
+    if isinstance(thing, Mesh):
+        surface = load_surface(folder / thing.path, thing.unit)
+        return [Piece(surface.corners_mm, thing.material, thing.smooth)]
+    if isinstance(thing, Plane):
+        return [Piece(shapes.plane(thing.width_mm, thing.depth_mm).corners_mm, thing.material)]
+    if isinstance(thing, SculptedRelief):
+        surface = shapes.sculpted_relief(thing.size_mm, triangles=thing.triangles, seed=thing.seed)
+        return [Piece(surface.corners_mm, thing.material)]
+    if isinstance(thing, GiltStepWedge):
+        steps: list[Material] = [
+            Gilt(kind="gilt", thickness_nm=nm, gold=thing.gold, roughness=thing.roughness)
+            for nm in thing.thicknesses_nm
+        ]
+        return _by_material(wedges.gilt_step_wedge(thing.thicknesses_nm), [*steps, _PRINT])
+    if isinstance(thing, PaintWedge):
+        return _by_material(
+            wedges.paint_wedge(thing.pigment, thing.thicknesses_mm), [*_paint_fields(thing), _PRINT]
+        )
+    if isinstance(thing, MakieTile):
+        surface = urushi.makie_tile(thing.side_mm, triangles=thing.triangles, petals=thing.petals, seed=thing.seed)
+        black = Lacquer(kind="lacquer")
+        return _by_material(surface, [Metal(kind="metal", roughness=thing.roughness), black, black])
+    if isinstance(thing, NashijiSlab):
+        return _nashiji(thing)
+    assert isinstance(thing, Arcature)
+    parts = arcature.arcature(thing.radius_mm, thing.height_mm, thing.depth_mm)
+    return [Piece(parts.gilded_mm, thing.gilt, smooth=True), Piece(parts.stone_mm, thing.stone)]
+
+
+def _paint_fields(thing: PaintWedge) -> list[Material]:
+    """In the generator's order: row by row, black ground first, as thick as the steps."""
+    return [
+        Paint(
+            kind="paint",
+            pigment=Pigment(kind="pigment", name=thing.pigment),
+            thickness_mm=thickness_mm,
+            ground=Constant(kind="constant", value=ground),
+            scattering_per_mm=thing.scattering_per_mm,
+        )
+        for ground in (0.02, 0.90)
+        for thickness_mm in thing.thicknesses_mm
+    ]
+
+
+def _nashiji(thing: NashijiSlab) -> list[Piece]:
+    """Black body, flakes, and the clear lacquer as a closed body round the flakes that lets rays in."""
+    from coupole.appearance.matter import nashiji
+    from sim.objects.patchwork import slab
+
+    found = nashiji.flakes(
+        nashiji.Slab(
+            size_mm=thing.size_mm,
+            depth_mm=thing.depth_mm,
+            flakes_per_mm2=thing.flakes_per_mm2,
+            flake_radius_mm=thing.flake_radius_mm,
+            tilt_deg=thing.tilt_deg,
+            seed=thing.seed,
+        )
+    )
+    width, length = thing.size_mm
+    black = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.006))
+    middle = np.array([0.5 * width, 0.5 * length, 0.0])
+    parts = [Piece(slab(width, length, _NASHIJI_BODY_MM) + middle, black)]
+    points, faces = nashiji.triangulate(found, around=12, along=4)
+    top_mm = _NASHIJI_BODY_MM + thing.depth_mm
+    corners = (points + np.array([0.0, 0.0, top_mm]))[faces].reshape(len(found.centres_mm), -1, 3, 3)
+    level = (-found.centres_mm[:, 2] / thing.depth_mm * _NASHIJI_LEVELS).astype(int).clip(0, _NASHIJI_LEVELS - 1)
+    for k in np.unique(level):
+        depth_mm = (k + 0.5) / _NASHIJI_LEVELS * thing.depth_mm
+        gold = Metal(kind="metal", roughness=thing.roughness, depth_mm=depth_mm)
+        parts.append(Piece(corners[level == k].reshape(-1, 3, 3), gold))
+    return [*parts, _clear(width, length, thing.depth_mm, 2.0 * thing.flake_radius_mm)]
+
+
+def _clear(width: float, length: float, thickness_mm: float, rim_mm: float) -> Piece:
+    """The lacquer's outside: it dips into the body, and is a little wider, as flakes at the rim reach over it."""
+    from coupole.appearance.optics import indices
+    from sim.objects.patchwork import slab
+
+    box = slab(width + 2 * rim_mm, length + 2 * rim_mm, thickness_mm + _DIP_MM)
+    lift = np.array([0.5 * width, 0.5 * length, _NASHIJI_BODY_MM - _DIP_MM])
+    return Piece(box + lift, Glass(kind="glass", index=indices.URUSHI))
+
+
+def _by_material(surface: Surface, materials: Sequence[Material]) -> list[Piece]:
+    """One piece for each of the surface's materials, which `materials` replace in order."""
+    return [
+        Piece(surface.corners_mm[surface.material == row], material)
+        for row, material in enumerate(materials)
+        if np.any(surface.material == row)
+    ]
+
+
+def _placed(piece: Piece, pose: Pose) -> Piece:
+    scene_from_thing = pose.scene_from_thing()
+    corners: NDArray[np.float64] = piece.corners_mm @ scene_from_thing[:3, :3].T + scene_from_thing[:3, 3]
+    return Piece(corners, piece.material, piece.smooth)

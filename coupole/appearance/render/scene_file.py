@@ -1,0 +1,145 @@
+"""The scene file of `coupole render`: what a spectral picture is made of (docs/reference/scene.md).
+
+Lengths are mm, angles degrees; z is up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, Field, model_validator
+
+from coupole.appearance.render.bands import StepNm
+from coupole.appearance.render.lights import Light
+from coupole.appearance.render.model import Model, Positive, Vector
+from coupole.appearance.render.objects import Object
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+Pixels = Annotated[int, Field(ge=4, le=8192)]
+
+
+class FieldOfView(Model):
+    kind: Literal["field"]
+    degrees: Annotated[float, Field(gt=0, lt=170)]
+    """Across the picture's width."""
+
+
+class Lens(Model):
+    kind: Literal["lens"]
+    focal_length_mm: Positive
+    pixel_pitch_um: Positive
+
+
+class Camera(Model):
+    """A pinhole camera."""
+
+    name: Name
+    position_mm: Vector
+    target_mm: Vector
+    up: Vector = (0.0, 0.0, 1.0)
+    optics: Annotated[FieldOfView | Lens, Field(discriminator="kind")]
+    width_px: Pixels
+    height_px: Pixels
+
+    @model_validator(mode="after")
+    def _looks(self) -> Camera:
+        way = np.subtract(self.target_mm, self.position_mm)
+        if np.linalg.norm(np.cross(way, self.up)) < 1e-6 * np.linalg.norm(way) * np.linalg.norm(self.up):
+            raise ValueError("the camera looks along `up`, or nowhere: choose another `up`, or move it")
+        return self
+
+    def field_deg(self) -> float:
+        """Across the picture's width."""
+        if isinstance(self.optics, FieldOfView):
+            return self.optics.degrees
+        half_mm = 0.5e-3 * self.width_px * self.optics.pixel_pitch_um
+        return float(np.degrees(2.0 * np.arctan(half_mm / self.optics.focal_length_mm)))
+
+    def narrowed(self, width_px: int) -> Camera:
+        """The same view with fewer pixels; one that is not wider stays as it is."""
+        if width_px >= self.width_px:
+            return self
+        optics = FieldOfView(kind="field", degrees=self.field_deg())
+        height_px = max(4, round(self.height_px * width_px / self.width_px))
+        return self.model_copy(update={"width_px": width_px, "height_px": height_px, "optics": optics})
+
+
+class Bands(Model):
+    """380 to 780 nm by `step_nm`."""
+
+    step_nm: StepNm = 5
+
+
+class Display(Model):
+    """How XYZ becomes a picture for a screen."""
+
+    white_cd_m2: Positive | None = None
+    """Luminance that is shown as white; none: the brightest but for the share `clipped`."""
+    clipped: Annotated[float, Field(ge=0, lt=0.5)] = 0.005
+    adaptation: Literal["CAT16", "Bradford", "none"] = "CAT16"
+    """From the white of the first light to D65; none shows the light's own colour."""
+
+
+class Outputs(Model):
+    spectra: Literal["half", "float"] = "float"
+    """Numbers of the EXR."""
+    xyz: bool = True
+    """Whether it has X, Y, Z beside the bands."""
+
+
+class Caustic(Model):
+    """A picture of the light on the arcature's back wall, by photons; the sun is the first distant light."""
+
+    photons: Annotated[int, Field(ge=1000, le=100_000_000)] = 1_000_000
+    cell_mm: Positive = 4.0
+
+
+class Scene(Model):
+    """One scene; all cameras see the same."""
+
+    schema_version: Literal[1]
+    name: Name
+    cameras: Annotated[tuple[Camera, ...], Field(min_length=1)]
+    objects: Annotated[tuple[Object, ...], Field(min_length=1)]
+    lights: Annotated[tuple[Light, ...], Field(min_length=1)]
+    observer: Literal["10 deg", "2 deg"] = "10 deg"
+    bands: Bands = Bands()
+    samples: Annotated[int, Field(ge=1, le=1_000_000)] = 64
+    """Paths through each pixel."""
+    depth: Annotated[int, Field(ge=1, le=100)] = 8
+    """Surfaces that a path meets at most."""
+    seed: Annotated[int, Field(ge=0, le=2**31)] = 1
+    polarisation: bool = False
+    """Stokes vectors of every band; four times the work, and slower."""
+    display: Display = Display()
+    outputs: Outputs = Outputs()
+    caustic: Caustic | None = None
+
+    @model_validator(mode="after")
+    def _names(self) -> Scene:
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) < len(names):
+            raise ValueError("two cameras have the same name; their pictures would overwrite each other")
+        return self
+
+    @model_validator(mode="after")
+    def _sun(self) -> Scene:
+        kinds = {part.kind for part in (*self.objects, *self.lights)}
+        if self.caustic is not None and not {"arcature", "distant"} <= kinds:
+            raise ValueError("`caustic` needs an object of kind `arcature` and a light of kind `distant`")
+        return self
+
+
+def files(part: Any, at: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Path]]:
+    """All paths that a scene names, with the keys that lead to them."""
+    if isinstance(part, Path):
+        yield at, part
+    elif isinstance(part, BaseModel):
+        for name in type(part).model_fields:
+            yield from files(getattr(part, name), (*at, name))
+    elif isinstance(part, tuple):
+        for number, inner in enumerate(part):
+            yield from files(inner, (*at, number))

@@ -1,0 +1,154 @@
+"""Spectra that a scene file can name: how things reflect, and what lights give; [81] on the materials' grid."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from coupole.appearance.matter import typical
+from coupole.appearance.render.model import Model, Share
+from coupole.appearance.spectra import light, measured, resampling
+from coupole.appearance.spectra.grid import BANDS, STEP_NM, WAVELENGTHS_NM, Array
+from coupole.errors import InputError
+from sim.optics.led_light import LedSpectrum, spectral_power
+
+LM_PER_W = 683.0
+"""CIE: luminous efficacy at 540 THz."""
+_C2_NM_K = 1.4388e7
+_SUN_K = 5778.0
+
+
+class Constant(Model):
+    """The same at all wavelengths."""
+
+    kind: Literal["constant"]
+    value: Share
+
+
+class Pigment(Model):
+    """A typical paint of `coupole.appearance.matter.typical`, opaque, inside its binder: assumed, not measured."""
+
+    kind: Literal["pigment"]
+    name: str
+
+
+class Bole(Model):
+    """The papers' bole, half red lead, half red ochre (seed 001, section 5)."""
+
+    kind: Literal["bole"]
+
+
+class Measured(Model):
+    """A spectrophotometer's export (docs/reference/materials.md); bands beyond it keep its ends."""
+
+    kind: Literal["file"]
+    path: Path
+    column: int | None = None
+
+
+Reflectance = Annotated[Constant | Pigment | Bole | Measured, Field(discriminator="kind")]
+
+
+class Illuminant(Model):
+    """A standard illuminant of the CIE: E, A, D50, D65, FL2, ..."""
+
+    kind: Literal["illuminant"]
+    name: str
+
+
+class Source(Model):
+    """A light source that colour-science knows, such as 'LED-B3'."""
+
+    kind: Literal["source"]
+    name: str
+
+
+class DomeLed(Model):
+    """The white LED of the simulated dome (`sim.optics.led_light`)."""
+
+    kind: Literal["dome_led"]
+
+
+class BlackBody(Model):
+    kind: Literal["black_body"]
+    kelvin: Annotated[float, Field(ge=800, le=30000)]
+
+
+class LowSun(Model):
+    """The sun at an elevation, through clear air: computed, not measured.
+
+    A black body of 5778 K behind Rayleigh scattering 0.008735 um^-4.08 and haze beta um^-1.3 (Leckner 1978), over
+    the air mass of Kasten and Young 1989. Ozone is left away.
+    """
+
+    kind: Literal["low_sun"]
+    elevation_deg: Annotated[float, Field(ge=0, le=90)]
+    haze: Annotated[float, Field(ge=0, le=0.5)] = 0.06
+    """Angstrom's beta: 0.02 is clear, 0.2 is turbid."""
+
+
+Power = Annotated[Illuminant | Source | DomeLed | BlackBody | LowSun | Measured, Field(discriminator="kind")]
+
+
+def reflectance(spectrum: Reflectance, folder: Path) -> Array:
+    """[81], 0 to 1; paths are relative to `folder`. Raises InputError."""
+    if isinstance(spectrum, Constant):
+        return np.full(BANDS, spectrum.value)
+    if isinstance(spectrum, Pigment):
+        return typical.reflectance(spectrum.name)
+    if isinstance(spectrum, Bole):
+        return typical.bole()
+    path = folder / spectrum.path
+    values = resampling.held(resampling.on_grid(measured.read_spectrum(path, column=spectrum.column)))
+    if values.min() < -0.02 or values.max() > 1.02:
+        raise InputError(
+            f"{path}: expected reflectances from 0 to 1, found {values.min():.3g} to {values.max():.3g}; "
+            "give a sample without gloss or fluorescence"
+        )
+    return np.clip(values, 0.0, 1.0)
+
+
+def power(spectrum: Power, folder: Path) -> Array:
+    """Relative spectral power [81]. Raises InputError."""
+    if isinstance(spectrum, Illuminant):
+        return light.illuminant(spectrum.name)
+    if isinstance(spectrum, Source):
+        return light.led(spectrum.name)
+    if isinstance(spectrum, DomeLed):
+        return spectral_power(LedSpectrum())
+    if isinstance(spectrum, BlackBody):
+        return _planck(spectrum.kelvin)
+    if isinstance(spectrum, LowSun):
+        return _low_sun(spectrum)
+    read = measured.read_spectrum(folder / spectrum.path, unit="power", column=spectrum.column)
+    return np.maximum(resampling.held(resampling.on_grid(read)), 0.0)
+
+
+def luminous(spectral: Array) -> Array:
+    """cd/m^2 of W/(m^2 sr nm) [..., 81], or lux of irradiance; V(lambda) is that of the CIE 1931 observer."""
+    return np.asarray(LM_PER_W * STEP_NM * (spectral @ light.observer("2 deg")[1]))
+
+
+def scaled(relative: Array, photometric: float) -> Array:
+    """Spectral power per nm [81] of the shape `relative` whose photometric amount is `photometric`."""
+    return np.asarray(relative * (photometric / luminous(relative)))
+
+
+def air_mass(elevation_deg: float) -> float:
+    """Way through the air over that straight up (Kasten and Young, Appl. Opt. 28, 4735, 1989)."""
+    return float(1.0 / (np.sin(np.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.07995) ** -1.6364))
+
+
+def _low_sun(sun: LowSun) -> Array:
+    um = WAVELENGTHS_NM * 1e-3
+    depth = 0.008735 * um**-4.08 + sun.haze * um**-1.3
+    return np.asarray(_planck(_SUN_K) * np.exp(-air_mass(sun.elevation_deg) * depth))
+
+
+def _planck(kelvin: float) -> Array:
+    """Planck's law, 1 at its greatest value of the grid."""
+    shape = WAVELENGTHS_NM**-5.0 / np.expm1(_C2_NM_K / (WAVELENGTHS_NM * kelvin))
+    return np.asarray(shape / shape.max())

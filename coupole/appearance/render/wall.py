@@ -1,0 +1,104 @@
+"""The back wall of a scene's arcature under its sun: light by photons (`caustic`), as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coupole.appearance.matter import gilding, layered
+from coupole.appearance.render import arcature, caustic, colour
+from coupole.appearance.render.lights import Distant
+from coupole.appearance.render.materials import Gilt, metal_index
+from coupole.appearance.render.model import unit
+from coupole.appearance.render.objects import Arcature
+from coupole.appearance.render.pictures import SYNTHETIC, write_png
+from coupole.appearance.render.scene_file import Caustic, Scene
+from coupole.appearance.render.spectra import luminous, power, reflectance, scaled
+from coupole.appearance.spectra.grid import Array
+from coupole.errors import InputError
+
+_PART = 500_000
+
+
+def write_wall(
+    scene: Scene, folder: Path, stem: Path, white: Array, progress: Callable[[int, int], None]
+) -> dict[str, Any]:
+    """Write `stem`.png, the wall's colour were it white, brightest cells but 0.5 % white; returns figures.
+
+    Light of the sun only: no sky, and no light from stone to stone. Raises InputError, OSError.
+    """
+    assert scene.caustic is not None
+    thing = next(thing for thing in scene.objects if isinstance(thing, Arcature))
+    light = next(light for light in scene.lights if isinstance(light, Distant))
+    sun = _sun(light, thing, folder, scene.name)
+    lit, share_by_gold = _lit(scene.caustic, scene.seed, thing, _niche(thing, folder), sun, progress)
+    xyz = colour.tristimulus(lit / np.pi, range(lit.shape[-1]), 5, scene.observer)
+    brightest = float(np.quantile(xyz[..., 1], 0.995))
+    picture, _ = colour.displayed(colour.adapted(xyz / brightest, white, scene.display.adaptation))
+    about = f"{scene.name}, light on the back wall: {SYNTHETIC}; {scene.caustic.photons} photons"
+    write_png(stem.with_suffix(".png"), picture, about)
+    return {
+        "file": stem.with_suffix(".png").name,
+        "photons": scene.caustic.photons,
+        "direct_lux": round(float(luminous(sun.irradiance) * sun.direction[1]), 3),
+        "greatest_lux": round(float(luminous(lit).max()), 3),
+        "share_by_gold": round(share_by_gold, 5),
+    }
+
+
+def _lit(
+    wanted: Caustic,
+    seed: int,
+    thing: Arcature,
+    niche: caustic.Niche,
+    sun: caustic.Sun,
+    progress: Callable[[int, int], None],
+) -> tuple[Array, float]:
+    """Irradiance [rows, columns, 81] of the wall, and the luminous share of the light that gold threw on stone.
+
+    In parts, as a photon takes 324 bytes.
+    """
+    sides, top_mm = (-thing.radius_mm, thing.radius_mm), thing.height_mm + thing.radius_mm
+    counts = [min(_PART, wanted.photons - first) for first in range(0, wanted.photons, _PART)]
+    lit: Array | float = 0.0
+    by_gold = 0.0
+    for part, count in enumerate(counts):
+        progress(part, len(counts))
+        weight = count / wanted.photons
+        found = caustic.photons(niche, sun, (*sides, top_mm), count, (seed, part))
+        lit = lit + weight * caustic.irradiance(found, sides, top_mm, wanted.cell_mm, thing.depth_mm)
+        on_stone = luminous(found.power[found.bounces > 0].sum(axis=0, dtype=float))
+        by_gold += weight * float(on_stone / luminous(found.started))
+    progress(len(counts), len(counts))
+    return np.asarray(lit), by_gold
+
+
+def _sun(light: Distant, thing: Arcature, folder: Path, scene_name: str) -> caustic.Sun:
+    """In the niche's frame."""
+    direction = thing.scene_from_thing()[:3, :3].T @ np.array(unit(light.direction))
+    if direction[1] <= 0.0:
+        raise InputError(
+            f"{scene_name}: expected a sun that shines into the arcature, found it behind the wall; "
+            "turn one of them"
+        )
+    return caustic.Sun(direction, light.width_deg, scaled(power(light.spectrum, folder), light.illuminance_lux))
+
+
+def _niche(thing: Arcature, folder: Path) -> caustic.Niche:
+    parts = arcature.arcature(thing.radius_mm, thing.height_mm, thing.depth_mm)
+    leaf = _leaf(thing.gilt, folder)
+    return caustic.Niche(
+        parts.gilded_mm, parts.stone_mm, lambda cosines: layered.at_cosine(leaf, cosines), thing.gilt.roughness
+    )
+
+
+def _leaf(gilt: Gilt, folder: Path) -> Array:
+    """Mirror part of the covered share, as `layered.Sheet` holds it; the bole's light is left away."""
+    index = metal_index(gilt.gold)
+    if gilt.holes > 0.0:
+        index = gilding.leaf_index(index, gilt.holes)
+    gilded = gilding.gilt(index, gilt.thickness_nm, reflectance(gilt.bole, folder))
+    return np.asarray((1.0 - gilt.uncovered) * gilded.leaf.reflectance)

@@ -1,0 +1,30 @@
+"""From spectra to what a camera measures, normalised by a white tile as the instrument does.
+
+The truth of a frame's channel c is f_c = integral(E S_c f)/integral(E S_c), with the light's spectrum E and the
+camera's sensitivity S_c: a mean of the BRDF over the light that counts, not a colorimetric value.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coupole.appearance.spectra.grid import Array
+from coupole.errors import InputError
+
+
+def channel_weights(power: ArrayLike, sensitivities: ArrayLike) -> Array:
+    """[channels, 81], each row summing to 1, from a light's spectral power [81] and sensitivities [channels,
+    81]."""
+    weights = np.asarray(power, dtype=float) * np.asarray(sensitivities, dtype=float)
+    total = weights.sum(axis=-1, keepdims=True)
+    if not np.all(total > 0.0):
+        raise InputError("channels: expected a light that every channel sees; one sees nothing of it; see to both")
+    return np.asarray(weights / total)
+
+
+def channel_values(spectral: Array, weights: Array, tile: ArrayLike = 1.0) -> Array:
+    """f_c [..., channels] of spectral values [..., 81]; `tile` is the reflectance [81] of the white that the
+    instrument divides by, and whose own value it takes as 1."""
+    white = np.broadcast_to(np.asarray(tile, dtype=float), weights.shape[-1:]) @ weights.T
+    return np.asarray(spectral @ weights.T / white)

@@ -1,0 +1,90 @@
+"""Measured spectra on the grid of 380 to 780 nm by 5 nm.
+
+Samples at 5 nm or coarser are interpolated with PCHIP (Fritsch and Butland 1984), which does not overshoot: what
+was between 0 and 1 stays there. Finer samples are averaged with a triangle of 5 nm width at half height, the
+bandpass of a 5 nm instrument, which takes noise away. Nothing is made up: bands that were not measured are NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coupole.appearance.spectra.grid import STEP_NM, WAVELENGTHS_NM, Array
+from coupole.appearance.spectra.measured import Measured
+from coupole.errors import InputError
+
+_WIDEST_GAP_NM = 20.0
+_TRIANGLE = 101
+
+
+@dataclass(frozen=True)
+class OnGrid:
+    """A spectrum on the grid."""
+
+    name: str
+    values: Array
+    """[81]; NaN where it was not measured."""
+    error: float
+    """Estimate of the largest error that resampling makes, in the unit of the values.
+
+    Interpolated: a quarter of the largest error with which every other sample is found from its neighbours,
+    because PCHIP's error falls at least as the square of the spacing. Averaged: the largest difference between
+    the band mean and the sampled curve in the band's middle, noise included.
+    """
+
+
+def on_grid(spectrum: Measured) -> OnGrid:
+    """`spectrum` on the grid. Bands outside its range, or in a gap wider than 20 nm, are NaN."""
+    nm, values = spectrum.wavelengths_nm, spectrum.values
+    bands = np.array(WAVELENGTHS_NM)
+    inside = (bands >= nm[0] - 1e-6) & (bands <= nm[-1] + 1e-6)
+    above = np.clip(np.searchsorted(nm, bands), 1, len(nm) - 1)
+    on_sample = np.isclose(nm[above], bands) | np.isclose(nm[above - 1], bands)
+    covered = inside & ((nm[above] - nm[above - 1] <= _WIDEST_GAP_NM) | on_sample)
+    if not covered.any():
+        raise InputError(
+            f"spectrum {spectrum.name}: expected samples between 380 and 780 nm, found {nm[0]:g} to {nm[-1]:g}; "
+            "give a spectrum of visible light"
+        )
+    if np.median(np.diff(nm)) < STEP_NM - 1e-6:
+        found, error = _averaged(nm, values, bands[covered])
+    else:
+        found, error = _interpolated(nm, values, bands[covered])
+    result = np.full(bands.shape, np.nan)
+    result[covered] = found
+    return OnGrid(spectrum.name, result, error)
+
+
+def held(spectrum: OnGrid) -> Array:
+    """[81] with missing ends filled by the nearest measured value, and gaps by straight lines.
+
+    That is a guess; rendering needs one, identification does not.
+    """
+    known = np.isfinite(spectrum.values)
+    return np.interp(WAVELENGTHS_NM, WAVELENGTHS_NM[known], spectrum.values[known])
+
+
+def _interpolated(nm: Array, values: Array, at: Array) -> tuple[Array, float]:
+    from scipy.interpolate import PchipInterpolator
+
+    # Ends within rounding of the range belong to it.
+    found = np.asarray(PchipInterpolator(nm, values)(np.clip(at, nm[0], nm[-1])))
+    if np.isclose(at[:, None], nm).any(axis=1).all():
+        return found, 0.0
+    kept = np.arange(0, len(nm), 2)
+    left_out = np.arange(1, kept[-1], 2)
+    if len(kept) < 2 or not len(left_out):
+        return found, float(np.ptp(values))
+    again = PchipInterpolator(nm[kept], values[kept])(nm[left_out])
+    return found, 0.25 * float(np.abs(again - values[left_out]).max())
+
+
+def _averaged(nm: Array, values: Array, at: Array) -> tuple[Array, float]:
+    # At the ends of the range the triangle gets narrower, so that it stays even about the band's middle.
+    half = np.minimum(STEP_NM, np.maximum(np.minimum(at - nm[0], nm[-1] - at), 0.0))
+    u = np.linspace(-1.0, 1.0, _TRIANGLE)
+    weight = (1.0 - np.abs(u)) / np.sum(1.0 - np.abs(u))
+    found = np.interp(at[:, None] + half[:, None] * u, nm, values) @ weight
+    return found, float(np.abs(found - np.interp(at, nm, values)).max())

@@ -1,0 +1,27 @@
+"""What is accepted of a lens and of a camera on a robot."""
+
+from __future__ import annotations
+
+from coupole.calibration.acceptance import Allowed
+
+IMAGES = (
+    Allowed("pixel_px", "noise of corners", 0.3, "px"),
+    Allowed("bare_field", "field without corners", 0.4),
+    Allowed("rejected", "corners left out", 0.05),
+    Allowed("clipped", "images too clipped for corners", 0.2),
+)
+"""`bare_field`: share of the field's 8 x 6 cells. `rejected`: share of the corners left out as gross errors."""
+CAMERA = (*IMAGES, Allowed("ray_px", "uncertainty at the field's corners", 0.5, "px"))
+"""`ray_px`: standard uncertainty of where the calibrated lens sees a point at the field's corners."""
+HAND_EYE = (
+    *IMAGES,
+    Allowed("centre_mm", "camera centre on the flange", 0.3, "mm"),
+    Allowed("turn_deg", "camera's turn", 0.05, "deg"),
+    Allowed("robot_ratio", "robot's noise, found over stated", 3.0),
+)
+"""`centre_mm`: standard uncertainty, all directions together (seed 003: 300 um)."""
+CHROMATIC = (
+    *IMAGES,
+    Allowed("shift_px", "uncertainty of the shift between colours", 0.1, "px"),
+)
+"""`shift_px`: standard uncertainty, the largest over the field."""

@@ -1,0 +1,19 @@
+"""What radiometric calibrations must reach to be accepted; uncertainties are relative."""
+
+from __future__ import annotations
+
+from coupole.calibration.acceptance import Allowed
+
+DARK = (Allowed("hot", "share of hot pixels", 1e-3),)
+RESPONSE = (
+    Allowed("linearity", "uncertainty of linearity", 0.003),
+    Allowed("flicker", "flicker of the light", 0.005),
+)
+LED_POWER = (
+    Allowed("power", "median uncertainty against the mean", 0.02),
+    Allowed("unusable", "share of LEDs without a usable picture", 0.02),
+)
+DRIFT = (
+    Allowed("factor", "uncertainty of the factor, worst frame", 0.01),
+    Allowed("left_out", "share of readings left out", 0.2),
+)

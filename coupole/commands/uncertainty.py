@@ -1,0 +1,209 @@
+"""`coupole budget`: what a reflectance is uncertain by, from calibration records."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from coupole.commands.calibrating import EmissionOption, emission_of
+from coupole.commands.common import JsonOption, fail
+from coupole.errors import CoupoleError, InputError, StorageError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.calibration.budget.accuracy import Accuracy, Case
+    from coupole.calibration.budget.budget import Budget, Known, Spread
+    from coupole.calibration.in_force import InForce
+
+_SAMPLES = 24
+
+
+def budget(
+    records: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Records, or folders of them: camera, hand-eye, leds, mesh, flat-field, response, led-power, "
+            "drift. Seed 003's figures, or assumed ones, where there is none.",
+            metavar="RECORD_OR_FOLDER",
+        ),
+    ] = None,
+    plan: Annotated[
+        Path | None, typer.Option("--plan", help="Take the records that this plan names, where none is given.")
+    ] = None,
+    beside: Annotated[
+        list[Path] | None,
+        typer.Option("--beside", help="Records of another cell, for a column of their own in the table."),
+    ] = None,
+    incidence_deg: Annotated[float, typer.Option("--incidence", min=0.0, max=75.0, help="Of the light.")] = 42.0,
+    vertex_um: Annotated[float, typer.Option("--vertex-um", min=0.0, help="Limit of the scanner's error.")] = 30.0,
+    edge_um: Annotated[float, typer.Option("--edge-um", min=1.0, help="Of the mesh's triangles.")] = 200.0,
+    pixels: Annotated[int, typer.Option("--pixels", min=1, help="Of a triangle, per channel.")] = 5,
+    contrast: Annotated[
+        float, typer.Option("--contrast", min=0.0, help="Relative change of albedo per mm of the object.")
+    ] = 0.02,
+    coverage: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--coverage", help="Of an interval, again for more. 0.68 and 0.95 if not given.", min=0.01, max=0.99
+        ),
+    ] = None,
+    emission: EmissionOption = "lambertian",
+    out: Annotated[Path | None, typer.Option("--out", help="Write this PNG, and HTML and JSON beside it.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """What a reflectance is uncertain by, what dominates it, and our accuracies beside the paper's.
+
+    Monte Carlo (JCGM 101) gives the intervals, the linear formula checks them.
+    """
+    from coupole.calibration.budget.accuracy import Case, accuracies
+    from coupole.calibration.budget.budget import Geometry, Known, budget_of
+    from coupole.calibration.budget.page import page
+    from coupole.calibration.budget.propagation import COVERAGES
+    from coupole.calibration.budget.records import doubts, known_from, read_records
+    from coupole.calibration.budget.report import as_json as figures_of
+    from coupole.calibration.budget.report import draw_budget
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    start = Known(vertex_mm=vertex_um / 1e3, edge_mm=edge_um / 1e3, pixels=pixels, contrast_per_mm=contrast)
+    try:
+        if out is not None:
+            _refuse_target(out)
+        ours = _with_plan(read_records(records or []), plan)
+        known = known_from(ours, start)
+        with console.status("propagating distributions"):
+            found = budget_of(
+                known,
+                Geometry(incidence_deg),
+                emission=emission_of(emission),
+                coverages=coverage or COVERAGES,
+            )
+            cases = [Case(_folder(ours), ours, _spread(known))]
+            if beside:
+                others = read_records(beside)
+                cases.append(Case(_folder(others), others, _spread(known_from(others, start))))
+        spread, table = cases[0].spread, accuracies(cases)
+        assert spread is not None
+        doubted = doubts([item for case in cases for item in case.records], datetime.now(UTC))
+        document = figures_of(found, spread, cases, table) | {"doubts": doubted}
+        if out is not None:
+            picture = draw_budget(found, spread)
+            text = page(found, spread, cases, table, picture, doubted)
+            _write(
+                {
+                    out: picture,
+                    out.with_suffix(".html"): text.encode(),
+                    out.with_suffix(".json"): f"{json.dumps(document, indent=1)}\n".encode(),
+                }
+            )
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    if as_json:
+        print(json.dumps(document))
+    else:
+        _show(console, found)
+        _show_accuracies(console, cases, table)
+        for line in doubted:
+            console.print(f"[yellow]{line}[/]")
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _with_plan(given: tuple[InForce, ...], plan: Path | None) -> tuple[InForce, ...]:
+    """The records given, and those in force for a plan of the kinds that are not given."""
+    from coupole.calibration.budget.records import of_use
+    from coupole.preflight.job import read_job
+
+    if plan is None:
+        return given
+    kinds = {item.record.kind for item in given}
+    return given + tuple(
+        item for item in of_use(read_job(plan).calibrations or ()) if item.record.kind not in kinds
+    )
+
+
+def _folder(records: tuple[InForce, ...]) -> str:
+    """What a column is called: the folder that its records stand in."""
+    return records[0].path.resolve().parent.name if records else "no records"
+
+
+def _spread(known: Known) -> Spread:
+    """Samples all over a dome: as many LEDs in each part of the sky above 20 degrees."""
+    from coupole.calibration.budget.budget import Geometry, spread_over
+
+    steps = [(number + 0.5) / _SAMPLES for number in range(_SAMPLES)]
+    cosines = [1.0 - step * (1.0 - math.cos(math.radians(70.0))) for step in steps]
+    return spread_over(known, [Geometry(math.degrees(math.acos(cosine))) for cosine in cosines])
+
+
+def _refuse_target(out: Path) -> None:
+    """Raise InputError where a picture's name is none, or something stands there."""
+    if out.suffix != ".png":
+        raise InputError(f"--out {out}: expected the name of a picture, as budget.png")
+    for path in (out, out.with_suffix(".html"), out.with_suffix(".json")):
+        if path.exists():
+            raise InputError(f"{path}: stands here already; choose another --out")
+
+
+def _write(files: Mapping[Path, bytes]) -> None:
+    for path, content in files.items():
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        except OSError as error:
+            raise StorageError(f"{path}: cannot write the budget: {error.strerror}. Free its disk.") from error
+
+
+def _show(console: Console, found: Budget) -> None:
+    from rich.table import Table
+
+    from coupole.calibration.budget.page import verdict
+
+    table = Table("source", "taken as", "said by", "alone", "variance", "without", box=None)
+    for share in found.shares:
+        table.add_row(
+            share.source,
+            share.figure,
+            share.said_by,
+            f"{share.alone:.2%}",
+            f"{share.linear:.1%}",
+            f"{share.removed:.1%}",
+        )
+    console.print(table)
+    for interval in found.numeric.intervals:
+        if interval.kind == "symmetric":
+            low, high = found.relative(interval.coverage)
+            short = found.relative(interval.coverage, "shortest")
+            console.print(
+                f"{interval.coverage:.0%}: [{low:+.2%}, {high:+.2%}], shortest [{short[0]:+.2%}, {short[1]:+.2%}]"
+            )
+    console.print(
+        "alone: half its own 68 % interval; variance: its share by the linear formula; without: how much"
+    )
+    console.print("narrower the interval is without it")
+    console.print(f"linear formula: u {found.linear.result.u / found.nominal:.2%}; {found.numeric.trials} trials")
+    for v in found.validations:
+        console.print(f"  at {v.coverage:.0%}, to digit {v.digits} of u (JCGM 101, section 8): it {verdict(v)}")
+
+
+def _show_accuracies(console: Console, cases: list[Case], lines: tuple[Accuracy, ...]) -> None:
+    from rich.table import Table
+
+    table = Table(
+        "accuracy", "seed 003", *(case.name for case in cases), box=None, padding=(0, 1, 0, 0), pad_edge=False
+    )
+    table.add_row("robot's noise, found", "", *(case.robot for case in cases))
+    for line in lines:
+        table.add_row(line.what, line.paper, *(line.cell(number) for number in range(len(cases))))
+    console.print()
+    console.print(table)
+    console.print("standard uncertainties, all directions together; samples over a dome: their 68 % intervals")

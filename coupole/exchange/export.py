@@ -1,0 +1,155 @@
+"""Frames of a run for other programs: one file for each frame, named after its shot.
+
+A format is a module with `encode(picture)`, which gives the file's bytes.
+"""
+
+from __future__ import annotations
+
+import errno
+import fnmatch
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import ChecksumMismatch, DiskFull, InputError, StorageError
+from coupole.storage import frame_file
+from coupole.storage.run import ProvenFrame, Run
+
+NO_LED = 65535
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One proven frame with what is known of it."""
+
+    pixels: NDArray[np.uint16]
+    """[H, W] DN, as the camera gave them."""
+    pattern: str
+    """2x2 Bayer pattern from the top left, or MONO."""
+    black_dn: int
+    white_dn: int
+    exposure_us: int
+    about: dict[str, Any]
+    """Goes into the file as JSON: shot, LED, exposure, pose, lens, `simulated`, run."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What `export_run` wrote."""
+
+    files: int
+    bytes: int
+
+
+def export_run(
+    run: Run,
+    to: str,
+    folder: Path,
+    *,
+    views: list[str],
+    shots: list[str],
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Exported:
+    """Write the proven frames whose view and whose label (`led0417/e0`) match any of some patterns (`*` and `?`;
+    none: all) into `folder`, as `<view>_led0417_e0.<to>`.
+
+    Raises InputError if nothing matches or a file stands there already (unless `overwrite`), before anything is
+    written; ChecksumMismatch if a frame is not what was proven, DiskFull or StorageError.
+    """
+    encode = _encoder(to)
+    frames = [
+        frame
+        for shot, frame in run.proven().items()
+        if _matches(shot.split("/")[0], views) and _matches(shot.partition("/")[2], shots)
+    ]
+    if not frames:
+        raise InputError(f"{run.folder}: no proven frame matches; see `coupole status` for its views")
+    paths = {frame.shot: folder / f"{frame.shot.replace('/', '_')}.{to}" for frame in frames}
+    standing = [path for path in paths.values() if path.exists()]
+    if standing and not overwrite:
+        raise InputError(
+            f"{standing[0]}: stands here already ({len(standing)} such files). Choose another --out, or say "
+            "--overwrite."
+        )
+    written = 0
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for done, picture in enumerate(_pictures(run, frames), start=1):
+            written += _write(paths[picture.about["shot"]], encode(picture))
+            progress(done, len(frames))
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise DiskFull(f"{folder}: the disk is full. Free space on it, then export again.") from error
+        raise StorageError(f"{folder}: {error.strerror or error}. Check the disk, then export again.") from error
+    return Exported(len(frames), written)
+
+
+def _encoder(to: str) -> Callable[[Picture], bytes]:
+    from coupole.exchange import dng, tiff
+
+    formats = {"dng": dng.encode, "tiff": tiff.encode}
+    if to not in formats:
+        raise InputError(f"--to: expected one of {', '.join(formats)}; found {to}")
+    return formats[to]
+
+
+def _matches(name: str, patterns: list[str]) -> bool:
+    return not patterns or any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _pictures(run: Run, frames: list[ProvenFrame]) -> Iterator[Picture]:
+    """The frames, in the order of their files and slots."""
+    by_file: dict[str, list[ProvenFrame]] = {}
+    for frame in sorted(frames, key=lambda f: (f.file, f.index)):
+        by_file.setdefault(frame.file, []).append(frame)
+    for name, mine in by_file.items():
+        path = run.folder / name
+        layout, facts, table = (
+            frame_file.read_layout(path),
+            frame_file.read_facts(path),
+            frame_file.read_frames(path),
+        )
+        poses, attributes = _poses_and_attributes(path)
+        for frame in mine:
+            pixels = frame_file.read_frame(path, layout, frame.index)
+            if f"{frame_file.checksum(pixels):016x}" != frame.xxh3:
+                raise ChecksumMismatch(f"{path}: {frame.shot} is not what was proven. See `coupole verify`.")
+            record = table[frame.index]
+            about = {
+                "shot": frame.shot,
+                "run": run.folder.name,
+                "led": None if record["led"] == NO_LED else int(record["led"]),
+                "exposure_us": int(record["exposure_us"]),
+                "board_temperature_c": int(record["board_temperature_dc"]) / 10,
+                "led_current_ma": int(record["led_current_ma"]),
+                "frame_id": frame.frame_id,
+                "xxh3": frame.xxh3,
+                "joints_deg": poses[record["pose"]]["joints_deg"].tolist(),
+                "base_from_camera": poses[record["pose"]]["base_from_camera"].tolist(),
+                **attributes,
+            }
+            yield Picture(pixels, **facts, exposure_us=int(record["exposure_us"]), about=about)
+
+
+def _poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
+    """Measured poses of a view, and what its file says of object, lens and gain, as JSON takes it."""
+    with h5py.File(path, "r") as file:
+        attributes = {k: v for k, v in file["entry"].attrs.items() if k not in ("NX_class", "default")}
+        return file[frame_file.POSES][:], {key: np.asarray(value).tolist() for key, value in attributes.items()}
+
+
+def _write(path: Path, content: bytes) -> int:
+    """A file that is there is whole: it gets its name when its bytes are written."""
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return len(content)

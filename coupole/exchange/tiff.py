@@ -1,0 +1,31 @@
+"""A frame as TIFF: 16 bits, grey, the camera's own numbers; what is known of it is JSON in ImageDescription."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import coupole
+from coupole.exchange.export import Picture
+
+
+def encode(picture: Picture) -> bytes:
+    """The whole file; of a colour sensor it shows the mosaic, whose pattern and levels stand beside the rest."""
+    import tifffile
+
+    about = {
+        **picture.about,
+        "bayer_pattern": picture.pattern,
+        "black_dn": picture.black_dn,
+        "white_dn": picture.white_dn,
+    }
+    buffer = io.BytesIO()
+    tifffile.imwrite(
+        buffer,
+        picture.pixels,
+        photometric="minisblack",
+        description=json.dumps(about),
+        software=f"coupole {coupole.__version__}",
+        metadata=None,
+    )
+    return buffer.getvalue()

@@ -1,0 +1,80 @@
+"""Simulated annealing over the order of groups and the place visited in each; compiled (`motion.ordering`)."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True, nogil=True)
+def anneal(seconds, unease_s, first, order, picked, rolls, hottest_s, coldest_s):  # type: ignore[no-untyped-def]
+    """The best order of groups [n], and the places picked in it [n], that random changes come across.
+
+    `seconds` [places, places] between places, symmetric; place 0 is the start, those of group g are `first[g]` to
+    `first[g + 1] - 1`; `unease_s` [places] is added for each place that is used; `rolls` [changes, 5] are random
+    numbers from 0 to 1.
+
+    A change reverses a stretch of the way, moves a visit elsewhere and to any place of its group, or changes its
+    place only. A worse way is taken with the probability of Metropolis at a temperature that falls geometrically.
+    """
+    n = len(order)
+    order, way = (
+        order.copy(),
+        np.zeros(n + 1, np.int64),
+    )  # visit i, from 1 to n, is at way[i], of group order[i - 1]
+    way[1:] = picked
+    best_order, best_way = order.copy(), way.copy()
+    gained_s, best_gained_s = 0.0, 0.0
+    heat_s, cooling = hottest_s, (coldest_s / hottest_s) ** (1.0 / len(rolls))
+    for roll in range(len(rolls)):
+        heat_s *= cooling
+        kind, i, j = int(3 * rolls[roll, 0]), 1 + int(n * rolls[roll, 1]), 1 + int(n * rolls[roll, 2])
+        group = order[i - 1]
+        place = first[group] + int((first[group + 1] - first[group]) * rolls[roll, 3])
+        if kind == 0:
+            i, j = min(i, j), max(i, j)
+            change_s = _reversed_s(seconds, way, i, j)
+        else:
+            j = i if kind == 1 else j
+            change_s = unease_s[place] - unease_s[way[i]] + _moved_s(seconds, way, i, j, place)
+        if change_s > 0.0 and rolls[roll, 4] >= np.exp(-change_s / heat_s):
+            continue
+        gained_s -= change_s
+        if kind == 0:
+            order[i - 1 : j] = order[i - 1 : j][::-1].copy()
+            way[i : j + 1] = way[i : j + 1][::-1].copy()
+        else:
+            step = 1 if j > i else -1
+            for k in range(i, j, step):
+                order[k - 1], way[k] = order[k - 1 + step], way[k + step]
+            order[j - 1], way[j] = group, place
+        if gained_s > best_gained_s + 1e-9:
+            best_gained_s = gained_s
+            best_order[:], best_way[:] = order, way
+    return best_order, best_way[1:]
+
+
+@numba.njit(cache=True, nogil=True)
+def _reversed_s(seconds, way, i, j):  # type: ignore[no-untyped-def]
+    """What it costs more to do visits i to j the other way round."""
+    change_s = seconds[way[i - 1], way[j]] - seconds[way[i - 1], way[i]]
+    if j + 1 < len(way):
+        change_s += seconds[way[i], way[j + 1]] - seconds[way[j], way[j + 1]]
+    return change_s
+
+
+@numba.njit(cache=True, nogil=True)
+def _moved_s(seconds, way, i, j, place):  # type: ignore[no-untyped-def]
+    """What it costs more to do visit i as the j-th, at another place."""
+    after_i, after_j = i + 1, j if j < i else j + 1
+    before_j = way[j] if j > i else way[j - 1]
+    change_s = seconds[before_j, place] - seconds[way[i - 1], way[i]]
+    if after_j < len(way):
+        change_s += seconds[place, way[after_j]]
+    if after_i < len(way):
+        change_s -= seconds[way[i], way[after_i]]
+    if j != i and after_i < len(way):
+        change_s += seconds[way[i - 1], way[after_i]]
+    if j != i and after_j < len(way):
+        change_s -= seconds[before_j, way[after_j]]
+    return change_s

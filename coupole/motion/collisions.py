@@ -1,0 +1,266 @@
+"""Distances between the bodies of the cell: what the arm must not touch, and by how much.
+
+The arm is a set of capsules that enclose the vendor's link meshes, or those meshes themselves; the camera and an
+allowance for its cables are capsules too. Around it stand the object (its scanned mesh), the support disk, the
+dome seen from inside, and keep-out volumes. All distances are conservative: bodies are unions of balls
+(`motion.sphere_tree`) that enclose what they stand for, and of motions nothing between two checked places is
+missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coupole.geometry import Transform, inverse
+from coupole.kinematics import JOINT_AXES, Arm, axis_senses, joint_origins_mm
+from coupole.motion.bodies import (
+    ARM_CAPSULES,
+    Body,
+    Capsule,
+    bodies_of_capsules,
+    bodies_of_meshes,
+    part_apart,
+    reach_mm,
+)
+from coupole.motion.sphere_tree import MESH_STEP_MM, Balls, Floats, forest_of
+
+REACH_MM = (1600.0, 1500.0, 1000.0, 420.0, 420.0, 250.0)
+"""Farthest that any point of arm and tool may be from axis 1 to 6 (links stretched out, tool of 300 mm)."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Two bodies that come too close."""
+
+    body: str
+    other: str
+    distance_mm: float
+    """Conservative; negative where they overlap."""
+    required_mm: float
+
+    def __str__(self) -> str:
+        how = f"{self.distance_mm:.0f} mm from" if self.distance_mm > 0 else "inside"
+        return f"{self.body} would be {how} {self.other}; {self.required_mm:.3g} mm must be kept"
+
+
+@dataclass(frozen=True)
+class Clearances:
+    """Distances that must be kept, mm."""
+
+    object_mm: float = 50.0
+    support_mm: float = 10.0
+    dome_mm: float = 20.0
+    self_mm: float = 0.0
+    keep_out_mm: float = 0.0
+    tube_mm: float = 0.0
+    """How far the arm may be off its way (`motion.path_deviation`): every pair keeps at least as much as that can
+    bring it together."""
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What stands round the arm, in the support frame."""
+
+    base_from_support: Transform
+    support_radius_mm: float
+    dome_radius_mm: float
+    dome_top_deg: float
+    """Elevation above which the dome is open."""
+    object_points_mm: NDArray[np.float64]
+    """[n, 3] on the object's surface, of which no point is farther than MESH_STEP_MM from one of them."""
+    keep_out_spheres: tuple[tuple[str, tuple[float, float, float], float], ...] = ()
+    keep_out_boxes: tuple[tuple[str, tuple[float, float, float], tuple[float, float, float]], ...] = ()
+
+
+_SELF_PAIRS = {
+    "link 2": ("base",),
+    "link 3": ("base",),
+    "link 4": ("base", "link 1"),
+    "link 5": ("base", "link 1", "link 2"),
+    "link 6": ("base", "link 1", "link 2"),
+    "tool": ("base", "link 1", "link 2", "link 3", "link 4"),
+}
+"""Bodies of the arm that can meet. The others cannot within the joints' limits, with A3's drawn in as
+`coupole.motion.itinerary` does (seen on the vendor's meshes)."""
+
+
+_EVERYDAY_DEG: dict[tuple[str, str], list[tuple[float, ...]]] = {
+    ("link 2", "base"): [(0, -170, 0, 0, 0, 0), (0, 20, 0, 0, 0, 0)],
+    ("tool", "link 4"): [(0, 0, 0, 0, a5, a6) for a5 in (-90, 0, 90) for a6 in range(0, 360, 15)],
+}
+"""Pairs next to each other: what is near in these postures stays so by the joint between them, or is drawn too
+large (an allowance for a camera reaches back over the wrist). The rest can meet when they bend further."""
+_NEIGHBOURLY_MM = 25.0
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A body and what it is kept from: a solid (`kind`, `figures`) or another body (`SHAPE`)."""
+
+    body: Body
+    other_name: str
+    required_mm: float
+    reach_mm: Floats
+    kind: int
+    figures: tuple[float, ...] = ()
+    other: Body | None = None
+
+    def contact(self, margin_mm: float) -> Contact:
+        return Contact(self.body.name, self.other_name, float(margin_mm + self.required_mm), self.required_mm)
+
+
+class CellBodies:
+    """The arm among its surroundings.
+
+    `link_meshes` is a folder with the links' meshes (`motion.bodies.bodies_of_meshes`), which then stand for the
+    arm instead of capsules round them: closer, and slower to check. Raises InputError if they cannot be read.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        surroundings: Surroundings,
+        tool: Sequence[Capsule],
+        clearances: Clearances | None = None,
+        link_meshes: Path | None = None,
+    ) -> None:
+        self._arm, self._around, self._keep = arm, surroundings, clearances or Clearances()
+        self._has_meshes = link_meshes is not None
+        self._links = bodies_of_meshes(link_meshes) if link_meshes else bodies_of_capsules(ARM_CAPSULES)
+        self._tools = bodies_of_capsules(tool)
+        self._pairs = [*self._pairs_with_surroundings(), *self._pairs_of_the_arm()]
+
+    @cached_property
+    def reach_mm(self) -> Floats:
+        """[6] farthest that any point of arm and tool can be from each axis."""
+        reach: Floats = np.max([reach_mm(self._arm, body) for body in (*self._links, *self._tools)], axis=0)
+        return reach
+
+    def margins(self, joints_deg: ArrayLike, far_mm: float = np.inf) -> dict[tuple[str, str], Floats]:
+        """For each pair of bodies, distance minus what must be kept [n], of joint angles [n, 6]; mm, never more
+        than the true value, and never said to be more than `far_mm` (which saves time)."""
+        margins = self._margins(np.atleast_2d(np.asarray(joints_deg, dtype=np.float64)), far_mm)
+        return {(pair.body.name, pair.other_name): margins[:, n] for n, pair in enumerate(self._pairs)}
+
+    def tightest_mm(self, joints_deg: ArrayLike) -> Floats:
+        """[n] the least of all margins where it is negative, else 0; of joint angles [n, 6]."""
+        tightest: Floats = self._margins(np.asarray(joints_deg, dtype=np.float64), 0.0).min(axis=1)
+        return tightest
+
+    def contacts(self, joints_deg: ArrayLike) -> list[Contact]:
+        """What comes too close in one place [6] of the arm, nearest first."""
+        (margins,) = self._margins(np.asarray(joints_deg, dtype=np.float64)[None], 0.0)
+        order = np.argsort(margins, kind="stable")
+        return [self._pairs[n].contact(margins[n]) for n in order if margins[n] < 0.0]
+
+    def is_clear(self, from_deg: Floats, to_deg: Floats) -> bool:
+        """True if nothing comes too close on a straight motion in joint space."""
+        from coupole.motion.distances import CLEAR, blocked_at
+
+        return bool(blocked_at(self._model, from_deg, to_deg)[0] == CLEAR)
+
+    def contact_on_the_way(self, from_deg: ArrayLike, to_deg: ArrayLike) -> Contact | None:
+        """The first contact found on a straight motion in joint space, None if there is none."""
+        from coupole.motion.distances import CLEAR, blocked_at
+
+        start, end = np.asarray(from_deg, dtype=np.float64), np.asarray(to_deg, dtype=np.float64)
+        pair, share, moved_mm = blocked_at(self._model, start, end)
+        if pair == CLEAR:
+            return None
+        margin_mm = self._margins((start + share * (end - start))[None], np.inf)[0, pair]
+        contact: Contact = self._pairs[pair].contact(margin_mm if margin_mm < 0.0 else margin_mm - moved_mm)
+        return contact
+
+    def _margins(self, joints_deg: Floats, far_mm: float) -> Floats:
+        from coupole.motion.distances import margins_at
+
+        margins: Floats = margins_at(self._model, joints_deg, float(far_mm))
+        return margins
+
+    # -- what is kept apart -------------------------------------------------------------------------------
+
+    def _pairs_with_surroundings(self) -> list[_Pair]:
+        from coupole.motion.distances import BOX, DISK, DOME, SHAPE, SPHERE, SUPPORT_FRAME
+
+        around, keep = self._around, self._keep
+        top = np.radians(around.dome_top_deg)
+        solids: list[tuple[str, float, int, tuple[float, ...]]] = [
+            ("the support", keep.support_mm, DISK, (around.support_radius_mm,)),
+            ("the dome", keep.dome_mm, DOME, (around.dome_radius_mm, float(np.sin(top)), float(np.cos(top)))),
+        ]
+        solids += [
+            (f"keep-out `{name}`", keep.keep_out_mm, SPHERE, (*center, radius))
+            for name, center, radius in around.keep_out_spheres
+        ]
+        solids += [
+            (f"keep-out `{name}`", keep.keep_out_mm, BOX, (*low, *high))
+            for name, low, high in around.keep_out_boxes
+        ]
+        points = around.object_points_mm
+        shape = Body("the object", SUPPORT_FRAME, Balls(points, np.full(len(points), MESH_STEP_MM)))
+        pairs = []
+        for body in (*self._tools, *self._links[:0:-1]):
+            reach = reach_mm(self._arm, body)
+            if len(points):
+                required_mm = self._required_mm(keep.object_mm, reach)
+                pairs.append(_Pair(body, shape.name, required_mm, reach, SHAPE, other=shape))
+            pairs += [
+                _Pair(body, name, self._required_mm(keep_mm, reach), reach, kind, figures)
+                for name, keep_mm, kind, figures in solids
+            ]
+        return pairs
+
+    def _pairs_of_the_arm(self) -> list[_Pair]:
+        from coupole.motion.distances import SHAPE
+
+        pairs = []
+        for body in (*self._tools, *self._links):
+            kind = "tool" if body in self._tools else body.name
+            for other in self._links:
+                if other.name not in _SELF_PAIRS.get(kind, ()):
+                    continue
+                drawn_large = kind == "tool" or not self._has_meshes
+                everyday = _EVERYDAY_DEG.get((kind, other.name)) if drawn_large else None
+                part = part_apart(self._arm, body, other, everyday, _NEIGHBOURLY_MM) if everyday else body
+                if part is not None:
+                    reach = reach_mm(self._arm, part, from_link=other.link)
+                    required_mm = self._required_mm(self._keep.self_mm, reach)
+                    pairs.append(_Pair(part, f"the arm's {other.name}", required_mm, reach, SHAPE, other=other))
+        return pairs
+
+    def _required_mm(self, keep_mm: float, reach: Floats) -> float:
+        """What a pair must keep: the rig's clearance, and in any case what an arm off its way by the tube's width
+        could take from it. `off_the_way_mm` counts each axis' deviation times REACH_MM, the pair feels it times
+        its own reach."""
+        return max(keep_mm, self._keep.tube_mm * float((reach / np.array(REACH_MM)).max()))
+
+    @cached_property
+    def _model(self) -> Any:
+        """All that as the compiled functions want it."""
+        from coupole.motion.distances import SUPPORT_FRAME, Model
+
+        all_bodies = [body for pair in self._pairs for body in (pair.body, pair.other) if body is not None]
+        bodies = list({id(body): body for body in all_bodies}.values())
+        tree_of = {id(body): tree for tree, body in enumerate(bodies)}
+        numbers, figures = [], np.zeros((len(self._pairs), 13))
+        for row, pair in zip(figures, self._pairs, strict=True):
+            other = pair.other or pair.body
+            on_link = pair.other.link if pair.other and pair.other.link != SUPPORT_FRAME else 0
+            trees = tree_of[id(pair.body)], tree_of[id(other)]
+            numbers.append((trees[0], pair.body.link, pair.kind, trees[1], other.link, on_link))
+            row[0], row[1:7] = pair.required_mm, pair.reach_mm
+            row[7 : 7 + len(pair.figures)] = pair.figures
+        return Model(
+            inverse(self._around.base_from_support),
+            np.column_stack([joint_origins_mm(self._arm), axis_senses(self._arm), JOINT_AXES]),
+            *forest_of([body.balls for body in bodies]),
+            np.array(numbers),
+            figures,
+        )

@@ -1,0 +1,266 @@
+"""Compiled distances between an arm made of balls and what stands round it; `motion.collisions` is the way in.
+
+Every obstacle is a function that says how far a point is from it, negative inside, and that never changes by more
+than the point moves. So the least distance to a whole tree of balls is found by looking only into those nodes
+whose bounding ball could come nearer than what was found already.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+DISK, DOME, SPHERE, BOX, SHAPE = range(5)
+"""Kinds of obstacles: the disk and all below it, the dome and all beyond it, keep-outs, another tree of balls."""
+SUPPORT_FRAME = 8
+"""Number of the support's frame among the links' (0 the base, 1 to 6 the links, 7 the flange)."""
+RESOLUTION_MM = 2.0
+"""A stretch of a motion as short as this that cannot be called clear is called blocked."""
+ROUNDING_MM = 1e-9
+CLEAR = -1
+
+
+class Model(NamedTuple):
+    """Arm, shapes and what is kept apart, as arrays."""
+
+    base: NDArray[np.float64]
+    """[4, 4] `support_from_base`, mm."""
+    joints: NDArray[np.float64]
+    """[6, 5] of each joint its origin in the frame of the link before (mm), its sense (1 or -1), its axis (0 x,
+    1 y, 2 z)."""
+    nodes: NDArray[np.float64]
+    trees: NDArray[np.int64]
+    """The `Forest` of all shapes."""
+    numbers: NDArray[np.int64]
+    """[pairs, 6] a tree and its link; the kind of obstacle; of SHAPE the other tree and its link; the link against
+    which the tree moves (0 where the obstacle stands still)."""
+    figures: NDArray[np.float64]
+    """[pairs, 13] 0: what must be kept, mm; 1 to 6: how far the two can move against each other for each radian of
+    an axis, mm; 7 on: DISK radius; DOME radius, sine and cosine of the opening's elevation; SPHERE centre, radius;
+    BOX lowest and highest corner."""
+
+
+# Written with numbers, not with rows and slices: compiling takes seconds less.
+
+
+@numba.njit(cache=True, nogil=True)
+def place_links(base, joints, joints_deg, frames):  # type: ignore[no-untyped-def]
+    """Fill `frames` [9, 3, 4], rotation and origin of each link's frame in the support's."""
+    for r in range(3):
+        for q in range(4):
+            frames[0, r, q] = base[r, q]
+            frames[SUPPORT_FRAME, r, q] = 1.0 if r == q else 0.0
+    for k in range(6):
+        angle = joints[k, 3] * joints_deg[k] * (np.pi / 180.0)
+        c, s = np.cos(angle), np.sin(angle)
+        axis = int(joints[k, 4])
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        for r in range(3):
+            frames[k + 1, r, axis] = frames[k, r, axis]
+            frames[k + 1, r, i] = c * frames[k, r, i] + s * frames[k, r, j]
+            frames[k + 1, r, j] = c * frames[k, r, j] - s * frames[k, r, i]
+            frames[k + 1, r, 3] = frames[k, r, 3]
+            for q in range(3):
+                frames[k + 1, r, 3] += frames[k, r, q] * joints[k, q]
+    for r in range(3):  # the flange's z axis is link 6's x axis, its x axis points against link 6's z axis
+        frames[7, r, 0], frames[7, r, 1] = -frames[6, r, 2], frames[6, r, 1]
+        frames[7, r, 2], frames[7, r, 3] = frames[6, r, 0], frames[6, r, 3]
+
+
+@numba.njit(cache=True, nogil=True)
+def _length(x, y, z):  # type: ignore[no-untyped-def]
+    return np.sqrt(x * x + y * y + z * z)
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_solid(kind, figures, pair, x, y, z):  # type: ignore[no-untyped-def]
+    """Distance of a point of the support frame to a DISK, DOME, SPHERE or BOX; negative inside."""
+    f0, f1, f2, f3 = figures[pair, 7], figures[pair, 8], figures[pair, 9], figures[pair, 10]
+    if kind == SPHERE:
+        return _length(x - f0, y - f1, z - f2) - f3
+    if kind == BOX:
+        out_x = max(f0 - x, x - f3)
+        out_y = max(f1 - y, y - figures[pair, 11])
+        out_z = max(f2 - z, z - figures[pair, 12])
+        deepest = max(out_x, out_y, out_z)
+        return deepest if deepest <= 0.0 else _length(max(out_x, 0.0), max(out_y, 0.0), max(out_z, 0.0))
+    out = _length(x, y, 0.0)
+    if kind == DISK:
+        beside = out - f0
+        return max(beside, z) if beside <= 0.0 or z <= 0.0 else _length(beside, z, 0.0)
+    along, above = out * f2 + z * f1, z * f2 - out * f1  # from the ray on which the rim of the opening lies
+    if above > 0.0:
+        return above if along >= f0 else _length(along - f0, above, 0.0)
+    inside = f0 - _length(out, z, 0.0)
+    return max(inside, above) if inside < 0.0 and along > f0 else inside  # beyond the shell all is forbidden
+
+
+@numba.njit(cache=True, nogil=True)
+def _after(i):  # type: ignore[no-untyped-def]
+    """The node that follows node i and all below it; 0 after the last."""
+    while i & 1:
+        i >>= 1
+    return i + 1 if i else 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_node(nodes, n, x, y, z):  # type: ignore[no-untyped-def]
+    return _length(x - nodes[n, 0], y - nodes[n, 1], z - nodes[n, 2]) - nodes[n, 3]
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_tree(nodes, begin, first_leaf, x, y, z, best, hasty):  # type: ignore[no-untyped-def]
+    """Distance of a point, in the tree's own frame, to the nearest of its balls; `best` if that is less. If it is
+    `hasty`, to any ball that is nearer than `best`, probably one of the nearest."""
+    if _to_node(nodes, begin + 1, x, y, z) >= best:
+        return best
+    i = 1
+    while i < first_leaf:
+        nearer = _to_node(nodes, begin + 2 * i, x, y, z) <= _to_node(nodes, begin + 2 * i + 1, x, y, z)
+        i = 2 * i if nearer else 2 * i + 1
+    away = _to_node(nodes, begin + i, x, y, z)
+    if away < best and hasty:
+        return away
+    best = min(best, away)
+    i = 1
+    while i:
+        away = _to_node(nodes, begin + i, x, y, z)
+        if away >= best:
+            i = _after(i)
+        elif i < first_leaf:
+            i *= 2
+        elif hasty:
+            return away
+        else:
+            best = away
+            i = _after(i)
+    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_obstacle(nodes, trees, numbers, figures, frames, pair, n, best, hasty):  # type: ignore[no-untyped-def]
+    """Distance of node n, in the frame of the pair's link, to the pair's obstacle; `best` if that is less, and
+    `hasty` as `_to_tree`."""
+    link, other = numbers[pair, 1], numbers[pair, 4]
+    bx, by, bz, radius = nodes[n, 0], nodes[n, 1], nodes[n, 2], nodes[n, 3]
+    x = frames[link, 0, 0] * bx + frames[link, 0, 1] * by + frames[link, 0, 2] * bz + frames[link, 0, 3]
+    y = frames[link, 1, 0] * bx + frames[link, 1, 1] * by + frames[link, 1, 2] * bz + frames[link, 1, 3]
+    z = frames[link, 2, 0] * bx + frames[link, 2, 1] * by + frames[link, 2, 2] * bz + frames[link, 2, 3]
+    if numbers[pair, 2] != SHAPE:
+        return _to_solid(numbers[pair, 2], figures, pair, x, y, z) - radius
+    x, y, z = x - frames[other, 0, 3], y - frames[other, 1, 3], z - frames[other, 2, 3]
+    own_x = frames[other, 0, 0] * x + frames[other, 1, 0] * y + frames[other, 2, 0] * z
+    own_y = frames[other, 0, 1] * x + frames[other, 1, 1] * y + frames[other, 2, 1] * z
+    own_z = frames[other, 0, 2] * x + frames[other, 1, 2] * y + frames[other, 2, 2] * z
+    tree = numbers[pair, 3]
+    return _to_tree(nodes, trees[tree, 0], trees[tree, 1], own_x, own_y, own_z, best + radius, hasty) - radius
+
+
+@numba.njit(cache=True, nogil=True)
+def _margin(nodes, trees, numbers, figures, frames, pair, far, hasty):  # type: ignore[no-untyped-def]
+    """Least distance of a pair minus what it must keep; `far` if that is less. If it is `hasty`, what is found
+    first of anything less than `far`."""
+    begin, first_leaf = trees[numbers[pair, 0], 0], trees[numbers[pair, 0], 1]
+    required = figures[pair, 0]
+    best = far
+    i = 1
+    while i:
+        reached = best + required
+        margin = _to_obstacle(nodes, trees, numbers, figures, frames, pair, begin + i, reached, hasty) - required
+        if margin > best - ROUNDING_MM:
+            i = _after(i)
+        elif i < first_leaf:
+            i *= 2
+        elif hasty:
+            return margin
+        else:
+            best = margin
+            i = _after(i)
+    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def _moved_mm(nodes, trees, numbers, figures, joints, frames, pair, turned):  # type: ignore[no-untyped-def]
+    """How far a pair can move against each other while the axes turn by at most `turned` [6] radians from a place.
+
+    A point moves by no more than each axis' turn times its greatest distance from that axis meanwhile, which is
+    the distance now and what the axes farther out move the point.
+    """
+    n, link = trees[numbers[pair, 0], 0] + 1, numbers[pair, 1]
+    bx, by, bz, radius = nodes[n, 0], nodes[n, 1], nodes[n, 2], nodes[n, 3]
+    x = frames[link, 0, 0] * bx + frames[link, 0, 1] * by + frames[link, 0, 2] * bz + frames[link, 0, 3]
+    y = frames[link, 1, 0] * bx + frames[link, 1, 1] * by + frames[link, 1, 2] * bz + frames[link, 1, 3]
+    z = frames[link, 2, 0] * bx + frames[link, 2, 1] * by + frames[link, 2, 2] * bz + frames[link, 2, 3]
+    moved = 0.0
+    for k in range(min(link, 6) - 1, numbers[pair, 5] - 1, -1):
+        axis = int(joints[k, 4])
+        ux, uy, uz = frames[k + 1, 0, axis], frames[k + 1, 1, axis], frames[k + 1, 2, axis]
+        dx, dy, dz = x - frames[k + 1, 0, 3], y - frames[k + 1, 1, 3], z - frames[k + 1, 2, 3]
+        away = _length(uy * dz - uz * dy, uz * dx - ux * dz, ux * dy - uy * dx)
+        moved += turned[k] * min(figures[pair, 1 + k], away + radius + moved)
+    return moved
+
+
+@numba.njit(cache=True, nogil=True)
+def margins_at(model, joints_deg, far_mm):  # type: ignore[no-untyped-def]
+    """Distance minus what must be kept [n, pairs] with the arm at `joints_deg` [n, 6]; nothing above `far_mm`."""
+    frames = np.empty((9, 3, 4))
+    margins = np.empty((joints_deg.shape[0], model.numbers.shape[0]))
+    for n in range(margins.shape[0]):
+        place_links(model.base, model.joints, joints_deg[n], frames)
+        for pair in range(margins.shape[1]):
+            margins[n, pair] = _margin(
+                model.nodes, model.trees, model.numbers, model.figures, frames, pair, far_mm, False
+            )
+    return margins
+
+
+@numba.njit(cache=True, nogil=True)
+def blocked_at(model, start_deg, end_deg):  # type: ignore[no-untyped-def]
+    """The first pair found to come too close on a straight motion in joint space, CLEAR if none does; where on the
+    way (0 to 1), and how far the pair can move against each other within the stretch that was looked at, mm.
+
+    A stretch is clear if, in its middle, each pair is farther apart than it can come together from there to the
+    stretch's ends; other stretches are halved.
+    """
+    numbers, figures = model.numbers, model.figures
+    frames, here_deg, turned = np.empty((9, 3, 4)), np.empty(6), np.empty(6)
+    most_mm = 0.0
+    for pair in range(numbers.shape[0]):
+        moved = 0.0
+        for k in range(6):
+            moved += figures[pair, 1 + k] * abs(end_deg[k] - start_deg[k]) * (np.pi / 180.0)
+        most_mm = max(most_mm, moved)
+    size = int(2.0 * most_mm / RESOLUTION_MM) + 4
+    middles, unclear = np.empty(size), np.empty(size)
+    middles[0], count, half = 0.5, 1, 0.5
+    while count:
+        found = 0
+        for k in range(6):
+            turned[k] = half * abs(end_deg[k] - start_deg[k]) * (np.pi / 180.0)
+        for m in range(count):
+            for k in range(6):
+                here_deg[k] = start_deg[k] + middles[m] * (end_deg[k] - start_deg[k])
+            place_links(model.base, model.joints, here_deg, frames)
+            for pair in range(numbers.shape[0]):
+                first = pair == 0 or numbers[pair, 0] != numbers[pair - 1, 0]
+                if first or numbers[pair, 5] != numbers[pair - 1, 5]:
+                    moved = _moved_mm(
+                        model.nodes, model.trees, numbers, figures, model.joints, frames, pair, turned
+                    )
+                margin = _margin(model.nodes, model.trees, numbers, figures, frames, pair, moved, True)
+                if margin == moved:
+                    continue
+                if margin < 0.0 or moved < RESOLUTION_MM:
+                    return pair, middles[m], moved
+                unclear[found] = middles[m]
+                found += 1
+                break
+        half /= 2.0
+        for m in range(found):
+            middles[2 * m], middles[2 * m + 1] = unclear[m] - half, unclear[m] + half
+        count = 2 * found
+    return CLEAR, 0.0, 0.0

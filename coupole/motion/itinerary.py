@@ -1,0 +1,175 @@
+"""From views to motions: a posture of the arm for each view, and ways between them that touch nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole import kinematics
+from coupole.geometry import Transform, inverse
+from coupole.motion import singularities
+from coupole.motion.bodies import Capsule
+from coupole.motion.collisions import REACH_MM, CellBodies, Clearances, Surroundings
+from coupole.motion.ordering import shortest_tour
+from coupole.motion.path_deviation import TUBE_MM
+from coupole.motion.path_planner import Joints, Leg, PathPlanner
+from coupole.motion.sphere_tree import surface_points
+from coupole.plan.led_table import LedTable
+from coupole.plan.rig import KeepOutBox, KeepOutSphere, Rig
+from coupole.plan.shots import ViewPose
+
+ELBOW_LIMITS_DEG = (-115.0, 154.0)
+"""A3's limits, closer than the data sheet's: beyond them link 4 comes too near to link 2 (seen on the vendor's
+meshes: 6 mm at these angles, 9 mm at 150 deg, touching at -119 deg), and capsules are too coarse to tell."""
+UNEASE_S = 0.3
+"""So much time a posture may cost that is farther from limits and singularities."""
+
+
+@dataclass(frozen=True)
+class Visit:
+    """One view on the way: the joint angles there [6] and the leg that leads to them."""
+
+    joints_deg: Joints
+    leg: Leg
+
+
+@dataclass(frozen=True)
+class Itinerary:
+    """Visits, one for each view, None where a view cannot be visited; why not is in `refusals`."""
+
+    visits: tuple[Visit | None, ...]
+    refusals: tuple[str, ...]
+    order: tuple[int, ...]
+    """Which view is visited when; each visit's leg begins at the one before it here. Views that are refused are
+    left out."""
+
+
+def arm_of(rig: Rig) -> kinematics.Arm:
+    """The rig's arm with the speeds and limits that plans are run at."""
+    arm = kinematics.slowed(
+        kinematics.KR10_R1100_SIXX,
+        speed_fraction=rig.motion.speed_fraction,
+        acceleration_deg_s2=rig.motion.acceleration_deg_s2,
+        jerk_deg_s3=rig.motion.jerk_deg_s3,
+    )
+    return replace(arm, limits_deg=(*arm.limits_deg[:2], ELBOW_LIMITS_DEG, *arm.limits_deg[3:]))
+
+
+def bodies_of(
+    rig: Rig, leds: LedTable, object_corners_support_mm: NDArray[np.float64], link_meshes: Path | None = None
+) -> CellBodies:
+    """The rig's arm, tool and surroundings, with the object's mesh ([triangles, 3, 3], support frame).
+
+    `link_meshes` is a folder of meshes that stand for the arm's links instead of capsules round them; InputError
+    if they cannot be read.
+    """
+    base_from_support = rig.support.base_from_support.matrix()
+    support_from_base = inverse(base_from_support)
+    leds_mm = leds.positions_mm @ support_from_base[:3, :3].T + support_from_base[:3, 3]
+    radius_mm = np.linalg.norm(leds_mm, axis=1)
+    elevation_deg = np.degrees(np.arcsin(leds_mm[:, 2] / radius_mm))
+    keep = rig.clearances
+    return CellBodies(
+        kinematics.KR10_R1100_SIXX,
+        Surroundings(
+            base_from_support,
+            rig.support.diameter_mm / 2,
+            float(radius_mm.min()),
+            float(elevation_deg.max()),
+            surface_points(object_corners_support_mm),
+            tuple((k.name, k.center_mm, k.radius_mm) for k in rig.keep_out if isinstance(k, KeepOutSphere)),
+            tuple((k.name, k.min_mm, k.max_mm) for k in rig.keep_out if isinstance(k, KeepOutBox)),
+        ),
+        [Capsule(body.name, 7, body.from_mm, body.to_mm, body.radius_mm) for body in rig.tool],
+        Clearances(keep.object_mm, keep.support_mm, keep.dome_mm, keep.self_mm, keep.keep_out_mm, TUBE_MM),
+        link_meshes,
+    )
+
+
+def base_from_flange(view: ViewPose, rig: Rig) -> Transform:
+    """Where the flange must be for a view that is given as a camera pose."""
+    assert view.support_from_camera is not None
+    base_from_camera = rig.support.base_from_support.matrix() @ view.support_from_camera
+    flange: Transform = base_from_camera @ inverse(rig.flange_from_camera.matrix())
+    return flange
+
+
+def plan_itinerary(
+    views: Sequence[ViewPose],
+    rig: Rig,
+    bodies: CellBodies | None,
+    start_deg: Sequence[float],
+    order: Literal["fastest", "as_written"] = "fastest",
+) -> Itinerary:
+    """Order, postures and legs of views, shortest in all from where the arm stands; or in the order given.
+
+    Without `bodies` nothing is in the way: times of straight motions only.
+    """
+    arm = arm_of(rig)
+    planner = PathPlanner(arm, bodies, [rig.motion.home_joints_deg])
+    refusals = _rig_refusals(rig, bodies)
+    choices: dict[int, NDArray[np.float64]] = {}
+    for index, view in enumerate(views):
+        postures, why_not = _postures(view, rig, bodies)
+        if why_not:
+            refusals.append(f"view {view.name}: {why_not}")
+        else:
+            choices[index] = postures
+    start = np.asarray(start_deg, dtype=np.float64)
+    while True:
+        unease_s = [UNEASE_S * singularities.unease(arm, postures) for postures in choices.values()]
+        tour = shortest_tour(planner, start, list(choices.values()), unease_s, as_written=order == "as_written")
+        visited = [list(choices)[group] for group in tour.order]
+        contacts = [leg.contact for leg in tour.legs]
+        cut_off = next((k for k, contact in enumerate(contacts) if contact is not None), None)
+        if cut_off is None:
+            break
+        before = f"view {views[visited[cut_off - 1]].name}" if cut_off else "where the arm stands"
+        name = views[visited[cut_off]].name
+        refusals.append(f"view {name}: no way to it was found from {before}: {contacts[cut_off]}")
+        del choices[visited[cut_off]]  # what comes after it may be reached without it
+    visits: list[Visit | None] = [None] * len(views)
+    for index, joints, leg in zip(visited, tour.places, tour.legs, strict=True):
+        visits[index] = Visit(joints, leg)
+    return Itinerary(tuple(visits), tuple(refusals), tuple(visited))
+
+
+def _rig_refusals(rig: Rig, bodies: CellBodies | None) -> list[str]:
+    """What no plan on this rig could make good."""
+    refusals = []
+    if violation := kinematics.limit_violations(arm_of(rig), rig.motion.home_joints_deg):
+        refusals.append(f"rig: at home {violation}")
+    if bodies is not None:
+        refusals += [
+            f"rig: a part of arm or tool may be {reach:.0f} mm from axis A{axis}; at most {most:g} mm are watched"
+            for axis, (reach, most) in enumerate(zip(bodies.reach_mm, REACH_MM, strict=True), start=1)
+            if reach > most
+        ]
+    return refusals
+
+
+def _postures(view: ViewPose, rig: Rig, bodies: CellBodies | None) -> tuple[NDArray[np.float64], str]:
+    """Joint angles [k, 6] that give a view, touch nothing and are no singularity, or why there are none."""
+    arm = arm_of(rig)
+    if view.joints_deg is not None:
+        postures = np.array([view.joints_deg], dtype=np.float64)
+        if violation := kinematics.limit_violations(arm, view.joints_deg):
+            return postures, violation
+    else:
+        pose = base_from_flange(view, rig)
+        postures = kinematics.inverse(arm, pose)
+        if len(postures) == 0:
+            return postures, kinematics.unreachable_reason(arm, pose)
+    tightest_mm = bodies.tightest_mm(postures) if bodies is not None else np.zeros(len(postures))
+    if bodies is not None and tightest_mm.max() < 0:
+        return postures, str(bodies.contacts(postures[int(np.argmax(tightest_mm))])[0])
+    postures = postures[tightest_mm >= 0]
+    margin = singularities.margin(arm, postures)
+    if margin.max() < 1.0:
+        return postures, singularities.reason(arm, postures[int(np.argmax(margin))])
+    return postures[margin >= 1.0], ""

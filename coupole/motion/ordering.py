@@ -1,0 +1,180 @@
+"""The order of views and their postures that make the whole way shortest.
+
+Which view comes when, and with which of the arm's solutions, is one problem: a travelling salesman who visits one
+place of each group (a generalised TSP; Noon, Bean 1993), on an open way from where the arm stands. To find the
+true time of a leg is dear, that of the straight motion is cheap and never more. So a way is sought under straight
+times; whether its legs are clear is looked at, then those that are not are found; what was learnt takes the place
+of the straight times, and so on until a way is best whose legs are all known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.motion.path_planner import Joints, Leg, PathPlanner
+
+Floats = NDArray[np.float64]
+
+_RESTARTS, _ROUNDS = 3, 200
+_CHANGES_PER_PLACE, _MOST_CHANGES = 2_000, 600_000
+_AGAIN = 0.03
+"""Share of the changes, and of the first temperature, when a way is sought again after some legs were learnt."""
+_COLDEST_S = 1e-3
+_DETOUR_S = 0.5
+"""What a way round something costs at least, as a rule: another stop. Until it is known, that is added."""
+
+
+@dataclass(frozen=True)
+class Tour:
+    """Groups in the order of the visits, the place chosen in each, and the leg that leads there."""
+
+    order: tuple[int, ...]
+    places: tuple[Joints, ...]
+    legs: tuple[Leg, ...]
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """Places as numbers: 0 is the start, those of group g are `first[g]` to `first[g + 1] - 1`."""
+
+    places: Floats
+    first: NDArray[np.int64]
+    unease_s: Floats
+    """[places] what is added to the time of a way that uses a place."""
+
+
+def shortest_tour(
+    planner: PathPlanner,
+    start: Joints,
+    choices: Sequence[NDArray[np.float64]],
+    unease_s: Sequence[Floats],
+    *,
+    as_written: bool = False,
+) -> Tour:
+    """One place of each group (`choices` [k, 6] each) and the legs between, shortest in all, from `start` on.
+
+    `unease_s` [k] each is added to a place's time, so that of nearly equal ways the easier is taken. With
+    `as_written` the order of the groups stays. The same arguments give the same tour.
+    """
+    if not choices:
+        return Tour((), (), ())
+    groups = _Groups(
+        np.concatenate([start[None], *choices]),
+        np.cumsum([1, *(len(c) for c in choices)]),
+        np.concatenate([[0.0], *unease_s]),
+    )
+    times = _Times(planner, groups.places)
+    order = np.arange(len(choices))
+    best, best_s = (order, order), np.inf
+    for seed in range(1 if as_written else _RESTARTS):
+        order, picked = _settled(times, groups, order, seed, as_written=as_written)
+        total_s = _way_s(times.seconds, groups, picked)
+        if total_s < best_s:
+            best, best_s = (order, picked), total_s
+    order, picked = best
+    places = [start, *groups.places[picked]]
+    return Tour(tuple(order.tolist()), tuple(places[1:]), tuple(planner.leg(a, b) for a, b in pairwise(places)))
+
+
+def _settled(
+    times: _Times, groups: _Groups, order: NDArray[np.int64], seed: int, *, as_written: bool
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """An order and the places picked in it that are still best when all legs of the way are known."""
+    picked = _best_places(times.seconds, groups, order)
+    for count in range(_ROUNDS):
+        if not as_written and len(order) > 1:
+            order, picked = _best_order(times.seconds, groups, order, picked, seed, again=count > 0)
+        picked = _best_places(times.seconds, groups, order)
+        news = False
+        while times.learn_blocked(picked):
+            news, picked = True, _best_places(times.seconds, groups, order)
+        if not news and not times.learn_detours(picked):
+            break
+    times.learn_detours(picked)
+    return order, picked
+
+
+class _Times:
+    """Times `seconds` [places, places] of legs, as far as they are known: at first of straight motions."""
+
+    def __init__(self, planner: PathPlanner, places: Floats) -> None:
+        self._planner, self._places = planner, places
+        self.seconds = planner.straight_s(places)
+        self._looked_at = np.zeros(self.seconds.shape, dtype=bool)
+        self._to_find: set[tuple[int, int]] = set()
+
+    def learn_blocked(self, picked: NDArray[np.int64]) -> bool:
+        """Look whether the straight motions of a way are clear; True if one is not; it costs a detour more now."""
+        blocked = False
+        for a, b in self._legs(picked):
+            if not self._looked_at[a, b]:
+                self._looked_at[a, b] = self._looked_at[b, a] = True
+                if not self._planner.is_straight(self._places[a], self._places[b]):
+                    blocked = True
+                    self._to_find.add((a, b))
+                    self._set(a, b, self.seconds[a, b] + _DETOUR_S)
+        return blocked
+
+    def learn_detours(self, picked: NDArray[np.int64]) -> bool:
+        """Find the legs of a way that are not straight; True if there was one to be found."""
+        wanted = self._to_find.intersection(self._legs(picked))
+        for a, b in sorted(wanted):
+            self._set(a, b, self._planner.leg(self._places[a], self._places[b]).duration_s)
+        self._to_find -= wanted
+        return bool(wanted)
+
+    def _legs(self, picked: NDArray[np.int64]) -> list[tuple[int, int]]:
+        return [(min(a, b), max(a, b)) for a, b in pairwise([0, *picked.tolist()])]
+
+    def _set(self, a: int, b: int, seconds: float) -> None:
+        self.seconds[a, b] = self.seconds[b, a] = seconds
+
+
+def _way_s(seconds: Floats, groups: _Groups, picked: NDArray[np.int64]) -> float:
+    way = np.concatenate([[0], picked])
+    return float(seconds[way[:-1], way[1:]].sum() + groups.unease_s[picked].sum())
+
+
+def _best_places(seconds: Floats, groups: _Groups, order: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The place of each group that makes the way in a given order shortest, by dynamic programming."""
+    before, total_s = slice(0, 1), np.zeros(1)
+    came_from = []
+    for group in order:
+        here = slice(groups.first[group], groups.first[group + 1])
+        costs_s = total_s[:, None] + seconds[before, here]
+        came_from.append(costs_s.argmin(axis=0))
+        before, total_s = here, costs_s.min(axis=0) + groups.unease_s[here]
+    k = int(total_s.argmin())
+    picked = []
+    for group, back in zip(order[::-1], came_from[::-1], strict=True):
+        picked.append(groups.first[group] + k)
+        k = int(back[k])
+    return np.array(picked[::-1])
+
+
+def _best_order(
+    seconds: Floats,
+    groups: _Groups,
+    order: NDArray[np.int64],
+    picked: NDArray[np.int64],
+    seed: int,
+    *,
+    again: bool,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """A better order, by simulated annealing from the one given; warm when it is sought `again`."""
+    from coupole.motion.annealing import anneal
+
+    share = _AGAIN if again else 1.0
+    changes = int(share * min(_CHANGES_PER_PLACE * len(groups.places), _MOST_CHANGES))
+    hottest_s = max(share * float(np.median(seconds[0, 1:])), 2 * _COLDEST_S)
+    rolls = np.random.default_rng(seed).random((changes, 5))
+    found: tuple[Any, Any] = anneal(
+        seconds, groups.unease_s, groups.first, order, picked, rolls, hottest_s, _COLDEST_S
+    )
+    return found

@@ -1,0 +1,211 @@
+"""Ways of the arm between places that touch nothing.
+
+A *leg* brings the arm from one view to the next: straight in joint space where that is clear, else over via
+points, else along paths that RRT-Connect finds (Kuffner, LaValle 2000: two trees that grow towards each other) to
+and from a resting place, shortened afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.kinematics import Arm, move_durations_s
+from coupole.motion.collisions import CellBodies, Contact
+
+Joints = NDArray[np.float64]
+
+_RRT_STEP_DEG = 15.0
+_RRT_TRIES = 300
+_SHORTCUTS = 40
+NO_WAY_S = 1e6
+
+
+@dataclass(frozen=True)
+class Leg:
+    """One motion: `waypoints` [k, 6] in degrees after the start, the last is the goal; empty if there is none."""
+
+    waypoints: tuple[Joints, ...]
+    duration_s: float
+    contact: Contact | None = None
+    """Where there is no way: what stands in it."""
+
+
+class PathPlanner:
+    """Legs among the cell's bodies, remembered; without bodies every straight motion is taken as clear.
+
+    The way back is the way there reversed, and what is found does not depend on what was asked before.
+    """
+
+    def __init__(
+        self, arm: Arm, bodies: CellBodies | None, vias_deg: Sequence[Sequence[float]], seed: int = 1
+    ) -> None:
+        self._arm, self._bodies, self._seed = arm, bodies, seed
+        self._vias = [np.asarray(via, dtype=np.float64) for via in vias_deg]
+        self._straight: dict[tuple[bytes, bytes], bool] = {}
+        self._chains: dict[tuple[bytes, bytes], list[Joints] | Contact] = {}
+        self._from_via: dict[tuple[int, bytes], list[Joints] | None] = {}
+
+    def straight_s(self, places_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Times [n, n] of straight motions between places [n, 6], clear or not; lower bounds of the legs'."""
+        return move_durations_s(self._arm, places_deg[:, None], places_deg)
+
+    def is_straight(self, start: Joints, goal: Joints) -> bool:
+        """True if nothing is in the way of the straight motion."""
+        a, b = _sorted(start, goal)
+        key = (a.tobytes(), b.tobytes())
+        if key not in self._straight:
+            self._straight[key] = self._clear(a, b)
+        return self._straight[key]
+
+    def leg(self, start: Joints, goal: Joints) -> Leg:
+        """The way from one place to another."""
+        a, b = _sorted(start, goal)
+        key = (a.tobytes(), b.tobytes())
+        if key not in self._chains:
+            self._chains[key] = self._find(a, b)
+        found = self._chains[key]
+        if isinstance(found, Contact):
+            return Leg((), NO_WAY_S, found)
+        chain = found if a is start else found[::-1]
+        return Leg(tuple(chain[1:]), self._chain_s(chain))
+
+    def _find(self, start: Joints, goal: Joints) -> list[Joints] | Contact:
+        """Places [k] from start to goal, straight motions between which are clear, or what is in the way."""
+        if self.is_straight(start, goal):
+            return [start, goal]
+        for place in (start, goal):
+            if self._bodies is not None and (contacts := self._bodies.contacts(place)):
+                return contacts[0]
+        chain = self._over_vias(start, goal) or self._over_resting_place(start, goal)
+        if chain is None and self._is_cut_off(start) == self._is_cut_off(goal):
+            chain = self._rrt_connect(start, goal)
+        if chain is not None:
+            return self._shortened(chain)
+        assert self._bodies is not None
+        contact = self._bodies.contact_on_the_way(start, goal)
+        assert contact is not None
+        return contact
+
+    def _over_vias(self, start: Joints, goal: Joints) -> list[Joints] | None:
+        for vias in self._via_chains(start, goal):
+            chain = [start, *vias, goal]
+            if all(self._clear(a, b) for a, b in pairwise(chain)):
+                return chain
+        return None
+
+    def _over_resting_place(self, start: Joints, goal: Joints) -> list[Joints] | None:
+        for number in range(len(self._vias)):
+            there, on = (self._way_from_via(number, place) for place in (start, goal))
+            if there is not None and on is not None:
+                return there[::-1] + on[1:]
+        return None
+
+    def _is_cut_off(self, place: Joints) -> bool:
+        """True if no way was found there from any resting place."""
+        return all(self._way_from_via(number, place) is None for number in range(len(self._vias)))
+
+    def _way_from_via(self, number: int, place: Joints) -> list[Joints] | None:
+        """From a resting place to another place; searched once."""
+        key = (number, place.tobytes())
+        if key not in self._from_via:
+            via = self._vias[number]
+            straight = [via, place] if self._clear(via, place) else None
+            self._from_via[key] = straight or self._rrt_connect(via, place)
+        return self._from_via[key]
+
+    def _clear(self, a: Joints, b: Joints) -> bool:
+        return self._bodies is None or self._bodies.is_clear(a, b)
+
+    def _chain_s(self, chain: Sequence[Joints]) -> float:
+        return float(move_durations_s(self._arm, chain[:-1], chain[1:]).sum())
+
+    def _via_chains(self, start: Joints, goal: Joints) -> list[list[Joints]]:
+        """Via points to try: a resting place of the arm, reached and left with axis 1 where start and goal have
+        it, so that the arm first draws back, then turns, then reaches out."""
+        chains = []
+        for via in self._vias:
+            drawn_back, before_goal = via.copy(), via.copy()
+            drawn_back[0], before_goal[0] = start[0], goal[0]
+            chains += [[drawn_back, before_goal], [via]]
+        return chains
+
+    # -- RRT-Connect --------------------------------------------------------------------------------------
+
+    def _rrt_connect(self, start: Joints, goal: Joints) -> list[Joints] | None:
+        random = np.random.default_rng([self._seed, *np.frombuffer(np.concatenate([start, goal]), np.uint32)])
+        low, high = np.array(self._arm.limits_deg).T
+        low, high = np.maximum(low, np.minimum(start, goal) - 120), np.minimum(high, np.maximum(start, goal) + 120)
+        trees: tuple[list[Joints], list[Joints]] = ([start], [goal])
+        parents: tuple[list[int], list[int]] = ([-1], [-1])
+        grow = 0
+        for _ in range(_RRT_TRIES):
+            target = random.uniform(low, high)
+            reached = self._extend(trees[grow], parents[grow], target, greedy=False)
+            if reached is not None:
+                place = trees[grow][reached]
+                met = self._extend(trees[1 - grow], parents[1 - grow], place, greedy=True)
+                if met is not None and np.array_equal(trees[1 - grow][met], place):
+                    branches = [_branch(trees[k], parents[k], n) for k, n in ((grow, reached), (1 - grow, met))]
+                    ours, theirs = branches if grow == 0 else branches[::-1]
+                    return ours + theirs[::-1][1:]
+            grow = 1 - grow
+        return None
+
+    def _extend(self, tree: list[Joints], parents: list[int], target: Joints, *, greedy: bool) -> int | None:
+        """Grow a tree towards `target` by one step, or until something is in the way; the last node reached."""
+        node = int(np.argmin(np.abs(np.array(tree) - target).max(axis=1)))
+        reached: int | None = None
+        while True:
+            away = target - tree[node]
+            distance = float(np.abs(away).max())
+            if distance == 0.0:
+                return node
+            there = target if distance <= _RRT_STEP_DEG else tree[node] + away * (_RRT_STEP_DEG / distance)
+            if not self._clear(tree[node], there):
+                return reached
+            tree.append(there)
+            parents.append(node)
+            node = reached = len(tree) - 1
+            if not greedy:
+                return reached
+
+    def _shortened(self, chain: list[Joints]) -> list[Joints]:
+        """Leave out via points that are not needed, then cut corners at random."""
+        random = np.random.default_rng(self._seed)
+        chain = list(chain)
+        i = 0
+        while i + 2 < len(chain):
+            for j in range(len(chain) - 1, i + 1, -1):
+                if self._clear(chain[i], chain[j]):
+                    del chain[i + 1 : j]
+                    break
+            i += 1
+        for _ in range(_SHORTCUTS if len(chain) > 2 else 0):
+            i = int(random.integers(1, len(chain) - 1))
+            before, here, after = chain[i - 1 : i + 2]
+            a, b = random.uniform(0.2, 0.9, 2)
+            corner = [before + a * (here - before), here + (1 - b) * (after - here)]
+            if self._chain_s([before, *corner, after]) < self._chain_s([before, here, after]) and all(
+                self._clear(p, q) for p, q in pairwise([before, *corner, after])
+            ):
+                chain[i : i + 1] = corner
+        return chain
+
+
+def _sorted(a: Joints, b: Joints) -> tuple[Joints, Joints]:
+    """The two places in an order that does not depend on which comes first."""
+    return (b, a) if a.tobytes() > b.tobytes() else (a, b)
+
+
+def _branch(tree: list[Joints], parents: list[int], node: int) -> list[Joints]:
+    """From the root to a node."""
+    places = []
+    while node >= 0:
+        places.append(tree[node])
+        node = parents[node]
+    return places[::-1]

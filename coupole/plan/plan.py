@@ -1,0 +1,212 @@
+"""What the operator writes: which views, which lights, which exposures, of which object.
+
+Positions are in the support frame (disk centre, z up), in mm; angles in degrees. Every model is frozen and
+refuses keys that it does not know. `coupole.plan.yamlfile` turns what is refused here into file:line:column.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from coupole.geometry import Transform, transform
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+"""Letters, digits, dot, underscore, hyphen: it becomes part of file names and shot ids."""
+Vector = tuple[float, float, float]
+Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
+ExposureUs = Annotated[int, Field(ge=10, le=2_000_000)]
+LedId = Annotated[int, Field(ge=0, le=65534)]
+
+
+class Model(BaseModel):
+    """Frozen; unknown keys are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Pose(Model):
+    """A rigid transform as people write it: translation in mm, KUKA's A, B, C in degrees."""
+
+    translation_mm: Vector = (0.0, 0.0, 0.0)
+    abc_deg: Vector = (0.0, 0.0, 0.0)
+
+    def matrix(self) -> Transform:
+        return transform(self.translation_mm, self.abc_deg)
+
+
+class AllLights(Model):
+    kind: Literal["all"]
+
+
+class LightIds(Model):
+    kind: Literal["ids"]
+    ids: Annotated[tuple[LedId, ...], Field(min_length=1)]
+
+    @field_validator("ids")
+    @classmethod
+    def _no_twice(cls, ids: tuple[int, ...]) -> tuple[int, ...]:
+        if twice := sorted({i for i in ids if ids.count(i) > 1}):
+            raise ValueError(f"each LED once; given more than once: {twice}")
+        return ids
+
+
+class LightBoards(Model):
+    """All LEDs of some boards."""
+
+    kind: Literal["boards"]
+    boards: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+
+
+class EveryLight(Model):
+    """Every n-th LED of the table, from `offset` on."""
+
+    kind: Literal["every"]
+    every: Annotated[int, Field(ge=1)]
+    offset: Annotated[int, Field(ge=0)] = 0
+
+
+class LightCone(Model):
+    """LEDs within `half_angle_deg` of a direction seen from the support's centre."""
+
+    kind: Literal["cone"]
+    azimuth_deg: Degrees
+    elevation_deg: Annotated[float, Field(ge=-90, le=90)]
+    half_angle_deg: Annotated[float, Field(gt=0, le=180)]
+
+
+class Panels(Model):
+    """The flat white panels, one after the other."""
+
+    kind: Literal["panels"]
+    panels: Annotated[tuple[Annotated[int, Field(ge=1, le=4)], ...], Field(min_length=1)] = (1, 2, 3, 4)
+
+
+class NoLights(Model):
+    """Dark frames only."""
+
+    kind: Literal["none"]
+
+
+Lights = Annotated[
+    AllLights | LightIds | LightBoards | EveryLight | LightCone | Panels | NoLights, Field(discriminator="kind")
+]
+
+
+class LookAt(Model):
+    """One view: the camera looks at a point from a direction."""
+
+    kind: Literal["look_at"]
+    name: Name
+    target_mm: Vector
+    distance_mm: Annotated[float, Field(gt=0, le=3000, description="to the camera's projection centre")]
+    azimuth_deg: Degrees
+    elevation_deg: Annotated[float, Field(ge=-90, le=90)]
+    roll_deg: Degrees = 0.0
+    lights: Lights | None = None
+    """Of this view; the plan's if not given."""
+
+
+class Grid(Model):
+    """Views from all pairs of azimuth and elevation, named `<name>-az<azimuth>-el<elevation>`."""
+
+    kind: Literal["grid"]
+    name: Name
+    target_mm: Vector
+    distance_mm: Annotated[float, Field(gt=0, le=3000)]
+    azimuths_deg: Annotated[tuple[Degrees, ...], Field(min_length=1)]
+    elevations_deg: Annotated[tuple[Annotated[float, Field(ge=-90, le=90)], ...], Field(min_length=1)]
+    roll_deg: Degrees = 0.0
+    lights: Lights | None = None
+    """Of this view; the plan's if not given."""
+
+
+class Joints(Model):
+    """One view from given joint angles of the arm."""
+
+    kind: Literal["joints"]
+    name: Name
+    joints_deg: tuple[Degrees, Degrees, Degrees, Degrees, Degrees, Degrees]
+    lights: Lights | None = None
+    """Of this view; the plan's if not given."""
+
+
+View = Annotated[LookAt | Grid | Joints, Field(discriminator="kind")]
+
+
+class FixedExposure(Model):
+    kind: Literal["fixed"]
+    exposure_us: ExposureUs
+
+    @property
+    def exposures_us(self) -> tuple[int, ...]:
+        return (self.exposure_us,)
+
+
+class BracketExposure(Model):
+    """Each light at each of several exposures, shortest first as written."""
+
+    kind: Literal["bracket"]
+    exposures_us: Annotated[tuple[ExposureUs, ...], Field(min_length=2, max_length=16)]
+
+    @field_validator("exposures_us")
+    @classmethod
+    def _increasing(cls, exposures_us: tuple[int, ...]) -> tuple[int, ...]:
+        if any(b <= a for a, b in pairwise(exposures_us)):
+            raise ValueError("increasing exposures, each longer than the one before")
+        return exposures_us
+
+
+Exposures = Annotated[FixedExposure | BracketExposure, Field(discriminator="kind")]
+
+
+class MeasuredObject(Model):
+    """The object on the support: who it is, its shape, what light it may take."""
+
+    id: Name
+    mesh: Path | None = None
+    mesh_unit: Literal["mm", "m", "um"] = "mm"
+    support_from_object: Pose = Pose()
+    dose_budget_lux_h: Annotated[float, Field(gt=0)] | None = None
+
+
+class Optics(Model):
+    """What the operator believes is set on the lens; preflight compares it with the rig."""
+
+    focus_distance_mm: Annotated[float, Field(gt=0)] | None = None
+    f_number: Annotated[float, Field(gt=0)] | None = None
+
+
+class Plan(Model):
+    """One acquisition."""
+
+    schema_version: Literal[1]
+    name: Name
+    rig: Path
+    object: MeasuredObject | None = None
+    optics: Optics = Optics()
+    calibrations: Literal["none"] | tuple[Path, ...] | None = None
+    """Records that must be in force; None: those that the rig names."""
+    views: Annotated[tuple[View, ...], Field(min_length=1)]
+    order: Literal["fastest", "as_written"] = "fastest"
+    """In which order the views are visited: on the shortest way, or as they stand here."""
+    lights: Lights
+    repeats: Annotated[int, Field(ge=1, le=1000)] = 1
+    hidden_lights: Literal["mark", "skip"] = "mark"
+    """What becomes of LEDs that arm, camera or object hide from all that a view sees: taken and marked, or left
+    out."""
+    exposure: Exposures
+    gain_db: Annotated[float, Field(ge=0, le=42)] = 0.0
+    darks_per_view: Annotated[int, Field(ge=0, le=1000)] = 2
+    trigger: Literal["hardware", "software"] = "hardware"
+    reshoot_limit: Annotated[int, Field(ge=0, le=20)] = 3
+
+    @model_validator(mode="after")
+    def _something_to_shoot(self) -> Plan:
+        lights = [view.lights or self.lights for view in self.views]
+        if any(isinstance(one, NoLights) for one in lights) and self.darks_per_view == 0:
+            raise ValueError("lights, or at least one dark frame per view: a view would shoot nothing")
+        return self

@@ -1,0 +1,301 @@
+"""Exposure advice: a few lights, a few exposures, each twice; what follows for the exposure of a whole plan.
+
+Two wishes bound the exposure. From above: of no picture may more than a share of the pixels be saturated. From
+below: of the object's pixels a share must reach a signal-to-noise ratio under the light that suits them best.
+Noise is measured, not assumed: differences of pairs give the photon transfer line, variance = read^2 + gain *
+signal (Janesick, "Photon Transfer", 2007, eq. 3.5, in DN). Where one exposure meets both wishes the shortest that
+does is proposed, as it gives the object least light; else a bracket.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.devices import ArmState, Frame, FrameFormat
+from coupole.errors import InputError
+from coupole.geometry import Transform
+from coupole.plan.led_table import LedTable
+from coupole.plan.plan import BracketExposure, FixedExposure, LightIds, Plan
+from coupole.storage.frame_file import Collections
+from coupole.storage.run import is_shot
+
+METERING_LIGHTS = 12
+SHORTER = (16, 4, 1)
+"""Metering exposures are the plan's shortest divided by these."""
+_REPEATS = 2
+_CELL_STEP = 4
+"""Of the Bayer cells every so-manieth in both directions is looked at."""
+_BRACKET_STEP = 4.0
+_FULL = 0.95
+"""Of the range above black that counts as full: noise must not reach saturation."""
+_UNSEEN_LIGHTS = 0.8
+"""Lights that were not metered may be brighter by as much."""
+_NOISE_MARGIN = 1.25
+_SEEN_SIGMA = 5.0
+"""A pixel shows the object if, in the longest exposure, its best light lifts it so far above the read noise."""
+_LEVELS = 48
+_ROUNDING_DN = math.sqrt(1.0 / 12.0)
+_SHORTEST_US = 10
+"""The plan's own limit."""
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What pictures shall be like."""
+
+    saturated_share: float = 1e-3
+    """Of the pixels of any picture, at most."""
+    snr: float = 30.0
+    """Signal-to-noise ratio of a single pixel in a single picture."""
+    object_share: float = 0.9
+    """Of the object's pixels that must reach it."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variance of a pixel at a signal of s DN above black: read_dn^2 + gain_dn * s."""
+
+    read_dn: float
+    gain_dn: float
+    """DN per electron."""
+
+    def signal_for(self, snr: float) -> float:
+        """Signal in DN at which s / sqrt(variance) is `snr`."""
+        shot = snr**2 * self.gain_dn
+        return (shot + math.sqrt(shot**2 + 4.0 * (snr * self.read_dn) ** 2)) / 2.0
+
+
+@dataclass(frozen=True)
+class ViewAdvice:
+    """Bounds of one view's exposure."""
+
+    view: str
+    longest_us: float
+    """Beyond it more than the wished share of some picture is saturated."""
+    shortest_us: float
+    """Below it too few of the object's pixels reach the wished signal-to-noise ratio."""
+    object_share: float
+    """Pixels that show the object, of all."""
+    dazzled: bool
+    """Even the shortest metering exposure saturated more than was wished: `longest_us` may be too long."""
+
+
+@dataclass(frozen=True)
+class Advice:
+    """For the whole plan."""
+
+    noise: Noise
+    views: tuple[ViewAdvice, ...]
+    exposure: FixedExposure | BracketExposure
+    remarks: tuple[str, ...]
+
+
+def metering_plan(plan: Plan, leds: LedTable, rows: NDArray[np.int64]) -> Plan:
+    """The plan with a few of its lights (`rows` of the table) spread over the dome, each twice at a few exposures.
+
+    Plans without LEDs (panels, darks) keep their lights.
+    """
+    base_us = plan.exposure.exposures_us[0]
+    exposures_us = sorted({max(10, base_us // shorter) for shorter in SHORTER})
+    exposure: FixedExposure | BracketExposure = FixedExposure(kind="fixed", exposure_us=base_us)
+    if len(exposures_us) > 1:
+        exposure = BracketExposure(kind="bracket", exposures_us=tuple(exposures_us))
+    changes: dict[str, Any] = {"exposure": exposure, "repeats": _REPEATS, "darks_per_view": 0}
+    if len(rows):
+        spread = rows[_spread(leds.positions_mm[rows], METERING_LIGHTS)]
+        changes["lights"] = LightIds(kind="ids", ids=tuple(int(led) for led in leds.ids[spread]))
+        changes["views"] = tuple(view.model_copy(update={"lights": None}) for view in plan.views)
+    return plan.model_copy(update=changes)
+
+
+def _spread(positions_mm: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """`count` of the positions [n, 3], each as far as possible from those before it."""
+    chosen = [0]
+    apart = np.linalg.norm(positions_mm - positions_mm[0], axis=1)
+    while len(chosen) < min(count, len(positions_mm)):
+        chosen.append(int(np.argmax(apart)))
+        apart = np.minimum(apart, np.linalg.norm(positions_mm - positions_mm[chosen[-1]], axis=1))
+    return np.array(sorted(chosen))
+
+
+@dataclass
+class Metered:
+    """Samples of one view: signals in DN above black by light and exposure, one array [pixels] for each repeat."""
+
+    frame_format: FrameFormat
+    samples: dict[str, dict[int, list[NDArray[np.int32]]]] = field(default_factory=dict)
+
+
+class MeterRecorder:
+    """`coupole.acquisition.recorder.Recorder` that keeps a sample of the pixels in memory, and nothing else."""
+
+    def __init__(self) -> None:
+        self.views: dict[str, Metered] = {}
+        self.events: list[dict[str, Any]] = []
+        self._proven: set[str] = set()
+        self._slots: list[tuple[int, NDArray[np.int32]]] = []
+        self._view = ""
+
+    def proven(self) -> set[str]:
+        return self._proven
+
+    def begin_view(
+        self,
+        view: str,
+        frames: int,
+        frame_format: FrameFormat,
+        arm: ArmState,
+        base_from_camera: Transform,
+        collections: Collections,
+    ) -> None:
+        self._view = view
+        self.views.setdefault(view, Metered(frame_format))
+
+    def put(self, frame: Frame, exposure_us: int) -> int:
+        height, width = (size // (2 * _CELL_STEP) * 2 * _CELL_STEP for size in frame.pixels.shape)
+        cells = frame.pixels[:height, :width].reshape(
+            height // (2 * _CELL_STEP), 2 * _CELL_STEP, -1, 2 * _CELL_STEP
+        )
+        black = self.views[self._view].frame_format.black_dn
+        self._slots.append((exposure_us, cells[:, :2, :, :2].astype(np.int32).ravel() - black))
+        return len(self._slots) - 1
+
+    def prove(self, slot: int, shot: str, fields: Mapping[str, int]) -> None:
+        self._proven.add(shot)
+        if is_shot(shot):
+            exposure_us, sample = self._slots[slot]
+            light = shot.split("/")[1]
+            by_exposure = self.views[self._view].samples.setdefault(light, {})
+            by_exposure.setdefault(exposure_us, []).append(sample)
+
+    def free(self, slot: int) -> None:
+        """Nobody asks for it again."""
+
+    def event(self, event: str, **fields: Any) -> None:
+        self.events.append({"event": event, **fields})
+
+    def commit(self, *, now: bool) -> None:
+        """Nothing lasts."""
+
+    def end_view(self) -> None:
+        self._slots.clear()
+
+
+def noise_of(views: Iterable[Metered]) -> Noise:
+    """Photon transfer line through all pairs: mean squared difference / 2 against mean signal, in levels with as
+    many pixels each, weighted by how well a level's variance is known; rounding alone where all is saturated."""
+    signal, squared = [np.zeros(0)], [np.zeros(0)]
+    for metered in views:
+        white = metered.frame_format.white_dn - metered.frame_format.black_dn
+        for samples in (s for by_exposure in metered.samples.values() for s in by_exposure.values()):
+            for a, b in zip(samples[::2], samples[1::2], strict=False):
+                unsaturated = np.maximum(a, b) < white
+                signal.append((a[unsaturated] + b[unsaturated]) / 2.0)
+                squared.append((a[unsaturated] - b[unsaturated]) ** 2 / 2.0)
+    if sum(map(len, signal)) < _LEVELS:
+        return Noise(_ROUNDING_DN, _ROUNDING_DN)
+    order = np.argsort(all_signal := np.concatenate(signal), kind="stable")
+    levels = np.array_split(all_signal[order], _LEVELS)
+    spreads = np.array_split(np.concatenate(squared)[order], _LEVELS)
+    mean = np.array([level.mean() for level in levels])
+    variance = np.array([spread.mean() for spread in spreads])
+    weight = np.sqrt([len(level) for level in levels]) / np.maximum(variance, 1e-3)
+    design = np.stack([np.ones_like(mean), mean], axis=1)
+    (offset, gain), *_ = np.linalg.lstsq(design * weight[:, None], variance * weight, rcond=None)
+    return Noise(max(math.sqrt(max(offset, 0.0)), _ROUNDING_DN), max(float(gain), 1e-6))
+
+
+def advise_view(view: str, metered: Metered, wish: Wish, noise: Noise) -> ViewAdvice:
+    """Bounds of a view's exposure."""
+    white = metered.frame_format.white_dn - metered.frame_format.black_dn
+    rates = []
+    for by_exposure in metered.samples.values():
+        rate = np.full(next(iter(by_exposure.values()))[0].shape, np.inf)
+        for exposure_us, samples in sorted(by_exposure.items()):  # the longest that is not saturated counts
+            mean = np.mean(samples, axis=0)
+            rate = np.where(np.max(samples, axis=0) < white, mean / exposure_us, rate)
+        rates.append(rate)
+    shortest_metered_us = min(e for by_exposure in metered.samples.values() for e in by_exposure)
+    longest_metered_us = max(e for by_exposure in metered.samples.values() for e in by_exposure)
+    per_light = np.minimum(np.array(rates), white / shortest_metered_us)
+    brightest = np.quantile(per_light, 1.0 - wish.saturated_share, axis=1).max()
+    best = per_light.max(axis=0)
+    # The best of many lights is lifted by noise: of n looks at nothing the highest lies sqrt(2 ln n) sigma up.
+    looks = math.sqrt(2.0 * math.log(max(2, len(rates)))) + _SEEN_SIGMA
+    of_object = best * longest_metered_us > looks * noise.read_dn
+    longest_us = _FULL * _UNSEEN_LIGHTS * white / max(brightest, 1e-12)
+    dazzled = bool((np.isinf(rates).mean(axis=1) > wish.saturated_share).any())
+    if not of_object.any():
+        return ViewAdvice(view, longest_us, math.inf, 0.0, dazzled)
+    darkest = max(float(np.quantile(best[of_object], 1.0 - wish.object_share)), 1e-12)
+    shortest_us = _NOISE_MARGIN * noise.signal_for(wish.snr) / darkest
+    return ViewAdvice(view, longest_us, shortest_us, float(of_object.mean()), dazzled)
+
+
+def advise(views: Mapping[str, Metered], wish: Wish, *, longest_us: int) -> Advice:
+    """The exposure or bracket that all views can be taken with; LEDs can be on for one of `longest_us`."""
+    noise = noise_of(views.values())
+    found = tuple(advise_view(view, metered, wish, noise) for view, metered in views.items())
+    remarks = [
+        f"view {a.view}: nothing but noise is seen; is the object lit?" for a in found if not a.object_share
+    ]
+    remarks += [
+        f"view {a.view}: saturated at all that was metered; meter again from this" for a in found if a.dazzled
+    ]
+    low_us, high_us = _SHORTEST_US, longest_us
+    brightest_us = min(a.longest_us for a in found)
+    seen = [a.shortest_us for a in found if a.object_share]
+    shortest_us = max(seen, default=brightest_us)
+    if brightest_us < low_us:
+        remarks.append(f"even {low_us} us saturate more than wished: close the aperture or dim the lights")
+    if shortest_us > high_us:
+        remarks.append(
+            f"even {high_us} us are too short for the wished noise: open the aperture or raise the gain"
+        )
+    first = _rounded(min(max(min(shortest_us, brightest_us), low_us), high_us), up=shortest_us <= brightest_us)
+    if shortest_us <= brightest_us:
+        return Advice(noise, found, FixedExposure(kind="fixed", exposure_us=first), tuple(remarks))
+    exposures_us = [first]
+    while exposures_us[-1] < min(shortest_us, high_us) and len(exposures_us) < 16:
+        exposures_us.append(_rounded(min(exposures_us[-1] * _BRACKET_STEP, shortest_us, high_us), up=True))
+        if exposures_us[-1] <= exposures_us[-2]:
+            exposures_us.pop()
+            break
+    if len(exposures_us) == 1:
+        return Advice(noise, found, FixedExposure(kind="fixed", exposure_us=first), tuple(remarks))
+    bracket = BracketExposure(kind="bracket", exposures_us=tuple(min(e, high_us) for e in exposures_us))
+    return Advice(noise, found, bracket, tuple(remarks))
+
+
+def write_plan(plan_path: Path, out: Path, exposure: FixedExposure | BracketExposure) -> None:
+    """Copy a plan, comments and all, with another exposure. `out` lies in the plan's folder, as the paths in a
+    plan are relative to it; raises InputError where it does not, or stands there already."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.comments import CommentedMap
+
+    if out.resolve().parent != plan_path.resolve().parent:
+        raise InputError(f"{out}: expected a file in the plan's folder, {plan_path.resolve().parent}")
+    yaml = YAML()
+    yaml.preserve_quotes, yaml.width = True, 4096
+    document = yaml.load(plan_path.read_text(encoding="utf-8"))
+    written = CommentedMap(exposure.model_dump(mode="json"))
+    written.fa.set_flow_style()
+    document["exposure"] = written
+    try:
+        with out.open("x", encoding="utf-8") as file:
+            yaml.dump(document, file)
+    except FileExistsError as error:
+        raise InputError(f"{out}: stands here already; choose another name") from error
+
+
+def _rounded(exposure_us: float, *, up: bool) -> int:
+    """Two digits: 8137 becomes 8200 or 8100."""
+    step = 10.0 ** max(0, math.floor(math.log10(max(exposure_us, 1.0))) - 1)
+    return max(10, int((math.ceil if up else math.floor)(round(exposure_us / step, 6)) * step))

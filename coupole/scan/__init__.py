@@ -1,0 +1,1 @@
+"""Meshes and target tables as a scanner writes them: readers, checks, import."""

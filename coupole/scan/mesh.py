@@ -1,0 +1,73 @@
+"""A triangle mesh, and what every reader of one expects of its file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.scan.mesh_text import OK, TOO_FEW
+
+CHUNK = 4_000_000
+"""Records that are converted at once."""
+MOST_VERTICES = 2**31
+"""An edge is kept as one 64-bit number (`coupole.scan.mesh_defects`)."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles over shared vertices, in the file's unit."""
+
+    vertices: NDArray[np.float32]
+    """[n, 3], finite."""
+    triangles: NDArray[np.uint32]
+    """[m, 3] rows of `vertices`."""
+
+
+def expect_records(path: Path, what: str, count: int, read: int, wanted: int | None = None) -> None:
+    if read < (count if wanted is None else wanted):
+        raise InputError(f"{path}: the file ends in {what} {read} of {count}: it was cut off")
+
+
+def expect_finite(path: Path, points: NDArray[np.float32], where: str) -> None:
+    """`where` names a point by its number."""
+    bad = _first_not_finite(points.reshape(-1, 3))
+    if bad >= 0:
+        xyz = ", ".join(f"{value:g}" for value in points.reshape(-1, 3)[bad])
+        raise InputError(f"{path}: {where.format(bad)}: expected finite coordinates, found {xyz}")
+
+
+def expect_corners(path: Path, triangles: NDArray[np.uint32], vertices: int, first: int) -> None:
+    bad = _first_beyond(triangles, vertices)
+    if bad >= 0:
+        worst = int(triangles[bad].max())
+        raise InputError(
+            f"{path}: face {first + bad}: corner {worst} does not exist; there are {vertices} vertices"
+        )
+
+
+@numba.njit(cache=True, nogil=True)
+def _first_not_finite(points):  # type: ignore[no-untyped-def]
+    for k in range(len(points)):
+        if not np.isfinite(points[k, 0] + points[k, 1] + points[k, 2]):
+            return k
+    return -1
+
+
+@numba.njit(cache=True, nogil=True)
+def _first_beyond(triangles, vertices):  # type: ignore[no-untyped-def]
+    for k in range(len(triangles)):
+        if triangles[k, 0] >= vertices or triangles[k, 1] >= vertices or triangles[k, 2] >= vertices:
+            return k
+    return -1
+
+
+def expect_text(path: Path, state: int, line: int, expected: str) -> None:
+    if state == TOO_FEW:
+        raise InputError(f"{path}:{line}: expected {expected}; the file ends here: it was cut off")
+    if state != OK:
+        raise InputError(f"{path}:{line}: expected {expected}")

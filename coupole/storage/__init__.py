@@ -1,0 +1,1 @@
+"""What is on disk: run folder, journal, frame files, archive."""

@@ -1,0 +1,94 @@
+"""Archive a run: each view's file is replaced by a compressed one that holds the same frames.
+
+Views are archived one after the other, so that each frees its space before the next needs some. How one view is
+archived without ever being at risk: `storage.archive_view`. That a view is archived stands in its file alone: the
+journal tells how frames were taken, and that is over.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from coupole.errors import UnprovenError
+from coupole.storage import frame_file
+from coupole.storage.archive_view import ArchivedView, Progress, archive_view
+from coupole.storage.bitshuffle import Codec
+from coupole.storage.run import Run
+
+KEPT_FOLDER = "unarchived"
+"""Of the run's folder: where `keep` puts the files that were archived."""
+
+
+@dataclass
+class Archived:
+    """What `archive_run` did."""
+
+    views: list[ArchivedView] = field(default_factory=list)
+    already: list[str] = field(default_factory=list)
+    """Views that an earlier call archived."""
+    incomplete: list[str] = field(default_factory=list)
+    """Views that were left as they are, because frames of them are missing."""
+
+    def figures(self) -> dict[str, Any]:
+        """What `--json` says: sizes in bytes, speeds in MB/s of uncompressed frames."""
+        pixels, stored = sum(v.pixel_bytes for v in self.views), sum(v.stored_bytes for v in self.views)
+        seconds = sum((v.compress_s + v.read_back_s for v in self.views), 0.0)
+        return {
+            "views": [view.figures() for view in self.views],
+            "already": self.already,
+            "incomplete": self.incomplete,
+            "frames": sum(v.frames for v in self.views),
+            "bytes": pixels,
+            "stored_bytes": stored,
+            "ratio": round(pixels / stored, 4) if stored else None,
+            "mb_s": round(pixels / seconds / 1e6, 1) if seconds else None,
+            "duration_s": round(seconds, 3),
+            "freed_bytes": sum(v.freed_bytes for v in self.views),
+        }
+
+
+def archive_run(
+    run: Run,
+    codec: Codec,
+    *,
+    keep: bool = False,
+    partial: bool = False,
+    progress: Progress = lambda what, done, total: None,
+    on_view: Callable[[ArchivedView], None] = lambda view: None,
+) -> Archived:
+    """Archive all views of a run.
+
+    With `keep` the files as they were stay in `RUN/unarchived`. With `partial` the complete views of a run that is
+    not complete are archived; views that are not complete never are, so that the run can still be resumed.
+
+    Raises InputError while another process has the run, UnprovenError if frames are missing (without `partial`),
+    ChecksumMismatch if a frame is not what was proven, before or after, and DiskFull; the view at hand is then as
+    it was before.
+    """
+    held = run.lock()
+    try:
+        proven = run.proven()
+        missing = [shot for shot in run.expected_shots() if shot not in proven]
+        if missing and not partial:
+            raise UnprovenError(
+                f"{run.folder}: {len(missing)} frames are missing, the first {missing[0]}. Resume the run first, "
+                "or archive its complete views with --partial."
+            )
+        result = Archived(incomplete=sorted({shot.split("/")[0] for shot in missing}))
+        for view in run.about["views"]:
+            path = run.view_path(view)
+            if view in result.incomplete:
+                continue
+            if frame_file.read_layout(path).archived:
+                result.already.append(view)
+                continue
+            frames = [frame for frame in proven.values() if run.folder / frame.file == path]
+            done = archive_view(path, frames, codec, progress, keep_in=run.folder / KEPT_FOLDER if keep else None)
+            result.views.append(done)
+            on_view(done)
+    finally:
+        os.close(held)
+    return result

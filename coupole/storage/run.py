@@ -1,0 +1,327 @@
+"""A run folder: create, open, status, verify.
+
+::
+
+    RUN/
+      run.json        what was asked, by whom, with which software, plan, rig and files (and their SHA-256)
+      journal.jsonl   one line per event; a `frame` line for each proven shot
+      views/NAME.h5   frames
+      report.html     what happened, in pictures
+"""
+
+from __future__ import annotations
+
+import fcntl
+import getpass
+import hashlib
+import json
+import os
+import platform
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import coupole
+from coupole.errors import InputError, StorageError
+from coupole.storage import frame_file, journal
+
+SCHEMA_VERSION = 1
+
+
+def sha256(path: Path) -> str:
+    """Hex digest of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Files that a run depends on; a run is resumed only with the same ones."""
+
+    plan: Path
+    rig: Path
+    others: tuple[Path, ...]
+
+    def describe(self) -> dict[str, Any]:
+        def one(path: Path) -> dict[str, str]:
+            return {"path": str(path), "sha256": sha256(path)}
+
+        return {
+            "plan": {**one(self.plan), "text": self.plan.read_text(encoding="utf-8")},
+            "rig": {**one(self.rig), "text": self.rig.read_text(encoding="utf-8")},
+            "files": [one(path) for path in self.others],
+        }
+
+
+@dataclass(frozen=True)
+class ProvenFrame:
+    """A `frame` line of the journal."""
+
+    shot: str
+    file: str
+    index: int
+    frame_id: int
+    xxh3: str
+
+
+class Run:
+    """One run folder, opened."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open an existing run. Raises InputError if there is none."""
+        self.folder = folder.resolve()
+        try:
+            self.about: dict[str, Any] = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        except (OSError, json.JSONDecodeError) as error:
+            raise InputError(f"{folder}: not a run folder: {error}") from error
+        if self.about.get("schema_version") != SCHEMA_VERSION:
+            raise InputError(
+                f"{folder}: expected run.json of schema version {SCHEMA_VERSION}, "
+                f"found {self.about.get('schema_version')}"
+            )
+
+    @staticmethod
+    def create(parent: Path, name: str, inputs: Inputs, about: dict[str, Any]) -> Run:
+        """Make `<UTC time>-<name>` under `parent`."""
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+            folder = _new_folder(parent, f"{stamp}-{name}")
+            (folder / "views").mkdir()
+            described = {
+                "schema_version": SCHEMA_VERSION,
+                "software": {"name": "coupole", "version": coupole.__version__},
+                "created": journal.utc_now(),
+                "host": platform.node(),
+                "operator": _user(),
+                **about,
+                **inputs.describe(),
+            }
+            text = json.dumps(described, indent=2, ensure_ascii=False)
+            _write_synced(folder / "run.json", text)
+        except OSError as error:
+            raise StorageError(f"{parent}: cannot make a run folder: {error.strerror}") from error
+        return Run(folder)
+
+    @property
+    def created(self) -> datetime:
+        return datetime.fromisoformat(self.about["created"])
+
+    @property
+    def journal_path(self) -> Path:
+        return self.folder / "journal.jsonl"
+
+    def view_path(self, view: str) -> Path:
+        return self.folder / "views" / f"{view}.h5"
+
+    def allocated_bytes(self) -> int:
+        """What the run's views need no more of the disk: laid out whole before their first frame, or archived."""
+        return sum(map(_settled_bytes, (self.folder / "views").glob("*.h5")))
+
+    def expected_shots(self) -> Iterable[str]:
+        """Ids of all shots and dark frames of the plan, those apart that were left out as hidden in their view."""
+        labels: list[str] | dict[str, list[str]] = self.about["labels"]
+        for view in self.about["views"]:
+            hidden = {f"led{led:04d}" for led in self.hidden_leds.get(view, ())}
+            for label in labels[view] if isinstance(labels, dict) else labels:
+                if label.partition("/")[0] not in hidden:
+                    yield f"{view}/{label}"
+
+    @property
+    def hidden_leds(self) -> dict[str, list[int]]:
+        """LEDs that were left out of views, by name of view: arm, camera or object hide them there."""
+        found: dict[str, list[int]] = self.about.get("hidden_leds", {})
+        return found
+
+    def proven(self) -> dict[str, ProvenFrame]:
+        """Proven shots by id, as the journal says."""
+        if not self.journal_path.exists():
+            return {}
+        return {
+            event["shot"]: ProvenFrame(
+                event["shot"], event["file"], event["index"], event["frame_id"], event["xxh3"]
+            )
+            for event in journal.read(self.journal_path)
+            if event["event"] == "frame"
+        }
+
+    def robot_fault(self) -> str:
+        """The fault of the arm that ended the last session, empty if none did."""
+        found = ""
+        for event in journal.read(self.journal_path) if self.journal_path.exists() else ():
+            match event:
+                case {"event": "start"} | {"event": "resume", "simulated": _}:
+                    found = ""
+                case {"event": "fault", "device": "robot", "message": message}:
+                    found = message
+        return found
+
+    def lock(self) -> int:
+        """Hold the run for this process. Raises InputError if another process acquires into it."""
+        fd = os.open(self.folder / "run.json", os.O_RDONLY)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(fd)
+            raise InputError(f"{self.folder}: another process is acquiring into this run") from error
+        return fd
+
+    def refuse_changes(self, inputs: Inputs) -> None:
+        """Raise InputError unless plan, rig and the files they name are those that the run began with."""
+        now = inputs.describe()
+        changed = [
+            f"{what} ({now[what]['path']})"
+            for what in ("plan", "rig")
+            if now[what]["sha256"] != self.about[what]["sha256"]
+        ]
+        before = Counter(entry["sha256"] for entry in self.about["files"])
+        changed += [entry["path"] for entry in now["files"] if not before[entry["sha256"]]]
+        if changed:
+            raise InputError(
+                f"{self.folder}: cannot be resumed: {', '.join(changed)} changed since the run began. "
+                "Put the old file back, or start a new run."
+            )
+
+
+def is_shot(shot_id: str) -> bool:
+    """True for a shot under a light, False for dark frames and marks."""
+    light = shot_id.split("/")[-3 if "/r" in shot_id else -2]
+    return not light.startswith("dark") and "mark" not in light
+
+
+def _new_folder(parent: Path, name: str) -> Path:
+    for attempt in range(1000):
+        folder = parent / (f"{name}-{attempt + 1}" if attempt else name)
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+    raise StorageError(f"{parent}: a thousand runs named {name} stand here already")
+
+
+def _settled_bytes(view_file: Path) -> int:
+    layout = frame_file.read_layout(view_file)
+    return layout.frames * layout.frame_bytes if layout.archived else view_file.stat().st_blocks * 512
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):
+        return "unknown"
+
+
+def _write_synced(path: Path, text: str) -> None:
+    with path.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@dataclass
+class Status:
+    """How far a run is, by its journal alone."""
+
+    state: str = "created"
+    shots: int = 0
+    proven: int = 0
+    darks_proven: int = 0
+    reshot: int = 0
+    faults: list[str] = field(default_factory=list)
+    views: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Proven and expected frames of each view."""
+    last_event: str = ""
+
+    @property
+    def missing(self) -> int:
+        return self.shots - self.proven
+
+
+def status(run: Run) -> Status:
+    """Progress of a run, also while it goes on."""
+    found = Status()
+    expected = list(run.expected_shots())
+    found.shots = sum(map(is_shot, expected))
+    per_view = Counter(shot.split("/")[0] for shot in expected)
+    proven_ids = set(run.proven())
+    found.proven = sum(map(is_shot, proven_ids))
+    found.darks_proven = len(proven_ids) - found.proven
+    proven_per_view = Counter(shot.split("/")[0] for shot in proven_ids)
+    found.views = {view: (proven_per_view[view], count) for view, count in per_view.items()}
+    if run.journal_path.exists():
+        for event in journal.read(run.journal_path):
+            found.last_event = event["t"]
+            match event["event"]:
+                case "start" | "resume":
+                    found.state = "running or interrupted"
+                case "pause":
+                    found.state = "paused"
+                case "stop":
+                    found.state = event.get("outcome", "stopped")
+                case "reshoot":
+                    found.reshot += len(event.get("shots", ()))
+                case "fault":
+                    found.faults.append(event.get("message", ""))
+    return found
+
+
+@dataclass
+class Verification:
+    """What `verify` found."""
+
+    frames: int = 0
+    bad: list[str] = field(default_factory=list)
+    """One line for each thing that is not as it must be."""
+    missing: list[str] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        return not self.bad and not self.missing
+
+
+def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Verification:
+    """Read every proven frame back: each shot of the plan once, each record and checksum right."""
+    result = Verification()
+    proven = run.proven()
+    result.missing = [shot for shot in run.expected_shots() if shot not in proven]
+    by_file: dict[str, list[ProvenFrame]] = {}
+    for frame in proven.values():
+        by_file.setdefault(frame.file, []).append(frame)
+    lines = Counter(e["shot"] for e in journal.read(run.journal_path) if e["event"] == "frame") if proven else {}
+    result.bad += [f"{shot}: proven {n} times in the journal" for shot, n in lines.items() if n > 1]
+    done = 0
+    for name, frames in sorted(by_file.items()):
+        path = run.folder / name
+        try:
+            layout, table = frame_file.read_layout(path), frame_file.read_frames(path)
+        except StorageError as error:
+            result.bad.append(str(error))
+            continue
+        claimed = Counter(record["shot"] for record in table if record["state"] == frame_file.PROVEN)
+        result.bad += [f"{name}: {shot.decode()} stands in {n} slots" for shot, n in claimed.items() if n > 1]
+        for frame in sorted(frames, key=lambda f: f.index):
+            if problem := _frame_problem(path, layout, table, frame):
+                result.bad.append(problem)
+            result.frames += 1
+            done += 1
+            progress(done, len(proven))
+    return result
+
+
+def _frame_problem(path: Path, layout: frame_file.Layout, table: Any, frame: ProvenFrame) -> str:
+    if not 0 <= frame.index < layout.frames:
+        return f"{frame.shot}: slot {frame.index} is not in {path.name}"
+    record = table[frame.index]
+    if record["state"] != frame_file.PROVEN or record["shot"].decode() != frame.shot:
+        return f"{frame.shot}: slot {frame.index} of {path.name} is recorded as `{record['shot'].decode()}`"
+    try:
+        found = frame_file.checksum(frame_file.read_frame(path, layout, frame.index))
+    except StorageError as error:
+        return f"{frame.shot}: {error}"
+    if not f"{found:016x}" == f"{int(record['xxh3']):016x}" == frame.xxh3:
+        return f"{frame.shot}: slot {frame.index} of {path.name} has checksum {found:016x}, not {frame.xxh3}"
+    return ""

@@ -1,0 +1,1 @@
+"""Pictures and pages of plans, cells, live frames and runs; the terminal."""

@@ -1,0 +1,241 @@
+"""What the operator sees: progress bars on a terminal, plain lines elsewhere, tables of reports."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from coupole.acquisition.observer import Observer, Outcome
+from coupole.acquisition.observer import Progress as RunProgress
+from coupole.acquisition.recorder import DryRecorder
+from coupole.plan.shots import BurstTiming
+from coupole.preflight.preflight import Report
+from coupole.storage.run import Status
+
+if TYPE_CHECKING:
+    from coupole.preflight.exposure_advice import Advice
+    from coupole.viewing.live import Shown
+
+_PLAIN_LINE_EVERY_S = 5.0
+
+
+def make_console(*, quiet: bool) -> Console:
+    """The console for people: standard error, so that standard output stays free for `--json`."""
+    return Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=not sys.stderr.isatty())
+
+
+def ask(question: str) -> bool:
+    """Put a yes-or-no question on standard error, even where all else is quiet; only a typed yes is one."""
+    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
+    try:
+        return sys.stdin.readline().strip().lower() in {"y", "yes"}
+    except OSError:  # no standard input
+        return False
+
+
+def duration_text(seconds: float) -> str:
+    """`2 h 05 min`, `3 min 20 s`, `12.3 s`."""
+    if seconds >= 3600:
+        return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"
+    return f"{int(seconds // 60)} min {seconds % 60:02.0f} s" if seconds >= 60 else f"{seconds:.1f} s"
+
+
+def bytes_text(count: float) -> str:
+    return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
+
+
+class RunObserver(Observer):
+    """Bars on a terminal, a line every few seconds elsewhere."""
+
+    def __init__(self, console: Console, frame_bytes: int, proven_before: int) -> None:
+        self._console, self._frame_bytes = console, frame_bytes
+        self._started_s = time.monotonic()
+        self._printed_s = 0.0
+        self._before = proven_before
+        self._bars: Progress | None = None
+        self._view_bar: Any = None
+        self._run_bar: Any = None
+
+    @contextmanager
+    def showing(self, frames: int, views: int) -> Iterator[None]:
+        """Bars for the time of the run, if this is a terminal."""
+        if not self._console.is_terminal or self._console.quiet:
+            yield
+            return
+        columns = (
+            SpinnerColumn(),
+            TextColumn("{task.description}", justify="left"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[detail]}"),
+            TimeRemainingColumn(elapsed_when_finished=True),
+        )
+        with Progress(*columns, console=self._console, expand=True) as self._bars:
+            self._run_bar = self._bars.add_task("frames", total=frames, completed=self._before, detail="")
+            self._view_bar = self._bars.add_task("views", total=views, detail="")
+            yield
+        self._bars = None
+
+    def progress(self, progress: RunProgress) -> None:
+        elapsed_s = max(1e-6, time.monotonic() - self._started_s)
+        rate = (progress.proven - self._before) / elapsed_s
+        detail = (
+            f"{rate:5.1f} frames/s  {rate * self._frame_bytes / 1e6:5.1f} MB/s  {progress.dose_lux_h:.3f} lux.h"
+        )
+        if self._bars is not None:
+            self._bars.update(self._run_bar, completed=progress.proven, detail=detail)
+            self._bars.update(
+                self._view_bar,
+                completed=progress.view_number,
+                description=f"view {progress.view}",
+                detail=progress.light,
+            )
+        elif time.monotonic() - self._printed_s > _PLAIN_LINE_EVERY_S:
+            self._printed_s = time.monotonic()
+            left_s = (progress.frames - progress.proven) / rate if rate > 0 else 0.0
+            self._console.print(
+                f"view {progress.view} ({progress.view_number + 1}/{progress.views}) {progress.light}: "
+                f"{progress.proven}/{progress.frames} frames proven, {detail}, {duration_text(left_s)} left"
+            )
+
+    def note(self, message: str) -> None:
+        self._console.print(message)
+
+
+def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> None:
+    """Summary of what will happen."""
+    table = Table(title=f"{name} on {rig}", title_justify="left", box=None, show_header=False)
+    table.add_row("views, shots, frames", f"{len(report.views)}, {report.shots}, {report.frames}")
+    table.add_row("on disk", f"{bytes_text(report.bytes)} at {bytes_text(report.asked_bytes_s)}/s" + _disk(report))
+    table.add_row("a frame every", "; ".join(map(_pace, report.timings)))
+    table.add_row("duration", f"{duration_text(report.duration_s)} (at best {duration_text(report.ideal_s)})")
+    budget = "" if report.dose_budget_lux_h is None else f" of {report.dose_budget_lux_h:g} allowed"
+    before = f" after {report.dose_before_lux_h:.3f} before" if report.dose_before_lux_h else ""
+    table.add_row("light on the object", f"{report.dose_lux_h:.3f} lux.h{before}{budget}")
+    table.add_row("hottest LED board", f"{report.peak_board_c:.1f} C")
+    console.print(table)
+    for warning in report.warnings:
+        console.print(f"[yellow]note:[/] {warning}")
+
+
+def _pace(timing: BurstTiming) -> str:
+    bounds = {"LED": "the LED's time alight", "heat": "the LEDs' heat", "disk": "the disk", "camera": "the camera"}
+    return (
+        f"{timing.period_us / 1e3:g} ms, as {bounds[timing.bound]} asks ({timing.exposure_us / 1e3:g} ms exposed)"
+    )
+
+
+def _disk(report: Report) -> str:
+    return f"; the disk takes {bytes_text(report.disk_bytes_s)}/s" if report.disk_bytes_s else ""
+
+
+def show_views(console: Console, report: Report) -> None:
+    """One line for each view."""
+    table = Table("view", "joints (deg)", "move", "bursts", "lux.h", box=None)
+    for view in report.views:
+        joints = "-" if view.joints_deg is None else " ".join(f"{j:.1f}" for j in view.joints_deg)
+        table.add_row(
+            view.name, joints, duration_text(view.move_s), duration_text(view.burst_s), f"{view.dose_lux_h:.3f}"
+        )
+    console.print(table)
+
+
+def show_status(console: Console, status: Status) -> None:
+    """Progress of a run."""
+    console.print(
+        f"{status.state}: {status.proven} of {status.shots} shots proven, {status.darks_proven} dark frames, "
+        f"{status.reshot} re-shot; last event {status.last_event or 'none'}"
+    )
+    for view, (proven, expected) in status.views.items():
+        console.print(f"  {view}: {proven} of {expected} frames")
+    for fault in status.faults:
+        console.print(f"  [red]fault:[/] {fault}")
+
+
+def show_dry_run(console: Console, recorder: DryRecorder, outcome: Outcome, found: dict[str, Any]) -> None:
+    """What a dry run learnt."""
+    console.print(
+        f"dry run: {duration_text(found['duration_s'])} of the cell's time in {duration_text(found['machine_s'])} "
+        f"({found['speed']:.1f} times faster); preflight said {duration_text(found['preflight_s'])}"
+    )
+    table = Table("view", "pictures", "brightest", "saturated", "exposure", box=None)
+    for view, seen in recorder.exposures.items():
+        table.add_row(view, str(seen.pictures), f"{seen.brightest:.0%}", f"{seen.saturated:.2%}", seen.verdict())
+    console.print(table)
+    if outcome.reshot or outcome.over_triggers or outcome.lost_transfers:
+        console.print(
+            f"{outcome.reshot} shots re-shot, {outcome.over_triggers} edges came too early for the camera, "
+            f"{outcome.lost_transfers} frames lost in transfer"
+        )
+
+
+def show_advice(console: Console, advice: Advice) -> None:
+    """What metering learnt."""
+    table = Table("view", "at least", "at most", "object", box=None)
+    for seen in advice.views:
+        table.add_row(
+            seen.view,
+            f"{seen.shortest_us:,.0f} us",
+            f"{seen.longest_us:,.0f} us",
+            f"{seen.object_share:.0%} of the pixels",
+        )
+    console.print(table)
+    console.print(f"noise: {advice.noise.read_dn:.2f} DN read, {advice.noise.gain_dn:.4f} DN per electron")
+    for remark in advice.remarks:
+        console.print(f"[yellow]{remark}[/]")
+    exposures = ", ".join(f"{exposure_us:,}" for exposure_us in advice.exposure.exposures_us)
+    console.print(f"proposed: {advice.exposure.kind} {exposures} us")
+
+
+class LiveFigures:
+    """The live view's figures: drawn in place on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._live = Live(console=console, refresh_per_second=5, transient=True) if console.is_terminal else None
+        self._best: dict[str, float] = {}
+        self._said_s, self._number = 0.0, 0
+
+    def __enter__(self) -> LiveFigures:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self, shown: Shown | None) -> None:
+        """Draw what is newest, if it is new."""
+        if shown is None or shown.number == self._number:
+            return
+        self._number = shown.number
+        seen = shown.figures
+        best = self._best[shown.title] = max(self._best.get(shown.title, 0.0), seen.sharpness)
+        saturated = ", ".join(f"{name} {share:.2%}" for name, share in seen.saturated.items())
+        line = (
+            f"{shown.title}, {shown.exposure_us} us: brightest {seen.brightest:.0%}; saturated {saturated}; "
+            f"sharpness {seen.sharpness / best:.0%} of the best; {shown.frames_per_s:.1f} frames/s"
+        )
+        if self._live is not None:
+            self._live.update("\n".join([line, *(_bars(name, bins) for name, bins in seen.histograms.items())]))
+        elif time.monotonic() - self._said_s > _PLAIN_LINE_EVERY_S:
+            self._said_s = time.monotonic()
+            self._console.print(line)
+
+
+def _bars(name: str, bins: list[int]) -> str:
+    """A histogram as one line of blocks, logarithmic."""
+    blocks = " ▁▂▃▄▅▆▇█"
+    top = math.log1p(max(bins)) or 1.0
+    pairs = [max(bins[i : i + 2]) for i in range(0, len(bins), 2)]
+    return f"{name:>2} " + "".join(blocks[round(math.log1p(n) / top * (len(blocks) - 1))] for n in pairs)

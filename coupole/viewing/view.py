@@ -1,0 +1,65 @@
+"""`coupole view`: a plan's picture and page, also of a plan that preflight refuses."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+
+from coupole.errors import InputError
+from coupole.motion.itinerary import plan_itinerary
+from coupole.preflight.job import Job, check_job
+from coupole.preflight.preflight import StorageFacts
+from coupole.viewing.view_page import write_page
+from coupole.viewing.view_picture import write_picture
+from coupole.viewing.view_scene import Scene, scene_of
+
+
+def look_at_plan(job: Job, folder: Path, console: Console, *, paths: bool) -> tuple[Path, Path]:
+    """Write `<plan>.png` and `<plan>.html` into a folder, and say where.
+
+    Raises InputError if they cannot be written there. Without `paths` ways are straight and nothing is
+    looked at for collisions.
+    """
+    scene = look(job, console, paths=paths)
+    png, html = folder / f"{job.plan.name}.png", folder / f"{job.plan.name}.html"
+    with _doing(console, "drawing"):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_picture(scene, png)
+            write_page(scene, html)
+        except OSError as error:
+            raise InputError(f"--out {folder}: cannot write there: {error}; name another folder") from error
+    for refusal in scene.refusals:
+        console.print(f"[red]refused:[/] {refusal}")
+    console.print(f"{png}\n{html}", markup=False)
+    return png, html
+
+
+def look(job: Job, console: Console, *, paths: bool) -> Scene:
+    """What there is to see, and the refusals that `check` would give, but for those that concern the disk."""
+    rig, views = job.cell.rig, job.schedule.views
+    with _doing(console, f"planning the ways to {len(views)} views" if paths else "finding postures"):
+        job = job.without_hidden() if paths else job
+        job, report = check_job(job, StorageFacts(free_bytes=sys.maxsize), paths=paths)
+        home_deg = rig.motion.home_joints_deg
+        if paths:
+            itinerary = job.itinerary(views, home_deg)
+        else:
+            itinerary = plan_itinerary(views, rig, None, home_deg, job.plan.order)
+    with _doing(console, "finding shadows"):
+        return scene_of(job, itinerary, job.bodies if paths else None, report.refusals)
+
+
+@contextmanager
+def _doing(console: Console, what: str) -> Iterator[None]:
+    """Say what takes its time: in a line that goes away again on a terminal, in a plain one elsewhere."""
+    if console.is_terminal:
+        with console.status(what):
+            yield
+    else:
+        console.print(what)
+        yield

@@ -1,0 +1,200 @@
+"""A small renderer: triangles, lines and dots with a depth buffer, in numpy and numba, for still pictures.
+
+Pictures are drawn twice as large as they are wanted, then made smaller: that smooths all edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coupole.geometry import Transform, apply, inverse
+from coupole.viewing.view_colours import Colour
+from coupole.viewing.view_solids import Points, Solid
+
+OVERSAMPLING = 2
+_TO_LIGHT = np.array((-0.35, -0.55, -0.76))
+"""In the frame of who looks: from above, from the left, from behind."""
+_AMBIENT = 0.45
+_OUTLINE = 0.55
+"""Where one body ends before another, pixels are darkened to this."""
+_LINE_BIAS, _LINE_BIAS_MM = 2e-3, 10.0
+"""Lines lie on surfaces: they are seen where they are hidden by less than this share of their depth (perspective)
+or by less than this."""
+_NEARNESS_PER_MM = 1e-5
+"""Without perspective."""
+
+
+@dataclass(frozen=True)
+class Lookout:
+    """Where a picture is seen from, its x to the right, y down, z forward. `scale` is in perspective the focal
+    length in pixels, else pixels per mm."""
+
+    world_from_eye: Transform
+    scale: float
+    width_px: int
+    height_px: int
+    perspective: bool
+
+    def project(self, points_mm: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pixels [..., 2] and nearness [...] of points [..., 3]: nearer points have more of it, and it is linear
+        in the picture. Points behind the eye give NaN."""
+        seen = apply(inverse(self.world_from_eye), points_mm)
+        depth_mm = seen[..., 2]
+        middle = np.array((self.width_px, self.height_px)) / 2
+        if not self.perspective:
+            return seen[..., :2] * self.scale + middle, -_NEARNESS_PER_MM * depth_mm
+        in_front = np.where(depth_mm > 1.0, depth_mm, np.nan)
+        return seen[..., :2] * (self.scale / in_front)[..., None] + middle, 1.0 / in_front
+
+
+class Canvas:
+    """A picture in the making, seen from one place."""
+
+    def __init__(self, lookout: Lookout, background: Colour = (1.0, 1.0, 1.0)) -> None:
+        self._lookout = lookout
+        size = (OVERSAMPLING * lookout.height_px, OVERSAMPLING * lookout.width_px)
+        self._colour = np.tile(np.array(background, np.float32), (*size, 1))
+        self._near = np.full(size, -np.inf)
+
+    def fill(
+        self, solids: Sequence[Solid], colours: Sequence[ArrayLike], *, opacity: float = 1.0, outlined: bool = True
+    ) -> None:
+        """Draw solids, each in one colour [3] or one per face [faces, 3]. Transparent ones are drawn as one layer:
+        of them only the nearest is seen, and what is drawn later shines through."""
+        if not solids:
+            return
+        corners_mm = np.concatenate([solid.corners_mm for solid in solids])
+        colour = np.concatenate(
+            [
+                np.broadcast_to(np.asarray(c, np.float32), (len(s.faces), 3))
+                for s, c in zip(solids, colours, strict=True)
+            ]
+        )
+        body = np.repeat(np.arange(len(solids)), [len(solid.faces) for solid in solids])
+        pixels, near = self._project(corners_mm)
+        layer = self._near.copy() if opacity == 1.0 else np.full_like(self._near, -np.inf)
+        face = np.full(layer.shape, -1, np.int32)
+        _rasterise(pixels, near, layer, face)
+        drawn = (face >= 0) & (layer >= self._near)
+        shaded = (colour * self._shade(corners_mm)[:, None])[face[drawn]]
+        if outlined:
+            shaded[_edges(np.where(face >= 0, body[face], -1))[drawn]] *= _OUTLINE
+        self._colour[drawn] += opacity * (shaded - self._colour[drawn])
+        if opacity == 1.0:
+            self._near = layer
+
+    def line(self, points_mm: Points, colour: Colour, width_px: float, *, hidden: float = 0.15) -> None:
+        """Draw a line through points [n, 3]; where it is hidden, with the opacity `hidden`."""
+        for a, b in pairwise(points_mm):
+            (start, end), near = self._project(np.array((a, b)))
+            if not np.isfinite(near).all():
+                continue
+            share = np.linspace(0, 1, int(np.abs(end - start).max()) + 2)
+            centers = start + share[:, None] * (end - start)
+            self._stamp(centers, near[0] + share * (near[1] - near[0]), colour, width_px / 2, 1.0, hidden)
+
+    def dots(self, points_mm: Points, colours: ArrayLike, radius_px: float, *, opacity: float = 1.0) -> None:
+        """Draw discs of one size round points [n, 3], far ones first, in colours [n, 3] or one [3]."""
+        pixels, near = self._project(points_mm)
+        every = np.broadcast_to(np.asarray(colours, np.float32), (len(points_mm), 3))
+        for k in np.argsort(near):
+            if np.isfinite(near[k]):
+                self._stamp(pixels[k : k + 1], near[k : k + 1], every[k], radius_px, opacity, 0.0)
+
+    def image(self) -> Any:
+        """The picture as a PIL image of the lookout's size."""
+        from PIL import Image
+
+        full = Image.fromarray((np.clip(self._colour, 0, 1) * 255 + 0.5).astype(np.uint8))
+        return full.resize((self._lookout.width_px, self._lookout.height_px), Image.Resampling.BOX)
+
+    def _project(self, points_mm: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        pixels, near = self._lookout.project(points_mm)
+        return pixels * OVERSAMPLING, near
+
+    def _shade(self, corners_mm: Points) -> NDArray[np.float32]:
+        """Brightness [faces]: Lambert's law, on both sides of a face."""
+        normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+        length = np.linalg.norm(normals, axis=1)
+        normals /= np.where(length > 0, length, 1.0)[:, None]
+        eye = self._lookout.world_from_eye
+        away = np.einsum("nk,nk->n", normals, corners_mm[:, 0] - eye[:3, 3]) > 0
+        if not self._lookout.perspective:
+            away = normals @ eye[:3, 2] > 0
+        normals[away] *= -1
+        lambert = np.clip(normals @ eye[:3, :3] @ (_TO_LIGHT / np.linalg.norm(_TO_LIGHT)), 0, None)
+        shade: NDArray[np.float32] = (_AMBIENT + (1 - _AMBIENT) * lambert).astype(np.float32)
+        return shade
+
+    def _stamp(
+        self,
+        centers: NDArray[np.float64],
+        near: NDArray[np.float64],
+        colour: ArrayLike,
+        radius_px: float,
+        opacity: float,
+        hidden: float,
+    ) -> None:
+        """Draw overlapping discs [n, 2] as one, so that their opacity does not add up."""
+        radius = radius_px * OVERSAMPLING
+        steps = np.arange(-int(radius) - 1, int(radius) + 2)
+        offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        offsets = offsets[np.linalg.norm(offsets, axis=1) <= radius]
+        places = (np.floor(centers)[:, None] + offsets).astype(np.int64).reshape(-1, 2)
+        nearness = np.repeat(near, len(offsets))
+        height, width = self._near.shape
+        inside = ((places >= 0) & (places < (width, height))).all(axis=1)
+        flat = places[inside, 1] * width + places[inside, 0]
+        bias = _LINE_BIAS * nearness[inside] if self._lookout.perspective else _LINE_BIAS_MM * _NEARNESS_PER_MM
+        seen = nearness[inside] + bias >= self._near.ravel()[flat]
+        at, of = np.unique(flat, return_inverse=True)
+        strength = np.full((len(at), 1), hidden, np.float32)
+        strength[of[seen]] = opacity
+        pixels = self._colour.reshape(-1, 3)
+        pixels[at] += strength * (np.asarray(colour, np.float32) - pixels[at])
+
+
+def _edges(body: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """[height, width] True beside a pixel of another body."""
+    edge = np.zeros(body.shape, np.bool_)
+    across, down = body[:, 1:] != body[:, :-1], body[1:] != body[:-1]
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= down
+    edge[:-1] |= down
+    return edge
+
+
+@numba.njit(cache=True, nogil=True)
+def _rasterise(pixels, near, nearest, face):  # type: ignore[no-untyped-def]
+    """For each pixel the nearest triangle (pixels [n, 3, 2], nearness [n, 3]), into `nearest` and `face`."""
+    height, width = nearest.shape
+    for k in range(len(pixels)):
+        ax, ay = pixels[k, 0]
+        bx, by = pixels[k, 1]
+        cx, cy = pixels[k, 2]
+        twice = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if twice == 0.0 or np.isnan(twice) or np.isnan(near[k].sum()):
+            continue
+        left, right = max(0, int(np.ceil(min(ax, bx, cx) - 0.5))), min(width - 1, int(max(ax, bx, cx) - 0.5))
+        top, bottom = max(0, int(np.ceil(min(ay, by, cy) - 0.5))), min(height - 1, int(max(ay, by, cy) - 0.5))
+        for row in range(top, bottom + 1):
+            y = row + 0.5
+            for column in range(left, right + 1):
+                x = column + 0.5
+                wb = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / twice
+                wc = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / twice
+                wa = 1.0 - wb - wc
+                if wa < 0.0 or wb < 0.0 or wc < 0.0:
+                    continue
+                here = wa * near[k, 0] + wb * near[k, 1] + wc * near[k, 2]
+                if here > nearest[row, column]:
+                    nearest[row, column] = here
+                    face[row, column] = k

@@ -1,0 +1,253 @@
+"""The page of a plan: the cell to turn round, view by view. One file that needs no network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.motion.shadow import AWAY, BY_ARM, BY_OBJECT, BY_TOOL
+from coupole.viewing import view_colours as colours
+from coupole.viewing.terminal import duration_text
+from coupole.viewing.view_colours import Colour, css
+from coupole.viewing.view_scene import Scene, Stop
+from coupole.viewing.view_sight import sight_lines
+from coupole.viewing.view_solids import Points, Solid, disk, joined, simplified
+
+_OBJECT_FACES = 30_000
+_ROUND = 12
+_MANY = 8
+"""With more views than this the arm is shown in one view at a time only."""
+_SUPPORT_THICKNESS_MM = 15.0
+_OVERVIEW, _ALWAYS = 0, -1
+"""Steps of the slider beside the views' numbers: when a part of the drawing is shown."""
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
+body {{ font-family: sans-serif; color: #22262d; margin: 1.2em; }}
+h1 {{ font-size: 1.5em; font-weight: normal; margin: 0 0 .2em; }}
+p, ol {{ margin: .2em 0; }}
+.refused {{ color: {red}; }}
+</style></head><body>
+<h1>{title}</h1>
+<p>{about}</p>
+{refusals}
+{figure}
+</body></html>
+"""
+
+
+def write_page(scene: Scene, path: Path) -> None:
+    """Write the HTML page, plotly.js in it."""
+    clear = sum(not stop.refusal for stop in scene.stops)
+    checked = "" if scene.paths_checked else " Ways were not checked for collisions."
+    why = "".join(f"<li>{escape(refusal)}</li>" for refusal in scene.refusals)
+    page = _PAGE.format(
+        title=escape(scene.plan),
+        red=css(colours.RED),
+        about=f"{len(scene.stops)} views on {escape(scene.rig.name)}, {clear} of them clear.{checked} "
+        "Drag to turn, scroll to come nearer, point at a thing to read what it is; the slider goes from view to "
+        "view. LEDs are the lighter the more they reach of what the camera sees.",
+        refusals=f'<p class="refused">The plan is refused:</p><ol class="refused">{why}</ol>' if why else "",
+        figure=_figure(scene).to_html(
+            full_html=False,
+            include_plotlyjs=True,
+            default_height="82vh",
+            config={"displaylogo": False, "responsive": True},
+        ),
+    )
+    path.write_text(page, encoding="utf-8")
+
+
+def _figure(scene: Scene) -> Any:
+    import plotly.graph_objects as go
+
+    shown: list[tuple[int, Any]] = [(_ALWAYS, trace) for trace in _cell(scene)]
+    shown.append((_OVERVIEW, _leds(scene, scene.led_share, None)))
+    few = len(scene.stops) <= _MANY
+    for stop in scene.stops:
+        shown += [(_ALWAYS, trace) for trace in _ways(stop)]
+        for step in (_OVERVIEW, stop.number):
+            shown += [(step, trace) for trace in _camera(scene, stop)]
+            if step == stop.number or few or stop.clash is not None:
+                shown += [(step, trace) for trace in _arm(scene, stop, opacity=0.3 if step == _OVERVIEW else 1.0)]
+        share = np.zeros(len(scene.leds_mm)) if stop.shadow is None else stop.shadow.share()
+        shown.append((stop.number, _leds(scene, share, stop)))
+    traces = [trace.update(visible=step in (_ALWAYS, _OVERVIEW)) for step, trace in shown]
+    titles = ["all views", *(_title(scene, stop) for stop in scene.stops)]
+    labels = ["all", *(f"{stop.number} {stop.name}" for stop in scene.stops)]
+    steps = [
+        {
+            "method": "update",
+            "label": label,
+            "args": [{"visible": [step in (_ALWAYS, k) for step, _ in shown]}, {"title.text": title}],
+        }
+        for k, (label, title) in enumerate(zip(labels, titles, strict=True))
+    ]
+    axis = {"showbackground": False, "gridcolor": "#dddddd", "zeroline": False}
+    return go.Figure(
+        traces,
+        {
+            "title": {"text": titles[0], "font": {"size": 15}},
+            "margin": {"l": 0, "r": 0, "t": 70, "b": 0},
+            "showlegend": False,
+            "sliders": [{"steps": steps, "currentvalue": {"prefix": "view: "}, "pad": {"t": 10, "b": 30}}],
+            "scene": {
+                "aspectmode": "data",
+                "camera": {"eye": {"x": 0.7, "y": -1.2, "z": 0.5}, "center": {"x": 0, "y": 0, "z": -0.15}},
+                **{f"{name}axis": {**axis, "title": {"text": f"{name} (mm)"}} for name in "xyz"},
+            },
+        },
+    )
+
+
+def _title(scene: Scene, stop: Stop) -> str:
+    return (
+        f"{stop.number} {stop.name}: {stop.refusal}"
+        if stop.refusal
+        else _words_on(scene, stop).replace("<br>", "; ")
+    )
+
+
+def _words_on(scene: Scene, stop: Stop) -> str:
+    """What is told of a view where it is pointed at."""
+    words = [f"<b>{stop.number} {stop.name}</b>"]
+    if stop.refusal:
+        words.append(f"refused: {escape(stop.refusal)}")
+    if stop.joints_deg is not None:
+        words.append("axes " + ", ".join(f"{angle:.1f}" for angle in stop.joints_deg) + " deg")
+    if stop.leg_s is not None:
+        via = f" over {len(stop.vias_mm)} via points" if len(stop.vias_mm) else ""
+        words.append(f"way of {duration_text(stop.leg_s)}{via}")
+    words += scene.light_on(stop)
+    return "<br>".join(words)
+
+
+# -- traces -------------------------------------------------------------------------------------------------------
+
+
+def _cell(scene: Scene) -> list[Any]:
+    traces = [_mesh(disk("support", scene.rig.support.diameter_mm / 2, _SUPPORT_THICKNESS_MM), colours.SUPPORT)]
+    if scene.measured is not None:
+        traces.append(_mesh(simplified(scene.measured, _OBJECT_FACES), colours.OBJECT))
+    traces += [_mesh(volume, colours.KEEP_OUT, 0.1, f"keep-out {volume.name}") for volume in scene.keep_out]
+    traces.append(_mesh(joined("arm at home", scene.arm(scene.home_deg, _ROUND)), colours.HOME, 0.25))
+    if not scene.used.all():
+        unused = {"size": 2, "color": css(colours.UNUSED)}
+        traces.append(_points(scene.leds_mm[~scene.used], unused, "LED that the plan does not light"))
+    return traces
+
+
+def _arm(scene: Scene, stop: Stop, *, opacity: float) -> list[Any]:
+    """The arm at a view, and where it would touch something, that in red."""
+    traces = []
+    if stop.joints_deg is not None:
+        arm = scene.arm(stop.joints_deg, _ROUND)
+        of_tool = _is(scene.tool_names)
+        traces.append(_mesh(_those(arm, of_tool), colours.TOOL, opacity, _words_on(scene, stop)))
+        traces.append(
+            _mesh(_those(arm, lambda name: not of_tool(name)), colours.ARM, opacity, _words_on(scene, stop))
+        )
+    if stop.clash is not None:
+        arm = scene.arm(stop.clash.joints_deg, _ROUND)
+        touches = _is(stop.clash.bodies)
+        red, rest = _those(arm, touches), _those(arm, lambda name: not touches(name))
+        words = f"{stop.number} {stop.name}: {stop.clash.words}"
+        traces += [_mesh(red, colours.RED, 1.0, words), _mesh(rest, colours.ARM, 0.3, words)]
+        traces.append(_text(red.vertices_mm.mean(axis=0), stop.clash.words, colours.RED))
+    return traces
+
+
+def _is(names: frozenset[str] | tuple[str, ...]) -> Callable[[str], bool]:
+    return lambda name: name in names
+
+
+def _those(parts: Sequence[Solid], wanted: Callable[[str], bool]) -> Solid:
+    return joined("arm", [part for part in parts if wanted(part.name)])
+
+
+def _ways(stop: Stop) -> list[Any]:
+    colour = colours.RED if stop.refusal else colours.CAMERA_WAY
+    words = f"way of the camera to {stop.number} {stop.name}"
+    traces = [_line([stop.camera_way_mm], colour, 4, words)]
+    traces.append(_line([stop.flange_way_mm], colours.FLANGE_WAY, 2, words.replace("camera", "flange")))
+    if len(stop.vias_mm):
+        traces.append(_points(stop.vias_mm, {"size": 4, "color": css(colour)}, "via point"))
+    return traces
+
+
+def _camera(scene: Scene, stop: Stop) -> list[Any]:
+    if stop.sight is None:
+        return []
+    colour = colours.RED if stop.refusal else colours.SIGHT
+    words = _words_on(scene, stop)
+    return [
+        _line([*sight_lines(stop.sight), stop.footprint_mm], colour, 3, words),
+        _text(stop.sight.support_from_camera[:3, 3], str(stop.number), colour, words),
+    ]
+
+
+def _leds(scene: Scene, share: NDArray[np.float64], stop: Stop | None) -> Any:
+    """LEDs of the plan, coloured by the share that they reach; in a view one is told what hides the rest."""
+    columns = [scene.led_ids, share]
+    told = "LED %{customdata[0]:.0f}: reaches %{customdata[1]:.0%} of what is seen"
+    if stop is not None and stop.shadow is not None:
+        columns += [stop.shadow.share(code) for code in (AWAY, BY_OBJECT, BY_ARM, BY_TOOL)]
+        told += "<br>turned away from %{customdata[2]:.0%}; hidden by the object %{customdata[3]:.0%}, "
+        told += "by the arm %{customdata[4]:.0%}, by what it carries %{customdata[5]:.0%}"
+    marker = {
+        "size": 3.5,
+        "color": share[scene.used].astype(np.float32),
+        "cmin": 0,
+        "cmax": 1,
+        "colorscale": [[k / 8, css(colours.of_share(k / 8))] for k in range(9)],
+        "showscale": True,
+        "colorbar": {"title": {"text": "reached"}, "tickformat": ".0%", "len": 0.5, "thickness": 12},
+    }
+    told_of = np.stack(columns, axis=1)[scene.used].astype(np.float32)
+    trace = _points(scene.leds_mm[scene.used], marker, told)
+    return trace.update(customdata=told_of)
+
+
+def _mesh(solid: Solid, colour: Colour, opacity: float = 1.0, words: str = "") -> Any:
+    import plotly.graph_objects as go
+
+    x, y, z = solid.vertices_mm.astype(np.float32).T
+    i, j, k = solid.faces.astype(np.uint16 if len(solid.vertices_mm) < 65536 else np.uint32).T
+    return go.Mesh3d(
+        x=x,
+        y=y,
+        z=z,
+        i=i,
+        j=j,
+        k=k,
+        color=css(colour),
+        opacity=opacity,
+        flatshading=False,
+        lighting={"ambient": 0.55, "diffuse": 0.6, "specular": 0.1},
+        hovertemplate=(words or solid.name) + "<extra></extra>",
+    )
+
+
+def _line(lines_mm: Sequence[Points], colour: Colour, width: int, words: str) -> Any:
+    """Several lines [n, 3] as one trace, with gaps between them."""
+    gap = np.full((1, 3), np.nan)
+    points = np.concatenate([part for line in lines_mm for part in (line, gap)])
+    trace = _points(points, None, words)
+    return trace.update(mode="lines", line={"color": css(colour), "width": width})
+
+
+def _points(points_mm: Points, marker: dict[str, Any] | None, words: str) -> Any:
+    import plotly.graph_objects as go
+
+    x, y, z = points_mm.astype(np.float32).T
+    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, hovertemplate=words + "<extra></extra>")
+
+
+def _text(at_mm: Points, text: str, colour: Colour, words: str = "") -> Any:
+    trace = _points(at_mm[None], None, words or text)
+    return trace.update(mode="text", text=[text], textfont={"color": css(colour), "size": 15})

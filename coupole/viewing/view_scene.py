@@ -1,0 +1,299 @@
+"""What there is to see of a plan: the cell, where the arm stands at each view, its ways, and what it would touch.
+
+Everything is in the support frame, in mm, and says nothing of how it is drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole import kinematics
+from coupole.geometry import inverse
+from coupole.motion import singularities
+from coupole.motion.bodies import ARM_CAPSULES, FLANGE, Capsule
+from coupole.motion.collisions import CellBodies, Contact
+from coupole.motion.itinerary import Itinerary, Visit, arm_of, base_from_flange
+from coupole.motion.path_planner import Joints
+from coupole.motion.shadow import Shadow, Shadows, Sight, capsule_axes, sight_of
+from coupole.plan.rig import KeepOutBox, Rig
+from coupole.plan.shots import ViewPose, leds_of_plan
+from coupole.preflight.job import Job
+from coupole.viewing.view_sight import footprint
+from coupole.viewing.view_solids import Points, Solid, ball, box, capsule, joined
+
+_WAY_STEP_DEG = 3.0
+_CLASH_PLACES = 200
+
+
+@dataclass(frozen=True)
+class Clash:
+    """The arm where it would touch something."""
+
+    contact: Contact
+    joints_deg: Joints
+
+    @property
+    def words(self) -> str:
+        """What touches what, and how far off it is."""
+        apart_mm = self.contact.distance_mm
+        how = f"{apart_mm:.0f} mm from" if apart_mm > 0 else f"{-apart_mm:.0f} mm inside"
+        return f"{self.contact.body} {how} {self.contact.other}"
+
+    @property
+    def bodies(self) -> tuple[str, str]:
+        """Both bodies, by the names that solids have."""
+        return self.contact.body, self.contact.other.removeprefix("the arm's ").removeprefix("the ")
+
+
+@dataclass(frozen=True)
+class Stop:
+    """One view and the way to it."""
+
+    name: str
+    number: int
+    """In the order of visiting, from 1; refused views come last."""
+    joints_deg: Joints | None
+    """[6] where the arm stands; None where it cannot be there."""
+    leg_s: float | None
+    """Time of the leg; None where there is none."""
+    camera_way_mm: Points
+    """[n, 3] of the projection centre on the leg; where there is none, straight ahead into what is in the way."""
+    flange_way_mm: Points
+    vias_mm: Points
+    """[k, 3] the projection centre at the leg's via points."""
+    sight: Sight | None
+    footprint_mm: Points
+    """[n, 3] closed line round what the picture shows of object and support."""
+    shadow: Shadow | None
+    refusal: str
+    """Why the plan must not be run, as far as this view is concerned; empty if nothing speaks against it."""
+    clash: Clash | None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The cell and all views, in the order of their numbers."""
+
+    plan: str
+    rig: Rig
+    stops: tuple[Stop, ...]
+    refusals: tuple[str, ...]
+    measured: Solid | None
+    """The object."""
+    patch_of_face: NDArray[np.int64]
+    """[faces] of the object, -1 for none."""
+    keep_out: tuple[Solid, ...]
+    leds_mm: Points
+    led_ids: NDArray[np.int64]
+    used: NDArray[np.bool_]
+    """[leds] True for those that the plan lights."""
+    paths_checked: bool
+
+    @property
+    def home_deg(self) -> Joints:
+        return np.array(self.rig.motion.home_joints_deg)
+
+    @property
+    def tool_names(self) -> frozenset[str]:
+        """Names of the bodies that the flange carries."""
+        return frozenset(body.name for body in self.rig.tool)
+
+    @property
+    def led_share(self) -> NDArray[np.float64]:
+        """[leds] share of what the camera sees that each LED reaches, mean of the views that can be taken."""
+        shares = [stop.shadow.share() for stop in self.stops if stop.shadow is not None]
+        return np.mean(shares, axis=0) if shares else np.zeros(len(self.leds_mm))
+
+    def light_on(self, stop: Stop) -> list[str]:
+        """What is to be said of the plan's LEDs in a view, a line each."""
+        if stop.shadow is None or not self.used.any():
+            return []
+        reached, useless = stop.shadow.share()[self.used].mean(), stop.shadow.useless()[self.used].sum()
+        return [
+            f"an LED reaches {reached:.0%} of what is seen",
+            f"{useless} of {self.used.sum()} LEDs reach nothing of it",
+        ]
+
+    def arm(self, joints_deg: Joints, around: int = 24) -> list[Solid]:
+        """The arm's and the tool's bodies, each a solid, at joint angles [6]."""
+        capsules = [
+            *ARM_CAPSULES,
+            *(Capsule(b.name, FLANGE, b.from_mm, b.to_mm, b.radius_mm) for b in self.rig.tool),
+        ]
+        axes_mm, radii_mm = capsule_axes(capsules, _frames(self.rig, joints_deg))
+        parts: dict[str, list[Solid]] = {}
+        for part, axis_mm, radius_mm in zip(capsules, axes_mm, radii_mm, strict=True):
+            parts.setdefault(part.body, []).append(capsule(part.body, axis_mm[0], axis_mm[1], radius_mm, around))
+        return [joined(name, of) for name, of in parts.items()]
+
+
+def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals: Sequence[str]) -> Scene:
+    """Everything that there is to see of a job; without `bodies` nothing is looked at for collisions."""
+    rig, views = job.cell.rig, job.schedule.views
+    shadows, corners_mm = job.shadows, job.object_corners_mm
+    refused = [index for index in range(len(views)) if index not in itinerary.order]
+    home_deg = place_deg = np.array(rig.motion.home_joints_deg)
+    stops = []
+    for number, index in enumerate([*itinerary.order, *refused], start=1):
+        view, visit = views[index], itinerary.visits[index]
+        if visit is not None:
+            stops.append(_visited(number, view, place_deg, visit, rig, shadows))
+            place_deg = visit.joints_deg
+        else:
+            why = _refusal(view, itinerary.refusals)
+            stops.append(_refused(number, view, why, (place_deg, home_deg), rig, bodies, shadows))
+    measured = None
+    if len(corners_mm):
+        vertices, faces = np.unique(corners_mm.reshape(-1, 3), axis=0, return_inverse=True)
+        measured = Solid("object", vertices, faces.reshape(-1, 3))
+    used = np.zeros(len(job.cell.leds.ids), np.bool_)
+    used[leds_of_plan(job.plan, job.cell.leds, rig.support.base_from_support.matrix())] = True
+    return Scene(
+        job.plan.name,
+        rig,
+        tuple(stops),
+        tuple(refusals),
+        measured,
+        shadows.patches.of_triangles(len(corners_mm)),
+        tuple(
+            box(k.name, k.min_mm, k.max_mm)
+            if isinstance(k, KeepOutBox)
+            else ball(k.name, k.center_mm, k.radius_mm)
+            for k in rig.keep_out
+        ),
+        shadows.leds_mm,
+        job.cell.leds.ids,
+        used,
+        bodies is not None,
+    )
+
+
+def _refusal(view: ViewPose, refusals: Sequence[str]) -> str:
+    start = f"view {view.name}: "
+    return next((text.removeprefix(start) for text in refusals if text.startswith(start)), "")
+
+
+def _visited(number: int, view: ViewPose, from_deg: Joints, visit: Visit, rig: Rig, shadows: Shadows) -> Stop:
+    way_deg = [from_deg, *visit.leg.waypoints]
+    sight = _sight(view, visit.joints_deg, rig)
+    return Stop(
+        view.name,
+        number,
+        visit.joints_deg,
+        visit.leg.duration_s,
+        *_ways_mm(way_deg, rig),
+        sight,
+        _footprint(sight, rig, shadows),
+        shadows.at(visit.joints_deg),
+        refusal="",
+        clash=None,
+    )
+
+
+def _refused(
+    number: int,
+    view: ViewPose,
+    why: str,
+    starts_deg: Sequence[Joints],
+    rig: Rig,
+    bodies: CellBodies | None,
+    shadows: Shadows,
+) -> Stop:
+    clash, from_deg = None, starts_deg[0]
+    if bodies is not None:
+        clash, from_deg = _clash(view, starts_deg, rig, bodies)
+    way_deg = [from_deg] if clash is None else [from_deg, clash.joints_deg]
+    sight = _sight(view, None if view.joints_deg is None else np.array(view.joints_deg), rig)
+    return Stop(
+        view.name,
+        number,
+        None,
+        None,
+        *_ways_mm(way_deg, rig),
+        sight,
+        _footprint(sight, rig, shadows),
+        None,
+        why,
+        clash,
+    )
+
+
+def _sight(view: ViewPose, joints_deg: Joints | None, rig: Rig) -> Sight | None:
+    if view.support_from_camera is not None:
+        return sight_of(rig, view.support_from_camera)
+    if joints_deg is None:
+        return None
+    return sight_of(rig, _frames(rig, joints_deg)[FLANGE] @ rig.flange_from_camera.matrix())
+
+
+def _footprint(sight: Sight | None, rig: Rig, shadows: Shadows) -> Points:
+    return np.zeros((0, 3)) if sight is None else footprint(sight, shadows.mesh, rig.support.diameter_mm / 2)
+
+
+def _ways_mm(way_deg: Sequence[Joints], rig: Rig) -> tuple[Points, Points, Points]:
+    """Ways [n, 3] of camera and flange, and the camera's via points [k, 3]."""
+    along, vias = (_frames(rig, np.array(places))[..., FLANGE, :, :] for places in (_along(way_deg), way_deg))
+    camera_mm = rig.flange_from_camera.matrix()[:3, 3]
+    return (
+        along[:, :3, :3] @ camera_mm + along[:, :3, 3],
+        along[:, :3, 3],
+        (vias[:, :3, :3] @ camera_mm + vias[:, :3, 3])[1:-1],
+    )
+
+
+def _frames(rig: Rig, joints_deg: Joints) -> NDArray[np.float64]:
+    """`support_from_link` [..., 8, 4, 4]."""
+    frames: NDArray[np.float64] = inverse(rig.support.base_from_support.matrix()) @ kinematics.link_frames(
+        arm_of(rig), joints_deg
+    )
+    return frames
+
+
+def _along(way_deg: Sequence[Joints]) -> Joints:
+    """Places [n, 6] close together on straight motions."""
+    places = [way_deg[0][None]]
+    for a, b in pairwise(way_deg):
+        steps = max(1, int(np.ceil(np.abs(b - a).max() / _WAY_STEP_DEG)))
+        places.append(a + np.linspace(0, 1, steps + 1)[1:, None] * (b - a))
+    return np.concatenate(places)
+
+
+def _clash(
+    view: ViewPose, starts_deg: Sequence[Joints], rig: Rig, bodies: CellBodies
+) -> tuple[Clash | None, Joints]:
+    """What a refused view, or else a straight way to it, would touch, and where that way starts.
+
+    Of postures that all touch something, the one that lacks least counts.
+    """
+    arm = arm_of(rig)
+    postures = (
+        kinematics.inverse(arm, base_from_flange(view, rig)) if view.joints_deg is None else [view.joints_deg]
+    )
+    postures = np.array(postures, np.float64).reshape(-1, 6)
+    postures = postures[singularities.margin(arm, postures) >= 1.0]
+    if len(postures) == 0:
+        return None, starts_deg[0]
+    tightest_mm = bodies.tightest_mm(postures)
+    if tightest_mm.max() < 0:
+        least_bad = postures[int(np.argmax(tightest_mm))]
+        return Clash(bodies.contacts(least_bad)[0], least_bad), least_bad
+    for goal_deg in postures[tightest_mm >= 0]:
+        for start_deg in starts_deg:
+            if clash := _clash_on_the_way(start_deg, goal_deg, bodies):
+                return clash, start_deg
+    return None, starts_deg[0]
+
+
+def _clash_on_the_way(from_deg: Joints, to_deg: Joints, bodies: CellBodies) -> Clash | None:
+    """Where the straight motion between two places first touches something."""
+    places = from_deg + np.linspace(0, 1, _CLASH_PLACES)[:, None] * (to_deg - from_deg)
+    touches = bodies.tightest_mm(places) < 0
+    if not touches.any():
+        return None
+    first = places[int(np.argmax(touches))]
+    return Clash(bodies.contacts(first)[0], first)

@@ -1,0 +1,54 @@
+"""Where a camera looks: the edges of its field of view, and where its picture falls."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from coupole.geometry import apply
+from coupole.motion.shadow import Sight
+from coupole.viewing.view_solids import Points
+
+_BORDER_POINTS = 16
+"""Points on each side of the picture whose rays draw its footprint."""
+_FAR_MM = 1e4
+
+
+def picture_border(sight: Sight) -> Points:
+    """Points [4 n, 3] in the camera's frame, 1 mm in front of it, round its picture; every n-th is a corner."""
+    half = np.array((sight.width_px, sight.height_px)) / 2 / sight.focal_px
+    corners = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
+    share = np.arange(_BORDER_POINTS)[:, None] / _BORDER_POINTS
+    border = np.concatenate([a + share * (b - a) for a, b in pairwise(corners)])
+    return np.concatenate([border, np.ones((len(border), 1))], axis=1)
+
+
+def sight_lines(sight: Sight, length_mm: float = 120.0) -> list[Points]:
+    """The edges of a camera's field of view: four rays [2, 3], and the closed line [5, 3] round their ends."""
+    corners = length_mm * picture_border(sight)[::_BORDER_POINTS]
+    far_mm = apply(sight.support_from_camera, np.concatenate([corners, corners[:1]]))
+    eye_mm = sight.support_from_camera[:3, 3]
+    return [*(np.array((eye_mm, corner)) for corner in far_mm[:4]), far_mm]
+
+
+def footprint(sight: Sight, mesh: Any, support_radius_mm: float) -> Points:
+    """Closed line [n, 3] where the border of a camera's picture falls on the object, else on the support; without
+    the places where it falls on neither."""
+    eye_mm = sight.support_from_camera[:3, 3]
+    rays = picture_border(sight) @ sight.support_from_camera[:3, :3].T
+    with np.errstate(divide="ignore"):
+        reach = np.where(rays[:, 2] < 0, -eye_mm[2] / rays[:, 2], np.inf)
+    if mesh is not None:
+        met = mesh.run(
+            np.tile(eye_mm, (len(rays), 1)).astype(np.float32),
+            rays.astype(np.float32),
+            dists=np.full(len(rays), _FAR_MM, np.float32),
+            query="DISTANCE",
+        )
+        reach = np.where(met < _FAR_MM, np.minimum(met, reach), reach)
+    hit = np.isfinite(reach) & (reach > 0)
+    points = eye_mm + reach[hit, None] * rays[hit]
+    points = points[np.linalg.norm(points[:, :2], axis=1) <= support_radius_mm]
+    return np.concatenate([points, points[:1]])

@@ -1,0 +1,331 @@
+"""GigE Vision and USB3 Vision cameras through libaravis: `coupole.devices.Camera`.
+
+The camera is found by its address, serial number or Aravis id; the rig's `features` are checked, written and
+read back at opening, in their order. Frames are views of our own page-aligned buffers, not copied (packed and
+8-bit formats are widened once). What a camera cannot tell is -1, never guessed. The settings are listed in
+`docs/reference/camera-aravis.md`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+
+from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
+from coupole.errors import DeviceError, DeviceLost, DeviceRefused
+from drivers.camera.aravis.discovery import name_of, open_controlled
+from drivers.camera.aravis.features import Features
+from drivers.camera.aravis.library import ON_CONTROL_LOST, call, is_a, require
+from drivers.camera.aravis.settings import Counter, Settings
+from drivers.camera.aravis.stream import Pool, Stream, StreamStatistics
+from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_region
+from drivers.camera.pixel_formats import widen
+
+__all__ = ["AravisCamera", "Settings"]
+
+_PACKET_SOCKET_DISABLED = 1
+"""ArvGvStreamOption (arvgvstream.h)."""
+_LAST_WIDE_ID = 2**62
+"""Stands for the end of 64-bit ids, which is never reached."""
+
+
+class AravisCamera:
+    """`coupole.devices.Camera`; see the module's text."""
+
+    delivery_s = 1.0
+
+    def __init__(self, settings: Settings, clock: Clock) -> None:
+        self._settings, self._name = settings, settings.device
+        self.timestamp_jitter_us = settings.timestamp_jitter_us
+        self._library = require(self._name)
+        self._lost = threading.Event()
+        self._format: FrameFormat | None = None
+        self._exposure = Exposure(0)
+        self._stream: Stream | None = None
+        self._counted_before = (0, 0)
+        self._last = (CameraStatistics(-1, 0, 0, -1, 0), StreamStatistics())
+        self._raw = self._wide = Pool(1, 1)
+        self._armed = threading.Event()
+        self._arming = threading.Lock()
+        self._handle = open_controlled(self._library, self._name, name_of(self._name, settings.address))
+        self._is_gige = is_a(self._library, self._handle, "arv_gv_device")
+        self._on_lost = ON_CONTROL_LOST(lambda *_: self._lost.set())  # libaravis keeps no reference
+        self._signal = self._library.g_signal_connect_data(
+            self._handle, b"control-lost", self._on_lost, None, None, 0
+        )
+        self._features = Features(self._library, self._handle, self._name)
+        try:
+            self._set_up()
+            self.id_modulus = self._ids()
+        except BaseException:
+            self.close()
+            raise
+
+    # -- opening and closing ------------------------------------------------------------------------------
+
+    def _set_up(self) -> None:
+        settings, features = self._settings, self._features
+        with contextlib.suppress(DeviceRefused):  # a client that died may have left it running
+            features.execute("AcquisitionStop")
+        features.write_all(settings.features)
+        if settings.region is not None:
+            set_region(features, settings.region)
+        features.write("PixelFormat", settings.pixel_format)
+        if self._is_gige:
+            self._set_packets()
+
+    def _set_packets(self) -> None:
+        library, handle, size = self._library, self._handle, self._settings.packet_size
+        if not self._settings.packet_socket:
+            library.arv_gv_device_set_stream_options(handle, _PACKET_SOCKET_DISABLED)
+        if size is None:
+            call(self._name, "a packet size that fits", library.arv_gv_device_auto_packet_size, handle)
+        else:
+            call(self._name, f"packets of {size} B", library.arv_gv_device_set_packet_size, handle, size)
+
+    def _ids(self) -> tuple[int, int]:
+        """The transport's frame ids: 64 bits on USB3 Vision, and on GigE Vision 2 where the camera says so."""
+        if not self._is_gige:
+            return (0, _LAST_WIDE_ID)
+        extended = "GevGVSPExtendedIDMode"
+        if self._features.has(extended) and self._features.read(extended) in {"On", True}:
+            return (1, _LAST_WIDE_ID)
+        return (1, 65535)
+
+    def close(self) -> None:
+        with contextlib.suppress(DeviceError):
+            self.disarm()
+        if self._handle:
+            self._library.g_signal_handler_disconnect(self._handle, self._signal)
+            self._library.g_object_unref(self._handle)
+            self._handle = 0
+
+    # -- who it is ----------------------------------------------------------------------------------------
+
+    def identify(self) -> Identity:
+        vendor, model, serial, firmware = (
+            self._text(*names)
+            for names in (
+                ("DeviceVendorName",),
+                ("DeviceModelName",),
+                ("DeviceSerialNumber", "DeviceID"),
+                ("DeviceFirmwareVersion", "DeviceVersion"),
+            )
+        )
+        return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
+
+    def _text(self, *names: str) -> str:
+        name = self._features.first_of(*names)
+        return str(self._features.read(name)) if name else "unknown"
+
+    def self_test(self) -> Mapping[str, str]:
+        """Raises DeviceError if the camera does not answer."""
+        self._check_link()
+        report = {"protocol": "GigE Vision" if self._is_gige else "USB3 Vision"}
+        for what, names in (
+            ("temperature_c", ("DeviceTemperature", "DeviceTemperatureRaw")),
+            ("pixel_format", ("PixelFormat",)),
+            ("payload_bytes", ("PayloadSize",)),
+            ("packet_bytes", ("GevSCPSPacketSize",)),
+        ):
+            name = self._features.first_of(*names)
+            if name is not None:
+                report[what] = str(self._features.read(name))
+        return report
+
+    def temperature_c(self) -> float:
+        """Of the sensor or body, as the camera has it. Raises DeviceRefused if it has no thermometer."""
+        return self._features.number("DeviceTemperature")
+
+    # -- exposure -----------------------------------------------------------------------------------------
+
+    def configure(self, exposure: Exposure) -> FrameFormat:
+        if self._stream is not None:
+            raise self._misused("a disarmed camera", "configure() was called while it is armed")
+        self._check_link()
+        features, settings = self._features, self._settings
+        for name, entry in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("TriggerSelector", "FrameStart")):
+            if features.has(name):
+                features.write(name, entry)
+        features.write("TriggerMode", "On")
+        if exposure.hardware_trigger:
+            features.write("TriggerSource", settings.trigger_line)
+            if features.has("TriggerActivation"):
+                features.write("TriggerActivation", settings.trigger_activation)
+        else:
+            features.write("TriggerSource", settings.software_trigger)
+        features.write(features.first_of("ExposureTimeAbs") or "ExposureTime", float(exposure.exposure_us))
+        if exposure.gain_db or features.has("Gain"):
+            features.write("Gain", float(exposure.gain_db))
+        self._exposure = exposure
+        self._format = frame_format(features, self._name, settings.black_dn)
+        return self._format
+
+    def min_period_us(self, exposure: Exposure) -> int:
+        settings = self._settings
+        least_us = readout_us(self._features, self._name, settings.readout_us)
+        return max(least_us, exposure.exposure_us + settings.exposure_gap_us)
+
+    # -- acquisition --------------------------------------------------------------------------------------
+
+    def arm(self, buffers: int) -> None:
+        if self._format is None:
+            raise self._misused("configure() before arm()", "no exposure is set")
+        self.disarm()
+        self._check_link()
+        self._allocate(max(buffers, self._settings.buffers))
+        retention_us = self._settings.frame_retention_ms * 1000
+        stream = Stream(self._library, self._handle, self._name, self._raw, frame_retention_us=retention_us)
+        try:
+            self._counted_before = self._count()
+            self._features.execute("AcquisitionStart")
+        except BaseException:
+            stream.close()
+            raise
+        self._stream = stream
+        self._armed.set()
+
+    def _allocate(self, slots: int) -> None:
+        """Memory for the device's payload, never for what the format should make of it (facts/genicam)."""
+        assert self._format is not None
+        self._wire_format = pixel_format(self._features, self._name)
+        payload_bytes = int(self._features.number("PayloadSize"))
+        pixels = self._format.width_px * self._format.height_px
+        if payload_bytes < self._wire_format.wire_bytes(pixels):
+            raise DeviceRefused(
+                self._name,
+                expected=f"a payload of {self._wire_format.wire_bytes(pixels)} B or more",
+                happened=f"the camera announces {payload_bytes} B",
+                remedy="Check width, height and pixel format in the rig.",
+            )
+        if not self._raw.fits(slots, payload_bytes):
+            self._raw = Pool(slots, payload_bytes)
+        widens = self._wire_format.packing != "two bytes"
+        if widens and (self._wide.slots, self._wide.payload_bytes) != (self._raw.slots, 2 * pixels):
+            self._wide = Pool(self._raw.slots, 2 * pixels)
+
+    def next_frame(self, timeout_s: float) -> Frame | None:
+        end_s = time.monotonic() + timeout_s
+        while True:
+            left_s = end_s - time.monotonic()
+            if self._lost.is_set():
+                raise self._link_lost("the camera no longer obeys: its control channel is gone")
+            stream = self._stream
+            if stream is None:
+                self._armed.wait(max(0.0, left_s))
+                stream = self._stream
+            taken = stream.next(max(0.0, end_s - time.monotonic()), *self.id_modulus) if stream else None
+            if taken is not None:
+                assert stream is not None
+                return self._frame(stream, taken.buffer, taken.slot, taken.frame_id, taken.timestamp_ns)
+            if time.monotonic() >= end_s:
+                return None
+
+    def _frame(self, stream: Stream, buffer: int, slot: int, frame_id: int, timestamp_ns: int) -> Frame:
+        assert self._format is not None
+        shape = (self._format.height_px, self._format.width_px)
+        raw = self._raw.slot(slot)
+        got = (
+            self._library.arv_buffer_get_image_height(buffer),
+            self._library.arv_buffer_get_image_width(buffer),
+            self._library.arv_buffer_get_image_pixel_format(buffer),
+        )
+        if got != (*shape, self._wire_format.code):
+            stream.give_back(buffer)
+            raise DeviceError(
+                self._name,
+                expected=f"{shape[1]} x {shape[0]} pixels of {self._wire_format.name}",
+                happened=f"frame {frame_id} has {got[1]} x {got[0]} of format 0x{got[2]:08x}",
+                remedy="Has another program changed the camera? Start again.",
+            )
+        if self._wire_format.packing == "two bytes":
+            pixels = raw[: 2 * shape[0] * shape[1]].view(np.uint16).reshape(shape)
+        else:
+            pixels = self._wide.slot(slot).view(np.uint16).reshape(shape)
+            widen(pixels.reshape(-1), raw, self._wire_format)
+        return Frame(frame_id, timestamp_ns, pixels, partial(stream.give_back, buffer))
+
+    def trigger(self) -> None:
+        if self._stream is None or self._exposure.hardware_trigger:
+            raise self._misused(
+                "a camera armed for the software trigger", "it is disarmed, or armed for the cable"
+            )
+        self._check_link()
+        self._features.execute("TriggerSoftware")
+
+    def disarm(self) -> None:
+        with self._arming:
+            stream, self._stream = self._stream, None
+            self._armed.clear()
+            if stream is None:
+                return
+            try:
+                self._check_link()
+                self._last = (self._statistics(stream), stream.statistics())
+                self._features.execute("AcquisitionStop")
+            finally:
+                stream.close()
+
+    # -- statistics ---------------------------------------------------------------------------------------
+
+    def statistics(self) -> CameraStatistics:
+        stream = self._stream
+        return self._statistics(stream) if stream is not None else self._last[0]
+
+    def _statistics(self, stream: Stream) -> CameraStatistics:
+        exposed, over_triggers = self._count()
+        found = stream.statistics()
+        overflows = max(0, found.skipped - found.failed) if found.underruns else 0
+        return CameraStatistics(
+            _since(exposed, self._counted_before[0]),
+            found.completed,
+            found.skipped - overflows,
+            _since(over_triggers, self._counted_before[1]),
+            overflows,
+        )
+
+    def _count(self) -> tuple[int, int]:
+        """The camera's own counts, -1 where it has none."""
+        return (self._read(self._settings.exposed_counter), self._read(self._settings.over_trigger_counter))
+
+    def _read(self, counter: Counter | None) -> int:
+        if counter is None:
+            return -1
+        self._features.write_all(counter.select)
+        return int(self._features.number(counter.read))
+
+    def stream_statistics(self) -> StreamStatistics:
+        """Figures of frames and packets since `arm`."""
+        stream = self._stream
+        return stream.statistics() if stream is not None else self._last[1]
+
+    # -- errors -------------------------------------------------------------------------------------------
+
+    def _check_link(self) -> None:
+        if self._lost.is_set() or not self._handle:
+            raise self._link_lost("its control channel is gone" if self._handle else "it was closed")
+
+    def _link_lost(self, happened: str) -> DeviceLost:
+        return DeviceLost(
+            self._name,
+            expected="control of the camera",
+            happened=happened,
+            remedy="Check cable and power, and that no other program uses the camera; then resume the run.",
+        )
+
+    def _misused(self, expected: str, happened: str) -> DeviceRefused:
+        return DeviceRefused(
+            self._name,
+            expected=expected,
+            happened=happened,
+            remedy="This is a fault of the program that drives the camera.",
+        )
+
+
+def _since(count: int, before: int) -> int:
+    return count if count < 0 else (count - before) % 2**32

@@ -1,0 +1,183 @@
+"""GenICam features of an opened camera by name, with their types and ranges checked before anything is written."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import threading
+from collections.abc import Mapping
+from typing import Any, NoReturn
+
+from pydantic import StrictBool, StrictFloat, StrictInt, StrictStr
+
+from coupole.errors import DeviceRefused
+from drivers.camera.aravis.library import call, is_a
+
+Value = StrictBool | StrictInt | StrictFloat | StrictStr
+"""What a feature holds; an enumeration's is the name of its entry."""
+
+_KINDS = ("command", "enumeration", "boolean", "integer", "float", "string")
+_READ_ONLY = 0
+"""ArvGcAccessMode (arvgcenums.h)."""
+_READBACK_TOLERANCE = 0.01
+"""Cameras round: an exposure to their line time, a gain to their converter's steps."""
+
+
+class Features:
+    """Reads and writes features of one device; `device` is its name in the rig."""
+
+    def __init__(self, library: Any, handle: int, device: str) -> None:
+        self._library, self._handle, self._device = library, handle, device
+        self._lock = threading.RLock()  # libaravis evaluates formulas without one
+
+    def has(self, name: str) -> bool:
+        """True if the camera has the feature and it can be used now."""
+        with self._lock:
+            if not self._library.arv_device_get_feature(self._handle, name.encode()):
+                return False
+            return bool(self._call("is_feature_available", name))
+
+    def first_of(self, *names: str) -> str | None:
+        """The first of these features that the camera has."""
+        return next((name for name in names if self.has(name)), None)
+
+    def read(self, name: str) -> Value:
+        """Raises DeviceRefused if the camera has no such feature, or it holds no value."""
+        with self._lock:
+            match self._kind(name):
+                case "enumeration" | "string":
+                    text = self._call("get_string_feature_value", name)
+                    return (text or b"").decode(errors="replace")
+                case "boolean":
+                    return bool(self._call("get_boolean_feature_value", name))
+                case "integer":
+                    return int(self._call("get_integer_feature_value", name))
+                case "float":
+                    return float(self._call("get_float_feature_value", name))
+                case kind:
+                    self._refuse(f"`{name}` to hold a value", f"it is a {kind}")
+
+    def number(self, name: str) -> float:
+        """The value of an integer or float feature."""
+        value = self.read(name)
+        if isinstance(value, str):
+            self._refuse(f"a number in `{name}`", f"it holds {value!r}")
+        return value
+
+    def write(self, name: str, value: Value) -> None:
+        """Set a feature and read it back.
+
+        Raises DeviceRefused if there is no such feature, the value is of another type or out of range, or the
+        camera then holds another one.
+        """
+        with self._lock:
+            kind = self._kind(name)
+            if self._library.arv_device_get_feature_access_mode(self._handle, name.encode()) == _READ_ONLY:
+                self._refuse("a feature that can be set", f"`{name}` can only be read")
+            getattr(self, f"_write_{kind}")(name, value)
+            if kind == "command":
+                return
+            held = self.read(name)
+        if not _alike(held, value):
+            self._refuse(f"`{name}` to hold {value!r} once it is set", f"it holds {held!r}")
+
+    def write_all(self, values: Mapping[str, Value]) -> None:
+        """Set features in their order."""
+        for name, value in values.items():
+            self.write(name, value)
+
+    def execute(self, name: str) -> None:
+        """Run a command."""
+        with self._lock:
+            self._call("execute_command", name)
+
+    def bounds(self, name: str) -> tuple[float, float]:
+        """Least and greatest value of an integer or float feature."""
+        kind = self._kind(name)
+        number = ctypes.c_int64 if kind == "integer" else ctypes.c_double
+        least, most = number(), number()
+        with self._lock:
+            self._call(f"get_{kind}_feature_bounds", name, ctypes.byref(least), ctypes.byref(most))
+        return least.value, most.value
+
+    def entries(self, name: str) -> list[str]:
+        """Names that an enumeration takes now."""
+        count = ctypes.c_uint()
+        with self._lock:
+            names = self._call("dup_available_enumeration_feature_values_as_strings", name, ctypes.byref(count))
+        try:
+            return [names[i].decode() for i in range(count.value)]
+        finally:
+            self._library.g_free(ctypes.cast(names, ctypes.c_void_p))
+
+    # -- by type ------------------------------------------------------------------------------------------
+
+    def _kind(self, name: str) -> str:
+        node = self._library.arv_device_get_feature(self._handle, name.encode())
+        if not node:
+            self._refuse(f"a camera with the feature `{name}`", "it has none of that name")
+        for kind in _KINDS:
+            if is_a(self._library, node, f"arv_gc_{kind}"):
+                return kind
+        self._refuse(f"a feature `{name}` with a value", "it is a category or a register")
+
+    def _write_command(self, name: str, value: Value) -> None:
+        if value is not True:
+            self._refuse(f"`true` for the command `{name}`", f"{value!r} was given")
+        self.execute(name)
+
+    def _write_enumeration(self, name: str, value: Value) -> None:
+        entries = self.entries(name)
+        if value not in entries:
+            self._refuse(f"one of {', '.join(entries)} for `{name}`", f"{value!r} was given")
+        self._call("set_string_feature_value", name, str(value).encode())
+
+    def _write_string(self, name: str, value: Value) -> None:
+        if not isinstance(value, str):
+            self._refuse(f"a text for `{name}`", f"{value!r} was given")
+        self._call("set_string_feature_value", name, value.encode())
+
+    def _write_boolean(self, name: str, value: Value) -> None:
+        if not isinstance(value, bool):
+            self._refuse(f"true or false for `{name}`", f"{value!r} was given")
+        self._call("set_boolean_feature_value", name, int(value))
+
+    def _write_integer(self, name: str, value: Value) -> None:
+        if isinstance(value, bool) or not isinstance(value, int):
+            self._refuse(f"a whole number for `{name}`", f"{value!r} was given")
+        self._check_range(name, value)
+        least, step = int(self.bounds(name)[0]), int(self._call("get_integer_feature_increment", name))
+        if step > 1 and (value - least) % step:
+            self._refuse(f"{least} plus a multiple of {step} for `{name}`", f"{value} was given")
+        self._call("set_integer_feature_value", name, value)
+
+    def _write_float(self, name: str, value: Value) -> None:
+        if isinstance(value, bool | str):
+            self._refuse(f"a number for `{name}`", f"{value!r} was given")
+        self._check_range(name, value)
+        self._call("set_float_feature_value", name, float(value))
+
+    def _check_range(self, name: str, value: float) -> None:
+        least, most = self.bounds(name)
+        if not least <= value <= most:
+            self._refuse(f"{least:.10g} to {most:.10g} for `{name}`", f"{value:.10g} was given")
+
+    def _call(self, function: str, name: str, *arguments: Any) -> Any:
+        whole = getattr(self._library, f"arv_device_{function}")
+        return call(
+            self._device, f"an answer about the feature `{name}`", whole, self._handle, name.encode(), *arguments
+        )
+
+    def _refuse(self, expected: str, happened: str) -> NoReturn:
+        raise DeviceRefused(
+            self._device,
+            expected=expected,
+            happened=happened,
+            remedy="Correct the camera's settings in the rig (`arv-tool-0.8 features` lists what a camera has).",
+        )
+
+
+def _alike(held: Value, wanted: Value) -> bool:
+    if isinstance(held, float) and not isinstance(wanted, str):
+        return math.isclose(held, wanted, rel_tol=_READBACK_TOLERANCE, abs_tol=1e-9)
+    return held == wanted

@@ -1,0 +1,59 @@
+"""Settings of the Aravis driver in the rig file."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from drivers.camera.aravis.features import Value
+from drivers.camera.genicam_image import Region
+
+
+class Counter(BaseModel):
+    """A counter of the camera: features to set first (selectors), and the one that holds the count."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    select: dict[str, Value] = Field(default_factory=dict)
+    read: str = "CounterValue"
+
+
+class Settings(BaseModel):
+    """Settings of the driver in the rig file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    device: str = "camera"
+    """How messages call it."""
+    address: str = ""
+    """IP address, serial number or Aravis id; empty: the only camera there is."""
+    pixel_format: str = "BayerGB12"
+    region: Region | None = None
+    """None: as the camera has it."""
+    features: dict[str, Value] = Field(default_factory=dict)
+    """GenICam features to set at opening, in this order, before all else."""
+    black_dn: Annotated[int, Field(ge=0)] | None = None
+    """Digital number of black; None: what the feature `BlackLevel` holds, where that is in DN."""
+    trigger_line: str = "Line0"
+    """Entry of `TriggerSource` that the box's cable is on."""
+    trigger_activation: str = "RisingEdge"
+    software_trigger: str = "Software"
+    exposed_counter: Counter | None = None
+    """Counts exposures. Without one, the host cannot tell how many frames were lost at a burst's end."""
+    over_trigger_counter: Counter | None = None
+    """Counts edges that came too early."""
+    readout_us: Annotated[int, Field(gt=0)] | None = None
+    """Least time between frames; None: the feature `SensorReadoutTime`, else `AcquisitionFrameRate`'s maximum."""
+    exposure_gap_us: Annotated[int, Field(ge=0)] = 100
+    """Least time from the end of one exposure to the start of the next."""
+    timestamp_jitter_us: Annotated[float, Field(gt=0)] = 20.0
+    """Largest deviation of the camera's timestamps from the edges; from its data sheet, or measured."""
+    packet_size: Annotated[int, Field(ge=576, le=65500)] | None = None
+    """Bytes of a GigE Vision packet; None: as large as the network lets through. Jumbo frames take 9000."""
+    packet_socket: bool = True
+    """Take packets past the kernel's network stack where the process has the privilege (CAP_NET_RAW)."""
+    frame_retention_ms: Annotated[int, Field(ge=1)] = 200
+    """How long the last packets of a frame may take before it counts as incomplete."""
+    buffers: Annotated[int, Field(ge=2)] = 16
+    """At least so many are queued."""

@@ -1,0 +1,100 @@
+"""What a GenICam camera's features say of its images, and setting the region that it reads out.
+
+For all drivers that reach such features, by whichever library.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from coupole.devices import FrameFormat
+from coupole.errors import DeviceRefused
+from drivers.camera.pixel_formats import FORMATS, PixelFormat, pixels_in_a_group
+
+
+class Region(BaseModel):
+    """Part of the sensor, in pixels."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    width_px: Annotated[int, Field(gt=0)]
+    height_px: Annotated[int, Field(gt=0)]
+    left_px: Annotated[int, Field(ge=0)] = 0
+    top_px: Annotated[int, Field(ge=0)] = 0
+
+
+class Features(Protocol):
+    """Of an opened camera, by name; see the drivers' own."""
+
+    def has(self, name: str) -> bool: ...
+
+    def read(self, name: str) -> bool | int | float | str: ...
+
+    def number(self, name: str) -> float: ...
+
+    def bounds(self, name: str) -> tuple[float, float]: ...
+
+    def write(self, name: str, value: bool | int | float | str) -> None: ...
+
+
+def set_region(features: Features, region: Region) -> None:
+    """Offsets go to zero first: they bound the size, and the size bounds them."""
+    for name, value in (
+        ("OffsetX", 0),
+        ("OffsetY", 0),
+        ("Width", region.width_px),
+        ("Height", region.height_px),
+        ("OffsetX", region.left_px),
+        ("OffsetY", region.top_px),
+    ):
+        if value or features.has(name):
+            features.write(name, value)
+
+
+def pixel_format(features: Features, device: str) -> PixelFormat:
+    """The format that the camera sends now. Raises DeviceRefused for one that the driver does not know."""
+    name = str(features.read("PixelFormat"))
+    if name not in FORMATS:
+        raise DeviceRefused(
+            device,
+            expected="a Bayer or mono format of 8 to 16 bits",
+            happened=f"it sends {name}",
+            remedy=f"Choose one of {', '.join(FORMATS)} for `pixel_format` in the rig.",
+        )
+    return FORMATS[name]
+
+
+def frame_format(features: Features, device: str, black_dn: int | None) -> FrameFormat:
+    """Of the camera's frames; `black_dn` None stands for what `BlackLevel` holds. Raises DeviceRefused."""
+    sent = pixel_format(features, device)
+    width_px, height_px = int(features.number("Width")), int(features.number("Height"))
+    if width_px * height_px % pixels_in_a_group(sent):
+        raise DeviceRefused(
+            device,
+            expected=f"an image whose pixels fill whole bytes in {sent.name}",
+            happened=f"it has {width_px} x {height_px}",
+            remedy="Choose another region or pixel format in the rig.",
+        )
+    if black_dn is None:
+        black_dn = round(features.number("BlackLevel")) if features.has("BlackLevel") else 0
+    white_dn = (1 << sent.bit_depth) - 1
+    return FrameFormat(height_px, width_px, sent.bit_depth, sent.bayer_pattern, black_dn, white_dn)
+
+
+def readout_us(features: Features, device: str, given_us: int | None) -> int:
+    """Least time between two frames, us: as given, as the camera says, or by its greatest frame rate."""
+    if given_us is not None:
+        return given_us
+    if features.has("SensorReadoutTime"):
+        return math.ceil(features.number("SensorReadoutTime"))
+    if features.has("AcquisitionFrameRate"):
+        return math.ceil(1e6 / features.bounds("AcquisitionFrameRate")[1])
+    raise DeviceRefused(
+        device,
+        expected="the camera's readout time",
+        happened="it has neither `SensorReadoutTime` nor `AcquisitionFrameRate`",
+        remedy="Give `readout_us` in the camera's settings of the rig, from its data sheet.",
+    )

@@ -1,0 +1,268 @@
+"""Cameras behind a GenTL producer (.cti), through `harvesters` and `genicam`: `coupole.devices.Camera`.
+
+The extra `gentl` installs both. Any maker's producer gives access to its cameras; each pixel is copied once, from
+the producer's buffer into page-aligned memory of ours, 8-bit and packed ones widened on the way, and the producer
+gets its buffer back at once.
+
+The tests run it on a producer of their own (tests/conformance/gentl_producer), and on the one that the package
+genicam ships, which knows no trigger. **No real camera** has been seen behind it yet.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
+from coupole.errors import DeviceError, DeviceRefused
+from drivers.camera.frame_pool import FramePool, Slot
+from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_region
+from drivers.camera.gentl.features import Features
+from drivers.camera.gentl.image import copy_pixels, timestamp_ns
+from drivers.camera.gentl.producer import Gaps, open_camera, reporting, told, when_incomplete
+from drivers.camera.gentl.settings import Counter, Settings
+from drivers.fair_lock import Turns
+
+_A_LOOK_S = 1e-4
+"""harvesters may not look at all in less: its clock steps by 0.2 us."""
+_NAP_S = 1e-3
+"""Between two looks for a frame: genicam 1.6 would keep all of Python waiting while it waits."""
+_SILENCE_S = 0.5
+"""Without frames for so long, the camera is asked whether it is there: not every producer tells when it goes."""
+_IN_HAND = 16
+"""Frames that are on their way to the disk at once."""
+_LAST_WIDE_ID = 2**62
+"""Stands for the end of 64-bit ids, which is never reached."""
+
+
+class GenTLCamera:
+    """`coupole.devices.Camera`; see the module's text."""
+
+    delivery_s = 1.0
+
+    def __init__(self, settings: Settings, clock: Clock) -> None:
+        self._settings, self._name, self._clock = settings, settings.device, clock
+        self.timestamp_jitter_us = settings.timestamp_jitter_us
+        self._format: FrameFormat | None = None
+        self._exposure: Exposure | None = None
+        self._pool = FramePool(1, 2)
+        self._turns, self._armed = Turns(), threading.Event()
+        self._gaps = Gaps()
+        self._counted_before = (0, 0)
+        self._heard_s = 0.0
+        self._last = CameraStatistics(-1, 0, 0, -1, 0)
+        self._harvester, self._acquirer, self._info = open_camera(settings)
+        try:
+            self._features = Features(self._acquirer.remote_device.node_map, self._name)
+            self._acquirer.add_callback(
+                self._acquirer.Events.INCOMPLETE_BUFFER, when_incomplete(self._gaps.incomplete)
+            )
+            self._acquirer.timeout_period_on_update_event_data_call = 0
+            self._set_up()
+            self.id_modulus = self._ids()
+        except BaseException:
+            self.close()
+            raise
+
+    # -- opening and closing ------------------------------------------------------------------------------
+
+    def _set_up(self) -> None:
+        self._features.write_all(self._settings.features)
+        if self._settings.region is not None:
+            set_region(self._features, self._settings.region)
+        self._features.write("PixelFormat", self._settings.pixel_format)
+
+    def _ids(self) -> tuple[int, int]:
+        """16 bits on GigE Vision, unless the camera says that it uses the extended ones; else 64."""
+        if self._info["tl_type"] != "GEV":
+            return (0, _LAST_WIDE_ID)
+        extended = "GevGVSPExtendedIDMode"
+        wide = self._features.has(extended) and self._features.read(extended) in {"On", True}
+        return (1, _LAST_WIDE_ID if wide else 65535)
+
+    def close(self) -> None:
+        with contextlib.suppress(DeviceError):
+            self.disarm()
+        with self._turns.mine():
+            with contextlib.suppress(DeviceError), reporting(self._name, "the camera to close"):
+                self._acquirer.destroy()
+            with contextlib.suppress(DeviceError), reporting(self._name, "the producer to close"):
+                self._harvester.reset()
+
+    # -- who it is ----------------------------------------------------------------------------------------
+
+    def identify(self) -> Identity:
+        vendor, model, serial, version = (
+            self._info[what] or "unknown" for what in ("vendor", "model", "serial", "version")
+        )
+        return Identity(vendor, model, serial, version)
+
+    def self_test(self) -> Mapping[str, str]:
+        """Raises DeviceError if the camera does not answer."""
+        names = ("DeviceTemperature", "PixelFormat", "Width", "Height", "PayloadSize")
+        with self._turns.mine():
+            return {name: str(self._features.read(name)) for name in names if self._features.has(name)}
+
+    # -- exposure -----------------------------------------------------------------------------------------
+
+    def configure(self, exposure: Exposure) -> FrameFormat:
+        if self._armed.is_set():
+            raise self._misused("a disarmed camera", "configure() was called while it is armed")
+        with self._turns.mine():
+            if not self._settings.free_running:
+                self._set_exposure(exposure)
+            self._format = frame_format(self._features, self._name, self._settings.black_dn)
+        self._exposure = exposure
+        return self._format
+
+    def _set_exposure(self, exposure: Exposure) -> None:
+        features, settings = self._features, self._settings
+        if not features.has("TriggerMode"):
+            raise DeviceRefused(
+                self._name,
+                expected="a camera that can be triggered",
+                happened="it has no feature `TriggerMode`",
+                remedy="Use another camera, or set `free_running: true` to look through this one.",
+            )
+        for name, entry in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("TriggerSelector", "FrameStart")):
+            if features.has(name):
+                features.write(name, entry)
+        features.write("TriggerMode", "On")
+        by_edges = exposure.hardware_trigger
+        features.write("TriggerSource", settings.trigger_line if by_edges else settings.software_trigger)
+        if by_edges and features.has("TriggerActivation"):
+            features.write("TriggerActivation", settings.trigger_activation)
+        features.write(features.first_of("ExposureTimeAbs") or "ExposureTime", float(exposure.exposure_us))
+        if exposure.gain_db or features.has("Gain"):
+            features.write("Gain", float(exposure.gain_db))
+
+    def min_period_us(self, exposure: Exposure) -> int:
+        with self._turns.mine():
+            readout = readout_us(self._features, self._name, self._settings.readout_us)
+        return max(readout, exposure.exposure_us + self._settings.exposure_gap_us)
+
+    # -- acquisition --------------------------------------------------------------------------------------
+
+    def arm(self, buffers: int) -> None:
+        if self._format is None:
+            raise self._misused("configure() before arm()", "no exposure is set")
+        self.disarm()
+        wanted = max(buffers, self._settings.buffers, self._acquirer.min_num_buffers)
+        slots = min(wanted, _IN_HAND)
+        if (self._pool.slots, self._pool.slot_bytes) != (slots, self._format.frame_bytes):
+            self._pool = FramePool(slots, self._format.frame_bytes)
+        self._pool.begin()
+        with self._turns.mine():
+            self._wire_format = pixel_format(self._features, self._name)
+            self._gaps.begin(self.id_modulus)
+            self._counted_before = self._count()
+            with reporting(self._name, "the acquisition to start"):
+                self._acquirer.num_buffers = wanted
+                self._acquirer.start()
+            self._heard_s = time.monotonic()
+            self._armed.set()
+
+    def next_frame(self, timeout_s: float) -> Frame | None:
+        end_s = time.monotonic() + timeout_s
+        while True:
+            left_s = max(0.0, end_s - time.monotonic())
+            if self._armed.wait(left_s):
+                slot = self._pool.take(left_s)
+                frame = self._fetch(slot) if slot is not None else None
+                if frame is not None:
+                    self._heard_s = time.monotonic()
+                    return frame
+                self._listen()
+            if time.monotonic() >= end_s:
+                return None
+            time.sleep(_NAP_S)
+
+    def _listen(self) -> None:
+        """Raises DeviceLost if the camera has been silent for long and does not answer."""
+        if time.monotonic() > self._heard_s + _SILENCE_S:
+            with self._turns.mine():
+                if self._armed.is_set():
+                    self._features.expect_answer()
+            self._heard_s = time.monotonic()
+
+    def _fetch(self, slot: Slot) -> Frame | None:
+        """The oldest whole image that has come, in `slot`; None, and the slot is free again, if there is none."""
+        with self._turns.mine(), reporting(self._name, "an image"):
+            buffer = self._acquirer.try_fetch(timeout=_A_LOOK_S, is_raw=True) if self._armed.is_set() else None
+            if buffer is None:
+                slot.release()
+                return None
+            try:
+                return self._frame(buffer, slot)
+            finally:
+                buffer.parent.queue_buffer(buffer)
+
+    def _frame(self, buffer: Any, slot: Slot) -> Frame:
+        assert self._format is not None
+        pixels = copy_pixels(buffer, slot.memory, self._format, self._wire_format, self._name)
+        self._gaps.whole(int(buffer.frame_id))
+        by_host = self._settings.timestamps == "host"
+        stamp_ns = self._clock.now_ns() if by_host else timestamp_ns(buffer, self._acquirer.device, self._name)
+        return Frame(int(buffer.frame_id), stamp_ns, pixels, slot.release)
+
+    def trigger(self) -> None:
+        if self._settings.free_running or self._exposure is None or self._exposure.hardware_trigger:
+            raise self._misused("hardware_trigger=False", "a software trigger while something else triggers")
+        with self._turns.mine():
+            self._features.write("TriggerSoftware", True)
+
+    def statistics(self) -> CameraStatistics:
+        """At rest: those of the last acquisition."""
+        if self._armed.is_set():
+            with self._turns.mine(), reporting(self._name, "the camera's counters"):
+                self._last = self._statistics()
+        return self._last
+
+    def _statistics(self) -> CameraStatistics:
+        exposed, over_triggers = self._count()
+        missing = self._gaps.missing
+        overflows = min(missing, int(told(self._acquirer.data_streams[0].module, "num_underrun") or 0))
+        return CameraStatistics(
+            exposed=_since(exposed, self._counted_before[0]),
+            delivered=self._gaps.delivered,
+            lost_transfers=missing - overflows,
+            over_triggers=_since(over_triggers, self._counted_before[1]),
+            overflows=overflows,
+        )
+
+    def _count(self) -> tuple[int, int]:
+        """The camera's own counts, -1 where it has none."""
+        return (self._read(self._settings.exposed_counter), self._read(self._settings.over_trigger_counter))
+
+    def _read(self, counter: Counter | None) -> int:
+        if counter is None:
+            return -1
+        self._features.write_all(counter.select)
+        return int(self._features.number(counter.read))
+
+    def disarm(self) -> None:
+        if not self._armed.is_set():
+            return
+        try:
+            self.statistics()
+        finally:
+            self._armed.clear()
+            with self._turns.mine(), reporting(self._name, "the acquisition to stop"):
+                self._acquirer.stop()
+
+    # -- errors -------------------------------------------------------------------------------------------
+
+    def _misused(self, expected: str, happened: str) -> DeviceRefused:
+        return DeviceRefused(
+            self._name,
+            expected=expected,
+            happened=happened,
+            remedy="This is a fault of the program that drives the camera.",
+        )
+
+
+def _since(count: int, before: int) -> int:
+    return count if count < 0 else count - before

@@ -1,0 +1,67 @@
+"""What a buffer of a GenTL producer brings: pixels and a time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.devices import FrameFormat
+from coupole.errors import DeviceRefused
+from drivers.camera.gentl.producer import told
+from drivers.camera.pixel_formats import PixelFormat, widen
+
+_PLAIN_IMAGE = 1
+"""PAYLOAD_TYPE_IMAGE of the GenTL standard."""
+
+
+def copy_pixels(
+    buffer: Any, memory: NDArray[np.uint8], promised: FrameFormat, wire: PixelFormat, device: str
+) -> NDArray[np.uint16]:
+    """A buffer's image as 16-bit pixels [height_px, width_px] in `memory` [frame_bytes].
+
+    Raises DeviceRefused for an image that is not what `configure` promised.
+    """
+    wanted = {
+        "payload_type": _PLAIN_IMAGE,
+        "height": promised.height_px,
+        "width": promised.width_px,
+        "pixel_format": wire.code,
+        "padding_x": 0,
+    }
+    for what, value in wanted.items():
+        seen = told(buffer, what)
+        if seen not in {None, value}:
+            raise DeviceRefused(
+                device,
+                expected=f"images with {what} {value}",
+                happened=f"one came with {seen}",
+                remedy="Set the camera up in the rig so that it sends plain images of one size and format.",
+            )
+    offset = told(buffer, "image_offset") or 0
+    wire_bytes = wire.wire_bytes(promised.height_px * promised.width_px)
+    data = np.frombuffer(buffer.raw_buffer, np.uint8, wire_bytes, offset)
+    pixels = memory.view(np.uint16)
+    if wire.packing == "two bytes":
+        pixels[:] = data.view("<u2")
+    else:
+        widen(pixels, data, wire)
+    return pixels.reshape(promised.height_px, promised.width_px)
+
+
+def timestamp_ns(buffer: Any, camera: Any, device: str) -> int:
+    """When the camera says that a buffer's exposure began; older producers count ticks, and `camera` says of how
+    long. Raises DeviceRefused where neither is told."""
+    stamp_ns = told(buffer, "timestamp_ns")
+    if stamp_ns is not None:
+        return stamp_ns
+    ticks, ticks_hz = told(buffer, "timestamp"), told(camera, "timestamp_frequency")
+    if ticks is None or not ticks_hz:
+        raise DeviceRefused(
+            device,
+            expected="timestamps from the producer, in nanoseconds or with their frequency",
+            happened="it gives none",
+            remedy="Set `timestamps: host` to look through this camera; shots cannot be proven with it.",
+        )
+    return ticks * 10**9 // ticks_hz

@@ -1,0 +1,179 @@
+"""Between the driver and `harvesters`: one camera of a producer opened, errors in our words, gaps in ids."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+from coupole.errors import DeviceError, DeviceLost, DeviceRefused
+from drivers.camera.gentl.settings import Settings
+
+_LOG = logging.getLogger("harvesters")
+"""In place of harvesters' own, which prints to the terminal what is raised here anyway."""
+_LOG.addHandler(logging.NullHandler())
+
+
+def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
+    """Harvester, acquirer and description of the one camera that the settings mean."""
+    name = settings.device
+    try:
+        import genicam.gentl
+        from harvesters.core import Harvester
+    except ImportError as error:
+        raise _lost(
+            name, "the packages harvesters and genicam", str(error), "Install the extra `gentl`."
+        ) from error
+    if not settings.producer.is_file():
+        raise _lost(name, f"a GenTL producer {settings.producer}", "there is no such file", "Correct the rig.")
+    harvester = Harvester(logger=_LOG)
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        harvester.add_file(str(settings.producer))
+        harvester.update()
+        if not harvester.device_info_list:
+            harvester.reset()
+            _open_in_vain(str(settings.producer))
+        found = [(one, _describe(one)) for one in harvester.device_info_list]
+        wanted = {"serial": settings.serial, "model": settings.model}
+        fitting = [
+            one for one in found if all(not value or one[1][what] == value for what, value in wanted.items())
+        ]
+        if len(fitting) != 1:
+            known = ", ".join(f"{one['model']} {one['serial']}" for _, one in found) or "none"
+            raise _lost(
+                name,
+                "exactly one camera of that model and serial number",
+                f"{len(fitting)} of the producer's fit; it finds: {known}",
+                "Check cable and power, that no other program uses the producer, and `serial` and `model`.",
+            )
+        acquirer = harvester.create(fitting[0][0])
+    except genicam.gentl.GenericException as error:
+        harvester.reset()
+        raise _opening_failed(name, error) from error
+    except BaseException:
+        harvester.reset()
+        raise
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, handler)  # harvesters would catch Ctrl-C and close the camera
+    return harvester, acquirer, fitting[0][1]
+
+
+def _open_in_vain(producer: str) -> None:
+    """Raises what the producer says if it does not open: harvesters keeps that to itself and finds no camera.
+
+    A producer can be open but once in a process (GenTL standard, GCInitLib).
+    """
+    import genicam.gentl
+
+    library = genicam.gentl.GenTLProducer.create_producer()
+    library.open(producer)
+    try:
+        system = library.create_system()
+        system.open()
+        system.close()
+    finally:
+        library.close()
+
+
+def _opening_failed(name: str, error: Exception) -> DeviceError:
+    import genicam.gentl
+
+    if isinstance(error, genicam.gentl.ResourceInUseException | genicam.gentl.AccessDeniedException):
+        return DeviceRefused(
+            name,
+            expected="a free camera",
+            happened=f"it is in use ({error})",
+            remedy="Close the other program.",
+        )
+    return _lost(name, "the camera to open", str(error))
+
+
+def _describe(device: Any) -> dict[str, str]:
+    """What a producer says of a camera before it is opened; empty where it says nothing."""
+    import genicam.gentl
+
+    def text(attribute: str) -> str:
+        try:
+            return str(getattr(device, attribute) or "")
+        except genicam.gentl.GenericException:
+            return ""
+
+    names = {"vendor": "vendor", "model": "model", "serial": "serial_number", "version": "version"}
+    return {what: text(attribute) for what, attribute in names.items()} | {"tl_type": text("tl_type")}
+
+
+def _lost(
+    name: str, expected: str, happened: str, remedy: str = "Check cable and power, then resume the run."
+) -> DeviceLost:
+    return DeviceLost(name, expected=expected, happened=happened, remedy=remedy)
+
+
+@contextlib.contextmanager
+def reporting(name: str, expected: str) -> Iterator[None]:
+    """What the producer or GenApi raises becomes a DeviceLost with its own words."""
+    import genicam.genapi
+    import genicam.gentl
+
+    try:
+        yield
+    except (genicam.genapi.GenericException, genicam.gentl.GenericException) as error:
+        raise _lost(name, expected, str(error)) from error
+
+
+def told(module: Any, what: str) -> int | None:
+    """A figure that producers need not give."""
+    import genicam.gentl
+
+    try:
+        value = getattr(module, what)
+    except genicam.gentl.GenericException:
+        return None
+    return int(value)
+
+
+def when_incomplete(count: Any) -> Any:
+    """`count` as harvesters wants to be given it."""
+    from harvesters.core import Callback
+
+    class Counting(Callback):  # type: ignore[misc,unused-ignore]  # harvesters has no types
+        def emit(self, context: object | None = None) -> None:
+            count()
+
+    return Counting()
+
+
+class Gaps:
+    """Frame ids as they come, and what is missing between them."""
+
+    def __init__(self) -> None:
+        self.begin((0, 0))
+
+    def begin(self, id_modulus: tuple[int, int]) -> None:
+        """A new acquisition; `id_modulus` as `coupole.devices.Camera` has it."""
+        self._ids = id_modulus[1] - id_modulus[0] + 1
+        self._last_id: int | None = None
+        self._skipped = self._incomplete_since = 0
+        self.delivered = 0
+        """Whole images."""
+
+    def whole(self, frame_id: int) -> None:
+        self.delivered += 1
+        if self._last_id is None:
+            self._skipped += self._incomplete_since
+        else:
+            self._skipped += (frame_id - self._last_id) % self._ids - 1
+        self._last_id, self._incomplete_since = frame_id, 0
+
+    def incomplete(self) -> None:
+        """An image came with parts missing; its id will be a gap."""
+        self._incomplete_since += 1
+
+    @property
+    def missing(self) -> int:
+        """Images that did not come whole, as far as ids tell: none before the first, none after the last."""
+        return self._skipped + self._incomplete_since

@@ -1,0 +1,287 @@
+"""A still camera whose RAW files a tethering program puts into a folder: `coupole.devices.Camera`.
+
+The box's edge (or a command) releases the shutter; the camera or its program writes CR2, NEF, ARW or DNG files;
+LibRaw (`rawpy`, extra `real-data`) decodes them. A file is taken as a frame when its size has stood still.
+
+*Order and count are proven, never assumed.* The frame id is the number in the file's name, which the camera counts
+on with every picture and wraps from 9999 to 1: a picture that never comes leaves a gap. The timestamp is Exif's
+capture time with its fraction of a second. A file that comes after a later one, a number that comes twice, a
+capture time that runs backwards, another camera, exposure or sensitivity: each ends the run with a message.
+
+*Slow by nature.* Marks stand a sixteenth of a period apart (docs/decisions/0002), so the period must be 40 times
+the jitter of the timestamps: 0.4 s with hundredths of a second, 20 s with whole ones.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
+from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.camera.frame_pool import FramePool
+from drivers.camera.raw.exif import Exif
+from drivers.camera.raw.order import Order, file_number
+from drivers.camera.raw.picture import RawPicture, read_picture
+
+_LOOK_S = 0.05
+"""Between two looks into the folder."""
+_PERIOD_IN_JITTERS = 40
+"""A mark stands a sixteenth of a period off the grid; that must be more than twice the jitter, with some drift."""
+_IN_HAND = 4
+"""Pictures in memory at once; the others wait as files."""
+_NOMINAL_EXPOSURE = 0.1
+"""A camera that is set to 1/125 s exposes for 1/128 s: by so much the two may differ."""
+_RELEASE_TIMEOUT_S = 30.0
+
+
+class Settings(BaseModel):
+    """Settings of a still camera in a rig."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    folder: Path
+    """Where the tethering program puts the files."""
+    period_us: Annotated[int, Field(gt=0)]
+    """From picture to picture, for as long as a burst lasts: with the camera's own memory full."""
+    device: str = "camera"
+    """How messages call it."""
+    sample: Path | None = None
+    """A RAW file of this camera, which tells what frames look like; None: the newest in the folder."""
+    suffixes: tuple[str, ...] = (".cr2", ".nef", ".arw", ".dng")
+    last_number: Annotated[int, Field(ge=99)] = 9999
+    """After it the camera counts from 1 again."""
+    release_command: tuple[str, ...] = ()
+    """Program and arguments that release the shutter, for `trigger: software`."""
+    shutter_jitter_us: Annotated[float, Field(ge=0)] = 5_000.0
+    """By how much the time from edge to exposure varies."""
+    still_s: Annotated[float, Field(gt=0)] = 1.0
+    """A file whose size has not changed for so long is complete."""
+    patience_s: Annotated[float, Field(gt=0)] = 30.0
+    """How long a picture is waited for whose successor has come, before it counts as lost."""
+    black_dn: Annotated[int, Field(ge=0)] | None = None
+    """Digital number of black; None: what LibRaw finds in the file."""
+
+
+class RawFiles:
+    """`coupole.devices.Camera`; see the module's text."""
+
+    def __init__(self, settings: Settings, clock: Clock) -> None:
+        self._settings, self._name = settings, settings.device
+        self._armed = threading.Event()
+        self._exposure: Exposure | None = None
+        self._format: FrameFormat | None = None
+        self._pool = FramePool(1, 2)
+        if not settings.folder.is_dir():
+            raise DeviceLost(
+                self._name,
+                expected=f"a folder {settings.folder} that the tethering program writes to",
+                happened="there is none",
+                remedy="Make it, or correct `folder` in the rig.",
+            )
+        self._order = Order(settings.folder, settings.suffixes, settings.last_number, settings.device)
+        self._sample = self._read(settings.sample or self._newest())
+        self._last_taken: Exif | None = None
+        self.id_modulus = (1, settings.last_number)
+        # a stamp is the middle of what it may stand for
+        self.delivery_s = settings.patience_s
+        self.timestamp_jitter_us = self._sample.exif.resolution_us / 2 + settings.shutter_jitter_us
+
+    def _newest(self) -> Path:
+        files = self._order.files()
+        if not files:
+            raise DeviceRefused(
+                self._name,
+                expected="one RAW file of this camera, to tell what frames look like",
+                happened=f"none is in {self._settings.folder}",
+                remedy="Take a picture, or name a file as `sample` in the rig.",
+            )
+        return max(files, key=lambda path: path.stat().st_mtime_ns)
+
+    def _read(self, path: Path) -> RawPicture:
+        try:
+            return read_picture(path, self._settings.black_dn)
+        except (OSError, ValueError) as error:
+            raise DeviceRefused(
+                self._name,
+                expected=f"a whole RAW file of a Bayer sensor in {path.name}",
+                happened=str(error),
+                remedy="Look at the file; if it is cut off, raise `still_s` in the rig.",
+            ) from error
+
+    # -- who it is ----------------------------------------------------------------------------------------
+
+    def identify(self) -> Identity:
+        exif = self._sample.exif
+        words = (exif.make, exif.model, exif.serial, exif.firmware)
+        vendor, model, serial, firmware = (word or "unknown" for word in words)
+        return Identity(vendor, model, serial, firmware)
+
+    def self_test(self) -> Mapping[str, str]:
+        """What the sample tells. Raises DeviceLost if the folder is gone."""
+        files = self._order.files()
+        return {
+            "files": str(len(files)),
+            "timestamp_resolution_us": str(self._sample.exif.resolution_us),
+            "sample_exposure_us": f"{self._sample.exif.exposure_us:.0f}",
+            "sample_iso": str(self._sample.exif.iso),
+        }
+
+    # -- exposure -----------------------------------------------------------------------------------------
+
+    def configure(self, exposure: Exposure) -> FrameFormat:
+        """The exposure is set on the camera, by hand: each picture is checked for it."""
+        if self._armed.is_set():
+            raise self._misused("a disarmed camera", "configure() was called while it is armed")
+        if exposure.gain_db:
+            raise DeviceRefused(
+                self._name,
+                expected="a gain of 0 dB: a still camera's sensitivity is set on its body",
+                happened=f"{exposure.gain_db:g} dB was asked for",
+                remedy="Set ISO on the camera and the gain to 0 in the plan.",
+            )
+        if not exposure.hardware_trigger and not self._settings.release_command:
+            raise DeviceRefused(
+                self._name,
+                expected="a `release_command` in the rig for `trigger: software`",
+                happened="there is none",
+                remedy="Name one, or let the box release the shutter.",
+            )
+        self._exposure, self._format = exposure, self._sample.frame_format
+        return self._format
+
+    def min_period_us(self, exposure: Exposure) -> int:
+        to_tell_marks_apart = int(_PERIOD_IN_JITTERS * self.timestamp_jitter_us)
+        return max(self._settings.period_us, exposure.exposure_us, to_tell_marks_apart)
+
+    # -- acquisition --------------------------------------------------------------------------------------
+
+    def arm(self, buffers: int) -> None:
+        """Files that are there already are not of this burst. `buffers` is met by the disk."""
+        if self._format is None:
+            raise self._misused("configure() before arm()", "no exposure is set")
+        self.disarm()
+        self._order.begin()
+        self._last_taken = None
+        if self._pool.slot_bytes != self._format.frame_bytes:
+            self._pool = FramePool(_IN_HAND, self._format.frame_bytes)
+        self._pool.begin()
+        self._armed.set()
+
+    def next_frame(self, timeout_s: float) -> Frame | None:
+        end_s = time.monotonic() + timeout_s
+        while True:
+            if self._armed.is_set():
+                path = self._order.next(self._settings.still_s, self._settings.patience_s)
+                if path is not None:
+                    return self._frame(path, max(0.0, end_s - time.monotonic()))
+            left_s = end_s - time.monotonic()
+            if left_s <= 0:
+                return None
+            time.sleep(min(_LOOK_S, left_s))
+
+    def _frame(self, path: Path, timeout_s: float) -> Frame | None:
+        """None if no memory became free in time: the file stays the next one."""
+        slot = self._pool.take(timeout_s)
+        if slot is None:
+            return None
+        try:
+            picture = self._read(path)
+            self._check(path, picture)
+        except BaseException:
+            slot.release()
+            raise
+        pixels = slot.memory.view(np.uint16).reshape(picture.pixels.shape)
+        np.copyto(pixels, picture.pixels)
+        self._order.take(path)
+        self._last_taken = picture.exif
+        return Frame(
+            frame_id=file_number(path, self._name, self._settings.last_number),
+            timestamp_ns=picture.exif.taken_ns + picture.exif.resolution_us * 500,
+            pixels=pixels,
+            release=slot.release,
+        )
+
+    def _check(self, path: Path, picture: RawPicture) -> None:
+        """Raises DeviceFault for a picture that is not of this burst or was not taken as asked."""
+        assert self._exposure is not None
+        sample, exif, asked_us = self._sample, picture.exif, self._exposure.exposure_us
+        body = (exif.make, exif.model, exif.serial)
+        if body != (sample.exif.make, sample.exif.model, sample.exif.serial):
+            raise self._odd(path, f"a picture of {sample.exif.model} {sample.exif.serial}", " ".join(body))
+        if picture.frame_format != self._format:
+            raise self._odd(path, f"a picture like {self._format}", f"it is {picture.frame_format}")
+        if exif.resolution_us > sample.exif.resolution_us:
+            raise self._odd(
+                path,
+                f"a capture time to {sample.exif.resolution_us} us",
+                f"it is told to {exif.resolution_us} us",
+            )
+        if abs(exif.exposure_us - asked_us) > _NOMINAL_EXPOSURE * asked_us:
+            raise self._odd(path, f"an exposure of {asked_us} us", f"it was {exif.exposure_us:.0f} us")
+        before = self._last_taken
+        if before is not None and exif.iso != before.iso:
+            raise self._odd(path, f"ISO {before.iso} as before", f"it was ISO {exif.iso}")
+        if before is not None and exif.taken_ns <= before.taken_ns:
+            raise self._odd(path, "a capture time after that of the picture before", "it is not later")
+
+    def trigger(self) -> None:
+        if self._exposure is None or self._exposure.hardware_trigger:
+            raise self._misused("hardware_trigger=False", "a software trigger while the box releases the shutter")
+        command = self._settings.release_command
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=_RELEASE_TIMEOUT_S, check=False)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise DeviceTimeout(
+                self._name,
+                expected=f"`{command[0]}` to release the shutter",
+                happened=str(error),
+                remedy="Check `release_command` in the rig.",
+            ) from error
+        if done.returncode:
+            raise DeviceRefused(
+                self._name,
+                expected=f"`{command[0]}` to release the shutter",
+                happened=f"it ended with code {done.returncode}: {done.stderr.strip()[-200:]}",
+                remedy="Check the camera's USB cable and `release_command` in the rig.",
+            )
+
+    def statistics(self) -> CameraStatistics:
+        """A picture is taken to be exposed once its own number or a later one has come."""
+        counted, taken = self._order.counted, self._order.taken
+        return CameraStatistics(
+            exposed=counted, delivered=taken, lost_transfers=counted - taken, over_triggers=-1, overflows=0
+        )
+
+    def disarm(self) -> None:
+        self._armed.clear()
+
+    def close(self) -> None:
+        with contextlib.suppress(DeviceError):
+            self.disarm()
+
+    # -- errors -------------------------------------------------------------------------------------------
+
+    def _odd(self, path: Path, expected: str, happened: str) -> DeviceFault:
+        return DeviceFault(
+            self._name,
+            expected=f"{expected} in {path.name}",
+            happened=happened,
+            remedy="Set the camera to manual, let no other program write into the folder, then resume the run.",
+        )
+
+    def _misused(self, expected: str, happened: str) -> DeviceRefused:
+        return DeviceRefused(
+            self._name,
+            expected=expected,
+            happened=happened,
+            remedy="This is a fault of the program that drives the camera.",
+        )

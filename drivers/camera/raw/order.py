@@ -1,0 +1,181 @@
+"""The order of a still camera's files, proven by the numbers in their names."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from coupole.errors import DeviceFault, DeviceLost
+from drivers.camera.raw.exif import read_exif
+
+_NUMBER = re.compile(r"(\d+)$")
+
+
+def file_number(path: Path, device: str, last_number: int) -> int:
+    """The digits that a file's name ends in: 42 of `IMG_0042.CR2`. Raises DeviceFault if there are none."""
+    found = _NUMBER.search(path.stem)
+    number = int(found[1]) if found else 0
+    if not 1 <= number <= last_number:
+        raise DeviceFault(
+            device,
+            expected=f"a name that ends in a number from 1 to {last_number}, as in IMG_0042.CR2",
+            happened=f"a file is called {path.name}",
+            remedy="Let the camera name its files, and keep others out of the folder.",
+        )
+    return number
+
+
+def proven_order(
+    paths: Sequence[Path], triggers: int, *, device: str = "camera", last_number: int = 9999
+) -> list[Path]:
+    """The files of one burst in the order in which they were taken, one for each of `triggers`.
+
+    The proof is twofold: numbers follow each other without a gap (over the wrap, too), and capture times rise with
+    them, strictly where they have a fraction of a second. Raises DeviceFault for a file that is missing, surplus
+    or out of order, and ValueError for one without capture time.
+    """
+
+    def refuse(expected: str, happened: str) -> DeviceFault:
+        remedy = "Leave out pictures that are not of the burst, or take it again."
+        return DeviceFault(device, expected=expected, happened=happened, remedy=remedy)
+
+    if len(paths) != triggers:
+        raise refuse(f"{triggers} files for {triggers} edges", f"there are {len(paths)}")
+    by_number = {file_number(path, device, last_number): path for path in paths}
+    if len(by_number) != len(paths):
+        raise refuse("one file for each number", "numbers come twice")
+    if not paths:
+        return []
+    starts = [number for number in by_number if (number - 2) % last_number + 1 not in by_number]
+    if len(starts) != 1:
+        raise refuse("numbers without a gap", f"they begin anew at {sorted(starts)}")
+    ordered = [by_number[(starts[0] + step - 1) % last_number + 1] for step in range(triggers)]
+    for earlier, later in itertools.pairwise(ordered):
+        before, after = read_exif(earlier), read_exif(later)
+        whole_seconds = max(before.resolution_us, after.resolution_us) >= 1_000_000
+        if after.taken_ns < before.taken_ns or (after.taken_ns == before.taken_ns and not whole_seconds):
+            raise refuse(f"{later.name} taken after {earlier.name}", "its capture time is not later")
+    return ordered
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A file that is not taken yet, as it was found."""
+
+    size: int
+    first_s: float
+    """Since when it is there, machine time."""
+    still_s: float
+    """Since when its size has not changed."""
+
+
+class Order:
+    """Which file comes next. `begin`, then `next` and `take` in turn."""
+
+    def __init__(self, folder: Path, suffixes: Sequence[str], last_number: int, device: str) -> None:
+        self._folder, self._suffixes = folder, frozenset(suffix.lower() for suffix in suffixes)
+        self._last_number, self._device = last_number, device
+        self._old: frozenset[Path] = frozenset()
+        self._taken: set[Path] = set()
+        self._waiting: dict[Path, _Seen] = {}
+        self._last: int | None = None
+        self.counted = self.taken = 0
+        """Numbers that have passed since `begin`, and files that were taken."""
+
+    def files(self) -> list[Path]:
+        """All RAW files of the folder. Raises DeviceLost if it cannot be read."""
+        try:
+            return [path for path in self._folder.iterdir() if path.suffix.lower() in self._suffixes]
+        except OSError as error:
+            raise DeviceLost(
+                self._device,
+                expected=f"the folder {self._folder}",
+                happened=str(error),
+                remedy="Check the disk or network drive, then resume the run.",
+            ) from error
+
+    def begin(self) -> None:
+        """What is there now is not of this burst; the newest of it tells the number that comes next."""
+        files = self.files()
+        self._old, self._taken, self._waiting = frozenset(files), set(), {}
+        newest = max(files, key=lambda path: path.stat().st_mtime_ns, default=None)
+        self._last = None if newest is None else self._number(newest)
+        self.counted = self.taken = 0
+
+    def _number(self, path: Path) -> int:
+        return file_number(path, self._device, self._last_number)
+
+    def _steps(self, path: Path) -> int:
+        """How many numbers after the last one this file stands, 1 for the next."""
+        last = self._before_first() if self._last is None else self._last
+        steps = (self._number(path) - last) % self._last_number
+        if not 1 <= steps <= self._last_number // 2:
+            raise DeviceFault(
+                self._device,
+                expected=f"the files after number {last}, in their order",
+                happened=f"{path.name} came after it",
+                remedy="A picture came too late or twice: raise `patience_s` in the rig, then resume the run.",
+            )
+        return steps
+
+    def _before_first(self) -> int:
+        """Where no number was known when the burst began: the one before the first of the files that have come.
+
+        Should an earlier one come after that was taken, it is refused.
+        """
+        numbers = [self._number(path) for path in self._waiting]
+        half = self._last_number // 2
+        earliest = (a for a in numbers if all((b - a) % self._last_number <= half for b in numbers))
+        first = next(earliest, numbers[0])  # numbers[0]: there is none, and the others will be refused
+        return (first - 2) % self._last_number + 1
+
+    def next(self, still_s: float, patience_s: float) -> Path | None:
+        """The file that comes next, once its size has stood still for `still_s`; None if there is none yet.
+
+        A number that does not come is passed over when a later file has waited for `patience_s`. Raises
+        DeviceFault for a file that comes after a later one, and for two files of one number.
+        """
+        self._look()
+        waiting = sorted((self._steps(path), path) for path in self._waiting)
+        if not waiting:
+            return None
+        if len({steps for steps, _ in waiting}) < len(waiting):
+            raise DeviceFault(
+                self._device,
+                expected="one file for each number",
+                happened="these came: " + ", ".join(sorted(path.name for _, path in waiting)),
+                remedy="Let the camera write one RAW file for each picture, and one program fetch it.",
+            )
+        steps, path = waiting[0]
+        seen, now_s = self._waiting[path], time.monotonic()
+        patient = steps > 1 and now_s - seen.first_s < patience_s
+        return None if patient or now_s - seen.still_s < still_s else path
+
+    def _look(self) -> None:
+        now_s = time.monotonic()
+        found: dict[Path, _Seen] = {}
+        for path in self.files():
+            if path in self._old or path in self._taken:
+                continue
+            try:
+                size = path.stat().st_size
+            except FileNotFoundError:  # the tethering program has just renamed it
+                continue
+            before = self._waiting.get(path)
+            if before is None or before.size != size or not size:
+                found[path] = _Seen(size, now_s if before is None else before.first_s, now_s)
+            else:
+                found[path] = before
+        self._waiting = found
+
+    def take(self, path: Path) -> None:
+        """`path`, which `next` has named, is a frame now."""
+        self.counted += self._steps(path)
+        self.taken += 1
+        self._last = self._number(path)
+        self._taken.add(path)
+        del self._waiting[path]

@@ -1,0 +1,6 @@
+"""Ximea cameras through the maker's library."""
+
+from drivers.camera.xiapi.driver import XiCamera
+from drivers.camera.xiapi.settings import Settings
+
+__all__ = ["Settings", "XiCamera"]

@@ -1,0 +1,60 @@
+"""What a rig says of a XIMEA camera."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from drivers.camera.xiapi.library import LIBRARY
+
+
+class Region(BaseModel):
+    """Part of the sensor, in pixels; even offsets keep the Bayer pattern."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    width_px: Annotated[int, Field(gt=0, multiple_of=2)]
+    height_px: Annotated[int, Field(gt=0, multiple_of=2)]
+    left_px: Annotated[int, Field(ge=0, multiple_of=2)] = 0
+    top_px: Annotated[int, Field(ge=0, multiple_of=2)] = 0
+
+
+class Settings(BaseModel):
+    """Settings of a XIMEA camera in a rig."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    device: str = "camera"
+    """How messages call it."""
+    serial: str = ""
+    """As printed on the camera; empty: the only one there is."""
+    library: str = LIBRARY
+    """Name or path of libm3api."""
+    region: Region | None = None
+    """None: as the camera has it."""
+    bit_depth: Literal[8, 10, 12] = 12
+    packed: bool = True
+    """Pixels of 10 and 12 bits travel without gaps: 12 megapixels of 12 bits are 18.9 MB instead of 25.2 MB."""
+    trigger_input: Annotated[int, Field(ge=1, le=12)] = 1
+    """`gpi_selector` of the box's cable."""
+    trigger_edge: Literal["rising", "falling"] = "rising"
+    ready_output: Annotated[int, Field(ge=1, le=12)] | None = None
+    """`gpo_selector` of the line that tells the box when the camera is ready for an edge."""
+    ready_inverted: bool = False
+    """The line is low while the camera is ready."""
+    black_dn: Annotated[int, Field(ge=0)] | None = None
+    """Digital number of black; None: what the camera says in `image_black_level`."""
+    readout_us: Annotated[int, Field(gt=0)] | None = None
+    """Least time between frames; None: from the largest `framerate` at the shortest exposure."""
+    exposure_gap_us: Annotated[int, Field(ge=0)] = 100
+    """Least time from the end of one exposure to the start of the next."""
+    timestamps: Literal["seconds", "4ns"] = "seconds"
+    """What images carry: seconds and microseconds, as xiApi.h says; or one count of 4 ns in both fields, as
+    XIMEA's Rust bindings say of the xiB series."""
+    timestamp_jitter_us: Annotated[float, Field(gt=0)] = 20.0
+    """Largest deviation of the camera's timestamps from the edges; to be measured."""
+    buffers: Annotated[int, Field(ge=2)] = 16
+    """At least so many images can wait."""
+    parameters: dict[str, int | float | str] = Field(default_factory=dict)
+    """Further xiAPI parameters, set at opening in this order."""

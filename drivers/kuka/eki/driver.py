@@ -1,0 +1,342 @@
+"""A KUKA arm through EthernetKRL (EKI): `coupole.devices.Robot`, the gentle way to move, stop and settle.
+
+The controller plans and runs every motion itself (PTP); this driver names targets and watches the statuses
+that come at a steady rate. Nothing must be answered within a cycle. The programs for the controller are in
+`configs/kuka/`; order of work in the cell: start them, then open this driver.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Mapping
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from coupole.devices import ArmState, Clock, Identity
+from coupole.errors import DeviceError, DeviceLost, DeviceTimeout
+from coupole.geometry import transform
+from coupole.kinematics import KR10_R1100_SIXX, Arm, forward, move_duration_s, slowed
+from drivers.arm_motion import News, checked_target, farthest_stop_deg, longest_stop_s, overtaken, refused
+from drivers.kuka.eki import wire
+from drivers.kuka.eki.link import Link, connect
+from drivers.kuka.eki.watch import Tolerances, Watch
+from drivers.kuka.eki.wire import Command, Six, Status
+
+_SAME_POSE_MM, _SAME_ROTATION = 1.0, 0.005
+"""How far the controller's pose may be from this driver's, for the axes that it tells."""
+_T1_SLOWER = 10.0
+"""Motions last up to so much longer in T1, for the time-outs."""
+
+
+class Settings(BaseModel):
+    """Settings of the driver in the rig file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    address: str = Field(default="172.31.1.147:54600", pattern=r"^[^:]+:\d+$")
+    """host:port of the controller, or of this machine where the controller is the client."""
+    controller_is: Literal["server", "client"] = "server"
+    """Who waits for the connection; the other way round in EKI's configuration (EXTERNAL/TYPE)."""
+    status_ms: int = Field(default=20, ge=4)
+    """How often the controller's program sends a status, in its own time."""
+    link_timeout_s: float = Field(default=2.0, gt=0)
+    """Silence after which the link counts as lost, in machine time; longer than any pause of the world."""
+    connect_timeout_s: float = Field(default=10.0, gt=0)
+    """How long to wait for the connection and its first answer, in machine time."""
+    speed_fraction: float = Field(default=0.5, gt=0, le=1)
+    """Of the axes' highest speeds; the controller takes whole percents, rounded down."""
+    acceleration_deg_s2: float = Field(default=300.0, gt=0)
+    full_acceleration_deg_s2: float = Field(default=600.0, gt=0)
+    """What $ACC_AXIS = 100 % gives. KUKA publishes no figure: measure it; as before, whole percents of it."""
+    jerk_deg_s3: float = Field(default=3000.0, gt=0)
+    """What the controller's profile is taken to have, for durations; EKI cannot set it."""
+    settle_deg: float = Field(default=0.003, gt=0)
+    settle_deg_s: float = Field(default=0.1, gt=0)
+    settle_cycles: int = Field(default=3, ge=1)
+    """Settled: within both tolerances for so many statuses, and again after the dwell."""
+    dwell_s: float = Field(default=0.1, ge=0)
+    follow_deg: float = Field(default=1.0, gt=0)
+    follow_cycles: int = Field(default=3, ge=1)
+    """The arm does not follow: done, but farther than `follow_deg` from the target for so many statuses."""
+
+    @model_validator(mode="after")
+    def _percents_exist(self) -> Self:
+        if not (self.velocity_percent() >= 1 and 1 <= self.acceleration_percent() <= 100):
+            raise ValueError(
+                f"speed is {self.velocity_percent()} % and acceleration {self.acceleration_percent()} % "
+                f"of the controller's own: both must be from 1 to 100 %"
+            )
+        return self
+
+    def velocity_percent(self) -> int:
+        return int(round(100.0 * self.speed_fraction, 6))
+
+    def acceleration_percent(self) -> int:
+        return int(round(100.0 * self.acceleration_deg_s2 / self.full_acceleration_deg_s2, 6))
+
+    def arm(self) -> Arm:
+        """The arm with the speeds that this driver moves it at; preflight computes durations with it."""
+        return slowed(
+            KR10_R1100_SIXX,
+            speed_fraction=self.velocity_percent() / 100.0,
+            acceleration_deg_s2=self.acceleration_percent() / 100.0 * self.full_acceleration_deg_s2,
+            jerk_deg_s3=self.jerk_deg_s3,
+        )
+
+
+class KukaEki:
+    """See `coupole.devices.Robot`. After a fault it moves no more: close it and open another."""
+
+    def __init__(self, settings: Settings, clock: Clock) -> None:
+        """Connect and have the controller begin a session, in which the arm stands where it stands.
+
+        Raises DeviceLost without connection, DeviceTimeout without answer, DeviceFault where the controller
+        tells a fault.
+        """
+        self.settings = settings
+        self.arm = settings.arm()
+        self._clock = clock
+        self._news = News(clock)
+        self._number = 0
+        self._motion_s = 0.0
+        self._watch = Watch(
+            1 + secrets.randbelow(2**31 - 2),
+            Tolerances(settings.settle_deg, settings.settle_deg_s, settings.follow_deg, settings.follow_cycles),
+        )
+        try:
+            link = connect(settings.address, settings.controller_is, settings.connect_timeout_s)
+        except OSError as error:
+            raise DeviceLost(
+                "robot",
+                expected=f"an EthernetKRL connection at {settings.address}",
+                happened=str(error) or "nobody connected",
+                remedy="Start the controller's programs (configs/kuka), and check its IP and PORT",
+            ) from error
+        self._link = Link(link, self._watch, settings.link_timeout_s)
+        try:
+            self._begin_session()
+        except BaseException:
+            self.close()
+            raise
+
+    def identify(self) -> Identity:
+        status = self._status()
+        return Identity(
+            vendor="KUKA",
+            model=self.arm.name,
+            serial=str(status.serial),
+            firmware=f"EthernetKRL, controller tells {status.model!r}",
+            simulated="simulated" in status.model,
+        )
+
+    def self_test(self) -> Mapping[str, str]:
+        self._raise_fault()
+        status = self._status()
+        axes = ", ".join(f"{angle:.3f}" for angle in status.joints_deg)
+        return {
+            "axes": f"{axes} deg",
+            "pose": self._compare_pose(status),
+            "override": f"{status.override_percent} %",
+            "mode": "T1: slow, for tests" if status.t1 else "automatic or T2",
+        }
+
+    def move_to(self, joints_deg: NDArray[np.float64]) -> None:
+        target_deg = checked_target(joints_deg, self.arm.limits_deg)
+        self._raise_fault()
+        status = self._status()
+        if status.override_percent <= 0:
+            raise refused("an override above 0 %", "the controller's program override stands at 0 %")
+        # Retargeted in motion, the arm first has to brake: as long as from the farthest point, twice.
+        move_s = move_duration_s(self.arm, status.joints_deg, target_deg) + self._stop_s()
+        self._motion_s = move_s * _slower(status)
+        self._order(wire.MOVE, target_deg)
+
+    def wait_settled(self) -> ArmState:
+        settings, watch = self.settings, self._watch
+        order = watch.order
+        with self._link.changed:  # what the controller says from now on counts, not what is on its way
+            watch.asked(self._number + 1)
+        self._send(wire.ASK)
+        self._wait_taken()
+        settle_s = settings.settle_cycles * settings.status_ms / 1e3
+        limit_s = 1.5 * self._motion_s + settle_s + settings.dwell_s + 1.0
+
+        def settled() -> bool:
+            if watch.order != order:
+                raise overtaken()
+            return watch.taken_ms is not None and watch.settled_cycles >= settings.settle_cycles
+
+        self._wait(settled, limit_s, "the arm at its target and still")
+        dwell_ends_ms = self._status().time_ms + 1e3 * settings.dwell_s
+        self._wait(
+            lambda: self._status().time_ms >= dwell_ends_ms and settled(), limit_s, "the arm still after the dwell"
+        )
+        return self.measured()
+
+    def measured(self) -> ArmState:
+        """As of the last status. Raises DeviceLost where none comes any more."""
+        with self._link.changed:
+            if self._watch.link_lost:
+                self._raise_fault()
+            status, fault = self._status(), self._watch.fault
+            return ArmState(
+                joints_deg=status.joints_deg,
+                base_from_flange=forward(self.arm, status.joints_deg),
+                t_ns=self._news.since_ns(self._watch.statuses),
+                moving=self._watch.moving,
+                fault=fault.text if fault else "",
+            )
+
+    def stop(self) -> None:
+        """Brake and wait until the arm stands; raises DeviceTimeout if it does not come to rest.
+
+        With a lost link it returns at once: the controller has stopped the arm itself.
+        """
+        watch = self._watch
+        if watch.link_lost:
+            return
+        self._order(wire.STOP, None)
+        self._wait_taken()
+        self._wait(lambda: not watch.moving, 2.0 * self._stop_s() + 1.0, "the arm at rest", faults=False)
+
+    def stopping_deg(self) -> NDArray[np.float64]:
+        """See `farthest_stop_deg`. The controller's program looks for commands at least as often as it sends
+        statuses; another such time is for the network, and for the robot program to be interrupted."""
+        settings, arm = self.settings, self.arm
+        delay_s = 2.0 * settings.status_ms / 1e3
+        return farthest_stop_deg(arm.velocity_deg_s, arm.acceleration_deg_s2[0], settings.jerk_deg_s3, delay_s)
+
+    def statistics(self) -> Mapping[str, float]:
+        watch = self._watch
+        return {
+            "statuses": watch.statuses,
+            "foreign_statuses": watch.foreign,
+            "malformed_statuses": self._link.reader.malformed,
+            "max_gap_ms": watch.max_gap_ms,
+        }
+
+    def close(self) -> None:
+        """Bring the arm to rest, then end the connection. Safe to call again."""
+        try:
+            if self._watch.status is not None:
+                self.stop()
+        except DeviceError:
+            pass  # its program stops the arm where it loses the connection
+        finally:
+            self._link.close()
+
+    def _begin_session(self) -> None:
+        """A first STOP: the answers to it are this session's, whatever came before."""
+        self._order(wire.STOP, None)
+        watch = self._watch
+        self._link.wait_for(
+            lambda: watch.fault or (watch.status and not watch.moving), self.settings.connect_timeout_s
+        )
+        self._raise_fault()
+        if watch.status is None or watch.moving:
+            raise DeviceTimeout(
+                "robot",
+                expected=f"an answer from the program at {self.settings.address}",
+                happened=f"{watch.statuses} statuses answered, {watch.foreign} belonged to another session, "
+                f"{self._link.reader.malformed} were malformed",
+                remedy="Start the controller's programs anew, and check that they are those of configs/kuka",
+            )
+
+    def _order(self, verb: int, target_deg: Six | None) -> None:
+        with self._link.changed:
+            self._watch.ordered(self._number + 1, target_deg)
+        self._send(verb, target_deg)
+
+    def _send(self, verb: int, target_deg: Six | None = None) -> None:
+        self._number += 1
+        settings, status = self.settings, self._watch.status
+        here_deg = status.joints_deg if status else (0.0,) * 6
+        self._link.send(
+            Command(
+                session=self._watch.session,
+                number=self._number,
+                verb=verb,
+                velocity_percent=settings.velocity_percent(),
+                acceleration_percent=settings.acceleration_percent(),
+                joints_deg=target_deg or here_deg,
+            )
+        )
+
+    def _status(self) -> Status:
+        status = self._watch.status
+        if status is None:
+            raise DeviceLost("robot", expected="a status", happened="none has come", remedy="Open the robot again")
+        return status
+
+    def _wait_taken(self) -> None:
+        watch, patience_s = self._watch, 2.0 * self.settings.link_timeout_s  # silence would be told before
+        self._link.wait_for(lambda: watch.link_lost or watch.taken_ms is not None, patience_s)
+        if watch.taken_ms is None and not watch.link_lost:
+            raise DeviceTimeout(
+                "robot",
+                expected=f"command {self._number} to be taken within {patience_s:.1f} s",
+                happened="statuses come, but none acknowledges it",
+                remedy="See the controller's messages: its submit interpreter must run",
+            )
+
+    def _wait(self, done: Callable[[], bool], limit_s: float, expected: str, *, faults: bool = True) -> None:
+        """Wait until `done`. Raises a fault, once the arm stands, or DeviceTimeout `limit_s` of the
+        controller's time after the last command was taken."""
+        watch = self._watch
+
+        def outcome() -> str:
+            if watch.link_lost or (watch.fault and not watch.moving):
+                return "fault"
+            if watch.fault is None and done():
+                return "done"
+            return "overdue" if watch.overdue(limit_s) else ""
+
+        how = self._link.wait_for(outcome)
+        if faults:
+            self._raise_fault()
+        if how == "overdue":
+            raise DeviceTimeout(
+                "robot",
+                expected=f"{expected} within {limit_s:.1f} s",
+                happened=f"axes measured at {np.round(self._status().joints_deg, 3).tolist()} deg",
+                remedy="See the controller's messages; a motion may wait for an enabling switch or a condition",
+            )
+
+    def _compare_pose(self, status: Status) -> str:
+        """Phrase for the self-test; raises DeviceError where the controller has another arm or tool in mind."""
+        if status.pose is None:
+            return "the controller tells none"
+        x, y, z, *abc_deg = status.pose
+        told = transform((x, y, z), (abc_deg[0], abc_deg[1], abc_deg[2]))
+        apart = np.abs(told - forward(self.arm, status.joints_deg))
+        if apart[:3, 3].max() > _SAME_POSE_MM or apart[:3, :3].max() > _SAME_ROTATION:
+            raise DeviceError(
+                "robot",
+                expected=f"the flange of a {self.arm.name} where its axes put it",
+                happened=f"the controller tells {np.round(status.pose, 3).tolist()} (mm, deg)",
+                remedy="Check that the program sets $TOOL and $BASE to $NULLFRAME, and the arm's model",
+            )
+        return f"flange at {x:.2f}, {y:.2f}, {z:.2f} mm, as computed from the axes"
+
+    def _stop_s(self) -> float:
+        arm = self.arm
+        return longest_stop_s(arm.velocity_deg_s, arm.acceleration_deg_s2[0], self.settings.jerk_deg_s3)
+
+    def _raise_fault(self) -> None:
+        fault = self._watch.fault
+        if fault is None:
+            return
+        raise fault.kind(
+            "robot",
+            expected="an arm that moves as its program says",
+            happened=fault.text,
+            remedy="See to the cell, acknowledge at the controller, restart its program, reopen the robot",
+        )
+
+
+def _slower(status: Status) -> float:
+    """By how much motions are slowed down at the controller."""
+    return 100.0 / status.override_percent * (_T1_SLOWER if status.t1 else 1.0)

@@ -1,0 +1,116 @@
+"""The TCP connection to EthernetKRL, and the thread that reads it so that statuses never pile up."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Literal, TypeVar
+
+from coupole.errors import DeviceLost
+from drivers.kuka.eki.watch import Watch
+from drivers.kuka.eki.wire import Command, StatusReader, command_xml
+
+Outcome = TypeVar("Outcome")
+
+_LOOK_S = 0.05
+"""How often silence is looked at, and connecting is tried again."""
+_UNREAD_BYTES = 16384
+"""Room for statuses that wait to be read, half a second of them or less: what is read must not be old. A
+controller that is faster than its reader, as in a simulated world that hurries, is held back."""
+
+
+def connect(address: str, controller_is: Literal["server", "client"], timeout_s: float) -> socket.socket:
+    """An open connection, tried for `timeout_s` of machine time. Raises OSError."""
+    host, port = address.rsplit(":", 1)
+    give_up = time.monotonic() + timeout_s
+    if controller_is == "client":
+        with socket.create_server((host, int(port)), backlog=1) as listener:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNREAD_BYTES)  # handed on to the link
+            listener.settimeout(timeout_s)
+            link, _ = listener.accept()
+    else:
+        while True:
+            link = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNREAD_BYTES)  # must be set before connecting
+            link.settimeout(timeout_s)
+            try:
+                link.connect((host, int(port)))
+                break
+            except OSError as error:
+                link.close()
+                if not isinstance(error, ConnectionRefusedError) or time.monotonic() > give_up:
+                    raise
+                time.sleep(_LOOK_S)
+    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return link
+
+
+class Link:
+    """Sends commands, and has `watch` judge every status that comes."""
+
+    def __init__(self, link: socket.socket, watch: Watch, timeout_s: float) -> None:
+        self.reader = StatusReader()
+        self._link, self._watch, self._timeout_s = link, watch, timeout_s
+        self._link.settimeout(timeout_s)
+        self.changed = threading.Condition()
+        """Hold this while the watch is read or changed."""
+        self._closing = False
+        self._thread = threading.Thread(target=self._read, name="kuka-eki", daemon=True)
+        self._thread.start()
+
+    def send(self, command: Command) -> None:
+        """Send a command whole, or latch that the link is lost."""
+        try:
+            self._link.sendall(command_xml(command))
+        except OSError as error:
+            self._lose(f"link lost: a command could not be sent ({error})")
+
+    def wait_for(self, outcome: Callable[[], Outcome], patience_s: float | None = None) -> Outcome:
+        """Wait until there is an outcome (anything true), asked after every status, and give it.
+
+        After `patience_s` of machine time it gives what there is then. Without patience a silent controller
+        ends the wait, because that latches a fault: so `outcome` must look at the watch's fault.
+        """
+        with self.changed:
+            return self.changed.wait_for(outcome, patience_s)
+
+    def close(self) -> None:
+        """End the connection and the thread. Safe to call again."""
+        self._closing = True
+        with contextlib.suppress(OSError):
+            self._link.shutdown(socket.SHUT_RDWR)
+        self._thread.join()
+        self._link.close()
+
+    def _read(self) -> None:
+        heard = time.monotonic()
+        while not self._closing:
+            try:
+                if not select.select([self._link], [], [], _LOOK_S)[0]:
+                    silent_s = time.monotonic() - heard
+                    if silent_s > self._timeout_s:
+                        self._lose(f"link lost: no status for {silent_s:.2f} s")
+                        return
+                    continue
+                data = self._link.recv(65536)
+            except OSError as error:
+                self._lose(f"link lost: {error}")
+                return
+            if not data:
+                self._lose("link lost: the connection was closed")
+                return
+            heard = time.monotonic()
+            with self.changed:
+                for status in self.reader.feed(data):
+                    self._watch.take(status)
+                self.changed.notify_all()
+        self._lose("link lost: the driver was closed")
+
+    def _lose(self, text: str) -> None:
+        with self.changed:
+            self._watch.fail(DeviceLost, text)
+            self.changed.notify_all()

@@ -1,0 +1,121 @@
+"""What a controller's statuses say over time: whether the arm is settled, astray, or the session in a fault.
+
+Time is the controller's own, as the statuses tell it: they come in order, so nothing is judged late because
+the machine was slow to read them. Touches neither socket nor thread.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused
+from drivers.kuka.eki import wire
+from drivers.kuka.eki.wire import Six, Status
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Why the session is over; the first one stays."""
+
+    kind: type[DeviceError]
+    text: str
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """See the fields of the same names in `drivers.kuka.eki.driver.Settings`."""
+
+    settle_deg: float
+    settle_deg_s: float
+    follow_deg: float
+    follow_cycles: int
+
+
+class Watch:
+    """The state of one session, status by status."""
+
+    def __init__(self, session: int, tolerances: Tolerances) -> None:
+        self.session = session
+        self.status: Status | None = None
+        """The last one of this session."""
+        self.statuses = self.foreign = self.max_gap_ms = 0
+        """Statuses of this session and of others, and the longest time between two (controller time)."""
+        self.fault: Fault | None = None
+        self.link_lost = False
+        """Nothing comes any more, whatever the first fault was."""
+        self.order = 0
+        """Number of the last STOP or MOVE."""
+        self.taken_ms: int | None = None
+        """Controller time at which the last command of any kind was known to be taken."""
+        self.settled_cycles = 0
+        self.speed_deg_s = 0.0
+        self._tolerances = tolerances
+        self._rest_deg: Six | None = None
+        """Where the arm must stand when the order is done; None: wherever it comes to rest."""
+        self._asked = self._astray_cycles = 0
+
+    @property
+    def moving(self) -> bool:
+        """True while an order is on its way or the axes turn; after a fault only the axes count."""
+        if self.status is None:
+            return False
+        waiting = self.fault is None and self.status.done != self.order
+        return waiting or self.status.moving or self.speed_deg_s > self._tolerances.settle_deg_s
+
+    def ordered(self, number: int, target_deg: Six | None) -> None:
+        """A STOP (without target) or a MOVE is on its way."""
+        self.order = number
+        self._rest_deg = target_deg
+        self.asked(number)
+
+    def asked(self, number: int) -> None:
+        """A command of any kind is on its way: only what is said after it was taken counts."""
+        self._asked, self.taken_ms = number, None
+        self.settled_cycles = self._astray_cycles = 0
+
+    def fail(self, kind: type[DeviceError], text: str) -> None:
+        self.fault = self.fault or Fault(kind, text)
+        self.link_lost |= kind is DeviceLost
+
+    def take(self, status: Status) -> None:
+        """Judge the next status."""
+        if status.session != self.session:
+            self.foreign += 1
+            return
+        self.statuses += 1
+        last, self.status = self.status, status
+        elapsed_ms = status.time_ms - last.time_ms if last else 0
+        self.max_gap_ms = max(self.max_gap_ms, elapsed_ms)
+        if last and elapsed_ms > 0:
+            turned = map(float.__sub__, status.joints_deg, last.joints_deg)
+            self.speed_deg_s = max(map(abs, turned)) * 1e3 / elapsed_ms
+        if status.taken >= self._asked and self.taken_ms is None:
+            self.taken_ms = status.time_ms
+            self.settled_cycles = self._astray_cycles = 0
+        if status.fault != wire.NO_FAULT:
+            kind = DeviceRefused if status.fault == wire.TARGET_REFUSED else DeviceFault
+            self.fail(kind, wire.FAULTS.get(status.fault, f"the controller tells fault {status.fault}"))
+        self._judge_rest(status, known_speed=elapsed_ms > 0)
+
+    def _judge_rest(self, status: Status, *, known_speed: bool) -> None:
+        if self.moving:
+            self.settled_cycles = self._astray_cycles = 0
+            return
+        if self._rest_deg is None:
+            self._rest_deg = status.joints_deg
+        error_deg = max(map(abs, map(float.__sub__, status.joints_deg, self._rest_deg)))
+        settled = known_speed and error_deg <= self._tolerances.settle_deg
+        self.settled_cycles = self.settled_cycles + 1 if settled else 0
+        self._astray_cycles = self._astray_cycles + 1 if error_deg > self._tolerances.follow_deg else 0
+        if self._astray_cycles >= self._tolerances.follow_cycles:
+            self.fail(
+                DeviceFault,
+                f"the arm does not follow: it stands {error_deg:.2f} deg from where it was sent "
+                f"(brakes, collision, or moved by hand)",
+            )
+
+    def overdue(self, limit_s: float) -> bool:
+        """True if the last command was taken longer ago than that, on the controller's clock."""
+        if self.status is None or self.taken_ms is None:
+            return False
+        return self.status.time_ms - self.taken_ms > 1e3 * limit_s

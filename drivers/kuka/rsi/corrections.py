@@ -1,0 +1,71 @@
+"""What an answer says: the corrections that bring the controller from where it stands to the commanded axes.
+
+Absolute corrections count from where the session began. Relative ones add up on the controller, so what counts
+as told is what it has applied, rounded as it was sent: an increment that came too late is part of the next one,
+and the roundings of many do not add up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from drivers.kuka.rsi.pose import Geometry, corrected, correction, flange_pose
+
+Six = tuple[float, ...]
+
+DECIMALS = 6
+"""Of a correction on the wire."""
+NAMES = {"axes": ("A1", "A2", "A3", "A4", "A5", "A6"), "pose": ("X", "Y", "Z", "A", "B", "C")}
+"""Attributes of a correction, by what is corrected."""
+TAGS = {"axes": "AKorr", "pose": "RKorr"}
+"""The element that carries it, unless the controller's configuration calls it otherwise."""
+_NOTHING: Six = (0.0,) * 6
+
+
+class Corrections:
+    """See the module. A `place` is where the arm is: its axes, or the flange's pose."""
+
+    def __init__(self, corrects: str, mode: str, geometry: Geometry) -> None:
+        self._relative = mode == "relative"
+        self._place: Callable[[Six], Any] = tuple
+        self._between: Callable[[Any, Any], Six] = _axes_between
+        self._moved: Callable[[Any, Six], Any] = _axes_moved
+        if corrects == "pose":
+            self._place, self._between, self._moved = partial(flange_pose, geometry), correction, corrected
+        self._from: Any = None
+        """The place that the next correction counts from."""
+        self._last = self._applied = _NOTHING
+        """The last correction said, and the last that the controller is known to have applied."""
+
+    def begin(self, start_deg: Six) -> None:
+        """A session begins with the axes here."""
+        self._from = self._place(start_deg)
+        self._last = self._applied = _NOTHING
+
+    def taken(self) -> None:
+        """The controller has applied the last correction."""
+        self._applied = self._last
+        if self._relative:
+            self._from = self._moved(self._from, self._last)
+            self._last = _NOTHING
+
+    def to(self, commanded_deg: Six) -> Six:
+        """The correction that leads to these axes."""
+        values = self._between(self._from, self._place(commanded_deg))
+        self._last = tuple(round(value, DECIMALS) for value in values)
+        return self._last
+
+    def hold(self) -> Six:
+        """The correction that moves nothing."""
+        self._last = _NOTHING if self._relative else self._applied
+        return self._last
+
+
+def _axes_between(before_deg: Six, after_deg: Six) -> Six:
+    return tuple(map(float.__sub__, after_deg, before_deg))
+
+
+def _axes_moved(before_deg: Six, values_deg: Six) -> Six:
+    return tuple(map(float.__add__, before_deg, values_deg))

@@ -1,0 +1,305 @@
+"""A KUKA arm through RobotSensorInterface (RSI): `coupole.devices.Robot`.
+
+The controller sends a packet every 4 or 12 ms and must be answered within that cycle, so a process of its
+own (`kuka_rsi_loop`) answers; this class writes commands to shared memory and reads the arm's state there.
+Order of work in the cell: open this driver, then start the controller's RSI program.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.devices import ArmState, Clock, Deadline, Identity
+from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
+from coupole.kinematics import Arm, forward, limit_violations, move_duration_s
+from drivers.kuka.rsi import shared_state as block
+from drivers.kuka.rsi.limits import correction_violations
+from drivers.kuka.rsi.pose import Geometry
+from drivers.kuka.rsi.rsi_session import Config
+from drivers.kuka.rsi.settings import Settings
+
+__all__ = ["KukaRsi", "Settings"]
+
+_SESSION_ANSWERS = 10
+"""Answers after which a session counts as established."""
+_POLL_S = 0.004
+
+
+class KukaRsi:
+    """See `coupole.devices.Robot`. After a fault it moves no more: close it and open another."""
+
+    def __init__(self, settings: Settings, clock: Clock) -> None:
+        """Wait for the controller's packets and answer them, with no correction until `move_to`.
+
+        Raises DeviceLost if the port cannot be bound, DeviceTimeout if no session begins in time.
+        """
+        self.settings = settings
+        self.arm = settings.arm()
+        self._clock = clock
+        self._command = block.Command()
+        self._motion_s = 0.0
+        self._target_deg: block.Six = (0.0,) * 6
+        """Of the last motion."""
+        self._last_packets, self._last_news_ns = -1, 0
+        self._process, self._block = _spawn(settings, self.arm)
+        try:
+            self._wait_for_session()
+        except BaseException:
+            self.close()
+            raise
+
+    def identify(self) -> Identity:
+        controller = self._state().controller.decode(errors="replace")
+        return Identity(
+            vendor="KUKA",
+            model=self.arm.name,
+            serial="",
+            firmware=f"RSI, controller type {controller!r}",
+            simulated="simulated" in controller,
+        )
+
+    def self_test(self) -> Mapping[str, str]:
+        state = self._state()
+        self._raise_fault(state)
+        axes = ", ".join(f"{angle:.3f}" for angle in state.measured_deg)
+        return {
+            "axes": f"{axes} deg",
+            "delay counter": f"{state.delay}",
+            "scheduling": "SCHED_FIFO" if state.realtime else "normal: answers may be late on a busy machine",
+        }
+
+    def move_to(self, joints_deg: NDArray[np.float64]) -> None:
+        target_deg = np.asarray(joints_deg, dtype=np.float64)
+        if target_deg.shape != (6,) or not np.all(np.isfinite(target_deg)):
+            raise self._refused("six finite joint angles in degrees", f"got {joints_deg!r}")
+        if violations := limit_violations(self.arm, target_deg):
+            raise self._refused("joint angles within the arm's limits", violations)
+        state = self._state()
+        self._raise_fault(state)
+        # Retargeted in motion, the arm sets out from anywhere on the rest of its line.
+        on_the_way_deg = [state.commanded_deg] if self._stands(state) else [state.commanded_deg, self._target_deg]
+        if violations := correction_violations(
+            self.settings, self.arm, state.start_deg, on_the_way_deg, target_deg
+        ):
+            raise self._refused("a motion that corrections can bring about", violations)
+        self._target_deg = tuple(float(angle) for angle in target_deg)
+        # It may first have to brake: as long as from the farthest point, twice.
+        self._motion_s = move_duration_s(self.arm, state.measured_deg, target_deg) + self._stop_s()
+        self._send(block.MOVE, self._target_deg)
+
+    def wait_settled(self) -> ArmState:
+        command = self._command
+        settings = self.settings
+        settle_s = settings.settle_cycles * settings.cycle_ms / 1e3
+        deadline = Deadline(self._clock, 1.5 * self._motion_s + settle_s + settings.dwell_s + 1.0)
+        self._wait(lambda state: self._settled(state, command), deadline, "the arm at its target and still")
+        self._clock.sleep(settings.dwell_s)
+        self._wait(lambda state: self._settled(state, command), deadline, "the arm still after the dwell")
+        return self.measured()
+
+    def measured(self) -> ArmState:
+        state = self._state()
+        joints = state.measured_deg
+        if state.packets != self._last_packets:
+            self._last_packets, self._last_news_ns = state.packets, self._clock.now_ns()
+        return ArmState(
+            joints_deg=(joints[0], joints[1], joints[2], joints[3], joints[4], joints[5]),
+            base_from_flange=forward(self.arm, joints),
+            t_ns=self._last_news_ns,
+            moving=self._moves(state),
+            fault=state.fault_text.decode(errors="replace"),
+        )
+
+    def stop(self) -> None:
+        """Brake and wait until the arm stands; raises DeviceTimeout if it does not come to rest.
+
+        With a lost link it returns at once: the controller has stopped the arm itself.
+        """
+        if self._process.poll() is not None:
+            return
+        self._send(block.STOP)
+        number = self._command.number
+        deadline = Deadline(self._clock, 2.0 * self._stop_s() + 1.0)
+
+        def stands(state: block.State) -> bool:
+            ended = state.fault != block.NO_FAULT and state.phase == block.STANDING
+            obeyed = state.command >= number and not self._moves(state)
+            return state.fault == block.LINK_LOST or ended or obeyed
+
+        self._wait(stands, deadline, "the arm at rest", faults=False)
+
+    def stopping_deg(self) -> NDArray[np.float64]:
+        return self.settings.stopping_deg()
+
+    def statistics(self) -> Mapping[str, float]:
+        state = self._block.read_state()
+        return {
+            "packets": state.packets,
+            "answers": state.answers,
+            "late_answers": state.late,
+            "malformed_packets": state.malformed,
+            "foreign_packets": state.foreign,
+            "max_gap_ms": state.max_gap_ns / 1e6,
+            "delay_counter": state.delay,
+            "realtime": state.realtime,
+        }
+
+    def close(self) -> None:
+        """Bring the arm to rest, then end the process that answers. Safe to call again."""
+        if self._process.poll() is None:
+            with contextlib.suppress(DeviceError):
+                self.stop()
+            self._send(block.LEAVE)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(timeout=1.0)
+            self._process.kill()
+        self._process.wait()
+
+    def _wait_for_session(self) -> None:
+        give_up = time.monotonic() + self.settings.connect_timeout_s
+        while (state := self._state()).answers < _SESSION_ANSWERS:
+            if time.monotonic() > give_up:
+                raise DeviceTimeout(
+                    "robot",
+                    expected=f"RSI packets at {self.settings.listen}",
+                    happened=_why_no_session(state),
+                    remedy="Start the RSI program on the controller anew, and check its IP_NUMBER and PORT",
+                )
+            time.sleep(_POLL_S)
+        self._raise_fault(state)
+
+    def _send(self, verb: int, target_deg: tuple[float, ...] = (0.0,) * 6) -> None:
+        self._command = block.Command(self._command.number + 1, verb, target_deg)
+        self._block.write_command(self._command)
+
+    def _state(self) -> block.State:
+        """The loop's last word; raises DeviceLost if the loop is gone."""
+        try:
+            if self._process.poll() is None:
+                return self._block.read_state()
+        except TimeoutError:
+            self._process.kill()
+            self._process.wait()
+        raise DeviceLost(
+            "robot",
+            expected="a process that answers the controller",
+            happened=f"it ended with exit code {self._process.returncode}",
+            remedy="Open the robot again",
+        )
+
+    def _wait(
+        self, done: Callable[[block.State], bool], deadline: Deadline, expected: str, *, faults: bool = True
+    ) -> None:
+        while True:
+            state = self._state()
+            if faults:
+                self._raise_fault(state)
+            if done(state):
+                return
+            if deadline.expired:
+                raise DeviceTimeout(
+                    "robot",
+                    expected=f"{expected} within {deadline.seconds:.1f} s",
+                    happened=f"axes measured at {np.round(state.measured_deg, 3).tolist()} deg, "
+                    f"commanded to {np.round(state.commanded_deg, 3).tolist()} deg",
+                    remedy="See the controller's messages; its override must stand at 100 %",
+                )
+            self._clock.sleep(_POLL_S)
+
+    def _settled(self, state: block.State, command: block.Command) -> bool:
+        if self._command is not command:
+            raise self._refused("the arm to go on to its target", "another command ended the motion")
+        return state.command == command.number and state.settled_cycles >= self.settings.settle_cycles
+
+    def _moves(self, state: block.State) -> bool:
+        speed_deg_s = max(map(abs, state.velocity_deg_s))
+        # A command that the loop has not taken yet counts as motion.
+        return not self._stands(state) or speed_deg_s > self.settings.settle_deg_s
+
+    def _stands(self, state: block.State) -> bool:
+        return state.phase == block.STANDING and state.command == self._command.number
+
+    def _stop_s(self) -> float:
+        """Longest time that any axis needs to come to rest: v/a, and twice a/jerk to build it up."""
+        acceleration, jerk = self.settings.acceleration_deg_s2, self.settings.jerk_deg_s3
+        return max(self.arm.velocity_deg_s) / acceleration + 2.0 * acceleration / jerk
+
+    def _raise_fault(self, state: block.State) -> None:
+        if state.fault == block.NO_FAULT:
+            return
+        kind = DeviceLost if state.fault == block.LINK_LOST else DeviceFault
+        raise kind(
+            "robot",
+            expected="an arm that follows its RSI corrections",
+            happened=state.fault_text.decode(errors="replace"),
+            remedy="See to the cell, acknowledge at the controller, restart its program, reopen the robot",
+        )
+
+    @staticmethod
+    def _refused(expected: str, happened: str) -> DeviceRefused:
+        return DeviceRefused("robot", expected=expected, happened=happened, remedy="Ask for another pose")
+
+
+def _why_no_session(state: block.State) -> str:
+    if state.refused:
+        return f"{state.refused} packets belong to a running RSI session that another program may have begun"
+    if state.malformed:
+        return (
+            f"{state.malformed} packets came, but none with an IPOC and six axes (and, for relative corrections, "
+            "the delay counter)"
+        )
+    return f"{state.packets} came"
+
+
+def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], block.Block]:
+    """Bind the port and start the loop; raises DeviceLost if the port is not to be had."""
+    host, port = settings.listen.rsplit(":", 1)
+    derived: dict[str, Any] = {
+        "cycle_s": settings.cycle_ms / 1e3,
+        "correction_tag": settings.tag,
+        "geometry": Geometry(*(getattr(arm, name) for name in Geometry._fields)),
+        "velocity_deg_s": arm.velocity_deg_s,
+        "acceleration_deg_s2": arm.acceleration_deg_s2,
+        "jerk_deg_s3": arm.jerk_deg_s3,
+    }
+    passed_on = {f.name: getattr(settings, f.name) for f in fields(Config) if f.name not in derived}
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        try:
+            link.bind((host, int(port)))
+        except OSError as error:
+            raise DeviceLost(
+                "robot",
+                expected=f"to listen for the controller at {settings.listen}",
+                happened=str(error),
+                remedy="End the other program that uses this port, or change `listen`",
+            ) from error
+        memory_fd = os.memfd_create("coupole-rsi")
+        try:
+            os.truncate(memory_fd, block.BLOCK_BYTES)
+            shared = block.Block(memory_fd)
+            process = subprocess.Popen(
+                [
+                    sys.executable,
+                    *("-m", "drivers.kuka.rsi.loop"),
+                    *map(str, (link.fileno(), memory_fd, os.getpid())),
+                    json.dumps(derived | passed_on),
+                ],
+                pass_fds=(link.fileno(), memory_fd),
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        finally:
+            os.close(memory_fd)
+    return process, shared

@@ -1,0 +1,98 @@
+"""The process that answers a KUKA controller's RSI packets.
+
+    python -m drivers.kuka.rsi.loop SOCKET_FD BLOCK_FD PARENT_PID CONFIG_JSON
+
+It imports little and does nothing else, because it must answer within the cycle; see `kuka_rsi_responder`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import json
+import os
+import signal
+import socket
+import struct
+import sys
+import time
+
+from drivers.kuka.rsi import shared_state as block
+from drivers.kuka.rsi.pose import Geometry
+from drivers.kuka.rsi.rsi_session import Config, Responder
+
+_TICK_S = 0.05
+"""How often the loop looks at its parent and at the link while no packet comes."""
+_ORPHAN_S = 0.8
+"""Longest life after the parent's death: the time to brake."""
+_REALTIME_PRIORITY = 20
+
+
+def serve(link: socket.socket, shared: block.Block, parent_pid: int, config: Config) -> None:
+    """Answer packets until told to leave or the parent is gone, and leave with the arm at rest."""
+    # The kernel's own receive time-out costs nothing per packet; Python's is a poll before each call.
+    link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@qq", 0, int(_TICK_S * 1e6)))
+    realtime = _become_realtime()
+    responder = Responder(config, time.monotonic_ns())
+    shared.write_state(responder.state(realtime))
+    _drop_backlog(link)
+    leaving, orphan_ns, look_ns = False, 0, 0
+    controller = None
+    while not (leaving and responder.motion.phase == block.STANDING):
+        try:
+            data, address = link.recvfrom(4096)
+            idle = False
+        except BlockingIOError:
+            idle = True
+        now_ns = time.monotonic_ns()
+        if shared.command_number() != responder.command:
+            command = shared.read_command()
+            responder.obey(command)
+            leaving |= command.verb == block.LEAVE
+        late, answer = responder.late, None
+        if not idle and controller not in (None, address):
+            responder.foreign += 1  # somebody else's axes must not be taken for this arm's
+        elif not idle:
+            answer = responder.answer(data, now_ns)
+        if answer is None:
+            responder.check_link(now_ns)
+        else:
+            controller = address
+            with contextlib.suppress(OSError):  # a controller that is gone is noticed by its silence
+                link.sendto(answer, address)
+        if responder.late > late:
+            _drop_backlog(link)  # answers to packets that wait here would be late too
+        shared.write_state(responder.state(realtime))
+        if now_ns > look_ns:
+            look_ns = now_ns + int(_TICK_S * 1e9)
+            if os.getppid() != parent_pid and not leaving:
+                leaving, orphan_ns = True, now_ns
+                responder.motion.stop()
+        if orphan_ns and now_ns - orphan_ns > _ORPHAN_S * 1e9:
+            break
+
+
+def _become_realtime() -> int:
+    """1 if the process may run under SCHED_FIFO; 0, and it runs as any other, if not."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_REALTIME_PRIORITY))
+    except OSError:
+        return 0
+    return 1
+
+
+def _drop_backlog(link: socket.socket) -> None:
+    """Forget packets that have waited; the controller has long gone on."""
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            link.recv(4096, socket.MSG_DONTWAIT)
+
+
+if __name__ == "__main__":
+    # Ctrl-C is the operator's word to the program, which then stops us.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.disable()
+    socket_fd, block_fd, parent_pid = map(int, sys.argv[1:4])
+    settings = json.loads(sys.argv[4])
+    settings["geometry"] = Geometry(*settings["geometry"])
+    serve(socket.socket(fileno=socket_fd), block.Block(block_fd), parent_pid, Config(**settings))

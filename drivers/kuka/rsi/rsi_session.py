@@ -1,0 +1,226 @@
+"""What the RSI loop thinks: the commanded axes, and an answer to every packet.
+
+Each packet moves the commanded axes on by one cycle of a jerk-limited trajectory and is answered with their
+corrections, so the arm keeps pace with a real controller as well as with a world that waits or runs fast.
+
+Corrections count from where RSI was started (`kuka_rsi_corrections`). So only a program that saw the session
+begin may answer: to a session in progress a first answer of zero would be a jump back to its start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.kuka.rsi import shared_state as block
+from drivers.kuka.rsi.corrections import NAMES, Corrections
+from drivers.kuka.rsi.pose import Geometry
+from drivers.kuka.rsi.trajectory import Motion
+from drivers.kuka.rsi.wire import Packet, answer_template, controller_type, packet_parser
+
+_GAP_STEPS = 25
+"""A jump of the IPOC by more than so many of its steps is a new session, or an outage long enough for one."""
+_LAST_WORDS = 5
+"""Packets that are still answered when the commanded axes stand after a fault."""
+_HALTED_PACKETS = 5
+"""After so many late answers in a row the arm has come to a halt at the last correction that was in time."""
+_QUIET_NS = 500_000_000
+"""Where packets carry no delay counter, one after so long a silence is taken for the first of a session."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """What the driver tells the loop; the fields are explained at `drivers.kuka.rsi.driver.Settings`."""
+
+    cycle_s: float
+    sen_type: str
+    measured_tag: str
+    delay_tag: str
+    correction_tag: str
+    corrects: str
+    mode: str
+    geometry: Geometry
+    velocity_deg_s: tuple[float, ...]
+    acceleration_deg_s2: tuple[float, ...]
+    jerk_deg_s3: tuple[float, ...]
+    link_timeout_s: float
+    delay_limit: int
+    settle_deg: float
+    settle_deg_s: float
+    follow_deg: float
+    follow_lag_s: float
+    follow_cycles: int
+
+
+class Responder:
+    """Makes an answer of every packet, and the state for the driver; touches neither socket nor memory."""
+
+    def __init__(self, config: Config, opened_ns: int = 0) -> None:
+        self.fault, self.fault_text = block.NO_FAULT, b""
+        self.packets = self.answers = self.malformed = self.refused = self.foreign = 0
+        self.late = self.delay = self.max_gap_ns = self.command = 0
+        self.settled_cycles = self._astray_cycles = self._late_in_row = 0
+        limits = config.velocity_deg_s, config.acceleration_deg_s2, config.jerk_deg_s3
+        self.motion = Motion(config.cycle_s, limits)
+        self._config = config
+        self._parse = packet_parser(config.measured_tag, config.delay_tag)
+        self._template = answer_template(config.sen_type, config.correction_tag, NAMES[config.corrects])
+        self._corrections = Corrections(config.corrects, config.mode, config.geometry)
+        self._controller = b""
+        self._start_deg: tuple[float, ...] | None = None
+        """The measured axes at the start of the session, which corrections refer to; None before it."""
+        self._measured_deg: tuple[float, ...] = (0.0,) * 6
+        self._velocity_deg_s: tuple[float, ...] = (0.0,) * 6
+        self._ipoc = self._ipoc_step = 0
+        self._packet_ns = opened_ns
+        """When the last packet came, that of another program's session included."""
+        self._session_over = False
+        self._last_words = _LAST_WORDS
+        self._last_answer: bytes | None = None
+
+    def obey(self, command: block.Command) -> None:
+        """Take a command. After a fault only stopping is obeyed."""
+        self.command = command.number
+        self.settled_cycles = 0
+        if command.verb == block.MOVE and self.fault == block.NO_FAULT:
+            self.motion.move_to(command.target_deg)
+        elif command.verb in (block.STOP, block.LEAVE):
+            self.motion.stop()
+
+    def answer(self, data: bytes, now_ns: int) -> bytes | None:
+        """What to send back, or None if this packet must not be answered."""
+        packet = self._parse(data)
+        if packet is None or (packet.delay is None and self._config.mode == "relative"):
+            self.malformed += 1
+            return None
+        advance, rose = int(packet.ipoc) - self._ipoc, 0
+        if self._start_deg is None:
+            if not self._may_begin(packet, now_ns):
+                self.refused += 1
+                return None
+            self._controller = controller_type(data)
+            self._begin_session(packet)
+        else:
+            self.max_gap_ns = max(self.max_gap_ns, now_ns - self._packet_ns)
+            if not self._in_sequence(packet, advance):
+                return self._last_answer if advance == 0 else None
+            rose = max(0, (packet.delay or 0) - self.delay) if advance > 0 else 0
+        self._ipoc, self._packet_ns, self.delay = int(packet.ipoc), now_ns, packet.delay or 0
+        self.packets += 1
+        self.late += rose
+        # Packets lost on the way here count as late, too, but say nothing of the answer before them.
+        applied = rose == 0 or rose < advance // self._ipoc_step
+        if applied:
+            self._corrections.taken()
+        self._watch(packet)
+        self._late_in_row = self._late_in_row + 1 if rose else 0
+        if not applied:  # say the last answer again instead of running ahead of the arm
+            if self._late_in_row >= _HALTED_PACKETS:
+                self.motion.halted()
+        elif not self.motion.step():
+            self.fail(block.NO_TRAJECTORY, "no trajectory within the limits leads to the target")
+        self._last_answer = None if self._silent() else self._template % (*self._values(), packet.ipoc)
+        self.answers += self._last_answer is not None
+        return self._last_answer
+
+    def _values(self) -> block.Six:
+        """The six corrections. When the arm has come to rest after a fault they move it no more."""
+        if self.fault != block.NO_FAULT and self.motion.phase == block.STANDING:
+            return self._corrections.hold()
+        return self._corrections.to(self.motion.commanded_deg)
+
+    def _silent(self) -> bool:
+        """After a fault the session is ended by silence, so that no old correction can meet a new session: at
+        once where a new one may have begun, else when the commanded axes, and the arm with them, stand."""
+        if self.fault != block.NO_FAULT and self.motion.phase == block.STANDING:
+            self._last_words -= 1
+        return self._session_over or self._last_words < 0
+
+    def check_link(self, now_ns: int) -> None:
+        """Latch a fault if packets stayed away for longer than the link's time-out."""
+        silent_s = (now_ns - self._packet_ns) / 1e9
+        if self._start_deg is not None and silent_s > self._config.link_timeout_s:
+            self.fail(block.LINK_LOST, f"no packet for {silent_s:.2f} s, the delay counter was {self.delay}")
+
+    def fail(self, fault: int, text: str) -> None:
+        """Latch the first fault and bring the commanded axes to rest: along their path if the arm is with them
+        and listens, else where they are, so that nothing pushes on."""
+        if self.fault == block.NO_FAULT:
+            self.fault, self.fault_text = fault, text.encode()
+        self._session_over |= fault == block.LINK_LOST
+        if fault in (block.LINK_LOST, block.NOT_FOLLOWING):
+            self.motion.stand_at(self.motion.commanded_deg)
+        else:
+            self.motion.stop()
+
+    def state(self, realtime: int) -> block.State:
+        return block.State(
+            packets=self.packets,
+            answers=self.answers,
+            malformed=self.malformed,
+            refused=self.refused,
+            foreign=self.foreign,
+            late=self.late,
+            delay=self.delay,
+            max_gap_ns=self.max_gap_ns,
+            realtime=realtime,
+            command=self.command,
+            phase=self.motion.phase,
+            settled_cycles=self.settled_cycles,
+            fault=self.fault,
+            measured_deg=self._measured_deg,
+            velocity_deg_s=self._velocity_deg_s,
+            commanded_deg=self.motion.commanded_deg,
+            start_deg=self._start_deg or (0.0,) * 6,
+            controller=self._controller,
+            fault_text=self.fault_text,
+        )
+
+    def _may_begin(self, packet: Packet, now_ns: int) -> bool:
+        """Whether no other program can have begun this packet's session."""
+        quiet_ns, self._packet_ns = now_ns - self._packet_ns, now_ns
+        return packet.delay == 0 if packet.delay is not None else quiet_ns > _QUIET_NS
+
+    def _begin_session(self, packet: Packet) -> None:
+        self._start_deg = self._measured_deg = packet.joints_deg
+        self._ipoc_step = self._astray_cycles = 0
+        self._corrections.begin(packet.joints_deg)
+        self.motion.stand_at(packet.joints_deg)
+
+    def _in_sequence(self, packet: Packet, advance: int) -> bool:
+        """False for a packet that came twice or out of order. Notices sessions that begin anew."""
+        step = self._ipoc_step or 1
+        if advance > 0 and not 0 < self._ipoc_step <= advance:
+            self._ipoc_step = advance  # the smallest so far: a packet may have been lost on the way
+        elif advance > _GAP_STEPS * step:
+            self.fail(block.LINK_LOST, f"{advance // step - 1} packets are missing")
+        elif advance < -_GAP_STEPS * step:
+            if self.motion.phase != block.STANDING:
+                self.fail(block.RESTARTED, "RSI was started anew while the arm was moving")
+            self._begin_session(packet)
+        return advance > 0 or advance < -_GAP_STEPS * step
+
+    def _watch(self, packet: Packet) -> None:
+        """Compare the measured axes with those commanded in the last answer."""
+        config, motion = self._config, self.motion
+        if packet.joints_deg == self._measured_deg:
+            self._velocity_deg_s = (0.0,) * 6
+            speed_deg_s = 0.0
+        else:
+            rates = map(float.__sub__, packet.joints_deg, self._measured_deg)
+            self._velocity_deg_s = tuple(rate / config.cycle_s for rate in rates)
+            speed_deg_s = max(map(abs, self._velocity_deg_s))
+            self._measured_deg = packet.joints_deg
+        error_deg = max(map(abs, map(float.__sub__, packet.joints_deg, motion.commanded_deg)))
+        settled = motion.phase == block.STANDING and error_deg <= config.settle_deg
+        self.settled_cycles = self.settled_cycles + 1 if settled and speed_deg_s <= config.settle_deg_s else 0
+
+        allowed_deg = config.follow_deg + config.follow_lag_s * max(map(abs, motion.velocity_deg_s))
+        self._astray_cycles = self._astray_cycles + 1 if error_deg > allowed_deg else 0
+        if self._astray_cycles >= config.follow_cycles:
+            self.fail(
+                block.NOT_FOLLOWING,
+                f"the arm does not follow: {error_deg:.2f} deg from the commanded axes for "
+                f"{self._astray_cycles} cycles (emergency stop, brakes or collision)",
+            )
+        if self.delay >= config.delay_limit:
+            self.fail(block.LATE, f"late answers: the controller's delay counter rose to {self.delay}")

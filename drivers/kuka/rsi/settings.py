@@ -1,0 +1,95 @@
+"""Settings of the RSI driver: what the rig says of the controller's configuration, and how the arm moves."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+
+from coupole.kinematics import KR10_R1100_SIXX, Arm, slowed
+from drivers.kuka.rsi.corrections import TAGS
+
+_TAG = r"^[A-Za-z_]\w*$"
+
+
+class Settings(BaseModel):
+    """Settings of the driver in the rig file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    listen: str = Field(default="0.0.0.0:49152", pattern=r"^[^:]+:\d+$")
+    """host:port to bind; the controller's RSI configuration names it (IP_NUMBER, PORT)."""
+    cycle_ms: Literal[4, 12] = 4
+    """4 for #IPO_FAST, 12 for #IPO."""
+    sen_type: str = Field(default="ImFree", pattern=r"^[\w.-]+$")
+    """SENTYPE of the controller's RSI configuration."""
+    measured_tag: str = Field(default="AIPos", pattern=_TAG)
+    delay_tag: str = Field(default="Delay", pattern=_TAG)
+    correction_tag: str = Field(default="", pattern=_TAG + "|^$")
+    """Empty: AKorr for axes, RKorr for the pose."""
+    corrects: Literal["axes", "pose"] = "axes"
+    """What the controller is corrected by: its axes (AXISCORR) or its flange's pose (POSCORR). Motions are
+    straight lines of the axes either way; where a pose does not tell the axes, they are refused."""
+    mode: Literal["absolute", "relative"] = "absolute"
+    """As in RSI_ON: corrections count from where RSI was started, or add up from cycle to cycle."""
+    axis_correction_deg: tuple[PositiveFloat, ...] = Field(
+        default=tuple(high - low for low, high in KR10_R1100_SIXX.limits_deg), min_length=6, max_length=6
+    )
+    """How far each axis may be from where RSI was started: MaxA1 to MaxA6 of the context's AXISCORRMON. The
+    controller stops RSI beyond it, so a target there is refused. The default is each axis' whole range."""
+    pose_correction_mm: float = Field(default=2300.0, gt=0)
+    pose_correction_deg: float = Field(default=180.0, gt=0, le=180)
+    """The same for corrections of the pose: MaxTrans and MaxRotAngle of POSCORRMON. The defaults forbid nothing:
+    the arm's whole reach, and any rotation."""
+    singularity_margin_deg: float = Field(default=5.0, gt=0, lt=45)
+    """Corrections of the pose: how far A5, elbow and shoulder stay from where the pose leaves the axes open."""
+    link_timeout_s: float = Field(default=2.0, gt=0)
+    """Silence after which the link counts as lost, in machine time; longer than any pause of the world."""
+    connect_timeout_s: float = Field(default=10.0, gt=0)
+    """How long to wait for the first packets, in machine time."""
+    delay_limit: int = Field(default=50, ge=1)
+    """Delay counter at which motion ends in a fault; below the controller's own limit (100 as shipped)."""
+    speed_fraction: float = Field(default=0.5, gt=0, le=1)
+    """Of the axes' highest speeds."""
+    acceleration_deg_s2: float = Field(default=300.0, gt=0)
+    jerk_deg_s3: float = Field(default=3000.0, gt=0)
+    settle_deg: float = Field(default=0.003, gt=0)
+    settle_deg_s: float = Field(default=0.1, gt=0)
+    settle_cycles: int = Field(default=10, ge=1)
+    """Settled: within both tolerances for so many cycles, and again after the dwell."""
+    dwell_s: float = Field(default=0.1, ge=0)
+    follow_deg: float = Field(default=1.0, gt=0)
+    follow_lag_s: float = Field(default=0.06, ge=0)
+    follow_cycles: int = Field(default=10, ge=1)
+    """The arm does not follow: farther than `follow_deg` plus `follow_lag_s` times the commanded speed from
+    the commanded axes for so many cycles."""
+
+    def arm(self) -> Arm:
+        """The arm with the speeds that this driver moves it at; preflight computes durations with it."""
+        return slowed(
+            KR10_R1100_SIXX,
+            speed_fraction=self.speed_fraction,
+            acceleration_deg_s2=self.acceleration_deg_s2,
+            jerk_deg_s3=self.jerk_deg_s3,
+        )
+
+    @property
+    def tag(self) -> str:
+        """The element that carries the corrections."""
+        return self.correction_tag or TAGS[self.corrects]
+
+    def stopping_deg(self) -> NDArray[np.float64]:
+        """Farthest that each axis [6] turns after a stop: its highest speed times the time that it may still last.
+
+        Coming to rest from speed v takes v/a + a/j, at half the speed on average; an axis that still speeds up
+        needs a/j before that. All axes share the time of the one that takes longest. To this come two cycles
+        until the command is obeyed, one until its answer is applied, and how far the arm lags behind its command.
+        """
+        speeds_deg_s = np.array(self.arm().velocity_deg_s)
+        rise_s = self.acceleration_deg_s2 / self.jerk_deg_s3
+        brake_s = speeds_deg_s.max() / self.acceleration_deg_s2 + rise_s
+        delay_s = 3.0 * self.cycle_ms / 1e3 + self.follow_lag_s
+        stopping_deg: NDArray[np.float64] = speeds_deg_s * (rise_s + 0.5 * brake_s + delay_s)
+        return stopping_deg

@@ -1,0 +1,92 @@
+"""The commanded axes: a jerk-limited run from rest to rest, one cycle at a time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import ruckig
+
+from drivers.kuka.rsi import shared_state as block
+from drivers.kuka.rsi.shared_state import Six
+
+
+class Motion:
+    """The commanded axes: standing, moving to a target or coming to rest, always within the limits.
+
+    Motions are straight in joint space: one jerk-limited run along the line, as fast as the axis that limits it
+    allows. (Six axes synchronised by ruckig leave the line by up to 5 degrees in one move of six.) Coming to rest
+    happens on the line, too; a new target given on the way is set out for from there.
+    """
+
+    def __init__(self, cycle_s: float, limits: tuple[Six, Six, Six]) -> None:
+        """`limits` are the axes' speeds (deg/s), accelerations (deg/s2) and jerks (deg/s3)."""
+        self.phase = block.STANDING
+        self.commanded_deg: Six = (0.0,) * 6
+        self.velocity_deg_s: Six = (0.0,) * 6
+        self._limits = limits
+        self._run: Any = ruckig.Ruckig(1, cycle_s)
+        self._input: Any = ruckig.InputParameter(1)
+        self._output: Any = ruckig.OutputParameter(1)
+        self._start_deg: Six = (0.0,) * 6
+        self._way_deg: Six = (0.0,) * 6
+        """From start to target; the run goes from 0 to 1 of it."""
+        self._next_target_deg: Six | None = None
+
+    def stand_at(self, joints_deg: Six) -> None:
+        """Take the axes as they are, at rest."""
+        self.phase, self.commanded_deg, self.velocity_deg_s = block.STANDING, joints_deg, (0.0,) * 6
+        self._next_target_deg = None
+
+    def halted(self) -> None:
+        """The arm stood still though the axes were commanded to go on: go on from rest."""
+        self.velocity_deg_s = (0.0,) * 6
+        self._input.current_velocity = self._input.current_acceleration = [0.0]
+
+    def move_to(self, target_deg: Six) -> None:
+        if self.phase != block.STANDING:
+            self.stop()
+            self._next_target_deg = target_deg
+            return
+        way_deg = tuple(map(float.__sub__, target_deg, self.commanded_deg))
+        if not any(way_deg):
+            return
+        self._start_deg, self._way_deg = self.commanded_deg, way_deg
+        highest = [
+            min(limit / abs(way) for limit, way in zip(limits, way_deg, strict=True) if way)
+            for limits in self._limits
+        ]
+        self._input.max_velocity, self._input.max_acceleration, self._input.max_jerk = ([h] for h in highest)
+        self._input.current_position = self._input.current_velocity = self._input.current_acceleration = [0.0]
+        self._input.target_position = [1.0]
+        self._go(ruckig.ControlInterface.Position, block.MOVING)
+
+    def stop(self) -> None:
+        self._next_target_deg = None
+        if self.phase == block.MOVING:
+            self._go(ruckig.ControlInterface.Velocity, block.STOPPING)
+
+    def _go(self, control: Any, phase: int) -> None:
+        self._input.control_interface = control
+        self._input.target_velocity = self._input.target_acceleration = [0.0]
+        self.phase = phase
+
+    def step(self) -> bool:
+        """One cycle on; False if the trajectory could not be computed, and then the axes stand."""
+        if self.phase == block.STANDING:
+            return True
+        result = self._run.update(self._input, self._output)
+        if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+            self.stand_at(self.commanded_deg)
+            return False
+        self._output.pass_to_input(self._input)
+        share, rate = self._output.new_position[0], self._output.new_velocity[0]
+        self.commanded_deg = tuple(
+            start + share * way for start, way in zip(self._start_deg, self._way_deg, strict=True)
+        )
+        self.velocity_deg_s = tuple(rate * way for way in self._way_deg)
+        if result == ruckig.Result.Finished:
+            following = self._next_target_deg
+            self.stand_at(self.commanded_deg)
+            if following is not None:
+                self.move_to(following)
+        return True

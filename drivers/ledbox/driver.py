@@ -1,0 +1,268 @@
+"""The LED control box, by SCPI over a serial line or USBTMC (docs/reference/ledbox-protocol.md).
+
+Every message ends in `SYSTem:ERRor?`, so no command goes unproven and each costs one round trip. The box's
+table banks are used in turn: while one runs, the next table is uploaded into the other.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import zlib
+from collections.abc import Mapping
+from typing import Literal, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from coupole.devices import STEP_DTYPE, STEP_RECORD_DTYPE, Clock, Identity
+from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.ledbox.scpi import REPLY_MARGIN_S, Link, ScpiSession
+from drivers.ledbox.serial_link import SerialLink
+from drivers.ledbox.usbtmc import UsbtmcLink
+
+_BLOCK_TIMEOUT_S = 2.2
+"""After this silence the box has forgotten a block that was cut off (its own limit is 2 s)."""
+_POLL_S, _POLL_OVERHEAD_BYTES = 0.055, 130
+"""A poll's time on the line while a burst runs, and its bytes apart from records."""
+_MAX_RECORDS_PER_POLL = 512
+
+
+class Settings(BaseModel):
+    """Settings of the LED box in a rig."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    port: str
+    """A pyserial URL (`/dev/ttyACM0`, `COM3`, `socket://host:port`, `rfc2217://host:port`) or
+    `usbtmc:VID:PID[:SERIAL]`, VID and PID in hexadecimal."""
+    baud: int = Field(default=115200, ge=1200)
+    led_count: int = Field(default=1080, ge=1, le=65535)
+    """LEDs that the box must have."""
+    watchdog_s: float = Field(default=2.0, ge=0, le=60)
+    """The box darkens itself when it hears nothing for so long; 0 for never."""
+    edge_width_us: int = Field(default=50, ge=10, le=10_000)
+    edge_polarity: Literal["normal", "inverted"] = "normal"
+    wait_for_ready: bool = False
+    """Hold each step back until the camera's exposure-ready line is up; needs that cable."""
+    name: str = "led box"
+
+
+class LedBox:
+    """The box: a `coupole.devices.LedBox`.
+
+    Opening it resets it. A latched fault of the box (watchdog, over-temperature) ends with opening it anew.
+    Each call may raise DeviceTimeout, DeviceLost, DeviceRefused (the box's error is quoted) or DeviceFault.
+    """
+
+    def __init__(self, settings: Settings, clock: Clock) -> None:
+        self._settings, self._clock = settings, clock
+        self._banks: list[bytes | None] = [None, None]
+        self._last_loaded = 1
+        self._running_bank: int | None = None
+        self._started: NDArray[np.void] = np.empty(0, STEP_DTYPE)
+        self._next_record = 0
+        self._scpi = ScpiSession(settings.name, settings.port, self._open(), clock)
+        try:
+            self._identity = self._greet()
+            self.led_count = self._set_up()
+        except BaseException:
+            self.close()
+            raise
+
+    def identify(self) -> Identity:
+        return self._identity
+
+    def self_test(self) -> Mapping[str, str]:
+        """State, hottest board and settings; raises DeviceFault in a latched fault."""
+        state, celsius, watchdog_s = self._scpi.ask("SEQ:STAT?;:MEAS:TEMP?;:SYST:WATC?", 3)
+        if state == "FAULT":
+            self._raise_fault("the box says FAULT")
+        return {
+            "state": str(state),
+            "LEDs": str(self.led_count),
+            "hottest board": f"{self._scpi.number(celsius)} C",
+            "watchdog": f"{self._scpi.number(watchdog_s):g} s",
+        }
+
+    def load(self, table: NDArray[np.void]) -> None:
+        """Upload into the bank that is not running. At 115200 baud 1080 records take 1.5 s, during which
+        nothing is polled; the box keeps the log."""
+        payload = _payload(table)
+        if payload in self._banks:
+            return
+        bank = 1 - (self._last_loaded if self._running_bank is None else self._running_bank)
+        self._upload(bank, payload)
+
+    def start(self, table: NDArray[np.void]) -> None:
+        """Run a loaded table. A bank whose CRC-32 is not the table's is uploaded once more, then refused."""
+        payload = _payload(table)
+        if payload not in self._banks:
+            self._refuse("a loaded table", "neither bank holds this one", "Call load() before.")
+        bank = self._banks.index(payload)
+        if self._crc(bank) != zlib.crc32(payload):
+            self._upload(bank, payload)
+            if (found := self._crc(bank)) != (wanted := zlib.crc32(payload)):
+                self._banks[bank] = None
+                self._refuse(
+                    f"CRC-32 {wanted} in bank {bank}",
+                    f"it is {found} though uploaded twice",
+                    "Check the cable for disturbance.",
+                )
+        self._scpi.ask("INIT", 0)
+        self._running_bank, self._next_record = bank, 0
+        self._started = np.frombuffer(payload, STEP_DTYPE)
+
+    def poll_log(self) -> NDArray[np.void]:
+        """New records, STEP_RECORD_DTYPE [k]: of every step that had finished when the last round trip of this
+        call began (at 115200 baud one of 60 ms keeps up with 100 steps a second)."""
+        more, records = self._poll()
+        parts = [records]
+        while more:
+            more, records = self._poll()
+            parts.append(records)
+        return np.concatenate(parts)
+
+    def running(self) -> bool:
+        (state,) = self._scpi.ask("SEQ:STAT?", 1)
+        return self._note_state(str(state))
+
+    def edges(self) -> int:
+        (count,) = self._scpi.ask("TRIG:COUN?", 1)
+        return int(self._scpi.number(count))
+
+    def lights_off(self) -> None:
+        """Abort, and see the box confirm it; raises only after a second try, which a box that was waiting for
+        the rest of a cut-off upload understands. Takes some 5 s at most."""
+        self._running_bank = None
+        try:
+            self._abort()
+        except DeviceTimeout:
+            self._clock.sleep(_BLOCK_TIMEOUT_S - REPLY_MARGIN_S)
+            self._abort()
+
+    def panel(self, panel: int, on: bool) -> None:
+        self._scpi.ask(f"OUTP:PAN{panel} {int(on)}", 0)
+
+    def board_temperature_c(self, board: int) -> float:
+        (celsius,) = self._scpi.ask(f"MEAS:TEMP? (@{board})", 1)
+        return self._scpi.number(celsius)
+
+    def close(self) -> None:
+        """Lights off if the box still listens; never raises for a link that is dead."""
+        with contextlib.suppress(DeviceError):
+            self.lights_off()
+        self._scpi.close()
+
+    def _abort(self) -> None:
+        with contextlib.suppress(DeviceFault, DeviceRefused):  # older errors in the queue: ABORt was obeyed
+            self._scpi.ask("ABOR", 0)
+
+    # Opening.
+
+    def _open(self) -> Link:
+        settings = self._settings
+        try:
+            if settings.port.startswith("usbtmc:"):
+                vendor, product, *serial = settings.port.split(":")[1:]
+                return UsbtmcLink(int(vendor, 16), int(product, 16), ":".join(serial) or None, self._clock)
+            return SerialLink(settings.port, settings.baud, self._clock)
+        except (ConnectionError, ValueError) as error:
+            raise DeviceLost(
+                settings.name,
+                expected=f"a port {settings.port}",
+                happened=str(error),
+                remedy="Check the cable, the port's name in the rig, and that no other program has it open.",
+            ) from error
+
+    def _greet(self) -> Identity:
+        """Bring both ends into step, whatever a former program left on the line, and ask who is there."""
+        try:
+            self._scpi.ask("*CLS", 0)
+        except DeviceTimeout:
+            self._clock.sleep(_BLOCK_TIMEOUT_S - REPLY_MARGIN_S)
+        (text,) = self._scpi.ask("*RST;*CLS;*IDN?", 1)
+        fields = str(text).split(",")
+        if len(fields) != 4:
+            self._scpi.unexpected("four fields in the answer to *IDN?", repr(text))
+        vendor, model, serial, firmware = fields
+        return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
+
+    def _set_up(self) -> int:
+        settings = self._settings
+        commands = [
+            f"TRIG:OUTP:WIDT {settings.edge_width_us}",
+            f":TRIG:OUTP:POL {'NORM' if settings.edge_polarity == 'normal' else 'INV'}",
+            f":TRIG:READ:SOUR {'INP' if settings.wait_for_ready else 'NONE'}",
+            f":SYST:WATC {settings.watchdog_s:g}",
+            ":SYST:LEDS?",
+        ]
+        (count,) = self._scpi.ask(";".join(commands), 1)
+        if int(self._scpi.number(count)) != settings.led_count:
+            self._refuse(
+                f"{settings.led_count} LEDs",
+                f"the box has {count!r}",
+                "Set led_count in the rig, or connect the right box.",
+            )
+        return settings.led_count
+
+    # Tables and log.
+
+    def _upload(self, bank: int, payload: bytes) -> None:
+        self._banks[bank] = None
+        length = str(len(payload))
+        block = f"#{len(length)}{length}".encode("ascii") + payload
+        self._scpi.ask(f"SEQ:BANK {bank};DATA ".encode("ascii") + block, 0)
+        self._banks[bank], self._last_loaded = payload, bank
+
+    def _crc(self, bank: int) -> int:
+        (crc,) = self._scpi.ask(f"SEQ:BANK {bank};CRC?", 1)
+        return int(self._scpi.number(crc))
+
+    def _poll(self) -> tuple[bool, NDArray[np.void]]:
+        """Whether there are more records of finished steps to fetch, and the next ones."""
+        bytes_wanted = self._scpi.bytes_per_s * _POLL_S - _POLL_OVERHEAD_BYTES
+        limit = max(1, min(_MAX_RECORDS_PER_POLL, int(bytes_wanted / STEP_RECORD_DTYPE.itemsize)))
+        command = f"SEQ:STAT?;INDex?;LOG? {self._next_record},{limit}"
+        state, index, log = self._scpi.ask(command, 3, reply_bytes=limit * STEP_RECORD_DTYPE.itemsize)
+        self._note_state(str(state))
+        if not isinstance(log, bytes) or len(log) % STEP_RECORD_DTYPE.itemsize:
+            self._scpi.unexpected("a block of whole log records", f"{len(log)} bytes came")
+        records = np.frombuffer(log, STEP_RECORD_DTYPE)
+        steps = np.arange(self._next_record, self._next_record + len(records))
+        finished = int(self._scpi.number(index))
+        if finished > len(self._started) or self._next_record + len(records) > len(self._started):
+            self._scpi.unexpected(f"at most {len(self._started)} records", f"the box claims {finished}")
+        wrong = (records["step"] != steps) | (records["led"] != self._started["led"][steps])
+        if wrong.any():
+            first = int(np.flatnonzero(wrong)[0])
+            self._scpi.unexpected(f"the log's record of step {steps[first]}", f"{records[first]} came")
+        self._next_record += len(records)
+        return self._next_record < finished, records
+
+    def _note_state(self, state: str) -> bool:
+        if state not in ("IDLE", "RUN", "ABORTED", "FAULT"):
+            self._scpi.unexpected("IDLE, RUN, ABORTED or FAULT", repr(state))
+        if state == "FAULT" or (state == "ABORTED" and self._running_bank is not None):
+            self._raise_fault(f"the burst ended in state {state}")
+        if state != "RUN":
+            self._running_bank = None
+        return state == "RUN"
+
+    def _raise_fault(self, what: str) -> NoReturn:
+        raise DeviceFault(
+            self._settings.name,
+            expected="a box without fault",
+            happened=what,
+            remedy="Find the cause, then open the box anew: that resets the fault.",
+        )
+
+    def _refuse(self, expected: str, happened: str, remedy: str) -> NoReturn:
+        raise DeviceRefused(self._settings.name, expected=expected, happened=happened, remedy=remedy)
+
+
+def _payload(table: NDArray[np.void]) -> bytes:
+    """The bytes that travel; a table of another layout is a mistake of the caller's."""
+    if table.dtype != STEP_DTYPE or table.ndim != 1:
+        raise TypeError(f"a table is one row of STEP_DTYPE records, not {table.dtype} {table.shape}")
+    return np.ascontiguousarray(table).tobytes()

@@ -1,0 +1,87 @@
+"""Bytes to and from a device on a serial line, by any URL that pyserial knows.
+
+Time-outs are counted on the rig's clock, so that they hold in a world that runs faster or slower; pyserial's
+own, which are of the machine's clock, only set how often that clock is looked at.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import select
+from typing import Any
+
+from coupole.devices import Clock, Deadline
+
+_LOOK_S = 0.02
+"""Machine time between two looks at the rig's clock."""
+_BITS_PER_BYTE = 10
+_QUIET_S, _DRAIN_S = 0.05, 2.0
+
+
+class SerialLink:
+    """An open serial port: a `drivers.ledbox.scpi.Link`."""
+
+    def __init__(self, url: str, baud: int, clock: Clock) -> None:
+        import serial
+
+        self._lost: tuple[type[Exception], ...] = (serial.SerialException, OSError)
+        with contextlib.suppress(ImportError):  # not on Windows
+            import termios
+
+            self._lost += (termios.error,)  # pyserial lets it pass when it flushes a hung-up terminal
+        self._clock = clock
+        self.bytes_per_s = baud / _BITS_PER_BYTE
+        own_port = {} if "://" in url else {"exclusive": True}
+        try:
+            self._port: Any = serial.serial_for_url(url, baudrate=baud, timeout=_LOOK_S, **own_port)
+        except (serial.SerialException, OSError, ValueError) as error:
+            raise ConnectionError(str(error)) from error
+        try:
+            self._fileno: int | None = self._port.fileno()
+            self._port.write_timeout = 0
+        except (AttributeError, io.UnsupportedOperation):
+            self._fileno = None  # rfc2217: its writes go to a socket, whole
+
+    def write(self, data: bytes, deadline: Deadline) -> None:
+        """Send all of `data`."""
+        rest = memoryview(data)
+        while rest:
+            try:
+                # pyserial 3.5 spins for ever in a non-blocking write to a full port: wait for room first
+                if self._fileno is None or select.select([], [self._fileno], [], _LOOK_S)[1]:
+                    rest = rest[self._port.write(rest) :]
+                    continue
+            except self._lost as error:
+                raise ConnectionError(str(error)) from error
+            if deadline.expired:
+                raise TimeoutError(f"{len(rest)} of {len(data)} bytes could not be sent")
+
+    def read(self, deadline: Deadline) -> bytes:
+        """At least one byte, and what else has come."""
+        while True:
+            late = deadline.expired  # looked at before reading: what has come in time is taken however late
+            try:
+                data: bytes = self._port.read(max(1, self._port.in_waiting))
+            except self._lost as error:
+                raise ConnectionError(str(error)) from error
+            if data:
+                return data
+            if late:
+                raise TimeoutError("nothing came")
+
+    def clear(self) -> None:
+        """Forget what is on its way from the device: read until the line is quiet."""
+        deadline = Deadline(self._clock, _DRAIN_S)
+        with contextlib.suppress(TimeoutError):
+            while not deadline.expired:
+                self.read(Deadline(self._clock, _QUIET_S))
+
+    def close(self) -> None:
+        with contextlib.suppress(*self._lost):
+            self._port.reset_output_buffer()  # else close() may wait for a dead line to drain
+        socket = getattr(self._port, "_socket", None)
+        with contextlib.suppress(*self._lost):
+            self._port.close()
+        if socket is not None:
+            socket.close()  # pyserial 3.5 forgets to, where the other side of a socket:// hung up

@@ -1,0 +1,5 @@
+"""Universal Robots arms by RTDE."""
+
+from drivers.ur.driver import Settings, UrRobot
+
+__all__ = ["Settings", "UrRobot"]

@@ -1,0 +1,265 @@
+"""The process that talks to a UR controller through ur-rtde, for `drivers.ur.driver`.
+
+    python -m drivers.ur.worker SOCKET_FD CONFIG_JSON
+
+The library is not let into the acquisition itself, for four reasons seen with ur-rtde 1.6: it prints on
+standard output; its constructor and moveJ can hang for minutes; after a lost link its getters go on telling
+stale data; and by itself it connects again and starts its program anew. A process can be ended, and this one
+ends itself when the link is lost.
+
+The controller watches this process (RTDE watchdog): silence ends the program and so all motion.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from drivers.ur.dashboard import CannotBegin, end_program, ready_controller, why_ended
+from drivers.ur.messages import Ask, Config, Six, State, receive, send
+
+_VARIABLES = [
+    "timestamp",
+    "target_q",
+    "actual_q",
+    "actual_qd",
+    "actual_TCP_pose",
+    "robot_mode",
+    "safety_status_bits",
+    "runtime_state",
+    "target_speed_fraction",
+]
+_ROBOT_MODE_RUNNING = 7
+_RUNTIME_PLAYING = 2
+_SAFETY_FAULTS = (
+    (0x0E0, "emergency stop"),
+    (0x004, "protective stop"),
+    (0x010, "safeguard stop"),
+    (0x300, "safety fault"),
+)
+"""Bits of RTDE's safety_status_bits, in the order of their weight."""
+_NAMING_SAMPLES = 10
+"""A program that ended is named as a fault only so many samples later: the bits that say why come after it."""
+_CANNOT_BEGIN, _LOST = 1, 2
+"""Exit codes."""
+_LEAVE_S = 3
+"""Longest life after being told to leave, or after the driver's death."""
+
+
+class Link:
+    """The library's two interfaces, and what this process makes of them."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        model, serial, firmware = ready_controller(config)
+        from rtde_control import RTDEControlInterface  # type: ignore[import-not-found]
+        from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
+
+        try:
+            self._receive: Any = RTDEReceiveInterface(config.host, config.frequency_hz, _VARIABLES)
+            self._control: Any = RTDEControlInterface(config.host, config.frequency_hz)
+            watched = self._control.setWatchdog(1.0 / config.watchdog_s)
+            tcp_offset = self._control.getTCPOffset()
+        except (RuntimeError, ValueError) as error:
+            raise CannotBegin("lost", "a session of ur-rtde", str(error), "See the controller's log") from error
+        if not watched:
+            raise CannotBegin("fault", "a watched program", "it took no watchdog", "See the controller's log")
+        self._goal_deg: Six | None = None
+        self._pending_deg: Six | None = None
+        """A target that waits until the arm stands: what movej does to a moving arm is not documented."""
+        self._quiet_samples = self._astray_samples = self._ended_samples = 0
+        self._timestamp_s = -1.0
+        self._changed_s = self._kicked_s = time.monotonic()
+        zeros = (0.0,) * 6
+        self.state = State(
+            command=0,
+            joints_deg=zeros,
+            wanted_deg=zeros,
+            tcp_pose_m_rad=zeros,
+            tcp_offset_m_rad=_six(tcp_offset),
+            speed_fraction=0.0,
+            still_samples=0,
+            samples=0,
+            max_gap_s=0.0,
+            max_call_s=0.0,
+            model=model,
+            serial=serial,
+            firmware=firmware,
+        )
+
+    def tick(self) -> None:
+        """Look at the controller, keep its watchdog quiet, start what waits."""
+        self._look()
+        if self.state.fault:
+            return
+        now_s = time.monotonic()
+        if now_s - self._kicked_s > self.config.watchdog_s / 5.0:
+            self._kicked_s = now_s
+            self._call(self._control.kickWatchdog)
+        if self._pending_deg is not None and self._quiet_samples >= self.config.settle_samples:
+            self._start(self._pending_deg)
+
+    def obey(self, ask: Ask) -> None:
+        """Begin what is asked, or, after a fault, nothing; the answer is `state`."""
+        if ask.verb == "state" or self.state.fault:
+            return
+        stands = self._settled()
+        self.state = replace(self.state, command=ask.number, still_samples=0)
+        self._quiet_samples, self._goal_deg = 0, None
+        if ask.verb == "move" and ask.target_deg is not None and stands:
+            self._start(ask.target_deg)
+            return
+        self._call(lambda: self._control.stopJ(math.radians(self.config.stop_deg_s2), True))
+        self._pending_deg = ask.target_deg
+
+    def leave(self) -> None:
+        """Bring the arm to rest and end the program. A hang here ends the process by SIGALRM."""
+        signal.alarm(_LEAVE_S)
+        self.obey(Ask("stop", self.state.command))
+        while not self.state.fault and not self._settled():
+            time.sleep(1.0 / self.config.frequency_hz)
+            self.tick()
+        if not self.state.lost:
+            end_program(self.config.host)
+
+    def _settled(self) -> bool:
+        return self.state.still_samples >= self.config.settle_samples
+
+    def _start(self, target_deg: Six) -> None:
+        config = self.config
+        self._goal_deg, self._pending_deg = target_deg, None
+        self.state = replace(self.state, still_samples=0)
+        target = [math.radians(angle) for angle in target_deg]
+        speed, acceleration = math.radians(config.speed_deg_s), math.radians(config.acceleration_deg_s2)
+        if not self._call(lambda: self._control.moveJ(target, speed, acceleration, True)):
+            time.sleep(_NAMING_SAMPLES / config.frequency_hz)
+            self._look()  # a safety stop is named as what it is
+            if not self.state.fault:
+                self._latch("program stopped: it did not take moveJ")
+
+    def _call(self, call: Callable[[], Any]) -> Any:
+        began_s = time.monotonic()
+        result = call()
+        took_s = time.monotonic() - began_s
+        self.state = replace(self.state, max_call_s=max(self.state.max_call_s, took_s))
+        return result
+
+    def _look(self) -> None:
+        """Take the controller's sample, if it is a new one, and judge it."""
+        timestamp_s, now_s = self._receive.getTimestamp(), time.monotonic()
+        age_s = now_s - self._changed_s
+        if not (self._receive.isConnected() and self._control.isConnected()):
+            end_program(self.config.host)
+            self._latch("link lost: the controller closed it", lost=True)
+            return
+        if timestamp_s == self._timestamp_s:
+            if age_s > self.config.link_timeout_s:
+                self._latch(f"link lost: no sample for {age_s:.2f} s", lost=True)
+            return
+        self._timestamp_s, self._changed_s = timestamp_s, now_s
+        joints_deg, wanted_deg = _degrees(self._receive.getActualQ()), _degrees(self._receive.getTargetQ())
+        speed_deg_s = max(map(abs, _degrees(self._receive.getActualQd())))
+        self._quiet_samples = self._quiet_samples + 1 if speed_deg_s < self.config.settle_deg_s else 0
+        at_target = _apart(joints_deg, self._goal_deg or wanted_deg) < self.config.settle_deg
+        still = self._quiet_samples > 0 and at_target and self._pending_deg is None
+        self.state = replace(
+            self.state,
+            joints_deg=joints_deg,
+            wanted_deg=wanted_deg,
+            tcp_pose_m_rad=_six(self._receive.getActualTCPPose()),
+            speed_fraction=self._receive.getTargetSpeedFraction(),
+            still_samples=self.state.still_samples + 1 if still else 0,
+            samples=self.state.samples + 1,
+            max_gap_s=max(self.state.max_gap_s, age_s),
+        )
+        if not self.state.fault:
+            self._judge(_apart(joints_deg, wanted_deg))
+
+    def _judge(self, astray_deg: float) -> None:
+        """Latch the fault that the last sample shows, if any."""
+        config = self.config
+        self._astray_samples = self._astray_samples + 1 if astray_deg > config.follow_deg else 0
+        plays = self._receive.getRuntimeState() == _RUNTIME_PLAYING
+        self._ended_samples = 0 if plays else self._ended_samples + 1
+        bits, mode = self._receive.getSafetyStatusBits(), self._receive.getRobotMode()
+        for mask, name in _SAFETY_FAULTS:
+            if bits & mask:
+                self._latch(f"{name} (safety status {bits:#x})")
+                return
+        if mode != _ROBOT_MODE_RUNNING:
+            self._latch(f"arm not running (robot mode {mode})")
+        elif self._astray_samples >= config.follow_samples:
+            self._latch(f"the arm does not follow: it is {astray_deg:.2f} deg off")
+        elif self._ended_samples >= _NAMING_SAMPLES:
+            self._latch(why_ended(config.host))
+
+    def _latch(self, fault: str, *, lost: bool = False) -> None:
+        """From now on nothing is commanded; the program is ended, so that no acknowledgement resumes a motion."""
+        self._goal_deg = self._pending_deg = None
+        self.state = replace(self.state, fault=fault, lost=lost)
+        if not lost:
+            end_program(self.config.host)
+
+
+def _six(values: Sequence[float]) -> Six:
+    x, y, z, u, v, w = values
+    return x, y, z, u, v, w
+
+
+def _degrees(values: Sequence[float]) -> Six:
+    return _six([math.degrees(v) for v in values])
+
+
+def _apart(a_deg: Six, b_deg: Six) -> float:
+    return max(abs(a - b) for a, b in zip(a_deg, b_deg, strict=True))
+
+
+def serve(driver: socket.socket, link: Link) -> None:
+    """Answer the driver until it asks to leave, or is gone, or the link is."""
+    config = link.config
+    period_s = 1.0 / config.frequency_hz
+    opened, next_s = False, time.monotonic()
+    while not link.state.lost:
+        if select.select([driver], [], [], max(0.0, next_s - time.monotonic()))[0]:
+            ask = receive(driver)
+            if not isinstance(ask, Ask) or ask.verb == "leave":
+                link.leave()
+                return
+            link.obey(ask)
+            send(driver, link.state)
+        if time.monotonic() >= next_s:
+            next_s = time.monotonic() + period_s
+            link.tick()
+            if not opened and (link.state.samples >= config.settle_samples or link.state.fault):
+                send(driver, link.state)
+                opened = True
+    send(driver, link.state)
+
+
+def main() -> None:
+    """Serve, then end at once, with `link` alive: the library's destructors hang on a lost link, and while they
+    do, the library connects again and starts its program anew."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    driver = socket.socket(fileno=int(sys.argv[1]))
+    try:
+        link = Link(Config(**json.loads(sys.argv[2])))
+    except CannotBegin as error:
+        send(driver, error.failure)
+        os._exit(_CANNOT_BEGIN)
+    with contextlib.suppress(ConnectionError):  # the driver is gone
+        serve(driver, link)
+    os._exit(_LOST if link.state.lost else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,263 @@
+"""What every simulated camera has in common, whatever carries its frames: trigger input, sensor, clock, counters.
+
+An edge that comes while the sensor is ready begins an exposure; one that comes too early is counted and
+ignored. Each exposure has a number, a frame id and a time on the camera's own clock, is rendered on a worker
+thread, and goes to the camera's *wire* in order, not before its readout has ended.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from typing import Annotated, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from coupole.geometry import Transform
+from sim.devices.arm_bodies import NONE, Capsules
+from sim.optics.sensor_model import SensorModel
+from sim.world.lighting import Lighting
+from sim.world.reactor import Reactor
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """What one exposure saw, for the renderer."""
+
+    seconds_of_led: dict[int, float]
+    """At tabulated flux: an LED that gives a tenth more shines a tenth longer."""
+    panels: list[int]
+    exposure_s: float
+    gain: float
+    number: int
+    """Counts exposures from power-on."""
+    base_from_flange: Transform
+    arm_mm: Capsules = field(default_factory=lambda: NONE)
+    """What of arm and tool stands in the light, in the base frame."""
+
+
+_RENDER_PATIENCE_S = 30.0
+
+Render = Callable[[NDArray[np.uint16], Exposed], None]
+"""Fill a frame [h, w] with what an exposure saw."""
+
+
+class Settings(BaseModel):
+    """Character of the simulated camera, apart from its wire."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    render_every: Annotated[int, Field(ge=0)] = 1
+    """Every n-th frame holds a picture, the others none; 0 for none at all (dry runs)."""
+    render_once: bool = False
+    """Each frame memory gets a picture when it is first used, and shows it ever after: for tests of speed."""
+    samples_per_side: Annotated[int, Field(ge=1, le=8)] = 1
+    """Rays through each pixel, k x k: for targets whose corners are measured to a fraction of a pixel."""
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 of the true lens (Brown and Conrady, OpenCV's order), which calibration must find."""
+    blur: bool = False
+    """Defocus and diffraction blur pictures; seconds a frame at full size."""
+    rim_radius: Annotated[float, Field(gt=0)] = 3.0
+    rim_shift: Annotated[float, Field(ge=0)] = 4.0
+    """Mechanical vignetting, as `sim.optics.objective.Objective` has it."""
+    lateral_colour: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Relative change of magnification of red, green and blue; with `blur` alone."""
+    sensor: SensorModel = SensorModel()
+    """What the sensor is; Bayer pattern, bits and black level are the rig's."""
+    sensor_temperature_c: float = 25.0
+    clock_offset_ns: int = 7_777_000_000
+    clock_ppm: float = -23.0
+    timestamp_jitter_us: float = 2.0
+    first_frame_id: Annotated[int, Field(ge=1, le=65535)] = 1
+    id_modulus: Annotated[int, Field(ge=0)] = 65535
+    """Last frame id; after it comes 1 (GigE Vision 1)."""
+    seed: int = 11
+
+
+@dataclass
+class Shot:
+    """A frame on its way from the sensor to the wire."""
+
+    slot: int
+    """The wire's frame memory that it lies in."""
+    frame_id: int
+    timestamp_ns: int
+    deliver_ns: int
+    """World time at which its readout ends."""
+    rendered: bool
+    ready: bool = False
+
+
+class Wire(Protocol):
+    """What carries frames to the host. Both are called on the reactor's thread, and may let the world wait."""
+
+    def claim(self) -> int | None:
+        """A free slot of frame memory, or None if the host leaves none."""
+        ...
+
+    def pixels(self, slot: int) -> NDArray[np.uint16]:
+        """The slot's frame memory [h, w]."""
+        ...
+
+    def send(self, shot: Shot) -> bool:
+        """Send a frame; False if it cannot go now, and `CameraBody.deliver` must be called later."""
+        ...
+
+
+class CameraBody:
+    """One camera without its wire; `edge(t_ns)` is the trigger cable."""
+
+    def __init__(
+        self,
+        reactor: Reactor,
+        settings: Settings,
+        wire: Wire,
+        *,
+        readout_us: float,
+        exposure_gap_us: float,
+        lighting: Lighting,
+        pose: Callable[[], Transform],
+        render: Render,
+        arm: Callable[[], Capsules] = lambda: NONE,
+    ) -> None:
+        self._reactor, self._settings, self._wire = reactor, settings, wire
+        self._lighting, self._pose, self._render, self._arm = lighting, pose, render, arm
+        self.readout_ns, self.gap_ns = round(readout_us * 1e3), round(exposure_gap_us * 1e3)
+        self._random = random.Random(settings.seed)
+        self._workers = ThreadPoolExecutor(1, "render")
+        self._pending: deque[Shot] = deque()
+        self.armed = False
+        self.hardware = False
+        """Edges make exposures; otherwise only `expose` does."""
+        self.exposure_ns = 8_000_000
+        self.gain = 1.0
+        self._session = 0
+        self._ready_ns = self._readout_until_ns = 0
+        self._frame_id = settings.first_frame_id
+        self._number = self._edge_number = 0
+        self.counters = dict.fromkeys(("exposed", "delivered", "lost_transfers", "over_triggers", "overflows"), 0)
+        """Since power-on."""
+        self.lose_frames: set[int] = set()
+        """Numbers of frames (counted from power-on) whose transfer gets lost."""
+        self.ignore_edges: set[int] = set()
+        """Numbers of edges (counted from power-on) that the camera does not see."""
+        self.pictured: set[int] = set()
+        """Slots that hold a picture already; the wire empties it with its memory."""
+
+    # -- triggers -----------------------------------------------------------------------------------------
+
+    def edge(self, t_ns: int) -> None:
+        """A rising edge on the trigger line at world time `t_ns`."""
+        number, self._edge_number = self._edge_number, self._edge_number + 1
+        if self.armed and self.hardware and number not in self.ignore_edges:
+            self.expose(t_ns)
+
+    def ready(self) -> bool:
+        """The exposure-ready line: an edge now would make a frame."""
+        return self.armed and self._reactor.now_ns >= self._next_start_ns()
+
+    def _next_start_ns(self) -> int:
+        """The next exposure must not end before the last frame is read out (facts/genicam)."""
+        return max(self._ready_ns, self._readout_until_ns - self.exposure_ns)
+
+    def expose(self, t_ns: int) -> None:
+        """Begin an exposure, whatever triggered it, unless the sensor is not ready yet."""
+        if t_ns < self._next_start_ns():
+            self.counters["over_triggers"] += 1
+            return
+        end_ns = t_ns + self.exposure_ns
+        self._ready_ns = end_ns + self.gap_ns
+        self._readout_until_ns = end_ns + self.readout_ns
+        self.counters["exposed"] += 1
+        frame_id = self._frame_id
+        self._frame_id = self._frame_id + 1 if self._frame_id != self._settings.id_modulus else 1
+        number, self._number = self._number, self._number + 1
+        jitter_ns = self._random.gauss(0.0, self._settings.timestamp_jitter_us * 1e3)
+        stamp_ns = self._settings.clock_offset_ns + t_ns * (1 + self._settings.clock_ppm * 1e-6) + jitter_ns
+        session = self._session
+        self._reactor.at(
+            end_ns, lambda: self._end_exposure(session, t_ns, end_ns, frame_id, number, int(stamp_ns))
+        )
+
+    # -- frames -------------------------------------------------------------------------------------------
+
+    def _end_exposure(
+        self, session: int, start_ns: int, end_ns: int, frame_id: int, number: int, stamp_ns: int
+    ) -> None:
+        if session != self._session or not self.armed:
+            return
+        if number in self.lose_frames:
+            self.counters["lost_transfers"] += 1
+            return
+        slot = self._wire.claim()
+        if slot is None:
+            self.counters["overflows"] += 1
+            return
+        every = self._settings.render_every
+        rendered = every > 0 and number % every == 0
+        shot = Shot(slot, frame_id, stamp_ns, end_ns + self.readout_ns, rendered)
+        self._pending.append(shot)
+        if not shot.rendered or (self._settings.render_once and slot in self.pictured):
+            shot.ready = True
+            self._reactor.at(shot.deliver_ns, self.deliver)
+            return
+        self.pictured.add(slot)
+        exposed = Exposed(
+            self._lighting.exposure_s(start_ns, end_ns),
+            self._lighting.panels(start_ns),
+            (end_ns - start_ns) / 1e9,
+            self.gain,
+            number,
+            self._pose(),
+            self._arm(),
+        )
+        working = self._workers.submit(self._work, shot, exposed)
+        self._reactor.at(shot.deliver_ns, lambda: self._wait_for(working, session))
+
+    def _wait_for(self, working: Future[None], session: int) -> None:
+        """World time stands still until a picture that is due is there: how fast this machine renders is no fault
+        of the camera."""
+        if session == self._session:
+            wait([working], _RENDER_PATIENCE_S)
+            self.deliver()
+
+    def _work(self, shot: Shot, exposed: Exposed) -> None:
+        self._render(self._wire.pixels(shot.slot), exposed)
+        shot.ready = True
+        self._reactor.call_threadsafe(self.deliver)
+
+    def deliver(self) -> None:
+        """Give finished frames to the wire, in order, not before their readout has ended."""
+        while self._pending and self._pending[0].ready:
+            shot = self._pending[0]
+            if shot.deliver_ns > self._reactor.now_ns:
+                self._reactor.at(shot.deliver_ns, self.deliver)
+                return
+            if not self._wire.send(shot):
+                return
+            if self._pending and self._pending[0] is shot:  # sending may have ended the session
+                self._pending.popleft()
+                self.counters["delivered"] += 1
+
+    # -- sessions -----------------------------------------------------------------------------------------
+
+    def arm(self) -> None:
+        """Begin a session: edges or `expose` make frames from now on."""
+        self.disarm()
+        self._ready_ns = self._readout_until_ns = 0
+        self.armed = True
+
+    def disarm(self) -> None:
+        """End the session: what is under way is forgotten, and nothing renders any more."""
+        self.armed = False
+        self._session += 1
+        self._workers.submit(lambda: None).result()
+        self._pending.clear()
+
+    def close(self) -> None:
+        self._workers.shutdown(cancel_futures=True)

@@ -1,0 +1,70 @@
+"""The camera's stand-in, whichever it is: what the world asks of it, and how a rig's choice is built."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+from pydantic import Discriminator, Tag
+
+from sim.devices import camera_server, gige_camera
+from sim.world import faults
+from sim.world.reactor import Reactor
+
+
+def _kind(settings: Any) -> str:
+    """Which stand-in these settings are for; shared memory where they do not say."""
+    return str(settings.get("kind", "memory") if isinstance(settings, dict) else settings.kind)
+
+
+CameraSettings = Annotated[
+    Annotated[camera_server.Settings, Tag("memory")] | Annotated[gige_camera.Settings, Tag("gige")],
+    Discriminator(_kind),
+]
+
+
+class CameraStandIn(Protocol):
+    """All methods are called on the reactor's thread. GigE Vision's has one more, `lose_control`: see
+    `impossible`."""
+
+    lose_frames: set[int]
+    """Numbers of frames (counted from power-on) whose transfer gets lost."""
+
+    @property
+    def armed(self) -> bool: ...
+
+    def edge(self, t_ns: int) -> None:
+        """A rising edge on the trigger line at world time `t_ns`."""
+        ...
+
+    def ready(self) -> bool:
+        """The exposure-ready line."""
+        ...
+
+    def unplug(self) -> None:
+        """The cable is pulled."""
+        ...
+
+    def close(self) -> None: ...
+
+
+def impossible(fault: faults.Fault, settings: CameraSettings) -> str:
+    """Why this stand-in cannot have the fault; empty if it can."""
+    if isinstance(fault, faults.CameraControlLoss) and settings.kind != "gige":
+        return f"`camera_control_loss` cannot happen to a camera of kind `{settings.kind}`: it has no such channel"
+    return ""
+
+
+def build(
+    reactor: Reactor, settings: CameraSettings, folder: Path, **sensor: Any
+) -> tuple[CameraStandIn, dict[str, Any]]:
+    """The stand-in, and what a client needs to know to reach it: under the names of our drivers' settings.
+
+    `sensor` is what every stand-in for a camera is made with (see `sim.devices.camera_body.CameraBody`).
+    """
+    match settings:
+        case camera_server.Settings():
+            path = folder / "camera"
+            return camera_server.CameraServer(reactor, settings, path=path, **sensor), {"address": str(path)}
+        case gige_camera.Settings():
+            return gige_camera.GigeCamera(reactor, settings, **sensor), {"address": settings.address}

@@ -1,0 +1,246 @@
+"""The stand-in for a KUKA controller that runs an RSI program: UDP packets out, corrections in.
+
+Every cycle of world time it applies the client's last answer and sends where the axes are. It stops for what
+the real one stops for: limits of axes and corrections, too fast corrections, poses that cannot be followed,
+workspaces, late answers, a silent client, an emergency stop. Then the brakes close, and the arm stays where it
+is until the RSI program is started again.
+In lock-step the world waits for an outstanding answer, so a client on a busy machine is never late; lateness
+is then something that the world's script asks for (`late`).
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Sequence
+from enum import Enum
+
+from coupole.geometry import Transform
+from sim.devices.kuka_axes import Axes
+from sim.devices.kuka_corrections import Corrections
+from sim.devices.kuka_kinematics import PoseErrors
+from sim.devices.kuka_rsi_wire import PacketWriter, answer_reader
+from sim.devices.kuka_settings import Settings
+from sim.world.reactor import Reactor, Timer
+
+__all__ = ["ALIKE", "KukaController", "Settings"]
+
+ALIKE = ("cycle_ms", "corrects", "mode", "sen_type", "measured_tag", "correction_tag")
+"""Settings that must be the same at both ends of the wire; the driver's have these names, too."""
+_FIRST_IPOC = 4208163634
+_SEND_AGAIN_S = 0.05
+"""Lock-step: an unanswered packet is sent again after this machine time."""
+
+
+class _Does(Enum):
+    WAIT = "send packets until a client answers"
+    FOLLOW = "apply a client's corrections"
+    BRAKE = "stop the axes, answers are ignored"
+    REST = "send nothing"
+
+
+class KukaController:
+    """See the module. All methods must be called on the reactor's thread."""
+
+    def __init__(self, reactor: Reactor, settings: Settings) -> None:
+        self.fault = ""
+        """Why RSI stopped; empty while it runs or waits for a client."""
+        self.errors = PoseErrors(
+            seed=settings.seed,
+            repeatability_um=settings.repeatability_um,
+            repeatability_deg=settings.repeatability_deg,
+            absolute_mm=settings.absolute_mm,
+            absolute_deg=settings.absolute_deg,
+        )
+        self._reactor, self._settings = reactor, settings
+        self._cycle_ns = settings.cycle_ms * 1_000_000
+        self._axes = Axes(settings, reactor.now_ns)
+        self._corrections = Corrections(settings)
+        self._read_answer, self._writer = answer_reader(settings), PacketWriter(settings)
+        self._does = _Does.WAIT
+        self._springs_back: list[Timer] = []
+        self._ipoc_step = settings.ipoc_step or settings.cycle_ms
+        self._ipoc = self._ended_ipoc = _FIRST_IPOC
+        """IPOC of the last packet, and of the last packet of the RSI program's last run."""
+        self._delay = self._late_cycles = 0
+        self._changes_ns = 0
+        self._after_braking = _Does.WAIT
+        self._packet = b""
+        self._sent_s = 0.0
+        """Machine time of the last packet."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        host, port = settings.sends_to.rsplit(":", 1)
+        self._socket.connect((host, int(port)))  # connected, so that a closed port there is told at once
+        self._socket.setblocking(False)
+        self._timer = reactor.after(0.0, self._cycle)
+
+    @property
+    def joints_deg(self) -> tuple[float, ...]:
+        """The axes now, as the controller measures and reports them."""
+        return self._axes.measured_deg(self._reactor.now_ns)
+
+    @property
+    def settled_since_ns(self) -> int | None:
+        """World time since when the arm stands still; None while it moves or vibrates."""
+        return self._axes.settled_since_ns(self._reactor.now_ns)
+
+    @property
+    def moving(self) -> bool:
+        return self.settled_since_ns is None
+
+    @property
+    def brakes_closed(self) -> bool:
+        """True from the end of a stop of the controller's own until its RSI program starts again."""
+        return self._axes.brakes_closed
+
+    @property
+    def delay(self) -> int:
+        """The counter of late answers."""
+        return self._delay
+
+    def true_base_from_flange(self) -> Transform:
+        """Where the flange truly is: what the controller believes, with the arm's fixed error and the last
+        stop's own."""
+        return self.errors.true_flange_pose(self.joints_deg, self._axes.stops)
+
+    def estop(self) -> None:
+        """Emergency stop: the axes brake, packets go on for a while, then RSI ends until `reset`."""
+        self._stop_axes("emergency stop", _Does.REST, self._settings.packets_after_estop_s)
+
+    def reset(self) -> None:
+        """Acknowledge all faults and start the RSI program again, from the axes where they stand."""
+        self.fault = ""
+        self._does, self._changes_ns, self._ended_ipoc = _Does.WAIT, 0, self._ipoc
+        self._release_axes()
+        self._delay = self._late_cycles = 0
+
+    def late(self, cycles: int) -> None:
+        """Take the next answers, one a cycle, for late ones."""
+        self._late_cycles += cycles
+
+    def lose_link(self, seconds: float) -> None:
+        """No packet leaves for `seconds`; the axes brake, and then the RSI program starts again."""
+        self._stop_axes("link lost", _Does.WAIT, seconds)
+
+    def nudge(self, joints_deg: Sequence[float], seconds: float | None = None) -> None:
+        """Push the arm off the commanded axes by six angles; after `seconds` it springs back, if given."""
+        self._axes.push(joints_deg, self._reactor.now_ns)
+        if seconds is not None:
+            back_deg = [-angle for angle in joints_deg]
+            spring = self._reactor.after(seconds, lambda: self._axes.push(back_deg, self._reactor.now_ns))
+            self._springs_back.append(spring)
+
+    def close(self) -> None:
+        self._timer.cancel()
+        self._socket.close()
+
+    def _cycle(self) -> None:
+        """What happens once per interpolation cycle."""
+        self._ipoc += self._ipoc_step
+        if self._does is _Does.FOLLOW:
+            self._follow()
+        elif self._does is not _Does.BRAKE:
+            self._axes.stay(self._reactor.now_ns)
+        if self._does is _Does.BRAKE and self._axes.brake(self._reactor.now_ns):
+            self._does = self._after_braking
+        if self._sends():
+            if self._does is _Does.WAIT:
+                self._look_for_client()
+            self._send()
+        self._timer = self._reactor.at(self._reactor.now_ns + self._cycle_ns, self._cycle)
+
+    def _sends(self) -> bool:
+        """Whether packets leave: after a lost link only from `_changes_ns` on, after an E-stop until then."""
+        ending = self._does is _Does.REST or (self._does is _Does.BRAKE and self._after_braking is _Does.REST)
+        return ending == (self._reactor.now_ns < self._changes_ns)
+
+    def _follow(self) -> None:
+        values = self._take_answer()
+        if self._does is not _Does.FOLLOW:
+            return
+        if self._late_cycles > 0:
+            self._late_cycles -= 1
+            values = None
+        if values is None:
+            self._delay += 1
+            if self._delay >= self._settings.delay_limit:
+                self._stop_axes(f"KSS29002: {self._delay} late answers", _Does.WAIT, self._settings.restart_s)
+                return
+        elif self._settings.delay_counts == "consecutive":
+            self._delay = 0
+        target_deg, fault = self._corrections.take(values)
+        if fault := fault or self._axes.follow(target_deg, self._reactor.now_ns):
+            self._stop_axes(fault, _Does.REST, 0.0)
+
+    def _take_answer(self) -> tuple[float, ...] | None:
+        """The corrections that answer the last packet; None if they are late or the client left."""
+        awaited = self._ipoc - self._ipoc_step
+        while True:
+            try:
+                data = self._socket.recv(4096)
+            except BlockingIOError:
+                patience_s = self._patience_s()
+                if self._reactor.hold_for(self._socket, min(patience_s, _SEND_AGAIN_S)):
+                    continue
+                if patience_s > _SEND_AGAIN_S:
+                    self._send_packet()  # a client that left with the packet unread is found out by the next
+                    continue
+                if self._settings.lock_step:
+                    self._stop_axes("link lost: no answer", _Does.WAIT, self._settings.restart_s)
+                return None
+            except ConnectionRefusedError:
+                self._stop_axes("link lost: nobody listens", _Does.WAIT, self._settings.restart_s)
+                return None
+            answer = self._read_answer(data)
+            if answer is not None and answer.ipoc == awaited:
+                return answer.values
+
+    def _patience_s(self) -> float:
+        """Machine time that an answer may still take. In real time that is one cycle from its packet on, also
+        where the world itself is late and works cycles off in a row."""
+        settings = self._settings
+        cycle_s = settings.cycle_ms / 1e3 / self._reactor.clock.speed
+        allowed_s = settings.answer_limit_s if settings.lock_step else cycle_s
+        return max(0.0, self._sent_s + allowed_s - time.monotonic())
+
+    def _look_for_client(self) -> None:
+        """Any answer to a packet of this run of the RSI program begins a session."""
+        if self._axes.brakes_closed:
+            self._release_axes()  # the program has been started again
+        try:
+            answer = self._read_answer(self._socket.recv(4096))
+            while answer is not None and answer.ipoc <= self._ended_ipoc:
+                answer = self._read_answer(self._socket.recv(4096))
+        except (BlockingIOError, ConnectionRefusedError):
+            return
+        if answer is not None:
+            self.fault = ""
+            self._does = _Does.FOLLOW
+            self._release_axes()
+            self._corrections.begin(self._axes.commanded_deg)
+
+    def _release_axes(self) -> None:
+        """Brakes open, and the axes are commanded where they are, pushed or not."""
+        for spring in self._springs_back:
+            spring.cancel()
+        self._springs_back.clear()
+        self._axes.release()
+
+    def _stop_axes(self, fault: str, then: _Does, seconds: float) -> None:
+        """End the session: brake, and let packets end (REST) or begin again (WAIT) `seconds` from now."""
+        self.fault = self.fault or fault
+        self._does, self._after_braking = _Does.BRAKE, then
+        self._changes_ns = self._reactor.now_ns + round(seconds * 1e9)
+        self._ended_ipoc = self._ipoc
+        self._delay = self._late_cycles = 0
+
+    def _send(self) -> None:
+        self._packet = self._writer.packet(self.joints_deg, self._delay, self._ipoc)
+        self._sent_s = time.monotonic()
+        self._send_packet()
+
+    def _send_packet(self) -> None:
+        try:
+            self._socket.send(self._packet)
+        except (ConnectionRefusedError, BlockingIOError):
+            return  # nobody there: the missing answer tells

@@ -1,0 +1,351 @@
+"""The stand-in for a KUKA controller that runs the EthernetKRL programs of `configs/kuka/eki`: XML over TCP.
+
+Like them it has two parts: one takes commands and sends statuses at a steady rate, also while the robot
+program stands in a fault; the other runs point-to-point motions, braking for whatever comes in between.
+Nothing is simulated in steps: where the axes are follows from world time, so any world speed will do.
+"""
+
+from __future__ import annotations
+
+import math
+import select
+import socket
+from collections.abc import Sequence
+from typing import Any, Literal
+from xml.etree import ElementTree
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from coupole.geometry import Transform, abc_from_rotation
+from sim.devices.kuka_kinematics import AXIS_LIMITS_DEG, AXIS_SPEEDS_DEG_S, PoseErrors, flange_pose
+from sim.devices.kuka_ptp import Motion, braked, point_to_point, standing
+from sim.world.pushes import Pushes
+from sim.world.reactor import Reactor, Timer
+
+Six = tuple[float, float, float, float, float, float]
+
+_STOP, _MOVE, _ASK = range(3)
+_NO_FAULT, _EMERGENCY_STOP, _TARGET_REFUSED = 0, 1, 5
+_TRY_AGAIN_S = 0.1
+_UNSENT_BYTES = 4096
+"""Room for statuses that the client has no room for: the world waits rather than run ahead of its client."""
+_HARD = 100.0
+"""An emergency stop does not care for jerk: this many times more of it."""
+
+
+class Settings(BaseModel):
+    """Settings of the stand-in in the rig's world."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["eki"] = "eki"
+    address: str = Field(default="127.0.0.1:0", pattern=r"^[^:]+:\d+$")
+    """host:port to listen at, or to connect to; port 0 for one that is free, see `KukaEkiController.address`."""
+    controller_is: Literal["server", "client"] = "server"
+    status_ms: int = Field(default=20, ge=4)
+    ping_s: float = Field(default=0.2, gt=0)
+    """World time after which the controller knows that its link is dead, and brakes."""
+    write_limit_s: float = Field(default=2.0, gt=0)
+    """Machine time that the world waits for a client that does not read its statuses."""
+    full_acceleration_deg_s2: float = Field(default=600.0, gt=0)
+    """What 100 % gives."""
+    jerk_deg_s3: float = Field(default=3000.0, gt=0)
+    start_joints_deg: Six = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
+    brake_deg_s2: float = Field(default=1000.0, gt=0)
+    """Deceleration of the fastest axis in an emergency stop."""
+    override_percent: int = Field(default=100, ge=1, le=100)
+    seed: int = 0
+    repeatability_um: float = Field(default=10.0, ge=0)
+    repeatability_deg: float = Field(default=0.001, ge=0)
+    """Standard deviation in each coordinate of what differs from stop to stop."""
+    absolute_mm: float = Field(default=0.0, ge=0)
+    absolute_deg: float = Field(default=0.0, ge=0)
+    """Standard deviation, over arms, of what stays the same: see `PoseErrors`."""
+
+
+class KukaEkiController:
+    """See the module. All methods must be called on the reactor's thread."""
+
+    def __init__(self, reactor: Reactor, settings: Settings) -> None:
+        self.fault = ""
+        """Why the robot program does not run; empty while it does."""
+        self.settled_since_ns: int | None = reactor.now_ns
+        """World time since when the axes stand; None while they move."""
+        self.errors = PoseErrors(
+            seed=settings.seed,
+            repeatability_um=settings.repeatability_um,
+            repeatability_deg=settings.repeatability_deg,
+            absolute_mm=settings.absolute_mm,
+            absolute_deg=settings.absolute_deg,
+        )
+        self._reactor, self._settings = reactor, settings
+        self._motion: Motion = standing(settings.start_joints_deg)
+        self._begun_ns = reactor.now_ns
+        self._acceleration_deg_s2 = settings.full_acceleration_deg_s2
+        self._pushes = Pushes(reactor)
+        self._stops = 0
+        self._end: Timer | None = None
+        self._session = self._taken = self._done = self._order = 0
+        self._refused = False
+        self._target: tuple[tuple[float, ...], float] | None = None
+        """Axes and speed (share of the highest) of the motion to begin once the axes stand."""
+        self._client: socket.socket | None = None
+        self._parser = _new_parser()
+        self._cut = False
+        """Nothing passes, by `lose_link`."""
+        self._healing: Timer | None = None
+        self._listener: socket.socket | None = None
+        self.address = _with_free_port(settings.address)
+        """host:port where it listens, or where it connects to."""
+        if settings.controller_is == "server":
+            host, port = self.address.rsplit(":", 1)
+            self._listener = socket.create_server((host, int(port)))
+            self._listener.setblocking(False)
+        self._open()
+        self._timer = reactor.after(settings.status_ms / 1e3, self._cycle)
+
+    @property
+    def joints_deg(self) -> tuple[float, ...]:
+        """The axes now, as the controller measures and reports them."""
+        path_deg = self._motion.joints_deg((self._reactor.now_ns - self._begun_ns) / 1e9)
+        return tuple(map(float.__add__, path_deg, self._pushes.deg))
+
+    @property
+    def moving(self) -> bool:
+        return self.settled_since_ns is None
+
+    def true_base_from_flange(self) -> Transform:
+        """Where the flange truly is: what the controller believes, with the arm's fixed error and the last
+        stop's own."""
+        return self.errors.true_flange_pose(self.joints_deg, self._stops)
+
+    def estop(self) -> None:
+        """Emergency stop: the axes brake hard, the robot program ends until `reset`; statuses go on."""
+        self.fault = "emergency stop"
+        self._target = None
+        self._brake(self._settings.brake_deg_s2, _HARD * self._settings.jerk_deg_s3)
+
+    def reset(self) -> None:
+        """Acknowledge all faults and start the robot program again, from the axes where they stand."""
+        self.fault = ""
+
+    def lose_link(self, seconds: float) -> None:
+        """Nothing passes for `seconds`; the axes brake, and then the controller is ready for a connection."""
+        self._unlisten()
+        self._reactor.after(self._settings.ping_s, self._abandon)
+        if self._healing is not None:
+            self._healing.cancel()
+        self._healing = self._reactor.after(seconds, self._heal)
+
+    def nudge(self, joints_deg: Sequence[float], seconds: float | None = None) -> None:
+        """Push the arm off the commanded axes by six angles; after `seconds` it springs back, if given."""
+        self._pushes.push(joints_deg, seconds)
+        self._stops += not self.moving
+
+    def close(self) -> None:
+        self._timer.cancel()
+        self._unlisten()
+        self._hang_up()
+        if self._listener is not None:
+            self._listener.close()
+
+    # -- the submit interpreter: commands in, statuses out ------------------------------------------------
+
+    def _open(self) -> None:
+        """Be ready for a connection, or go for one."""
+        if self._listener is not None:
+            self._reactor.add_reader(self._listener, self._accept)
+        else:
+            self._reactor.after(_TRY_AGAIN_S, self._connect)
+
+    def _unlisten(self) -> None:
+        """Hear nothing more, neither of the client nor of one that would be."""
+        for port in (self._listener, self._client):
+            if port is not None and not self._cut:
+                self._reactor.remove_reader(port)
+        self._cut = True
+
+    def _accept(self) -> None:
+        assert self._listener is not None
+        client, _ = self._listener.accept()
+        if self._client is not None:
+            self._receive()  # it may have left already
+        if self._client is not None:
+            client.close()  # EKI serves one client
+        else:
+            self._welcome(client)
+
+    def _connect(self) -> None:
+        if self._cut:
+            return
+        host, port = self.address.rsplit(":", 1)
+        try:
+            self._welcome(socket.create_connection((host, int(port)), timeout=1.0))
+        except OSError:
+            self._reactor.after(_TRY_AGAIN_S, self._connect)
+
+    def _welcome(self, client: socket.socket) -> None:
+        client.setblocking(False)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNSENT_BYTES)
+        self._client, self._parser = client, _new_parser()
+        self._reactor.add_reader(client, self._receive)
+
+    def _receive(self) -> None:
+        assert self._client is not None
+        try:
+            data = self._client.recv(65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop()
+            return
+        try:
+            self._parser.feed(data)
+            messages = [element for _, element in self._parser.read_events() if element.tag == "Coupole"]
+            for message in messages:
+                self._take(message)
+                message.clear()
+        except (ElementTree.ParseError, KeyError, ValueError):
+            self._drop()
+
+    def _drop(self) -> None:
+        """The client has left, or speaks another language."""
+        self._hang_up()
+        self._abandon()
+        if self._listener is None:
+            self._open()
+
+    def _hang_up(self) -> None:
+        if self._client is not None:
+            if not self._cut:
+                self._reactor.remove_reader(self._client)
+            self._client.close()
+            self._client = None
+
+    def _abandon(self) -> None:
+        """The program knows that nobody commands it any more."""
+        self._target = None
+        self._brake(self._acceleration_deg_s2, self._settings.jerk_deg_s3)
+
+    def _heal(self) -> None:
+        self._hang_up()
+        self._cut = False
+        self._open()
+
+    def _take(self, message: ElementTree.Element) -> None:
+        values = {f"{child.tag}/{name}": value for child in message for name, value in child.items()}
+        session, number, verb = (int(values[f"Command/{name}"]) for name in ("Session", "Number", "Verb"))
+        if session != self._session:
+            self._session, self._done, self._refused = session, 0, False
+            if not self.moving:  # from now on the arm belongs where it stands
+                self._motion = standing(self.joints_deg)
+                self._pushes.forget()
+        self._taken = number
+        if verb == _ASK:
+            return
+        self._order, self._target = number, None
+        if self.fault:
+            return
+        if verb == _MOVE:
+            target_deg = tuple(float(values[f"Axes/A{axis}"]) for axis in range(1, 7))
+            self._refused = not _within_limits(target_deg)
+            if not self._refused:
+                self._target = target_deg, int(values["Command/Velocity"]) / 100.0
+        self._brake(self._acceleration_deg_s2, self._settings.jerk_deg_s3)
+        share = int(values["Command/Acceleration"]) / 100.0
+        self._acceleration_deg_s2 = share * self._settings.full_acceleration_deg_s2
+
+    def _cycle(self) -> None:
+        if self._client is not None and not self._cut:
+            self._send(self._status())
+        self._timer = self._reactor.after(self._settings.status_ms / 1e3, self._cycle)
+
+    def _send(self, status: bytes) -> None:
+        assert self._client is not None
+        try:
+            while status:
+                if not select.select([], [self._client], [], self._settings.write_limit_s)[1]:
+                    raise TimeoutError
+                status = status[self._client.send(status) :]
+        except OSError:
+            return  # the client is gone: reading tells
+
+    def _status(self) -> bytes:
+        axes = " ".join(f'A{axis}="{angle:.4f}"' for axis, angle in enumerate(self.joints_deg, start=1))
+        believed = flange_pose(self.joints_deg)
+        pose = (*believed[:3, 3], *abc_from_rotation(believed[:3, :3]))
+        fault = _EMERGENCY_STOP if self.fault else _TARGET_REFUSED if self._refused else _NO_FAULT
+        return (
+            f'<Coupole><Status Session="{self._session}" Taken="{self._taken}" Done="{self._done}" '
+            f'Moving="{int(self.moving)}" Fault="{fault}" Time="{self._reactor.now_ns // 1_000_000}" '
+            f'Override="{self._settings.override_percent}" T1="0"/>'
+            f'<Arm Model="KR10R1100SIXX simulated" Serial="{self._settings.seed}"/><Axes {axes}/><Pose Valid="1" '
+            + " ".join(f'{name}="{value:.4f}"' for name, value in zip("XYZABC", pose, strict=True))
+            + "/></Coupole>"
+        ).encode()
+
+    # -- the robot interpreter: motions -------------------------------------------------------------------
+
+    def _brake(self, acceleration_deg_s2: float, jerk_deg_s3: float) -> None:
+        """Come to rest along the way; then what is asked next begins."""
+        t_s = (self._reactor.now_ns - self._begun_ns) / 1e9
+        self._begin(braked(self._motion, t_s, acceleration_deg_s2, jerk_deg_s3))
+
+    def _begin(self, motion: Motion) -> None:
+        self._motion, self._begun_ns = motion, self._reactor.now_ns
+        if self._end is not None:
+            self._end.cancel()
+        if motion.phases:
+            self.settled_since_ns = None
+            self._end = self._reactor.at(self._begun_ns + math.ceil(motion.duration_s * 1e9), self._stand)
+        else:
+            self._stand()
+
+    def _stand(self) -> None:
+        """The axes are at rest."""
+        self._end = None
+        self._motion = standing(self._motion.joints_deg(self._motion.duration_s))
+        if self.settled_since_ns is None:
+            self.settled_since_ns = self._reactor.now_ns
+            self._stops += 1
+        if self.fault:
+            return
+        if self._target is None:
+            self._done = self._order
+            return
+        target_deg, speed_share = self._target
+        self._target = None
+        share = speed_share * self._settings.override_percent / 100.0
+        speeds_deg_s = [speed * share for speed in AXIS_SPEEDS_DEG_S]
+        self._begin(
+            point_to_point(
+                self._motion.start_deg,
+                target_deg,
+                speeds_deg_s,
+                self._acceleration_deg_s2,
+                self._settings.jerk_deg_s3,
+            )
+        )
+
+
+def _within_limits(joints_deg: Sequence[float]) -> bool:
+    return all(low <= angle <= high for angle, (low, high) in zip(joints_deg, AXIS_LIMITS_DEG, strict=True))
+
+
+def _with_free_port(address: str) -> str:
+    """The address, with a port that is free in place of port 0."""
+    host, port = address.rsplit(":", 1)
+    if port != "0":
+        return address
+    with socket.create_server((host, 0)) as probe:
+        return f"{host}:{probe.getsockname()[1]}"
+
+
+def _new_parser() -> Any:
+    """For a stream of documents: they become children of one that never ends."""
+    parser: Any = ElementTree.XMLPullParser(["end"])
+    parser.feed(b"<stream>")
+    return parser

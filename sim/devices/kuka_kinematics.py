@@ -1,0 +1,109 @@
+"""The stand-in's own arm: a chain of joints, as in KUKA's drawing of the KR10 R1100 sixx.
+
+Written apart from `coupole.kinematics` on purpose, so that each checks the other. Millimetres and degrees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.geometry import Transform
+from sim.devices import newton
+
+_CHAIN = (
+    ((0.0, 0.0, 400.0), (0.0, 0.0, -1.0)),
+    ((25.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((560.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((0.0, 0.0, 35.0), (-1.0, 0.0, 0.0)),
+    ((515.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((80.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
+)
+"""Of each joint: its origin in the frame of the link before it, and the axis it turns about."""
+AXIS_LIMITS_DEG = (
+    (-170.0, 170.0),
+    (-190.0, 45.0),
+    (-120.0, 156.0),
+    (-185.0, 185.0),
+    (-120.0, 120.0),
+    (-350.0, 350.0),
+)
+AXIS_SPEEDS_DEG_S = (300.0, 225.0, 225.0, 381.0, 311.0, 492.0)
+
+
+def flange_pose(joints_deg: Sequence[float]) -> Transform:
+    """`base_from_flange` of six joint angles."""
+    return _chain(joints_deg)[0]
+
+
+def joint_origins_mm(joints_deg: Sequence[float]) -> NDArray[np.float64]:
+    """[6, 3] the joints' origins in the base frame."""
+    return _chain(joints_deg)[1]
+
+
+def _chain(joints_deg: Sequence[float]) -> tuple[Transform, NDArray[np.float64], NDArray[np.float64]]:
+    """`base_from_flange`, and in the base frame the joints' origins in mm and their axes, each [6, 3]."""
+    origins_mm, axes = np.zeros((6, 3)), np.zeros((6, 3))
+    base_from_link = np.eye(4)
+    for k, (angle_deg, (origin_mm, axis)) in enumerate(zip(joints_deg, _CHAIN, strict=True)):
+        base_from_link[:3, 3] += base_from_link[:3, :3] @ origin_mm
+        origins_mm[k], axes[k] = base_from_link[:3, 3], base_from_link[:3, :3] @ axis
+        base_from_link[:3, :3] = base_from_link[:3, :3] @ turn(axis, angle_deg)
+    base_from_link[:3, :3] = base_from_link[:3, :3] @ turn((0.0, 1.0, 0.0), 90.0)
+    return base_from_link, origins_mm, axes
+
+
+def joints_near(base_from_flange: Transform, joints_deg: Sequence[float]) -> tuple[float, ...] | None:
+    """`sim.devices.newton.joints_near` for this arm."""
+    return newton.joints_near(_chain, base_from_flange, joints_deg)
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """How far the true flange is from where the controller believes it; the same for one seed.
+
+    Standard deviations of each coordinate. An arm's absolute errors are drawn once: the flange's position in
+    the base's coordinates, and the zero of each axis, which makes an error that varies over the cell. Those
+    of repeatability are drawn for each stop: position, and a rotation vector in the flange's coordinates.
+    """
+
+    seed: int
+    repeatability_um: float
+    repeatability_deg: float
+    absolute_mm: float
+    absolute_deg: float
+
+    def base_error_mm(self) -> NDArray[np.float64]:
+        """[3]."""
+        return np.random.default_rng((self.seed, 0)).normal(0.0, 1.0, 3) * self.absolute_mm
+
+    def axis_zero_error_deg(self) -> NDArray[np.float64]:
+        """[6]."""
+        return np.random.default_rng((self.seed, 1)).normal(0.0, 1.0, 6) * self.absolute_deg
+
+    def true_flange_pose(self, joints_deg: Sequence[float], stop: int) -> Transform:
+        """`base_from_flange` as it truly is at the reported angles, in the arm's stop number `stop`."""
+        base_from_flange = flange_pose((np.array(joints_deg) + self.axis_zero_error_deg()).tolist())
+        random = np.random.default_rng((self.seed, 2, stop))
+        stop_error_mm = random.normal(0.0, 1.0, 3) * self.repeatability_um / 1e3
+        turned_deg = random.normal(0.0, 1.0, 3) * self.repeatability_deg
+        base_from_flange[:3, 3] += self.base_error_mm() + stop_error_mm
+        angle_deg = float(np.linalg.norm(turned_deg))
+        if angle_deg > 0.0:
+            base_from_flange[:3, :3] = base_from_flange[:3, :3] @ turn(
+                (turned_deg / angle_deg).tolist(), angle_deg
+            )
+        return base_from_flange
+
+
+def turn(axis: Sequence[float], angle_deg: float) -> NDArray[np.float64]:
+    """3x3 rotation about a unit axis by Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = math.radians(angle_deg)
+    rotation: NDArray[np.float64] = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    return rotation

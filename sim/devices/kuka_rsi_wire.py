@@ -1,0 +1,69 @@
+"""RSI's packets as the stand-in writes them, and answers as it reads them; apart from the drivers' on purpose."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import NamedTuple
+
+from coupole.geometry import abc_from_rotation
+from sim.devices.kuka_kinematics import flange_pose
+from sim.devices.kuka_settings import Settings
+
+VALUE_NAMES = {"axes": ("A1", "A2", "A3", "A4", "A5", "A6"), "pose": ("X", "Y", "Z", "A", "B", "C")}
+TAGS = {"axes": "AKorr", "pose": "RKorr"}
+
+_PAIR = re.compile(rb'(\w+)="([^"]*)"')
+_IPOC = re.compile(rb"<IPOC>(\d+)</IPOC>")
+_POSE_XML = b'<RIst X="%.4f" Y="%.4f" Z="%.4f" A="%.4f" B="%.4f" C="%.4f"/>'
+
+
+class Answer(NamedTuple):
+    ipoc: int
+    values: tuple[float, ...]
+    """Six corrections, degrees or millimetres; one that is missing is none."""
+
+
+def answer_reader(settings: Settings) -> Callable[[bytes], Answer | None]:
+    """A function that reads an answer; None for what is none, or is of another SENTYPE."""
+    tag = re.escape(settings.correction_tag or TAGS[settings.corrects]).encode()
+    names = [name.encode() for name in VALUE_NAMES[settings.corrects]]
+    begins = re.compile(rb'<Sen\b[^>]*\bType="%s"' % re.escape(settings.sen_type).encode())
+    correction = re.compile(rb"<%s\s([^>]*)/>" % tag)
+    in_order = re.compile(rb"<%s " % tag + rb" ".join(rb'%s="([^"]+)"' % name for name in names) + rb"\s*/>")
+
+    def read(data: bytes) -> Answer | None:
+        ipoc = _IPOC.search(data)
+        if ipoc is None or not begins.search(data):
+            return None
+        try:
+            if values := in_order.search(data):
+                return Answer(int(ipoc[1]), tuple(map(float, values.groups())))
+            found = correction.search(data)
+            pairs = dict(_PAIR.findall(found[1])) if found else {}
+            return Answer(int(ipoc[1]), tuple(float(pairs.get(name, b"0")) for name in names))
+        except ValueError:
+            return None
+
+    return read
+
+
+class PacketWriter:
+    """Makes packets; the part that tells the axes is made anew only when they have moved."""
+
+    def __init__(self, settings: Settings) -> None:
+        axes = " ".join(f'A{axis}="%.4f"' for axis in range(1, 7))
+        self._axes_xml = f"<{settings.measured_tag} {axes}/>".encode()
+        self._sends_delay, self._sends_pose = bool(settings.delay_tag), settings.sends_pose
+        self._delay_xml = f'<{settings.delay_tag} D="%d"/>'.encode()
+        self._axes_deg: tuple[float, ...] = ()
+        self._place = b""
+
+    def packet(self, axes_deg: tuple[float, ...], delay: int, ipoc: int) -> bytes:
+        if axes_deg != self._axes_deg:
+            self._axes_deg, self._place = axes_deg, self._axes_xml % axes_deg
+            if self._sends_pose:
+                pose = flange_pose(axes_deg)
+                self._place = _POSE_XML % (*pose[:3, 3], *abc_from_rotation(pose[:3, :3])) + self._place
+        late = self._delay_xml % delay if self._sends_delay else b""
+        return b'<Rob Type="KUKA simulated">%b%b<IPOC>%d</IPOC></Rob>' % (self._place, late, ipoc)

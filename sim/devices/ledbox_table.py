@@ -1,0 +1,80 @@
+"""The limits of the box's table, as the firmware checks them: a table is taken whole or refused whole."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.devices import FLAG_NO_TRIGGER, NO_LIGHT, STEP_DTYPE
+from sim.devices.scpi_parser import ScpiError
+
+MAX_RECORDS = 4096
+MIN_ON_US, MAX_ON_US = 1_000, 2_000_000
+MIN_PERIOD_US = 100
+REST_PER_ON = 2
+"""An LED that was lit for t rests for REST_PER_ON * t at least before the table lights it again."""
+
+
+def read_table(payload: bytes, led_count: int, edge_width_us: int) -> NDArray[np.void]:
+    """The records (STEP_DTYPE [n]) of an uploaded block; raises ScpiError for one that is out of limits."""
+    if len(payload) % STEP_DTYPE.itemsize:
+        raise ScpiError(-161, f"{len(payload)} bytes are not a multiple of {STEP_DTYPE.itemsize}")
+    if len(payload) > MAX_RECORDS * STEP_DTYPE.itemsize:
+        raise ScpiError(-222, f"{len(payload) // STEP_DTYPE.itemsize} records exceed {MAX_RECORDS}")
+    table = np.frombuffer(payload, STEP_DTYPE)
+    check_table(table, led_count, edge_width_us)
+    return table
+
+
+def check_table(table: NDArray[np.void], led_count: int, edge_width_us: int) -> None:
+    """Raise ScpiError -222, naming the first record out of limits and what is wrong with it."""
+    led, flags = table["led"], table["flags"]
+    on_us, delay_us, period_us = (
+        table[name].astype(np.int64) for name in ("on_us", "trigger_delay_us", "period_us")
+    )
+    lit, edge = led != NO_LIGHT, (flags & FLAG_NO_TRIGGER) == 0
+    edge_end_us = np.where(edge, delay_us + edge_width_us, 0)
+    rules = (
+        (lit & (led >= led_count), f"led must be below {led_count}, or {NO_LIGHT} for none", led),
+        (flags & ~np.uint16(FLAG_NO_TRIGGER) != 0, "flags has bits that mean nothing", flags),
+        (
+            (lit & (on_us < MIN_ON_US)) | (on_us > MAX_ON_US),
+            f"on_us must be {MIN_ON_US} to {MAX_ON_US}",
+            on_us,
+        ),
+        (lit & edge & (delay_us > on_us), "trigger_delay_us must not exceed on_us", delay_us),
+        (
+            period_us < np.maximum(np.maximum(on_us, edge_end_us), MIN_PERIOD_US),
+            f"period_us must cover on_us, the edge's end and {MIN_PERIOD_US}",
+            period_us,
+        ),
+    )
+    faults = [
+        (int(record), f"{rule}, not {int(values[record])}")
+        for wrong, rule, values in rules
+        for record in np.flatnonzero(wrong)[:1]
+    ]
+    if not faults and (hot := _cooling_fault(led, on_us, period_us)):
+        faults = [hot]
+    if faults:
+        record, what = min(faults)
+        raise ScpiError(-222, f"record {record}: {what}")
+
+
+def _cooling_fault(
+    led: NDArray[np.uint16], on_us: NDArray[np.int64], period_us: NDArray[np.int64]
+) -> tuple[int, str] | None:
+    """The first record that lights an LED which has not rested long enough, and why."""
+    t_on_us = np.cumsum(period_us) - period_us
+    order = np.argsort(led, kind="stable")
+    before, after = order[:-1], order[1:]
+    rest_us = t_on_us[after] - t_on_us[before] - on_us[before]
+    hot = (led[before] == led[after]) & (led[after] != NO_LIGHT) & (rest_us < REST_PER_ON * on_us[before])
+    if not hot.any():
+        return None
+    pair = np.flatnonzero(hot)[np.argmin(after[hot])]
+    record, earlier = int(after[pair]), int(before[pair])
+    return record, (
+        f"led {int(led[record])} rests {int(rest_us[pair])} us after record {earlier}, "
+        f"{REST_PER_ON * int(on_us[earlier])} us are needed"
+    )

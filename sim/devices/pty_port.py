@@ -1,0 +1,114 @@
+"""A serial port without a wire: a pseudo-terminal read by the world at the pace of a baud rate."""
+
+from __future__ import annotations
+
+import os
+import tty
+from collections.abc import Callable
+
+from sim.world.reactor import Reactor, Timer
+
+_PIECE_BYTES = 64
+"""Paced bytes travel in pieces of this size: 5.6 ms at 115200 baud."""
+_RETRY_S = 0.001
+_BITS_PER_BYTE = 10
+
+
+class PtyPort:
+    """The box's end of a serial line. `port` is what a client opens; `baud` 0 means no pacing.
+
+    A client may come and go: the world keeps the client's side open too, so the line never hangs up.
+    """
+
+    def __init__(self, reactor: Reactor, baud: int) -> None:
+        self._reactor = reactor
+        self._byte_s = _BITS_PER_BYTE / baud if baud else 0.0
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.port = os.ttyname(self._slave)
+        self._received: Callable[[bytes], None] | None = None
+        self._output = bytearray()
+        self._timers: dict[str, Timer] = {}
+        self._reading = self._sending = False
+
+    def listen(self, received: Callable[[bytes], None]) -> None:
+        """Call `received` with bytes as they have come in whole."""
+        self._received = received
+        self._wait_for_bytes()
+
+    def send(self, data: bytes) -> None:
+        """Queue bytes for the client."""
+        if self._received is None:
+            return
+        self._output += data
+        if not self._sending:
+            self._sending = True
+            if self._byte_s:
+                self._write_later()
+            else:
+                self._write()
+
+    def mute(self) -> None:
+        """Neither read nor write any more; the line stays up."""
+        self._received = None
+        self._output.clear()
+        for timer in self._timers.values():
+            timer.cancel()
+        self._stop_waiting()
+
+    def close(self) -> None:
+        """Take the line away: the client sees a hang-up. A second call does nothing."""
+        self.mute()
+        if self._master >= 0:
+            os.close(self._master)
+            os.close(self._slave)
+            self._master = self._slave = -1
+
+    def _wait_for_bytes(self) -> None:
+        if not self._reading:
+            self._reactor.add_reader(self._master, self._read_piece)
+            self._reading = True
+
+    def _stop_waiting(self) -> None:
+        if self._reading:
+            self._reactor.remove_reader(self._master)
+            self._reading = False
+
+    def _read_piece(self) -> None:
+        """Take a piece off the terminal; it is received when its last bit would have come."""
+        try:
+            piece = os.read(self._master, _PIECE_BYTES if self._byte_s else 65536)
+        except BlockingIOError:
+            self._wait_for_bytes()
+            return
+        if self._byte_s:
+            self._stop_waiting()
+            callback = self._deliver_and_read_on(piece)
+            self._timers["read"] = self._reactor.after(len(piece) * self._byte_s, callback)
+        elif self._received is not None:
+            self._received(piece)
+
+    def _deliver_and_read_on(self, piece: bytes) -> Callable[[], None]:
+        def callback() -> None:
+            if self._received is not None:
+                self._received(piece)
+            if self._received is not None:  # a fault may have muted the line meanwhile
+                self._read_piece()
+
+        return callback
+
+    def _write(self) -> None:
+        """Write a piece as far as the terminal takes it; come back when the next one's bits have passed."""
+        try:
+            written = os.write(self._master, self._output[:_PIECE_BYTES] if self._byte_s else self._output)
+        except BlockingIOError:
+            written = 0
+        del self._output[:written]
+        self._sending = bool(self._output)
+        if self._sending:
+            self._write_later()
+
+    def _write_later(self) -> None:
+        piece_s = min(len(self._output), _PIECE_BYTES) * self._byte_s
+        self._timers["write"] = self._reactor.after(piece_s or _RETRY_S, self._write)

@@ -1,0 +1,92 @@
+"""The robot's stand-in, whichever it is: what the world asks of it, and how a rig's choice is built."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Sequence
+from typing import Annotated, Any, Protocol
+
+from pydantic import Discriminator, Tag
+
+from coupole.geometry import Transform
+from sim.devices import kuka_controller, kuka_eki_controller, ur_controller
+from sim.world import faults
+from sim.world.reactor import Reactor
+
+
+def _kind(settings: Any) -> str:
+    """Which stand-in these settings are for; RSI where they do not say."""
+    return str(settings.get("kind", "rsi") if isinstance(settings, dict) else settings.kind)
+
+
+RobotSettings = Annotated[
+    Annotated[kuka_controller.Settings, Tag("rsi")]
+    | Annotated[kuka_eki_controller.Settings, Tag("eki")]
+    | Annotated[ur_controller.Settings, Tag("ur")],
+    Discriminator(_kind),
+]
+
+
+class RobotStandIn(Protocol):
+    """All methods are called on the reactor's thread. RSI's has one more, `late`: see `impossible`."""
+
+    @property
+    def joints_deg(self) -> tuple[float, ...]:
+        """The axes now, as the controller measures and reports them."""
+        ...
+
+    @property
+    def moving(self) -> bool: ...
+
+    def true_base_from_flange(self) -> Transform:
+        """Where the flange truly is."""
+        ...
+
+    def estop(self) -> None: ...
+
+    def reset(self) -> None:
+        """Acknowledge all faults."""
+        ...
+
+    def lose_link(self, seconds: float) -> None: ...
+
+    def nudge(self, joints_deg: Sequence[float], seconds: float | None = None) -> None:
+        """Push the arm by six angles, for good, or until it springs back after `seconds`."""
+        ...
+
+    def close(self) -> None: ...
+
+
+def impossible(fault: faults.Fault, settings: RobotSettings) -> str:
+    """Why this stand-in cannot have the fault; empty if it can."""
+    if isinstance(fault, faults.LateRsi) and settings.kind != "rsi":
+        return f"`late_rsi` cannot happen to a robot of kind `{settings.kind}`: it has no RSI answers"
+    return ""
+
+
+def build(reactor: Reactor, settings: RobotSettings) -> tuple[RobotStandIn, dict[str, Any]]:
+    """The stand-in, and what a client needs to know to reach it: under the names of our drivers' settings."""
+    match settings:
+        case kuka_controller.Settings():
+            alike = {name: getattr(settings, name) for name in kuka_controller.ALIKE}
+            sends_to = _with_free_port(settings.sends_to)
+            settings = settings.model_copy(update={"sends_to": sends_to})
+            endpoint = {"listen": sends_to, "sends_to": sends_to, **alike}
+            return kuka_controller.KukaController(reactor, settings), endpoint
+        case kuka_eki_controller.Settings():
+            eki = kuka_eki_controller.KukaEkiController(reactor, settings)
+            theirs = {"controller_is": settings.controller_is, "status_ms": settings.status_ms}
+            return eki, {"address": eki.address, **theirs}
+        case ur_controller.Settings():
+            ur = ur_controller.UrController(reactor, settings)
+            return ur, {"host": ur.address}
+
+
+def _with_free_port(address: str) -> str:
+    """The UDP address, with a port that is free in place of port 0."""
+    host, port = address.rsplit(":", 1)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        if port == "0":
+            probe.bind((host, 0))
+            port = probe.getsockname()[1]
+    return f"{host}:{port}"

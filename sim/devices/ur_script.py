@@ -1,0 +1,96 @@
+"""What the program that ur-rtde uploads does with the registers, written after that program (ur-rtde 1.6).
+
+The client writes a command number to input_int_register_0 and its numbers beside it; the program answers in
+output_int_register_0: 1 ready, 2 done. Then the client writes 0, and the program is ready again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Protocol
+
+from sim.devices.ur_arm import Six
+from sim.devices.ur_rtde_wire import Value
+
+_NONE, _MOVEJ, _MOVEL, _STOPJ, _SET_WATCHDOG, _GET_TCP_OFFSET, _END = 0, 1, 3, 34, 35, 40, 255
+_READY, _DONE = 1, 2
+_ASYNC_RUNNING = 0x8000
+
+
+class Arm(Protocol):
+    """What the program does to the arm."""
+
+    @property
+    def moving(self) -> bool: ...
+    def start_movej(self, target_deg: Six, speed_deg_s: float, acceleration_deg_s2: float) -> None: ...
+    def start_movel(self, tool_pose_m_rad: Six, speed_m_s: float, acceleration_m_s2: float) -> None: ...
+    def start_stopj(self, deceleration_deg_s2: float) -> None: ...
+
+
+class ControlScript:
+    """One run of the program, one `cycle` after the other."""
+
+    def __init__(self, arm: Arm, tcp_offset_m_rad: Six) -> None:
+        self.ended = ""
+        """Why the program ended by itself; empty while it runs."""
+        self.watchdog_s: float | None = None
+        """Silence of input_int_register_0 after which the controller ends the program, once that is asked."""
+        self.outputs: dict[str, Value] = {}
+        self._arm, self._tcp_offset = arm, tcp_offset_m_rad
+        self._executing = False
+        self._async_running = False
+        self._async_count = self._async_operation = 0
+        self._signal_async(running=False)
+
+    def cycle(self, inputs: Mapping[str, Value]) -> None:
+        """Work off the registers once; `inputs` holds all that were ever written."""
+        if self._async_running and not self._arm.moving:
+            self._signal_async(running=False)
+        command = int(_number(inputs, "input_int_register_0"))
+        if command == _NONE:
+            self._executing = False
+            self.outputs["output_int_register_0"] = _READY
+        elif not self._executing:
+            self._executing = True
+            self._process(command, inputs)
+        elif self._async_running or not self._arm.moving:
+            self.outputs["output_int_register_0"] = _DONE  # a synchronous motion is done when it has ended
+
+    def _process(self, command: int, inputs: Mapping[str, Value]) -> None:
+        numbers = [_number(inputs, f"input_double_register_{i}") for i in range(8)]
+        asynchronous = _number(inputs, "input_int_register_1") == 1
+        if command == _MOVEJ:
+            self._arm.start_movej(
+                tuple(map(math.degrees, numbers[:6])), math.degrees(numbers[6]), math.degrees(numbers[7])
+            )
+            self._signal_async(running=asynchronous)
+        elif command == _MOVEL:
+            self._arm.start_movel(tuple(numbers[:6]), numbers[6], numbers[7])
+            self._signal_async(running=asynchronous)
+        elif command == _STOPJ:
+            self._arm.start_stopj(math.degrees(numbers[0]))
+            self._signal_async(running=asynchronous)
+        elif command == _SET_WATCHDOG:
+            self.watchdog_s = 1.0 / numbers[0]
+        elif command == _GET_TCP_OFFSET:
+            for i, number in enumerate(self._tcp_offset):
+                self.outputs[f"output_double_register_{i}"] = number
+        elif command == _END:
+            self.ended = "the client ended it"
+        else:
+            self.ended = f"this stand-in does not know command {command}"
+
+    def _signal_async(self, *, running: bool) -> None:
+        """Bits 24 to 30 count operations, bits 16 to 22 writes; bit 15 says that an operation runs."""
+        self._async_running = running
+        self._async_count = (self._async_count + 1) % 128
+        self._async_operation = (self._async_operation + running) % 128
+        register = self._async_operation << 24 | self._async_count << 16 | _ASYNC_RUNNING * running
+        self.outputs["output_int_register_2"] = register
+
+
+def _number(inputs: Mapping[str, Value], name: str) -> float:
+    value = inputs.get(name, 0.0)
+    assert not isinstance(value, tuple)  # registers hold one number each
+    return value

@@ -1,0 +1,62 @@
+"""The dome as it was built: its boards stand a little beside where their table says, and wires may be swapped.
+
+The controller knows the table; frames are lit by what is here. This is the truth that the LEDs' calibration must
+find.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict
+from scipy.spatial.transform import Rotation
+
+from sim.scene.scene import Leds
+
+_SHIFT, _TURN, _PLACE = 1, 2, 3
+"""Purposes of the seed's streams."""
+
+
+@dataclass(frozen=True)
+class DomeErrors:
+    """How far the dome is from its table; all normal."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
+    seed: int = 1
+    board_shift_mm: float = 0.0
+    """Standard deviation of a board's place along each axis."""
+    board_turn_deg: float = 0.0
+    """Standard deviation of a board's turn about each axis through its middle."""
+    led_shift_mm: float = 0.0
+    """Standard deviation of an LED's place on its board along each axis."""
+    swapped: tuple[tuple[int, int], ...] = ()
+    """Pairs of LEDs whose wires are swapped: each lights where the other stands."""
+
+
+def as_built(table: Leds, errors: DomeErrors) -> Leds:
+    """The LEDs where they are; ids and fluxes are the table's, but a swapped LED has the other's flux as well."""
+    positions_mm, normals = table.positions_mm.copy(), table.normals.copy()
+    for board in np.unique(table.boards):
+        mine = table.boards == board
+        turn_deg = errors.board_turn_deg * _normals(errors.seed, _TURN, int(board), 1)[0]
+        turn = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
+        shift_mm = errors.board_shift_mm * _normals(errors.seed, _SHIFT, int(board), 1)[0]
+        own_mm = errors.led_shift_mm * _normals(errors.seed, _PLACE, int(board), int(mine.sum()))
+        middle_mm = positions_mm[mine].mean(axis=0)
+        positions_mm[mine] = (positions_mm[mine] - middle_mm + own_mm) @ turn.T + middle_mm + shift_mm
+        normals[mine] = normals[mine] @ turn.T
+    row_of_led = {int(led): row for row, led in enumerate(table.ids)}
+    at = np.arange(len(table.ids))
+    for first, second in errors.swapped:
+        a, b = row_of_led[first], row_of_led[second]
+        at[[a, b]] = at[[b, a]]
+    return replace(table, positions_mm=positions_mm[at], normals=normals[at], flux_lm=table.flux_lm[at])
+
+
+def _normals(seed: int, purpose: int, board: int, count: int) -> NDArray[np.float64]:
+    """Standard normal numbers [count, 3] of a board."""
+    return np.random.default_rng((seed, purpose, board)).standard_normal((count, 3))

@@ -1,0 +1,140 @@
+"""The dome's LEDs as single things: their spectrum, and how much each gives compared with its table.
+
+Everything is a function of seed, LED and flash; the model's figures are the truth that calibrations are tested
+against.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import ConfigDict
+
+from coupole.appearance.spectra import channels
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
+
+_OWN_FLUX, _OWN_PUMP, _FLASH, _LOOSE = 1, 2, 3, 4
+"""Purposes of the seed's streams."""
+
+
+@dataclass(frozen=True)
+class LedSpectrum:
+    """A blue chip under a yellow phosphor. Both bands are normal curves; the figures are those of a white LED of
+    about 5500 K (assumed)."""
+
+    pump_nm: float = 450.0
+    pump_fwhm_nm: float = 20.0
+    phosphor_nm: float = 560.0
+    phosphor_fwhm_nm: float = 115.0
+    pump_share: float = 0.22
+    """Of the radiant power between 380 and 780 nm."""
+
+
+@dataclass(frozen=True)
+class LedModel:
+    """How a dome's LEDs differ from their table; all figures are assumed, of the order of white power LEDs."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
+    seed: int = 1
+    flux_spread: float = 0.04
+    """Standard deviation of the logarithm of an LED's flux over its tabulated one: bins are some 10 % wide."""
+    pump_spread_nm: float = 2.5
+    """Standard deviation of the chip's wavelength."""
+    flux_per_k: float = -0.003
+    """Relative change of flux per kelvin of board temperature."""
+    reference_c: float = 25.0
+    """Board temperature at which the table holds."""
+    hours_to_70_percent: float = 50_000.0
+    """Time of light after which 70 % of the flux is left (L70), on an exponential."""
+    hours_shone: float = 0.0
+    """How old the LEDs are."""
+    flicker: float = 5e-4
+    """Relative standard deviation from flash to flash."""
+    dead: tuple[int, ...] = ()
+    """LEDs that give no light."""
+    spectrum: LedSpectrum = LedSpectrum()
+
+
+STEADY = LedModel(flux_spread=0.0, pump_spread_nm=0.0, flux_per_k=0.0, flicker=0.0)
+"""LEDs that give what their table says, always."""
+
+
+def spectral_power(spectrum: LedSpectrum) -> Array:
+    """Relative spectral power [81] of a white LED; its sum is 1."""
+    pump = _band(spectrum.pump_nm, spectrum.pump_fwhm_nm)
+    phosphor = _band(spectrum.phosphor_nm, spectrum.phosphor_fwhm_nm)
+    return spectrum.pump_share * pump + (1.0 - spectrum.pump_share) * phosphor
+
+
+def own_flux_factor(model: LedModel, led: int) -> float:
+    """Flux of a new LED at the reference temperature over its tabulated flux; 0 if it is dead."""
+    if led in model.dead:
+        return 0.0
+    return float(np.exp(model.flux_spread * _normal(model.seed, _OWN_FLUX, led)))
+
+
+def led_flux_factor(model: LedModel, led: int, flash: int, temperature_c: float, *, hours: float = 0.0) -> float:
+    """Flux of one flash over the tabulated flux.
+
+    `flash` counts this world's flashes, `temperature_c` is the board's, and `hours` is how long the LED has shone.
+    """
+    warmth = 1.0 + model.flux_per_k * (temperature_c - model.reference_c)
+    age = 0.7 ** (hours / model.hours_to_70_percent)
+    flicker = 1.0 + model.flicker * _normal(model.seed, _FLASH, led, flash)
+    return max(0.0, float(own_flux_factor(model, led) * warmth * age * flicker))
+
+
+class Flashes:
+    """A world's flashes, one after the other."""
+
+    def __init__(self, model: LedModel) -> None:
+        self._model = model
+        self._count = 0
+        self.unsteady: dict[int, float] = {}
+        """LEDs with a loose contact: relative standard deviation from flash to flash, beside the model's."""
+
+    def flux(self, led: int, temperature_c: float) -> float:
+        """Flux of the LED's next flash over its tabulated flux."""
+        self._count += 1
+        loose = self.unsteady.get(led, 0.0) * _normal(self._model.seed, _LOOSE, led, self._count)
+        flux = led_flux_factor(self._model, led, self._count, temperature_c, hours=self._model.hours_shone)
+        return max(0.0, flux * (1.0 + loose))
+
+
+def led_power(model: LedModel, led: int) -> Array:
+    """Relative spectral power [81] of one LED, whose chip has its own wavelength; its sum is 1."""
+    own = model.spectrum
+    shift_nm = model.pump_spread_nm * _normal(model.seed, _OWN_PUMP, led)
+    return spectral_power(
+        LedSpectrum(
+            own.pump_nm + shift_nm, own.pump_fwhm_nm, own.phosphor_nm, own.phosphor_fwhm_nm, own.pump_share
+        )
+    )
+
+
+def channel_factors(model: LedModel, led: int, sensitivities: Array) -> Array:
+    """[channels] signal of white under this LED over that under the model's own spectrum, at equal radiant power.
+
+    `sensitivities` [channels, 81], such as `coupole.appearance.spectra.light.camera()`.
+    """
+    return np.asarray(sensitivities @ led_power(model, led) / (sensitivities @ spectral_power(model.spectrum)))
+
+
+def camera_weights(model: LedModel, sensitivities: ArrayLike) -> Array:
+    """[channels, 81] for `channels.channel_values`: what spectra become under the model's LED."""
+    return channels.channel_weights(spectral_power(model.spectrum), sensitivities)
+
+
+def _band(centre_nm: float, fwhm_nm: float) -> Array:
+    """A normal curve on the grid; its sum is 1."""
+    curve = np.exp(-4.0 * np.log(2.0) * ((WAVELENGTHS_NM - centre_nm) / fwhm_nm) ** 2)
+    return np.asarray(curve / curve.sum())
+
+
+def _normal(*where: int) -> float:
+    """Standard normal number of a place in the seed's streams."""
+    return float(np.random.default_rng(where).standard_normal())

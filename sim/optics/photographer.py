@@ -1,0 +1,320 @@
+"""The world's photographer: renders what the true camera pose sees under the lights that shone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.spectra import light
+from coupole.geometry import Transform, inverse
+from sim.devices.arm_bodies import NONE, Capsules
+from sim.devices.camera_body import Exposed
+from sim.optics import panels
+from sim.optics.blur import through
+from sim.optics.dome import as_built
+from sim.optics.glow import Glow, glow
+from sim.optics.led_light import channel_factors
+from sim.optics.objective import Objective, vignetting
+from sim.optics.sensor import electrons, expose, expose_electrons, mosaic
+from sim.render import arm_shadow
+from sim.render.camera_view import View, Viewer, tangents
+from sim.render.embree import Obstacles
+from sim.render.emitter import LED_SIDE_MM, Emitter, irradiance, square
+from sim.render.lens import Lens, sight
+from sim.render.radiance import led_radiance, panel_radiance
+from sim.render.shadows import Shadows
+from sim.scene.scene import Leds, Scene, build_scene, load_surface, read_leds, support_disk
+from sim.scene.surface import Material, Surface
+from sim.scene.things import placed
+from sim.world.config import WHITE_SHARE, CameraConfig, MeshConfig, SceneConfig, Settings
+
+if TYPE_CHECKING:
+    from sim.render.interreflection import Prepared
+
+_POSE_TOLERANCE, _ARM_TOLERANCE_MM = 1e-6, 1e-3
+_SHADOW_BYTES = 512 << 20
+_RADIANCE_BYTES = 256 << 20
+_WARM_UP_HEIGHT_MM = 1000.0
+
+_AHEAD = square((0.0, 0.0, 1000.0), (0.0, 0.0, -1.0), side_mm=LED_SIDE_MM, flux_lm=1.0)
+"""A lamp before the camera, to try it on."""
+
+Radiance = NDArray[np.float32]
+
+
+@dataclass
+class Look:
+    """What one pose of camera and arm sees, and what was worked out for it so far."""
+
+    base_from_camera: Transform
+    arm_mm: Capsules
+    """Bodies of the arm, which cast shadows."""
+    view: View
+    places: NDArray[np.int32]
+    """[seen] of the triangles seen, in the table of shadows."""
+    samples: int
+    scene: Scene
+    radiance: dict[int, Radiance] = field(default_factory=dict)
+    """Of the triangles seen, by LED, or by minus the number of a panel."""
+    glows: dict[int, Glow | None] = field(default_factory=dict)
+    """By the same numbers."""
+
+    @cached_property
+    def empty(self) -> NDArray[np.float32]:
+        """[h, w] share of each pixel that sees nothing."""
+        return self.view.empty(self.samples)
+
+    @cached_property
+    def prepared(self) -> Prepared:
+        """For light that goes from surface to surface."""
+        from sim.render.interreflection import prepare
+
+        return prepare(self.scene, self.view.sides >> 1, self.view.towards_camera)
+
+
+class Photographer:
+    """Holds the scene, its shadows and the last look at it; `render` is called from one worker thread."""
+
+    def __init__(self, scene: SceneConfig, camera: CameraConfig, settings: Settings) -> None:
+        base_from_support = np.array(scene.base_from_support)
+        surfaces = [(support_disk(scene.support_diameter_mm), base_from_support)]
+        surfaces += [
+            (_surface(mesh, settings), base_from_support @ np.array(mesh.support_from_object))
+            for mesh in scene.objects
+        ]
+        surfaces += placed(settings.things, base_from_support)
+        self._scene = build_scene(surfaces)
+        self._emission = scene.emission
+        table = read_leds(scene.leds)
+        self.leds: Leds = as_built(table, settings.dome)
+        """Where they are; the controller has the table's."""
+        self._led_model = settings.leds
+        self._emitters = _emitters(self.leds)
+        self._row_of_led = {int(led): row for row, led in enumerate(self.leds.ids)}
+        self._objective = Objective(
+            camera.focal_length_mm,
+            camera.focus_distance_mm,
+            camera.f_number,
+            rim_radius=camera.rim_radius,
+            rim_shift=camera.rim_shift,
+            lateral_colour=camera.lateral_colour,
+        )
+        self._camera = camera
+        lens = Lens.focused(
+            camera.width_px,
+            camera.height_px,
+            pixel_pitch_um=camera.pixel_pitch_um,
+            focal_length_mm=camera.focal_length_mm,
+            focus_distance_mm=camera.focus_distance_mm,
+            distortion=camera.distortion,
+        )
+        self._sight = sight(lens)
+        self._falloff = vignetting(self._objective, tangents(self._sight)).astype(np.float32)
+        self._viewer = Viewer(self._scene, lens, camera.samples_per_side)
+        self.sensor = camera.true_sensor(settings.seed)
+        self.flange_from_camera: Transform = np.array(camera.flange_from_camera)
+        self.reference_lux = _reference_lux(_emitters(table), base_from_support)
+        white_e = WHITE_SHARE * self.sensor.full_scale_e
+        self._electrons = white_e * np.pi / (self.reference_lux * camera.nominal_exposure_us * 1e-6)
+        self._panels = [
+            (panels.whole(panel, base_from_support, self.reference_lux), panel.unevenness)
+            for panel in settings.panels
+        ]
+        pieces = [piece for panel, unevenness in self._panels for piece in panels.pieces(panel, unevenness)]
+        self._pieces = pieces
+        places_mm = np.array([*self.leds.positions_mm, *(piece.centre_mm for piece in pieces)])
+        self._shadows = Shadows(Obstacles(self._scene.corners_mm), places_mm, _SHADOW_BYTES)
+        self._look: Look | None = None
+        self._interreflection = settings.interreflection
+        self._colour: dict[int, NDArray[np.float32]] = {}
+        self._warm_up(base_from_support)
+
+    def _warm_up(self, base_from_support: Transform) -> None:
+        """Compile by looking down at the support under one LED, before anybody waits for a frame."""
+        support_from_camera = np.diag([1.0, -1.0, -1.0, 1.0])
+        support_from_camera[2, 3] = _WARM_UP_HEIGHT_MM
+        look = self._look_from(base_from_support @ support_from_camera @ inverse(self.flange_from_camera))
+        self._led(look, int(self.leds.ids[0]))
+        arm_shadow.warm_up()
+        glow(_AHEAD, "lambertian", self._sight, np.eye(4), look.empty, None)
+
+    def render(self, out: NDArray[np.uint16], exposed: Exposed) -> None:
+        """Fill `out` [h, w] with the frame of one exposure, DN."""
+        look = self._look_from(exposed.base_from_flange, exposed.arm_mm)
+        radiance, seconds = self._lit(look, exposed)
+        sensed: dict[str, Any] = {
+            "model": self.sensor,
+            "frame": exposed.number,
+            "exposure_s": exposed.exposure_s,
+            "gain": exposed.gain,
+            "temperature_c": self._camera.sensor_temperature_c,
+        }
+        glows = self._glows(look, exposed)
+        scale = self._electrons * seconds
+        if self._camera.blur:
+            sharp = electrons(look.view.triangle, radiance, self._falloff, electrons_per_radiance=scale)
+            k = self._camera.samples_per_side
+            depth_mm = look.view.depth_mm(look.base_from_camera)[k // 2 :: k, k // 2 :: k]
+            image = through(self._objective, sharp, depth_mm, pixel_pitch_um=self._camera.pixel_pitch_um)
+            mean_e = mosaic(image, self.sensor)
+            if glows is not None:
+                mean_e += glows
+            expose_electrons(out, mean_e, **sensed)
+        else:
+            expose(
+                out,
+                look.view.triangle,
+                radiance,
+                self._falloff,
+                electrons_per_radiance=scale,
+                more_e=glows,
+                **sensed,
+            )
+
+    def _lit(self, look: Look, exposed: Exposed) -> tuple[Radiance, float]:
+        """Radiance of what is seen, and for how many seconds."""
+        lights = [(self._led(look, led), lit_s) for led, lit_s in exposed.seconds_of_led.items()]
+        lights += [(self._panel(look, panel), exposed.exposure_s) for panel in exposed.panels]
+        if len(lights) == 1:
+            return lights[0]
+        count = len(look.view.sides)
+        radiance = np.zeros((max(1, count), 3), np.float32)
+        for each, lit_s in lights:
+            radiance[:count] += each * np.float32(lit_s)
+        return radiance, 1.0
+
+    def _look_from(self, base_from_flange: Transform, arm_mm: Capsules = NONE) -> Look:
+        """Rasterise from a flange pose, unless it is the last one still."""
+        base_from_camera = base_from_flange @ self.flange_from_camera
+        look = self._look
+        if look is None or np.abs(base_from_camera - look.base_from_camera).max() > _POSE_TOLERANCE:
+            view = self._viewer.look(base_from_camera)
+            places, samples = self._shadows.places(view.sides), self._camera.samples_per_side
+            look = self._look = Look(base_from_camera, arm_mm, view, places, samples, self._scene)
+        arm_moved = arm_mm.shape != look.arm_mm.shape or np.abs(arm_mm - look.arm_mm).max(initial=0.0)
+        if arm_moved > _ARM_TOLERANCE_MM:
+            look.arm_mm = arm_mm
+            look.radiance.clear()
+        return look
+
+    # -- what lights things -------------------------------------------------------------------------------
+
+    def _led(self, look: Look, led: int) -> Radiance:
+        """Radiance of the view's triangles under one LED at its tabulated flux."""
+        row = self._row_of_led[led]
+        return _remembered(look, led, lambda: self._lit_by_led(look, row) * self._colour_of(led))
+
+    def _lit_by_led(self, look: Look, row: int) -> Radiance:
+        return self._shaded(look, self._emitters[row], row) + self._indirect(look, self._emitters[row])
+
+    def _panel(self, look: Look, panel: int) -> Radiance:
+        """Radiance of the view's triangles under panel 1 to 4."""
+        if not self._panels:
+            return panel_radiance(look.view, self._scene.materials, self.reference_lux)
+        if panel > len(self._panels):
+            return np.zeros((len(look.view.sides), 3), np.float32)
+        return _remembered(look, -panel, lambda: self._lit_by_panel(look, panel))
+
+    def _lit_by_panel(self, look: Look, panel: int) -> Radiance:
+        count = panels.PARTS**2
+        radiance = np.zeros((len(look.view.sides), 3), np.float32) + self._indirect(
+            look, self._panels[panel - 1][0]
+        )
+        for piece in range((panel - 1) * count, panel * count):
+            radiance += self._shaded(look, self._pieces[piece], len(self._emitters) + piece, "lambertian")
+        return radiance
+
+    def _shaded(self, look: Look, emitter: Emitter, row: int, emission: str = "") -> Radiance:
+        radiance = led_radiance(
+            look.view,
+            self._scene.materials,
+            emitter,
+            emission or self._emission,
+            look.places,
+            self._shadows.reached(row),
+        )
+        arm_shadow.cast(radiance, look.view.centroids_mm, look.arm_mm, emitter.centre_mm)
+        return radiance
+
+    def _indirect(self, look: Look, emitter: Emitter) -> Radiance:
+        """What reaches the view's triangles by way of others; zeros where that is not asked for."""
+        if self._interreflection is None or len(look.view.sides) == 0:
+            return np.zeros((len(look.view.sides), 3), np.float32)
+        from sim.render.interreflection import indirect_radiance
+
+        asked = self._interreflection
+        return indirect_radiance(look.prepared, emitter, bounces=asked.bounces, samples=asked.samples)
+
+    def _colour_of(self, led: int) -> NDArray[np.float32]:
+        """[3] signal of white under this LED over that under the median one, at equal flux."""
+        if self._led_model.pump_spread_nm == 0.0:
+            return np.ones(3, np.float32)
+        if led not in self._colour:
+            self._colour[led] = channel_factors(self._led_model, led, light.camera()).astype(np.float32)
+        return self._colour[led]
+
+    # -- lamps in the picture -----------------------------------------------------------------------------
+
+    def _glows(self, look: Look, exposed: Exposed) -> NDArray[np.float32] | None:
+        """[h, w] mean electrons of lamps that the camera looks at, or None if it sees none."""
+        seen: list[tuple[Glow, NDArray[np.float32]]] = []
+        for led, lit_s in exposed.seconds_of_led.items():
+            if spot := self._glow(look, led, self._emitters[self._row_of_led[led]], self._emission):
+                seen.append((spot, self._colour_of(led) * np.float32(lit_s)))
+        for panel in exposed.panels:
+            if panel <= len(self._panels):
+                whole, unevenness = self._panels[panel - 1]
+                if area := self._glow(look, -panel, whole, "lambertian", unevenness):
+                    seen.append((area, np.full(3, exposed.exposure_s, np.float32)))
+        if not seen:
+            return None
+        mean_e = np.zeros(self._falloff.shape, np.float32)
+        for lamp, seconds in seen:
+            of_row, of_column = np.ogrid[lamp.rows, lamp.columns]
+            weights = seconds[self.sensor.channels()[of_row & 1, of_column & 1]]
+            mean_e[lamp.rows, lamp.columns] += lamp.radiance * weights
+        return mean_e * self._falloff * np.float32(self._electrons)
+
+    def _glow(self, look: Look, light: int, lamp: Emitter, emission: str, unevenness: float = 0.0) -> Glow | None:
+        """What the camera sees of a lamp; computed once per pose."""
+        if light not in look.glows:
+            blur = (self._objective, self._camera.pixel_pitch_um) if self._camera.blur else None
+            look.glows[light] = glow(
+                lamp, emission, self._sight, look.base_from_camera, look.empty, blur, unevenness
+            )
+        return look.glows[light]
+
+
+def _remembered(look: Look, light: int, compute: Callable[[], Radiance]) -> Radiance:
+    """What fits into memory is computed once per pose."""
+    if light in look.radiance:
+        return look.radiance[light]
+    radiance = compute()
+    if (len(look.radiance) + 1) * radiance.nbytes <= _RADIANCE_BYTES:
+        look.radiance[light] = radiance
+    return radiance
+
+
+def _emitters(leds: Leds) -> list[Emitter]:
+    return [
+        square(position, normal, side_mm=LED_SIDE_MM, flux_lm=float(flux))
+        for position, normal, flux in zip(leds.positions_mm, leds.normals, leds.flux_lm, strict=True)
+    ]
+
+
+def _reference_lux(emitters: list[Emitter], base_from_support: Transform) -> float:
+    """Median over the LEDs of the irradiance on a horizontal white target at the support's centre."""
+    centre, up = base_from_support[:3, 3], base_from_support[:3, 2]
+    return float(np.median([irradiance(emitter, centre, up)[0] for emitter in emitters]))
+
+
+def _surface(mesh: MeshConfig, settings: Settings) -> Surface:
+    given = mesh.material or settings.material
+    material = Material(mesh.path.stem, given.diffuse, given.f0, given.roughness) if given else None
+    surface = load_surface(mesh.path, mesh.unit, material)
+    return settings.stickers.on(surface) if settings.stickers else surface

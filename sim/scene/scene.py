@@ -1,0 +1,167 @@
+"""What stands in the simulated dome: the support disk and the objects on it, their materials, and the LEDs.
+
+Everything is in the robot's base frame, in mm; fluxes in lm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.geometry import Transform
+from sim.scene.surface import Material, Surface
+
+STONE = Material("warm stone", (0.62, 0.55, 0.42))
+"""Of what an object is made that says nothing of itself (assumed)."""
+PAINTED = Material("as coloured in its file", (1.0, 1.0, 1.0))
+DIBOND = Material("black anodised Dibond", (0.04, 0.04, 0.045))
+"""The support (facts/instrument: 'more absorbing'; the value is assumed)."""
+_UNIT_MM = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
+SUPPORT_CELL_MM = 5.0
+"""Edges of the support's triangles: shadows on it are so fine."""
+_CHUNK = 1 << 18
+
+
+@dataclass(frozen=True)
+class Leds:
+    """The LED table: positions [n, 3] and normals [n, 3] in the base frame, flux [n] in lm."""
+
+    ids: NDArray[np.int64]
+    boards: NDArray[np.int64]
+    positions_mm: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    flux_lm: NDArray[np.float64]
+
+
+def read_leds(path: Path) -> Leds:
+    """LEDs of a dome's CSV: id, board, x_mm, y_mm, z_mm, nx, ny, nz, flux_lm; `#` starts a comment."""
+    lines = [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
+    table = np.array([[float(v) for v in line.split(",")] for line in lines[1:]])
+    return Leds(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:5], table[:, 5:8], table[:, 8])
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All triangles in the base frame, and of what they are; 40 bytes a triangle at least."""
+
+    corners_mm: NDArray[np.float32]
+    """[triangles, 3, 3]; at least 4 bytes follow in memory, which Embree may read."""
+    material: NDArray[np.int32]
+    """[triangles] row of `materials`."""
+    materials: NDArray[np.float64]
+    """[materials, 7] red, green, blue diffuse reflectance; red, green, blue f0; roughness."""
+    tint: NDArray[np.float32] | None
+    """[triangles, 3] factor of the diffuse reflectance."""
+    normals: NDArray[np.float32] | None
+    """[triangles, 3] unit normals for shading, where they are not the flat ones."""
+
+
+def load_surface(path: Path, unit: str, material: Material | None = None) -> Surface:
+    """Any mesh that trimesh reads (PLY, STL, OBJ, ...), in mm, as it is: no vertex is merged or dropped.
+
+    Colours of vertices or faces, or a texture (at triangles' centroids), become the tint; they are sRGB. Without
+    `material` a coloured mesh reflects diffusely what its colours say, any other is of `STONE`. Raises InputError.
+    """
+    import trimesh
+
+    try:
+        mesh: Any = trimesh.load(path, process=False, force="mesh")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: expected a mesh of triangles (PLY, STL, OBJ); {error}") from error
+    faces = np.asarray(mesh.faces)
+    if len(faces) == 0:
+        raise InputError(f"{path}: expected a mesh of triangles; found none")
+    tint = _tint(mesh)
+    plain = PAINTED if tint is not None else STONE
+    corners = np.asarray(mesh.vertices)[faces]
+    corners *= _UNIT_MM[unit]
+    return Surface(corners, (material or plain,), np.zeros(len(faces), np.int32), tint)
+
+
+def _tint(mesh: Any) -> NDArray[np.float32] | None:
+    """[triangles, 3] linear colours of a mesh; None if it has none."""
+    kind, faces = mesh.visual.kind, np.asarray(mesh.faces)
+    if kind == "face":
+        srgb = np.asarray(mesh.visual.face_colors)[:, :3] / 255.0
+    elif kind == "vertex":
+        srgb = np.asarray(mesh.visual.vertex_colors)[faces][:, :, :3].mean(axis=1) / 255.0
+    elif kind == "texture" and mesh.visual.uv is not None and _picture(mesh) is not None:
+        picture = np.asarray(_picture(mesh).convert("RGB"))
+        u, v = (np.asarray(mesh.visual.uv)[faces].mean(axis=1) % 1.0).T
+        rows = ((1.0 - v) * len(picture)).astype(int).clip(0, len(picture) - 1)
+        columns = (u * picture.shape[1]).astype(int).clip(0, picture.shape[1] - 1)
+        srgb = picture[rows, columns] / 255.0
+    else:
+        return None
+    # IEC 61966-2-1
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)
+
+
+def _picture(mesh: Any) -> Any:
+    material = mesh.visual.material
+    return getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+
+
+def support_disk(diameter_mm: float, cell_mm: float = SUPPORT_CELL_MM) -> Surface:
+    """The support in its own frame, z up: rings of nearly equilateral triangles, 6 i points on ring i."""
+    rings = max(1, round(0.5 * diameter_mm / cell_mm))
+    parts = []
+    inner = np.zeros((1, 3))
+    for ring in range(1, rings + 1):
+        angle = 2 * np.pi * np.arange(6 * ring) / (6 * ring)
+        outer = 0.5 * diameter_mm * ring / rings * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+        sector, step = np.divmod(np.arange(6 * ring), ring)
+        within = sector * (ring - 1) + step
+        next_out = np.roll(outer, -1, axis=0)
+        parts.append(np.stack([inner[within % len(inner)], outer, next_out], axis=1))
+        gap = step < ring - 1
+        ends = inner[(within[gap] + 1) % len(inner)]
+        parts.append(np.stack([inner[within[gap]], next_out[gap], ends], axis=1))
+        inner = outer
+    corners = np.concatenate(parts)
+    return Surface(corners, (DIBOND,), np.zeros(len(corners), np.int32))
+
+
+def build_scene(things: Sequence[tuple[Surface, Transform]]) -> Scene:
+    """Scene of surfaces, each with its `base_from_surface`."""
+    counts = [len(surface.corners_mm) for surface, _ in things]
+    total = sum(counts)
+    # Embree reads vertices by 16 bytes: one float more than the last corner's three.
+    corners = np.zeros(9 * total + 1, np.float32)[:-1].reshape(total, 3, 3)
+    material = np.empty(total, np.int32)
+    tint = np.ones((total, 3), np.float32) if any(s.tint is not None for s, _ in things) else None
+    detailed = any(surface.normals is not None for surface, _ in things)
+    normals = np.empty((total, 3), np.float32) if detailed else None
+    materials: list[Material] = []
+    first = 0
+    for (surface, base_from_surface), count in zip(things, counts, strict=True):
+        part = slice(first, first + count)
+        # In chunks: a scan of 40 million triangles must not stand in memory twice in float64.
+        for start in range(0, count, _CHUNK):
+            piece = surface.corners_mm[start : start + _CHUNK]
+            placed = piece.reshape(-1, 3) @ base_from_surface[:3, :3].T + base_from_surface[:3, 3]
+            corners[first + start : first + start + len(piece)] = placed.reshape(-1, 3, 3)
+        material[part] = surface.material + len(materials)
+        materials += surface.materials
+        if tint is not None and surface.tint is not None:
+            tint[part] = surface.tint
+        if normals is not None:
+            own = surface.normals if surface.normals is not None else _flat_normals(surface.corners_mm)
+            normals[part] = own @ base_from_surface[:3, :3].T
+        first += count
+    table = np.array([[*m.diffuse, *m.f0, m.roughness] for m in materials], np.float64).reshape(-1, 7)
+    return Scene(corners, material, table, tint, normals)
+
+
+def _flat_normals(corners_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    cross = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    length = np.linalg.norm(cross, axis=1, keepdims=True)
+    flat: NDArray[np.float64] = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0)
+    return flat

@@ -1,0 +1,147 @@
+"""Things that a world puts into its scene beside the plan's object: targets of calibration, samples.
+
+Listed in the rig under `world: settings: things:`, each with its kind, its measures and where it stands on the
+support. The controller knows nothing of them: keep views clear of what is tall.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from coupole.geometry import Transform, transform
+from sim.scene.surface import Surface
+
+_Length = Annotated[float, Field(gt=0)]
+_Vector = tuple[float, float, float]
+Poses = NDArray[np.float64]
+
+
+class _Thing(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    translation_mm: _Vector = (0.0, 0.0, 0.0)
+    abc_deg: _Vector = (0.0, 0.0, 0.0)
+    """Where it stands, in the support frame, as in a plan's poses."""
+
+    def support_from_thing(self) -> Transform:
+        return transform(self.translation_mm, self.abc_deg)
+
+
+class CharucoBoard(_Thing):
+    """Defaults are those of `sim.objects.charuco.Charuco`."""
+
+    kind: Literal["charuco_board"]
+    squares_x: Annotated[int, Field(ge=3)] = 12
+    squares_y: Annotated[int, Field(ge=3)] = 9
+    square_mm: _Length = 16.0
+    marker_mm: _Length = 12.0
+    dictionary: str = "DICT_5X5_250"
+    thickness_mm: _Length = 4.0
+    margin_mm: _Length = 5.0
+
+    def surface(self) -> Surface:
+        from sim.objects.charuco import Charuco, charuco_board
+
+        measures = {field.name: getattr(self, field.name) for field in dataclasses.fields(Charuco)}
+        return charuco_board(Charuco(**measures))
+
+
+class Sphere(_Thing):
+    kind: Literal["chrome_ball", "glossy_sphere"]
+    diameter_mm: _Length = 30.0
+
+    def surface(self) -> Surface:
+        from sim.objects import shapes, standards
+
+        if self.kind == "chrome_ball":
+            return standards.chrome_ball(self.diameter_mm)
+        return shapes.glossy_sphere(self.diameter_mm / 2)
+
+
+class Stickers(BaseModel):
+    """The scanner's retro-reflective targets, stuck where the surface is flat enough."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    count: Annotated[int, Field(ge=1)]
+    """How many there are now."""
+    seed: int = 1
+    diameter_mm: _Length = 6.0
+    gap_mm: _Length = 0.8
+    """As in `sim.objects.standards.sticker_poses`, which tells where they are."""
+    new: Annotated[int, Field(ge=0)] = 0
+    """So many of them were put on after the scan: its table does not know them."""
+    fallen: Annotated[int, Field(ge=0)] = 0
+    """So many more there were then, which have come off."""
+
+    @model_validator(mode="after")
+    def _some_stayed(self) -> Stickers:
+        if self.new > self.count:
+            raise ValueError(f"`new` is {self.new}, but there are only {self.count} stickers")
+        return self
+
+    def on(self, surface: Surface) -> Surface:
+        """The surface with its stickers as it is now. Raises InputError if it has no room for so many."""
+        from sim.objects.standards import stuck_on
+
+        return stuck_on(surface, self._poses(surface)[: self.count], diameter_mm=self.diameter_mm)
+
+    def poses_when_scanned(self, surface: Surface) -> Poses:
+        """[n, 4, 4] of the stickers that the scanner saw, in the thing's frame."""
+        return self._poses(surface)[self.new :]
+
+    def _poses(self, surface: Surface) -> Poses:
+        """Of all that ever were on it: first the new ones, last those that fell off."""
+        from sim.objects.standards import sticker_poses
+
+        total = self.count + self.fallen
+        return sticker_poses(surface, total, self.seed, diameter_mm=self.diameter_mm, gap_mm=self.gap_mm)
+
+
+class Sample(_Thing):
+    """A sample of a material, at the measures of its generator."""
+
+    kind: Literal[
+        "spectralon_tile",
+        "grey_card",
+        "gilt_step_wedge",
+        "paint_wedge",
+        "makie_tile",
+        "nashiji_slab",
+        "fabric",
+        "sculpted_relief",
+    ]
+    stickers: Stickers | None = None
+
+    def surface(self) -> Surface:
+        return self.bare() if self.stickers is None else self.stickers.on(self.bare())
+
+    def bare(self) -> Surface:
+        """Without its stickers."""
+        from sim.objects import fabric, shapes, standards, urushi, wedges
+
+        generators: dict[str, Callable[[], Surface]] = {
+            "spectralon_tile": standards.spectralon_tile,
+            "grey_card": standards.grey_card,
+            "gilt_step_wedge": wedges.gilt_step_wedge,
+            "paint_wedge": wedges.paint_wedge,
+            "makie_tile": urushi.makie_tile,
+            "nashiji_slab": urushi.nashiji_slab,
+            "fabric": fabric.fabric,
+            "sculpted_relief": shapes.sculpted_relief,
+        }
+        return generators[self.kind]()
+
+
+Thing = Annotated[CharucoBoard | Sphere | Sample, Field(discriminator="kind")]
+
+
+def placed(things: tuple[Thing, ...], base_from_support: Transform) -> list[tuple[Surface, Transform]]:
+    """Surfaces and where they are in the base frame."""
+    return [(thing.surface(), np.asarray(base_from_support @ thing.support_from_thing())) for thing in things]

@@ -1,0 +1,145 @@
+"""The world's heart: one thread that works off timed events and input, in the order of world time.
+
+Stand-ins do not own threads. They ask for callbacks: at a world time (`at`, `after`), when a file descriptor
+can be read (`add_reader`), or from a worker thread (`call_threadsafe`). A timed callback sees its own world
+time as `now_ns`, exactly, however late the machine gets round to it; so what happens in the world does not
+depend on the machine's load, only how long it takes to watch.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import os
+import select
+import selectors
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from sim.world.clock import FOREVER_NS, ClockWriter
+
+_MAX_LAG_S = 0.02
+"""A world further behind its pace than this (machine time) slips instead of catching up."""
+_TIMERS_PER_POLL = 16
+_IDLE_TICK_NS = 10_000_000
+
+
+class Readable(Protocol):
+    def fileno(self) -> int: ...
+
+
+@dataclass(order=True)
+class Timer:
+    """One callback to come; `cancel()` makes it not happen."""
+
+    t_ns: int
+    order: int
+    callback: Callable[[], None] | None = field(compare=False)
+
+    def cancel(self) -> None:
+        self.callback = None
+
+
+class Reactor:
+    """Runs the world until `stop()`."""
+
+    def __init__(self, clock: ClockWriter) -> None:
+        self.clock = clock
+        self._now_ns = 0
+        self._timers: list[Timer] = []
+        self._order = itertools.count()
+        self._selector = selectors.DefaultSelector()
+        self._calls: deque[Callable[[], None]] = deque()
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        self._selector.register(self._wake_read, selectors.EVENT_READ, self._run_calls)
+        self._stopped = threading.Event()
+
+    @property
+    def now_ns(self) -> int:
+        """World time of what is being worked off."""
+        return self._now_ns
+
+    def at(self, t_ns: int, callback: Callable[[], None]) -> Timer:
+        """Call back at world time `t_ns` (at once if that is past)."""
+        timer = Timer(max(t_ns, self._now_ns), next(self._order), callback)
+        heapq.heappush(self._timers, timer)
+        return timer
+
+    def after(self, seconds: float, callback: Callable[[], None]) -> Timer:
+        """Call back `seconds` of world time from now."""
+        return self.at(self._now_ns + round(seconds * 1e9), callback)
+
+    def add_reader(self, readable: Readable | int, callback: Callable[[], None]) -> None:
+        """Call back whenever `readable` has bytes, or has come to its end."""
+        self._selector.register(readable, selectors.EVENT_READ, callback)
+
+    def remove_reader(self, readable: Readable | int) -> None:
+        self._selector.unregister(readable)
+
+    def call_threadsafe(self, callback: Callable[[], None]) -> None:
+        """Have the reactor's thread call back soon; for worker threads."""
+        self._calls.append(callback)
+        os.write(self._wake_write, b"!")
+
+    @staticmethod
+    def hold_for(readable: Readable, machine_s: float) -> bool:
+        """Let world time stand still until `readable` has bytes; False if it had none after `machine_s`.
+
+        This is how a stand-in walks in lock-step with a client: the world waits for the client's answer.
+        """
+        return bool(select.select([readable], [], [], machine_s)[0])
+
+    def stop(self) -> None:
+        """End `run()`; safe from any thread and from signal handlers."""
+        self._stopped.set()
+        os.write(self._wake_write, b"!")
+
+    def run(self) -> None:
+        """Work until stopped."""
+        while not self._stopped.is_set():
+            next_ns = self._next_ns()
+            wait_s = self.clock.machine_s_until(next_ns)
+            for key, _ in self._selector.select(max(0.0, wait_s)):
+                self._now_ns = max(self._now_ns, min(self.clock.paced_ns(), next_ns))
+                key.data()
+            self._run_due_timers()
+            self._publish()
+        self.clock.close()
+
+    def _next_ns(self) -> int:
+        while self._timers and self._timers[0].callback is None:
+            heapq.heappop(self._timers)
+        tick_ns = self._now_ns + _IDLE_TICK_NS
+        return min(self._timers[0].t_ns, tick_ns) if self._timers else tick_ns
+
+    def _run_due_timers(self) -> None:
+        paced_ns = self.clock.paced_ns()
+        for _ in range(_TIMERS_PER_POLL):
+            if self._next_ns() > paced_ns:
+                break
+            if not self._timers or self._timers[0].t_ns > self._next_ns():
+                self._now_ns = self._next_ns()
+                continue
+            timer = heapq.heappop(self._timers)
+            self._now_ns = max(self._now_ns, timer.t_ns)
+            if timer.callback is not None:
+                timer.callback()
+
+    def _publish(self) -> None:
+        next_ns = self._next_ns()
+        max_lag_ns = int(_MAX_LAG_S * self.clock.speed * 1e9)
+        if self.clock.paced_ns() - next_ns > max_lag_ns:
+            self.clock.slip_to(next_ns)
+        self.clock.publish(min(next_ns, FOREVER_NS))
+
+    def _run_calls(self) -> None:
+        try:
+            os.read(self._wake_read, 4096)
+        except BlockingIOError:
+            return
+        while self._calls:
+            self._calls.popleft()()

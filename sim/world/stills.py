@@ -1,0 +1,44 @@
+"""Pictures of a simulated cell without a world round it: no clock, no wires, just what the camera would see."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.geometry import Transform
+from sim.devices.arm_bodies import NONE, tool_capsules
+from sim.devices.camera_body import Exposed
+from sim.optics.photographer import Photographer
+from sim.world.config import Config
+
+
+class Stills:
+    """A camera that stands wherever it is wanted; `config` is that of the world (`sim.world.config.Config`)."""
+
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        checked = Config.model_validate(config)
+        self._photographer = Photographer(checked.scene, checked.photographed, checked.settings)
+        self._tool, self._arm_shadows = checked.scene.tool, checked.settings.arm_shadows
+        self._shape = (checked.camera.height_px, checked.camera.width_px)
+        self._taken = 0
+
+    def take(
+        self,
+        base_from_flange: Transform,
+        *,
+        leds: Sequence[int],
+        panels: Sequence[int],
+        exposure_s: float,
+        gain: float = 1.0,
+    ) -> NDArray[np.uint16]:
+        """A RAW frame [h, w], DN; LEDs and panels shine throughout, and of the arm only the tool is there."""
+        pixels = np.empty(self._shape, np.uint16)
+        shining = dict.fromkeys(leds, exposure_s)
+        tool = tool_capsules(base_from_flange, self._tool) if self._arm_shadows else NONE
+        exposed = Exposed(shining, list(panels), exposure_s, gain, self._taken, base_from_flange, tool)
+        self._photographer.render(pixels, exposed)
+        self._taken += 1
+        return pixels

@@ -1,0 +1,260 @@
+"""The simulated cell: one process, one reactor, and the stand-ins that share its state.
+
+`python -m sim.world.world` reads its configuration as one JSON line from standard input, prints its endpoints as
+one JSON line and serves until standard input closes (its parent is gone), a signal comes or it is told to stop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from coupole.devices import NO_LIGHT
+from sim.devices import camera_stand_in, gige_camera, kuka_controller, ledbox_firmware, robot
+from sim.devices.arm_bodies import NONE, Capsules, arm_capsules, tool_capsules
+from sim.devices.camera_body import Exposed
+from sim.optics.led_light import Flashes
+from sim.optics.photographer import Photographer
+from sim.world import faults as script
+from sim.world.clock import ClockWriter
+from sim.world.config import CameraConfig, Config
+from sim.world.lighting import Lighting
+from sim.world.reactor import Reactor
+
+SCRATCH = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gettempdir())
+
+
+class World:
+    """Stand-ins and what joins them: the trigger cable, the light, the arm that carries the camera_stand_in."""
+
+    def __init__(self, config: Config, folder: Path) -> None:
+        settings = config.settings
+        self.clock = ClockWriter(
+            folder / "clock", settings.speed, hurry_only_when_told=settings.hurry_only_when_told
+        )
+        self.reactor = Reactor(self.clock)
+        self.lighting = Lighting()
+        self._photographer = Photographer(config.scene, config.photographed, settings)
+        self._flashes = Flashes(settings.leds)
+        self._robot_settings, self._camera_settings = settings.robot, settings.camera
+        self._tool, self._arm_shadows = config.scene.tool, settings.arm_shadows
+        self.robot, robot_endpoint = robot.build(self.reactor, settings.robot)
+        self.camera, camera_endpoint = camera_stand_in.build(
+            self.reactor,
+            settings.camera,
+            folder,
+            frame_format={
+                "height_px": config.camera.height_px,
+                "width_px": config.camera.width_px,
+                "bit_depth": config.camera.bit_depth,
+                "bayer_pattern": config.camera.bayer_pattern,
+                "black_dn": config.camera.black_dn,
+                "white_dn": self._photographer.sensor.white_dn,
+            },
+            readout_us=1e6 / config.camera.max_frames_per_s,
+            exposure_gap_us=config.camera.exposure_gap_us,
+            lighting=self.lighting,
+            pose=self.robot.true_base_from_flange,
+            render=self._photographer.render,
+            arm=self._arm,
+        )
+        self.box = ledbox_firmware.LedBoxFirmware(
+            self.reactor,
+            settings.ledbox,
+            on_edge=self.camera.edge,
+            on_light=self._light,
+            on_dark=self.lighting.dark,
+            on_panel=self.lighting.panel,
+            ready=self.camera.ready,
+        )
+        self._control = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._control.bind(str(folder / "control"))
+        self._control.listen(4)
+        self.reactor.add_reader(self._control, self._accept)
+        self.box.on_edge_counted = self._edge_counted
+        self._faults_at_edge: dict[int, list[script.Fault]] = {}
+        for fault in settings.faults:
+            self._schedule(fault)
+        self._warm_up(config.camera)
+        self.endpoints = {
+            "ledbox": {"port": self.box.port},
+            "robot": {"kind": settings.robot.kind, **robot_endpoint},
+            "camera": {
+                "kind": settings.camera.kind,
+                **camera_endpoint,
+                "scaling": f"white at the support's centre reaches 60 % of full scale in "
+                f"{config.camera.nominal_exposure_us} us under the median LED",
+            },
+            "clock": {"path": str(folder / "clock"), "speed": settings.speed},
+            "control": {"address": str(folder / "control")},
+            "pid": os.getpid(),
+        }
+
+    def _warm_up(self, camera: CameraConfig) -> None:
+        """Compile the renderer, and lay out what it keeps, before anybody waits for a frame."""
+        led = int(self._photographer.leds.ids[0])
+        lit = Exposed({led: 1e-3}, [1], 1e-3, 1.0, 0, self.robot.true_base_from_flange())
+        self._photographer.render(np.zeros((camera.height_px, camera.width_px), np.uint16), lit)
+
+    # -- the cables ---------------------------------------------------------------------------------------
+
+    def _arm(self) -> Capsules:
+        """What of arm and tool is in the way of light."""
+        if not self._arm_shadows:
+            return NONE
+        tool = tool_capsules(self.robot.true_base_from_flange(), self._tool)
+        if self._robot_settings.kind == "ur":
+            return tool
+        return np.concatenate([arm_capsules(self.robot.joints_deg), tool])
+
+    def _light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
+        """The box drives an LED, which shines as bright as it can now."""
+        if led != NO_LIGHT:
+            flux = self._flashes.flux(led, self.box.temperature_of_led_c(led))
+            self.lighting.light(led, t_on_ns, t_off_ns, flux)
+
+    def _edge_counted(self, number: int) -> None:
+        """The box sent, or should have sent, edge `number`: faults that wait for it happen."""
+        for fault in self._faults_at_edge.pop(number, ()):
+            self._happen(fault)
+
+    # -- faults -------------------------------------------------------------------------------------------
+
+    def _schedule(self, fault: script.Fault) -> None:
+        if isinstance(fault, script.When) and fault.at_edge is not None:
+            self._faults_at_edge.setdefault(fault.at_edge, []).append(fault)
+        elif isinstance(fault, script.When) and fault.at_s is not None:
+            self.reactor.at(round(fault.at_s * 1e9), lambda: self._happen(fault))
+        else:
+            self._happen(fault)
+
+    def _happen(self, fault: script.Fault) -> None:  # noqa: PLR0912
+        match fault:
+            case script.DropTrigger():
+                self.box.drop_edge(fault.edge)
+            case script.DoubleTrigger():
+                self.box.double_edge(fault.edge, fault.delay_us)
+            case script.LostTransfer():
+                self.camera.lose_frames.add(fault.frame)
+            case script.MuteBox():
+                self.box.mute()
+            case script.CutWire():
+                self.box.unplug()
+            case script.UnplugCamera():
+                self.camera.unplug()
+            case script.CameraControlLoss():
+                assert isinstance(self.camera, gige_camera.GigeCamera)  # others are refused before
+                self.camera.lose_control()
+            case script.OverTemperature():
+                self.box.over_temperature(fault.board)
+            case script.DeadLed():
+                self.box.kill_led(fault.led)
+            case script.FlickeringLed():
+                self._flashes.unsteady[fault.led] = fault.rms
+            case script.EmergencyStop():
+                self.robot.estop()
+            case script.LateRsi():
+                assert isinstance(self.robot, kuka_controller.KukaController)  # others are refused before
+                self.robot.late(fault.cycles)
+            case script.RsiLinkLoss():
+                self.robot.lose_link(fault.seconds)
+            case script.NudgeArm():
+                self.robot.nudge([fault.deg] * 6, fault.seconds)
+
+    # -- control ------------------------------------------------------------------------------------------
+
+    def _accept(self) -> None:
+        client, _ = self._control.accept()
+        self.reactor.add_reader(client, lambda: self._on_command(client))
+
+    def _on_command(self, client: socket.socket) -> None:
+        try:
+            data = client.recv(4096)
+            if data:
+                client.send(json.dumps(self._do(json.loads(data))).encode())
+                return
+        except (ConnectionResetError, BrokenPipeError):  # killed before it read the answer
+            pass
+        self.reactor.remove_reader(client)
+        client.close()
+
+    def _do(self, command: dict[str, Any]) -> dict[str, Any]:
+        match command["do"]:
+            case "state":
+                now_ns = self.reactor.now_ns
+                return {
+                    "t_s": now_ns / 1e9,
+                    "shining": self.lighting.shining(now_ns),
+                    "panels": self.lighting.panels(now_ns),
+                    "arm_moving": self.robot.moving,
+                    "joints_deg": list(self.robot.joints_deg),
+                    "camera_armed": self.camera.armed,
+                }
+            case "fault":
+                fault = OneFault.model_validate({"fault": command["fault"]}).fault
+                if why := robot.impossible(fault, self._robot_settings) or camera_stand_in.impossible(
+                    fault, self._camera_settings
+                ):
+                    return {"error": why}
+                self._schedule(fault)
+                return {}
+            case "reset_robot":
+                self.robot.reset()
+                return {}
+            case "stop":
+                self.reactor.stop()
+                return {}
+            case other:
+                return {"error": f"unknown command {other}"}
+
+    def close(self) -> None:
+        self.camera.close()
+        self.box.close()
+        self.robot.close()
+        self._control.close()
+
+
+class OneFault(BaseModel):
+    """A fault on its own, for the control line."""
+
+    fault: script.Fault
+
+
+def main() -> int:
+    """Serve one world; see the module's text."""
+    config = Config.model_validate_json(sys.stdin.readline())
+    folder = Path(tempfile.mkdtemp(prefix="coupole-world-", dir=SCRATCH))
+    try:
+        world = World(config, folder)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: world.reactor.stop())
+        threading.Thread(target=_stop_when_parent_is_gone, args=(world.reactor,), daemon=True).start()
+        print(json.dumps(world.endpoints), flush=True)
+        world.reactor.run()
+        world.close()
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return 0
+
+
+def _stop_when_parent_is_gone(reactor: Reactor) -> None:
+    with contextlib.suppress(OSError):
+        while os.read(sys.stdin.fileno(), 4096):
+            pass
+    reactor.stop()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,27 +1,25 @@
-"""One call to a device at a time, whatever thread it comes from, in the order of asking."""
+"""A lock that serves threads in the order in which they asked."""
 
 from __future__ import annotations
 
-import contextlib
 import threading
-from collections.abc import Iterator
+from types import TracebackType
 
 
-class Turns:
-    """A lock that is fair: who waits goes before the thread that held it last and wants it again.
+class FairLock:
+    """A thread that waits goes before the thread that held the lock last and wants it again.
 
-    So a thread that polls a device without a pause cannot shut the others out, as it could with a plain lock.
+    With a plain lock a thread that polls a device without a pause could shut the others out. Not re-entrant.
     """
 
     def __init__(self) -> None:
-        self._queue, self._busy = threading.Lock(), threading.Lock()
+        self._queue, self._held = threading.Lock(), threading.Lock()
 
-    @contextlib.contextmanager
-    def mine(self) -> Iterator[None]:
-        """The device is the caller's. Not to be entered twice by one thread."""
+    def __enter__(self) -> None:
         with self._queue:
-            self._busy.acquire()
-        try:
-            yield
-        finally:
-            self._busy.release()
+            self._held.acquire()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._held.release()

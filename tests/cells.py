@@ -24,6 +24,7 @@ import numpy as np
 import trimesh
 import xxhash
 from numpy.typing import NDArray
+from places import REPO
 from ruamel.yaml import YAML
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -33,7 +34,6 @@ from coupole.preflight.job import read_job
 from coupole.storage import journal
 from sim.world.client import World
 
-REPO = Path(__file__).resolve().parent.parent
 BLACK_DN = 64
 PIXEL_STEP = 3
 """Of the object's pixels every so-manieth is looked at to tell LEDs apart."""

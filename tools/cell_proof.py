@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coupole.appearance.render.led_squares import read_leds
 from coupole.calibration.adjustment import coverage_factor
 from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses, read_arm
 from coupole.calibration.leds.equations import Stated as StatedOfLeds
@@ -26,7 +27,7 @@ from coupole.calibration.lens.images import find_board
 from coupole.calibration.lens.workflow import camera_from, hand_eye_from
 from coupole.calibration.posed_camera import CameraPrior, read_posed_camera
 from coupole.calibration.record import Record, write_record
-from coupole.calibration.request import Wish
+from coupole.calibration.request import Request
 from coupole.calibration.sources import About
 from coupole.calibration.stickers.mesh_to_robot import Stated as StatedOfMesh
 from coupole.calibration.stickers.sources import Scan, find_all_stickers, read_scan
@@ -52,7 +53,6 @@ from random_cells import (
 from sim.devices.kuka_kinematics import flange_pose
 from sim.devices.scanner import export_scan, scanner_from_thing
 from sim.optics.dome import as_built
-from sim.scene.scene import read_leds
 
 STEPS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
 
@@ -80,18 +80,18 @@ class Proof:
 def prove_cell(seed: int, *, at: Postures, width_px: int, samples: int, absolute: bool) -> Proof:
     """Render, find, adjust, and compare what the records say with the truth."""
     cell = RandomCell(seed, width_px, samples, absolute)
-    wish = Wish(f"cell{seed}", datetime.now(UTC))
+    request = Request(f"cell{seed}", datetime.now(UTC))
     model: Arm | None = planning_arm(cell.cell.rig) if absolute else None
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        camera, hand_eye = _camera_and_hand_eye(cell, at, wish, model)
+        camera, hand_eye = _camera_and_hand_eye(cell, at, request, model)
         write_record(folder / "hand-eye.yaml", hand_eye)
         prior = read_posed_camera(folder / "hand-eye.yaml", None, About(simulated=True), cell.size_px)
         arm = None if model is None else read_arm(folder / "hand-eye.yaml", model)
         proof = Proof([*_of_camera(cell, camera), *_of_hand_eye(cell, hand_eye)], {})
         _far(proof, "camera_mm", cell, *_camera_centres_mm(cell, at, prior, arm))
-        _prove_leds(proof, cell, at, wish, prior, arm)
-        _prove_mesh(proof, cell, at, wish, prior, arm, folder)
+        _prove_leds(proof, cell, at, request, prior, arm)
+        _prove_mesh(proof, cell, at, request, prior, arm, folder)
     return proof
 
 
@@ -117,7 +117,9 @@ def _camera_centres_mm(
     return (poses @ prior.flange_from_camera)[:, :3, 3], true[:, :3, 3]
 
 
-def _camera_and_hand_eye(cell: RandomCell, at: Postures, wish: Wish, model: Arm | None) -> tuple[Record, Record]:
+def _camera_and_hand_eye(
+    cell: RandomCell, at: Postures, request: Request, model: Arm | None
+) -> tuple[Record, Record]:
     place = cell.place(0)
     thing = {"kind": "charuco_board", "square_mm": SQUARE_MM, "marker_mm": MARKER_MM, "thickness_mm": THICKNESS_MM}
     sources = Photographs(cell, at.board, 0, thing | place).sources()
@@ -127,8 +129,8 @@ def _camera_and_hand_eye(cell: RandomCell, at: Postures, wish: Wish, model: Arm 
     found = find_board(board, sources)
     off = (0.3, 0.02) if cell.absolute else (0.0, 1e-5)
     robot = RobotNoise(absolute_mm=off[0], absolute_deg=off[1])
-    camera = camera_from(found, sources, "brown4", wish)[1].record
-    return camera, hand_eye_from(found, sources, board, "brown4", wish, robot=robot, arm=model)[2].record
+    camera = camera_from(found, sources, "brown4", request)[1].record
+    return camera, hand_eye_from(found, sources, board, "brown4", request, robot=robot, arm=model)[2].record
 
 
 def _of_camera(cell: RandomCell, record: Record) -> Iterator[Judged]:
@@ -155,7 +157,7 @@ def _of_hand_eye(cell: RandomCell, record: Record) -> Iterator[Judged]:
 
 
 def _prove_leds(
-    proof: Proof, cell: RandomCell, at: Postures, wish: Wish, prior: CameraPrior, arm: CalibratedArm | None
+    proof: Proof, cell: RandomCell, at: Postures, request: Request, prior: CameraPrior, arm: CalibratedArm | None
 ) -> None:
     random = np.random.default_rng((cell.seed, 4))
     some = at.boards_of_leds[int(random.integers(len(at.boards_of_leds)))]
@@ -170,7 +172,7 @@ def _prove_leds(
     photographs = Photographs(cell, at.leds[views], 1000)
     truth = as_built(read_leds(photographs.truth.scene.leds), photographs.truth.settings.dome)
     stated = StatedOfLeds(tolerance_mm=0.05)
-    found = leds_from(photographs.leds(table, lit), table, prior, wish, stated=stated, arm=arm).geometry
+    found = leds_from(photographs.leds(table, lit), table, prior, request, stated=stated, arm=arm).geometry
     row_of = {int(led): row for row, led in enumerate(truth.ids)}
     at_truth = [row_of[int(led)] for led in table.ids]
     own = cell.own_base(np.eye(4))
@@ -197,7 +199,7 @@ def _prove_mesh(
     proof: Proof,
     cell: RandomCell,
     at: Postures,
-    wish: Wish,
+    request: Request,
     prior: CameraPrior,
     arm: CalibratedArm | None,
     folder: Path,
@@ -209,7 +211,7 @@ def _prove_mesh(
     depth_mm = (200.0, 900.0)
     images = find_all_stickers(sources, prior.lens, diameter_mm=STICKER_MM, depth_mm=depth_mm)
     stated = StatedOfMesh(scanner_mm=0.03, robot_mm=0.03, robot_deg=0.003)
-    found = mesh_from(images, sources, scan, prior, wish, stated=stated, depth_mm=depth_mm, arm=arm).pose
+    found = mesh_from(images, sources, scan, prior, request, stated=stated, depth_mm=depth_mm, arm=arm).pose
     in_support = transform(place["translation_mm"], place["abc_deg"])
     true = cell.base_from_support @ in_support @ inverse(scanner_from_thing(cell.seed))
     u = np.sqrt(np.diag(found.covariance))

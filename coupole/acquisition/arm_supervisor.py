@@ -18,7 +18,7 @@ from coupole.errors import DeviceFault, DeviceLost, DeviceRefused, Interrupted, 
 from coupole.geometry import Transform
 from coupole.kinematics import move_duration_s
 from coupole.motion.itinerary import Itinerary, Visit, arm_of
-from coupole.motion.path_deviation import TUBE_MM, off_the_way_mm
+from coupole.motion.path_deviation import PATH_TOLERANCE_MM, path_deviation_mm
 from coupole.motion.path_planner import Joints
 from coupole.plan.shots import ViewPose
 from coupole.preflight.job import Job
@@ -32,21 +32,21 @@ class ArmMovedError(Exception):
 
 
 @dataclass(frozen=True)
-class Stand:
-    """Where the arm was measured to stand, still."""
+class SettledPose:
+    """Where the arm was measured to settled, still."""
 
     arm: ArmState
     base_from_camera: Transform
 
 
-class Posing:
+class ArmSupervisor:
     """One session's moves. Every method that waits gives way to the operator's stop and to the arm's faults."""
 
     def __init__(self, job: Job, cell: OpenedCell, control: Control) -> None:
         self._job, self._robot, self._clock, self._control = job, cell.robot, cell.clock, control
         self._motion = job.cell.rig.motion
         self._arm = arm_of(job.cell.rig)
-        self._stand: Stand | None = None
+        self._settled: SettledPose | None = None
         self._from_deg = np.zeros(6)
         """Where the next leg begins."""
 
@@ -62,9 +62,9 @@ class Posing:
         """Raise Interrupted if the operator said stop, DeviceFault if the arm is in a fault."""
         self._watched()
 
-    def go(self, visit: Visit, meanwhile: Callable[[], None]) -> Stand:
+    def go(self, visit: Visit, meanwhile: Callable[[], None]) -> SettledPose:
         """Follow the leg of a visit, doing something `meanwhile`; where the arm stands then, measured."""
-        self._stand = None
+        self._settled = None
         way = (self._from_deg, *visit.leg.waypoints)
         self._keep_to(way, self._watched(), "before it set out")
         for here_deg, there_deg in pairwise(way):
@@ -78,14 +78,14 @@ class Posing:
         self._from_deg = way[-1]
         return self._settle()
 
-    def stand_again(self) -> Stand:
+    def return_to_view(self) -> SettledPose:
         """Bring an arm that was moved back to where it stood; where it stands now, measured anew.
 
         Raises DeviceRefused where something is in the way.
         """
-        assert self._stand is not None
+        assert self._settled is not None
         here_deg = np.array(self._robot.measured().joints_deg)
-        there_deg = np.array(self._stand.arm.joints_deg)
+        there_deg = np.array(self._settled.arm.joints_deg)
         contact = self._job.bodies.contact_on_the_way(here_deg, there_deg)
         if contact is not None:
             raise DeviceRefused(
@@ -100,9 +100,9 @@ class Posing:
     def heard_at_rest(self) -> int:
         """When the arm was last heard of, on the rig's clock; raises ArmMovedError if it does not stand where
         it was measured."""
-        assert self._stand is not None
+        assert self._settled is not None
         arm = self._watched()
-        off_deg = float(np.abs(np.subtract(arm.joints_deg, self._stand.arm.joints_deg)).max())
+        off_deg = float(np.abs(np.subtract(arm.joints_deg, self._settled.arm.joints_deg)).max())
         if off_deg > self._motion.still_deg:
             raise ArmMovedError(f"the arm moved by {off_deg:.3f} deg during a burst")
         return arm.t_ns
@@ -141,18 +141,18 @@ class Posing:
 
     def _keep_to(self, way: Sequence[Joints], arm: ArmState, when: str) -> None:
         """Stop an arm that is not where its leg was found clear."""
-        off_mm = off_the_way_mm(way, np.array(arm.joints_deg))
-        if off_mm <= TUBE_MM:
+        off_mm = path_deviation_mm(way, np.array(arm.joints_deg))
+        if off_mm <= PATH_TOLERANCE_MM:
             return
         self._robot.stop()
         raise DeviceFault(
             "robot",
-            expected=f"all of the arm within {TUBE_MM:g} mm of the way that was found clear",
+            expected=f"all of the arm within {PATH_TOLERANCE_MM:g} mm of the way that was found clear",
             happened=f"{when} it was up to {off_mm:.1f} mm beside it and has been stopped",
             remedy="See to the cell; the controller may move by other rules than straight lines of its axes.",
         )
 
-    def _settle(self) -> Stand:
+    def _settle(self) -> SettledPose:
         arm = self._robot.wait_settled()
-        self._stand = Stand(arm, arm.base_from_flange @ self._job.cell.rig.flange_from_camera.matrix())
-        return self._stand
+        self._settled = SettledPose(arm, arm.base_from_flange @ self._job.cell.rig.flange_from_camera.matrix())
+        return self._settled

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.acquisition.arm_supervisor import Posing
+from coupole.acquisition.arm_supervisor import ArmSupervisor
 from coupole.acquisition.cell import OpenedCell
 from coupole.acquisition.dose import DoseMeter
-from coupole.acquisition.frame_grabber import Intake, buffers_for, memory_for_buffers
+from coupole.acquisition.frame_grabber import FrameGrabber, buffers_for, memory_for_buffers
 from coupole.acquisition.frame_matching import UNLABELLED, FaultModel, Match, match
 from coupole.acquisition.observer import Outcome
 from coupole.acquisition.recorder import Recorder
@@ -39,7 +39,7 @@ _BOX_JITTER_US = 20.0
 _ONE_SHOT_BUFFERS = 8
 _UNCOUNTED = -1
 """A camera that does not count its exposures: one frame came while the light shone, which must do."""
-_LIT_IN_VAIN = STATUS_LED_OPEN | STATUS_OVER_TEMPERATURE
+_INVALID_EXPOSURE = STATUS_LED_OPEN | STATUS_OVER_TEMPERATURE
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,11 @@ NOTHING_TO_MATCH = Match(_NONE, _NONE > 0, _NONE > 0, _NONE > 0, ambiguous=False
 
 
 @dataclass
-class _UnderWay:
+class _RunningBurst:
     """A burst that runs: what box and camera have said of it so far."""
 
     burst: Burst
-    intake: Intake
+    grabber: FrameGrabber
     arm_before: ArmState
     arm_after: ArmState | None = None
     """Measured after the last frame; None while it runs, and where the arm did not stand still."""
@@ -70,14 +70,14 @@ class _UnderWay:
     """Frames that the recorder has been told of."""
 
 
-class Firing:
+class BurstRunner:
     """Fires bursts at an arm that stands. `tell(burst, step)` is called as it goes."""
 
     def __init__(
         self,
         cell: OpenedCell,
         recorder: Recorder,
-        posing: Posing,
+        arm: ArmSupervisor,
         dose: DoseMeter,
         outcome: Outcome,
         *,
@@ -86,7 +86,7 @@ class Firing:
         tell: Callable[[Burst, int], None],
         wait_while_paused: Callable[[], None],
     ) -> None:
-        self._cell, self._recorder, self._posing, self._dose = cell, recorder, posing, dose
+        self._cell, self._recorder, self._arm, self._dose = cell, recorder, arm, dose
         self._outcome, self._gain_db, self._max_frames_per_s = outcome, gain_db, max_frames_per_s
         self._tell, self._wait_while_paused = tell, wait_while_paused
         self._buffer_memory_bytes = memory_for_buffers()
@@ -125,19 +125,19 @@ class Firing:
 
     def _by_cable(self, burst: Burst, following: Burst | None, buffers: int) -> Verdict:
         box, camera, clock = self._cell.ledbox, self._cell.camera, self._cell.clock
-        intake = Intake(camera, lambda frame: self._recorder.put(frame, burst.timing.exposure_us))
-        under_way = _UnderWay(burst, intake, self._cell.robot.measured())
+        grabber = FrameGrabber(camera, lambda frame: self._recorder.put(frame, burst.timing.exposure_us))
+        running = _RunningBurst(burst, grabber, self._cell.robot.measured())
         camera.arm(buffers)
         try:
-            intake.start()
+            grabber.start()
             if burst.panel:
                 box.panel(burst.panel, True)
             started_ns = clock.now_ns()
             box.start(burst.table)
             if following is not None:
                 box.load(following.table)
-            self._posing.hurry(burst.duration_s - _LAST_STRETCH_S)
-            self._follow(under_way)
+            self._arm.hurry(burst.duration_s - _LAST_STRETCH_S)
+            self._follow(running)
             self.times_s.append((clock.now_ns() - started_ns) / 1e9)
             if burst.panel:
                 box.panel(burst.panel, False)
@@ -145,19 +145,19 @@ class Firing:
             with contextlib.suppress(DeviceError):
                 camera.disarm()
             with contextlib.suppress(CoupoleError):
-                self._end(under_way, camera=None)
+                self._end(running, camera=None)
             raise
         statistics = camera.statistics()
         camera.disarm()
-        self._end(under_way, camera=statistics)
-        log = under_way.log
+        self._end(running, camera=statistics)
+        log = running.log
         dark = (log["led"] != NO_LIGHT) & ((log["status"] & STATUS_LED_OPEN) != 0)
-        assert under_way.judged is not None
-        return Verdict(under_way.judged, [burst.shot_ids[i] for i in np.flatnonzero(dark)])
+        assert running.judged is not None
+        return Verdict(running.judged, [burst.shot_ids[i] for i in np.flatnonzero(dark)])
 
-    def _follow(self, under_way: _UnderWay) -> None:
+    def _follow(self, running: _RunningBurst) -> None:
         """Read log and frames until the burst is over, proving as it goes."""
-        box, clock, burst, intake = self._cell.ledbox, self._cell.clock, under_way.burst, under_way.intake
+        box, clock, burst, grabber = self._cell.ledbox, self._cell.clock, running.burst, running.grabber
         readout_s = 1.0 / self._max_frames_per_s + burst.timing.exposure_us * 1e-6
         step_s = burst.timing.period_us * 1e-6
         next_step = Deadline(clock, step_s + _STALL_S)
@@ -166,26 +166,26 @@ class Firing:
         judged_at = (-1, -1)
         taken, confirmed, heard_ns = 0, 0, 0
         while True:
-            if (news_ns := self._posing.heard_at_rest()) > heard_ns:
+            if (news_ns := self._arm.heard_at_rest()) > heard_ns:
                 heard_ns, confirmed = news_ns, taken  # what had come by the last round was taken at rest
-            taken = len(intake)  # before the log is read: the proof needs frames that are older than the log
+            taken = len(grabber)  # before the log is read: the proof needs frames that are older than the log
             steps = box.poll_log()
             if len(steps):
-                under_way.log = np.concatenate([under_way.log, steps])
+                running.log = np.concatenate([running.log, steps])
                 next_step = Deadline(clock, step_s + _STALL_S)
-            if len(under_way.log) == len(burst.table) and last_frames is None:
+            if len(running.log) == len(burst.table) and last_frames is None:
                 last_frames = Deadline(clock, readout_s + self._cell.camera.delivery_s)
                 edges = box.edges()
             complete = last_frames is not None and (taken >= edges or last_frames.expired)
             if complete:
                 clock.sleep(readout_s)  # a surplus frame may be on its way still
-                taken = confirmed = len(intake)
-                under_way.arm_after = self._posing.await_news()
-            if complete or (confirmed, len(under_way.log)) != judged_at:
-                judged_at = (confirmed, len(under_way.log))
-                under_way.judged = self._match(under_way, taken, complete=complete)
-                self._prove(under_way, confirmed, complete=complete)
-                self._tell(burst, len(under_way.log))
+                taken = confirmed = len(grabber)
+                running.arm_after = self._arm.await_news()
+            if complete or (confirmed, len(running.log)) != judged_at:
+                judged_at = (confirmed, len(running.log))
+                running.judged = self._match(running, taken, complete=complete)
+                self._prove(running, confirmed, complete=complete)
+                self._tell(burst, len(running.log))
             if complete:
                 return
             self._recorder.commit(now=False)
@@ -194,15 +194,15 @@ class Firing:
                     "led box",
                     expected=f"a step of the burst every {1e3 * step_s:.0f} ms",
                     happened=f"none came for {next_step.seconds:.1f} s; "
-                    f"{len(under_way.log)} of {len(burst.table)} are in its log",
+                    f"{len(running.log)} of {len(burst.table)} are in its log",
                     remedy="Check the box, then resume the run.",
                 )
             clock.sleep(_POLL_S)
 
-    def _match(self, under_way: _UnderWay, taken: int, *, complete: bool) -> Match:
-        frame_ids, timestamps_ns = under_way.intake.frames(taken)
+    def _match(self, running: _RunningBurst, taken: int, *, complete: bool) -> Match:
+        frame_ids, timestamps_ns = running.grabber.frames(taken)
         return match(
-            under_way.log,
+            running.log,
             frame_ids,
             timestamps_ns,
             id_modulus=self._cell.camera.id_modulus,
@@ -210,39 +210,39 @@ class Firing:
             model=FaultModel(jitter_us=self._cell.camera.timestamp_jitter_us + _BOX_JITTER_US),
         )
 
-    def _prove(self, under_way: _UnderWay, confirmed: int, *, complete: bool) -> None:
+    def _prove(self, running: _RunningBurst, confirmed: int, *, complete: bool) -> None:
         """Hand newly proven frames to the recorder, of the first `confirmed`, once their bytes are written."""
-        judged, intake, log = under_way.judged, under_way.intake, under_way.log
+        judged, grabber, log = running.judged, running.grabber, running.log
         assert judged is not None
         for frame in np.flatnonzero(judged.step_of_frame != UNLABELLED).tolist():
-            if frame in under_way.proven or frame >= confirmed or not (complete or intake.kept(frame)):
+            if frame in running.proven or frame >= confirmed or not (complete or grabber.kept(frame)):
                 continue
             record = log[judged.step_of_frame[frame]]
-            label = under_way.burst.labels[int(record["step"])]
-            in_vain = record["led"] != NO_LIGHT and record["status"] & _LIT_IN_VAIN
-            if label and not in_vain:
-                shot = f"{under_way.burst.view}/{label}"
-                self._recorder.prove(intake.slot(frame), shot, _fields(record, int(record["t_trigger_ns"])))
-                under_way.proven.add(frame)
+            label = running.burst.labels[int(record["step"])]
+            invalid = record["led"] != NO_LIGHT and record["status"] & _INVALID_EXPOSURE
+            if label and not invalid:
+                shot = f"{running.burst.view}/{label}"
+                self._recorder.prove(grabber.slot(frame), shot, _fields(record, int(record["t_trigger_ns"])))
+                running.proven.add(frame)
 
-    def _end(self, under_way: _UnderWay, camera: CameraStatistics | None) -> None:
+    def _end(self, running: _RunningBurst, camera: CameraStatistics | None) -> None:
         """Note light and figures, give back what is not wanted, make the rest last."""
-        log, intake = under_way.log, under_way.intake
-        intake.stop()
-        for frame in range(intake.count):
-            if frame not in under_way.proven:
-                self._recorder.free(intake.slot(frame))
+        log, grabber = running.log, running.grabber
+        grabber.stop()
+        for frame in range(grabber.count):
+            if frame not in running.proven:
+                self._recorder.free(grabber.slot(frame))
         if camera is not None:
             self._outcome.over_triggers += max(0, camera.over_triggers)
             self._outcome.lost_transfers += max(0, camera.lost_transfers)
-        clocks = under_way.judged.clocks if under_way.judged is not None else None
+        clocks = running.judged.clocks if running.judged is not None else None
         self._note(
-            under_way.burst,
+            running.burst,
             log,
-            under_way.arm_before,
-            under_way.arm_after,
-            frames=intake.count,
-            table_s=under_way.burst.duration_s,
+            running.arm_before,
+            running.arm_after,
+            frames=grabber.count,
+            table_s=running.burst.duration_s,
             clocks=None if clocks is None else vars(clocks),
             camera=None if camera is None else vars(camera),
             hottest_board_c=float(log["board_temperature_dc"].max()) / 10 if len(log) else None,
@@ -258,16 +258,16 @@ class Firing:
         arm_before, arm_after = self._cell.robot.measured(), None
         try:
             for index, shot in enumerate(burst.shot_ids):
-                self._posing.attend()
+                self._arm.attend()
                 self._wait_while_paused()
                 frame, record, lit_throughout = self._fire_one(burst, burst.table[index : index + 1])
                 logs.append(record)
                 step = record[0]
-                if step["led"] != NO_LIGHT and step["status"] & _LIT_IN_VAIN:
+                if step["led"] != NO_LIGHT and step["status"] & _INVALID_EXPOSURE:
                     dead.append(shot)
                     lit_throughout = False
                 arm_after = None
-                arm_after = self._posing.await_news()
+                arm_after = self._arm.await_news()
                 if frame is not None:
                     self._keep(frame, burst, shot, step, proven=lit_throughout)
                 self._tell(burst, index)

@@ -32,7 +32,7 @@ def buffers_for(frames: int, frame_bytes: int, period_s: float, memory_bytes: in
     return max(_FEWEST_BUFFERS, min(frames, math.ceil(_STALL_S / period_s), memory_bytes // frame_bytes))
 
 
-class Intake:
+class FrameGrabber:
     """From `start()` to `stop()`: every frame that the camera gives is put away and its buffer handed back.
 
     `keep(frame)` runs on `writers` threads and returns the slot. Frames are listed in order of arrival.
@@ -46,7 +46,7 @@ class Intake:
         self._slots: list[Future[int]] = []
         self._error: BaseException | None = None
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._take, name="intake")
+        self._thread = threading.Thread(target=self._take, name="grabber")
 
     def start(self) -> None:
         self._thread.start()

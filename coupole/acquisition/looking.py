@@ -14,10 +14,10 @@ from coupole.acquisition.operator import (
     UNLIMITED_BYTES,
     ask_to_begin,
     enter_dose,
+    identity_printer,
     longest_exposure_us,
     operator_at,
     refuse,
-    teller,
 )
 from coupole.acquisition.sequencer import Sequencer
 from coupole.errors import InputError
@@ -33,7 +33,9 @@ from coupole.viewing.terminal import LiveFigures, RunObserver
 _FIGURES_EVERY_S = 0.2
 
 
-def meter(job: Job, console: Console, wish: exposure_advice.Wish, *, confirm: bool) -> exposure_advice.Advice:
+def meter(
+    job: Job, console: Console, request: exposure_advice.Request, *, confirm: bool
+) -> exposure_advice.Advice:
     """Take a few pictures of each view under lights spread over the dome, keep none, and advise on exposure.
 
     The light that this gives the object is entered in its ledger. Raises PreflightRefused, DeviceError,
@@ -46,7 +48,7 @@ def meter(job: Job, console: Console, wish: exposure_advice.Wish, *, confirm: bo
     refuse(preflight)
     ask_to_begin(job.cell, confirm=confirm)
     recorder, control = exposure_advice.MeterRecorder(), Control()
-    with open_cell(job.cell, job=small, on_opened=teller(console)) as cell:
+    with open_cell(job.cell, job=small, on_opened=identity_printer(console)) as cell:
         observer = RunObserver(console, job.cell.rig.frame_bytes, 0)
         sequencer = Sequencer(small, cell, recorder, observer=observer, control=control)
         try:
@@ -55,7 +57,7 @@ def meter(job: Job, console: Console, wish: exposure_advice.Wish, *, confirm: bo
         finally:
             cell.make_safe()
             enter_dose(job, cell, sequencer.outcome.dose_lux_h, "meter")
-    return exposure_advice.advise(recorder.views, wish, longest_us=longest_exposure_us(job.cell.rig))
+    return exposure_advice.advise(recorder.views, request, longest_us=longest_exposure_us(job.cell.rig))
 
 
 def watch_cell(
@@ -72,7 +74,7 @@ def watch_cell(
     ids = tuple(leds.ids.tolist())
     studio = Studio(choice_from(vars(choice), choice, ids, longest_exposure_us(rig)))
     ask_to_begin(rig_cell, confirm=confirm)
-    with open_cell(rig_cell, job=job, on_opened=teller(console)) as cell:
+    with open_cell(rig_cell, job=job, on_opened=identity_printer(console)) as cell:
         source = CellSource(cell, rig, leds, lux.__getitem__, frames_per_s=frames_per_s)
         try:
             _show_live(source, studio, console, port, longest_us=longest_exposure_us(rig))

@@ -70,7 +70,7 @@ def enter_dose(job: Job, cell: OpenedCell, dose_lux_h: float, what_for: str) -> 
         ledger.add(job.cell.storage_folder, job.plan.object.id, run=what_for, dose_lux_h=dose_lux_h)
 
 
-def teller(console: Console) -> Any:
+def identity_printer(console: Console) -> Any:
     def tell(kind: str, identity: Identity) -> None:
         how = " (simulated)" if identity.simulated else ""
         console.print(f"  {kind}: {identity.vendor} {identity.model} {identity.serial}{how}")

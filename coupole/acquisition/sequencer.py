@@ -1,6 +1,6 @@
 """Runs a schedule: moves the arm, fires bursts, shoots again what is missing.
 
-Only this module and its two hands, `posing` and `firing`, command devices. They keep to one order at all times:
+Only this module and its two hands, `arm` and `firing`, command devices. They keep to one order at all times:
 arm at rest and measured, camera armed, then lights; and backwards. On the way out, whatever the reason,
 `coupole.acquisition.cell` makes the devices safe.
 """
@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from coupole.acquisition.arm_supervisor import ArmMovedError, Posing, Stand
-from coupole.acquisition.burst_runner import NOTHING_TO_MATCH, Firing, Verdict
+from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor, SettledPose
+from coupole.acquisition.burst_runner import NOTHING_TO_MATCH, BurstRunner, Verdict
 from coupole.acquisition.cell import OpenedCell
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_matching import compile_now
@@ -46,11 +46,11 @@ class Sequencer:
         self._view_number = 0
         self._view_name = ""
         self.outcome = Outcome(shots=job.schedule.shots)
-        self._posing = Posing(job, cell, self._control)
-        self._firing = Firing(
+        self._arm = ArmSupervisor(job, cell, self._control)
+        self._burst_runner = BurstRunner(
             cell,
             recorder,
-            self._posing,
+            self._arm,
             self._dose,
             self.outcome,
             gain_db=job.plan.gain_db,
@@ -63,7 +63,7 @@ class Sequencer:
     @property
     def burst_times_s(self) -> list[float]:
         """From start to last proof of each burst, on the rig's clock."""
-        return self._firing.times_s
+        return self._burst_runner.times_s
 
     # -- the run ------------------------------------------------------------------------------------------
 
@@ -72,7 +72,7 @@ class Sequencer:
         schedule = self._job.schedule
         left = {n: found for n, bursts in enumerate(schedule.bursts) if (found := self._left_of(bursts))}
         numbers = list(left)
-        itinerary = self._posing.itinerary([schedule.views[n] for n in numbers])
+        itinerary = self._arm.itinerary([schedule.views[n] for n in numbers])
         start_ns = self._cell.clock.now_ns()
         try:
             for count, index in enumerate(itinerary.order):
@@ -103,30 +103,30 @@ class Sequencer:
         return left
 
     def _acquire_view(self, view: ViewPose, visit: Visit, left: list[Burst], all_bursts: Sequence[Burst]) -> None:
-        shadow = self._job.shadows.at(visit.joints_deg)
-        self._recorder.event("view", view=view.name, hidden_leds=self._job.useless_leds(shadow))
-        collections = {"shadow": {**shadow.arrays(self._job.shadows.patches), "leds": self._job.cell.leds.ids}}
+        shadow = self._job.occlusions.at(visit.joints_deg)
+        self._recorder.event("view", view=view.name, hidden_leds=self._job.occluded_leds(shadow))
+        collections = {"shadow": {**shadow.arrays(self._job.occlusions.patches), "leds": self._job.cell.leds.ids}}
         motion_s = visit.leg.duration_s + self._job.cell.rig.motion.settle_dwell_s
         self.outcome.ideal_s += motion_s + sum(burst.duration_s for burst in left)
         waypoints_deg = [np.round(place, 6).tolist() for place in visit.leg.waypoints]
         self._recorder.event("move", view=view.name, joints_deg=waypoints_deg)
-        stand = self._posing.go(visit, lambda: self._cell.ledbox.load(left[0].table))
-        frame_format = self._cell.camera.configure(self._firing.exposure(left[0]))
+        settled = self._arm.go(visit, lambda: self._cell.ledbox.load(left[0].table))
+        frame_format = self._cell.camera.configure(self._burst_runner.exposure(left[0]))
         self._check_format(frame_format)
         frames = sum(len(burst.labels) for burst in all_bursts)
 
-        def begin(stand: Stand) -> None:
+        def begin(settled: SettledPose) -> None:
             self._recorder.event(
                 "settled",
                 view=view.name,
-                joints_deg=[round(j, 6) for j in stand.arm.joints_deg],
-                base_from_camera=np.round(stand.base_from_camera, 6).tolist(),
+                joints_deg=[round(j, 6) for j in settled.arm.joints_deg],
+                base_from_camera=np.round(settled.base_from_camera, 6).tolist(),
             )
             self._recorder.begin_view(
-                view.name, frames, frame_format, stand.arm, stand.base_from_camera, collections
+                view.name, frames, frame_format, settled.arm, settled.base_from_camera, collections
             )
 
-        begin(stand)
+        begin(settled)
         try:
             for index, burst in enumerate(left):
                 following = left[index + 1] if index + 1 < len(left) else None
@@ -145,7 +145,7 @@ class Sequencer:
                 remedy="Correct the rig, or the camera's region of interest.",
             )
 
-    def _acquire_burst(self, burst: Burst, following: Burst | None, begin: Callable[[Stand], None]) -> None:
+    def _acquire_burst(self, burst: Burst, following: Burst | None, begin: Callable[[SettledPose], None]) -> None:
         """Fire a burst, and what it left unproven again, up to the plan's limit.
 
         An arm that was pushed is brought back, and frames taken from there on `begin` anew.
@@ -158,12 +158,12 @@ class Sequencer:
                 self.outcome.reshot += len(shots)
                 self._recorder.event("reshoot", view=burst.view, attempt=attempt, shots=shots)
             try:
-                verdict = self._firing.fire(todo, following if attempt == 0 else None)
+                verdict = self._burst_runner.fire(todo, following if attempt == 0 else None)
             except ArmMovedError as moved:
                 self._cell.ledbox.lights_off()
                 self._observer.note(f"{burst.view}: {moved}; back to the view")
                 self._recorder.event("fault", kind="ArmMoved", message=f"{burst.view}: {moved}")
-                begin(self._posing.stand_again())
+                begin(self._arm.return_to_view())
                 verdict = Verdict(NOTHING_TO_MATCH, [])
             done = self._recorder.proven()
             left = {label for label in todo.labels if label and f"{burst.view}/{label}" not in done}
@@ -224,6 +224,6 @@ class Sequencer:
         self._recorder.commit(now=True)
         self._observer.note("paused; lights are off")
         while self._control.pause.is_set():
-            self._posing.attend()
+            self._arm.attend()
             self._cell.clock.sleep(_PAUSE_NAP_S)
         self._recorder.event("resume", after="pause")

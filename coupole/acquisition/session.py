@@ -13,7 +13,14 @@ from rich.console import Console
 
 from coupole.acquisition.cell import OpenedCell, open_cell
 from coupole.acquisition.observer import Control, Outcome
-from coupole.acquisition.operator import UNLIMITED_BYTES, ask_to_begin, enter_dose, operator_at, refuse, teller
+from coupole.acquisition.operator import (
+    UNLIMITED_BYTES,
+    ask_to_begin,
+    enter_dose,
+    identity_printer,
+    operator_at,
+    refuse,
+)
 from coupole.acquisition.recorder import DryRecorder, RunRecorder
 from coupole.acquisition.sequencer import Sequencer
 from coupole.errors import (
@@ -80,7 +87,7 @@ def _acquire_into(
     acknowledged = _ask_whether_clear(run.robot_fault()) if run else ""
     ask_to_begin(job.cell, confirm=confirm)
     console.print("opening the devices ...")
-    with open_cell(job.cell, job=job, on_opened=teller(console)) as cell:
+    with open_cell(job.cell, job=job, on_opened=identity_printer(console)) as cell:
         room_c = _refuse_other_calibrations(job, cell)
         if run is None:
             run = Run.create(folder, job.plan.name, job.inputs, about_run(job, cell))
@@ -252,7 +259,7 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
     show_preflight(console, preflight, name=job.plan.name, rig=f"the twin of {job.cell.rig.name}")
     refuse(preflight)
     recorder, control = DryRecorder(), Control()
-    with open_cell(job.cell, job=job, dry_run=True, speed=speed, on_opened=teller(console)) as cell:
+    with open_cell(job.cell, job=job, dry_run=True, speed=speed, on_opened=identity_printer(console)) as cell:
         observer = RunObserver(console, cell.sensor.width_px * cell.sensor.height_px * 2, 0)
         sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
         outcome = sequencer.outcome

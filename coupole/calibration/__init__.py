@@ -15,7 +15,7 @@
     adjustment.py   least squares with variance components: values, covariance, and what dominates it
     multi_view.py point_sets.py rotations.py arm_errors.py  the geometry of it
 
-    wish.py         what the operator asks of a calibration; limits.py: what is accepted
+    request.py         what the operator asks of a calibration; limits.py: what is accepted
     record.py       the result on disk, sealed by its checksum
     report.py       the result as a page and a picture
     in_force.py     which records a plan may be acquired with

@@ -12,7 +12,7 @@ from coupole.calibration.sources import About
 
 
 @dataclass(frozen=True)
-class Wish:
+class Request:
     """What the operator says beside the images."""
 
     name: str

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from coupole.calibration.calibrated_arm import CalibratedArm
     from coupole.calibration.report import Outcome
-    from coupole.calibration.request import Wish
+    from coupole.calibration.request import Request
     from coupole.preflight.job import Cell
 
 Runs = Annotated[list[Path], typer.Argument(help="Runs.", show_default=False, metavar="RUN...")]
@@ -53,7 +53,7 @@ def leds(
     from coupole.calibration.report import Outcome
     from coupole.storage.run import sha256
 
-    def work(console: Console, wish: Wish) -> Outcome:
+    def work(console: Console, request: Request) -> Outcome:
         cell = _cell(rig, runs)
         table = cell.leds
         with bar(console, "looking for spots") as progress:
@@ -66,7 +66,7 @@ def leds(
         prior = read_posed_camera(hand_eye, camera, images.about, images.size_px)
         stated = Stated(tolerance_mm=tolerance_mm, robot_mm=repeatability_mm, robot_deg=repeatability_deg)
         with console.status("adjusting boards, poses, lens and hand-eye"):
-            found = leds_from(images, table, prior, wish, stated=stated, arm=_arm(cell, hand_eye))
+            found = leds_from(images, table, prior, request, stated=stated, arm=_arm(cell, hand_eye))
         return Outcome(found.record, partial(draw_leds, found), found.files)
 
     return work
@@ -101,7 +101,7 @@ def mesh(
     from coupole.calibration.stickers.workflow import mesh_from
     from coupole.geometry import transform
 
-    def work(console: Console, wish: Wish) -> Outcome:
+    def work(console: Console, request: Request) -> Outcome:
         known, sources = read_scan(scan), open_sources(runs, None)
         for made_with in (hand_eye, camera, rig):
             sources = sources.with_file(made_with)
@@ -125,7 +125,7 @@ def mesh(
             sources,
             known,
             prior,
-            wish,
+            request,
             stated=stated,
             depth_mm=depth_mm,
             base_from_support=support,

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from coupole.calibration.lens.images import Found
     from coupole.calibration.lens.workflow import Shown
     from coupole.calibration.report import Outcome
-    from coupole.calibration.request import Wish
+    from coupole.calibration.request import Request
     from coupole.calibration.sources import Sources
     from coupole.kinematics import Arm
 
@@ -42,10 +42,10 @@ def camera(
     """Lens and distortion from 8 to 60 images of a board, tilted to all sides, corners over the whole field."""
     from coupole.calibration.lens.workflow import camera_from
 
-    def work(console: Console, wish: Wish) -> Outcome:
+    def work(console: Console, request: Request) -> Outcome:
         _refuse_unknown_model(model)
         sources, _, found = _look(paths, board, None, console)
-        return _drawn(camera_from(found, sources, model, wish)[1])
+        return _drawn(camera_from(found, sources, model, request)[1])
 
     return work
 
@@ -60,11 +60,11 @@ def chromatic(
     from coupole.calibration.lens.chromatic_workflow import chromatic_from, draw_chromatic
     from coupole.calibration.report import Outcome
 
-    def work(console: Console, wish: Wish) -> Outcome:
+    def work(console: Console, request: Request) -> Outcome:
         _refuse_unknown_model(model)
         sources, described, shown = _look(paths, board, None, console)
         with console.status("adjusting a lens for each colour"):
-            found = chromatic_from(shown, sources, described, model, wish)
+            found = chromatic_from(shown, sources, described, model, request)
         return Outcome(found.record, partial(draw_chromatic, found))
 
     return work
@@ -94,7 +94,7 @@ def hand_eye(
     from coupole.calibration.lens.bundle import RobotNoise
     from coupole.calibration.lens.workflow import hand_eye_from
 
-    def work(console: Console, wish: Wish) -> Outcome:
+    def work(console: Console, request: Request) -> Outcome:
         _refuse_unknown_model(model)
         arm = _arm(rig)
         sources, described, found = _look(paths, board, poses, console)
@@ -102,7 +102,7 @@ def hand_eye(
         sources = sources.with_file(camera_record).with_file(rig)
         robot = RobotNoise(repeatability_mm, repeatability_deg, absolute_mm, absolute_deg)
         with console.status("adjusting lens, hand-eye, board and the robot's errors"):
-            shown = hand_eye_from(found, sources, described, model, wish, robot=robot, arm=arm, lens=earlier)[2]
+            shown = hand_eye_from(found, sources, described, model, request, robot=robot, arm=arm, lens=earlier)[2]
         return _drawn(shown)
 
     return work

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from coupole.calibration.light.led_power_tile import Setting
     from coupole.calibration.optics import Intrinsics
     from coupole.calibration.report import Outcome
-    from coupole.calibration.request import Wish
+    from coupole.calibration.request import Request
 
 Runs = Annotated[list[Path], typer.Argument(help="Runs.", show_default=False, metavar="RUN...")]
 DarkOption = Annotated[
@@ -47,9 +47,9 @@ def dark(
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.records import dark_outcome
 
-    def work(console: Console, wish: Wish) -> Outcome:
+    def work(console: Console, request: Request) -> Outcome:
         with bar(console, "dark frames") as progress:
-            return dark_outcome(open_light_frames(runs), wish, progress)
+            return dark_outcome(open_light_frames(runs), request, progress)
 
     return work
 
@@ -63,9 +63,9 @@ def response(
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.records import response_outcome
 
-    def work(console: Console, wish: Wish) -> Outcome:
+    def work(console: Console, request: Request) -> Outcome:
         with bar(console, "exposures") as progress:
-            return response_outcome(open_light_frames(runs), wish, dark_record, progress)
+            return response_outcome(open_light_frames(runs), request, dark_record, progress)
 
     return work
 
@@ -83,10 +83,10 @@ def flat_field(
     from coupole.calibration.light.flat_field_records import flat_field_outcome
     from coupole.calibration.light.frames import open_light_frames
 
-    def work(console: Console, wish: Wish) -> Outcome:
+    def work(console: Console, request: Request) -> Outcome:
         frames = open_light_frames(runs)
         with bar(console, "views of the panel") as progress:
-            return flat_field_outcome(frames, wish, dark_record, response_record, panel_mm, progress)
+            return flat_field_outcome(frames, request, dark_record, response_record, panel_mm, progress)
 
     return work
 
@@ -108,11 +108,11 @@ def led_power(
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.led_power_records import led_power_outcome
 
-    def work(console: Console, wish: Wish) -> Outcome:
+    def work(console: Console, request: Request) -> Outcome:
         frames = _posed(open_light_frames(runs), hand_eye)
         setting = _setting(frames, tile, rig, leds, hand_eye, camera, dark_record, response_record, flat, emission)
         with bar(console, "frames of the tile") as progress:
-            return led_power_outcome(frames, setting, wish, progress)
+            return led_power_outcome(frames, setting, request, progress)
 
     return work
 
@@ -140,11 +140,11 @@ def drift(
     from coupole.calibration.light.drift_records import drift_outcome
     from coupole.calibration.light.frames import open_light_frames
 
-    def work(console: Console, wish: Wish) -> Outcome:
+    def work(console: Console, request: Request) -> Outcome:
         frames = _posed(open_light_frames(runs), hand_eye)
         setting = _setting(frames, tile, rig, leds, hand_eye, camera, dark_record, response_record, flat, emission)
         with bar(console, "frames with the tile") as progress:
-            return drift_outcome(frames, setting, led_power_record, wish, progress)
+            return drift_outcome(frames, setting, led_power_record, request, progress)
 
     return work
 

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from coupole.calibration.light.irradiance import Emission
     from coupole.calibration.record import Record
     from coupole.calibration.report import Outcome
-    from coupole.calibration.request import Wish
+    from coupole.calibration.request import Request
 
-    Work = Callable[[Console, Wish], Outcome]
+    Work = Callable[[Console, Request], Outcome]
     """Of a calibration, once its options are known."""
 else:
     Work = Callable
@@ -111,19 +111,19 @@ def _calibrate(
     `limit` is what the operator said of the calibration's `limits`.
     """
     from coupole.calibration.report import write_outcome
-    from coupole.calibration.request import Wish
+    from coupole.calibration.request import Request
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     now = datetime.now(UTC)
     try:
         _refuse_name(name)
-        wish = Wish(name or f"{kind}-{now:%Y%m%d}", now, valid_days, lens, limits=asked(limit or (), limits))
-        record_path = out / f"{wish.name}.yaml"
-        for path in (out / f"{wish.name}{suffix}" for suffix in _SUFFIXES):
+        request = Request(name or f"{kind}-{now:%Y%m%d}", now, valid_days, lens, limits=asked(limit or (), limits))
+        record_path = out / f"{request.name}.yaml"
+        for path in (out / f"{request.name}{suffix}" for suffix in _SUFFIXES):
             if path.exists():
                 raise InputError(f"{path}: stands here already. Choose another --name or --out.")
-        outcome = work(console, wish)
+        outcome = work(console, request)
         page, picture = write_outcome(record_path, outcome)
     except CoupoleError as error:
         fail(error, as_json=as_json)

@@ -99,13 +99,13 @@ def meter(
 ) -> None:
     """Advise on a plan's exposure: a few pictures of each view, under a few lights, none of them kept."""
     from coupole.acquisition.looking import meter as meter_plan
-    from coupole.preflight.exposure_advice import Wish, write_plan
+    from coupole.preflight.exposure_advice import Request, write_plan
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console, show_advice
 
     console = make_console(quiet=as_json)
     try:
-        advice = meter_plan(read_job(plan, rig), console, Wish(saturated, snr, share), confirm=not yes)
+        advice = meter_plan(read_job(plan, rig), console, Request(saturated, snr, share), confirm=not yes)
         if write is not None:
             write_plan(plan, write, advice.exposure)
     except CoupoleError as error:

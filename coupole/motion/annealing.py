@@ -7,12 +7,12 @@ import numpy as np
 
 
 @numba.njit(cache=True, nogil=True)
-def anneal(seconds, unease_s, first, order, picked, rolls, hottest_s, coldest_s):  # type: ignore[no-untyped-def]
+def anneal(seconds, posture_cost_s, first, order, picked, rolls, hottest_s, coldest_s):  # type: ignore[no-untyped-def]
     """The best order of groups [n], and the places picked in it [n], that random changes come across.
 
     `seconds` [places, places] between places, symmetric; place 0 is the start, those of group g are `first[g]` to
-    `first[g + 1] - 1`; `unease_s` [places] is added for each place that is used; `rolls` [changes, 5] are random
-    numbers from 0 to 1.
+    `first[g + 1] - 1`; `posture_cost_s` [places] is added for each place that is used; `rolls` [changes, 5] are
+    random numbers from 0 to 1.
 
     A change reverses a stretch of the way, moves a visit elsewhere and to any place of its group, or changes its
     place only. A worse way is taken with the probability of Metropolis at a temperature that falls geometrically.
@@ -36,7 +36,7 @@ def anneal(seconds, unease_s, first, order, picked, rolls, hottest_s, coldest_s)
             change_s = _reversed_s(seconds, way, i, j)
         else:
             j = i if kind == 1 else j
-            change_s = unease_s[place] - unease_s[way[i]] + _moved_s(seconds, way, i, j, place)
+            change_s = posture_cost_s[place] - posture_cost_s[way[i]] + _moved_s(seconds, way, i, j, place)
         if change_s > 0.0 and rolls[roll, 4] >= np.exp(-change_s / heat_s):
             continue
         gained_s -= change_s

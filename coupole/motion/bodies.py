@@ -1,4 +1,4 @@
-"""Bodies of the arm and its tool: their shapes as balls in the frames of its links, and how far they reach."""
+"""Bodies of the arm and its tool: their shapes as spheres in the frames of its links, and how far they reach."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.kinematics import JOINT_AXES, Arm, joint_origins_mm, link_frames
-from coupole.motion.sphere_tree import Balls, Floats, balls_of, surface_points
+from coupole.motion.sphere_tree import Floats, Spheres, spheres_of, surface_points
 
 FLANGE = 7
 LINK_MESH_STEP_MM = 12.0
@@ -34,11 +34,11 @@ class Capsule:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Something rigid: balls in the frame of one link."""
+    """Something rigid: spheres in the frame of one link."""
 
     name: str
     link: int
-    balls: Balls
+    spheres: Spheres
 
 
 ARM_CAPSULES = (
@@ -68,7 +68,7 @@ def bodies_of_capsules(capsules: Sequence[Capsule]) -> list[Body]:
     for name in dict.fromkeys(c.body for c in capsules):
         own = [c for c in capsules if c.body == name]
         ends = np.array([[c.start_mm, c.end_mm] for c in own], dtype=np.float64)
-        bodies.append(Body(name, own[0].link, balls_of(ends, np.array([c.radius_mm for c in own], dtype=float))))
+        bodies.append(Body(name, own[0].link, spheres_of(ends, np.array([c.radius_mm for c in own], dtype=float))))
     return bodies
 
 
@@ -78,8 +78,8 @@ def bodies_of_meshes(folder: Path) -> list[Body]:
     bodies = []
     for link in range(7):
         points = surface_points(link_corners(folder, link), LINK_MESH_STEP_MM)
-        balls = Balls(points, np.full(len(points), LINK_MESH_STEP_MM))
-        bodies.append(Body(f"link {link}" if link else "base", link, balls))
+        spheres = Spheres(points, np.full(len(points), LINK_MESH_STEP_MM))
+        bodies.append(Body(f"link {link}" if link else "base", link, spheres))
     return bodies
 
 
@@ -110,17 +110,17 @@ def _mesh_path(folder: Path, link: int) -> Path:
 def reach_mm(arm: Arm, body: Body, from_link: int = 0) -> Floats:
     """[6] farthest that any point of a body can be from each axis; 0 for axes that do not move it against
     `from_link`. Links are taken as stretched out, so no posture reaches farther."""
-    centers, link = body.balls.centers_mm, body.link
+    centers, link = body.spheres.centers_mm, body.link
     if link == FLANGE:
         frames = link_frames(arm, np.zeros(6))
         centers, link = apply(np.linalg.inv(frames[6]) @ frames[FLANGE], centers), 6
     origins = np.array(joint_origins_mm(arm))
-    farthest = float((np.linalg.norm(centers, axis=1) + body.balls.radii_mm).max())
+    farthest = float((np.linalg.norm(centers, axis=1) + body.spheres.radii_mm).max())
     reach = np.zeros(6)
     for k in range(from_link, link):
         across = [i for i in range(3) if i != JOINT_AXES[k]]
         if k == link - 1:
-            reach[k] = (np.linalg.norm(centers[:, across], axis=1) + body.balls.radii_mm).max()
+            reach[k] = (np.linalg.norm(centers[:, across], axis=1) + body.spheres.radii_mm).max()
         else:
             beyond = np.linalg.norm(origins[k + 2 : link], axis=1).sum()
             reach[k] = np.linalg.norm(origins[k + 1, across]) + beyond + farthest
@@ -130,14 +130,14 @@ def reach_mm(arm: Arm, body: Body, from_link: int = 0) -> Floats:
 def part_apart(
     arm: Arm, body: Body, other: Body, postures_deg: Sequence[Sequence[float]], by_mm: float
 ) -> Body | None:
-    """The part of a body whose balls are more than `by_mm` from another in all of some postures; None if there is
-    none."""
-    apart = np.ones(len(body.balls.radii_mm), dtype=bool)
+    """The part of a body whose spheres are more than `by_mm` from another in all of some postures; None if there
+    is none."""
+    apart = np.ones(len(body.spheres.radii_mm), dtype=bool)
     for joints_deg in postures_deg:
         frames = link_frames(arm, joints_deg)
-        at, others = (apply(frames[b.link], b.balls.centers_mm) for b in (body, other))
-        distances_mm = np.linalg.norm(at[:, None] - others, axis=2) - other.balls.radii_mm
-        apart &= distances_mm.min(axis=1) > body.balls.radii_mm + by_mm
+        at, others = (apply(frames[b.link], b.spheres.centers_mm) for b in (body, other))
+        distances_mm = np.linalg.norm(at[:, None] - others, axis=2) - other.spheres.radii_mm
+        apart &= distances_mm.min(axis=1) > body.spheres.radii_mm + by_mm
     if not apart.any():
         return None
-    return Body(body.name, body.link, Balls(body.balls.centers_mm[apart], body.balls.radii_mm[apart]))
+    return Body(body.name, body.link, Spheres(body.spheres.centers_mm[apart], body.spheres.radii_mm[apart]))

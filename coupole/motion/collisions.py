@@ -2,7 +2,7 @@
 
 The arm is a set of capsules that enclose the vendor's link meshes, or those meshes themselves; the camera and an
 allowance for its cables are capsules too. Around it stand the object (its scanned mesh), the support disk, the
-dome seen from inside, and keep-out volumes. All distances are conservative: bodies are unions of balls
+dome seen from inside, and keep-out volumes. All distances are conservative: bodies are unions of spheres
 (`motion.sphere_tree`) that enclose what they stand for, and of motions nothing between two checked places is
 missed.
 """
@@ -29,7 +29,7 @@ from coupole.motion.bodies import (
     part_apart,
     reach_mm,
 )
-from coupole.motion.sphere_tree import MESH_STEP_MM, Balls, Floats, forest_of
+from coupole.motion.sphere_tree import MESH_STEP_MM, Floats, Spheres, sphere_trees_of
 
 REACH_MM = (1600.0, 1500.0, 1000.0, 420.0, 420.0, 250.0)
 """Farthest that any point of arm and tool may be from axis 1 to 6 (links stretched out, tool of 300 mm)."""
@@ -59,7 +59,7 @@ class Clearances:
     dome_mm: float = 20.0
     self_mm: float = 0.0
     keep_out_mm: float = 0.0
-    tube_mm: float = 0.0
+    path_tolerance_mm: float = 0.0
     """How far the arm may be off its way (`motion.path_deviation`): every pair keeps at least as much as that can
     bring it together."""
 
@@ -204,7 +204,7 @@ class CellBodies:
             for name, low, high in around.keep_out_boxes
         ]
         points = around.object_points_mm
-        shape = Body("the object", SUPPORT_FRAME, Balls(points, np.full(len(points), MESH_STEP_MM)))
+        shape = Body("the object", SUPPORT_FRAME, Spheres(points, np.full(len(points), MESH_STEP_MM)))
         pairs = []
         for body in (*self._tools, *self._links[:0:-1]):
             reach = reach_mm(self._arm, body)
@@ -237,9 +237,9 @@ class CellBodies:
 
     def _required_mm(self, keep_mm: float, reach: Floats) -> float:
         """What a pair must keep: the rig's clearance, and in any case what an arm off its way by the tube's width
-        could take from it. `off_the_way_mm` counts each axis' deviation times REACH_MM, the pair feels it times
+        could take from it. `path_deviation_mm` counts each axis' deviation times REACH_MM, the pair feels it times
         its own reach."""
-        return max(keep_mm, self._keep.tube_mm * float((reach / np.array(REACH_MM)).max()))
+        return max(keep_mm, self._keep.path_tolerance_mm * float((reach / np.array(REACH_MM)).max()))
 
     @cached_property
     def _model(self) -> Any:
@@ -260,7 +260,7 @@ class CellBodies:
         return Model(
             inverse(self._around.base_from_support),
             np.column_stack([joint_origins_mm(self._arm), axis_senses(self._arm), JOINT_AXES]),
-            *forest_of([body.balls for body in bodies]),
+            *sphere_trees_of([body.spheres for body in bodies]),
             np.array(numbers),
             figures,
         )

@@ -1,8 +1,8 @@
-"""Compiled distances between an arm made of balls and what stands round it; `motion.collisions` is the way in.
+"""Compiled distances between an arm made of spheres and what stands round it; `motion.collisions` is the way in.
 
 Every obstacle is a function that says how far a point is from it, negative inside, and that never changes by more
-than the point moves. So the least distance to a whole tree of balls is found by looking only into those nodes
-whose bounding ball could come nearer than what was found already.
+than the point moves. So the least distance to a whole tree of spheres is found by looking only into those nodes
+whose bounding sphere could come nearer than what was found already.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 DISK, DOME, SPHERE, BOX, SHAPE = range(5)
-"""Kinds of obstacles: the disk and all below it, the dome and all beyond it, keep-outs, another tree of balls."""
+"""Kinds of obstacles: the disk and all below it, the dome and all beyond it, keep-outs, a tree of spheres."""
 SUPPORT_FRAME = 8
 """Number of the support's frame among the links' (0 the base, 1 to 6 the links, 7 the flange)."""
 RESOLUTION_MM = 2.0
@@ -33,7 +33,7 @@ class Model(NamedTuple):
     1 y, 2 z)."""
     nodes: NDArray[np.float64]
     trees: NDArray[np.int64]
-    """The `Forest` of all shapes."""
+    """The `SphereTrees` of all shapes."""
     numbers: NDArray[np.int64]
     """[pairs, 6] a tree and its link; the kind of obstacle; of SHAPE the other tree and its link; the link against
     which the tree moves (0 where the obstacle stands still)."""
@@ -113,8 +113,8 @@ def _to_node(nodes, n, x, y, z):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _to_tree(nodes, begin, first_leaf, x, y, z, best, hasty):  # type: ignore[no-untyped-def]
-    """Distance of a point, in the tree's own frame, to the nearest of its balls; `best` if that is less. If it is
-    `hasty`, to any ball that is nearer than `best`, probably one of the nearest."""
+    """Distance of a point, in the tree's own frame, to the nearest of its spheres; `best` if that is less. If
+    `hasty`, to any sphere that is nearer than `best`, probably one of the nearest."""
     if _to_node(nodes, begin + 1, x, y, z) >= best:
         return best
     i = 1

@@ -16,7 +16,7 @@ from coupole.motion import singularities
 from coupole.motion.bodies import Capsule
 from coupole.motion.collisions import REACH_MM, CellBodies, Clearances, Surroundings
 from coupole.motion.ordering import shortest_tour
-from coupole.motion.path_deviation import TUBE_MM
+from coupole.motion.path_deviation import PATH_TOLERANCE_MM
 from coupole.motion.path_planner import Joints, Leg, PathPlanner
 from coupole.motion.sphere_tree import surface_points
 from coupole.plan.led_table import LedTable
@@ -26,7 +26,7 @@ from coupole.plan.shots import ViewPose
 ELBOW_LIMITS_DEG = (-115.0, 154.0)
 """A3's limits, closer than the data sheet's: beyond them link 4 comes too near to link 2 (seen on the vendor's
 meshes: 6 mm at these angles, 9 mm at 150 deg, touching at -119 deg), and capsules are too coarse to tell."""
-UNEASE_S = 0.3
+POSTURE_COST_S = 0.3
 """So much time a posture may cost that is farther from limits and singularities."""
 
 
@@ -86,7 +86,9 @@ def bodies_of(
             tuple((k.name, k.min_mm, k.max_mm) for k in rig.keep_out if isinstance(k, KeepOutBox)),
         ),
         [Capsule(body.name, 7, body.from_mm, body.to_mm, body.radius_mm) for body in rig.tool],
-        Clearances(keep.object_mm, keep.support_mm, keep.dome_mm, keep.self_mm, keep.keep_out_mm, TUBE_MM),
+        Clearances(
+            keep.object_mm, keep.support_mm, keep.dome_mm, keep.self_mm, keep.keep_out_mm, PATH_TOLERANCE_MM
+        ),
         link_meshes,
     )
 
@@ -122,8 +124,12 @@ def plan_itinerary(
             choices[index] = postures
     start = np.asarray(start_deg, dtype=np.float64)
     while True:
-        unease_s = [UNEASE_S * singularities.unease(arm, postures) for postures in choices.values()]
-        tour = shortest_tour(planner, start, list(choices.values()), unease_s, as_written=order == "as_written")
+        posture_cost_s = [
+            POSTURE_COST_S * singularities.posture_cost(arm, postures) for postures in choices.values()
+        ]
+        tour = shortest_tour(
+            planner, start, list(choices.values()), posture_cost_s, as_written=order == "as_written"
+        )
         visited = [list(choices)[group] for group in tour.order]
         contacts = [leg.contact for leg in tour.legs]
         cut_off = next((k for k, contact in enumerate(contacts) if contact is not None), None)

@@ -45,7 +45,7 @@ class _Groups:
 
     places: Floats
     first: NDArray[np.int64]
-    unease_s: Floats
+    posture_cost_s: Floats
     """[places] what is added to the time of a way that uses a place."""
 
 
@@ -53,13 +53,13 @@ def shortest_tour(
     planner: PathPlanner,
     start: Joints,
     choices: Sequence[NDArray[np.float64]],
-    unease_s: Sequence[Floats],
+    posture_cost_s: Sequence[Floats],
     *,
     as_written: bool = False,
 ) -> Tour:
     """One place of each group (`choices` [k, 6] each) and the legs between, shortest in all, from `start` on.
 
-    `unease_s` [k] each is added to a place's time, so that of nearly equal ways the easier is taken. With
+    `posture_cost_s` [k] each is added to a place's time, so that of nearly equal ways the easier is taken. With
     `as_written` the order of the groups stays. The same arguments give the same tour.
     """
     if not choices:
@@ -67,7 +67,7 @@ def shortest_tour(
     groups = _Groups(
         np.concatenate([start[None], *choices]),
         np.cumsum([1, *(len(c) for c in choices)]),
-        np.concatenate([[0.0], *unease_s]),
+        np.concatenate([[0.0], *posture_cost_s]),
     )
     times = _Times(planner, groups.places)
     order = np.arange(len(choices))
@@ -138,7 +138,7 @@ class _Times:
 
 def _way_s(seconds: Floats, groups: _Groups, picked: NDArray[np.int64]) -> float:
     way = np.concatenate([[0], picked])
-    return float(seconds[way[:-1], way[1:]].sum() + groups.unease_s[picked].sum())
+    return float(seconds[way[:-1], way[1:]].sum() + groups.posture_cost_s[picked].sum())
 
 
 def _best_places(seconds: Floats, groups: _Groups, order: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -149,7 +149,7 @@ def _best_places(seconds: Floats, groups: _Groups, order: NDArray[np.int64]) -> 
         here = slice(groups.first[group], groups.first[group + 1])
         costs_s = total_s[:, None] + seconds[before, here]
         came_from.append(costs_s.argmin(axis=0))
-        before, total_s = here, costs_s.min(axis=0) + groups.unease_s[here]
+        before, total_s = here, costs_s.min(axis=0) + groups.posture_cost_s[here]
     k = int(total_s.argmin())
     picked = []
     for group, back in zip(order[::-1], came_from[::-1], strict=True):
@@ -175,6 +175,6 @@ def _best_order(
     hottest_s = max(share * float(np.median(seconds[0, 1:])), 2 * _COLDEST_S)
     rolls = np.random.default_rng(seed).random((changes, 5))
     found: tuple[Any, Any] = anneal(
-        seconds, groups.unease_s, groups.first, order, picked, rolls, hottest_s, _COLDEST_S
+        seconds, groups.posture_cost_s, groups.first, order, picked, rolls, hottest_s, _COLDEST_S
     )
     return found

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from coupole.motion.collisions import REACH_MM
 
-TUBE_MM = 10.0
+PATH_TOLERANCE_MM = 10.0
 
 
-def off_the_way_mm(way_deg: Sequence[NDArray[np.float64]], joints_deg: NDArray[np.float64]) -> float:
+def path_deviation_mm(way_deg: Sequence[NDArray[np.float64]], joints_deg: NDArray[np.float64]) -> float:
     """How far, at most, any point of arm and tool is from where it would be on the straight motions of `way_deg`
     ([6] each), with the axes at `joints_deg` [6]: the nearest place of the way is taken, and each axis' deviation
     there times the farthest that anything can be from that axis."""

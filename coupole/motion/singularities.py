@@ -17,7 +17,7 @@ from coupole.kinematics import Arm, axis_senses, limit_margin_deg
 
 
 @dataclass(frozen=True)
-class KeptFrom:
+class SingularityMargin:
     """How far a view's posture stays from singularities."""
 
     wrist_deg: float = 5.0
@@ -28,10 +28,10 @@ class KeptFrom:
     """Least distance of the wrist's centre from axis 1."""
 
 
-KEPT_FROM = KeptFrom()
-_AT_EASE = 3.0
+SINGULARITY_MARGIN = SingularityMargin()
+_FREE_MARGIN = 3.0
 """So many times the least distance from a singularity, a posture has no more to gain."""
-_AT_EASE_LIMIT_DEG = 10.0
+_FREE_LIMIT_MARGIN_DEG = 10.0
 
 
 def distances(arm: Arm, joints_deg: ArrayLike) -> tuple[NDArray[np.float64], ...]:
@@ -47,7 +47,7 @@ def distances(arm: Arm, joints_deg: ArrayLike) -> tuple[NDArray[np.float64], ...
     return wrist_deg, elbow_deg, np.hypot(out_mm, arm.b_mm)
 
 
-def margin(arm: Arm, joints_deg: ArrayLike, kept: KeptFrom = KEPT_FROM) -> NDArray[np.float64]:
+def margin(arm: Arm, joints_deg: ArrayLike, kept: SingularityMargin = SINGULARITY_MARGIN) -> NDArray[np.float64]:
     """[...] how many times as far as it must be a posture [..., 6] is from the nearest singularity."""
     wrist_deg, elbow_deg, shoulder_mm = distances(arm, joints_deg)
     shares = (wrist_deg / kept.wrist_deg, elbow_deg / kept.elbow_deg, shoulder_mm / kept.shoulder_mm)
@@ -55,7 +55,7 @@ def margin(arm: Arm, joints_deg: ArrayLike, kept: KeptFrom = KEPT_FROM) -> NDArr
     return least
 
 
-def reason(arm: Arm, joints_deg: ArrayLike, kept: KeptFrom = KEPT_FROM) -> str:
+def reason(arm: Arm, joints_deg: ArrayLike, kept: SingularityMargin = SINGULARITY_MARGIN) -> str:
     """Which singularity a posture [6] is too near to, as a phrase for messages; empty if it is not."""
     wrist_deg, elbow_deg, shoulder_mm = (float(distance) for distance in distances(arm, joints_deg))
     if wrist_deg < kept.wrist_deg:
@@ -76,9 +76,9 @@ def reason(arm: Arm, joints_deg: ArrayLike, kept: KeptFrom = KEPT_FROM) -> str:
     return ""
 
 
-def unease(arm: Arm, postures_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+def posture_cost(arm: Arm, postures_deg: NDArray[np.float64]) -> NDArray[np.float64]:
     """[k] 0 for postures [k, 6] well away from singularities and limits, up to 1 for those just allowed."""
-    from_singular = (_AT_EASE - margin(arm, postures_deg)) / (_AT_EASE - 1.0)
-    from_limit = 1.0 - limit_margin_deg(arm, postures_deg) / _AT_EASE_LIMIT_DEG
-    uneasy: NDArray[np.float64] = np.clip(np.maximum(from_singular, from_limit), 0.0, 1.0)
-    return uneasy
+    from_singular = (_FREE_MARGIN - margin(arm, postures_deg)) / (_FREE_MARGIN - 1.0)
+    from_limit = 1.0 - limit_margin_deg(arm, postures_deg) / _FREE_LIMIT_MARGIN_DEG
+    cost: NDArray[np.float64] = np.clip(np.maximum(from_singular, from_limit), 0.0, 1.0)
+    return cost

@@ -1,8 +1,8 @@
-"""Shapes as unions of balls, in trees: the one vocabulary in which distances are reckoned.
+"""Shapes as unions of spheres, in trees: the one vocabulary in which distances are reckoned.
 
-A capsule is a chain of balls, a mesh is one ball about each of many points of its surface; both enclose what they
-stand for, so a distance between balls is never more than the true one. A tree has one bounding ball over all of
-a shape and halves it down to single balls (Quinlan, "Efficient Distance Computation between Non-Convex
+A capsule is a chain of spheres, a mesh is one sphere about each of many points of its surface. Both enclose what
+they stand for, so a distance between spheres is never more than the true one. A tree has one bounding sphere over
+all of a shape and halves it down to single spheres (Quinlan, "Efficient Distance Computation between Non-Convex
 Objects", 1994).
 """
 
@@ -19,31 +19,31 @@ Floats = NDArray[np.float64]
 MESH_STEP_MM = 6.0
 """Spacing of the points on an object's surface."""
 _CHAIN_EXCESS_MM = 1.0
-"""How much a chain of balls may be wider than the capsule that it covers."""
+"""How much a chain of spheres may be wider than the capsule that it covers."""
 
 
-class Balls(NamedTuple):
+class Spheres(NamedTuple):
     """Centres [n, 3] and radii [n], mm."""
 
     centers_mm: Floats
     radii_mm: Floats
 
 
-class Forest(NamedTuple):
-    """Trees of balls, one after the other (two arrays, because numba's compile time grows with their number)."""
+class SphereTrees(NamedTuple):
+    """Trees of spheres, one after the other (two arrays, because numba's compile time grows with their number)."""
 
     nodes: Floats
-    """[m, 4] centre and radius of each node's ball, mm: what bounds all below it; of a leaf, the shape's own."""
+    """[m, 4] centre and radius of each node's sphere, mm: what bounds all below it; of a leaf, the shape's own."""
     trees: NDArray[np.int64]
     """[k, 2] of each tree where its nodes begin, and its first leaf. They are numbered like a heap: the root is 1,
     the children of i are 2 i and 2 i + 1."""
 
 
-def balls_of(segments_mm: Floats, radii_mm: Floats) -> Balls:
-    """Chains of balls that cover capsules: all within `radii_mm` [n] of segments [n, 2, 3].
+def spheres_of(segments_mm: Floats, radii_mm: Floats) -> Spheres:
+    """Chains of spheres that cover capsules: all within `radii_mm` [n] of segments [n, 2, 3].
 
-    The first and last ball stand at the ends. Between them, a point that is at most h further along than a ball's
-    centre lies within sqrt(r^2 + h^2) of it.
+    The first and last sphere stand at the ends. Between them, a point that is at most h further along than the
+    centre of a sphere lies within sqrt(r^2 + h^2) of it.
     """
     centers, radii = [], []
     for (start, end), radius in zip(segments_mm, radii_mm, strict=True):
@@ -52,7 +52,7 @@ def balls_of(segments_mm: Floats, radii_mm: Floats) -> Balls:
         count = max(1, int(np.ceil(length / (2.0 * longest_half_step))))
         centers.append(np.linspace(start, end, count + 1))
         radii.append(np.full(count + 1, np.hypot(radius, length / (2.0 * count))))
-    return Balls(np.concatenate(centers), np.concatenate(radii))
+    return Spheres(np.concatenate(centers), np.concatenate(radii))
 
 
 def surface_points(corners_mm: Floats, step_mm: float = MESH_STEP_MM) -> Floats:
@@ -85,29 +85,29 @@ def _one_per_cell(points: Floats, cell_mm: float) -> Floats:
     return kept
 
 
-def forest_of(shapes: Sequence[Balls]) -> Forest:
-    """Trees over shapes, in their order. Each shape has at least one ball."""
+def sphere_trees_of(shapes: Sequence[Spheres]) -> SphereTrees:
+    """Trees over shapes, in their order. Each shape has at least one sphere."""
     trees = [_tree(shape) for shape in shapes]
     sizes = [len(nodes) for nodes in trees]
-    return Forest(
+    return SphereTrees(
         np.concatenate(trees), np.column_stack([np.cumsum([0, *sizes[:-1]]), [size // 2 for size in sizes]])
     )
 
 
-def _tree(shape: Balls) -> Floats:
-    """[m, 4] nodes of a tree that halves a shape across its longest side; number 0 is not used, and the last ball
-    stands several times to fill the leaves."""
-    balls = np.column_stack([shape.centers_mm, shape.radii_mm])
-    depth = int(np.ceil(np.log2(len(balls))))
-    balls = balls[np.minimum(np.arange(1 << depth), len(balls) - 1)]
+def _tree(shape: Spheres) -> Floats:
+    """[m, 4] nodes of a tree that halves a shape across its longest side; number 0 is not used, and the last
+    sphere stands several times to fill the leaves."""
+    spheres = np.column_stack([shape.centers_mm, shape.radii_mm])
+    depth = int(np.ceil(np.log2(len(spheres))))
+    spheres = spheres[np.minimum(np.arange(1 << depth), len(spheres) - 1)]
     levels = [np.zeros((1, 4))]
     for level in range(depth):
-        groups = balls.reshape(1 << level, -1, 4)
+        groups = spheres.reshape(1 << level, -1, 4)
         low, high = groups[..., :3].min(axis=1), groups[..., :3].max(axis=1)
         middles = (low + high) / 2
         radii = (np.linalg.norm(groups[..., :3] - middles[:, None], axis=2) + groups[..., 3]).max(axis=1)
         levels.append(np.column_stack([middles, radii]))
         longest = np.argmax(high - low, axis=1)[:, None, None]
         along = np.take_along_axis(groups[..., :3], longest, axis=2)[..., 0]
-        balls = np.take_along_axis(groups, np.argsort(along, axis=1)[..., None], axis=1)
-    return np.concatenate([*levels, balls.reshape(-1, 4)])
+        spheres = np.take_along_axis(groups, np.argsort(along, axis=1)[..., None], axis=1)
+    return np.concatenate([*levels, spheres.reshape(-1, 4)])

@@ -1,6 +1,6 @@
 """What a pydantic model refused, in words for an operator: one `Mistake` for each thing that is wrong.
 
-pydantic reports a flat list of errors whose locations mix keys with labels of unions. `explain` sorts them
+pydantic reports a flat list of errors whose locations mix keys with labels of unions. `mistakes_of` sorts them
 back along the model's core schema, where each level knows its valid keys, tags, bounds and lengths:
 
 - a tagged union answers for the chosen tag only, or lists the valid tags;
@@ -59,7 +59,7 @@ def key_text(key_path: KeyPath) -> str:
     return text.removeprefix(".")
 
 
-def explain(model: type[BaseModel], value: Any, error: ValidationError) -> list[Mistake]:
+def mistakes_of(model: type[BaseModel], value: Any, error: ValidationError) -> list[Mistake]:
     """The mistakes in `value` that made `model` raise `error`."""
     errors: Errors = [(tuple(item["loc"]), dict(item)) for item in error.errors(include_url=False)]
     return list(_Explainer(dict(model.__pydantic_core_schema__)).mistakes((), value, errors))

@@ -25,7 +25,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from coupole.errors import InputError, Problem
-from coupole.plan.validation_messages import KeyPath, Mistake, explain, key_text
+from coupole.plan.validation_messages import KeyPath, Mistake, key_text, mistakes_of
 
 M = TypeVar("M", bound=BaseModel)
 Place: TypeAlias = tuple[int, int]
@@ -94,7 +94,7 @@ class Document:
         try:
             return model.model_validate_json(json.dumps(_finite(part)), strict=True), []
         except ValidationError as error:
-            found = [self._mistake(at, mistake) for mistake in explain(model, part, error)]
+            found = [self._mistake(at, mistake) for mistake in mistakes_of(model, part, error)]
         return None, sorted(found, key=lambda problem: (problem.line, problem.column))
 
     def _part(self, at: KeyPath) -> Any:

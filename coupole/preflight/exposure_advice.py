@@ -31,7 +31,7 @@ SHORTER = (16, 4, 1)
 """Metering exposures are the plan's shortest divided by these."""
 _REPEATS = 2
 _CELL_STEP = 4
-"""Of the Bayer cells every so-manieth in both directions is looked at."""
+"""Of the Bayer cells every n-th in both directions is sampled."""
 _BRACKET_STEP = 4.0
 _FULL = 0.95
 """Of the range above black that counts as full: noise must not reach saturation."""
@@ -47,7 +47,7 @@ _SHORTEST_US = 10
 
 
 @dataclass(frozen=True)
-class Wish:
+class Request:
     """What pictures shall be like."""
 
     saturated_share: float = 1e-3
@@ -83,7 +83,7 @@ class ViewAdvice:
     """Below it too few of the object's pixels reach the wished signal-to-noise ratio."""
     object_share: float
     """Pixels that show the object, of all."""
-    dazzled: bool
+    saturated_at_shortest: bool
     """Even the shortest metering exposure saturated more than was wished: `longest_us` may be too long."""
 
 
@@ -212,7 +212,7 @@ def noise_of(views: Iterable[Metered]) -> Noise:
     return Noise(max(math.sqrt(max(offset, 0.0)), _ROUNDING_DN), max(float(gain), 1e-6))
 
 
-def advise_view(view: str, metered: Metered, wish: Wish, noise: Noise) -> ViewAdvice:
+def advise_view(view: str, metered: Metered, request: Request, noise: Noise) -> ViewAdvice:
     """Bounds of a view's exposure."""
     white = metered.frame_format.white_dn - metered.frame_format.black_dn
     rates = []
@@ -225,29 +225,31 @@ def advise_view(view: str, metered: Metered, wish: Wish, noise: Noise) -> ViewAd
     shortest_metered_us = min(e for by_exposure in metered.samples.values() for e in by_exposure)
     longest_metered_us = max(e for by_exposure in metered.samples.values() for e in by_exposure)
     per_light = np.minimum(np.array(rates), white / shortest_metered_us)
-    brightest = np.quantile(per_light, 1.0 - wish.saturated_share, axis=1).max()
+    brightest = np.quantile(per_light, 1.0 - request.saturated_share, axis=1).max()
     best = per_light.max(axis=0)
     # The best of many lights is lifted by noise: of n looks at nothing the highest lies sqrt(2 ln n) sigma up.
     looks = math.sqrt(2.0 * math.log(max(2, len(rates)))) + _SEEN_SIGMA
     of_object = best * longest_metered_us > looks * noise.read_dn
     longest_us = _FULL * _UNSEEN_LIGHTS * white / max(brightest, 1e-12)
-    dazzled = bool((np.isinf(rates).mean(axis=1) > wish.saturated_share).any())
+    saturated_at_shortest = bool((np.isinf(rates).mean(axis=1) > request.saturated_share).any())
     if not of_object.any():
-        return ViewAdvice(view, longest_us, math.inf, 0.0, dazzled)
-    darkest = max(float(np.quantile(best[of_object], 1.0 - wish.object_share)), 1e-12)
-    shortest_us = _NOISE_MARGIN * noise.signal_for(wish.snr) / darkest
-    return ViewAdvice(view, longest_us, shortest_us, float(of_object.mean()), dazzled)
+        return ViewAdvice(view, longest_us, math.inf, 0.0, saturated_at_shortest)
+    darkest = max(float(np.quantile(best[of_object], 1.0 - request.object_share)), 1e-12)
+    shortest_us = _NOISE_MARGIN * noise.signal_for(request.snr) / darkest
+    return ViewAdvice(view, longest_us, shortest_us, float(of_object.mean()), saturated_at_shortest)
 
 
-def advise(views: Mapping[str, Metered], wish: Wish, *, longest_us: int) -> Advice:
+def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -> Advice:
     """The exposure or bracket that all views can be taken with; LEDs can be on for one of `longest_us`."""
     noise = noise_of(views.values())
-    found = tuple(advise_view(view, metered, wish, noise) for view, metered in views.items())
+    found = tuple(advise_view(view, metered, request, noise) for view, metered in views.items())
     remarks = [
         f"view {a.view}: nothing but noise is seen; is the object lit?" for a in found if not a.object_share
     ]
     remarks += [
-        f"view {a.view}: saturated at all that was metered; meter again from this" for a in found if a.dazzled
+        f"view {a.view}: saturated at all that was metered; meter again from this"
+        for a in found
+        if a.saturated_at_shortest
     ]
     low_us, high_us = _SHORTEST_US, longest_us
     brightest_us = min(a.longest_us for a in found)

@@ -20,7 +20,7 @@ from coupole.geometry import apply
 from coupole.motion.bodies import missing_link_meshes
 from coupole.motion.collisions import CellBodies
 from coupole.motion.itinerary import Itinerary, bodies_of, plan_itinerary
-from coupole.motion.shadow import Shadow, Shadows, shadows_of
+from coupole.motion.occlusion import Occlusion, Occlusions, occlusions_of
 from coupole.plan import yamlfile
 from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.plan import MeasuredObject, Plan
@@ -111,20 +111,20 @@ class Job:
         hidden: dict[str, list[int]] = {}
         for view, visit, bursts in zip(self.schedule.views, itinerary.visits, self.schedule.bursts, strict=True):
             lit = {int(led) for burst in bursts for led in burst.table["led"]}
-            useless = self.useless_leds(self.shadows.at(visit.joints_deg)) if visit else []
-            if leds := [led for led in useless if led in lit]:
+            occluded = self.occluded_leds(self.occlusions.at(visit.joints_deg)) if visit else []
+            if leds := [led for led in occluded if led in lit]:
                 hidden[view.name] = leds
         return hidden
 
-    def useless_leds(self, shadow: Shadow) -> list[int]:
+    def occluded_leds(self, shadow: Occlusion) -> list[int]:
         """Ids of the LEDs that reach nothing of what a view sees."""
-        return [int(led) for led in self.cell.leds.ids[shadow.useless()]]
+        return [int(led) for led in self.cell.leds.ids[shadow.occluded_leds()]]
 
     @cached_property
-    def shadows(self) -> Shadows:
+    def occlusions(self) -> Occlusions:
         """What the object, and in each posture arm and tool, hide of the LEDs."""
         targets = [view.target_mm for view in self.schedule.views if view.target_mm is not None]
-        return shadows_of(self.cell.rig, self.cell.leds, self.object_corners_mm, targets or [(0.0, 0.0, 0.0)])
+        return occlusions_of(self.cell.rig, self.cell.leds, self.object_corners_mm, targets or [(0.0, 0.0, 0.0)])
 
     @cached_property
     def bodies(self) -> CellBodies:

@@ -24,7 +24,7 @@ _OURS = "X-Coupole-Live"
 def serve(studio: Studio, leds: tuple[int, ...], longest_us: int, port: int) -> ThreadingHTTPServer:
     """A server on 127.0.0.1, its port in `server_port`; call `serve_forever` on a thread, `shutdown` to end."""
 
-    page = resources.files("coupole").joinpath("live.html").read_bytes()
+    page = resources.files("coupole.viewing").joinpath("live.html").read_bytes()
 
     class Viewer(BaseHTTPRequestHandler):
         """One viewer's connection."""

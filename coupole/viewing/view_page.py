@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.motion.shadow import AWAY, BY_ARM, BY_OBJECT, BY_TOOL
+from coupole.motion.occlusion import AWAY, BY_ARM, BY_OBJECT, BY_TOOL
 from coupole.viewing import view_colours as colours
 from coupole.viewing.terminal import duration_text
 from coupole.viewing.view_colours import Colour, css

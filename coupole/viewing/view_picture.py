@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from coupole.geometry import look_at
-from coupole.motion.shadow import REACHED
+from coupole.motion.occlusion import REACHED
 from coupole.viewing import view_colours as colours
 from coupole.viewing.view_canvas import Canvas, Lookout
 from coupole.viewing.view_scene import Scene, Stop

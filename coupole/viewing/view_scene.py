@@ -18,13 +18,13 @@ from coupole.motion import singularities
 from coupole.motion.bodies import ARM_CAPSULES, FLANGE, Capsule
 from coupole.motion.collisions import CellBodies, Contact
 from coupole.motion.itinerary import Itinerary, Visit, arm_of, base_from_flange
+from coupole.motion.occlusion import Occlusion, Occlusions, Sight, capsule_axes, sight_of
 from coupole.motion.path_planner import Joints
-from coupole.motion.shadow import Shadow, Shadows, Sight, capsule_axes, sight_of
 from coupole.plan.rig import KeepOutBox, Rig
 from coupole.plan.shots import ViewPose, leds_of_plan
 from coupole.preflight.job import Job
 from coupole.viewing.view_sight import footprint
-from coupole.viewing.view_solids import Points, Solid, ball, box, capsule, joined
+from coupole.viewing.view_solids import Points, Solid, box, capsule, joined, sphere
 
 _WAY_STEP_DEG = 3.0
 _CLASH_PLACES = 200
@@ -69,7 +69,7 @@ class Stop:
     sight: Sight | None
     footprint_mm: Points
     """[n, 3] closed line round what the picture shows of object and support."""
-    shadow: Shadow | None
+    shadow: Occlusion | None
     refusal: str
     """Why the plan must not be run, as far as this view is concerned; empty if nothing speaks against it."""
     clash: Clash | None
@@ -113,10 +113,10 @@ class Scene:
         """What is to be said of the plan's LEDs in a view, a line each."""
         if stop.shadow is None or not self.used.any():
             return []
-        reached, useless = stop.shadow.share()[self.used].mean(), stop.shadow.useless()[self.used].sum()
+        reached, occluded = stop.shadow.share()[self.used].mean(), stop.shadow.occluded_leds()[self.used].sum()
         return [
             f"an LED reaches {reached:.0%} of what is seen",
-            f"{useless} of {self.used.sum()} LEDs reach nothing of it",
+            f"{occluded} of {self.used.sum()} LEDs reach nothing of it",
         ]
 
     def arm(self, joints_deg: Joints, around: int = 24) -> list[Solid]:
@@ -135,7 +135,7 @@ class Scene:
 def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals: Sequence[str]) -> Scene:
     """Everything that there is to see of a job; without `bodies` nothing is looked at for collisions."""
     rig, views = job.cell.rig, job.schedule.views
-    shadows, corners_mm = job.shadows, job.object_corners_mm
+    shadows, corners_mm = job.occlusions, job.object_corners_mm
     refused = [index for index in range(len(views)) if index not in itinerary.order]
     home_deg = place_deg = np.array(rig.motion.home_joints_deg)
     stops = []
@@ -163,7 +163,7 @@ def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals
         tuple(
             box(k.name, k.min_mm, k.max_mm)
             if isinstance(k, KeepOutBox)
-            else ball(k.name, k.center_mm, k.radius_mm)
+            else sphere(k.name, k.center_mm, k.radius_mm)
             for k in rig.keep_out
         ),
         shadows.leds_mm,
@@ -178,7 +178,7 @@ def _refusal(view: ViewPose, refusals: Sequence[str]) -> str:
     return next((text.removeprefix(start) for text in refusals if text.startswith(start)), "")
 
 
-def _visited(number: int, view: ViewPose, from_deg: Joints, visit: Visit, rig: Rig, shadows: Shadows) -> Stop:
+def _visited(number: int, view: ViewPose, from_deg: Joints, visit: Visit, rig: Rig, shadows: Occlusions) -> Stop:
     way_deg = [from_deg, *visit.leg.waypoints]
     sight = _sight(view, visit.joints_deg, rig)
     return Stop(
@@ -202,7 +202,7 @@ def _refused(
     starts_deg: Sequence[Joints],
     rig: Rig,
     bodies: CellBodies | None,
-    shadows: Shadows,
+    shadows: Occlusions,
 ) -> Stop:
     clash, from_deg = None, starts_deg[0]
     if bodies is not None:
@@ -231,7 +231,7 @@ def _sight(view: ViewPose, joints_deg: Joints | None, rig: Rig) -> Sight | None:
     return sight_of(rig, _frames(rig, joints_deg)[FLANGE] @ rig.flange_from_camera.matrix())
 
 
-def _footprint(sight: Sight | None, rig: Rig, shadows: Shadows) -> Points:
+def _footprint(sight: Sight | None, rig: Rig, shadows: Occlusions) -> Points:
     return np.zeros((0, 3)) if sight is None else footprint(sight, shadows.mesh, rig.support.diameter_mm / 2)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coupole.geometry import apply
-from coupole.motion.shadow import Sight
+from coupole.motion.occlusion import Sight
 from coupole.viewing.view_solids import Points
 
 _BORDER_POINTS = 16

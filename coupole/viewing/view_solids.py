@@ -1,4 +1,4 @@
-"""Shapes to draw: closed meshes of capsules, disks, boxes and balls, and large meshes made small."""
+"""Shapes to draw: closed meshes of capsules, disks, boxes and spheres, and large meshes made small."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def capsule(name: str, start_mm: ArrayLike, end_mm: ArrayLike, radius_mm: float,
     return Solid(name, vertices + np.where(at_end[:, None], end, start), faces)
 
 
-def ball(name: str, center_mm: ArrayLike, radius_mm: float, around: int = 24) -> Solid:
+def sphere(name: str, center_mm: ArrayLike, radius_mm: float, around: int = 24) -> Solid:
     return capsule(name, center_mm, center_mm, radius_mm, around)
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 from scipy.spatial.transform import Rotation
 
+from coupole.appearance.shapes.triangles import Array, welded
 from coupole.errors import InputError, StorageError
 from coupole.geometry import Transform
-from sim.objects.patchwork import Array, welded
 from sim.scene.things import Sample, Thing
 
 MESH, TARGETS = "scan.stl", "targets.txt"

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.appearance.shapes.triangles import Array, skirt
 from coupole.errors import InputError
 from sim.objects import appearance
-from sim.objects.patchwork import Array, joined, of_material, skirt
+from sim.objects.surfaces import joined, of_material
 from sim.scene.surface import Surface
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.objects.patchwork import Array, cells_for, of_material, rectangle
+from coupole.appearance.shapes.triangles import Array, cells_for, rectangle
+from sim.objects.surfaces import of_material
 from sim.scene.surface import Material, Surface
 
 LINEN = Material("linen", (0.55, 0.47, 0.34), (0.04, 0.04, 0.04), 0.5)

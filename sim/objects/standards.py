@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.appearance.shapes.triangles import Array, disk, flat_normals, rectangle, skirt
 from coupole.errors import InputError
 from sim.objects import appearance
-from sim.objects.patchwork import Array, disk, flat_normals, joined, moved, of_material, rectangle, skirt
 from sim.objects.shapes import sphere
+from sim.objects.surfaces import joined, moved, of_material
 from sim.scene.surface import Material, Surface
 
 _SEGMENTS = 48

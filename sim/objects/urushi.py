@@ -6,8 +6,10 @@ import numpy as np
 
 from coupole.appearance.matter import nashiji
 from coupole.appearance.optics import indices
+from coupole.appearance.shapes import samples
+from coupole.appearance.shapes.triangles import slab
 from sim.objects import appearance
-from sim.objects.patchwork import Array, cells_for, joined, of_material, rectangle, skirt, slab
+from sim.objects.surfaces import joined, of_material
 from sim.scene.surface import Surface
 
 _BODY_MM = 6.0
@@ -18,20 +20,16 @@ _LEVELS = 6
 def makie_tile(side_mm: float = 60.0, *, triangles: int = 60_000, petals: int = 8, seed: int = 1) -> Surface:
     """A tile of polished black urushi that stands on z = 0, with a flower of sprinkled gold on its face.
 
-    The share of gold falls from 95 % inside the drawing to none over its edge, as powder does: each triangle of
-    the face is gold with that probability, lacquer otherwise.
+    The drawing: `appearance.shapes.samples.makie_tile`.
     """
-    columns, rows = cells_for(triangles, side_mm, side_mm)
-    face = rectangle(side_mm, side_mm, columns, rows, z_mm=_BODY_MM)
-    share = _drawing(face.mean(axis=1)[:, :2] / (0.5 * side_mm), petals)
-    gold = np.random.default_rng(seed).random(len(face)) < share
+    parts = samples.makie_tile(side_mm, triangles, petals, seed)
     powder = appearance.metal("makie gold", indices.gold(), 0.25)
     black = appearance.black_lacquer()
     return joined(
         [
-            of_material(face[gold], powder),
-            of_material(face[~gold], black),
-            of_material(skirt(face), black),
+            of_material(parts.powder, powder),
+            of_material(parts.ground, black),
+            of_material(parts.body, black),
         ]
     )
 
@@ -59,14 +57,3 @@ def nashiji_slab(slab_of: nashiji.Slab | None = None) -> Surface:
         )
         parts.append(of_material(corners[level == k].reshape(-1, 3, 3), metal))
     return joined(parts)
-
-
-def _drawing(place: Array, petals: int) -> Array:
-    """Share of gold [n] at places [n, 2] of the face, -1 to 1: a flower, its heart and a rim."""
-    r, phi = np.hypot(*place.T), np.arctan2(*place.T[::-1])
-    edge = 0.45 + 0.25 * np.abs(np.cos(0.5 * petals * phi))
-    flower = (r > 0.16) & (r < edge) | (r < 0.10)
-    outside = np.where(flower, 0.0, np.maximum(r - edge, 0.0))
-    powder = 0.95 * np.exp(-((outside / 0.06) ** 2)) * (flower | (r > edge))
-    rim = np.abs(place).max(axis=1) > 0.94
-    return np.where(rim, 0.95, powder)

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
+from coupole.appearance.shapes.samples import GILT_NM, PAINT_MM, stepped_panel
 from sim.objects import appearance
-from sim.objects.patchwork import Array, joined, of_material, rectangle, skirt
+from sim.objects.surfaces import joined, of_material
 from sim.scene.surface import Material, Surface
-
-GILT_NM = (0.0, 10.0, 20.0, 40.0, 70.0, 100.0, 150.0, 250.0)
-"""From bare bole to bulk gold; a beaten leaf has some 100 nm."""
-PAINT_MM = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
 
 
 def gilt_step_wedge(
@@ -50,13 +45,9 @@ def paint_wedge(
     return _panel(fields, step_mm, row_mm)
 
 
-def _panel(fields: Sequence[Sequence[Material]], step_mm: float, row_mm: float, body_mm: float = 8.0) -> Surface:
-    """A plate whose top is divided into fields: rows along y, steps along x, z = `body_mm`."""
-    rows, steps = len(fields), len(fields[0])
-    parts = []
-    for row, materials in enumerate(fields):
-        for step, material in enumerate(materials):
-            middle = [(step - (steps - 1) / 2) * step_mm, (row - (rows - 1) / 2) * row_mm, body_mm]
-            parts.append(of_material(rectangle(step_mm, row_mm) + np.array(middle), material))
-    lid: Array = np.concatenate([part.corners_mm for part in parts])
-    return joined([*parts, of_material(skirt(lid), appearance.BLACK_PRINT)])
+def _panel(fields: Sequence[Sequence[Material]], step_mm: float, row_mm: float) -> Surface:
+    """Rows of fields along y, steps along x."""
+    panel = stepped_panel(len(fields), len(fields[0]), step_mm, row_mm)
+    materials = [material for row in fields for material in row]
+    parts = [of_material(corners, material) for corners, material in zip(panel.fields, materials, strict=True)]
+    return joined([*parts, of_material(panel.body, appearance.BLACK_PRINT)])

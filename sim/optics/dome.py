@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict
 from scipy.spatial.transform import Rotation
 
-from sim.scene.scene import Leds
+from coupole.appearance.render.led_squares import Leds
 
 _SHIFT, _TURN, _PLACE = 1, 2, 3
 """Purposes of the seed's streams."""

@@ -14,23 +14,11 @@ from numpy.typing import ArrayLike
 from pydantic import ConfigDict
 
 from coupole.appearance.spectra import channels
-from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
+from coupole.appearance.spectra.grid import Array
+from coupole.appearance.spectra.white_led import WHITE_LED, LedSpectrum, spectral_power
 
 _OWN_FLUX, _OWN_PUMP, _FLASH, _LOOSE = 1, 2, 3, 4
 """Purposes of the seed's streams."""
-
-
-@dataclass(frozen=True)
-class LedSpectrum:
-    """A blue chip under a yellow phosphor. Both bands are normal curves; the figures are those of a white LED of
-    about 5500 K (assumed)."""
-
-    pump_nm: float = 450.0
-    pump_fwhm_nm: float = 20.0
-    phosphor_nm: float = 560.0
-    phosphor_fwhm_nm: float = 115.0
-    pump_share: float = 0.22
-    """Of the radiant power between 380 and 780 nm."""
 
 
 @dataclass(frozen=True)
@@ -56,18 +44,11 @@ class LedModel:
     """Relative standard deviation from flash to flash."""
     dead: tuple[int, ...] = ()
     """LEDs that give no light."""
-    spectrum: LedSpectrum = LedSpectrum()
+    spectrum: LedSpectrum = WHITE_LED
 
 
 STEADY = LedModel(flux_spread=0.0, pump_spread_nm=0.0, flux_per_k=0.0, flicker=0.0)
 """LEDs that give what their table says, always."""
-
-
-def spectral_power(spectrum: LedSpectrum) -> Array:
-    """Relative spectral power [81] of a white LED; its sum is 1."""
-    pump = _band(spectrum.pump_nm, spectrum.pump_fwhm_nm)
-    phosphor = _band(spectrum.phosphor_nm, spectrum.phosphor_fwhm_nm)
-    return spectrum.pump_share * pump + (1.0 - spectrum.pump_share) * phosphor
 
 
 def own_flux_factor(model: LedModel, led: int) -> float:
@@ -127,12 +108,6 @@ def channel_factors(model: LedModel, led: int, sensitivities: Array) -> Array:
 def camera_weights(model: LedModel, sensitivities: ArrayLike) -> Array:
     """[channels, 81] for `channels.channel_values`: what spectra become under the model's LED."""
     return channels.channel_weights(spectral_power(model.spectrum), sensitivities)
-
-
-def _band(centre_nm: float, fwhm_nm: float) -> Array:
-    """A normal curve on the grid; its sum is 1."""
-    curve = np.exp(-4.0 * np.log(2.0) * ((WAVELENGTHS_NM - centre_nm) / fwhm_nm) ** 2)
-    return np.asarray(curve / curve.sum())
 
 
 def _normal(*where: int) -> float:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.appearance.render.led_squares import Leds, read_leds
 from coupole.appearance.spectra import light
 from coupole.geometry import Transform, inverse
 from sim.devices.arm_bodies import NONE, Capsules
@@ -28,7 +29,7 @@ from sim.render.emitter import LED_SIDE_MM, Emitter, irradiance, square
 from sim.render.lens import Lens, sight
 from sim.render.radiance import led_radiance, panel_radiance
 from sim.render.shadows import Shadows
-from sim.scene.scene import Leds, Scene, build_scene, load_surface, read_leds, support_disk
+from sim.scene.scene import Scene, build_scene, load_surface, support_disk
 from sim.scene.surface import Material, Surface
 from sim.scene.things import placed
 from sim.world.config import WHITE_SHARE, CameraConfig, MeshConfig, SceneConfig, Settings

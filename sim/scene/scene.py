@@ -29,24 +29,6 @@ _CHUNK = 1 << 18
 
 
 @dataclass(frozen=True)
-class Leds:
-    """The LED table: positions [n, 3] and normals [n, 3] in the base frame, flux [n] in lm."""
-
-    ids: NDArray[np.int64]
-    boards: NDArray[np.int64]
-    positions_mm: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    flux_lm: NDArray[np.float64]
-
-
-def read_leds(path: Path) -> Leds:
-    """LEDs of a dome's CSV: id, board, x_mm, y_mm, z_mm, nx, ny, nz, flux_lm; `#` starts a comment."""
-    lines = [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
-    table = np.array([[float(v) for v in line.split(",")] for line in lines[1:]])
-    return Leds(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:5], table[:, 5:8], table[:, 8])
-
-
-@dataclass(frozen=True)
 class Scene:
     """All triangles in the base frame, and of what they are; 40 bytes a triangle at least."""
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 _BLOCK = struct.Struct("<QqqdqqQ")
 """Sequence (odd while being written), machine ns and world ns at the anchor, speed, hurry-until ns, horizon ns,
-1 while the world lives. The client's wish, hurry-until ns, stands behind it."""
+1 while the world lives. The client's request, hurry-until ns, stands behind it."""
 _SEQUENCE, _WISH = struct.Struct("<Q"), struct.Struct("<q")
 BLOCK_BYTES = _BLOCK.size + _WISH.size
 _NAP_S = 0.02

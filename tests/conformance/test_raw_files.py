@@ -20,6 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from places import SHARED_DATA
 from tiny_dng import BLACK_DN, WHITE_DN, write_dng
 
 from coupole.acquisition.frame_matching import FaultModel, match
@@ -35,7 +36,7 @@ from drivers.camera.raw.picture import decode
 
 pytest.importorskip("rawpy", reason="the extra `real-data` is not installed")
 
-REAL_DNG = Path(__file__).parents[3] / "shared/data/raw/colorchart.dng"
+REAL_DNG = SHARED_DATA / "raw/colorchart.dng"
 HEIGHT_PX, WIDTH_PX = 24, 40
 EXPOSURE = Exposure(8_000)
 BY_COMMAND = Exposure(8_000, hardware_trigger=False)

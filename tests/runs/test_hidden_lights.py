@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cells import LOW, TOP, CellFolder
 
-from coupole.motion.shadow import REACHED
+from coupole.motion.occlusion import REACHED
 
 STEEP = {**TOP, "name": "steep", "elevation_deg": 88}
 

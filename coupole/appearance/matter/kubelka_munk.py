@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike
 
 from coupole.appearance.spectra.grid import Array, within
 
+_ROUNDING = 1e-12
+"""So much more than 1 a reflectance may become by rounding."""
+
 
 def decay(x: ArrayLike) -> Array:
     """(1 - exp(-x))/x, which is 1 at 0: the mean of exp(-z) over 0 < z < x."""
@@ -85,4 +88,6 @@ def saunderson_inverse(seen: ArrayLike, external_k1: ArrayLike, internal_k2: Arr
     """The layer's own reflectance from what is seen of it, gloss excluded: the inverse of `saunderson`."""
     k1, k2 = (np.asarray(v, dtype=float) for v in (external_k1, internal_k2))
     r = np.asarray(seen, dtype=float)
-    return within("R inside the binder", r / ((1.0 - k1) * (1.0 - k2) + k2 * r), 0.0, 1.0)
+    inside = r / ((1.0 - k1) * (1.0 - k2) + k2 * r)
+    rounded = np.where((inside > 1.0) & (inside < 1.0 + _ROUNDING), 1.0, inside)
+    return within("R inside the binder", rounded, 0.0, 1.0)

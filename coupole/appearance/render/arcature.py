@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from coupole.appearance.shapes.triangles import grid_faces
 from coupole.appearance.spectra.grid import Array
-from sim.objects.patchwork import grid_faces
 
 _SEGMENTS = 192
 _MARGIN = 0.45

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.appearance.shapes.triangles import flat_normals, welded
 from coupole.appearance.spectra.grid import BANDS, Array
-from sim.objects.patchwork import flat_normals, welded
 
 Reflectance = Callable[[Array], Array]
 """Cosines [n] to reflectances [n, 81]."""

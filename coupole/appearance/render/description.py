@@ -12,7 +12,7 @@ from coupole.appearance.render.bands import Description
 from coupole.appearance.render.materials import bsdf
 from coupole.appearance.render.model import unit
 from coupole.appearance.render.scene_file import Camera, Scene
-from sim.objects.patchwork import welded
+from coupole.appearance.shapes.triangles import welded
 
 Filter = float | Literal["circular"]
 """Angle in degrees of a polariser before the lens, from the picture's horizontal towards up; or one that passes

@@ -9,11 +9,11 @@ import numpy as np
 from pydantic import Field
 
 from coupole.appearance.render.bands import Description
+from coupole.appearance.render.led_squares import read_leds
 from coupole.appearance.render.model import Model, Positive, Vector, unit
 from coupole.appearance.render.spectra import DomeLed, Power, power, scaled
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
-from sim.scene.scene import read_leds
 
 LED_SIDE_MM = 7.0
 _FAR_MM = 1e5

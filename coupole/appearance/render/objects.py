@@ -1,30 +1,35 @@
-"""Objects of a scene file: triangles of `sim.objects`, each with a spectral material in place of its RGB one."""
+"""Objects of a scene file: triangles, each with a spectral material."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from coupole.appearance.matter import nashiji
+from coupole.appearance.optics import indices
 from coupole.appearance.render import arcature
 from coupole.appearance.render.materials import Diffuse, Gilt, Glass, Lacquer, Material, Metal, Paint
 from coupole.appearance.render.model import Pose, Positive, Roughness, Share
 from coupole.appearance.render.spectra import Constant, Pigment
+from coupole.appearance.shapes import samples
+from coupole.appearance.shapes.mesh_file import mesh_corners
+from coupole.appearance.shapes.solids import relief
+from coupole.appearance.shapes.triangles import rectangle, slab
 from coupole.appearance.spectra.grid import Array
-from sim.objects import shapes, urushi, wedges
-from sim.scene.scene import load_surface
-from sim.scene.surface import Surface
 
 _PRINT = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.035))
 """The black body of the wedges."""
 _NASHIJI_BODY_MM = 6.0
 _NASHIJI_LEVELS = 6
 _DIP_MM = 0.01
+_RELIEF_MM = 18.0
+_STEP_MM, _GILT_ROW_MM, _PAINT_ROW_MM = 15.0, 30.0, 20.0
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,7 @@ class GiltStepWedge(Pose):
     """Gold leaf of rising thickness on bole, along x (seed 001, section 5)."""
 
     kind: Literal["gilt_step_wedge"]
-    thicknesses_nm: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)] = wedges.GILT_NM
+    thicknesses_nm: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)] = samples.GILT_NM
     gold: Share = 1.0
     roughness: Roughness = 0.12
 
@@ -96,7 +101,7 @@ class PaintWedge(Pose):
 
     kind: Literal["paint_wedge"]
     pigment: str = "azurite"
-    thicknesses_mm: Annotated[tuple[Positive, ...], Field(min_length=1)] = wedges.PAINT_MM
+    thicknesses_mm: Annotated[tuple[Positive, ...], Field(min_length=1)] = samples.PAINT_MM
     scattering_per_mm: Positive = 8.0
 
 
@@ -141,10 +146,9 @@ class Arcature(Pose):
     stone: Material = Diffuse(kind="diffuse", reflectance=Pigment(kind="pigment", name="yellow ochre"))
 
 
-Object = Annotated[
-    Mesh | Plane | Sphere | SculptedRelief | GiltStepWedge | PaintWedge | MakieTile | NashijiSlab | Arcature,
-    Field(discriminator="kind"),
-]
+LocalObject = Mesh | Plane | SculptedRelief | GiltStepWedge | PaintWedge | MakieTile | NashijiSlab | Arcature
+"""Objects of triangles."""
+Object = Annotated[LocalObject | Sphere, Field(discriminator="kind")]
 
 
 def pieces(thing: Object, folder: Path) -> list[Piece | Ball]:
@@ -155,34 +159,46 @@ def pieces(thing: Object, folder: Path) -> list[Piece | Ball]:
     return [_placed(piece, thing) for piece in _local(thing, folder)]
 
 
-def _local(thing: Object, folder: Path) -> list[Piece]:
-    if isinstance(thing, Mesh):
-        surface = load_surface(folder / thing.path, thing.unit)
-        return [Piece(surface.corners_mm, thing.material, thing.smooth)]
-    if isinstance(thing, Plane):
-        return [Piece(shapes.plane(thing.width_mm, thing.depth_mm).corners_mm, thing.material)]
-    if isinstance(thing, SculptedRelief):
-        surface = shapes.sculpted_relief(thing.size_mm, triangles=thing.triangles, seed=thing.seed)
-        return [Piece(surface.corners_mm, thing.material)]
-    if isinstance(thing, GiltStepWedge):
-        steps: list[Material] = [
-            Gilt(kind="gilt", thickness_nm=nm, gold=thing.gold, roughness=thing.roughness)
-            for nm in thing.thicknesses_nm
-        ]
-        return _by_material(wedges.gilt_step_wedge(thing.thicknesses_nm), [*steps, _PRINT])
-    if isinstance(thing, PaintWedge):
-        return _by_material(
-            wedges.paint_wedge(thing.pigment, thing.thicknesses_mm), [*_paint_fields(thing), _PRINT]
-        )
-    if isinstance(thing, MakieTile):
-        surface = urushi.makie_tile(thing.side_mm, triangles=thing.triangles, petals=thing.petals, seed=thing.seed)
-        black = Lacquer(kind="lacquer")
-        return _by_material(surface, [Metal(kind="metal", roughness=thing.roughness), black, black])
-    if isinstance(thing, NashijiSlab):
-        return _nashiji(thing)
-    assert isinstance(thing, Arcature)
-    parts = arcature.arcature(thing.radius_mm, thing.height_mm, thing.depth_mm)
-    return [Piece(parts.gilded_mm, thing.gilt, smooth=True), Piece(parts.stone_mm, thing.stone)]
+def _local(thing: LocalObject, folder: Path) -> list[Piece]:
+    """In the object's own frame."""
+    match thing:
+        case Mesh():
+            corners = mesh_corners(folder / thing.path, thing.unit)
+            return [Piece(corners, thing.material, thing.smooth)]
+        case Plane():
+            return [Piece(rectangle(thing.width_mm, thing.depth_mm), thing.material)]
+        case SculptedRelief():
+            return [Piece(relief(thing.size_mm, thing.triangles, _RELIEF_MM, thing.seed), thing.material)]
+        case GiltStepWedge():
+            return _gilt_wedge(thing)
+        case PaintWedge():
+            panel = samples.stepped_panel(2, len(thing.thicknesses_mm), _STEP_MM, _PAINT_ROW_MM)
+            return _panel(panel, _paint_fields(thing))
+        case MakieTile():
+            tile = samples.makie_tile(thing.side_mm, thing.triangles, thing.petals, thing.seed)
+            black = Lacquer(kind="lacquer")
+            gold = Metal(kind="metal", roughness=thing.roughness)
+            return [Piece(tile.powder, gold), Piece(tile.ground, black), Piece(tile.body, black)]
+        case NashijiSlab():
+            return _nashiji(thing)
+        case Arcature():
+            parts = arcature.arcature(thing.radius_mm, thing.height_mm, thing.depth_mm)
+            return [Piece(parts.gilded_mm, thing.gilt, smooth=True), Piece(parts.stone_mm, thing.stone)]
+        case _:
+            assert_never(thing)
+
+
+def _gilt_wedge(thing: GiltStepWedge) -> list[Piece]:
+    steps: list[Material] = [
+        Gilt(kind="gilt", thickness_nm=nm, gold=thing.gold, roughness=thing.roughness)
+        for nm in thing.thicknesses_nm
+    ]
+    return _panel(samples.stepped_panel(1, len(steps), _STEP_MM, _GILT_ROW_MM), steps)
+
+
+def _panel(panel: samples.SteppedPanel, materials: Sequence[Material]) -> list[Piece]:
+    fields = [Piece(corners, material) for corners, material in zip(panel.fields, materials, strict=True)]
+    return [*fields, Piece(panel.body, _PRINT)]
 
 
 def _paint_fields(thing: PaintWedge) -> list[Material]:
@@ -202,9 +218,6 @@ def _paint_fields(thing: PaintWedge) -> list[Material]:
 
 def _nashiji(thing: NashijiSlab) -> list[Piece]:
     """Black body, flakes, and the clear lacquer as a closed body round the flakes that lets rays in."""
-    from coupole.appearance.matter import nashiji
-    from sim.objects.patchwork import slab
-
     found = nashiji.flakes(
         nashiji.Slab(
             size_mm=thing.size_mm,
@@ -232,21 +245,9 @@ def _nashiji(thing: NashijiSlab) -> list[Piece]:
 
 def _clear(width: float, length: float, thickness_mm: float, rim_mm: float) -> Piece:
     """The lacquer's outside: it dips into the body, and is a little wider, as flakes at the rim reach over it."""
-    from coupole.appearance.optics import indices
-    from sim.objects.patchwork import slab
-
     box = slab(width + 2 * rim_mm, length + 2 * rim_mm, thickness_mm + _DIP_MM)
     lift = np.array([0.5 * width, 0.5 * length, _NASHIJI_BODY_MM - _DIP_MM])
     return Piece(box + lift, Glass(kind="glass", index=indices.URUSHI))
-
-
-def _by_material(surface: Surface, materials: Sequence[Material]) -> list[Piece]:
-    """One piece for each of the surface's materials, which `materials` replace in order."""
-    return [
-        Piece(surface.corners_mm[surface.material == row], material)
-        for row, material in enumerate(materials)
-        if np.any(surface.material == row)
-    ]
 
 
 def _placed(piece: Piece, pose: Pose) -> Piece:

@@ -12,8 +12,8 @@ from coupole.appearance.matter import typical
 from coupole.appearance.render.model import Model, Share
 from coupole.appearance.spectra import light, measured, resampling
 from coupole.appearance.spectra.grid import BANDS, STEP_NM, WAVELENGTHS_NM, Array
+from coupole.appearance.spectra.white_led import LedSpectrum, spectral_power
 from coupole.errors import InputError
-from sim.optics.led_light import LedSpectrum, spectral_power
 
 LM_PER_W = 683.0
 """CIE: luminous efficacy at 540 THz."""
@@ -67,7 +67,7 @@ class Source(Model):
 
 
 class DomeLed(Model):
-    """The white LED of the simulated dome (`sim.optics.led_light`)."""
+    """The white LED of the simulated dome (`appearance.spectra.white_led`)."""
 
     kind: Literal["dome_led"]
 

@@ -21,7 +21,7 @@ from coupole.calibration.leds.matching import Fault, Matching, fault_lines, matc
 from coupole.calibration.leds.sources import LedImages
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.record import ImageResidual, Input, Limit, Noise, Parameter, Record, Validity, sealed
-from coupole.calibration.request import Wish
+from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats, rotation_vector
 from coupole.errors import InputError
 from coupole.plan.led_table import COLUMNS, LedTable
@@ -54,7 +54,7 @@ def leds_from(
     images: LedImages,
     table: LedTable,
     prior: CameraPrior,
-    wish: Wish,
+    request: Request,
     *,
     stated: Stated,
     arm: CalibratedArm | None = None,
@@ -97,16 +97,16 @@ def leds_from(
         table.flux_lm,
     )
     files = {
-        f"{wish.name}.csv": led_csv(new_table, wish.name).encode("ascii"),
-        f"{wish.name}.h5": _h5(geometry, matching, boards, where, place, len(table.ids)),
+        f"{request.name}.csv": led_csv(new_table, request.name).encode("ascii"),
+        f"{request.name}.h5": _h5(geometry, matching, boards, where, place, len(table.ids)),
     }
     views = len(images.base_from_flange)
-    limits = judged(LEDS, wish.limits, _figures(geometry, found, u_mm[where], u_deg[where]))
+    limits = judged(LEDS, request.limits, _figures(geometry, found, u_mm[where], u_deg[where]))
     record = sealed(
         kind="leds",
-        **wish.head(),
+        **request.head(),
         simulated=images.about.simulated,
-        validity=Validity(expires=wish.expires),
+        validity=Validity(expires=request.expires),
         transforms={},
         **_parameters(
             geometry, stated, float(np.median(u_mm[where][found])), float(np.median(u_deg[where][found]))

@@ -18,7 +18,7 @@ from coupole.calibration.lens.images import Found
 from coupole.calibration.lens.workflow import content_of, image_figures, image_lines, unit_name
 from coupole.calibration.record import Noise, Parameter, Record, rows_of, sealed
 from coupole.calibration.report import BLUE, DARK, RED
-from coupole.calibration.request import Wish
+from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import Sources
 
@@ -42,7 +42,7 @@ class ChromaticFound:
     """By channel: shift against green, px [k, 2], and its covariance, px^2 [k, 2, 2]."""
 
 
-def chromatic_from(found: Found, sources: Sources, board: Board, model: str, wish: Wish) -> ChromaticFound:
+def chromatic_from(found: Found, sources: Sources, board: Board, model: str, request: Request) -> ChromaticFound:
     """A lens for each colour from the same images. Raises InputError for images without colours."""
     fit = calibrate_camera(found.sightings, found.size_px, model)
     kept = without_gross_errors(fit)
@@ -71,7 +71,7 @@ def chromatic_from(found: Found, sources: Sources, board: Board, model: str, wis
             )
             for channel, sigma in lenses.sigma_px.items()
         ),
-        limits=judged(CHROMATIC, wish.limits, {**image_figures(fit, found), "shift_px": u_px}),
+        limits=judged(CHROMATIC, request.limits, {**image_figures(fit, found), "shift_px": u_px}),
         remarks=(*(_remark(channel, *shift) for channel, shift in shifts.items()), *found.left_out),
         fixed={
             f"{channel}.{unit_name(name)}": getattr(lenses.intrinsics[channel], name)
@@ -80,7 +80,7 @@ def chromatic_from(found: Found, sources: Sources, board: Board, model: str, wis
             if name not in fit.free
         },
         images=image_lines(kept, residuals, fit.sightings),
-        **content_of(found, sources, wish),
+        **content_of(found, sources, request),
     )
     return ChromaticFound(record, lenses, found.size_px, field_px, shifts)
 

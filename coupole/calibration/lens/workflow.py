@@ -39,7 +39,7 @@ from coupole.calibration.record import (
     rows_of,
     sealed,
 )
-from coupole.calibration.request import Wish
+from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import Sources
 from coupole.errors import InputError
@@ -65,7 +65,7 @@ class Shown:
     """[n, 6] of the robot, mm and degrees."""
 
 
-def camera_from(found: Found, sources: Sources, model: str, wish: Wish) -> tuple[CameraCalibration, Shown]:
+def camera_from(found: Found, sources: Sources, model: str, request: Request) -> tuple[CameraCalibration, Shown]:
     """Calibrate a lens from the images of a board."""
     fit = calibrate_camera(found.sightings, found.size_px, model)
     kept = without_gross_errors(fit)
@@ -88,11 +88,11 @@ def camera_from(found: Found, sources: Sources, model: str, wish: Wish) -> tuple
         parameters=tuple(parameters),
         covariance=rows_of(fit.covariance),
         noise=(_noise("corners", "px", 0.0, fit.sigma_px, redundancy),),
-        limits=judged(CAMERA, wish.limits, {**image_figures(fit, found), "ray_px": ray_u_px(fit)}),
+        limits=judged(CAMERA, request.limits, {**image_figures(fit, found), "ray_px": ray_u_px(fit)}),
         remarks=found.left_out,
         fixed=held(fit.intrinsics, fit.free),
         images=image_lines(kept, residuals, fit.sightings),
-        **content_of(found, sources, wish),
+        **content_of(found, sources, request),
     )
     shown = Shown(
         record,
@@ -111,7 +111,7 @@ def hand_eye_from(
     sources: Sources,
     board: Board,
     model: str,
-    wish: Wish,
+    request: Request,
     *,
     robot: RobotNoise,
     arm: Arm | None = None,
@@ -160,11 +160,11 @@ def hand_eye_from(
         parameters=_hand_eye_parameters(result),
         covariance=rows_of(result.covariance),
         noise=_hand_eye_noise(result),
-        limits=judged(HAND_EYE, wish.limits, {**image_figures(fit, found), **_hand_eye_figures(result)}),
+        limits=judged(HAND_EYE, request.limits, {**image_figures(fit, found), **_hand_eye_figures(result)}),
         remarks=tuple(filter(None, (*found.left_out, *diagnosis.sentences(), diagnosis.of_methods()))),
         fixed=held(result.intrinsics, lens.free if lens else optics.MODELS[model]),
         images=image_lines(kept, result.residuals_px, fit.sightings),
-        **content_of(found, sources, wish),
+        **content_of(found, sources, request),
     )
     shown = Shown(
         record,
@@ -221,13 +221,13 @@ def image_lines(
     )
 
 
-def content_of(found: Found, sources: Sources, wish: Wish) -> dict[str, object]:
+def content_of(found: Found, sources: Sources, request: Request) -> dict[str, object]:
     """What all records made from a board's images have."""
     about = sources.about
     return {
-        **wish.head(),
+        **request.head(),
         "simulated": about.simulated,
-        "validity": wish.validity(about, found.size_px, about.temperature_c),
+        "validity": request.validity(about, found.size_px, about.temperature_c),
         "inputs": tuple(Input(name=name, sha256=digest) for name, digest in sources.inputs),
     }
 

@@ -23,7 +23,7 @@ from coupole.calibration.light.records import Progress, counter, record_input, s
 from coupole.calibration.light.tile_views import OF_PLACE, rows_of
 from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome
-from coupole.calibration.request import Wish
+from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
@@ -83,7 +83,7 @@ def read_powers(path: Path) -> Powers:
 
 
 def drift_outcome(
-    frames: LightFrames, setting: Setting, led_power: Path, wish: Wish, progress: Progress
+    frames: LightFrames, setting: Setting, led_power: Path, request: Request, progress: Progress
 ) -> Outcome:
     """How the LEDs' power drifted from its calibration to a run, from views that show the reference tile.
 
@@ -129,14 +129,14 @@ def drift_outcome(
     height, width = read.shape
     return sealed_outcome(
         "drift",
-        wish,
+        request,
         frames,
         (width, height),
         _parameters(drift),
         drift.covariance,
         partial(draw_drift, drift, warmer_k, t_s),
-        limits=judged(DRIFT, wish.limits, {"factor": float(u.max()), "left_out": left_out}),
-        files={f"{wish.name}.csv": _table(drift).encode()},
+        limits=judged(DRIFT, request.limits, {"factor": float(u.max()), "left_out": left_out}),
+        files={f"{request.name}.csv": _table(drift).encode()},
         fixed={"start_s": drift.start_s, "hours": drift.hours, "noise": drift.noise},
         remarks=(
             f"{len(drift.used)} readings in {len(shown)} views; factor {factor.min():.4f} to {factor.max():.4f}",

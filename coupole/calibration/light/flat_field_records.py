@@ -34,7 +34,7 @@ from coupole.calibration.light.records import (
 )
 from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome
-from coupole.calibration.request import Wish
+from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
@@ -49,7 +49,7 @@ _MOST_DUST_DEPTH = 0.05
 
 def flat_field_outcome(
     frames: LightFrames,
-    wish: Wish,
+    request: Request,
     dark_record: Path | None,
     response_record: Path | None,
     panel_mm: float,
@@ -95,7 +95,7 @@ def flat_field_outcome(
     table = np.array([(s.column_px, s.row_px, s.pixels, s.depth) for s in spots]).reshape(-1, 4)
     return sealed_outcome(
         "flat-field",
-        wish,
+        request,
         frames,
         size_px,
         parameters,
@@ -106,7 +106,7 @@ def flat_field_outcome(
             limit_of("share of blocks left out", rejected, 0.05),
             limit_of("deepest dust", deepest, _MOST_DUST_DEPTH),
         ),
-        files={f"{wish.name}.h5": h5_of({"g": g, "pixel_response": ratio, "dust_x_y_pixels_depth": table})},
+        files={f"{request.name}.h5": h5_of({"g": g, "pixel_response": ratio, "dust_x_y_pixels_depth": table})},
         fixed={"focal_px": frames.focal_px},
         remarks=remarks,
         more_inputs=(*record_input(dark_record), *record_input(response_record)),

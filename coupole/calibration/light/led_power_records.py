@@ -18,12 +18,12 @@ from coupole.calibration.light.records import Progress, counter, sealed_outcome
 from coupole.calibration.light.tile_views import TileView, list_of
 from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome
-from coupole.calibration.request import Wish
+from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 
-def led_power_outcome(frames: LightFrames, setting: Setting, wish: Wish, progress: Progress) -> Outcome:
+def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, progress: Progress) -> Outcome:
     """Power of each LED per channel, from the tile's views. Raises InputError as `calibrate_led_power` does."""
     lit = [frame for frame in frames.lit if frame.light.startswith("led")]
     if not lit:
@@ -55,14 +55,14 @@ def led_power_outcome(frames: LightFrames, setting: Setting, wish: Wish, progres
     remarks += list(dict.fromkeys(remark for power in powers.values() for remark in power.remarks))
     return sealed_outcome(
         "led-power",
-        wish,
+        request,
         frames,
         (width, height),
         parameters,
         covariance,
         partial(pictures.draw_led_power, powers, setting.positions),
-        limits=judged(LED_POWER, wish.limits, {"power": typical, "unusable": unusable}),
-        files={f"{wish.name}.csv": power_table(powers, warm).encode()},
+        limits=judged(LED_POWER, request.limits, {"power": typical, "unusable": unusable}),
+        files={f"{request.name}.csv": power_table(powers, warm).encode()},
         fixed={"tile.reflectance": setting.tile.reflectance, "tile.minnaert": setting.tile.minnaert},
         remarks=(f"emission profile `{setting.emission}`", *remarks),
         more_inputs=setting.inputs,

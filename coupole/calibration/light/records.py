@@ -43,7 +43,7 @@ from coupole.calibration.record import (
     sealed,
 )
 from coupole.calibration.report import Outcome
-from coupole.calibration.request import Wish
+from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
@@ -54,7 +54,7 @@ _MOST_PIXELS = 200_000
 
 def sealed_outcome(
     kind: str,
-    wish: Wish,
+    request: Request,
     frames: LightFrames,
     size_px: tuple[int, int],
     parameters: Sequence[Parameter],
@@ -72,9 +72,9 @@ def sealed_outcome(
     about, given = frames.about, files or {}
     record = sealed(
         kind=kind,
-        **wish.head(),
+        **request.head(),
         simulated=about.simulated,
-        validity=wish.validity(about, size_px, temperatures_of(frames.frames)),
+        validity=request.validity(about, size_px, temperatures_of(frames.frames)),
         transforms={},
         parameters=tuple(parameters),
         fixed=dict(fixed or {}),
@@ -92,7 +92,7 @@ def sealed_outcome(
 # -- dark -----------------------------------------------------------------------------------------------------
 
 
-def dark_outcome(frames: LightFrames, wish: Wish, progress: Progress) -> Outcome:
+def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> Outcome:
     """Dark frames of runs: maps of offset and current, noise, hot pixels."""
     if not frames.dark:
         raise InputError("dark: no dark frame in these runs; acquire `coupole plan new darks`")
@@ -128,16 +128,16 @@ def dark_outcome(frames: LightFrames, wish: Wish, progress: Progress) -> Outcome
     )
     return sealed_outcome(
         "dark",
-        wish,
+        request,
         frames,
         (width, height),
         parameters,
         _of_means(dark, np.array([p.u for p in parameters])),
         partial(pictures.draw_dark, dark),
-        limits=judged(DARK, wish.limits, {"hot": len(dark.hot) / pixels}),
-        files={f"{wish.name}.h5": content},
+        limits=judged(DARK, request.limits, {"hot": len(dark.hot) / pixels}),
+        files={f"{request.name}.h5": content},
         fixed=fixed,
-        remarks=(f"{len(dark.hot)} hot pixels of {pixels}; the list is in {wish.name}.h5",),
+        remarks=(f"{len(dark.hot)} hot pixels of {pixels}; the list is in {request.name}.h5",),
     )
 
 
@@ -195,7 +195,9 @@ def _mean_and_u(
 # -- response -------------------------------------------------------------------------------------------------
 
 
-def response_outcome(frames: LightFrames, wish: Wish, dark_record: Path | None, progress: Progress) -> Outcome:
+def response_outcome(
+    frames: LightFrames, request: Request, dark_record: Path | None, progress: Progress
+) -> Outcome:
     """Bracketed exposures of a scene that stands still, each taken twice: gain, noise, linearity."""
     lit = _one_scene(frames)
     by_exposure: dict[float, list[LightFrame]] = {}
@@ -247,13 +249,13 @@ def response_outcome(frames: LightFrames, wish: Wish, dark_record: Path | None, 
     ]
     return sealed_outcome(
         "response",
-        wish,
+        request,
         frames,
         (width, height),
         parameters,
         covariance,
         partial(pictures.draw_response, transfers, lines),
-        limits=judged(RESPONSE, wish.limits, {"linearity": worst, "flicker": flicker}),
+        limits=judged(RESPONSE, request.limits, {"linearity": worst, "flicker": flicker}),
         noise=noise,
         fixed=fixed,
         remarks=remarks,

@@ -24,7 +24,7 @@ from coupole.calibration.record import (
     sealed,
     step_names,
 )
-from coupole.calibration.request import Wish
+from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats, inverses
 from coupole.calibration.sources import Sources
 from coupole.calibration.stickers.acceptance import MESH
@@ -66,7 +66,7 @@ def mesh_from(
     sources: Sources,
     scan: Scan,
     prior: CameraPrior,
-    wish: Wish,
+    request: Request,
     *,
     stated: Stated,
     depth_mm: tuple[float, float],
@@ -96,9 +96,9 @@ def mesh_from(
         transforms["support_from_object"] = pose_of(inverse(base_from_support) @ pose.base_from_mesh)
     record = sealed(
         kind="mesh",
-        **wish.head(),
+        **request.head(),
         simulated=sources.about.simulated,
-        validity=Validity(expires=wish.expires),
+        validity=Validity(expires=request.expires),
         transforms=transforms,
         parameters=_parameters(pose),
         fixed={"stickers_found": float(len(pose.matched)), "stickers_known": float(len(scan.names))},
@@ -108,7 +108,7 @@ def mesh_from(
             ImageResidual(name=name, corners=used, rejected=rejected, rms_px=rms_px)
             for name, (used, rejected, rms_px) in zip(images.names, pose.residuals_of, strict=True)
         ),
-        limits=judged(MESH, wish.limits, _figures(pose, scan, u_mm)),
+        limits=judged(MESH, request.limits, _figures(pose, scan, u_mm)),
         remarks=(*_remarks(pose), *(() if arm is None else (_of_the_arm(arm),))),
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in (*sources.inputs, *scan.inputs)),
     )

@@ -24,7 +24,7 @@ from drivers.camera.gentl.features import Features
 from drivers.camera.gentl.image import copy_pixels, timestamp_ns
 from drivers.camera.gentl.producer import Gaps, open_camera, reporting, told, when_incomplete
 from drivers.camera.gentl.settings import Counter, Settings
-from drivers.fair_lock import Turns
+from drivers.fair_lock import FairLock
 
 _A_LOOK_S = 1e-4
 """harvesters may not look at all in less: its clock steps by 0.2 us."""
@@ -49,7 +49,7 @@ class GenTLCamera:
         self._format: FrameFormat | None = None
         self._exposure: Exposure | None = None
         self._pool = FramePool(1, 2)
-        self._turns, self._armed = Turns(), threading.Event()
+        self._lock, self._armed = FairLock(), threading.Event()
         self._gaps = Gaps()
         self._counted_before = (0, 0)
         self._heard_s = 0.0
@@ -86,7 +86,7 @@ class GenTLCamera:
     def close(self) -> None:
         with contextlib.suppress(DeviceError):
             self.disarm()
-        with self._turns.mine():
+        with self._lock:
             with contextlib.suppress(DeviceError), reporting(self._name, "the camera to close"):
                 self._acquirer.destroy()
             with contextlib.suppress(DeviceError), reporting(self._name, "the producer to close"):
@@ -103,7 +103,7 @@ class GenTLCamera:
     def self_test(self) -> Mapping[str, str]:
         """Raises DeviceError if the camera does not answer."""
         names = ("DeviceTemperature", "PixelFormat", "Width", "Height", "PayloadSize")
-        with self._turns.mine():
+        with self._lock:
             return {name: str(self._features.read(name)) for name in names if self._features.has(name)}
 
     # -- exposure -----------------------------------------------------------------------------------------
@@ -111,7 +111,7 @@ class GenTLCamera:
     def configure(self, exposure: Exposure) -> FrameFormat:
         if self._armed.is_set():
             raise self._misused("a disarmed camera", "configure() was called while it is armed")
-        with self._turns.mine():
+        with self._lock:
             if not self._settings.free_running:
                 self._set_exposure(exposure)
             self._format = frame_format(self._features, self._name, self._settings.black_dn)
@@ -140,7 +140,7 @@ class GenTLCamera:
             features.write("Gain", float(exposure.gain_db))
 
     def min_period_us(self, exposure: Exposure) -> int:
-        with self._turns.mine():
+        with self._lock:
             readout = readout_us(self._features, self._name, self._settings.readout_us)
         return max(readout, exposure.exposure_us + self._settings.exposure_gap_us)
 
@@ -155,7 +155,7 @@ class GenTLCamera:
         if (self._pool.slots, self._pool.slot_bytes) != (slots, self._format.frame_bytes):
             self._pool = FramePool(slots, self._format.frame_bytes)
         self._pool.begin()
-        with self._turns.mine():
+        with self._lock:
             self._wire_format = pixel_format(self._features, self._name)
             self._gaps.begin(self.id_modulus)
             self._counted_before = self._count()
@@ -183,14 +183,14 @@ class GenTLCamera:
     def _listen(self) -> None:
         """Raises DeviceLost if the camera has been silent for long and does not answer."""
         if time.monotonic() > self._heard_s + _SILENCE_S:
-            with self._turns.mine():
+            with self._lock:
                 if self._armed.is_set():
                     self._features.expect_answer()
             self._heard_s = time.monotonic()
 
     def _fetch(self, slot: Slot) -> Frame | None:
         """The oldest whole image that has come, in `slot`; None, and the slot is free again, if there is none."""
-        with self._turns.mine(), reporting(self._name, "an image"):
+        with self._lock, reporting(self._name, "an image"):
             buffer = self._acquirer.try_fetch(timeout=_A_LOOK_S, is_raw=True) if self._armed.is_set() else None
             if buffer is None:
                 slot.release()
@@ -211,13 +211,13 @@ class GenTLCamera:
     def trigger(self) -> None:
         if self._settings.free_running or self._exposure is None or self._exposure.hardware_trigger:
             raise self._misused("hardware_trigger=False", "a software trigger while something else triggers")
-        with self._turns.mine():
+        with self._lock:
             self._features.write("TriggerSoftware", True)
 
     def statistics(self) -> CameraStatistics:
         """At rest: those of the last acquisition."""
         if self._armed.is_set():
-            with self._turns.mine(), reporting(self._name, "the camera's counters"):
+            with self._lock, reporting(self._name, "the camera's counters"):
                 self._last = self._statistics()
         return self._last
 
@@ -250,7 +250,7 @@ class GenTLCamera:
             self.statistics()
         finally:
             self._armed.clear()
-            with self._turns.mine(), reporting(self._name, "the acquisition to stop"):
+            with self._lock, reporting(self._name, "the acquisition to stop"):
                 self._acquirer.stop()
 
     # -- errors -------------------------------------------------------------------------------------------

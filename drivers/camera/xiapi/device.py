@@ -22,7 +22,7 @@ from drivers.camera.xiapi.library import (
     code_name,
     load,
 )
-from drivers.fair_lock import Turns
+from drivers.fair_lock import FairLock
 
 Value = int | float | str
 _TEXT_BYTES = 256
@@ -34,7 +34,7 @@ class XiDevice:
     def __init__(self, library: str, serial: str, name: str) -> None:
         self._name = name
         self._library = load(library, name)
-        self._turns = Turns()
+        self._lock = FairLock()
         self._handle = ctypes.c_void_p()
         self.acquiring = False
         self._open(serial)
@@ -78,7 +78,7 @@ class XiDevice:
     # -- parameters ---------------------------------------------------------------------------------------
 
     def _read(self, parameter: str, value: Any) -> int:
-        with self._turns.mine():
+        with self._lock:
             get = self._library.xiGetParamInt if isinstance(value, ctypes.c_int) else self._library.xiGetParamFloat
             code: int = get(self._handle, parameter.encode(), value)
         return code
@@ -98,7 +98,7 @@ class XiDevice:
 
     def text(self, parameter: str) -> str:
         value = ctypes.create_string_buffer(_TEXT_BYTES)
-        with self._turns.mine():
+        with self._lock:
             code = self._library.xiGetParamString(self._handle, parameter.encode(), value, _TEXT_BYTES)
         self._check(code, f"a value of `{parameter}`")
         return value.value.decode(errors="replace")
@@ -108,7 +108,7 @@ class XiDevice:
         if not isinstance(value, str):
             self._check_range(parameter, value)
         name = parameter.encode()
-        with self._turns.mine():
+        with self._lock:
             if isinstance(value, str):
                 raw = value.encode()
                 code = self._library.xiSetParamString(self._handle, name, raw, len(raw))
@@ -149,13 +149,13 @@ class XiDevice:
     # -- acquisition --------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        with self._turns.mine():
+        with self._lock:
             self._check(self._library.xiStartAcquisition(self._handle), "the acquisition to start")
             self.acquiring = True
 
     def stop(self) -> None:
         """Does nothing where nothing runs."""
-        with self._turns.mine():
+        with self._lock:
             if self.acquiring:
                 self.acquiring = False
                 self._check(self._library.xiStopAcquisition(self._handle), "the acquisition to stop")
@@ -163,7 +163,7 @@ class XiDevice:
     def image(self, address: int, size: int, timeout_s: float) -> Image | None:
         """The oldest image, its pixels at `address`; None if none came in time or nothing is being acquired."""
         image = Image(size=ctypes.sizeof(Image), bp=address, bp_size=size)
-        with self._turns.mine():
+        with self._lock:
             if not self.acquiring:
                 return None
             code = self._library.xiGetImage(self._handle, max(1, math.ceil(timeout_s * 1000)), image)
@@ -180,7 +180,7 @@ class XiDevice:
         return image
 
     def close(self) -> None:
-        with self._turns.mine():
+        with self._lock:
             handle, self._handle = self._handle, ctypes.c_void_p()
             if handle:
                 self._library.xiCloseDevice(handle)

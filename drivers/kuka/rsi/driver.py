@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from coupole.devices import ArmState, Clock, Deadline, Identity
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from coupole.kinematics import Arm, forward, limit_violations, move_duration_s
-from drivers.kuka.rsi import shared_state as block
+from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.limits import correction_violations
 from drivers.kuka.rsi.pose import Geometry
 from drivers.kuka.rsi.rsi_session import Config
@@ -48,9 +48,9 @@ class KukaRsi:
         self.settings = settings
         self.arm = settings.arm()
         self._clock = clock
-        self._command = block.Command()
+        self._command = shared_state.Command()
         self._motion_s = 0.0
-        self._target_deg: block.Six = (0.0,) * 6
+        self._target_deg: shared_state.Six = (0.0,) * 6
         """Of the last motion."""
         self._last_packets, self._last_news_ns = -1, 0
         self._process, self._block = _spawn(settings, self.arm)
@@ -97,7 +97,7 @@ class KukaRsi:
         self._target_deg = tuple(float(angle) for angle in target_deg)
         # It may first have to brake: as long as from the farthest point, twice.
         self._motion_s = move_duration_s(self.arm, state.measured_deg, target_deg) + self._stop_s()
-        self._send(block.MOVE, self._target_deg)
+        self._send(shared_state.MOVE, self._target_deg)
 
     def wait_settled(self) -> ArmState:
         command = self._command
@@ -129,14 +129,14 @@ class KukaRsi:
         """
         if self._process.poll() is not None:
             return
-        self._send(block.STOP)
+        self._send(shared_state.STOP)
         number = self._command.number
         deadline = Deadline(self._clock, 2.0 * self._stop_s() + 1.0)
 
-        def stands(state: block.State) -> bool:
-            ended = state.fault != block.NO_FAULT and state.phase == block.STANDING
+        def stands(state: shared_state.State) -> bool:
+            ended = state.fault != shared_state.NO_FAULT and state.phase == shared_state.STANDING
             obeyed = state.command >= number and not self._moves(state)
-            return state.fault == block.LINK_LOST or ended or obeyed
+            return state.fault == shared_state.LINK_LOST or ended or obeyed
 
         self._wait(stands, deadline, "the arm at rest", faults=False)
 
@@ -161,7 +161,7 @@ class KukaRsi:
         if self._process.poll() is None:
             with contextlib.suppress(DeviceError):
                 self.stop()
-            self._send(block.LEAVE)
+            self._send(shared_state.LEAVE)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(timeout=1.0)
             self._process.kill()
@@ -181,10 +181,10 @@ class KukaRsi:
         self._raise_fault(state)
 
     def _send(self, verb: int, target_deg: tuple[float, ...] = (0.0,) * 6) -> None:
-        self._command = block.Command(self._command.number + 1, verb, target_deg)
+        self._command = shared_state.Command(self._command.number + 1, verb, target_deg)
         self._block.write_command(self._command)
 
-    def _state(self) -> block.State:
+    def _state(self) -> shared_state.State:
         """The loop's last word; raises DeviceLost if the loop is gone."""
         try:
             if self._process.poll() is None:
@@ -200,7 +200,7 @@ class KukaRsi:
         )
 
     def _wait(
-        self, done: Callable[[block.State], bool], deadline: Deadline, expected: str, *, faults: bool = True
+        self, done: Callable[[shared_state.State], bool], deadline: Deadline, expected: str, *, faults: bool = True
     ) -> None:
         while True:
             state = self._state()
@@ -218,28 +218,28 @@ class KukaRsi:
                 )
             self._clock.sleep(_POLL_S)
 
-    def _settled(self, state: block.State, command: block.Command) -> bool:
+    def _settled(self, state: shared_state.State, command: shared_state.Command) -> bool:
         if self._command is not command:
             raise self._refused("the arm to go on to its target", "another command ended the motion")
         return state.command == command.number and state.settled_cycles >= self.settings.settle_cycles
 
-    def _moves(self, state: block.State) -> bool:
+    def _moves(self, state: shared_state.State) -> bool:
         speed_deg_s = max(map(abs, state.velocity_deg_s))
         # A command that the loop has not taken yet counts as motion.
         return not self._stands(state) or speed_deg_s > self.settings.settle_deg_s
 
-    def _stands(self, state: block.State) -> bool:
-        return state.phase == block.STANDING and state.command == self._command.number
+    def _stands(self, state: shared_state.State) -> bool:
+        return state.phase == shared_state.STANDING and state.command == self._command.number
 
     def _stop_s(self) -> float:
         """Longest time that any axis needs to come to rest: v/a, and twice a/jerk to build it up."""
         acceleration, jerk = self.settings.acceleration_deg_s2, self.settings.jerk_deg_s3
         return max(self.arm.velocity_deg_s) / acceleration + 2.0 * acceleration / jerk
 
-    def _raise_fault(self, state: block.State) -> None:
-        if state.fault == block.NO_FAULT:
+    def _raise_fault(self, state: shared_state.State) -> None:
+        if state.fault == shared_state.NO_FAULT:
             return
-        kind = DeviceLost if state.fault == block.LINK_LOST else DeviceFault
+        kind = DeviceLost if state.fault == shared_state.LINK_LOST else DeviceFault
         raise kind(
             "robot",
             expected="an arm that follows its RSI corrections",
@@ -252,7 +252,7 @@ class KukaRsi:
         return DeviceRefused("robot", expected=expected, happened=happened, remedy="Ask for another pose")
 
 
-def _why_no_session(state: block.State) -> str:
+def _why_no_session(state: shared_state.State) -> str:
     if state.refused:
         return f"{state.refused} packets belong to a running RSI session that another program may have begun"
     if state.malformed:
@@ -263,7 +263,7 @@ def _why_no_session(state: block.State) -> str:
     return f"{state.packets} came"
 
 
-def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], block.Block]:
+def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], shared_state.Block]:
     """Bind the port and start the loop; raises DeviceLost if the port is not to be had."""
     host, port = settings.listen.rsplit(":", 1)
     derived: dict[str, Any] = {
@@ -287,8 +287,8 @@ def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], block
             ) from error
         memory_fd = os.memfd_create("coupole-rsi")
         try:
-            os.truncate(memory_fd, block.BLOCK_BYTES)
-            shared = block.Block(memory_fd)
+            os.truncate(memory_fd, shared_state.BLOCK_BYTES)
+            shared = shared_state.Block(memory_fd)
             process = subprocess.Popen(
                 [
                     sys.executable,

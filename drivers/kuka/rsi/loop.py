@@ -17,9 +17,9 @@ import struct
 import sys
 import time
 
-from drivers.kuka.rsi import shared_state as block
+from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.pose import Geometry
-from drivers.kuka.rsi.rsi_session import Config, Responder
+from drivers.kuka.rsi.rsi_session import Config, RsiSession
 
 _TICK_S = 0.05
 """How often the loop looks at its parent and at the link while no packet comes."""
@@ -28,46 +28,46 @@ _ORPHAN_S = 0.8
 _REALTIME_PRIORITY = 20
 
 
-def serve(link: socket.socket, shared: block.Block, parent_pid: int, config: Config) -> None:
+def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, config: Config) -> None:
     """Answer packets until told to leave or the parent is gone, and leave with the arm at rest."""
     # The kernel's own receive time-out costs nothing per packet; Python's is a poll before each call.
     link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@qq", 0, int(_TICK_S * 1e6)))
     realtime = _become_realtime()
-    responder = Responder(config, time.monotonic_ns())
-    shared.write_state(responder.state(realtime))
+    session = RsiSession(config, time.monotonic_ns())
+    shared.write_state(session.state(realtime))
     _drop_backlog(link)
     leaving, orphan_ns, look_ns = False, 0, 0
     controller = None
-    while not (leaving and responder.motion.phase == block.STANDING):
+    while not (leaving and session.motion.phase == shared_state.STANDING):
         try:
             data, address = link.recvfrom(4096)
             idle = False
         except BlockingIOError:
             idle = True
         now_ns = time.monotonic_ns()
-        if shared.command_number() != responder.command:
+        if shared.command_number() != session.command:
             command = shared.read_command()
-            responder.obey(command)
-            leaving |= command.verb == block.LEAVE
-        late, answer = responder.late, None
+            session.obey(command)
+            leaving |= command.verb == shared_state.LEAVE
+        late, answer = session.late, None
         if not idle and controller not in (None, address):
-            responder.foreign += 1  # somebody else's axes must not be taken for this arm's
+            session.foreign += 1  # somebody else's axes must not be taken for this arm's
         elif not idle:
-            answer = responder.answer(data, now_ns)
+            answer = session.answer(data, now_ns)
         if answer is None:
-            responder.check_link(now_ns)
+            session.check_link(now_ns)
         else:
             controller = address
             with contextlib.suppress(OSError):  # a controller that is gone is noticed by its silence
                 link.sendto(answer, address)
-        if responder.late > late:
+        if session.late > late:
             _drop_backlog(link)  # answers to packets that wait here would be late too
-        shared.write_state(responder.state(realtime))
+        shared.write_state(session.state(realtime))
         if now_ns > look_ns:
             look_ns = now_ns + int(_TICK_S * 1e9)
             if os.getppid() != parent_pid and not leaving:
                 leaving, orphan_ns = True, now_ns
-                responder.motion.stop()
+                session.motion.stop()
         if orphan_ns and now_ns - orphan_ns > _ORPHAN_S * 1e9:
             break
 
@@ -95,4 +95,4 @@ if __name__ == "__main__":
     socket_fd, block_fd, parent_pid = map(int, sys.argv[1:4])
     settings = json.loads(sys.argv[4])
     settings["geometry"] = Geometry(*settings["geometry"])
-    serve(socket.socket(fileno=socket_fd), block.Block(block_fd), parent_pid, Config(**settings))
+    serve(socket.socket(fileno=socket_fd), shared_state.Block(block_fd), parent_pid, Config(**settings))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.kuka.rsi import shared_state as block
+from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.corrections import NAMES, Corrections
 from drivers.kuka.rsi.pose import Geometry
 from drivers.kuka.rsi.trajectory import Motion
@@ -51,11 +51,11 @@ class Config:
     follow_cycles: int
 
 
-class Responder:
+class RsiSession:
     """Makes an answer of every packet, and the state for the driver; touches neither socket nor memory."""
 
     def __init__(self, config: Config, opened_ns: int = 0) -> None:
-        self.fault, self.fault_text = block.NO_FAULT, b""
+        self.fault, self.fault_text = shared_state.NO_FAULT, b""
         self.packets = self.answers = self.malformed = self.refused = self.foreign = 0
         self.late = self.delay = self.max_gap_ns = self.command = 0
         self.settled_cycles = self._astray_cycles = self._late_in_row = 0
@@ -77,13 +77,13 @@ class Responder:
         self._last_words = _LAST_WORDS
         self._last_answer: bytes | None = None
 
-    def obey(self, command: block.Command) -> None:
+    def obey(self, command: shared_state.Command) -> None:
         """Take a command. After a fault only stopping is obeyed."""
         self.command = command.number
         self.settled_cycles = 0
-        if command.verb == block.MOVE and self.fault == block.NO_FAULT:
+        if command.verb == shared_state.MOVE and self.fault == shared_state.NO_FAULT:
             self.motion.move_to(command.target_deg)
-        elif command.verb in (block.STOP, block.LEAVE):
+        elif command.verb in (shared_state.STOP, shared_state.LEAVE):
             self.motion.stop()
 
     def answer(self, data: bytes, now_ns: int) -> bytes | None:
@@ -117,21 +117,21 @@ class Responder:
             if self._late_in_row >= _HALTED_PACKETS:
                 self.motion.halted()
         elif not self.motion.step():
-            self.fail(block.NO_TRAJECTORY, "no trajectory within the limits leads to the target")
+            self.fail(shared_state.NO_TRAJECTORY, "no trajectory within the limits leads to the target")
         self._last_answer = None if self._silent() else self._template % (*self._values(), packet.ipoc)
         self.answers += self._last_answer is not None
         return self._last_answer
 
-    def _values(self) -> block.Six:
+    def _values(self) -> shared_state.Six:
         """The six corrections. When the arm has come to rest after a fault they move it no more."""
-        if self.fault != block.NO_FAULT and self.motion.phase == block.STANDING:
+        if self.fault != shared_state.NO_FAULT and self.motion.phase == shared_state.STANDING:
             return self._corrections.hold()
         return self._corrections.to(self.motion.commanded_deg)
 
     def _silent(self) -> bool:
         """After a fault the session is ended by silence, so that no old correction can meet a new session: at
         once where a new one may have begun, else when the commanded axes, and the arm with them, stand."""
-        if self.fault != block.NO_FAULT and self.motion.phase == block.STANDING:
+        if self.fault != shared_state.NO_FAULT and self.motion.phase == shared_state.STANDING:
             self._last_words -= 1
         return self._session_over or self._last_words < 0
 
@@ -139,21 +139,23 @@ class Responder:
         """Latch a fault if packets stayed away for longer than the link's time-out."""
         silent_s = (now_ns - self._packet_ns) / 1e9
         if self._start_deg is not None and silent_s > self._config.link_timeout_s:
-            self.fail(block.LINK_LOST, f"no packet for {silent_s:.2f} s, the delay counter was {self.delay}")
+            self.fail(
+                shared_state.LINK_LOST, f"no packet for {silent_s:.2f} s, the delay counter was {self.delay}"
+            )
 
     def fail(self, fault: int, text: str) -> None:
         """Latch the first fault and bring the commanded axes to rest: along their path if the arm is with them
         and listens, else where they are, so that nothing pushes on."""
-        if self.fault == block.NO_FAULT:
+        if self.fault == shared_state.NO_FAULT:
             self.fault, self.fault_text = fault, text.encode()
-        self._session_over |= fault == block.LINK_LOST
-        if fault in (block.LINK_LOST, block.NOT_FOLLOWING):
+        self._session_over |= fault == shared_state.LINK_LOST
+        if fault in (shared_state.LINK_LOST, shared_state.NOT_FOLLOWING):
             self.motion.stand_at(self.motion.commanded_deg)
         else:
             self.motion.stop()
 
-    def state(self, realtime: int) -> block.State:
-        return block.State(
+    def state(self, realtime: int) -> shared_state.State:
+        return shared_state.State(
             packets=self.packets,
             answers=self.answers,
             malformed=self.malformed,
@@ -192,10 +194,10 @@ class Responder:
         if advance > 0 and not 0 < self._ipoc_step <= advance:
             self._ipoc_step = advance  # the smallest so far: a packet may have been lost on the way
         elif advance > _GAP_STEPS * step:
-            self.fail(block.LINK_LOST, f"{advance // step - 1} packets are missing")
+            self.fail(shared_state.LINK_LOST, f"{advance // step - 1} packets are missing")
         elif advance < -_GAP_STEPS * step:
-            if self.motion.phase != block.STANDING:
-                self.fail(block.RESTARTED, "RSI was started anew while the arm was moving")
+            if self.motion.phase != shared_state.STANDING:
+                self.fail(shared_state.RESTARTED, "RSI was started anew while the arm was moving")
             self._begin_session(packet)
         return advance > 0 or advance < -_GAP_STEPS * step
 
@@ -211,16 +213,16 @@ class Responder:
             speed_deg_s = max(map(abs, self._velocity_deg_s))
             self._measured_deg = packet.joints_deg
         error_deg = max(map(abs, map(float.__sub__, packet.joints_deg, motion.commanded_deg)))
-        settled = motion.phase == block.STANDING and error_deg <= config.settle_deg
+        settled = motion.phase == shared_state.STANDING and error_deg <= config.settle_deg
         self.settled_cycles = self.settled_cycles + 1 if settled and speed_deg_s <= config.settle_deg_s else 0
 
         allowed_deg = config.follow_deg + config.follow_lag_s * max(map(abs, motion.velocity_deg_s))
         self._astray_cycles = self._astray_cycles + 1 if error_deg > allowed_deg else 0
         if self._astray_cycles >= config.follow_cycles:
             self.fail(
-                block.NOT_FOLLOWING,
+                shared_state.NOT_FOLLOWING,
                 f"the arm does not follow: {error_deg:.2f} deg from the commanded axes for "
                 f"{self._astray_cycles} cycles (emergency stop, brakes or collision)",
             )
         if self.delay >= config.delay_limit:
-            self.fail(block.LATE, f"late answers: the controller's delay counter rose to {self.delay}")
+            self.fail(shared_state.LATE, f"late answers: the controller's delay counter rose to {self.delay}")

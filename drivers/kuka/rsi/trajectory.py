@@ -6,7 +6,7 @@ from typing import Any
 
 import ruckig
 
-from drivers.kuka.rsi import shared_state as block
+from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.shared_state import Six
 
 
@@ -20,7 +20,7 @@ class Motion:
 
     def __init__(self, cycle_s: float, limits: tuple[Six, Six, Six]) -> None:
         """`limits` are the axes' speeds (deg/s), accelerations (deg/s2) and jerks (deg/s3)."""
-        self.phase = block.STANDING
+        self.phase = shared_state.STANDING
         self.commanded_deg: Six = (0.0,) * 6
         self.velocity_deg_s: Six = (0.0,) * 6
         self._limits = limits
@@ -34,7 +34,7 @@ class Motion:
 
     def stand_at(self, joints_deg: Six) -> None:
         """Take the axes as they are, at rest."""
-        self.phase, self.commanded_deg, self.velocity_deg_s = block.STANDING, joints_deg, (0.0,) * 6
+        self.phase, self.commanded_deg, self.velocity_deg_s = shared_state.STANDING, joints_deg, (0.0,) * 6
         self._next_target_deg = None
 
     def halted(self) -> None:
@@ -43,7 +43,7 @@ class Motion:
         self._input.current_velocity = self._input.current_acceleration = [0.0]
 
     def move_to(self, target_deg: Six) -> None:
-        if self.phase != block.STANDING:
+        if self.phase != shared_state.STANDING:
             self.stop()
             self._next_target_deg = target_deg
             return
@@ -58,12 +58,12 @@ class Motion:
         self._input.max_velocity, self._input.max_acceleration, self._input.max_jerk = ([h] for h in highest)
         self._input.current_position = self._input.current_velocity = self._input.current_acceleration = [0.0]
         self._input.target_position = [1.0]
-        self._go(ruckig.ControlInterface.Position, block.MOVING)
+        self._go(ruckig.ControlInterface.Position, shared_state.MOVING)
 
     def stop(self) -> None:
         self._next_target_deg = None
-        if self.phase == block.MOVING:
-            self._go(ruckig.ControlInterface.Velocity, block.STOPPING)
+        if self.phase == shared_state.MOVING:
+            self._go(ruckig.ControlInterface.Velocity, shared_state.STOPPING)
 
     def _go(self, control: Any, phase: int) -> None:
         self._input.control_interface = control
@@ -72,7 +72,7 @@ class Motion:
 
     def step(self) -> bool:
         """One cycle on; False if the trajectory could not be computed, and then the axes stand."""
-        if self.phase == block.STANDING:
+        if self.phase == shared_state.STANDING:
             return True
         result = self._run.update(self._input, self._output)
         if result not in (ruckig.Result.Working, ruckig.Result.Finished):

@@ -1,0 +1,1 @@
+"""Triangles of simple and sculpted bodies, without materials."""

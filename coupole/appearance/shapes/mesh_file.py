@@ -1,0 +1,27 @@
+"""Triangles of mesh files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coupole.appearance.shapes.triangles import Array
+from coupole.errors import InputError
+
+_UNIT_MM = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
+
+
+def mesh_corners(path: Path, unit: str) -> Array:
+    """Corners [triangles, 3, 3] in mm of any mesh that trimesh reads; no vertex is merged. Raises InputError."""
+    import trimesh
+
+    try:
+        mesh: Any = trimesh.load(path, process=False, force="mesh")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: expected a mesh of triangles (PLY, STL, OBJ); {error}") from error
+    if len(mesh.faces) == 0:
+        raise InputError(f"{path}: expected a mesh of triangles; found none")
+    corners: Array = np.asarray(mesh.vertices)[np.asarray(mesh.faces)] * _UNIT_MM[unit]
+    return corners

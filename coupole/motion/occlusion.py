@@ -1,0 +1,286 @@
+"""Robot shadow: which LEDs reach which parts of the object in a view, and what hides the others.
+
+From the point of each patch of the object's surface, rays to the LEDs (points, too) are tested against the
+object's own mesh, which is the same for all views, and against the capsules of arm and tool in the view's
+posture. Capsules enclose the real bodies, so their shadows are rather too large than too small. All is in the
+support frame, in mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coupole.geometry import Transform, apply, inverse
+from coupole.kinematics import link_frames
+from coupole.motion.bodies import ARM_CAPSULES, FLANGE, Capsule
+from coupole.motion.itinerary import arm_of
+from coupole.motion.patches import PATCHES, Patches, patches_at, patches_of
+from coupole.plan.led_table import LedTable
+from coupole.plan.rig import Rig
+
+REACHED, AWAY, BY_OBJECT, BY_ARM, BY_TOOL = range(5)
+"""Codes of a patch and an LED. AWAY: the LED is below the patch's horizon, or the patch is behind the LED. Where
+several hold, the smallest of them is given; REACHED where none does."""
+RAY_START_MM = 0.1
+"""Rays start this far off the surface, along the patch's normal, so that a patch does not hide itself by rounding
+(Embree reckons with 24 bits: 0.00006 mm at 1 m). Steps of the surface that are lower cast no shadow."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A camera as a pinhole whose axis pierces the centre of the image."""
+
+    support_from_camera: Transform
+    focal_px: float
+    width_px: int
+    height_px: int
+
+    def project(self, points_mm: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Column and row [..., 2] in pixels and depth [...] in mm of points [..., 3] of the support frame.
+
+        The first pixel's centre is (0, 0). Pixels mean nothing where the depth is not positive.
+        """
+        in_camera = apply(inverse(self.support_from_camera), points_mm)
+        depth_mm = in_camera[..., 2]
+        scale = self.focal_px / np.where(depth_mm > 0, depth_mm, np.inf)
+        middle = (np.array((self.width_px, self.height_px)) - 1) / 2
+        return in_camera[..., :2] * scale[..., None] + middle, depth_mm
+
+
+@dataclass(frozen=True)
+class Occlusion:
+    """What the patches get of the LEDs in one view: plain arrays, LEDs in the order of the dome's table."""
+
+    codes: NDArray[np.uint8]
+    """[patches, leds] REACHED, AWAY, BY_OBJECT, BY_ARM or BY_TOOL."""
+    seen: NDArray[np.bool_]
+    """[patches] True where the camera sees the patch's point."""
+    areas_mm2: NDArray[np.float64]
+    """[patches] their weights."""
+
+    @property
+    def masks(self) -> NDArray[np.bool_]:
+        """[leds, patches] for each LED the patches that its light reaches."""
+        return np.ascontiguousarray(self.codes.T == REACHED)
+
+    def share(self, code: int = REACHED) -> NDArray[np.float64]:
+        """[leds] of the surface that the camera sees, the share that has this code; 0 where it sees none of it."""
+        weights = np.where(self.seen, self.areas_mm2, 0.0)
+        share: NDArray[np.float64] = weights @ (self.codes == code) / max(weights.sum(), 1e-300)
+        return share
+
+    def occluded_leds(self) -> NDArray[np.bool_]:
+        """[leds] True where an LED reaches no patch that the camera sees; nowhere if it sees none.
+
+        What is smaller than a patch may be lit all the same.
+        """
+        reaches: NDArray[np.bool_] = (self.codes[self.seen] == REACHED).any(axis=0)
+        return ~reaches & self.seen.any()
+
+    def arrays(self, patches: Patches) -> dict[str, NDArray[np.generic]]:
+        """Everything by name, to be stored beside a view's frames and read without this module.
+
+        `codes` uint8 [patches, leds] and `seen` [patches] as above; of the patches, in the support frame,
+        `points_mm` and outward `normals` float32 [patches, 3] and `areas_mm2` float32 [patches].
+        """
+        return {
+            "codes": self.codes,
+            "seen": self.seen,
+            "points_mm": patches.points_mm.astype(np.float32),
+            "normals": patches.normals.astype(np.float32),
+            "areas_mm2": patches.areas_mm2.astype(np.float32),
+        }
+
+
+@dataclass(frozen=True)
+class Occlusions:
+    """What is the same in all views, and the rig that makes the rest."""
+
+    rig: Rig
+    patches: Patches
+    mesh: Any
+    """The object's, ready for rays (`ray_mesh`)."""
+    leds_mm: NDArray[np.float64]
+    """[leds, 3] in the support frame."""
+    object_codes: NDArray[np.uint8]
+    """[patches, leds] REACHED, AWAY or BY_OBJECT, of the object alone."""
+
+    def at(self, joints_deg: ArrayLike) -> Occlusion:
+        """The shadows of a view with the arm at joint angles [6].
+
+        The camera's own bodies and what else the flange carries are taken to leave the view of its lens free.
+        """
+        support_from_base = inverse(self.rig.support.base_from_support.matrix())
+        frames = support_from_base @ link_frames(arm_of(self.rig), joints_deg)
+        tool = [Capsule(body.name, FLANGE, body.from_mm, body.to_mm, body.radius_mm) for body in self.rig.tool]
+        axes_mm, radii_mm = capsule_axes((*ARM_CAPSULES, *tool), frames)
+        by = hidden_by(ray_starts(self.patches), self.leds_mm, axes_mm, radii_mm, self.object_codes == REACHED)
+        codes = self.object_codes.copy()
+        codes[(by >= 0) & (by < len(ARM_CAPSULES))] = BY_ARM
+        codes[by >= len(ARM_CAPSULES)] = BY_TOOL
+        arm = slice(len(ARM_CAPSULES))
+        seen = self._seen(
+            sight_of(self.rig, frames[FLANGE] @ self.rig.flange_from_camera.matrix()), axes_mm[arm], radii_mm[arm]
+        )
+        return Occlusion(codes, seen, self.patches.areas_mm2)
+
+    def _seen(
+        self, sight: Sight, axes_mm: NDArray[np.float64], radii_mm: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """[patches] True where a camera sees the patch: in its picture, turned to it, nothing in between."""
+        eye_mm = sight.support_from_camera[:3, 3]
+        starts_mm = ray_starts(self.patches)
+        pixels, depth_mm = sight.project(starts_mm)
+        inside = (pixels >= -0.5) & (pixels <= np.array((sight.width_px, sight.height_px)) - 0.5)
+        seen = (depth_mm > 0) & inside.all(axis=1)
+        seen &= np.einsum("pk,pk->p", eye_mm - starts_mm, self.patches.normals) > 0
+        seen &= hidden_by(starts_mm, eye_mm[None], axes_mm, radii_mm, seen[:, None])[:, 0] < 0
+        asked = np.flatnonzero(seen)
+        seen[asked] = ~blocked(self.mesh, starts_mm[asked], np.tile(eye_mm, (len(asked), 1)))
+        return seen
+
+
+def occlusions_of(
+    rig: Rig, leds: LedTable, corners_mm: NDArray[np.float64], targets_mm: ArrayLike, count: int = PATCHES
+) -> Occlusions:
+    """Everything about an object's shadows that does not depend on the arm.
+
+    `corners_mm` [triangles, 3, 3] is its mesh in the support frame; without triangles `targets_mm` [n, 3]
+    stand for it.
+    """
+    patches = patches_of(corners_mm, count) if len(corners_mm) else patches_at(targets_mm)
+    support_from_base = inverse(rig.support.base_from_support.matrix())
+    leds_mm = apply(support_from_base, leds.positions_mm)
+    mesh = ray_mesh(corners_mm)
+    codes = own_codes(patches, mesh, leds_mm, leds.normals @ support_from_base[:3, :3].T)
+    return Occlusions(rig, patches, mesh, leds_mm, codes)
+
+
+def own_codes(
+    patches: Patches,
+    mesh: Any,
+    leds_mm: NDArray[np.float64],
+    led_normals: NDArray[np.float64],
+) -> NDArray[np.uint8]:
+    """Codes [patches, leds] of an object alone, with LEDs at [leds, 3] that shine to the side of their normals."""
+    starts_mm = ray_starts(patches)
+    to_leds = leds_mm[None] - starts_mm[:, None]
+    faces = np.einsum("plk,pk->pl", to_leds, patches.normals) > 0
+    faces &= np.einsum("plk,lk->pl", to_leds, led_normals) < 0
+    patch, led = np.nonzero(faces)
+    codes = np.where(faces, REACHED, AWAY).astype(np.uint8)
+    codes[patch, led] = np.where(blocked(mesh, starts_mm[patch], leds_mm[led]), BY_OBJECT, REACHED)
+    return codes
+
+
+def ray_starts(patches: Patches) -> NDArray[np.float64]:
+    """[patches, 3] where rays from the patches begin: RAY_START_MM above their points."""
+    starts_mm: NDArray[np.float64] = patches.points_mm + RAY_START_MM * patches.normals
+    return starts_mm
+
+
+def ray_mesh(corners_mm: NDArray[np.float64]) -> Any:
+    """A mesh [triangles, 3, 3] made ready for rays (Embree); None without triangles."""
+    if len(corners_mm) == 0:
+        return None
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene(robust=True)  # no ray slips through between two triangles
+    TriangleMesh(scene, np.ascontiguousarray(corners_mm, np.float32))
+    return scene
+
+
+def blocked(mesh: Any, starts_mm: NDArray[np.float64], ends_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[n] True where the segment between two points [n, 3] meets a triangle of a `ray_mesh`."""
+    if mesh is None or len(starts_mm) == 0:
+        return np.zeros(len(starts_mm), np.bool_)
+    starts, ways = starts_mm.astype(np.float32), (ends_mm - starts_mm).astype(np.float32)
+    met = mesh.run(starts, ways, dists=np.ones(len(starts), np.float32), query="OCCLUDED")
+    found: NDArray[np.bool_] = met >= 0
+    return found
+
+
+def capsule_axes(
+    capsules: Sequence[Capsule], frames: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Ends of the axes [n, 2, 3] and radii [n] of capsules, in the frame that `frames` [8, 4, 4] map links to."""
+    ends = [apply(frames[c.link], (c.start_mm, c.end_mm)) for c in capsules]
+    return np.array(ends), np.array([c.radius_mm for c in capsules], np.float64)
+
+
+def hidden_by(
+    starts_mm: NDArray[np.float64],
+    ends_mm: NDArray[np.float64],
+    axes_mm: NDArray[np.float64],
+    radii_mm: NDArray[np.float64],
+    asked: NDArray[np.bool_],
+) -> NDArray[np.int16]:
+    """For each segment from a start [n, 3] to an end [m, 3] the first capsule (axes [k, 2, 3], radii [k]) that it
+    meets, [n, m]; -1 where it meets none, or is not `asked` for [n, m]."""
+    found = np.full(asked.shape, -1, np.int16)
+    if len(starts_mm):
+        center_mm = starts_mm.mean(axis=0)
+        reach_mm = float(np.linalg.norm(starts_mm - center_mm, axis=1).max())
+        _first_met(starts_mm, ends_mm, axes_mm, radii_mm, asked, center_mm, reach_mm, found)
+    return found
+
+
+def sight_of(rig: Rig, support_from_camera: Transform) -> Sight:
+    """The rig's camera, somewhere. Its image lies where the lens equation has it for the distance of focus."""
+    image_mm = 1 / (1 / rig.lens.focal_length_mm - 1 / rig.lens.focus_distance_mm)
+    return Sight(
+        support_from_camera,
+        image_mm / (rig.sensor.pixel_pitch_um * 1e-3),
+        rig.sensor.width_px,
+        rig.sensor.height_px,
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def segment_distance_mm(p, q, a, b):  # type: ignore[no-untyped-def]
+    """Distance between the segments from p to q and from a to b, points [3] each.
+
+    Ericson, Real-Time Collision Detection (2005), section 5.1.9: nearest points of the lines, moved into the
+    segments. Of parallel lines any point will do to begin with.
+    """
+    ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+    vx, vy, vz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    wx, wy, wz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
+    uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
+    uw, vw = ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
+    across = uu * vv - uv * uv
+    s = min(1.0, max(0.0, (uv * vw - vv * uw) / across)) if across > 0.0 else 0.0
+    t = (uv * s + vw) / vv if vv > 0.0 else 0.0
+    if t < 0.0 or t > 1.0 or vv == 0.0:
+        t = min(1.0, max(0.0, t))
+        s = min(1.0, max(0.0, (uv * t - uw) / uu)) if uu > 0.0 else 0.0
+    dx, dy, dz = wx + s * ux - t * vx, wy + s * uy - t * vy, wz + s * uz - t * vz
+    return np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@numba.njit(cache=True, nogil=True)
+def _first_met(starts, ends, axes, radii, asked, center, reach, found):  # type: ignore[no-untyped-def]
+    """Fill `found` [n, m]. No segment to an end is farther than `reach` from the one that starts at `center`: what
+    that one misses by more need not be tried for each start."""
+    near = np.empty(len(radii), np.int64)
+    for j in range(len(ends)):
+        count = 0
+        for k in range(len(radii)):
+            if segment_distance_mm(center, ends[j], axes[k, 0], axes[k, 1]) <= radii[k] + reach:
+                near[count] = k
+                count += 1
+        for i in range(len(starts) if count else 0):
+            if not asked[i, j]:
+                continue
+            for n in range(count):
+                k = near[n]
+                if segment_distance_mm(starts[i], ends[j], axes[k, 0], axes[k, 1]) <= radii[k]:
+                    found[i, j] = k
+                    break

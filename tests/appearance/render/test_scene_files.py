@@ -1,0 +1,171 @@
+"""Scene files: what is refused, what is shipped, and what a rendering writes."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from places import REPO
+
+from coupole.appearance.render.rendering import opened
+from coupole.commands.render import render
+from coupole.commands.render_scene import STUDIO, read_scene, render_scene
+from coupole.errors import InputError, StorageError
+from coupole.plan.rig import load_class
+
+pytest.importorskip("mitsuba")
+pytest.importorskip("colour")
+
+ROOT = REPO
+SHIPPED = sorted((ROOT / "configs" / "scenes").glob("*.yaml"))
+SMALL = """\
+schema_version: 1
+name: small
+cameras:
+  - name: main
+    position_mm: [0, -100, 100]
+    target_mm: [0, 0, 0]
+    optics: {kind: lens, focal_length_mm: 35, pixel_pitch_um: 700}
+    width_px: 16
+    height_px: 12
+objects:
+  - kind: plane
+    width_mm: 500
+    depth_mm: 500
+    material: {kind: diffuse, reflectance: {kind: constant, value: 0.5}}
+lights:
+  - {kind: leds, dome: DOME, ids: [0, 7]}
+bands: {step_nm: 40}
+samples: 2
+depth: 2
+"""
+
+
+def written(folder: Path, text: str = SMALL) -> Path:
+    path = folder / "small.yaml"
+    path.write_text(text.replace("DOME", str(ROOT / "configs" / "domes" / "coupole.csv")))
+    return path
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_every_shipped_scene_renders(path: Path, tmp_path: Path) -> None:
+    document, scene = read_scene(path)
+    small = load_class(STUDIO).reduced(scene, samples=1, width_px=16, step_nm=40)
+    if small.caustic is not None:
+        small = small.model_copy(update={"caustic": small.caustic.model_copy(update={"photons": 20_000})})
+    summary = render_scene(document, small, tmp_path, lambda camera, done, total: None)
+    assert summary["synthetic"] is True
+    for seen in summary["cameras"].values():
+        assert seen["mean_cd_m2"] > 0.0
+        assert all((tmp_path / file).is_file() for file in seen["files"].values())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "place", "words"),
+    [
+        (("samples: 2", "sampels: 2"), "18:1", "sampels"),
+        (("value: 0.5", "value: 1.5"), "14:", "1"),
+        (("kind: leds", "kind: lamps"), "16:", "lamps"),
+        (("dome: DOME", "dome: nowhere.csv"), "16:24", "no such file"),
+        (("step_nm: 40", "step_nm: 7"), "17:", "7"),
+        (("target_mm: [0, 0, 0]", "target_mm: [0, -100, 0]"), "4:", "up"),
+    ],
+)
+def test_a_wrong_scene_is_refused_with_its_place(
+    wrong: tuple[str, str], place: str, words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError) as refused:
+        read_scene(written(tmp_path, SMALL.replace(*wrong)))
+    assert f"small.yaml:{place}" in str(refused.value)
+    assert words in str(refused.value)
+
+
+def test_an_led_that_the_dome_does_not_have_is_named(tmp_path: Path) -> None:
+    document, scene = read_scene(written(tmp_path, SMALL.replace("[0, 7]", "[0, 5000]")))
+    with pytest.raises(InputError, match="5000"):
+        render_scene(document, scene, tmp_path, lambda camera, done, total: None)
+
+
+def test_a_machine_without_mitsuba_is_told_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    document, scene = read_scene(written(tmp_path))
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    with pytest.raises(InputError, match=r"pip install 'coupole\[mitsuba,materials\]'"):
+        render_scene(document, scene, tmp_path, lambda camera, done, total: None)
+
+
+def test_the_same_scene_gives_the_same_files(tmp_path: Path) -> None:
+    document, scene = read_scene(written(tmp_path))
+    for folder in ("one", "two"):
+        render_scene(document, scene, tmp_path / folder, lambda camera, done, total: None)
+    for file in ("small-main.png", "small.json"):
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
+    assert np.array_equal(*(_exr(tmp_path / folder / "small-main.exr")[0] for folder in ("one", "two")))
+
+
+def test_the_exr_holds_bands_by_wavelength_and_says_that_it_is_simulated(tmp_path: Path) -> None:
+    document, scene = read_scene(written(tmp_path))
+    render_scene(document, scene, tmp_path, lambda camera, done, total: None)
+    pixels, names, told = _exr(tmp_path / "small-main.exr")
+    wavelengths = [f"S0.{nm}nm" for nm in range(380, 781, 40)]
+    assert pixels.shape == (12, 16, 14)
+    assert sorted(names) == sorted(["X", "Y", "Z", *wavelengths])
+    assert told["spectralLayoutVersion"] == "1.0"
+    assert told["synthetic"] == "true"
+    with opened(scene, tmp_path) as renderer:
+        radiance = renderer.render(scene.cameras[0]).radiance
+    assert pixels[..., names.index("S0.540nm")] == pytest.approx(radiance[..., 4])
+
+
+def test_the_png_is_srgb_and_says_that_it_is_simulated(tmp_path: Path) -> None:
+    from PIL import Image
+
+    document, scene = read_scene(written(tmp_path))
+    render_scene(document, scene, tmp_path, lambda camera, done, total: None)
+    with Image.open(tmp_path / "small-main.png") as picture:
+        assert picture.size == (16, 12)
+        assert "simulated" in picture.info["Description"]
+        assert picture.info["srgb"] == 0
+
+
+def test_polarisation_adds_its_picture_and_stokes_channels(tmp_path: Path) -> None:
+    document, scene = read_scene(written(tmp_path, SMALL + "polarisation: true\noutputs: {spectra: half}\n"))
+    summary = render_scene(document, scene, tmp_path, lambda camera, done, total: None)
+    _, names, _ = _exr(tmp_path / "small-main.exr")
+    assert (tmp_path / summary["cameras"]["main"]["files"]["polarisation"]).is_file()
+    assert {"S1.380nm", "S2.380nm", "S3.780nm"} <= set(names)
+
+
+def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None:
+    document, scene = read_scene(written(tmp_path))
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(StorageError, match="taken"):
+        render_scene(document, scene, tmp_path / "taken", lambda camera, done, total: None)
+
+
+def test_the_command_prints_one_json_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    render(written(tmp_path), out=tmp_path / "out", samples=1, width=8, step=None, as_json=True)
+    found = json.loads(capsys.readouterr().out)
+    assert found["scene"] == "small"
+    assert (tmp_path / "out" / found["cameras"]["main"]["files"]["png"]).is_file()
+
+
+def test_the_command_says_in_json_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InputError):
+        render(tmp_path / "none.yaml", out=tmp_path, samples=None, width=None, step=None, as_json=True)
+    assert json.loads(capsys.readouterr().out)["exit_code"] == 2
+
+
+def _exr(path: Path) -> tuple[Any, list[str], dict[str, Any]]:
+    import mitsuba
+
+    mi: Any = mitsuba
+    bitmap = mi.Bitmap(str(path))
+    told = bitmap.metadata()
+    names = [field.name for field in bitmap.struct_()]
+    return np.array(bitmap), names, {key: told[key] for key in ("spectralLayoutVersion", "synthetic")}

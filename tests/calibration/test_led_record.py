@@ -1,0 +1,108 @@
+"""What a calibration of the LEDs leaves: a record that holds, the dome's new table, uncertainties, remarks."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from domes import SIZE_PX, Dome, Noise, dome
+from test_led_matching import rewired
+
+from coupole.calibration.leds.drawing import draw_leds
+from coupole.calibration.leds.equations import Stated
+from coupole.calibration.leds.sources import LedImages
+from coupole.calibration.leds.workflow import LedsFound, leds_from
+from coupole.calibration.optics import Intrinsics
+from coupole.calibration.record import read_record
+from coupole.calibration.report import Outcome, write_outcome
+from coupole.calibration.request import Request
+from coupole.calibration.sources import About
+from coupole.errors import InputError
+from coupole.plan.led_table import read_led_table
+
+REQUEST = Request("leds-test", datetime(2026, 5, 1, tzinfo=UTC))
+
+
+def images(made: Dome) -> LedImages:
+    names = tuple(f"v{number}" for number in range(len(made.base_from_flange)))
+    inputs = (("run/run.json", "0" * 64),)
+    return LedImages(made.seen, made.base_from_flange, names, SIZE_PX, (), About(simulated=True), inputs)
+
+
+def found(made: Dome) -> LedsFound:
+    return leds_from(images(made), made.table, made.prior, REQUEST, stated=Stated())
+
+
+@pytest.fixture(scope="module")
+def sound() -> Dome:
+    return dome(1, views=24)
+
+
+def test_the_record_is_accepted_and_its_files_are_beside_it(sound: Dome, tmp_path: Path) -> None:
+    result = found(sound)
+    path = tmp_path / "leds-test.yaml"
+    write_outcome(path, Outcome(result.record, partial(draw_leds, result), result.files))
+    record = read_record(path)
+    assert record.passed
+    assert record.kind == "leds"
+    assert {file.name for file in record.files} == {"leds-test.csv", "leds-test.h5"}
+
+
+def test_the_new_table_can_be_a_rigs_dome(sound: Dome, tmp_path: Path) -> None:
+    path = tmp_path / "dome.csv"
+    path.write_bytes(found(sound).files["leds-test.csv"])
+    table = read_led_table(path)
+    assert (table.ids == sound.table.ids).all()
+    assert np.median(np.linalg.norm(table.positions_mm - sound.true_mm, axis=1)) < 0.12
+    assert np.allclose(np.linalg.norm(table.normals, axis=1), 1)
+
+
+def test_each_leds_covariance_is_kept(sound: Dome) -> None:
+    with h5py.File(io.BytesIO(found(sound).files["leds-test.h5"])) as file:
+        covariance = file["centre_covariance"][:]
+        assert covariance.shape == (48, 3, 3)
+        assert (np.linalg.eigvalsh(covariance) > 0).all()
+        assert file["normal_covariance"].shape == (48, 2, 2)
+        assert file["found"][:].all()
+
+
+def test_swapped_leds_have_each_others_place_in_the_new_table(sound: Dome) -> None:
+    result = found(replace(sound, seen=rewired(sound, {4: 29, 29: 4})))
+    assert np.linalg.norm(result.new_table.positions_mm[4] - sound.true_mm[29]) < 0.5
+    assert result.new_table.boards[4] == 4
+    assert any("swapped" in remark for remark in result.record.remarks)
+
+
+def test_a_board_that_moved_against_its_table_is_named(sound: Dome) -> None:
+    moved_mm = sound.table.positions_mm.copy()
+    moved_mm[18:24] += [0.0, 0.0, 14.0]
+    result = found(replace(sound, table=replace(sound.table, positions_mm=moved_mm)))
+    assert any(remark.startswith("board 3 stands 1") for remark in result.record.remarks)
+
+
+def test_too_many_dead_leds_are_not_accepted(sound: Dome) -> None:
+    dark = sound.seen.only(np.flatnonzero(sound.seen.led > 2))
+    record = found(replace(sound, seen=dark)).record
+    assert not record.passed
+    assert [limit.what for limit in record.limits if not limit.passed] == ["LEDs not found"]
+
+
+def test_a_lens_of_another_focus_is_named_though_its_record_says_nothing() -> None:
+    made = dome(2, views=24, noise=Noise(records=0.0))
+    lens = replace(made.prior.lens, fx=made.prior.lens.fx * 1.003, fy=made.prior.lens.fy * 1.003)
+    assert isinstance(lens, Intrinsics)
+    record = found(replace(made, prior=replace(made.prior, lens=lens))).record
+    assert not record.passed
+    assert any("a record of another focus" in remark for remark in record.remarks)
+
+
+def test_without_any_led_near_the_table_nothing_is_claimed(sound: Dome) -> None:
+    away = replace(sound.table, positions_mm=sound.table.positions_mm + 5000.0)
+    with pytest.raises(InputError, match="none was found near its place"):
+        found(replace(sound, table=away))

@@ -1,0 +1,26 @@
+"""The reference names every key that a plan or a rig may have."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from types import ModuleType
+
+import pytest
+from places import REPO
+
+from coupole.plan import plan, rig
+
+REFERENCE = REPO / "docs" / "reference"
+
+
+@pytest.mark.parametrize(("module", "page"), [(plan, "plan.md"), (rig, "rig.md")])
+def test_the_reference_names_every_key(module: ModuleType, page: str) -> None:
+    text = (REFERENCE / page).read_text(encoding="utf-8")
+    models = [
+        model
+        for _, model in inspect.getmembers(module, inspect.isclass)
+        if issubclass(model, plan.Model) and model.__module__ == module.__name__
+    ]
+    keys = {f"{model.__name__}.{key}" for model in models for key in model.model_fields}
+    assert sorted(key for key in keys if not re.search(rf"\b{key.split('.')[1]}\b", text)) == []

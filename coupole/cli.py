@@ -10,7 +10,7 @@ import typer
 
 from coupole.commands import keeping, planning, running
 from coupole.commands.calibrate import calibrate_app
-from coupole.commands.render import render
+from coupole.commands.render_scene import render
 from coupole.commands.uncertainty import budget
 from coupole.errors import CoupoleError, InputError, Interrupted
 

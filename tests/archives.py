@@ -13,6 +13,7 @@ from coupole.devices import ArmState, FrameFormat
 from coupole.storage import frame_file
 from coupole.storage.frame_file import ViewWriter
 from coupole.storage.journal import Journal
+from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
 from coupole.storage.run import Inputs, Run
 
 FORMAT = FrameFormat(height_px=96, width_px=128, bit_depth=12, bayer_pattern="GBRG", black_dn=64, white_dn=4095)
@@ -67,7 +68,7 @@ def make_run(
     about = {"views": list(views), "labels": labels, "simulated": True}
     run = Run.create(folder, "made", Inputs(folder / "plan.yaml", folder / "rig.yaml", ()), about)
     diary, frames = Journal(run.journal_path), {}
-    diary.write("start")
+    diary.write(SessionStarted())
     for place, view in enumerate(views):
         path = run.view_path(view)
         frame_file.create(path, shots + 3, of, {**METADATA, "title": view}, packed=packed)
@@ -81,11 +82,11 @@ def make_run(
             slot = writer.put(pixels, frame_id=number, camera_ns=number, exposure_us=8000)
             digest = writer.prove(slot, shot, led=number, pose=pose, board_temperature_dc=251, led_current_ma=700)
             file = str(path.relative_to(run.folder))
-            diary.write("frame", shot=shot, file=file, index=slot, frame_id=number, xxh3=f"{digest:016x}")
+            diary.write(FrameProven(shot=shot, file=file, index=slot, frame_id=number, xxh3=f"{digest:016x}"))
             frames[shot] = pixels
         writer.sync()
         writer.close()
-    diary.write("stop", outcome="done")
+    diary.write(SessionStopped(outcome="done"))
     diary.commit()
     diary.close()
     return MadeRun(run, frames)

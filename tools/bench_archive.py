@@ -118,7 +118,7 @@ def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[A
     """A view whose frames are all proven; returns what its journal would say of them."""
     from coupole.devices import FrameFormat
     from coupole.storage.frame_file import ViewWriter, create
-    from coupole.storage.run import ProvenFrame
+    from coupole.storage.journal_events import FrameProven
 
     metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}
     create(path, frames, FrameFormat(HEIGHT_PX, WIDTH_PX, 12, "GBRG", 64, 4095), metadata)
@@ -126,7 +126,7 @@ def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[A
     for number in range(frames):
         slot = writer.put(pictures[number % DISTINCT], frame_id=number, camera_ns=0, exposure_us=8000)
         shot = f"view/led{number:04d}/e0"
-        proven.append(ProvenFrame(shot, path.name, slot, number, f"{writer.prove(slot, shot, led=number):016x}"))
+        proven.append(FrameProven(shot, path.name, slot, number, f"{writer.prove(slot, shot, led=number):016x}"))
     writer.sync()
     writer.close()
     return proven

@@ -27,7 +27,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
 
     def ours() -> None:
         for joints_deg in poses_deg:
-            job.bodies.contacts(joints_deg)
+            job.motion.bodies.contacts(joints_deg)
 
     works = list(filter(None, (ours, fcl_check(job, poses_deg))))
     times_us: list[list[float]] = [[] for _ in works]
@@ -64,7 +64,7 @@ def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | 
     capsules = [c for c in (*ARM_CAPSULES, *tool) if c.link]
     arm, around = trimesh.collision.CollisionManager(), trimesh.collision.CollisionManager()
     base_from_support = rig.support.base_from_support.matrix()
-    corners = job.object_corners_mm.reshape(-1, 3) @ base_from_support[:3, :3].T + base_from_support[:3, 3]
+    corners = job.shape.corners_mm.reshape(-1, 3) @ base_from_support[:3, :3].T + base_from_support[:3, 3]
     around.add_object("object", trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3)))
     disk = trimesh.creation.cylinder(rig.support.diameter_mm / 2, 50.0, transform=base_from_support)
     around.add_object("support", disk.apply_translation(-25.0 * base_from_support[:3, 2]))

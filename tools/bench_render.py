@@ -143,8 +143,8 @@ def ray_tracers(
 
 def photographer(root: Path, mesh: Path, size: tuple[int, int]) -> Any:
     """The demo's dome around one mesh, and the flange pose that looks straight down at it."""
-    from coupole.acquisition.cell import world_config
     from coupole.preflight.job import read_job
+    from coupole.preflight.simulated_world import world_config
     from sim.optics.photographer import Photographer
     from sim.world.config import Config
 

@@ -34,8 +34,8 @@ from coupole.calibration.stickers.sources import Scan, find_all_stickers, read_s
 from coupole.calibration.stickers.workflow import mesh_from
 from coupole.geometry import apply, inverse, transform
 from coupole.kinematics import Arm
-from coupole.plan.rig import planning_arm
-from coupole.scan.scan import import_scan
+from coupole.plan.rig_devices import planning_arm
+from coupole.viewing.scan_sheet import import_scan
 from random_cells import (
     LED_BOARDS,
     MARKER_MM,

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole import kinematics
-from coupole.acquisition.cell import world_config
 from coupole.geometry import apply, inverse, transform
 from coupole.motion.itinerary import plan_itinerary
 from coupole.preflight.job import Job, read_job
+from coupole.preflight.simulated_world import world_config
 from coupole.viewing.raw_preview import develop, png
 from sim.devices.camera_body import Exposed
 from sim.optics.photographer import Photographer
@@ -60,7 +60,7 @@ def polyline(points: NDArray[np.float64], style: str) -> str:
 
 def joints_of_shown_view(job: Job) -> NDArray[np.float64]:
     rig = job.cell.rig
-    visits = plan_itinerary(job.schedule.views, rig, job.bodies, rig.motion.home_joints_deg).visits
+    visits = plan_itinerary(job.schedule.views, rig, job.motion.bodies, rig.motion.home_joints_deg).visits
     shown = visits[SHOWN_VIEW]
     assert shown is not None
     return shown.joints_deg
@@ -84,7 +84,7 @@ def draw_cell(job: Job) -> str:
     rim = 0.5 * rig.support.diameter_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     leds = project(apply(support_from_base, job.cell.leds.positions_mm))
     nearest, farthest = leds[:, 2].max(), leds[:, 2].min()
-    box = job.object_points_support_mm[:8]
+    box = job.shape.dose_points_mm[:8]
     edges = [(0, 1), (0, 2), (0, 4), (1, 3), (1, 5), (2, 3), (2, 6), (3, 7), (4, 5), (4, 6), (5, 7), (6, 7)]
     parts = [polyline(rim, 'fill="#20242a" stroke="#4a525c"')]
     for x, y, depth in leds[np.argsort(leds[:, 2])]:

@@ -10,8 +10,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from coupole.commands.render_scene import STUDIO, read_scene, render_scene
-from coupole.plan.rig import load_class
+from coupole.appearance.render import studio
+from coupole.commands.render_scene import read_scene, render_scene
 
 ROOT = Path(__file__).parent.parent
 PICTURES = ROOT / "docs" / "pictures" / "renderings"
@@ -28,7 +28,6 @@ QUICK = {
 
 
 def main() -> None:
-    studio = load_class(STUDIO)
     PICTURES.mkdir(parents=True, exist_ok=True)
     for name in sys.argv[1:] or QUICK:
         samples, width_px, step_nm = QUICK[name]

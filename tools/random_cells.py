@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.acquisition.cell import world_config
 from coupole.calibration.grey_image import Picture
 from coupole.calibration.leds.led_plan import led_plan
 from coupole.calibration.leds.matching import LedSightings
@@ -22,9 +21,11 @@ from coupole.calibration.poses import reported
 from coupole.calibration.sources import About, Source, Sources
 from coupole.geometry import apply, inverse, transform
 from coupole.motion.itinerary import plan_itinerary
+from coupole.plan.cell import Cell, read_cell
 from coupole.plan.led_table import LedTable
 from coupole.plan.templates import TEMPLATES
-from coupole.preflight.job import Cell, read_cell, read_job
+from coupole.preflight.job import read_job
+from coupole.preflight.simulated_world import world_config
 from sim.devices.kuka_kinematics import PoseErrors, flange_pose
 from sim.world.config import Config
 from sim.world.stills import Stills

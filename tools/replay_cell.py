@@ -122,7 +122,7 @@ class ReplayCell:
                 low, high = np.array(keep_out.min_mm), np.array(keep_out.max_mm)
                 shape, center = fcl.Box(*(high - low)), (low + high) / 2
             around.append((f"keep-out `{keep_out.name}`", fcl.CollisionObject(shape, fcl.Transform(center))))
-        if len(corners := job.object_corners_mm):
+        if len(corners := job.shape.corners_mm):
             around.append(("the object", fcl.CollisionObject(_bvh(*_shared(corners)))))
         return around
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from coupole.kinematics import KR10_R1100_SIXX
 from coupole.motion.itinerary import Itinerary, bodies_of, plan_itinerary
 from coupole.plan.plan import Plan
-from coupole.preflight.job import Job, read_job, schedule_of
+from coupole.preflight.job import Job, motion_of, read_job, schedule_of
 from replay_cell import ReplayCell, Touch, motion
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -110,14 +110,15 @@ def random_job(random: np.random.Generator, demo: Job) -> Job:
             "exposure": {"kind": "fixed", "exposure_us": 8000},
         }
     )
-    return replace(
-        demo, plan=plan, object_corners_mm=corners_mm, schedule=schedule_of(plan, demo.cell), _planned=[]
-    )
+    shape = replace(demo.shape, corners_mm=corners_mm)
+    schedule = schedule_of(plan, demo.cell)
+    motion = motion_of(plan, demo.cell, shape, schedule)
+    return replace(demo, plan=plan, shape=shape, schedule=schedule, motion=motion)
 
 
 def planned(job: Job, meshes: Path | None) -> Itinerary:
     """The ways that preflight looks at: from home."""
-    bodies = bodies_of(job.cell.rig, job.cell.leds, job.object_corners_mm, meshes) if meshes else job.bodies
+    bodies = bodies_of(job.cell.rig, job.cell.leds, job.shape.corners_mm, meshes) if meshes else job.motion.bodies
     home_deg = job.cell.rig.motion.home_joints_deg
     return plan_itinerary(job.schedule.views, job.cell.rig, bodies, home_deg, job.plan.order)
 

@@ -20,7 +20,7 @@ from coupole.kinematics import move_duration_s
 from coupole.motion.itinerary import Itinerary, Visit, arm_of
 from coupole.motion.path_deviation import PATH_TOLERANCE_MM, path_deviation_mm
 from coupole.motion.path_planner import Joints
-from coupole.plan.shots import ViewPose
+from coupole.plan.schedule import ViewPose
 from coupole.preflight.job import Job
 
 _POLL_S = 0.01
@@ -53,7 +53,7 @@ class ArmSupervisor:
     def itinerary(self, views: Sequence[ViewPose]) -> Itinerary:
         """Ways to views from where the arm really stands. Raises PreflightRefused where there is none."""
         self._from_deg = np.array(self._robot.measured().joints_deg)
-        found = self._job.itinerary(views, self._from_deg.tolist())
+        found = self._job.motion.itinerary(views, self._from_deg.tolist())
         if found.refusals:
             raise PreflightRefused(found.refusals)
         return found
@@ -86,7 +86,7 @@ class ArmSupervisor:
         assert self._settled is not None
         here_deg = np.array(self._robot.measured().joints_deg)
         there_deg = np.array(self._settled.arm.joints_deg)
-        contact = self._job.bodies.contact_on_the_way(here_deg, there_deg)
+        contact = self._job.motion.bodies.contact_on_the_way(here_deg, there_deg)
         if contact is not None:
             raise DeviceRefused(
                 "robot",

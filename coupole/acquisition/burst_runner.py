@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,6 @@ from coupole.acquisition.cell import OpenedCell
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_grabber import FrameGrabber, buffers_for, memory_for_buffers
 from coupole.acquisition.frame_matching import UNLABELLED, FaultModel, Match, match
-from coupole.acquisition.observer import Outcome
 from coupole.acquisition.recorder import Recorder
 from coupole.devices import (
     NO_LIGHT,
@@ -28,7 +28,10 @@ from coupole.devices import (
     Frame,
 )
 from coupole.errors import CoupoleError, DeviceError, DeviceTimeout
-from coupole.plan.shots import Burst
+from coupole.plan.bursts import Burst
+from coupole.plan.shot_id import ShotId
+from coupole.storage.journal_events import BurstEnded, Joints
+from coupole.viewing.progress import Outcome
 
 _POLL_S = 0.05
 _STALL_S = 5.0
@@ -47,7 +50,7 @@ class Verdict:
     """Of one burst, after its end."""
 
     match: Match
-    dead: list[str]
+    dead: list[ShotId]
     """Shots whose LED drew no current."""
 
 
@@ -153,7 +156,7 @@ class BurstRunner:
         log = running.log
         dark = (log["led"] != NO_LIGHT) & ((log["status"] & STATUS_LED_OPEN) != 0)
         assert running.judged is not None
-        return Verdict(running.judged, [burst.shot_ids[i] for i in np.flatnonzero(dark)])
+        return Verdict(running.judged, [shot for i in np.flatnonzero(dark) if (shot := burst.shots[i])])
 
     def _follow(self, running: _RunningBurst) -> None:
         """Read log and frames until the burst is over, proving as it goes."""
@@ -221,7 +224,7 @@ class BurstRunner:
             label = running.burst.labels[int(record["step"])]
             invalid = record["led"] != NO_LIGHT and record["status"] & _INVALID_EXPOSURE
             if label and not invalid:
-                shot = f"{running.burst.view}/{label}"
+                shot = ShotId(running.burst.view, label)
                 self._recorder.prove(grabber.slot(frame), shot, _fields(record, int(record["t_trigger_ns"])))
                 running.proven.add(frame)
 
@@ -254,10 +257,11 @@ class BurstRunner:
         """One light at a time, fired by the host: a frame is proven by being the only one, taken while the box
         says that this very step is running, from before the trigger until after the frame has come."""
         logs = []
-        dead: list[str] = []
+        dead: list[ShotId] = []
         arm_before, arm_after = self._cell.robot.measured(), None
         try:
-            for index, shot in enumerate(burst.shot_ids):
+            for index, shot in enumerate(burst.shots):
+                assert shot is not None
                 self._arm.attend()
                 self._wait_while_paused()
                 frame, record, lit_throughout = self._fire_one(burst, burst.table[index : index + 1])
@@ -277,7 +281,7 @@ class BurstRunner:
             self._note(burst, log, arm_before, arm_after, frames=len(log))
         return Verdict(NOTHING_TO_MATCH, dead)
 
-    def _keep(self, frame: Frame, burst: Burst, shot: str, step: np.void, *, proven: bool) -> None:
+    def _keep(self, frame: Frame, burst: Burst, shot: ShotId, step: np.void, *, proven: bool) -> None:
         slot = self._recorder.put(frame, burst.timing.exposure_us)
         frame.release()
         if not proven:
@@ -329,17 +333,18 @@ class BurstRunner:
         log: NDArray[np.void],
         arm_before: ArmState,
         arm_after: ArmState | None,
-        **figures: object,
+        **figures: Any,
     ) -> None:
         """The burst's line in the journal."""
-        self._recorder.event(
-            "burst",
-            view=burst.view,
-            steps=len(log),
-            on_s=self._dose.add(burst, log),
-            joints_before_deg=_rounded(arm_before),
-            joints_after_deg=_rounded(arm_after) if arm_after else None,
-            **figures,
+        self._recorder.note(
+            BurstEnded(
+                view=burst.view,
+                steps=len(log),
+                on_s=self._dose.add(burst, log),
+                joints_before_deg=_rounded(arm_before),
+                joints_after_deg=_rounded(arm_after) if arm_after else None,
+                **figures,
+            )
         )
         self._recorder.commit(now=True)
 
@@ -350,5 +355,5 @@ def _fields(record: np.void, t_trigger_ns: int) -> dict[str, int]:
     return {"t_trigger_ns": t_trigger_ns, **{name: int(record[name]) for name in names}}
 
 
-def _rounded(arm: ArmState) -> list[float]:
-    return [round(angle, 6) for angle in arm.joints_deg]
+def _rounded(arm: ArmState) -> Joints:
+    return tuple(round(angle, 6) for angle in arm.joints_deg)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from coupole.devices import NO_LIGHT
 from coupole.geometry import apply
-from coupole.plan.shots import Burst
+from coupole.plan.bursts import Burst
 from coupole.preflight.job import Job
 
 
@@ -16,7 +16,7 @@ class DoseMeter:
 
     def __init__(self, job: Job) -> None:
         rig = job.cell.rig
-        points_base = apply(rig.support.base_from_support.matrix(), job.object_points_support_mm)
+        points_base = apply(rig.support.base_from_support.matrix(), job.shape.dose_points_mm)
         self._lux = job.cell.leds.illuminance_lux(points_base, emission=rig.dome.emission)
         self._row_of_led = {int(led): row for row, led in enumerate(job.cell.leds.ids)}
         self._panel_lux = rig.dome.panel_lux

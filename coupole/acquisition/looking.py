@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from coupole.acquisition.cell import open_cell
+from coupole.acquisition.live_cell import CellSource
 from coupole.acquisition.observer import Control
 from coupole.acquisition.operator import (
     UNLIMITED_BYTES,
@@ -22,11 +23,13 @@ from coupole.acquisition.operator import (
 from coupole.acquisition.sequencer import Sequencer
 from coupole.errors import InputError
 from coupole.geometry import apply
-from coupole.plan.shots import leds_of_plan
+from coupole.plan.cell import Cell
+from coupole.plan.lights import leds_of_plan
 from coupole.preflight import exposure_advice
-from coupole.preflight.job import Cell, Job, check_job, schedule_of
+from coupole.preflight.checking import check_job
+from coupole.preflight.job import Job, schedule_of
 from coupole.preflight.preflight import StorageFacts
-from coupole.viewing.live import CellSource, Choice, RunSource, Source, Studio, choice_from, run_source
+from coupole.viewing.live import Choice, RunSource, Source, Studio, choice_from, run_source
 from coupole.viewing.live_page import serve
 from coupole.viewing.terminal import LiveFigures, RunObserver
 
@@ -68,7 +71,7 @@ def watch_cell(
     rig_cell = job_or_cell.cell if isinstance(job_or_cell, Job) else job_or_cell
     rig, leds = rig_cell.rig, rig_cell.leds
     centre = rig.support.base_from_support.matrix()[:3, 3]
-    points = apply(rig.support.base_from_support.matrix(), job.object_points_support_mm) if job else centre[None]
+    points = apply(rig.support.base_from_support.matrix(), job.shape.dose_points_mm) if job else centre[None]
     lux_of_row = leds.illuminance_lux(points, emission=rig.dome.emission).max(axis=0)
     lux = dict(zip(leds.ids.tolist(), lux_of_row.tolist(), strict=True))
     ids = tuple(leds.ids.tolist())

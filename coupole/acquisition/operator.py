@@ -14,10 +14,12 @@ from coupole.acquisition.cell import OpenedCell
 from coupole.acquisition.observer import Control
 from coupole.devices import Identity
 from coupole.errors import Interrupted, PreflightRefused
-from coupole.plan.rig import Rig, in_world
-from coupole.plan.shots import EXPOSURE_MARGIN_US
+from coupole.plan.bursts import EXPOSURE_MARGIN_US
+from coupole.plan.cell import Cell
+from coupole.plan.rig import Rig
+from coupole.plan.rig_devices import in_world
 from coupole.preflight import ledger
-from coupole.preflight.job import Cell, Job
+from coupole.preflight.job import Job
 from coupole.preflight.preflight import Report
 from coupole.viewing.terminal import ask
 

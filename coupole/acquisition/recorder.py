@@ -6,7 +6,6 @@ import contextlib
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,9 +13,12 @@ import numpy as np
 from coupole.devices import ArmState, Frame, FrameFormat
 from coupole.errors import StorageError
 from coupole.geometry import Transform
+from coupole.plan.shot_id import ShotId
 from coupole.storage.frame_file import Collections, ViewWriter, create
 from coupole.storage.journal import Journal
+from coupole.storage.journal_events import Event, FrameProven
 from coupole.storage.run import Run
+from coupole.viewing.progress import ViewExposure
 
 COMMIT_EVERY_S = 0.5
 SPARE_SLOTS = 32
@@ -26,7 +28,7 @@ SPARE_SLOTS = 32
 class Recorder(Protocol):
     """What the sequencer needs of it. `put` may come from several threads, all else from one."""
 
-    def proven(self) -> set[str]:
+    def proven(self) -> set[ShotId]:
         """Shots proven so far, also in an earlier session of the run."""
         ...
 
@@ -49,11 +51,13 @@ class Recorder(Protocol):
         """Keep a frame that is not proven yet; returns its slot."""
         ...
 
-    def prove(self, slot: int, shot: str, fields: Mapping[str, int]) -> None: ...
+    def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None: ...
 
     def free(self, slot: int) -> None: ...
 
-    def event(self, event: str, **fields: Any) -> None: ...
+    def note(self, event: Event) -> None:
+        """For the journal."""
+        ...
 
     def commit(self, *, now: bool) -> None:
         """Make what was proven and noted last; with `now=False` only if the last time was a while ago."""
@@ -77,7 +81,7 @@ class RunRecorder:
         self._committer = ThreadPoolExecutor(1, "commit")
         self._committing: Future[None] | None = None
 
-    def proven(self) -> set[str]:
+    def proven(self) -> set[ShotId]:
         return set(self._proven)
 
     def begin_view(
@@ -92,13 +96,13 @@ class RunRecorder:
         path = self._run.view_path(view)
         self._file = str(path.relative_to(self._run.folder))
         if self._writer is None:
-            mine = {s: i for s, i in self._proven.items() if s.startswith(f"{view}/")}
+            own = {str(shot): slot for shot, slot in self._proven.items() if shot.view == view}
             if not path.exists():
-                if mine:
+                if own:
                     raise StorageError(f"{path}: the journal knows proven frames of it, but it is gone")
                 metadata = {**self._metadata, "title": view}
                 create(path, frames + SPARE_SLOTS, frame_format, metadata, collections, packed=self._packed)
-            self._writer = ViewWriter(path, mine)
+            self._writer = ViewWriter(path, own)
         self._pose = self._writer.add_pose(arm, base_from_camera)
 
     @property
@@ -116,21 +120,21 @@ class RunRecorder:
             frame.pixels, frame_id=frame.frame_id, camera_ns=frame.timestamp_ns, exposure_us=exposure_us
         )
 
-    def prove(self, slot: int, shot: str, fields: Mapping[str, int]) -> None:
+    def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         if shot in self._proven:
             raise StorageError(f"{self._file}: {shot} is proven already in slot {self._proven[shot]}")
         frame_id = self._view.frame_id(slot)
-        digest = self._view.prove(slot, shot, pose=self._pose, **fields)
+        digest = self._view.prove(slot, str(shot), pose=self._pose, **fields)
         self._proven[shot] = slot
         self._journal.write(
-            "frame", shot=shot, file=self._file, index=slot, frame_id=frame_id, xxh3=f"{digest:016x}"
+            FrameProven(shot=shot, file=self._file, index=slot, frame_id=frame_id, xxh3=f"{digest:016x}")
         )
 
     def free(self, slot: int) -> None:
         self._view.free(slot)
 
-    def event(self, event: str, **fields: Any) -> None:
-        self._journal.write(event, **fields)
+    def note(self, event: Event) -> None:
+        self._journal.write(event)
 
     def commit(self, *, now: bool) -> None:
         """A disk may take seconds to sync, so this happens on another thread unless it must be `now`: while a
@@ -172,38 +176,18 @@ class RunRecorder:
         self._journal.close()
 
 
-@dataclass
-class ViewExposure:
-    """How well a view is exposed, on the frames of a sample of its lights."""
-
-    pictures: int = 0
-    saturated: float = 0.0
-    """Largest share of saturated pixels of any sampled frame."""
-    brightest: float = 0.0
-    """Highest 99.9 % quantile of any sampled frame, share of full scale above black."""
-    median_bright: float = 0.0
-    """Median over the sampled frames of that quantile."""
-    quantiles: list[float] = field(default_factory=list)
-
-    def verdict(self) -> str:
-        """`over`, `under` or `good`."""
-        if self.saturated > 1e-3:
-            return "over-exposed"
-        return "under-exposed" if self.median_bright < 0.05 else "well exposed"
-
-
 class DryRecorder:
     """Into figures: counts what is proven, judges the exposure of frames that hold a picture."""
 
     def __init__(self) -> None:
-        self._proven: set[str] = set()
-        self.events: list[dict[str, Any]] = []
+        self._proven: set[ShotId] = set()
+        self.events: list[Event] = []
         self.exposures: dict[str, ViewExposure] = {}
         self._format: FrameFormat | None = None
         self._slots: list[tuple[float, float] | None] = []
         self._view = ""
 
-    def proven(self) -> set[str]:
+    def proven(self) -> set[ShotId]:
         return self._proven
 
     def begin_view(
@@ -227,10 +211,10 @@ class DryRecorder:
             self._slots.append((bright, float(np.mean(frame.pixels >= white))))
         return len(self._slots) - 1
 
-    def prove(self, slot: int, shot: str, fields: Mapping[str, int]) -> None:
+    def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         self._proven.add(shot)
         judged = self._slots[slot]
-        if judged is not None and "/dark" not in shot and "mark" not in shot:
+        if judged is not None and shot.is_shot:
             seen = self.exposures.setdefault(self._view, ViewExposure())
             seen.pictures += 1
             seen.quantiles.append(judged[0])
@@ -241,8 +225,8 @@ class DryRecorder:
     def free(self, slot: int) -> None:
         self._slots[slot] = None
 
-    def event(self, event: str, **fields: Any) -> None:
-        self.events.append({"event": event, **fields})
+    def note(self, event: Event) -> None:
+        self.events.append(event)
 
     def commit(self, *, now: bool) -> None:
         """Nothing lasts in a dry run."""

@@ -16,14 +16,27 @@ from coupole.acquisition.burst_runner import NOTHING_TO_MATCH, BurstRunner, Verd
 from coupole.acquisition.cell import OpenedCell
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_matching import compile_now
-from coupole.acquisition.observer import Control, Observer, Outcome, Progress
+from coupole.acquisition.observer import Control, Observer, Unwatched
 from coupole.acquisition.recorder import Recorder
 from coupole.devices import FrameFormat
 from coupole.errors import DeviceError, UnprovenError
 from coupole.motion.itinerary import Visit
-from coupole.plan.shots import Burst, ViewPose
+from coupole.plan.bursts import Burst
+from coupole.plan.schedule import ViewPose
+from coupole.plan.shot_id import ShotId
 from coupole.preflight.job import Job
-from coupole.storage.run import is_shot
+from coupole.storage.journal_events import (
+    ArmSettled,
+    Continued,
+    FaultNoted,
+    GapFound,
+    MoveBegun,
+    Paused,
+    ReshootBegun,
+    ViewBegun,
+    ViewSealed,
+)
+from coupole.viewing.progress import Outcome, Progress
 
 _PAUSE_NAP_S = 0.1
 
@@ -41,7 +54,7 @@ class Sequencer:
         control: Control | None = None,
     ) -> None:
         self._job, self._cell, self._recorder = job, cell, recorder
-        self._observer, self._control = observer or Observer(), control or Control()
+        self._observer, self._control = observer or Unwatched(), control or Control()
         self._dose = DoseMeter(job)
         self._view_number = 0
         self._view_name = ""
@@ -85,9 +98,9 @@ class Sequencer:
             self.outcome.duration_s = (self._cell.clock.now_ns() - start_ns) / 1e9
             self.outcome.dose_lux_h = self._dose.lux_h
             done = self._recorder.proven()
-            self.outcome.proven = sum(map(is_shot, done))
-            expected = [s for bursts in schedule.bursts for b in bursts for s in b.shot_ids]
-            self.outcome.missing = [s for s in expected if is_shot(s) and s not in done]
+            self.outcome.proven = sum(shot.is_shot for shot in done)
+            expected = [shot for bursts in schedule.bursts for burst in bursts for shot in burst.shots if shot]
+            self.outcome.missing = [shot for shot in expected if shot.is_shot and shot not in done]
         if self.outcome.missing:
             raise UnprovenError(self._say_missing())
         return self.outcome
@@ -97,30 +110,33 @@ class Sequencer:
         done = self._recorder.proven()
         left = []
         for burst in bursts:
-            wanted = {label for label in burst.labels if f"{burst.view}/{label}" not in done}
+            wanted = {shot.label for shot in burst.shots if shot and shot not in done}
             if wanted:
                 left.append(burst if len(wanted) == len(burst.labels) else burst.only(wanted))
         return left
 
     def _acquire_view(self, view: ViewPose, visit: Visit, left: list[Burst], all_bursts: Sequence[Burst]) -> None:
-        shadow = self._job.occlusions.at(visit.joints_deg)
-        self._recorder.event("view", view=view.name, hidden_leds=self._job.occluded_leds(shadow))
-        collections = {"shadow": {**shadow.arrays(self._job.occlusions.patches), "leds": self._job.cell.leds.ids}}
+        occlusion = self._job.motion.occlusions.at(visit.joints_deg)
+        hidden_leds = self._job.motion.occluded_leds(occlusion)
+        self._recorder.note(ViewBegun(view=view.name, hidden_leds=tuple(hidden_leds)))
+        patches = self._job.motion.occlusions.patches
+        collections = {"shadow": {**occlusion.arrays(patches), "leds": self._job.cell.leds.ids}}
         motion_s = visit.leg.duration_s + self._job.cell.rig.motion.settle_dwell_s
         self.outcome.ideal_s += motion_s + sum(burst.duration_s for burst in left)
-        waypoints_deg = [np.round(place, 6).tolist() for place in visit.leg.waypoints]
-        self._recorder.event("move", view=view.name, joints_deg=waypoints_deg)
+        waypoints_deg = tuple(tuple(np.round(place, 6).tolist()) for place in visit.leg.waypoints)
+        self._recorder.note(MoveBegun(view=view.name, joints_deg=waypoints_deg))
         settled = self._arm.go(visit, lambda: self._cell.ledbox.load(left[0].table))
         frame_format = self._cell.camera.configure(self._burst_runner.exposure(left[0]))
         self._check_format(frame_format)
         frames = sum(len(burst.labels) for burst in all_bursts)
 
         def begin(settled: SettledPose) -> None:
-            self._recorder.event(
-                "settled",
-                view=view.name,
-                joints_deg=[round(j, 6) for j in settled.arm.joints_deg],
-                base_from_camera=np.round(settled.base_from_camera, 6).tolist(),
+            self._recorder.note(
+                ArmSettled(
+                    view=view.name,
+                    joints_deg=tuple(round(angle, 6) for angle in settled.arm.joints_deg),
+                    base_from_camera=tuple(map(tuple, np.round(settled.base_from_camera, 6).tolist())),
+                )
             )
             self._recorder.begin_view(
                 view.name, frames, frame_format, settled.arm, settled.base_from_camera, collections
@@ -131,7 +147,7 @@ class Sequencer:
             for index, burst in enumerate(left):
                 following = left[index + 1] if index + 1 < len(left) else None
                 self._acquire_burst(burst, following, begin)
-            self._recorder.event("seal", view=view.name)
+            self._recorder.note(ViewSealed(view=view.name))
         finally:
             self._recorder.end_view()
 
@@ -154,40 +170,41 @@ class Sequencer:
         for attempt in range(self._job.plan.reshoot_limit + 1):
             self._wait_while_paused()
             if attempt:
-                shots = [s for s in todo.shot_ids if s and is_shot(s)]
+                shots = tuple(shot for shot in todo.shots if shot and shot.is_shot)
                 self.outcome.reshot += len(shots)
-                self._recorder.event("reshoot", view=burst.view, attempt=attempt, shots=shots)
+                self._recorder.note(ReshootBegun(view=burst.view, attempt=attempt, shots=shots))
             try:
                 verdict = self._burst_runner.fire(todo, following if attempt == 0 else None)
             except ArmMovedError as moved:
                 self._cell.ledbox.lights_off()
                 self._observer.note(f"{burst.view}: {moved}; back to the view")
-                self._recorder.event("fault", kind="ArmMoved", message=f"{burst.view}: {moved}")
+                self._recorder.note(FaultNoted(kind="ArmMoved", message=f"{burst.view}: {moved}"))
                 begin(self._arm.return_to_view())
                 verdict = Verdict(NOTHING_TO_MATCH, [])
             done = self._recorder.proven()
-            left = {label for label in todo.labels if label and f"{burst.view}/{label}" not in done}
+            left = [shot for shot in todo.shots if shot and shot not in done]
             if not left:
                 return
             self._note_gap(burst, verdict, left)
-            self.outcome.bad = sorted(set(self.outcome.bad) | set(verdict.dead))
-            todo = burst.only(left)
+            self.outcome.bad |= set(verdict.dead)
+            todo = burst.only({shot.label for shot in left})
 
     # -- small things -------------------------------------------------------------------------------------
 
-    def _note_gap(self, burst: Burst, verdict: Verdict, left: set[str]) -> None:
+    def _note_gap(self, burst: Burst, verdict: Verdict, left: Sequence[ShotId]) -> None:
         judged = verdict.match
         missing = int(judged.missing.sum())
         lost = int(judged.lost_in_transfer.sum())
-        self._recorder.event(
-            "gap",
-            view=burst.view,
-            shots=[f"{burst.view}/{label}" for label in sorted(left)],
-            missing=missing,
-            lost_in_transfer=lost,
-            surplus=int(judged.surplus.sum()),
-            dead_leds=verdict.dead,
-            reason=judged.reason,
+        self._recorder.note(
+            GapFound(
+                view=burst.view,
+                shots=tuple(left),
+                missing=missing,
+                lost_in_transfer=lost,
+                surplus=int(judged.surplus.sum()),
+                dead_leds=tuple(verdict.dead),
+                reason=judged.reason,
+            )
         )
         why = [f"{lost} lost in transfer"] if lost else []
         why += [f"{missing - lost} never exposed"] if missing > lost else []
@@ -198,7 +215,7 @@ class Sequencer:
     def _say_missing(self) -> str:
         missing, bad = self.outcome.missing, self.outcome.bad
         text = f"{len(missing)} shots are not proven after {self._job.plan.reshoot_limit} re-shoots: "
-        text += ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
+        text += ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
         if bad:
             text += f". In {len(bad)} of them the LED drew no current: repair it or leave it out of `lights:`"
         return text + ". Resume the run to try again."
@@ -212,7 +229,7 @@ class Sequencer:
                 len(self._job.schedule.views),
                 len(self._recorder.proven()),
                 self._job.schedule.frames,
-                label.split("/")[0],
+                str(label.light) if label else "dark",
                 self._dose.lux_h,
             )
         )
@@ -220,10 +237,10 @@ class Sequencer:
     def _wait_while_paused(self) -> None:
         if not self._control.pause.is_set():
             return
-        self._recorder.event("pause")
+        self._recorder.note(Paused())
         self._recorder.commit(now=True)
         self._observer.note("paused; lights are off")
         while self._control.pause.is_set():
             self._arm.attend()
             self._cell.clock.sleep(_PAUSE_NAP_S)
-        self._recorder.event("resume", after="pause")
+        self._recorder.note(Continued())

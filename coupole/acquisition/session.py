@@ -6,13 +6,13 @@ import contextlib
 import os
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
 
 from coupole.acquisition.cell import OpenedCell, open_cell
-from coupole.acquisition.observer import Control, Outcome
+from coupole.acquisition.observer import Control
 from coupole.acquisition.operator import (
     UNLIMITED_BYTES,
     ask_to_begin,
@@ -31,11 +31,14 @@ from coupole.errors import (
     PreflightRefused,
     StorageError,
 )
-from coupole.plan.shots import Schedule
-from coupole.preflight.job import Job, calibration_refusals, check_job, preflight_of
+from coupole.plan.schedule import Schedule
+from coupole.preflight.checking import calibration_refusals, check_job, preflight_of
+from coupole.preflight.job import Job, without_hidden
 from coupole.preflight.preflight import StorageFacts
-from coupole.storage.run import Run, is_shot
+from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
+from coupole.storage.run import Run
 from coupole.viewing import report
+from coupole.viewing.progress import Outcome
 from coupole.viewing.terminal import RunObserver, ask, show_dry_run, show_preflight
 
 _ASKED_BOARDS = 12
@@ -59,8 +62,9 @@ def acquire_plan(
         run = Run(resume) if resume else None
         if run is not None:
             held.callback(os.close, run.lock())
+            run.refuse_old_journal()
             run.refuse_changes(job.inputs)
-        job = job.without_hidden(run.hidden_leds if run else None)
+        job = without_hidden(job, run.hidden_leds if run else None)
         _acquire_into(run, job, console, parent=parent, confirm=confirm, found=found, held=held)
 
 
@@ -96,9 +100,8 @@ def _acquire_into(
         packed = job.cell.rig.storage.pixels == "packed12"
         recorder = RunRecorder(run, metadata_of_views(job, cell), packed=packed)
         try:
-            how: dict[str, Any] = {"simulated": cell.simulated, "room_c": room_c}
-            how |= {"acknowledged": acknowledged} if acknowledged else {}
-            recorder.event("resume" if resumed else "start", **how)
+            begun = SessionResumed if resumed else SessionStarted
+            recorder.note(begun(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledged))
             _acquire(job, cell, run, recorder, console, found=found)
         except CoupoleError:
             with contextlib.suppress(StorageError):  # what ended the run matters more than its report
@@ -165,8 +168,10 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
 def _labels(schedule: Schedule) -> list[str] | dict[str, list[str]]:
     """One list where all views have the same frames; else one for each view, by its name."""
     if len(set(schedule.labels)) == 1:
-        return list(schedule.labels[0])
-    return {view.name: list(labels) for view, labels in zip(schedule.views, schedule.labels, strict=True)}
+        return list(map(str, schedule.labels[0]))
+    return {
+        view.name: list(map(str, labels)) for view, labels in zip(schedule.views, schedule.labels, strict=True)
+    }
 
 
 def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
@@ -199,21 +204,21 @@ def _acquire(
     observer = RunObserver(console, job.cell.rig.frame_bytes, len(recorder.proven()))
     sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
     outcome = sequencer.outcome
-    ended = "done"
+    ended: Literal["done", "interrupted", "failed"] = "done"
     try:
         with operator_at(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
             sequencer.acquire()
     except CoupoleError as error:
         ended = "interrupted" if isinstance(error, Interrupted) else "failed"
-        whose = {"device": error.device} if isinstance(error, DeviceError) else {}
-        recorder.event("fault", kind=type(error).__name__, message=str(error), **whose)
+        device = error.device if isinstance(error, DeviceError) else ""
+        recorder.note(FaultNoted(kind=type(error).__name__, message=str(error), device=device))
         raise
     finally:
         cell.make_safe()
         for trouble in cell.trouble:
-            recorder.event("fault", kind="unsafe", message=trouble)
+            recorder.note(FaultNoted(kind="unsafe", message=trouble))
             console.print(f"[red]{trouble}[/]")
-        recorder.event("stop", outcome=ended, robot=dict(cell.robot.statistics()))
+        recorder.note(SessionStopped(outcome=ended, robot=dict(cell.robot.statistics())))
         recorder.close_quietly()
         enter_dose(job, cell, outcome.dose_lux_h, run.folder.name)
         found.update(_figures(run, job, outcome))
@@ -226,7 +231,7 @@ def _figures(run: Run, job: Job, outcome: Outcome) -> dict[str, Any]:
     return {
         "run": str(run.folder),
         "shots": outcome.shots,
-        "proven": sum(map(is_shot, run.proven())),
+        "proven": sum(shot.is_shot for shot in run.proven()),
         "missing": len(outcome.missing),
         "reshot": outcome.reshot,
         "bad": len(outcome.bad),
@@ -254,7 +259,7 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> No
 
 def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any]) -> None:
     """Run a whole plan on the rig's twin, faster than life, and say what preflight could not know."""
-    job = job.without_hidden()
+    job = without_hidden(job)
     job, preflight = check_job(job, StorageFacts(UNLIMITED_BYTES))
     show_preflight(console, preflight, name=job.plan.name, rig=f"the twin of {job.cell.rig.name}")
     refuse(preflight)
@@ -294,4 +299,4 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
                     },
                 }
             )
-            show_dry_run(console, recorder, outcome, found)
+            show_dry_run(console, recorder.exposures, outcome, found)

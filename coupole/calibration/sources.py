@@ -25,7 +25,8 @@ from coupole.calibration.poses import PoseFile, ReportedPoses, read_poses, repor
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError, StorageError
 from coupole.storage import frame_file
-from coupole.storage.run import ProvenFrame, Run, is_shot, sha256
+from coupole.storage.journal_events import FrameProven
+from coupole.storage.run import Run, sha256
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
 POSES_NAME, BOARD_NAME = "poses.yaml", "board.yaml"
@@ -130,9 +131,9 @@ def _picture(path: Path) -> Picture:
 
 def _of_run(run: Run) -> Sources:
     """One image and pose for each view that has frames with light."""
-    by_view: dict[str, list[ProvenFrame]] = {}
+    by_view: dict[str, list[FrameProven]] = {}
     for shot, frame in run.proven().items():
-        by_view.setdefault(shot.split("/")[0], []).append(frame)
+        by_view.setdefault(shot.view, []).append(frame)
     images, flanges, inputs = [], [], [(f"{run.folder.name}/run.json", sha256(run.folder / "run.json"))]
     about = About(simulated=bool(run.about["simulated"]))
     temperatures: list[float] = []
@@ -140,10 +141,10 @@ def _of_run(run: Run) -> Sources:
         path = run.view_path(view)
         table = frame_file.read_frames(path)
         poses, attributes = poses_and_attributes(path)
-        lit = _at_one_pose([frame for frame in frames if is_shot(frame.shot)], table)
+        lit = _at_one_pose([frame for frame in frames if frame.shot.is_shot], table)
         if not lit:
             continue
-        dark = [frame for frame in frames if frame.shot.split("/")[1].startswith("dark")]
+        dark = [frame for frame in frames if frame.shot.is_dark]
         records = table[[frame.index for frame in lit]]
         pose = poses[int(records["pose"][0])]
         temperatures += (records["board_temperature_dc"] / 10.0).tolist()
@@ -158,14 +159,14 @@ def _of_run(run: Run) -> Sources:
     return Sources(tuple(images), reported(np.stack(flanges)), about, tuple(inputs))
 
 
-def _at_one_pose(frames: Sequence[ProvenFrame], table: NDArray[np.void]) -> list[ProvenFrame]:
+def _at_one_pose(frames: Sequence[FrameProven], table: NDArray[np.void]) -> list[FrameProven]:
     """The frames of the pose that most were taken at: an arm that was pushed aside has two in a view."""
     taken = Counter(int(table[frame.index]["pose"]) for frame in frames)
     return [frame for frame in frames if int(table[frame.index]["pose"]) == taken.most_common(1)[0][0]]
 
 
 def _mean_frame(
-    name: str, path: Path, lit: Sequence[ProvenFrame], dark: Sequence[ProvenFrame], table: NDArray[np.void]
+    name: str, path: Path, lit: Sequence[FrameProven], dark: Sequence[FrameProven], table: NDArray[np.void]
 ) -> Picture:
     """Mean of the frames at the longest exposure that clips little, dark frames subtracted."""
     layout, facts = frame_file.read_layout(path), frame_file.read_facts(path)
@@ -196,13 +197,13 @@ def _mean(frames: Sequence[NDArray[np.uint16]]) -> Floats:
     return total / len(frames)
 
 
-def _spread(frames: Sequence[ProvenFrame]) -> Iterator[ProvenFrame]:
+def _spread(frames: Sequence[FrameProven]) -> Iterator[FrameProven]:
     """At most `_MOST_FRAMES`, evenly over the list."""
     step = max(1, -(-len(frames) // _MOST_FRAMES))
     return iter(frames[::step])
 
 
-def frames_sha256(frames: Sequence[ProvenFrame]) -> str:
+def frames_sha256(frames: Sequence[FrameProven]) -> str:
     """Of the frames' proven checksums: the same however the file is packed or archived."""
     lines = sorted(f"{frame.shot} {frame.xxh3}" for frame in frames)
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()

@@ -39,8 +39,8 @@ def calibrate_all(
     again to finish. For a real cell it says what must stand on the support, and waits; a simulated one has its own
     object and scanner.
     """
-    from coupole.plan.rig import in_world
-    from coupole.preflight.job import read_cell
+    from coupole.plan.cell import read_cell
+    from coupole.plan.rig_devices import in_world
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from coupole.calibration.calibrated_arm import CalibratedArm
     from coupole.calibration.report import Outcome
     from coupole.calibration.request import Request
-    from coupole.preflight.job import Cell
+    from coupole.plan.cell import Cell
 
 Runs = Annotated[list[Path], typer.Argument(help="Runs.", show_default=False, metavar="RUN...")]
 HandEyeOption = Annotated[Path, typer.Option("--hand-eye", help="The hand-eye record, which has the lens too.")]
@@ -140,7 +140,7 @@ def _arm(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
     """The rig's arm by a hand-eye record; None for a record without axis zeros. Raises InputError where the rig's
     driver knows no model of the arm."""
     from coupole.calibration.calibrated_arm import has_axis_zeros, read_arm
-    from coupole.plan.rig import planning_arm
+    from coupole.plan.rig_devices import planning_arm
 
     if not has_axis_zeros(hand_eye):
         return None
@@ -155,7 +155,7 @@ def _arm(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
 
 def _cell(rig: Path | None, runs: list[Path]) -> Cell:
     """The rig that is named, or that of the first run if it is still what it was."""
-    from coupole.preflight.job import read_cell
+    from coupole.plan.cell import read_cell
     from coupole.storage.run import Run, sha256
 
     if rig is not None:

@@ -160,8 +160,8 @@ def _earlier_lens(path: Path | None, sources: Sources, found: Found) -> EarlierL
 
 
 def _arm(rig: Path | None) -> Arm | None:
-    from coupole.plan.rig import planning_arm
-    from coupole.preflight.job import read_cell
+    from coupole.plan.cell import read_cell
+    from coupole.plan.rig_devices import planning_arm
 
     if rig is None:
         return None

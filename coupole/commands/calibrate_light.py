@@ -178,7 +178,7 @@ def _setting(
     from coupole.calibration.light.led_power_tile import Setting, calibrated_positions
     from coupole.calibration.light.spectralon import read_tile
     from coupole.calibration.light.tile_views import Positions
-    from coupole.preflight.job import read_cell
+    from coupole.plan.cell import read_cell
 
     cell = read_cell(rig)
     by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)

@@ -36,7 +36,6 @@ OBJECT: Mapping[str, Any] = {
     "stickers": {"count": 24},
 }
 """What a simulated cell has on its support for the mesh, and its scanner scans."""
-SCANNER = "sim.devices.scanner:export_scan"
 MESH = "mesh"
 
 
@@ -164,8 +163,8 @@ class Campaign:
     def _plan(self, step: Step) -> Path:
         """The step's plan; one that stands there, and may have been changed by hand, is kept."""
         from coupole.calibration.leds.led_plan import led_plan
+        from coupole.plan.cell import read_cell
         from coupole.plan.templates import LEDS, TEMPLATES
-        from coupole.preflight.job import read_cell
 
         path, rig = self._out / "plans" / f"{step.name}.yaml", self._rig_of(step)
         if path.exists():
@@ -200,14 +199,14 @@ class Campaign:
 
     def _scan(self) -> Path:
         """The object's scan; a simulated cell's scanner makes one, which is taken in like any other."""
-        from coupole.plan.rig import load_class
-        from coupole.scan.scan import import_scan
+        from coupole.plan.registry import SCANNER_EXPORT, load_class
+        from coupole.viewing.scan_sheet import import_scan
 
         if self._given_scan is not None:
             return self._given_scan
         folder = self._out / "scan"
         if not folder.exists():
-            export: Any = load_class(SCANNER)
+            export: Any = load_class(SCANNER_EXPORT)
             mesh, targets = export(OBJECT, self._out / "scanner")
             with self._console.status("taking the scan in") as status:
                 import_scan(

@@ -152,7 +152,8 @@ def scan(
     as_json: JsonOption = False,
 ) -> None:
     """Take a scanned mesh and its targets in: check them, bring them to mm, draw them."""
-    from coupole.scan.scan import UNITS, import_scan
+    from coupole.scan.scan import UNITS
+    from coupole.viewing.scan_sheet import import_scan
     from coupole.viewing.terminal import make_console
 
     for option, given in (("--unit", unit), ("--targets-unit", targets_unit)):

@@ -22,7 +22,8 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Say everything that can be known of a plan before a device is touched."""
-    from coupole.preflight.job import preflight_of, read_job
+    from coupole.preflight.checking import preflight_of
+    from coupole.preflight.job import read_job, without_hidden
     from coupole.viewing.terminal import make_console, show_preflight, show_views
 
     console = make_console(quiet=as_json)
@@ -32,7 +33,7 @@ def check(
         fail(error, as_json=as_json, found={"ok": False, "refusals": []})
         raise
     if not no_paths:
-        job = job.without_hidden()
+        job = without_hidden(job)
     job, report = preflight_of(job, job.cell.storage_folder, paths=not no_paths)
     show_preflight(console, report, name=job.plan.name, rig=job.cell.rig.name)
     show_views(console, report)
@@ -162,7 +163,7 @@ def plan_new(
         raise InputError(f"{path}: stands here already; choose another name")
     if template == LEDS:
         from coupole.calibration.leds.led_plan import led_plan
-        from coupole.preflight.job import read_cell
+        from coupole.plan.cell import read_cell
 
         with make_console(quiet=False).status("reading the rig") as status:
             text = led_plan(read_cell(path.parent / rig), name=name, rig=rig, seed=seed, tell=status.update)

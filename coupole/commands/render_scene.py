@@ -1,30 +1,76 @@
-"""`coupole render`: a scene file to spectral pictures. The renderer itself is part of the simulation."""
+"""`coupole render SCENE`: spectral pictures by path tracing."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
+from coupole.commands.common import JsonOption, fail
 from coupole.errors import InputError, StorageError
 from coupole.plan import yamlfile
-from coupole.plan.rig import load_class
 from coupole.plan.yamlfile import Document
 
-STUDIO = "coupole.appearance.render.studio:Studio"
+if TYPE_CHECKING:
+    from coupole.appearance.render.scene_file import Scene
 
 Progress = Callable[[str, int, int], None]
 
 
-def read_scene(path: Path) -> tuple[Document, Any]:
+def render(
+    scene: Annotated[Path, typer.Argument(help="The scene (YAML).", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the pictures.")] = Path("rendered"),
+    samples: Annotated[int | None, typer.Option("--samples", min=1, help="Paths through each pixel.")] = None,
+    width: Annotated[
+        int | None, typer.Option("--width", min=4, help="Of the pictures, if less than the scene's.")
+    ] = None,
+    step: Annotated[int | None, typer.Option("--step", help="Between bands, nm: 5, 10, 20 or 40.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Render a scene in spectral bands: an EXR of all bands and a PNG for each camera, and a summary."""
+    from rich.progress import Progress, TaskID
+
+    from coupole.appearance.render import studio
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    try:
+        if step not in {None, 5, 10, 20, 40}:
+            raise InputError(f"--step: expected 5, 10, 20 or 40, found {step}; choose one of them")
+        document, wanted = read_scene(scene)
+        wanted = studio.reduced(wanted, samples=samples, width_px=width, step_nm=step)
+        console.print(f"{wanted.name}: Mitsuba, {studio.variant_of(wanted)}")
+        with Progress(console=console, disable=not console.is_terminal) as bars:
+            tasks: dict[str, TaskID] = {}
+
+            def show(name: str, done: int, total: int) -> None:
+                if name not in tasks:
+                    tasks[name] = bars.add_task(name, total=total)
+                bars.update(tasks[name], completed=done)
+
+            summary = render_scene(document, wanted, out, show)
+    except InputError as error:
+        fail(error, as_json=as_json)
+        raise
+    if as_json:
+        print(json.dumps({"folder": str(out), **summary}))
+        return
+    for seen in summary["cameras"].values():
+        console.print(f"{out / seen['files']['png']}: white {seen['white_cd_m2']:.4g} cd/m2, simulated")
+
+
+def read_scene(path: Path) -> tuple[Document, Scene]:
     """The scene file, checked; its files are there. Raises InputError with file:line:column."""
-    studio = load_class(STUDIO)
+    from coupole.appearance.render.scene_file import Scene, files
+
     document = yamlfile.read(path)
-    scene = document.validate(studio.Settings)
+    scene = document.validate(Scene)
     missing = [
         document.problem(at, f"no such file: {document.resolve(named)}")
-        for at, named in studio.files(scene)
+        for at, named in files(scene)
         if not document.resolve(named).is_file()
     ]
     if missing:
@@ -32,14 +78,16 @@ def read_scene(path: Path) -> tuple[Document, Any]:
     return document, scene
 
 
-def render_scene(document: Document, scene: Any, folder: Path, progress: Progress) -> dict[str, Any]:
+def render_scene(document: Document, scene: Scene, folder: Path, progress: Progress) -> dict[str, Any]:
     """Render into `folder`, with a summary (JSON) beside the pictures.
 
     Raises InputError if the scene or this machine cannot do it, StorageError if nothing can be written.
     """
+    from coupole.appearance.render import studio
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        summary: dict[str, Any] = load_class(STUDIO).render(scene, document.path.parent, folder, progress)
+        summary: dict[str, Any] = studio.render(scene, document.path.parent, folder, progress)
         path = folder / f"{scene.name}.json"
         path.write_text(json.dumps(summary, indent=2) + "\n")
     except OSError as error:

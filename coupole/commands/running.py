@@ -59,7 +59,7 @@ def devices(
     from rich.table import Table
 
     from coupole.acquisition.cell import open_cell
-    from coupole.preflight.job import read_cell
+    from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
@@ -142,8 +142,9 @@ def live(
     entered in the ledger) the camera is taken; the arm is held where it stands.
     """
     from coupole.acquisition.looking import watch_cell, watch_run
+    from coupole.plan.cell import read_cell
     from coupole.plan.yamlfile import read
-    from coupole.preflight.job import read_cell, read_job
+    from coupole.preflight.job import read_job
     from coupole.viewing.live import Choice
     from coupole.viewing.terminal import make_console
 
@@ -162,13 +163,14 @@ def sim(
     speed: Annotated[float | None, typer.Option("--speed", min=0.01, help="Pace of the world.")] = None,
 ) -> None:
     """Serve a rig's stand-ins for other clients; prints one JSON line with their endpoints, until Ctrl-C."""
-    from coupole.acquisition.cell import world_config
-    from coupole.plan.rig import load_class
-    from coupole.preflight.job import read_cell, read_job
+    from coupole.plan.cell import read_cell
+    from coupole.plan.registry import WORLD, load_class
+    from coupole.preflight.job import read_job
+    from coupole.preflight.simulated_world import world_config
 
     job = read_job(plan, rig) if plan else None
     cell = job.cell if job else read_cell(rig)
-    driver = cell.rig.world.driver if cell.rig.world else "sim.world.client:World"
+    driver = cell.rig.world.driver if cell.rig.world else WORLD
     world = load_class(driver).start(world_config(cell, job, cell.rig.sensor, speed=speed))
     try:
         print(json.dumps(world.endpoints), flush=True)

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from coupole.errors import ChecksumMismatch, DiskFull, InputError, StorageError
 from coupole.storage import frame_file
-from coupole.storage.run import ProvenFrame, Run
+from coupole.storage.journal_events import FrameProven
+from coupole.storage.run import Run
 
 NO_LED = 65535
 
@@ -66,11 +67,11 @@ def export_run(
     frames = [
         frame
         for shot, frame in run.proven().items()
-        if _matches(shot.split("/")[0], views) and _matches(shot.partition("/")[2], shots)
+        if _matches(shot.view, views) and _matches(str(shot.label), shots)
     ]
     if not frames:
         raise InputError(f"{run.folder}: no proven frame matches; see `coupole status` for its views")
-    paths = {frame.shot: folder / f"{frame.shot.replace('/', '_')}.{to}" for frame in frames}
+    paths = {str(frame.shot): folder / f"{str(frame.shot).replace('/', '_')}.{to}" for frame in frames}
     standing = [path for path in paths.values() if path.exists()]
     if standing and not overwrite:
         raise InputError(
@@ -103,9 +104,9 @@ def _matches(name: str, patterns: list[str]) -> bool:
     return not patterns or any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def _pictures(run: Run, frames: list[ProvenFrame]) -> Iterator[Picture]:
+def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
     """The frames, in the order of their files and slots."""
-    by_file: dict[str, list[ProvenFrame]] = {}
+    by_file: dict[str, list[FrameProven]] = {}
     for frame in sorted(frames, key=lambda f: (f.file, f.index)):
         by_file.setdefault(frame.file, []).append(frame)
     for name, mine in by_file.items():
@@ -122,7 +123,7 @@ def _pictures(run: Run, frames: list[ProvenFrame]) -> Iterator[Picture]:
                 raise ChecksumMismatch(f"{path}: {frame.shot} is not what was proven. See `coupole verify`.")
             record = table[frame.index]
             about = {
-                "shot": frame.shot,
+                "shot": str(frame.shot),
                 "run": run.folder.name,
                 "led": None if record["led"] == NO_LED else int(record["led"]),
                 "exposure_us": int(record["exposure_us"]),

@@ -13,6 +13,7 @@ from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.kinematics import JOINT_AXES, Arm, joint_origins_mm, link_frames
 from coupole.motion.sphere_tree import Floats, Spheres, spheres_of, surface_points
+from coupole.plan.link_meshes import LINKS, link_mesh_path
 
 FLANGE = 7
 LINK_MESH_STEP_MM = 12.0
@@ -76,7 +77,7 @@ def bodies_of_meshes(folder: Path) -> list[Body]:
     """The base and the six links from `base_link.stl` and `link_1.stl` to `link_6.stl`, in the links' frames, in
     metres or mm. Raises InputError where one of them cannot be read."""
     bodies = []
-    for link in range(7):
+    for link in range(LINKS):
         points = surface_points(link_corners(folder, link), LINK_MESH_STEP_MM)
         spheres = Spheres(points, np.full(len(points), LINK_MESH_STEP_MM))
         bodies.append(Body(f"link {link}" if link else "base", link, spheres))
@@ -87,7 +88,7 @@ def link_corners(folder: Path, link: int) -> Floats:
     """Triangles [n, 3, 3] of a link's mesh, mm. Raises InputError."""
     import trimesh
 
-    path = _mesh_path(folder, link)
+    path = link_mesh_path(folder, link)
     try:
         mesh: Any = trimesh.load(path, process=False, force="mesh")
     except Exception as error:  # whatever trimesh raises, the file is not a mesh to us
@@ -96,15 +97,6 @@ def link_corners(folder: Path, link: int) -> Floats:
     if len(corners) == 0 or not np.isfinite(corners).all():
         raise InputError(f"{path}: expected the mesh of link {link}; it has no triangles, or no finite ones")
     return corners * (1000.0 if np.ptp(corners) < _METRES_BELOW else 1.0)
-
-
-def missing_link_meshes(folder: Path) -> list[Path]:
-    """What `bodies_of_meshes` would not find in a folder."""
-    return [path for link in range(7) if not (path := _mesh_path(folder, link)).is_file()]
-
-
-def _mesh_path(folder: Path, link: int) -> Path:
-    return folder / (f"link_{link}.stl" if link else "base_link.stl")
 
 
 def reach_mm(arm: Arm, body: Body, from_link: int = 0) -> Floats:

@@ -21,7 +21,7 @@ from coupole.motion.path_planner import Joints, Leg, PathPlanner
 from coupole.motion.sphere_tree import surface_points
 from coupole.plan.led_table import LedTable
 from coupole.plan.rig import KeepOutBox, KeepOutSphere, Rig
-from coupole.plan.shots import ViewPose
+from coupole.plan.schedule import ViewPose
 
 ELBOW_LIMITS_DEG = (-115.0, 154.0)
 """A3's limits, closer than the data sheet's: beyond them link 4 comes too near to link 2 (seen on the vendor's

@@ -1,25 +1,20 @@
-"""The rig: which devices there are, where they stand, what they may do; and how they are opened.
+"""The rig as its YAML file describes it: which devices there are, where they stand, what they may do.
 
-This is the only module that imports drivers, and it does so by the name in the rig's YAML
-(`driver: drivers.ledbox:LedBox`). A driver's `settings:` are checked by that class's own pydantic `Settings`.
+Lengths are in mm, angles in degrees; poses are in the robot's base frame unless their names say otherwise.
 """
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, Field
 
-from coupole.errors import Problem
-from coupole.kinematics import Arm
 from coupole.plan.plan import Model, Name, Pose, Vector
-from coupole.plan.yamlfile import Document
+from coupole.plan.registry import WORLD, current_name
 
-DriverName = Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
+DriverName = Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"), AfterValidator(current_name)]
+"""`package.module:Class`; names of version 0.1 are understood."""
 
 
 class Twin(Model):
@@ -140,7 +135,7 @@ class ToolBody(Model):
     radius_mm: Annotated[float, Field(gt=0)]
 
 
-class Keep(Model):
+class Clearances(Model):
     """Distances that the arm keeps from what stands round it, mm."""
 
     object_mm: Annotated[float, Field(ge=0)] = 50.0
@@ -164,7 +159,7 @@ class WorldSection(Model):
     serves: Literal["always", "dry_run"] = "always"
     join: Path | None = None
     """File with the JSON line of a `coupole sim` that is running already."""
-    driver: DriverName = "sim.world.client:World"
+    driver: DriverName = WORLD
     settings: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -185,7 +180,7 @@ class Rig(Model):
     link_meshes: Path | None = None
     """Folder of meshes (`base_link.stl`, `link_1.stl` to `link_6.stl`) that stand for the arm's links, in place of
     capsules round them."""
-    clearances: Keep = Keep()
+    clearances: Clearances = Clearances()
     keep_out: tuple[KeepOut, ...] = ()
     led_limits: LedLimits = LedLimits()
     motion: Motion = Motion()
@@ -199,170 +194,3 @@ class Rig(Model):
         """Of a frame on the disk."""
         pixels = self.sensor.width_px * self.sensor.height_px
         return pixels * 3 // 2 if self.storage.pixels == "packed12" else pixels * 2
-
-
-DEVICES = ("ledbox", "camera", "robot")
-NOWHERE = {
-    "ledbox": {"port": "loop://"},
-    "camera": {"address": "/nowhere"},
-    "robot": {"listen": "127.0.0.1:0", "address": "127.0.0.1:0", "host": "127.0.0.1"},
-}
-"""Stands for what a world's endpoint will fill in, while settings are checked and no world runs yet."""
-DEFAULT_TWINS = {
-    "ledbox": "drivers.ledbox:LedBox",
-    "camera": "sim.devices.memory_camera:MemoryCamera",
-    "robot": "drivers.kuka.rsi:KukaRsi",
-}
-DEFAULT_WORLD = "sim.world.client:World"
-
-
-@dataclass(frozen=True)
-class StandIn:
-    """What a world has at the other end of a robot driver's wire."""
-
-    kind: str
-    """In `world.settings.robot`."""
-    alike: tuple[str, ...] = ()
-    """Settings of the driver that must be the stand-in's too."""
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    """More of the stand-in's, where the rig does not say otherwise."""
-
-
-STAND_INS = {
-    "drivers.kuka.rsi:KukaRsi": StandIn(
-        "rsi",
-        ("cycle_ms", "corrects", "mode", "sen_type", "measured_tag", "delay_tag", "correction_tag"),
-        {"sends_to": "127.0.0.1:0"},
-    ),
-    "drivers.kuka.eki:KukaEki": StandIn(
-        "eki", ("controller_is", "status_ms", "full_acceleration_deg_s2", "jerk_deg_s3")
-    ),
-    "drivers.ur:UrRobot": StandIn("ur"),
-}
-"""For the robot drivers that come with Coupole; all choose an address that is free."""
-CAMERA_KINDS = {"drivers.camera.aravis:AravisCamera": "gige"}
-"""For camera drivers whose stand-in is not the camera in shared memory: `world.settings.camera.kind`."""
-_MOTION_SETTINGS = {
-    "speed_fraction": "speed_fraction",
-    "acceleration_deg_s2": "acceleration_deg_s2",
-    "jerk_deg_s3": "jerk_deg_s3",
-    "settle_dwell_s": "dwell_s",
-}
-"""Figures of the rig's `motion:` and the settings of a robot's driver that they become."""
-
-
-def load_class(name: DriverName) -> type[Any]:
-    """The class behind `package.module:Class`. Raises ImportError or AttributeError."""
-    module, _, attribute = name.partition(":")
-    found: type[Any] = getattr(importlib.import_module(module), attribute)
-    return found
-
-
-def settings_class(name: DriverName) -> type[BaseModel]:
-    """The `Settings` model that stands beside a driver's class."""
-    found: type[BaseModel] = load_class(name.partition(":")[0] + ":Settings")
-    return found
-
-
-def planning_arm(rig: Rig) -> Arm | None:
-    """The arm that the robot's driver moves, at the speeds that the rig gives it; None where the driver knows no
-    model of it, so that neither postures nor collisions can be reckoned."""
-    driver, settings = device_for(rig, "robot", dry_run=False)
-    model = settings_class(driver)
-    described = model(**_known(NOWHERE["robot"], model) | settings)
-    arm: Arm | None = described.arm() if hasattr(described, "arm") else None
-    return arm
-
-
-def in_world(rig: Rig, *, dry_run: bool) -> bool:
-    """True if the rig's devices are stand-ins in a world."""
-    return dry_run or (rig.world is not None and rig.world.serves == "always")
-
-
-def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[str, Any]]:
-    """Driver and settings to open for a device: its twin in a dry run, itself otherwise."""
-    device: Device = getattr(rig, kind)
-    settings = dict(device.settings)
-    driver = device.driver
-    if dry_run and device.twin is not None:
-        driver, settings = device.twin.driver, dict(device.twin.settings)
-    elif dry_run and not (rig.world is not None and rig.world.serves == "always"):
-        driver = driver if driver in STAND_INS else DEFAULT_TWINS[kind]
-        settings = _known(settings, settings_class(driver))
-    if kind == "robot":
-        settings = _known(_motion_settings(rig), settings_class(driver)) | settings
-    return driver, settings
-
-
-def stand_in_for(rig: Rig, *, dry_run: bool) -> StandIn:
-    """What this rig's world has at the other end of the robot's wire: of its driver, or of its driver's twin where
-    the world takes no part but in dry runs. Of a driver that did not come with Coupole the rig must say it."""
-    driver, _ = device_for(rig, "robot", dry_run=dry_run or not in_world(rig, dry_run=False))
-    told = rig.world.settings.get("robot") if rig.world else None
-    return STAND_INS.get(driver) or StandIn(told.get("kind", "rsi") if isinstance(told, dict) else "rsi")
-
-
-def camera_kind(rig: Rig, *, dry_run: bool) -> str:
-    """Which camera this rig's world has at the other end of the driver's wire."""
-    driver, _ = device_for(rig, "camera", dry_run=dry_run or not in_world(rig, dry_run=False))
-    return CAMERA_KINDS.get(driver, "memory")
-
-
-def driver_problems(document: Document, rig: Rig) -> list[Problem]:
-    """Drivers that cannot be found and settings that their drivers do not take."""
-    problems = []
-    for kind in DEVICES:
-        device: Device = getattr(rig, kind)
-        for at, part, has_endpoint in (
-            ((kind,), device, in_world(rig, dry_run=False)),
-            ((kind, "twin"), device.twin, True),
-        ):
-            if part is not None:
-                given = NOWHERE[kind] if has_endpoint else {}
-                if kind == "robot":
-                    given = given | _motion_settings(rig)
-                problems += _settings_problems(document, at, part.driver, given)
-    if rig.world is not None:
-        problems += world_problems(document, rig, rig.world.settings)
-        told, kind = rig.world.settings.get("camera"), camera_kind(rig, dry_run=False)
-        if isinstance(told, dict) and told.get("kind", kind) != kind:
-            message = f"expected {kind}, which is at the other end of the camera's driver"
-            problems.append(document.problem(("world", "settings", "camera", "kind"), message))
-    return problems
-
-
-def world_problems(document: Document, rig: Rig, settings: Mapping[str, Any]) -> list[Problem]:
-    """What is wrong with the settings of the rig's world, with what follows from the rig filled in."""
-    stand_in, robot = stand_in_for(rig, dry_run=False), settings.get("robot", {})
-    if isinstance(robot, dict):
-        if robot.get("kind", stand_in.kind) != stand_in.kind:
-            message = f"expected {stand_in.kind}, which is at the other end of the robot's driver"
-            return [document.problem(("world", "settings", "robot", "kind"), message)]
-        robot = {"kind": stand_in.kind, **robot}
-    camera = settings.get("camera", {})
-    if isinstance(camera, dict):
-        camera = {"kind": camera_kind(rig, dry_run=False), **camera}
-    completed_settings = {**settings, "robot": robot, "camera": camera}
-    completed = replace(document, data={**document.data, "world": {"settings": completed_settings}})
-    return _settings_problems(completed, ("world",), rig.world.driver if rig.world else DEFAULT_WORLD, {})
-
-
-def _settings_problems(
-    document: Document, at: tuple[str, ...], driver: DriverName, given: dict[str, Any]
-) -> list[Problem]:
-    try:
-        load_class(driver)
-        model = settings_class(driver)
-    except (ImportError, AttributeError) as error:
-        return [document.problem((*at, "driver"), f"cannot find `{driver}`: {error}")]
-    return document.problems(model, (*at, "settings"), given=_known(given, model))[1]
-
-
-def _motion_settings(rig: Rig) -> dict[str, Any]:
-    """What the rig's `motion:` says to a robot's driver."""
-    return {setting: getattr(rig.motion, figure) for figure, setting in _MOTION_SETTINGS.items()}
-
-
-def _known(settings: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
-    """Of these settings those that the model has."""
-    return {name: value for name, value in settings.items() if name in model.model_fields}

@@ -23,8 +23,9 @@ from coupole.errors import InputError
 from coupole.geometry import Transform
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import BracketExposure, FixedExposure, LightIds, Plan
+from coupole.plan.shot_id import Light, ShotId
 from coupole.storage.frame_file import Collections
-from coupole.storage.run import is_shot
+from coupole.storage.journal_events import Event
 
 METERING_LIGHTS = 12
 SHORTER = (16, 4, 1)
@@ -130,7 +131,7 @@ class Metered:
     """Samples of one view: signals in DN above black by light and exposure, one array [pixels] for each repeat."""
 
     frame_format: FrameFormat
-    samples: dict[str, dict[int, list[NDArray[np.int32]]]] = field(default_factory=dict)
+    samples: dict[Light, dict[int, list[NDArray[np.int32]]]] = field(default_factory=dict)
 
 
 class MeterRecorder:
@@ -138,12 +139,12 @@ class MeterRecorder:
 
     def __init__(self) -> None:
         self.views: dict[str, Metered] = {}
-        self.events: list[dict[str, Any]] = []
-        self._proven: set[str] = set()
+        self.events: list[Event] = []
+        self._proven: set[ShotId] = set()
         self._slots: list[tuple[int, NDArray[np.int32]]] = []
         self._view = ""
 
-    def proven(self) -> set[str]:
+    def proven(self) -> set[ShotId]:
         return self._proven
 
     def begin_view(
@@ -167,19 +168,18 @@ class MeterRecorder:
         self._slots.append((exposure_us, cells[:, :2, :, :2].astype(np.int32).ravel() - black))
         return len(self._slots) - 1
 
-    def prove(self, slot: int, shot: str, fields: Mapping[str, int]) -> None:
+    def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         self._proven.add(shot)
-        if is_shot(shot):
+        if shot.is_shot:
             exposure_us, sample = self._slots[slot]
-            light = shot.split("/")[1]
-            by_exposure = self.views[self._view].samples.setdefault(light, {})
+            by_exposure = self.views[self._view].samples.setdefault(shot.light, {})
             by_exposure.setdefault(exposure_us, []).append(sample)
 
     def free(self, slot: int) -> None:
         """Nobody asks for it again."""
 
-    def event(self, event: str, **fields: Any) -> None:
-        self.events.append({"event": event, **fields})
+    def note(self, event: Event) -> None:
+        self.events.append(event)
 
     def commit(self, *, now: bool) -> None:
         """Nothing lasts."""

@@ -5,10 +5,12 @@ Only real light counts: simulated and dry runs never write here.
 
 from __future__ import annotations
 
+import contextlib
+import json
 from pathlib import Path
 
-from coupole.storage import journal
-from coupole.storage.journal import Journal
+from coupole.errors import StorageError
+from coupole.storage.line_file import LineFile, utc_now
 
 
 def ledger_path(storage_folder: Path, object_id: str) -> Path:
@@ -16,20 +18,29 @@ def ledger_path(storage_folder: Path, object_id: str) -> Path:
 
 
 def total_lux_h(storage_folder: Path, object_id: str) -> float:
-    """Sum of all doses in the object's ledger, lux hours."""
+    """Sum of all doses in the object's ledger, lux hours. A line torn by a crash is passed over."""
     path = ledger_path(storage_folder, object_id)
-    if not path.exists():
+    try:
+        lines = path.read_bytes().splitlines()
+    except FileNotFoundError:
         return 0.0
-    return sum(float(event["dose_lux_h"]) for event in journal.read(path) if event["event"] == "dose")
+    except OSError as error:
+        raise StorageError(f"{path}: cannot read the ledger: {error.strerror}") from error
+    total = 0.0
+    for line in lines:
+        with contextlib.suppress(json.JSONDecodeError, UnicodeDecodeError):
+            entry = json.loads(line)
+            total += float(entry["dose_lux_h"]) if entry["event"] == "dose" else 0.0
+    return total
 
 
 def add(storage_folder: Path, object_id: str, *, run: str, dose_lux_h: float) -> None:
     """Append a dose; it is on disk when this returns."""
     path = ledger_path(storage_folder, object_id)
     path.parent.mkdir(parents=True, exist_ok=True)
-    ledger = Journal(path)
+    entry = {"event": "dose", "t": utc_now(), "run": run, "dose_lux_h": round(dose_lux_h, 6)}
+    ledger = LineFile(path)
     try:
-        ledger.write("dose", run=run, dose_lux_h=round(dose_lux_h, 6))
-        ledger.commit()
+        ledger.append([json.dumps(entry, separators=(",", ":")) + "\n"])
     finally:
         ledger.close()

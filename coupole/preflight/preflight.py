@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from coupole.devices import NO_LIGHT
 from coupole.geometry import apply
 from coupole.motion.itinerary import Itinerary
+from coupole.plan.bursts import Burst, BurstTiming
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
 from coupole.plan.rig import BoardThermal, LedLimits, Rig
-from coupole.plan.shots import Burst, BurstTiming, Schedule
+from coupole.plan.schedule import Schedule
 
 BURST_OVERHEAD_S = 0.14
 """Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""

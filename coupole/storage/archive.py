@@ -77,7 +77,7 @@ def archive_run(
                 f"{run.folder}: {len(missing)} frames are missing, the first {missing[0]}. Resume the run first, "
                 "or archive its complete views with --partial."
             )
-        result = Archived(incomplete=sorted({shot.split("/")[0] for shot in missing}))
+        result = Archived(incomplete=sorted({shot.view for shot in missing}))
         for view in run.about["views"]:
             path = run.view_path(view)
             if view in result.incomplete:

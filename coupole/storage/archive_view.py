@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 
 import coupole
 from coupole.errors import ChecksumMismatch, DiskFull, StorageError
-from coupole.storage import bitshuffle, frame_file, journal
+from coupole.storage import bitshuffle, frame_file
 from coupole.storage.bitshuffle import Codec
-from coupole.storage.run import ProvenFrame
+from coupole.storage.journal_events import FrameProven
+from coupole.storage.line_file import utc_now
 
 _METADATA_BYTES = 2**20
 """Room that HDF5 may need for its own beside the frames of one step."""
@@ -74,7 +75,7 @@ class ArchivedView:
 
 
 def archive_view(
-    path: Path, proven: Iterable[ProvenFrame], codec: Codec, progress: Progress, *, keep_in: Path | None = None
+    path: Path, proven: Iterable[FrameProven], codec: Codec, progress: Progress, *, keep_in: Path | None = None
 ) -> ArchivedView:
     """Archive one view's file, keeping the frames `proven`; the file as it was goes into the folder `keep_in`.
 
@@ -123,10 +124,10 @@ def _storage_errors(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _check_records(path: Path, table: NDArray[np.void], frames: list[ProvenFrame]) -> None:
+def _check_records(path: Path, table: NDArray[np.void], frames: list[FrameProven]) -> None:
     """The file's own table must agree with the journal about every frame."""
     for frame in frames:
-        claims = (frame_file.PROVEN, frame.shot.encode(), int(frame.xxh3, 16))
+        claims = (frame_file.PROVEN, str(frame.shot).encode(), int(frame.xxh3, 16))
         if frame.index >= len(table) or table[frame.index][["state", "shot", "xxh3"]].item() != claims:
             raise ChecksumMismatch(
                 f"{path}: slot {frame.index} is not recorded as {frame.shot}, as the journal says. "
@@ -137,7 +138,7 @@ def _check_records(path: Path, table: NDArray[np.void], frames: list[ProvenFrame
 # -- writing ----------------------------------------------------------------------------------------------
 
 
-def _write(path: Path, partial: Path, frames: list[ProvenFrame], codec: Codec, progress: Progress) -> int:
+def _write(path: Path, partial: Path, frames: list[FrameProven], codec: Codec, progress: Progress) -> int:
     """Compress the frames of `path` into a new file `partial`, synced; returns the bytes that they take there."""
     layout, workers = (
         frame_file.read_layout(path),
@@ -155,7 +156,7 @@ def _write(path: Path, partial: Path, frames: list[ProvenFrame], codec: Codec, p
         shape = (layout.frames, layout.height_px, layout.width_px)
         data = _copy_all_but_frames(before, after, shape, tile, codec, {frame.index for frame in frames})
 
-        def compress(frame: ProvenFrame) -> Tiles:
+        def compress(frame: FrameProven) -> Tiles:
             with source.frame(frame) as pixels:
                 return list(bitshuffle.compressed_tiles(pixels, tile, codec))
 
@@ -206,7 +207,7 @@ def _copy_all_but_frames(
     )
     _copy_attributes(frames, data)
     data.attrs.pop("packing", None)
-    data.attrs["archived"] = f"{journal.utc_now()} by coupole {coupole.__version__}, bitshuffle and {codec.name}"
+    data.attrs["archived"] = f"{utc_now()} by coupole {coupole.__version__}, bitshuffle and {codec.name}"
     data.attrs["not_stored"] = f"slots without a proven frame have no pixels and read as {bitshuffle.FILL_DN}"
     table = after[frame_file.FRAMES]
     records = table[:]
@@ -221,10 +222,10 @@ def _copy_attributes(old: h5py.HLObject, new: h5py.HLObject) -> None:
 
 
 def _in_order(
-    pool: ThreadPoolExecutor, work: Callable[[ProvenFrame], Tiles], frames: list[ProvenFrame], ahead: int
-) -> Iterator[tuple[ProvenFrame, Tiles]]:
+    pool: ThreadPoolExecutor, work: Callable[[FrameProven], Tiles], frames: list[FrameProven], ahead: int
+) -> Iterator[tuple[FrameProven, Tiles]]:
     """Each frame with what `work` makes of it; the pool is at most `ahead` frames ahead, so memory is bounded."""
-    pending: deque[tuple[ProvenFrame, Future[Tiles]]] = deque()
+    pending: deque[tuple[FrameProven, Future[Tiles]]] = deque()
     for frame in frames:
         pending.append((frame, pool.submit(work, frame)))
         if len(pending) > ahead:
@@ -247,7 +248,7 @@ class _Source:
             self._spare.put(mmap.mmap(-1, layout.frame_bytes))
 
     @contextmanager
-    def frame(self, frame: ProvenFrame) -> Iterator[NDArray[np.uint16]]:
+    def frame(self, frame: FrameProven) -> Iterator[NDArray[np.uint16]]:
         """Pixels [H, W] while the context lasts. Raises ChecksumMismatch if they are not what was proven."""
         memory = self._spare.get()
         try:
@@ -282,7 +283,7 @@ def _open_direct(path: Path) -> int:
 # -- reading back and replacing ---------------------------------------------------------------------------
 
 
-def _read_back(path: Path, partial: Path, frames: list[ProvenFrame], progress: Progress) -> None:
+def _read_back(path: Path, partial: Path, frames: list[FrameProven], progress: Progress) -> None:
     """Compare each frame and record of the new file, read from the disk as any reader does, through HDF5."""
     import hdf5plugin  # noqa: F401  # registers the filter
 
@@ -298,7 +299,7 @@ def _read_back(path: Path, partial: Path, frames: list[ProvenFrame], progress: P
         for done, frame in enumerate(frames, start=1):
             data.read_direct(pixels, np.s_[frame.index])
             if f"{frame_file.checksum(pixels):016x}" != frame.xxh3:
-                raise _not_the_same(path, frame.shot)
+                raise _not_the_same(path, str(frame.shot))
             progress(f"{path.stem}: read back", done, len(frames))
 
 

@@ -1,4 +1,4 @@
-"""The run's diary: one JSON object a line, appended, never changed.
+"""The run's diary: one JSON object a line, appended, never changed. The only module that writes or reads it.
 
 A `frame` line stands for a proven shot whose bytes are on disk. So lines are kept back until `commit()`, which
 the caller calls after it has synced the frames; then lines are written and synced too.
@@ -6,44 +6,31 @@ the caller calls after it has synced the frames; then lines are written and sync
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import json
-import os
-from collections.abc import Iterator
-from datetime import UTC, datetime
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from coupole.errors import DiskFull, StorageError
+from pydantic import Field, TypeAdapter, ValidationError
 
+from coupole.errors import StorageError
+from coupole.storage.journal_events import JOURNAL_VERSION, Event, JournalBegun
+from coupole.storage.line_file import LineFile
 
-def utc_now() -> str:
-    """Now, ISO 8601 with milliseconds, UTC."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+_EVENT: TypeAdapter[Event] = TypeAdapter(Annotated[Event, Field(discriminator="event")])
 
 
 class Journal:
     """Append events; `commit()` makes them last."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._file = LineFile(path)
         self._lines: list[str] = []
-        try:
-            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
-            self._end_torn_line()
-        except OSError as error:
-            raise _storage_error(path, error) from error
+        self._begun = not self._file.was_empty
 
-    def _end_torn_line(self) -> None:
-        """After a crash the last line may be half written: close it, so that the next one is whole."""
-        size = os.fstat(self._fd).st_size
-        if size and os.pread(self._fd, 1, size - 1) != b"\n":
-            os.write(self._fd, b"\n")
-
-    def write(self, event: str, **fields: Any) -> None:
+    def write(self, event: Event) -> None:
         """Note an event; it reaches the disk with the next `commit()`."""
-        self._lines.append(json.dumps({"event": event, "t": utc_now(), **fields}, separators=(",", ":")) + "\n")
+        self._lines.append(event_line(event))
 
     def take(self) -> list[str]:
         """The lines noted since the last time; they are the caller's now, to be handed to `append`."""
@@ -58,53 +45,82 @@ class Journal:
         """Write and sync lines that were taken; may run on another thread than `write` and `take`."""
         if not lines:
             return
-        data = "".join(lines).encode()
-        start = os.fstat(self._fd).st_size
-        try:
-            view = memoryview(data)
-            while view:
-                view = view[os.write(self._fd, view) :]
-            os.fdatasync(self._fd)
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._fd, start)
-            raise _storage_error(self._path, error) from error
+        begin = [] if self._begun else [event_line(JournalBegun())]
+        self._file.append([*begin, *lines])
+        self._begun = True
 
     def close(self) -> None:
-        os.close(self._fd)
+        self._file.close()
 
 
-def _storage_error(path: Path, error: OSError) -> StorageError:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return DiskFull(f"{path}: the disk is full. Free space on it, then resume the run.")
-    return StorageError(f"{path}: {error.strerror}. Check the disk, then resume the run.")
+def event_line(event: Event) -> str:
+    """The line of an event: its tag, its time, and what else it says."""
+    fields = event.model_dump(mode="json")
+    first = {"event": fields.pop("event"), "t": fields.pop("t")}
+    return json.dumps({**first, **fields}, separators=(",", ":")) + "\n"
 
 
-def read(path: Path) -> Iterator[dict[str, Any]]:
-    """Events of a journal. A line torn by a crash is passed over: what it said did not count yet."""
+def read(path: Path) -> Iterator[Event]:
+    """Events of a journal, also of one that version 0.1 wrote; none if there is no journal yet.
+
+    A line torn by a crash is passed over: what it said did not count yet. Raises StorageError for a line that is
+    whole and says something else than an event, and for a journal of a later version.
+    """
     try:
         with path.open("rb") as file:
-            for line in file:
-                with contextlib.suppress(json.JSONDecodeError, UnicodeDecodeError):
-                    event = json.loads(line)
-                    if isinstance(event, dict) and "event" in event:
-                        yield event
+            yield from _events(path, file)
+    except FileNotFoundError:
+        return
     except OSError as error:
         raise StorageError(f"{path}: cannot read the journal: {error.strerror}") from error
 
 
-def tail(path: Path, most_bytes: int) -> list[dict[str, Any]]:
-    """The last events of a journal, as far as they lie in its last `most_bytes`."""
+def tail(path: Path, most_bytes: int) -> list[Event]:
+    """The last events of a journal, as far as they lie in its last `most_bytes`; none if there is no journal."""
     try:
         with path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - most_bytes))
+            begun = max(0, path.stat().st_size - most_bytes)
+            file.seek(begun)
             lines = file.read(most_bytes).splitlines()
+    except FileNotFoundError:
+        return []
     except OSError as error:
         raise StorageError(f"{path}: cannot read the journal: {error.strerror}") from error
-    found = []
-    for line in lines:
-        with contextlib.suppress(json.JSONDecodeError, UnicodeDecodeError):
-            event = json.loads(line)
-            if isinstance(event, dict) and "event" in event:
-                found.append(event)
-    return found
+    return list(_events(path, lines[1:] if begun else lines))
+
+
+def version(path: Path) -> int:
+    """Of the journal as it was begun; that of today for one that is not begun yet."""
+    first = next(read(path), None)
+    if first is None:
+        return JOURNAL_VERSION
+    return first.version if isinstance(first, JournalBegun) else 1
+
+
+def _events(path: Path, lines: Iterable[bytes]) -> Iterator[Event]:
+    for number, line in enumerate(lines, 1):
+        try:
+            fields = json.loads(line)
+        except (json.JSONDecodeError, UnicodeDecodeError):
+            continue
+        try:
+            event = _EVENT.validate_python(_of_today(fields))
+        except ValidationError as error:
+            what = error.errors()[0]
+            raise StorageError(
+                f"{path}: line {number} is no event of a journal that this version knows "
+                f"({'.'.join(map(str, what['loc']))}: {what['msg']}). Was it changed, or is it of a later version?"
+            ) from error
+        if isinstance(event, JournalBegun) and event.version > JOURNAL_VERSION:
+            raise StorageError(
+                f"{path}: a journal of version {event.version}; this program reads {JOURNAL_VERSION} at most. "
+                "Use the version of coupole that run.json names."
+            )
+        yield event
+
+
+def _of_today(fields: Any) -> Any:
+    """What a line says in the words of today: in version 1 `resume` with `after` meant the end of a pause."""
+    if isinstance(fields, dict) and fields.get("event") == "resume" and fields.get("after") == "pause":
+        return {"event": "continue", "t": fields.get("t", "")}
+    return fields

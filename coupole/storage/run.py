@@ -22,11 +22,32 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, assert_never
 
 import coupole
 from coupole.errors import InputError, StorageError
+from coupole.plan.shot_id import Led, ShotId, ShotLabel
 from coupole.storage import frame_file, journal
+from coupole.storage.journal_events import (
+    JOURNAL_VERSION,
+    ArmSettled,
+    BurstEnded,
+    Continued,
+    Event,
+    FaultNoted,
+    FrameProven,
+    GapFound,
+    JournalBegun,
+    MoveBegun,
+    Paused,
+    ReshootBegun,
+    SessionResumed,
+    SessionStarted,
+    SessionStopped,
+    ViewBegun,
+    ViewSealed,
+)
+from coupole.storage.line_file import utc_now
 
 SCHEMA_VERSION = 1
 
@@ -56,17 +77,6 @@ class Inputs:
         }
 
 
-@dataclass(frozen=True)
-class ProvenFrame:
-    """A `frame` line of the journal."""
-
-    shot: str
-    file: str
-    index: int
-    frame_id: int
-    xxh3: str
-
-
 class Run:
     """One run folder, opened."""
 
@@ -94,7 +104,7 @@ class Run:
             described = {
                 "schema_version": SCHEMA_VERSION,
                 "software": {"name": "coupole", "version": coupole.__version__},
-                "created": journal.utc_now(),
+                "created": utc_now(),
                 "host": platform.node(),
                 "operator": _user(),
                 **about,
@@ -121,14 +131,14 @@ class Run:
         """What the run's views need no more of the disk: laid out whole before their first frame, or archived."""
         return sum(map(_settled_bytes, (self.folder / "views").glob("*.h5")))
 
-    def expected_shots(self) -> Iterable[str]:
-        """Ids of all shots and dark frames of the plan, those apart that were left out as hidden in their view."""
+    def expected_shots(self) -> Iterable[ShotId]:
+        """All shots and dark frames of the plan, those apart that were left out as hidden in their view."""
         labels: list[str] | dict[str, list[str]] = self.about["labels"]
         for view in self.about["views"]:
-            hidden = {f"led{led:04d}" for led in self.hidden_leds.get(view, ())}
-            for label in labels[view] if isinstance(labels, dict) else labels:
-                if label.partition("/")[0] not in hidden:
-                    yield f"{view}/{label}"
+            hidden = set(map(Led, self.hidden_leds.get(view, ())))
+            for text in labels[view] if isinstance(labels, dict) else labels:
+                if (label := ShotLabel.parse(text)).light not in hidden:
+                    yield ShotId(view, label)
 
     @property
     def hidden_leds(self) -> dict[str, list[int]]:
@@ -136,27 +146,18 @@ class Run:
         found: dict[str, list[int]] = self.about.get("hidden_leds", {})
         return found
 
-    def proven(self) -> dict[str, ProvenFrame]:
-        """Proven shots by id, as the journal says."""
-        if not self.journal_path.exists():
-            return {}
-        return {
-            event["shot"]: ProvenFrame(
-                event["shot"], event["file"], event["index"], event["frame_id"], event["xxh3"]
-            )
-            for event in journal.read(self.journal_path)
-            if event["event"] == "frame"
-        }
+    def proven(self) -> dict[ShotId, FrameProven]:
+        """Proven shots, as the journal says."""
+        return {event.shot: event for event in journal.read(self.journal_path) if isinstance(event, FrameProven)}
 
     def robot_fault(self) -> str:
         """The fault of the arm that ended the last session, empty if none did."""
         found = ""
-        for event in journal.read(self.journal_path) if self.journal_path.exists() else ():
-            match event:
-                case {"event": "start"} | {"event": "resume", "simulated": _}:
-                    found = ""
-                case {"event": "fault", "device": "robot", "message": message}:
-                    found = message
+        for event in journal.read(self.journal_path):
+            if isinstance(event, SessionStarted | SessionResumed):
+                found = ""
+            elif isinstance(event, FaultNoted) and event.device == "robot":
+                found = event.message
         return found
 
     def lock(self) -> int:
@@ -168,6 +169,15 @@ class Run:
             os.close(fd)
             raise InputError(f"{self.folder}: another process is acquiring into this run") from error
         return fd
+
+    def refuse_old_journal(self) -> None:
+        """Raise InputError where the journal is of a version that is read but not written any more."""
+        if (found := journal.version(self.journal_path)) != JOURNAL_VERSION:
+            raise InputError(
+                f"{self.folder}: begun by coupole {self.about['software']['version']}, whose journal (version "
+                f"{found}) is not written any more: it cannot be resumed. It can be verified, exported, archived "
+                "and calibrated from; acquire what it lacks as a run of its own."
+            )
 
     def refuse_changes(self, inputs: Inputs) -> None:
         """Raise InputError unless plan, rig and the files they name are those that the run began with."""
@@ -184,12 +194,6 @@ class Run:
                 f"{self.folder}: cannot be resumed: {', '.join(changed)} changed since the run began. "
                 "Put the old file back, or start a new run."
             )
-
-
-def is_shot(shot_id: str) -> bool:
-    """True for a shot under a light, False for dark frames and marks."""
-    light = shot_id.split("/")[-3 if "/r" in shot_id else -2]
-    return not light.startswith("dark") and "mark" not in light
 
 
 def _new_folder(parent: Path, name: str) -> Path:
@@ -245,28 +249,37 @@ def status(run: Run) -> Status:
     """Progress of a run, also while it goes on."""
     found = Status()
     expected = list(run.expected_shots())
-    found.shots = sum(map(is_shot, expected))
-    per_view = Counter(shot.split("/")[0] for shot in expected)
-    proven_ids = set(run.proven())
-    found.proven = sum(map(is_shot, proven_ids))
-    found.darks_proven = len(proven_ids) - found.proven
-    proven_per_view = Counter(shot.split("/")[0] for shot in proven_ids)
+    found.shots = sum(shot.is_shot for shot in expected)
+    per_view = Counter(shot.view for shot in expected)
+    proven = set(run.proven())
+    found.proven = sum(shot.is_shot for shot in proven)
+    found.darks_proven = len(proven) - found.proven
+    proven_per_view = Counter(shot.view for shot in proven)
     found.views = {view: (proven_per_view[view], count) for view, count in per_view.items()}
-    if run.journal_path.exists():
-        for event in journal.read(run.journal_path):
-            found.last_event = event["t"]
-            match event["event"]:
-                case "start" | "resume":
-                    found.state = "running or interrupted"
-                case "pause":
-                    found.state = "paused"
-                case "stop":
-                    found.state = event.get("outcome", "stopped")
-                case "reshoot":
-                    found.reshot += len(event.get("shots", ()))
-                case "fault":
-                    found.faults.append(event.get("message", ""))
+    for event in journal.read(run.journal_path):
+        _note_event(found, event)
     return found
+
+
+def _note_event(found: Status, event: Event) -> None:
+    found.last_event = event.t
+    match event:
+        case SessionStarted() | SessionResumed() | Continued():
+            found.state = "running or interrupted"
+        case Paused():
+            found.state = "paused"
+        case SessionStopped():
+            found.state = event.outcome
+        case ReshootBegun():
+            found.reshot += len(event.shots)
+        case FaultNoted():
+            found.faults.append(event.message)
+        case JournalBegun() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven() | BurstEnded():
+            pass
+        case GapFound() | ViewSealed():
+            pass
+        case _:
+            assert_never(event)
 
 
 @dataclass
@@ -287,11 +300,11 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     """Read every proven frame back: each shot of the plan once, each record and checksum right."""
     result = Verification()
     proven = run.proven()
-    result.missing = [shot for shot in run.expected_shots() if shot not in proven]
-    by_file: dict[str, list[ProvenFrame]] = {}
+    result.missing = [str(shot) for shot in run.expected_shots() if shot not in proven]
+    by_file: dict[str, list[FrameProven]] = {}
     for frame in proven.values():
         by_file.setdefault(frame.file, []).append(frame)
-    lines = Counter(e["shot"] for e in journal.read(run.journal_path) if e["event"] == "frame") if proven else {}
+    lines = Counter(event.shot for event in journal.read(run.journal_path) if isinstance(event, FrameProven))
     result.bad += [f"{shot}: proven {n} times in the journal" for shot, n in lines.items() if n > 1]
     done = 0
     for name, frames in sorted(by_file.items()):
@@ -312,11 +325,11 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     return result
 
 
-def _frame_problem(path: Path, layout: frame_file.Layout, table: Any, frame: ProvenFrame) -> str:
+def _frame_problem(path: Path, layout: frame_file.Layout, table: Any, frame: FrameProven) -> str:
     if not 0 <= frame.index < layout.frames:
         return f"{frame.shot}: slot {frame.index} is not in {path.name}"
     record = table[frame.index]
-    if record["state"] != frame_file.PROVEN or record["shot"].decode() != frame.shot:
+    if record["state"] != frame_file.PROVEN or record["shot"].decode() != str(frame.shot):
         return f"{frame.shot}: slot {frame.index} of {path.name} is recorded as `{record['shot'].decode()}`"
     try:
         found = frame_file.checksum(frame_file.read_frame(path, layout, frame.index))

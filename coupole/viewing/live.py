@@ -16,20 +16,14 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.acquisition.cell import OpenedCell
-from coupole.devices import NO_LIGHT, STEP_DTYPE, Deadline, Exposure
-from coupole.errors import DeviceTimeout, InputError
-from coupole.plan.led_table import LedTable
-from coupole.plan.rig import Rig
-from coupole.plan.shots import burst_timing
+from coupole.errors import InputError
+from coupole.plan.shot_id import Led
 from coupole.storage import frame_file, journal
+from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 from coupole.viewing.raw_preview import Coding, Figures, figures
 
 _POLL_S = 0.2
-_FRAME_S = 2.0
-"""How long after its exposure a frame may take to reach the host."""
-_BUFFERS = 8
 
 
 @dataclass(frozen=True)
@@ -95,7 +89,7 @@ class Studio:
             self._shown = shown
 
 
-class _Pace:
+class FrameRate:
     """Frames a second, over the last ones."""
 
     def __init__(self) -> None:
@@ -107,78 +101,6 @@ class _Pace:
         return (len(self._times_s) - 1) / took_s if took_s > 0 else 0.0
 
 
-class CellSource:
-    """A cell's camera, one light at a time; the arm is held where it stands."""
-
-    def __init__(
-        self, cell: OpenedCell, rig: Rig, leds: LedTable, lux: Callable[[int], float], *, frames_per_s: float
-    ) -> None:
-        self.leds = tuple(int(led) for led in leds.ids)
-        self._cell, self._rig, self._lux = cell, rig, lux
-        self._every_s = 1.0 / frames_per_s
-
-    def frames(self, studio: Studio) -> None:
-        cell, limits, sensor = self._cell, self._rig.led_limits, self._rig.sensor
-        armed_for: Choice | None = None
-        pace, dose_lux_h, number = _Pace(), 0.0, 0
-        coding = Coding("MONO", 0, 1)
-        while not studio.closing.is_set():
-            choice = studio.choice
-            timing = burst_timing(
-                choice.exposure_us,
-                rise_us=limits.rise_us,
-                readout_us=1e6 / sensor.max_frames_per_s,
-                exposure_gap_us=sensor.exposure_gap_us,
-                hardware=True,
-            )
-            if armed_for != choice:
-                cell.camera.disarm()
-                made = cell.camera.configure(Exposure(choice.exposure_us))
-                coding = Coding(made.bayer_pattern, made.black_dn, made.white_dn)
-                cell.camera.arm(_BUFFERS)
-                armed_for = choice
-            table = np.zeros(1, STEP_DTYPE)
-            table["led"] = NO_LIGHT if choice.led is None else choice.led
-            table["on_us"], table["trigger_delay_us"] = timing.on_us, timing.trigger_delay_us
-            rest_us = int(timing.on_us * (1.0 + limits.cooldown_ratio))
-            table["period_us"] = max(timing.period_us, rest_us, int(self._every_s * 1e6))
-            cell.ledbox.load(table)
-            cell.ledbox.start(table)
-            frame = cell.camera.next_frame(timing.on_us * 1e-6 + _FRAME_S)
-            if frame is None:
-                raise DeviceTimeout(
-                    "camera",
-                    expected=f"a frame within {timing.on_us * 1e-6 + _FRAME_S:.1f} s of its trigger",
-                    happened="none came",
-                    remedy="Check the trigger cable.",
-                )
-            raw = frame.pixels.copy()
-            frame.release()
-            if choice.led is not None:
-                dose_lux_h += self._lux(choice.led) * timing.on_us / 3.6e9
-            number += 1
-            light = "no light" if choice.led is None else f"LED {choice.led}"
-            seen = figures(raw, coding)
-            studio.show(
-                Shown(number, light, raw, coding, choice.exposure_us, choice.led, seen, pace.beat(), dose_lux_h)
-            )
-            self._wait_for_the_box(float(table["period_us"][0]) * 1e-6)
-
-    def _wait_for_the_box(self, period_s: float) -> None:
-        deadline = Deadline(self._cell.clock, 2.0 * period_s + _FRAME_S)
-        while self._cell.ledbox.running():
-            self._cell.ledbox.poll_log()
-            if deadline.expired:
-                raise DeviceTimeout(
-                    "led box",
-                    expected=f"a step of {period_s:.3f} s to end within {deadline.seconds:.1f} s",
-                    happened="the box says that it is running still",
-                    remedy="Check the box.",
-                )
-            self._cell.clock.sleep(0.01)
-        self._cell.ledbox.poll_log()
-
-
 class RunSource:
     """A run's folder: the newest proven frame, read from the disk."""
 
@@ -188,8 +110,8 @@ class RunSource:
         self._run = Run(folder)
 
     def frames(self, studio: Studio) -> None:
-        pace, number = _Pace(), 0
-        newest: dict[str, Any] | None = None
+        pace, number = FrameRate(), 0
+        newest: FrameProven | None = None
         while not studio.closing.is_set():
             last = self._newest()
             if last is not None and last != newest:
@@ -198,23 +120,22 @@ class RunSource:
                 studio.show(replace(self._read(last, number), frames_per_s=pace.beat()))
             studio.closing.wait(_POLL_S)
 
-    def _newest(self) -> dict[str, Any] | None:
-        path = self._run.journal_path
+    def _newest(self) -> FrameProven | None:
         found = None
-        for event in journal.tail(path, 64 * 1024) if path.exists() else ():
-            if event["event"] == "frame" and "/led" in event["shot"]:
+        for event in journal.tail(self._run.journal_path, 64 * 1024):
+            if isinstance(event, FrameProven) and isinstance(event.shot.light, Led):
                 found = event
         return found
 
-    def _read(self, event: dict[str, Any], number: int) -> Shown:
-        path = self._run.folder / event["file"]
+    def _read(self, event: FrameProven, number: int) -> Shown:
+        path = self._run.folder / event.file
         layout, facts = frame_file.read_layout(path), frame_file.read_facts(path)
-        raw = frame_file.read_frame(path, layout, event["index"])
-        record = frame_file.read_frames(path)[event["index"]]
+        raw = frame_file.read_frame(path, layout, event.index)
+        record = frame_file.read_frames(path)[event.index]
         coding = Coding(facts["pattern"], facts["black_dn"], facts["white_dn"])
         seen = figures(raw, coding)
         exposure_us, led = int(record["exposure_us"]), int(record["led"])
-        return Shown(number, event["shot"], raw, coding, exposure_us, led, seen, 0.0, 0.0)
+        return Shown(number, str(event.shot), raw, coding, exposure_us, led, seen, 0.0, 0.0)
 
 
 def choice_from(wanted: dict[str, Any], before: Choice, leds: tuple[int, ...], longest_us: int) -> Choice:

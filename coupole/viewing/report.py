@@ -6,11 +6,12 @@ import base64
 import html
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 from coupole.errors import StorageError
+from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file, journal
-from coupole.storage.run import Run, is_shot, status
+from coupole.storage.journal_events import BurstEnded, Event, FaultNoted, GapFound
+from coupole.storage.run import Run, status
 from coupole.viewing.raw_preview import develop, png
 
 PICTURES_PER_VIEW = 12
@@ -50,7 +51,7 @@ def _page(run: Run) -> str:
     table = "".join(
         f"<tr><th>{key}<td>{value if key == 'shots' else html.escape(str(value))}" for key, value in rows.items()
     )
-    events = list(journal.read(run.journal_path)) if run.journal_path.exists() else []
+    events = list(journal.read(run.journal_path))
     name = html.escape(run.folder.name)
     return (
         f"<!doctype html><meta charset=utf-8><title>{name}</title><style>{_STYLE}</style><h1>{name}</h1>"
@@ -59,27 +60,27 @@ def _page(run: Run) -> str:
     )
 
 
-def _faults(events: list[dict[str, Any]]) -> str:
+def _faults(events: list[Event]) -> str:
     lines = []
     for event in events:
-        match event["event"]:
-            case "fault":
-                lines.append(f"<li class=bad>{event['t']} {html.escape(event['message'])}")
-            case "gap":
-                why = f"{event['missing']} missing, {event['surplus']} surplus {event['reason']}"
-                lines.append(f"<li>{event['t']} {html.escape(event['view'])}: {html.escape(why)}")
+        if isinstance(event, FaultNoted):
+            lines.append(f"<li class=bad>{event.t} {html.escape(event.message)}")
+        elif isinstance(event, GapFound):
+            why = f"{event.missing} missing, {event.surplus} surplus {event.reason}"
+            lines.append(f"<li>{event.t} {html.escape(event.view)}: {html.escape(why)}")
     return f"<h2>What went wrong</h2><ul>{''.join(lines)}</ul>" if lines else "<p>Nothing went wrong.</p>"
 
 
-def _bursts(events: list[dict[str, Any]]) -> str:
-    bursts = [event for event in events if event["event"] == "burst" and event.get("clocks")]
+def _bursts(events: list[Event]) -> str:
+    bursts = [event for event in events if isinstance(event, BurstEnded) and event.clocks]
     if not bursts:
         return ""
     rows = "".join(
-        f"<tr><td>{html.escape(b['view'])}<td>{b['steps']}<td>{b['frames']}<td>{b['on_s']:.2f}"
-        f"<td>{b['clocks']['drift_ppm']:.2f}<td>{b['clocks']['residual_rms_us']:.1f}"
-        f"<td>{b['clocks']['residual_max_us']:.1f}<td>{b['hottest_board_c']}"
+        f"<tr><td>{html.escape(b.view)}<td>{b.steps}<td>{b.frames}<td>{b.on_s:.2f}"
+        f"<td>{b.clocks['drift_ppm']:.2f}<td>{b.clocks['residual_rms_us']:.1f}"
+        f"<td>{b.clocks['residual_max_us']:.1f}<td>{b.hottest_board_c}"
         for b in bursts
+        if b.clocks
     )
     head = "<tr><th>view<th>steps<th>frames<th>light s<th>drift ppm<th>residual rms us<th>max us<th>board C"
     return f"<h2>Bursts: box against camera</h2><table>{head}{rows}</table>"
@@ -97,7 +98,7 @@ def _view(run: Run, view: str) -> str:
     shots = [
         (record["shot"].decode(), slot)
         for slot, record in enumerate(table)
-        if record["state"] == frame_file.PROVEN and is_shot(record["shot"].decode())
+        if record["state"] == frame_file.PROVEN and ShotId.parse(record["shot"].decode()).is_shot
     ]
     shots.sort()
     step = max(1, len(shots) // PICTURES_PER_VIEW)

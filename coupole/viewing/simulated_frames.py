@@ -14,18 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 import coupole
-from coupole.acquisition.cell import world_config
 from coupole.devices import NO_LIGHT
 from coupole.errors import InputError, StorageError
 from coupole.geometry import Transform
 from coupole.kinematics import KR10_R1100_SIXX, forward
 from coupole.motion.itinerary import base_from_flange
-from coupole.plan.rig import load_class
-from coupole.plan.shots import Burst, ViewPose
+from coupole.plan.bursts import Burst
+from coupole.plan.registry import STILLS, load_class
+from coupole.plan.schedule import ViewPose
 from coupole.preflight.job import Job
+from coupole.preflight.simulated_world import world_config
 from coupole.viewing.raw_preview import Coding, develop, figures
 
-STILLS = "sim.world.stills:Stills"
 _THUMBNAIL_PX, _LABEL_PX, _COLUMNS = 320, 22, 4
 
 Progress = Callable[[int, int], None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +14,11 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from coupole.acquisition.observer import Observer, Outcome
-from coupole.acquisition.observer import Progress as RunProgress
-from coupole.acquisition.recorder import DryRecorder
-from coupole.plan.shots import BurstTiming
+from coupole.plan.bursts import BurstTiming
 from coupole.preflight.preflight import Report
 from coupole.storage.run import Status
+from coupole.viewing.progress import Outcome, ViewExposure
+from coupole.viewing.progress import Progress as RunProgress
 
 if TYPE_CHECKING:
     from coupole.preflight.exposure_advice import Advice
@@ -53,8 +52,8 @@ def bytes_text(count: float) -> str:
     return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
 
 
-class RunObserver(Observer):
-    """Bars on a terminal, a line every few seconds elsewhere."""
+class RunObserver:
+    """Watches a run: bars on a terminal, a line every few seconds elsewhere."""
 
     def __init__(self, console: Console, frame_bytes: int, proven_before: int) -> None:
         self._console, self._frame_bytes = console, frame_bytes
@@ -161,14 +160,16 @@ def show_status(console: Console, status: Status) -> None:
         console.print(f"  [red]fault:[/] {fault}")
 
 
-def show_dry_run(console: Console, recorder: DryRecorder, outcome: Outcome, found: dict[str, Any]) -> None:
+def show_dry_run(
+    console: Console, exposures: Mapping[str, ViewExposure], outcome: Outcome, found: dict[str, Any]
+) -> None:
     """What a dry run learnt."""
     console.print(
         f"dry run: {duration_text(found['duration_s'])} of the cell's time in {duration_text(found['machine_s'])} "
         f"({found['speed']:.1f} times faster); preflight said {duration_text(found['preflight_s'])}"
     )
     table = Table("view", "pictures", "brightest", "saturated", "exposure", box=None)
-    for view, seen in recorder.exposures.items():
+    for view, seen in exposures.items():
         table.add_row(view, str(seen.pictures), f"{seen.brightest:.0%}", f"{seen.saturated:.2%}", seen.verdict())
     console.print(table)
     if outcome.reshot or outcome.over_triggers or outcome.lost_transfers:

@@ -11,7 +11,8 @@ from rich.console import Console
 
 from coupole.errors import InputError
 from coupole.motion.itinerary import plan_itinerary
-from coupole.preflight.job import Job, check_job
+from coupole.preflight.checking import check_job
+from coupole.preflight.job import Job, without_hidden
 from coupole.preflight.preflight import StorageFacts
 from coupole.viewing.view_page import write_page
 from coupole.viewing.view_picture import write_picture
@@ -43,15 +44,15 @@ def look(job: Job, console: Console, *, paths: bool) -> Scene:
     """What there is to see, and the refusals that `check` would give, but for those that concern the disk."""
     rig, views = job.cell.rig, job.schedule.views
     with _doing(console, f"planning the ways to {len(views)} views" if paths else "finding postures"):
-        job = job.without_hidden() if paths else job
+        job = without_hidden(job) if paths else job
         job, report = check_job(job, StorageFacts(free_bytes=sys.maxsize), paths=paths)
         home_deg = rig.motion.home_joints_deg
         if paths:
-            itinerary = job.itinerary(views, home_deg)
+            itinerary = job.motion.itinerary(views, home_deg)
         else:
             itinerary = plan_itinerary(views, rig, None, home_deg, job.plan.order)
     with _doing(console, "finding shadows"):
-        return scene_of(job, itinerary, job.bodies if paths else None, report.refusals)
+        return scene_of(job, itinerary, job.motion.bodies if paths else None, report.refusals)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from coupole.viewing.terminal import duration_text
 from coupole.viewing.view_colours import Colour, css
 from coupole.viewing.view_scene import Scene, Stop
 from coupole.viewing.view_sight import sight_lines
-from coupole.viewing.view_solids import Points, Solid, disk, joined, simplified
+from coupole.viewing.view_solids import Points, Solid, disk, joined, with_fewer_faces
 
 _OBJECT_FACES = 30_000
 _ROUND = 12
@@ -133,7 +133,7 @@ def _words_on(scene: Scene, stop: Stop) -> str:
 def _cell(scene: Scene) -> list[Any]:
     traces = [_mesh(disk("support", scene.rig.support.diameter_mm / 2, _SUPPORT_THICKNESS_MM), colours.SUPPORT)]
     if scene.measured is not None:
-        traces.append(_mesh(simplified(scene.measured, _OBJECT_FACES), colours.OBJECT))
+        traces.append(_mesh(with_fewer_faces(scene.measured, _OBJECT_FACES), colours.OBJECT))
     traces += [_mesh(volume, colours.KEEP_OUT, 0.1, f"keep-out {volume.name}") for volume in scene.keep_out]
     traces.append(_mesh(joined("arm at home", scene.arm(scene.home_deg, _ROUND)), colours.HOME, 0.25))
     if not scene.used.all():

@@ -20,8 +20,9 @@ from coupole.motion.collisions import CellBodies, Contact
 from coupole.motion.itinerary import Itinerary, Visit, arm_of, base_from_flange
 from coupole.motion.occlusion import Occlusion, Occlusions, Sight, capsule_axes, sight_of
 from coupole.motion.path_planner import Joints
+from coupole.plan.lights import leds_of_plan
 from coupole.plan.rig import KeepOutBox, Rig
-from coupole.plan.shots import ViewPose, leds_of_plan
+from coupole.plan.schedule import ViewPose
 from coupole.preflight.job import Job
 from coupole.viewing.view_sight import footprint
 from coupole.viewing.view_solids import Points, Solid, box, capsule, joined, sphere
@@ -135,7 +136,7 @@ class Scene:
 def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals: Sequence[str]) -> Scene:
     """Everything that there is to see of a job; without `bodies` nothing is looked at for collisions."""
     rig, views = job.cell.rig, job.schedule.views
-    shadows, corners_mm = job.occlusions, job.object_corners_mm
+    shadows, corners_mm = job.motion.occlusions, job.shape.corners_mm
     refused = [index for index in range(len(views)) if index not in itinerary.order]
     home_deg = place_deg = np.array(rig.motion.home_joints_deg)
     stops = []

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from coupole.acquisition.frame_matching import FaultModel, Match, match
 from coupole.devices import STEP_RECORD_DTYPE
+from coupole.plan.bursts import END_MARK_EXTRA, START_MARK_EXTRA, Burst
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
-from coupole.plan.shots import END_MARK_EXTRA, START_MARK_EXTRA, Burst, build_schedule
+from coupole.plan.schedule import build_schedule
 
 MODEL = FaultModel()
 START, END = len(START_MARK_EXTRA), len(END_MARK_EXTRA)

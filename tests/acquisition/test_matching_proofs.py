@@ -21,7 +21,7 @@ from matching_takes import (
     whole_burst,
 )
 
-from coupole.plan.shots import Burst
+from coupole.plan.bursts import Burst
 
 clocks = {
     "box_ppm": st.floats(-60, 60),

@@ -15,6 +15,7 @@ from coupole.devices import ArmState, FrameFormat
 from coupole.storage import frame_file
 from coupole.storage.frame_file import ViewWriter
 from coupole.storage.journal import Journal
+from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
 from coupole.storage.run import Inputs, Run
 
 SIZE_PX = (128, 96)
@@ -41,14 +42,14 @@ def write_light_run(folder: Path, frames: Sequence[Taken]) -> Path:
     folder.mkdir(parents=True)
     for name in ("plan.yaml", "rig.yaml"):
         (folder / name).write_text(f"# {name}\n")
-    views = list(dict.fromkeys(frame.shot.split("/")[0] for frame in frames))
+    views = list(dict.fromkeys(frame.shot.view for frame in frames))
     labels = list(dict.fromkeys(frame.shot.split("/", 1)[1] for frame in frames))
     about = {"views": views, "labels": labels, "simulated": True}
     run = Run.create(folder, "light", Inputs(folder / "plan.yaml", folder / "rig.yaml", ()), about)
     diary = Journal(run.journal_path)
-    diary.write("start")
+    diary.write(SessionStarted())
     for view in views:
-        mine = [frame for frame in frames if frame.shot.split("/")[0] == view]
+        mine = [frame for frame in frames if frame.shot.view == view]
         path = run.view_path(view)
         metadata = {**METADATA, "title": view, "focus_distance_mm": 335.0, "pixel_pitch_um": PITCH_UM}
         frame_file.create(path, len(mine), FORMAT, metadata)
@@ -63,10 +64,12 @@ def write_light_run(folder: Path, frames: Sequence[Taken]) -> Path:
                 slot, frame.shot, led=0, pose=pose, board_temperature_dc=250, t_trigger_ns=10**9 * number
             )
             file = str(path.relative_to(run.folder))
-            diary.write("frame", shot=frame.shot, file=file, index=slot, frame_id=number, xxh3=f"{digest:016x}")
+            diary.write(
+                FrameProven(shot=frame.shot, file=file, index=slot, frame_id=number, xxh3=f"{digest:016x}")
+            )
         writer.sync()
         writer.close()
-    diary.write("stop", outcome="done")
+    diary.write(SessionStopped(outcome="done"))
     diary.commit()
     diary.close()
     return run.folder

@@ -19,6 +19,7 @@ from coupole.devices import ArmState, FrameFormat
 from coupole.storage import frame_file
 from coupole.storage.frame_file import ViewWriter
 from coupole.storage.journal import Journal
+from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
 from coupole.storage.run import Inputs, Run
 
 BOARD = Board(kind="charuco", corners=(9, 6), square_mm=16.0, marker_mm=10.0)
@@ -105,7 +106,7 @@ def write_run(
     about = {"views": views, "labels": labels, "simulated": True}
     run = Run.create(folder, "board", Inputs(folder / "plan.yaml", folder / "rig.yaml", ()), about)
     diary, random = Journal(run.journal_path), np.random.default_rng(8)
-    diary.write("start")
+    diary.write(SessionStarted())
     for view, picture, pose, bright in zip(views, made.pictures, made.base_from_flange, lights, strict=True):
         path = run.view_path(view)
         frame_file.create(path, len(labels), FORMAT, {**METADATA, "title": view, "focus_distance_mm": 335.0})
@@ -121,11 +122,11 @@ def write_run(
             digest = writer.prove(slot, f"{view}/{label}", led=number, pose=at, **warmth)
             file = str(path.relative_to(run.folder))
             diary.write(
-                "frame", shot=f"{view}/{label}", file=file, index=slot, frame_id=number, xxh3=f"{digest:016x}"
+                FrameProven(shot=f"{view}/{label}", file=file, index=slot, frame_id=number, xxh3=f"{digest:016x}")
             )
         writer.sync()
         writer.close()
-    diary.write("stop", outcome="done")
+    diary.write(SessionStopped(outcome="done"))
     diary.commit()
     diary.close()
     return run

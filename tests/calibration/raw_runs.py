@@ -28,6 +28,7 @@ from coupole.plan.plan import Pose
 from coupole.storage import frame_file
 from coupole.storage.frame_file import ViewWriter
 from coupole.storage.journal import Journal
+from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
 from coupole.storage.run import Inputs, Run
 
 FLANGE_FROM_CAMERA = frame(np.array([31.0, -42.0, 118.0]), np.array([4.0, -3.0, 60.0]))
@@ -65,7 +66,7 @@ def write_raw_run(folder: Path, frames: Sequence[Frame], *, pattern: str = "GBRG
         {"views": views, "labels": labels, "simulated": True},
     )
     diary = Journal(run.journal_path)
-    diary.write("start")
+    diary.write(SessionStarted())
     for view in views:
         mine = [one for one in frames if one.view == view]
         path = run.view_path(view)
@@ -82,10 +83,10 @@ def write_raw_run(folder: Path, frames: Sequence[Frame], *, pattern: str = "GBRG
             warmth = {"board_temperature_dc": round(10 * room_c), "led_current_ma": 700}
             digest = writer.prove(slot, shot, led=number, pose=pose, **warmth)
             file = str(path.relative_to(run.folder))
-            diary.write("frame", shot=shot, file=file, index=slot, frame_id=number, xxh3=f"{digest:016x}")
+            diary.write(FrameProven(shot=shot, file=file, index=slot, frame_id=number, xxh3=f"{digest:016x}"))
         writer.sync()
         writer.close()
-    diary.write("stop", outcome="done")
+    diary.write(SessionStopped(outcome="done"))
     diary.commit()
     diary.close()
     return run.folder

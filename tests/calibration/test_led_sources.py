@@ -18,6 +18,7 @@ from coupole.plan.led_table import LedTable
 from coupole.storage import frame_file
 from coupole.storage.frame_file import ViewWriter
 from coupole.storage.journal import Journal
+from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
 from coupole.storage.run import Inputs, Run
 
 SHAPE = (96, 128)
@@ -37,7 +38,7 @@ def write_run(folder: Path, labels: tuple[str, ...], *, hot: bool = False) -> Ru
     about = {"views": views, "labels": list(labels), "simulated": True}
     run = Run.create(folder, "leds", Inputs(folder / "plan.yaml", folder / "rig.yaml", ()), about)
     diary, random = Journal(run.journal_path), np.random.default_rng(8)
-    diary.write("start")
+    diary.write(SessionStarted())
     for number, view in enumerate(views):
         path = run.view_path(view)
         frame_file.create(path, len(labels), FORMAT, {**METADATA, "title": view, "focus_distance_mm": 335.0})
@@ -57,11 +58,11 @@ def write_run(folder: Path, labels: tuple[str, ...], *, hot: bool = False) -> Ru
             )
             file = str(path.relative_to(run.folder))
             diary.write(
-                "frame", shot=f"{view}/{label}", file=file, index=slot, frame_id=slot, xxh3=f"{digest:016x}"
+                FrameProven(shot=f"{view}/{label}", file=file, index=slot, frame_id=slot, xxh3=f"{digest:016x}")
             )
         writer.sync()
         writer.close()
-    diary.write("stop", outcome="done")
+    diary.write(SessionStopped(outcome="done"))
     diary.commit()
     diary.close()
     return run

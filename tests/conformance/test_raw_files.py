@@ -28,7 +28,7 @@ from coupole.devices import STEP_RECORD_DTYPE, Exposure, Frame, FrameFormat, Sys
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
-from coupole.plan.shots import build_schedule
+from coupole.plan.schedule import build_schedule
 from drivers.camera.raw.driver import RawFiles, Settings
 from drivers.camera.raw.exif import read_exif
 from drivers.camera.raw.order import proven_order

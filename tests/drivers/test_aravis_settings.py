@@ -8,8 +8,8 @@ import pytest
 from places import REPO
 from pydantic import ValidationError
 
-from coupole.plan.rig import camera_kind
-from coupole.preflight.job import read_cell
+from coupole.plan.cell import read_cell
+from coupole.plan.rig_devices import camera_kind
 from drivers.camera.aravis.driver import Settings
 from sim.devices.gige_registers import DESCRIPTION
 

@@ -18,6 +18,7 @@ from coupole.devices import FrameFormat
 from coupole.errors import ChecksumMismatch, InputError
 from coupole.exchange import dng, tiff
 from coupole.exchange.export import Picture, export_run
+from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file
 from coupole.storage.archive import archive_run
 from coupole.storage.bitshuffle import CODECS
@@ -252,7 +253,7 @@ def test_nothing_is_written_over_unless_that_is_asked(made: MadeRun, out: Path) 
 
 
 def test_a_frame_that_changed_on_the_disk_is_not_exported(made: MadeRun, out: Path) -> None:
-    path, frame = made.run.view_path("top"), made.run.proven()["top/led0001/e0"]
+    path, frame = made.run.view_path("top"), made.run.proven()[ShotId.parse("top/led0001/e0")]
     layout = frame_file.read_layout(path)
     with path.open("r+b") as file:
         file.seek(layout.data_offset + frame.index * layout.frame_bytes)

@@ -138,7 +138,7 @@ def test_an_arm_pushed_in_a_burst_has_just_that_burst_taken_again(joining: CellF
     (moved,) = cells.events(run, "fault")
     assert moved["kind"] == "ArmMoved"
     assert moved["message"].startswith("side")
-    assert "side" in {shot.split("/")[0] for shot in cells.reshot(run)}
+    assert "side" in {shot.view for shot in cells.reshot(run)}
     cells.assert_each_shot_proven_once(run)
     assert cells.mislabelled(joining, run) == []
     side = [frame.record for shot, frame in cells.stored(run).items() if shot.startswith("side/")]

@@ -19,7 +19,7 @@ from coupole.motion.path_deviation import PATH_TOLERANCE_MM
 from coupole.motion.singularities import SINGULARITY_MARGIN
 from coupole.plan.led_table import read_led_table
 from coupole.plan.rig import Rig
-from coupole.plan.shots import ViewPose
+from coupole.plan.schedule import ViewPose
 from coupole.plan.yamlfile import read
 from coupole.preflight.job import read_job
 
@@ -213,8 +213,8 @@ def test_meshes_of_the_links_let_a_view_pass_that_the_capsules_round_them_refuse
 def test_the_rig_names_the_folder_of_link_meshes(tmp_path: Path) -> None:
     shipped = (ROOT / "configs/rigs/sim.yaml").read_text().replace("../", f"{ROOT}/configs/")
     (tmp_path / "rig.yaml").write_text(f"link_meshes: {LINK_MESHES}\n{shipped}")
-    with_meshes = read_job(ROOT / "configs/plans/demo.yaml", tmp_path / "rig.yaml").bodies
-    with_capsules = read_job(ROOT / "configs/plans/demo.yaml").bodies
+    with_meshes = read_job(ROOT / "configs/plans/demo.yaml", tmp_path / "rig.yaml").motion.bodies
+    with_capsules = read_job(ROOT / "configs/plans/demo.yaml").motion.bodies
     pair = ("link 2", "the dome")
     assert with_meshes.margins(HOME_DEG)[pair][0] > with_capsules.margins(HOME_DEG)[pair][0]
 

@@ -69,7 +69,7 @@ def demo() -> Job:
 
 @pytest.fixture(scope="module")
 def demo_shadows(demo: Job) -> Occlusions:
-    return occlusions_of(demo.cell.rig, demo.cell.leds, demo.object_corners_mm, demo.object_points_support_mm)
+    return occlusions_of(demo.cell.rig, demo.cell.leds, demo.shape.corners_mm, demo.shape.dose_points_mm)
 
 
 # -- patches --------------------------------------------------------------------------------------------------
@@ -217,7 +217,7 @@ def test_shadows_are_those_that_an_independent_checker_finds(
 
     rig, patches, leds_mm = demo.cell.rig, demo_shadows.patches, demo_shadows.leds_mm
     view = demo.schedule.views[1]
-    visit = plan_itinerary([view], rig, demo.bodies, rig.motion.home_joints_deg).visits[0]
+    visit = plan_itinerary([view], rig, demo.motion.bodies, rig.motion.home_joints_deg).visits[0]
     assert visit is not None
     shadow = demo_shadows.at(visit.joints_deg)
     frames = inverse(rig.support.base_from_support.matrix()) @ link_frames(KR10_R1100_SIXX, visit.joints_deg)
@@ -229,7 +229,7 @@ def test_shadows_are_those_that_an_independent_checker_finds(
         return _standing(fcl.Capsule(radius_mm, max(float(np.linalg.norm(end - start)), 1e-9)), start, end)
 
     bodies = {BY_ARM: [capsule(*body) for body in arm], BY_TOOL: [capsule(*body) for body in tool]}
-    corners = demo.object_corners_mm.astype(np.float32).astype(float)
+    corners = demo.shape.corners_mm.astype(np.float32).astype(float)
     model = fcl.BVHModel()
     model.beginModel(3 * len(corners), len(corners))
     model.addSubModel(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
@@ -318,7 +318,7 @@ def test_no_led_is_useless_to_a_camera_that_sees_nothing() -> None:
 def test_without_a_mesh_the_targets_stand_for_the_object(cell: CellFolder) -> None:
     cell.write(object={"id": "no-mesh"})
     job = read_job(cell.plan)
-    shadows = occlusions_of(job.cell.rig, job.cell.leds, job.object_corners_mm, job.object_points_support_mm)
+    shadows = occlusions_of(job.cell.rig, job.cell.leds, job.shape.corners_mm, job.shape.dose_points_mm)
     rig = job.cell.rig
     visit = plan_itinerary(job.schedule.views, rig, None, rig.motion.home_joints_deg).visits[0]
     assert visit is not None

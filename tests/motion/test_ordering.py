@@ -18,7 +18,7 @@ from coupole.motion.itinerary import arm_of, base_from_flange, bodies_of
 from coupole.motion.ordering import shortest_tour
 from coupole.motion.path_planner import PathPlanner
 from coupole.motion.singularities import margin
-from coupole.plan.shots import ViewPose
+from coupole.plan.schedule import ViewPose
 from coupole.preflight.job import read_job
 
 Floats = NDArray[np.float64]
@@ -31,7 +31,7 @@ HOME = np.array(RIG.motion.home_joints_deg)
 @cache
 def cell() -> CellBodies:
     """The simulated cell with the demo's relief."""
-    return bodies_of(RIG, JOB.cell.leds, JOB.object_corners_mm)
+    return bodies_of(RIG, JOB.cell.leds, JOB.shape.corners_mm)
 
 
 def planner() -> PathPlanner:

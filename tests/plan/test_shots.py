@@ -13,18 +13,12 @@ from places import REPO
 
 from coupole.devices import FLAG_NO_TRIGGER, NO_LIGHT
 from coupole.geometry import transform
+from coupole.plan.bursts import MARKS, START_MARK_EXTRA, Burst, burst_timing
 from coupole.plan.led_table import LedTable, read_led_table
+from coupole.plan.lights import interleave, missing_lights
 from coupole.plan.plan import Plan
-from coupole.plan.shots import (
-    MARKS,
-    START_MARK_EXTRA,
-    Burst,
-    Schedule,
-    build_schedule,
-    burst_timing,
-    interleave,
-    missing_lights,
-)
+from coupole.plan.schedule import Schedule, build_schedule
+from coupole.plan.shot_id import Led, ShotLabel
 
 DOME = read_led_table(REPO / "configs/domes/coupole.csv")
 BASE_FROM_SUPPORT = transform((200, 0, 1450), (0, 0, 180))
@@ -77,13 +71,13 @@ def test_every_light_is_shot_once_in_a_burst() -> None:
 
 
 def test_ids_are_view_light_exposure() -> None:
-    ids = first_burst({"kind": "ids", "ids": [417]}, darks_per_view=1).shot_ids
-    assert ids[START : START + 2] == ["top/dark10/e0", "top/led0417/e0"]
+    ids = first_burst({"kind": "ids", "ids": [417]}, darks_per_view=1).shots
+    assert list(map(str, ids[START : START + 2])) == ["top/dark10/e0", "top/led0417/e0"]
 
 
 def test_marks_are_the_dark_frames_that_begin_and_end_a_burst() -> None:
-    ids = first_burst({"kind": "ids", "ids": [3]}, darks_per_view=0).shot_ids
-    assert ids == [*(f"top/dark{k}/e0" for k in range(5)), "top/led0003/e0"] + [
+    ids = first_burst({"kind": "ids", "ids": [3]}, darks_per_view=0).shots
+    assert list(map(str, ids)) == [*(f"top/dark{k}/e0" for k in range(5)), "top/led0003/e0"] + [
         f"top/dark{k}/e0" for k in range(5, 10)
     ]
 
@@ -91,14 +85,13 @@ def test_marks_are_the_dark_frames_that_begin_and_end_a_burst() -> None:
 def test_the_led_of_a_step_is_that_of_its_id() -> None:
     burst = first_burst()
     for led, label in zip(burst.table["led"], burst.labels, strict=True):
-        assert label == (f"led{led:04d}/e0" if led != NO_LIGHT else label)
-        assert label.startswith("dark") == (led == NO_LIGHT)
+        assert label.light == Led(led) if led != NO_LIGHT else label.is_dark
 
 
 def test_all_ids_of_a_plan_differ() -> None:
     bracket = {"kind": "bracket", "exposures_us": [2000, 8000]}
     schedule = schedule_of(plan_of({"kind": "every", "every": 50}, exposure=bracket, repeats=3))
-    ids = Counter(shot for view in schedule.bursts for burst in view for shot in burst.shot_ids)
+    ids = Counter(shot for view in schedule.bursts for burst in view for shot in burst.shots)
     assert set(ids.values()) == {1}
     assert len(ids) == schedule.frames
 
@@ -128,7 +121,7 @@ def test_a_bracket_gives_one_burst_for_each_exposure_named_by_its_number() -> No
     bracket = {"kind": "bracket", "exposures_us": [2000, 8000, 32000]}
     bursts = schedule_of(plan_of({"kind": "ids", "ids": [9]}, exposure=bracket)).bursts[0]
     assert [b.timing.exposure_us for b in bursts] == [2000, 8000, 32000]
-    assert [label for b in bursts for label in b.labels if "led" in label] == [
+    assert [str(label) for b in bursts for label in b.labels if label.is_shot] == [
         "led0009/e0",
         "led0009/e1",
         "led0009/e2",
@@ -137,33 +130,37 @@ def test_a_bracket_gives_one_burst_for_each_exposure_named_by_its_number() -> No
 
 def test_repeats_after_the_first_are_named_by_their_number() -> None:
     bursts = schedule_of(plan_of({"kind": "ids", "ids": [9]}, repeats=3)).bursts[0]
-    assert [label for b in bursts for label in b.labels if "led" in label] == [
+    assert [str(label) for b in bursts for label in b.labels if label.is_shot] == [
         "led0009/e0",
         "led0009/e0/r1",
         "led0009/e0/r2",
     ]
 
 
+def labels(*texts: str) -> set[ShotLabel]:
+    return set(map(ShotLabel.parse, texts))
+
+
 def test_only_keeps_wanted_shots_and_all_marks() -> None:
-    burst = first_burst().only({"led0700/e0", "led0001/e0"})
+    burst = first_burst().only(labels("led0700/e0", "led0001/e0"))
     assert sorted(lit_leds(burst)) == [1, 700]
     assert len(burst.table) == MARKS + 2
 
 
 def test_only_drops_the_labels_of_marks_that_are_not_wanted() -> None:
-    burst = first_burst().only({"led0700/e0", "dark3/e0"})
-    assert [label for label in burst.labels if label] == ["dark3/e0", "led0700/e0"]
-    assert burst.shot_ids.count("") == MARKS - 1
+    burst = first_burst().only(labels("led0700/e0", "dark3/e0"))
+    assert [str(label) for label in burst.labels if label] == ["dark3/e0", "led0700/e0"]
+    assert burst.shots.count(None) == MARKS - 1
 
 
 def test_only_gives_the_marks_of_a_fresh_burst() -> None:
-    again = first_burst(darks_per_view=0).only({"led0007/e0"})
+    again = first_burst(darks_per_view=0).only(labels("led0007/e0"))
     fresh = first_burst({"kind": "ids", "ids": [7]}, darks_per_view=0)
     assert np.array_equal(again.table, fresh.table)
 
 
 def test_only_of_one_mark_is_a_burst_of_marks() -> None:
-    burst = first_burst().only({"dark0/e0"})
+    burst = first_burst().only(labels("dark0/e0"))
     assert len(burst.table) == MARKS
     assert not burst.is_light().any()
 
@@ -203,12 +200,12 @@ def test_panels_have_a_burst_each_and_no_led() -> None:
     bursts = schedule_of(plan_of({"kind": "panels", "panels": [2, 4]})).bursts[0]
     assert [b.panel for b in bursts] == [2, 4]
     assert all(lit_leds(b) == [] for b in bursts)
-    assert ["top/panel2/e0" in b.shot_ids for b in bursts] == [True, False]
+    assert ["top/panel2/e0" in list(map(str, b.shots)) for b in bursts] == [True, False]
 
 
 def test_the_marks_of_a_panels_burst_are_not_called_dark() -> None:
     burst = first_burst({"kind": "panels", "panels": [2]})
-    assert not any("dark" in label for label in burst.labels)
+    assert not any(label.is_dark for label in burst.labels)
     assert sum(burst.is_light()) == 1
 
 
@@ -326,4 +323,4 @@ def test_every_table_is_legal_for_the_box(lights: dict[str, Any], exposure_us: i
 
 
 def test_the_table_of_a_reshot_burst_is_legal_for_the_box() -> None:
-    assert_legal_for_the_box(first_burst().only({"led0007/e0", "led0008/e0"}).table)
+    assert_legal_for_the_box(first_burst().only(labels("led0007/e0", "led0008/e0")).table)

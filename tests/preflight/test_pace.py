@@ -9,9 +9,10 @@ import pytest
 from places import REPO
 
 from coupole.devices import NO_LIGHT
+from coupole.plan.bursts import FASTEST, Pace
 from coupole.plan.rig import BoardThermal, LedLimits
-from coupole.plan.shots import FASTEST, Pace
-from coupole.preflight.job import Job, check_job, read_job
+from coupole.preflight.checking import check_job
+from coupole.preflight.job import Job, at_pace, read_job
 from coupole.preflight.preflight import DISK_SHARE, StorageFacts
 
 ROOT = REPO
@@ -58,13 +59,13 @@ def test_boards_that_would_get_too_hot_set_the_pace_and_stay_below_their_limit(d
     assert timing.bound == "heat"
     assert report.refusals == []
     assert report.peak_board_c <= hot.limit_c
-    faster = job.at(replace(job.pace, led_duty=job.pace.led_duty / 0.9))
+    faster = at_pace(job, replace(job.pace, led_duty=job.pace.led_duty / 0.9))
     assert check_job(faster, StorageFacts(ROOMY, 4e9), paths=False)[0].pace == job.pace  # none faster would do
 
 
 def test_leds_that_must_rest_longer_set_the_pace(demo: Job) -> None:
     plan = demo.plan.model_copy(update={"lights": type(demo.plan.lights)(kind="all"), "repeats": 2})
-    again = with_limits(replace(demo, plan=plan).at(Pace(led_duty=0.999)), cooldown_ratio=2000.0)
+    again = with_limits(at_pace(replace(demo, plan=plan), Pace(led_duty=0.999)), cooldown_ratio=2000.0)
     _, report = check_job(again, StorageFacts(ROOMY, 4e9), paths=False)
     assert [timing.bound for timing in report.timings] == ["heat"]
     assert report.refusals == []
@@ -82,8 +83,8 @@ def test_a_job_at_another_pace_has_the_same_shots_without_the_same_hidden_lights
     view = demo.schedule.views[0].name
     hidden = {view: [3, 5]}
     skipping = replace(demo, schedule=demo.schedule.without(hidden), hidden_leds=hidden)
-    slower = skipping.at(Pace(disk_us=20_000))
+    slower = at_pace(skipping, Pace(disk_us=20_000))
     assert slower.schedule.bursts[0][0].labels == skipping.schedule.bursts[0][0].labels
     lit = slower.schedule.bursts[0][0].table["led"]
     assert not np.isin(lit[lit != NO_LIGHT], [3, 5]).any()
-    assert slower.at(FASTEST).schedule.bursts[0][0].duration_s == skipping.schedule.bursts[0][0].duration_s
+    assert at_pace(slower, FASTEST).schedule.bursts[0][0].duration_s == skipping.schedule.bursts[0][0].duration_s

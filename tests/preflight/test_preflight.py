@@ -15,10 +15,11 @@ from places import REPO
 
 from coupole.devices import NO_LIGHT
 from coupole.motion.itinerary import bodies_of, plan_itinerary
+from coupole.plan.bursts import MARKS
 from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
-from coupole.plan.shots import MARKS, Schedule, build_schedule
+from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.yamlfile import read
 from coupole.preflight import ledger
 from coupole.preflight.preflight import BURST_OVERHEAD_S, SETTLE_CHECK_S, Report, StorageFacts, check, upload_s

@@ -15,6 +15,7 @@ from archives import MadeRun, make_run
 from cells import SIDE, TOP, CellFolder
 
 from coupole.devices import FrameFormat
+from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file
 
 LARGE = FrameFormat(height_px=512, width_px=768, bit_depth=12, bayer_pattern="GBRG", black_dn=64, white_dn=4095)
@@ -34,7 +35,7 @@ def assert_frames_are_there(made: MadeRun) -> None:
     for shot, frame in made.run.proven().items():
         path = made.run.folder / frame.file
         pixels = frame_file.read_frame(path, frame_file.read_layout(path), frame.index)
-        assert pixels.tobytes() == made.frames[shot].tobytes(), shot
+        assert pixels.tobytes() == made.frames[str(shot)].tobytes(), shot
 
 
 # -- the commands -----------------------------------------------------------------------------------------
@@ -73,7 +74,10 @@ def test_archiving_what_is_wrong_on_the_disk_ends_with_six(tmp_path: Path) -> No
     made = make_run(tmp_path)
     path = made.run.view_path("side")
     with path.open("r+b") as file:
-        file.seek(frame_file.read_layout(path).data_offset + made.run.proven()["side/led0001/e0"].index * 24576)
+        file.seek(
+            frame_file.read_layout(path).data_offset
+            + made.run.proven()[ShotId.parse("side/led0001/e0")].index * 24576
+        )
         file.write(b"\xff\xff")
     ended = cells.here("archive", made.run.folder, "--json")
     assert (ended.code, ended.document["kind"]) == (6, "ChecksumMismatch")

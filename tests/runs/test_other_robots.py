@@ -11,8 +11,8 @@ import pytest
 from cells import SIDE, TOP, CellFolder
 from gige import gige_port, needs_aravis
 
-from coupole.plan.rig import planning_arm
-from coupole.preflight.job import read_cell
+from coupole.plan.cell import read_cell
+from coupole.plan.rig_devices import planning_arm
 
 EKI = "drivers.kuka.eki:KukaEki"
 UR = "drivers.ur:UrRobot"

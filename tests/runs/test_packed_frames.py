@@ -44,14 +44,14 @@ def test_packed_frames_are_read_with_numpy_as_the_file_says(made: MadeRun) -> No
     shot, frame = next(iter(made.run.proven().items()))
     with h5py.File(made.run.folder / frame.file) as file:
         assert "a[7:0], b[3:0] a[11:8], b[11:4]" in file[DATA].attrs["packing"]
-        assert np.array_equal(cells.unpacked(file[DATA][frame.index]), made.frames[shot])
+        assert np.array_equal(cells.unpacked(file[DATA][frame.index]), made.frames[str(shot)])
 
 
 def test_the_store_and_verify_read_packed_frames(made: MadeRun) -> None:
     for shot, frame in made.run.proven().items():
         path = made.run.folder / frame.file
         assert np.array_equal(
-            frame_file.read_frame(path, frame_file.read_layout(path), frame.index), made.frames[shot]
+            frame_file.read_frame(path, frame_file.read_layout(path), frame.index), made.frames[str(shot)]
         )
     assert cells.here("verify", made.run.folder).code == 0
 
@@ -64,7 +64,7 @@ def test_packed_frames_are_archived_as_whole_pixels(made: MadeRun) -> None:
     with h5py.File(made.run.folder / frame.file) as file:
         assert file[DATA].dtype == np.uint16
         assert "packing" not in file[DATA].attrs
-        assert np.array_equal(file[DATA][frame.index], made.frames[shot])
+        assert np.array_equal(file[DATA][frame.index], made.frames[str(shot)])
     assert cells.here("verify", made.run.folder).code == 0
 
 

@@ -141,10 +141,10 @@ def test_a_way_that_is_blocked_is_shown_where_it_first_touches(cell: CellFolder)
     cell.write(views=[{"kind": "joints", "name": "behind", "joints_deg": goal_deg.tolist()}])
     job = read_job(cell.plan)
     nowhere = Itinerary((None,), ("view behind: no way to it was found",), ())
-    scene = scene_of(job, nowhere, job.bodies, nowhere.refusals)
+    scene = scene_of(job, nowhere, job.motion.bodies, nowhere.refusals)
     (stop,) = scene.stops
     assert stop.clash is not None
-    assert job.bodies.contacts(stop.clash.joints_deg)[0] == stop.clash.contact
+    assert job.motion.bodies.contacts(stop.clash.joints_deg)[0] == stop.clash.contact
     home_deg = np.array(job.cell.rig.motion.home_joints_deg)
     along, whole = stop.clash.joints_deg - home_deg, goal_deg - home_deg
     share = float(along @ whole / (whole @ whole))
@@ -160,16 +160,16 @@ def _behind_something(job: Job) -> NDArray[np.float64]:
     home_deg = np.array(job.cell.rig.motion.home_joints_deg)
     while True:
         joints = random.uniform(*np.array(arm.limits_deg).T)
-        clear = not job.bodies.contacts(joints) and singularities.margin(arm, joints) >= 1.0
-        if clear and job.bodies.contact_on_the_way(home_deg, joints):
+        clear = not job.motion.bodies.contacts(joints) and singularities.margin(arm, joints) >= 1.0
+        if clear and job.motion.bodies.contact_on_the_way(home_deg, joints):
             return joints
 
 
 def test_views_are_numbered_in_the_order_of_visiting_and_refused_ones_come_last(cell: CellFolder) -> None:
     cell.write(views=[FAR, SIDE, TOP])
     job = read_job(cell.plan)
-    itinerary = job.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg)
-    stops = scene_of(job, itinerary, job.bodies, itinerary.refusals).stops
+    itinerary = job.motion.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg)
+    stops = scene_of(job, itinerary, job.motion.bodies, itinerary.refusals).stops
     expected = [job.schedule.views[index].name for index in itinerary.order]
     assert [stop.name for stop in stops] == [*expected, "far"]
     assert [stop.number for stop in stops] == [1, 2, 3]

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 from coupole.devices import FrameFormat
 from coupole.errors import ChecksumMismatch, InputError, StorageError, UnprovenError
+from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file
 from coupole.storage import run as run_module
 from coupole.storage.archive import KEPT_FOLDER, Archived, archive_run
@@ -113,7 +114,7 @@ def test_archived_frames_are_read_bit_exact_by_the_store(archived: MadeRun) -> N
     for shot, frame in archived.run.proven().items():
         path = archived.run.folder / frame.file
         pixels = frame_file.read_frame(path, frame_file.read_layout(path), frame.index)
-        assert np.array_equal(pixels, archived.frames[shot])
+        assert np.array_equal(pixels, archived.frames[str(shot)])
 
 
 def contents(path: Path) -> dict[str, Any]:
@@ -144,7 +145,7 @@ def test_frames_are_read_right_while_the_run_is_being_archived(made: MadeRun) ->
     archive_run(made.run, LZ4)
     for shot, frame in proven.items():
         pixels = frame_file.read_frame(made.run.folder / frame.file, layouts[frame.file], frame.index)
-        assert np.array_equal(pixels, made.frames[shot])
+        assert np.array_equal(pixels, made.frames[str(shot)])
 
 
 def test_all_but_the_frames_is_kept_as_it_was(made: MadeRun) -> None:
@@ -176,7 +177,7 @@ def test_an_archived_run_verifies(archived: MadeRun) -> None:
 @pytest.mark.parametrize("codec", list(CODECS))
 def test_verify_finds_a_flipped_byte_of_an_archive(made: MadeRun, codec: str) -> None:
     archive_run(made.run, CODECS[codec])
-    path, frame = made.run.view_path("top"), made.run.proven()["top/led0001/e0"]
+    path, frame = made.run.view_path("top"), made.run.proven()[ShotId.parse("top/led0001/e0")]
     with h5py.File(path) as file:
         chunk = file[DATA].id.get_chunk_info_by_coord((frame.index, 0, 0))
     flip_byte(path, chunk.byte_offset + chunk.size // 2)
@@ -296,14 +297,14 @@ def archive_is_refused(made: MadeRun, match: str, **options: Any) -> None:
 
 
 def test_a_frame_that_changed_on_the_disk_is_not_archived(made: MadeRun) -> None:
-    path, slot = made.run.view_path("top"), made.run.proven()["top/led0001/e0"].index
+    path, slot = made.run.view_path("top"), made.run.proven()[ShotId.parse("top/led0001/e0")].index
     layout = frame_file.read_layout(path)
     flip_byte(path, layout.data_offset + slot * layout.frame_bytes + 777)
     archive_is_refused(made, "top/led0001/e0 is not what was proven")
 
 
 def test_a_record_that_contradicts_the_journal_is_not_archived(made: MadeRun) -> None:
-    path, slot = made.run.view_path("top"), made.run.proven()["top/led0001/e0"].index
+    path, slot = made.run.view_path("top"), made.run.proven()[ShotId.parse("top/led0001/e0")].index
     flip_byte(path, frame_file.read_layout(path).table_offset + slot * frame_file.FRAME_DTYPE.itemsize + 12)
     archive_is_refused(made, f"slot {slot} is not recorded as top/led0001/e0")
 

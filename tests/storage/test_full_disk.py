@@ -17,6 +17,7 @@ from coupole.errors import DiskFull
 from coupole.storage import frame_file, journal
 from coupole.storage.frame_file import ViewWriter
 from coupole.storage.journal import Journal
+from coupole.storage.journal_events import FaultNoted, SessionStarted, SessionStopped
 
 
 @pytest.fixture
@@ -59,11 +60,11 @@ def test_the_space_of_a_view_is_its_own_though_the_disk_fills_up(small_disk: Pat
 def test_a_commit_on_a_full_disk_leaves_no_half_line(small_disk: Path) -> None:
     path = small_disk / "journal.jsonl"
     diary = Journal(path)
-    diary.write("start", plan="p")
+    diary.write(SessionStarted(simulated=True))
     diary.commit()
     before = path.read_bytes()
     fill(small_disk, 8192)
-    diary.write("fault", message="x" * 20_000)
+    diary.write(FaultNoted(kind="Test", message="x" * 20_000))
     with pytest.raises(DiskFull, match="Free space on it, then resume"):
         diary.commit()
     diary.close()
@@ -74,14 +75,14 @@ def test_lines_that_found_the_disk_full_never_count_and_later_ones_are_whole(sma
     path = small_disk / "journal.jsonl"
     diary = Journal(path)
     fill(small_disk, 4096)
-    diary.write("frame", shot="x" * 20_000)
+    diary.write(FaultNoted(kind="Test", message="x" * 20_000))
     with pytest.raises(DiskFull):
         diary.commit()
     (small_disk / "ballast").unlink()
-    diary.write("stop")
+    diary.write(SessionStopped(outcome="done"))
     diary.commit()
     diary.close()
-    assert [event["event"] for event in journal.read(path)] == ["stop"]
+    assert [event.event for event in journal.read(path)] == ["journal", "stop"]
 
 
 def test_a_journal_over_a_limit_of_the_system_leaves_no_half_line(tmp_path: Path) -> None:
@@ -89,8 +90,9 @@ def test_a_journal_over_a_limit_of_the_system_leaves_no_half_line(tmp_path: Path
     code = (
         "import sys; from pathlib import Path\n"
         "from coupole.storage.journal import Journal; from coupole.errors import StorageError\n"
-        "diary = Journal(Path(sys.argv[1])); diary.write('start'); diary.commit()\n"
-        "diary.write('fault', message='x' * 50_000)\n"
+        "from coupole.storage.journal_events import FaultNoted, SessionStarted\n"
+        "diary = Journal(Path(sys.argv[1])); diary.write(SessionStarted()); diary.commit()\n"
+        "diary.write(FaultNoted(kind='Test', message='x' * 50_000))\n"
         "try: diary.commit()\n"
         "except StorageError as error: print(type(error).__name__)\n"
     )
@@ -108,5 +110,5 @@ def test_a_journal_over_a_limit_of_the_system_leaves_no_half_line(tmp_path: Path
         env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
     )
     assert done.stdout.strip() == "StorageError"
-    assert [event["event"] for event in journal.read(path)] == ["start"]
+    assert [event.event for event in journal.read(path)] == ["journal", "start"]
     assert path.read_bytes().endswith(b"\n")

@@ -9,9 +9,11 @@ import pytest
 from view_files import frame, write_view
 
 from coupole.errors import InputError
+from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file, run
 from coupole.storage.frame_file import ViewWriter
 from coupole.storage.journal import Journal
+from coupole.storage.journal_events import FrameProven, SessionStarted
 from coupole.storage.run import Inputs, Run
 
 
@@ -29,7 +31,7 @@ def finished(tmp_path: Path, inputs: Inputs) -> Run:
     made = Run.create(tmp_path / "runs", "test", inputs, {"views": ["top"], "labels": labels})
     checksums = write_view(made.view_path("top"))
     diary = Journal(made.journal_path)
-    diary.write("start")
+    diary.write(SessionStarted())
     for slot, (shot, checksum) in enumerate(checksums.items()):
         prove_in(diary, shot, slot, f"{checksum:016x}")
     diary.commit()
@@ -38,7 +40,7 @@ def finished(tmp_path: Path, inputs: Inputs) -> Run:
 
 
 def prove_in(diary: Journal, shot: str, slot: int, checksum: str) -> None:
-    diary.write("frame", shot=shot, file="views/top.h5", index=slot, frame_id=100 + slot, xxh3=checksum)
+    diary.write(FrameProven(shot=shot, file="views/top.h5", index=slot, frame_id=100 + slot, xxh3=checksum))
 
 
 def test_a_whole_run_verifies(finished: Run) -> None:
@@ -79,7 +81,7 @@ def test_verify_finds_a_shot_that_stands_in_two_slots(finished: Run) -> None:
 
 def test_verify_finds_a_shot_that_was_proven_twice(finished: Run) -> None:
     diary = Journal(finished.journal_path)
-    proven = finished.proven()["top/led0001/e0"]
+    proven = finished.proven()[ShotId.parse("top/led0001/e0")]
     prove_in(diary, proven.shot, proven.index, proven.xxh3)
     diary.commit()
     diary.close()

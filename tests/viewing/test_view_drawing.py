@@ -11,7 +11,7 @@ from coupole.motion.occlusion import Sight, ray_mesh
 from coupole.viewing.view_canvas import Canvas, Lookout
 from coupole.viewing.view_colours import of_share
 from coupole.viewing.view_sight import footprint
-from coupole.viewing.view_solids import Solid, box, capsule, disk, joined, simplified, sphere
+from coupole.viewing.view_solids import Solid, box, capsule, disk, joined, sphere, with_fewer_faces
 
 BLUE, GREEN = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
 
@@ -46,10 +46,10 @@ def test_joined_solids_keep_all_their_faces() -> None:
 
 def test_a_simplified_mesh_has_fewer_faces_and_about_the_same_shape() -> None:
     fine = sphere("sphere", (5, 5, 5), 100, 200)
-    coarse = simplified(fine, 3000)
+    coarse = with_fewer_faces(fine, 3000)
     assert 300 < len(coarse.faces) <= 3000 < len(fine.faces)
     assert mesh_of(coarse).volume == pytest.approx(4 / 3 * np.pi * 100**3, rel=0.03)
-    assert simplified(coarse, 3000) is coarse
+    assert with_fewer_faces(coarse, 3000) is coarse
 
 
 @pytest.mark.parametrize("perspective", [True, False])

@@ -21,9 +21,9 @@ from coupole.errors import InputError
 from coupole.motion import singularities
 from coupole.motion.collisions import CellBodies
 from coupole.motion.itinerary import arm_of, bodies_of, plan_itinerary
+from coupole.plan.cell import Cell
 from coupole.plan.rig import Rig
-from coupole.plan.shots import ViewPose
-from coupole.preflight.job import Cell
+from coupole.plan.schedule import ViewPose
 
 _DRAWN = 60_000
 _MOST_CANDIDATES = 2_000

@@ -15,10 +15,10 @@ from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import About, about_of, frames_sha256, poses_and_attributes
 from coupole.errors import InputError
 from coupole.plan.led_table import LedTable
+from coupole.plan.shot_id import Led, ShotId
 from coupole.storage import frame_file
-from coupole.storage.run import ProvenFrame, Run, sha256
-
-_LED = "led"
+from coupole.storage.journal_events import FrameProven
+from coupole.storage.run import Run, sha256
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class LedImages:
 class _LedFrame:
     """One frame under one LED, the shortest exposed where there are several."""
 
-    shot: str
+    shot: ShotId
     led: int
     pose: tuple[str, int]
     """View's name, and number of the pose in it: an arm that was pushed aside has two."""
     exposure_us: int
-    frame: ProvenFrame
+    frame: FrameProven
 
 
 @dataclass
@@ -146,29 +146,21 @@ def _sightings(collected: _Collected) -> LedSightings:
     )
 
 
-def _by_view(run: Run) -> dict[str, list[ProvenFrame]]:
+def _by_view(run: Run) -> dict[str, list[FrameProven]]:
     """Proven frames of the views that have some under single LEDs."""
-    found: dict[str, list[ProvenFrame]] = {}
+    found: dict[str, list[FrameProven]] = {}
     for shot, frame in run.proven().items():
-        found.setdefault(shot.split("/")[0], []).append(frame)
-    return {
-        view: frames for view, frames in found.items() if any(_led(frame.shot) is not None for frame in frames)
-    }
+        found.setdefault(shot.view, []).append(frame)
+    return {view: frames for view, frames in found.items() if any(isinstance(f.shot.light, Led) for f in frames)}
 
 
-def _led(shot: str) -> int | None:
-    """The LED of a shot like `view/led0417/e0`; None for dark frames, panels and marks."""
-    light = shot.split("/")[1]
-    return int(light[len(_LED) :]) if light.startswith(_LED) and light[len(_LED) :].isdigit() else None
-
-
-def _single_leds(proven: Sequence[ProvenFrame], records: Any, view: str) -> list[_LedFrame]:
+def _single_leds(proven: Sequence[FrameProven], records: Any, view: str) -> list[_LedFrame]:
     """Frames under LEDs, of those of one LED at one pose the shortest exposed: spots are white in all of them."""
     shortest: dict[tuple[int, int], _LedFrame] = {}
     for frame in proven:
-        led = _led(frame.shot)
-        if led is None:
+        if not isinstance(frame.shot.light, Led):
             continue
+        led = frame.shot.light.id
         record = records[frame.index]
         pose = int(record["pose"])
         found = _LedFrame(frame.shot, led, (view, pose), int(record["exposure_us"]), frame)
@@ -178,12 +170,12 @@ def _single_leds(proven: Sequence[ProvenFrame], records: Any, view: str) -> list
     return list(shortest.values())
 
 
-def _dark_frames(proven: Sequence[ProvenFrame]) -> list[ProvenFrame]:
-    return [frame for frame in proven if frame.shot.split("/")[1].startswith("dark")]
+def _dark_frames(proven: Sequence[FrameProven]) -> list[FrameProven]:
+    return [frame for frame in proven if frame.shot.is_dark]
 
 
 def _darks(
-    path: Path, layout: frame_file.Layout, proven: Sequence[ProvenFrame], records: Any
+    path: Path, layout: frame_file.Layout, proven: Sequence[FrameProven], records: Any
 ) -> dict[int, Floats]:
     """Mean dark frame [H, W] for each exposure that has some, DN."""
     sums: dict[int, tuple[Floats, int]] = {}

@@ -90,7 +90,7 @@ def drift_outcome(
     Raises InputError: no view shows the tile, or as `fit_drift` does.
     """
     powers = read_powers(led_power)
-    lit = [frame for frame in frames.lit if frame.light.startswith("led")]
+    lit = [frame for frame in frames.lit if frame.led is not None]
     if not lit:
         raise InputError("drift: no frame under an LED in this run")
     read = TileReader(frames, setting, lit[0].read().shape)
@@ -106,7 +106,7 @@ def drift_outcome(
     for found in shown:
         view = read.view(found, tell)[CHANNEL]
         rows, _ = rows_of(0, view, setting.positions, setting.tile, setting.emission, remarks=remarks)
-        frame_of = {int(frame.light[3:]): frame for frame in found}
+        frame_of = {frame.led: frame for frame in found if frame.led is not None}
         readings += [
             _reading(frame_of[row.led], row.value, row.u, row.design, powers)
             for row in rows
@@ -153,16 +153,17 @@ def drift_outcome(
 
 def _by_view(lit: Sequence[LightFrame]) -> list[list[LightFrame]]:
     """Frames by view, exposure and repeat: each LED once."""
-    found: dict[tuple[str, ...], list[LightFrame]] = {}
+    found: dict[tuple[str, int, int], list[LightFrame]] = {}
     for frame in lit:
-        view, _, *which = frame.shot.split("/")
-        found.setdefault((view, *which), []).append(frame)
+        label = frame.shot.label
+        found.setdefault((frame.view, label.exposure, label.repeat), []).append(frame)
     return list(found.values())
 
 
 def _reading(frame: LightFrame, value: float, u: float, design: Floats, powers: Powers) -> Reading:
     """The tile under one LED against its calibrated power; `design` as `rows_of` has it."""
-    row = powers.row[int(frame.light[3:])]
+    assert frame.led is not None, "only frames under LEDs are read"
+    row = powers.row[frame.led]
     ratio, u_own = value / powers.power[row], float(powers.u_own[row])
     # The figures of the tile itself are those that the powers were calibrated with.
     ratio *= np.exp(-design[3] * powers.found["ln_reflectance"] - design[4] * powers.found["minnaert"])
@@ -171,7 +172,7 @@ def _reading(frame: LightFrame, value: float, u: float, design: Floats, powers: 
     common[powers.names.index("minnaert")] += design[4]
     noise = np.sqrt((u / value) ** 2 + u_own**2 + _FLASH**2) if value > 0 else 1.0
     return Reading(
-        frame.shot,
+        str(frame.shot),
         frame.t_s,
         _warmer_k(frame, powers),
         float(ratio),
@@ -189,7 +190,7 @@ def _shared_covariance(setting: Setting, powers: Powers) -> Floats:
 
 
 def _warmer_k(frame: LightFrame, powers: Powers) -> float:
-    row = powers.row.get(int(frame.light[3:]))
+    row = powers.row.get(frame.led) if frame.led is not None else None
     return float("nan") if row is None else frame.temperature_c - float(powers.board_c[row])
 
 

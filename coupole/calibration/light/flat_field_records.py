@@ -37,6 +37,7 @@ from coupole.calibration.report import Outcome
 from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
+from coupole.plan.shot_id import Light
 
 _BLOCKS = 64
 """Across the field."""
@@ -113,14 +114,14 @@ def flat_field_outcome(
     )
 
 
-def _brightest(frames: LightFrames) -> dict[tuple[str, str], list[LightFrame]]:
+def _brightest(frames: LightFrames) -> dict[tuple[str, Light], list[LightFrame]]:
     """Frames by view and light, of the longest exposure in which next to nothing is saturated.
 
     Raises InputError if that is so in fewer than three views.
     """
-    found: dict[tuple[str, str], list[LightFrame]] = {}
+    found: dict[tuple[str, Light], list[LightFrame]] = {}
     for frame in sorted(frames.lit, key=lambda frame: -frame.exposure_us):
-        mine = found.setdefault((frame.view, frame.light), [])
+        mine = found.setdefault((frame.view, frame.shot.light), [])
         usable = not mine and bool(np.mean(frame.read() >= frames.white_dn) < _MOST_SATURATED)
         if usable or (mine and mine[0].exposure_us == frame.exposure_us):
             mine.append(frame)

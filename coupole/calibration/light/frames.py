@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import About, about_of, frames_sha256, poses_and_attributes
 from coupole.errors import InputError
+from coupole.plan.shot_id import Led, PanelMark, ShotId
 from coupole.storage import frame_file
-from coupole.storage.run import ProvenFrame, Run, is_shot, sha256
+from coupole.storage.journal_events import FrameProven
+from coupole.storage.run import Run, sha256
 
 CHANNELS = ("R", "G", "B")
 
@@ -27,9 +29,7 @@ CHANNELS = ("R", "G", "B")
 class LightFrame:
     """One proven frame."""
 
-    shot: str
-    light: str
-    """`led0012`, `panel1`, or empty for a dark frame."""
+    shot: ShotId
     exposure_us: float
     t_s: float
     """Of its trigger, on the box's clock."""
@@ -44,7 +44,12 @@ class LightFrame:
 
     @property
     def view(self) -> str:
-        return self.shot.split("/")[0]
+        return self.shot.view
+
+    @property
+    def led(self) -> int | None:
+        """Id of the LED that shone; None under a panel or in the dark."""
+        return self.shot.light.id if isinstance(self.shot.light, Led) else None
 
 
 @dataclass(frozen=True)
@@ -64,11 +69,11 @@ class LightFrames:
 
     @property
     def lit(self) -> tuple[LightFrame, ...]:
-        return tuple(frame for frame in self.frames if frame.light)
+        return tuple(frame for frame in self.frames if frame.shot.is_shot)
 
     @property
     def dark(self) -> tuple[LightFrame, ...]:
-        return tuple(frame for frame in self.frames if not frame.light)
+        return tuple(frame for frame in self.frames if not frame.shot.is_shot)
 
     @cached_property
     def size_px(self) -> tuple[int, int]:
@@ -128,18 +133,17 @@ def temperatures_of(frames: Sequence[LightFrame]) -> tuple[float, float] | None:
     return (min(known), max(known)) if known else None
 
 
-def _by_view(run: Run) -> dict[Path, list[ProvenFrame]]:
+def _by_view(run: Run) -> dict[Path, list[FrameProven]]:
     """Proven frames by their view's file, marks left out: they are dark, but end when their light may glow."""
-    found: dict[Path, list[ProvenFrame]] = {}
+    found: dict[Path, list[FrameProven]] = {}
     for shot, frame in run.proven().items():
-        light = shot.split("/")[1]
-        if "mark" not in light:
-            found.setdefault(run.view_path(shot.split("/")[0]), []).append(frame)
+        if not isinstance(shot.light, PanelMark):
+            found.setdefault(run.view_path(shot.view), []).append(frame)
     return found
 
 
 def _of_view(
-    run: Run, path: Path, proven: Sequence[ProvenFrame]
+    run: Run, path: Path, proven: Sequence[FrameProven]
 ) -> tuple[list[LightFrame], tuple[str, int, int, float, float, About]]:
     layout, table, facts = frame_file.read_layout(path), frame_file.read_frames(path), frame_file.read_facts(path)
     poses, attributes = poses_and_attributes(path)
@@ -150,7 +154,6 @@ def _of_view(
         frames.append(
             LightFrame(
                 frame.shot,
-                frame.shot.split("/")[1] if is_shot(frame.shot) else "",
                 float(record["exposure_us"]),
                 float(record["t_trigger_ns"]) * 1e-9,
                 decicelsius / 10.0 if decicelsius else float("nan"),

@@ -25,7 +25,7 @@ from coupole.errors import InputError
 
 def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, progress: Progress) -> Outcome:
     """Power of each LED per channel, from the tile's views. Raises InputError as `calibrate_led_power` does."""
-    lit = [frame for frame in frames.lit if frame.light.startswith("led")]
+    lit = [frame for frame in frames.lit if frame.led is not None]
     if not lit:
         raise InputError("LED power: no frame under an LED; acquire `coupole plan new spectralon`")
     channels = channels_of(frames.pattern)
@@ -73,7 +73,8 @@ def board_temperatures(lit: Sequence[LightFrame]) -> dict[int, float]:
     """Mean temperature of each LED's board over its frames, C: where its power holds; NaN where none is known."""
     seen: dict[int, list[float]] = {}
     for frame in lit:
-        seen.setdefault(int(frame.light[3:]), []).append(frame.temperature_c)
+        assert frame.led is not None, "only frames under LEDs are read"
+        seen.setdefault(frame.led, []).append(frame.temperature_c)
     return {led: float(np.mean(celsius)) for led, celsius in seen.items()}
 
 

@@ -91,7 +91,7 @@ class TileReader:
                 seen[channel][:, n] = mean, u
                 saturated[n] |= full
             tell()
-        leds = np.array([int(frame.light[3:]) for frame in found])
+        leds = np.array([frame.led for frame in found], dtype=np.int64)
         return {
             channel: TileView(
                 found[0].view,

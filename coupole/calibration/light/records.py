@@ -46,6 +46,7 @@ from coupole.calibration.report import Outcome
 from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
+from coupole.plan.shot_id import Light
 
 Progress = Callable[[int, int], None]
 _MOST_PIXELS = 200_000
@@ -96,7 +97,7 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
     """Dark frames of runs: maps of offset and current, noise, hot pixels."""
     if not frames.dark:
         raise InputError("dark: no dark frame in these runs; acquire `coupole plan new darks`")
-    listed = [DarkFrame(f.shot, f.exposure_us * 1e-6, f.temperature_c, f.read) for f in frames.dark]
+    listed = [DarkFrame(str(f.shot), f.exposure_us * 1e-6, f.temperature_c, f.read) for f in frames.dark]
     dark = calibrate_dark(listed, white_dn=frames.white_dn, progress=progress)
     height, width = dark.offset_dn.shape
     pixels = height * width
@@ -219,7 +220,7 @@ def response_outcome(
             raw_a, raw_b, under = first[take], second[take], black[take]
             full = np.maximum(raw_a, raw_b) >= frames.white_dn
             a, b = (np.subtract(raw, under, dtype=np.float64) for raw in (raw_a, raw_b))
-            pairs[channel].append(Pair(found[0].shot, exposure_us, a, b, full))
+            pairs[channel].append(Pair(str(found[0].shot), exposure_us, a, b, full))
         progress(number + 1, len(by_exposure))
     range_dn = float(frames.white_dn - frames.black_dn)
     transfers = {channel: photon_transfer(pairs[channel]) for channel in channels}
@@ -267,9 +268,9 @@ def _one_scene(frames: LightFrames) -> list[LightFrame]:
     """The frames of one view under one light: of the light that most were taken with."""
     if not frames.lit:
         raise InputError("response: no frame with light; acquire `coupole plan new response`")
-    counted: dict[tuple[str, str], list[LightFrame]] = {}
+    counted: dict[tuple[str, Light], list[LightFrame]] = {}
     for frame in frames.lit:
-        counted.setdefault((frame.view, frame.light), []).append(frame)
+        counted.setdefault((frame.view, frame.shot.light), []).append(frame)
     return max(counted.values(), key=len)
 
 

@@ -40,6 +40,7 @@ from coupole.calibration.stickers.points import corrected, views_of
 from coupole.calibration.stickers.sources import Scan, StickerImages
 from coupole.errors import InputError
 from coupole.geometry import Transform, inverse
+from coupole.scan.simplify import simplified
 
 _LEAST_SIGMA_PX = 0.02
 _MOST_FACES = 1_000_000
@@ -127,11 +128,9 @@ def outline_px(found: MeshFound, mesh: Path) -> Floats:
     that do not: its outline, and that of what stands out of it."""
     import trimesh
 
-    from coupole.viewing.view_solids import Solid, simplified
-
     whole = trimesh.load_mesh(mesh, process=False)
-    coarse = simplified(Solid("mesh", np.asarray(whole.vertices), np.asarray(whole.faces)), _MOST_FACES)
-    scanned = trimesh.Trimesh(coarse.vertices_mm, coarse.faces, process=False)
+    coarse = simplified(np.asarray(whole.vertices), np.asarray(whole.faces), _MOST_FACES)
+    scanned = trimesh.Trimesh(*coarse, process=False)
     eye_mm = inverse(found.camera_from_mesh)[:3, 3]
     corners = np.asarray(scanned.triangles)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from places import REPO
 
+from coupole.appearance.render import studio
 from coupole.appearance.render.rendering import opened
-from coupole.commands.render import render
-from coupole.commands.render_scene import STUDIO, read_scene, render_scene
+from coupole.commands.render_scene import read_scene, render, render_scene
 from coupole.errors import InputError, StorageError
-from coupole.plan.rig import load_class
 
 pytest.importorskip("mitsuba")
 pytest.importorskip("colour")
@@ -54,7 +53,7 @@ def written(folder: Path, text: str = SMALL) -> Path:
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_every_shipped_scene_renders(path: Path, tmp_path: Path) -> None:
     document, scene = read_scene(path)
-    small = load_class(STUDIO).reduced(scene, samples=1, width_px=16, step_nm=40)
+    small = studio.reduced(scene, samples=1, width_px=16, step_nm=40)
     if small.caustic is not None:
         small = small.model_copy(update={"caustic": small.caustic.model_copy(update={"photons": 20_000})})
     summary = render_scene(document, small, tmp_path, lambda camera, done, total: None)

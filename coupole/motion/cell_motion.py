@@ -1,0 +1,68 @@
+"""The arm in its cell: bodies, paths and occlusion, computed when first asked for and kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.motion.collisions import CellBodies
+from coupole.motion.itinerary import Itinerary, bodies_of, plan_itinerary
+from coupole.motion.occlusion import Occlusion, Occlusions, occlusions_of
+from coupole.plan.cell import Cell
+from coupole.plan.schedule import ViewPose
+
+_SAME_PLACE_DEG = 1e-3
+
+
+class CellMotion:
+    """What depends on the cell and the object alone, for all views of a plan."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        object_corners_mm: NDArray[np.float64],
+        targets_mm: Sequence[Sequence[float]],
+        order: Literal["fastest", "as_written"],
+    ) -> None:
+        """`object_corners_mm` [triangles, 3, 3] and `targets_mm` are in the support frame; the targets stand for
+        the object where it has no mesh."""
+        self._cell, self._object_corners_mm, self._order = cell, object_corners_mm, order
+        self._targets_mm = targets_mm
+        self._planned: list[tuple[tuple[str, ...], Sequence[float], Itinerary]] = []
+
+    @cached_property
+    def bodies(self) -> CellBodies:
+        """Arm, tool and everything that they must not touch."""
+        meshes = self._cell.rig.link_meshes
+        folder: Path | None = self._cell.document.resolve(meshes) if meshes else None
+        return bodies_of(self._cell.rig, self._cell.leds, self._object_corners_mm, folder)
+
+    @cached_property
+    def occlusions(self) -> Occlusions:
+        """What the object, and in each posture arm and tool, hide of the LEDs."""
+        targets = self._targets_mm or [(0.0, 0.0, 0.0)]
+        return occlusions_of(self._cell.rig, self._cell.leds, self._object_corners_mm, targets)
+
+    def occluded_leds(self, occlusion: Occlusion) -> list[int]:
+        """Ids of the LEDs that reach nothing of what a view sees."""
+        return [int(led) for led in self._cell.leds.ids[occlusion.occluded_leds()]]
+
+    def itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
+        """Paths to views from where the arm stands, clear of everything; kept, so that what preflight planned
+        from home need not be planned again where the arm does stand there."""
+        names = tuple(view.name for view in views)
+        for planned_names, planned_deg, itinerary in self._planned:
+            if planned_names == names and np.allclose(planned_deg, start_deg, rtol=0, atol=_SAME_PLACE_DEG):
+                return itinerary
+        itinerary = plan_itinerary(views, self._cell.rig, self.bodies, start_deg, self._order)
+        self._planned.append((names, tuple(start_deg), itinerary))
+        return itinerary
+
+    def unchecked_itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
+        """Postures and durations as if nothing stood in the way."""
+        return plan_itinerary(views, self._cell.rig, None, start_deg, self._order)

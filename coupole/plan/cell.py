@@ -1,0 +1,61 @@
+"""The cell: a rig file, read and checked with everything that it names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from coupole.errors import InputError
+from coupole.plan import yamlfile
+from coupole.plan.led_table import LedTable, read_led_table
+from coupole.plan.link_meshes import missing_link_meshes
+from coupole.plan.rig import Rig
+from coupole.plan.rig_devices import driver_problems, renamed_drivers
+from coupole.plan.yamlfile import Document
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A rig file, read, with its dome."""
+
+    rig: Rig
+    document: Document
+    leds: LedTable
+    remarks: tuple[str, ...] = ()
+    """What the operator should know of the file though it is right."""
+
+    @property
+    def leds_path(self) -> Path:
+        return self.document.resolve(self.rig.dome.leds)
+
+    @property
+    def storage_folder(self) -> Path:
+        return self.document.resolve(self.rig.storage.folder)
+
+
+def read_cell(path: Path) -> Cell:
+    """Read a rig and its dome. Raises InputError with all problems."""
+    document = yamlfile.read(path)
+    rig, problems = document.problems(Rig)
+    if rig is None:
+        raise InputError(problems)
+    problems = driver_problems(document, rig)
+    leds: LedTable | None = None
+    leds_path = document.resolve(rig.dome.leds)
+    if not leds_path.is_file():
+        problems.append(document.problem(("dome", "leds"), f"expected the dome's CSV; there is no {leds_path}"))
+    else:
+        try:
+            leds = read_led_table(leds_path)
+        except InputError as error:
+            problems += error.problems
+    if rig.storage.pixels == "packed12" and (rig.sensor.bit_depth > 12 or rig.sensor.width_px % 2):
+        why = f"expected an even width and 12 bits at most, found {rig.sensor.width_px} and {rig.sensor.bit_depth}"
+        problems.append(document.problem(("storage", "pixels"), f"frames cannot be packed: {why}"))
+    if rig.link_meshes is not None and (missing := missing_link_meshes(document.resolve(rig.link_meshes))):
+        problems.append(
+            document.problem(("link_meshes",), f"expected the links' meshes; there is no {missing[0]}")
+        )
+    if problems or leds is None:
+        raise InputError(problems)
+    return Cell(rig, document, leds, tuple(renamed_drivers(document)))

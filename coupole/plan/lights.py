@@ -1,0 +1,94 @@
+"""Which LEDs a plan's `lights:` are, in a dome's table."""
+
+from __future__ import annotations
+
+from typing import assert_never
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.geometry import Transform, direction, inverse
+from coupole.plan.led_table import LedTable
+from coupole.plan.plan import (
+    AllLights,
+    EveryLight,
+    LightBoards,
+    LightCone,
+    LightIds,
+    Lights,
+    NoLights,
+    Panels,
+    Plan,
+)
+
+
+def leds_of_plan(plan: Plan, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
+    """Rows of the LED table that any view of the plan lights. Raises KeyError as `select_leds`."""
+    rows = [select_leds(view.lights or plan.lights, leds, base_from_support) for view in plan.views]
+    return np.unique(np.concatenate(rows))
+
+
+def select_leds(lights: Lights, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
+    """Rows of the LED table that are lit, in the order of the table; none for panels and darks.
+
+    Raises KeyError for an LED or a board that the dome does not have (`missing_lights` says it better).
+    """
+    match lights:
+        case AllLights():
+            return np.arange(len(leds.ids))
+        case LightIds(ids=ids):
+            return leds.rows(ids)
+        case LightBoards(boards=boards):
+            if unknown := set(boards) - set(leds.boards.tolist()):
+                raise KeyError(min(unknown))
+            return np.flatnonzero(np.isin(leds.boards, boards))
+        case EveryLight(every=every, offset=offset):
+            return np.arange(offset, len(leds.ids), every)
+        case LightCone() as cone:
+            position = (leds.positions_mm - base_from_support[:3, 3]) @ inverse(base_from_support)[:3, :3].T
+            towards = position / np.linalg.norm(position, axis=1, keepdims=True)
+            cosine = towards @ direction(cone.azimuth_deg, cone.elevation_deg)
+            return np.flatnonzero(cosine >= np.cos(np.radians(cone.half_angle_deg)))
+        case Panels() | NoLights():
+            return np.zeros(0, np.int64)
+        case _:
+            assert_never(lights)
+
+
+def missing_lights(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
+    """Key path and message for each light of the plan that the dome does not have."""
+    own = [(("views", i, "lights"), view.lights) for i, view in enumerate(plan.views) if view.lights is not None]
+    return [
+        (where + key, message)
+        for where, lights in [(("lights",), plan.lights), *own]
+        for key, message in _missing(lights, leds)
+    ]
+
+
+def _missing(lights: Lights, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
+    match lights:
+        case LightIds(ids=ids):
+            have, key, what = set(leds.ids.tolist()), "ids", "LED"
+            asked: tuple[int, ...] = ids
+        case LightBoards(boards=boards):
+            have, key, what, asked = set(leds.boards.tolist()), "boards", "board", boards
+        case EveryLight(offset=offset) if offset >= len(leds.ids):
+            return [(("offset",), f"expected less than the dome's {len(leds.ids)} LEDs, found {offset}")]
+        case AllLights() | EveryLight() | LightCone() | Panels() | NoLights():
+            return []
+        case _:
+            assert_never(lights)
+    return [
+        ((key, i), f"the dome has no {what} {n}; it has {min(have)} to {max(have)}")
+        for i, n in enumerate(asked)
+        if n not in have
+    ]
+
+
+def interleave(boards: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Order of LEDs [n] in which neighbours in time sit on different boards: one LED of each board in turn."""
+    turn = np.zeros(len(boards), np.int64)
+    for board in np.unique(boards):
+        mine = np.flatnonzero(boards == board)
+        turn[mine] = np.arange(len(mine))
+    return np.lexsort((boards, turn))

@@ -1,0 +1,18 @@
+"""Where a folder of link meshes keeps the mesh of each link."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+LINKS = 7
+"""The base and six links."""
+
+
+def link_mesh_path(folder: Path, link: int) -> Path:
+    """`base_link.stl` for link 0, `link_1.stl` to `link_6.stl` for the others."""
+    return folder / (f"link_{link}.stl" if link else "base_link.stl")
+
+
+def missing_link_meshes(folder: Path) -> list[Path]:
+    """Files that a folder of link meshes lacks."""
+    return [path for link in range(LINKS) if not (path := link_mesh_path(folder, link)).is_file()]

@@ -1,0 +1,84 @@
+"""A plan and the files that it names, read together: every mistake in them is found at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from coupole.errors import InputError, Problem
+from coupole.plan import yamlfile
+from coupole.plan.cell import Cell, read_cell
+from coupole.plan.lights import missing_lights
+from coupole.plan.plan import Plan
+from coupole.plan.rig import Rig
+from coupole.plan.schedule import names_too_long
+from coupole.plan.yamlfile import Document
+
+
+@dataclass(frozen=True)
+class PlanFiles:
+    """A plan as it was written, with its cell, and where the other files lie that it names."""
+
+    plan: Plan
+    document: Document
+    cell: Cell
+    mesh_path: Path | None
+    """The object's mesh; it is there."""
+    record_paths: tuple[Path, ...] | None
+    """The calibrations that plan or rig want in force; None if they want none."""
+
+
+def read_plan(plan_path: Path, rig_path: Path | None = None) -> PlanFiles:
+    """Read a plan with its rig, or with another one. Raises InputError with all problems of all files."""
+    document = yamlfile.read(plan_path)
+    plan, problems = document.problems(Plan)
+    cell: Cell | None = None
+    rig_path = rig_path or _named_rig(document)
+    if rig_path is not None and not rig_path.is_file():
+        problems.append(document.problem(("rig",), f"expected a rig file; there is no {rig_path}"))
+    elif rig_path is not None:
+        try:
+            cell = read_cell(rig_path)
+        except InputError as error:
+            problems += error.problems
+    if plan is None or cell is None:
+        raise InputError(problems)
+    wrong = missing_lights(plan, cell.leds) + names_too_long(plan, cell.leds)
+    problems += [document.problem(key, message) for key, message in wrong]
+    mesh_path = document.resolve(plan.object.mesh) if plan.object and plan.object.mesh else None
+    if mesh_path is not None and not mesh_path.is_file():
+        message = f"expected a mesh file (PLY, STL, OBJ); there is no {mesh_path}"
+        problems.append(document.problem(("object", "mesh"), message))
+    record_paths, missing = _named_records(document, plan, cell)
+    problems += missing
+    problems += _bad_exposures(document, plan, cell.rig)
+    if problems:
+        raise InputError(problems)
+    return PlanFiles(plan, document, cell, mesh_path, record_paths)
+
+
+def _named_rig(document: Document) -> Path | None:
+    named = document.data.get("rig")
+    return document.resolve(Path(named)) if isinstance(named, str) else None
+
+
+def _named_records(document: Document, plan: Plan, cell: Cell) -> tuple[tuple[Path, ...] | None, list[Problem]]:
+    """Files of the records that the plan names, or else its rig, None if it wants none; and which are missing."""
+    named = plan.calibrations
+    if named is None:
+        document, named = cell.document, cell.rig.calibrations
+    if named == "none":
+        return None, []
+    paths = tuple(document.resolve(path) for path in named)
+    return paths, [
+        document.problem(("calibrations", i), f"expected a calibration record; there is no {path}")
+        for i, path in enumerate(paths)
+        if not path.is_file()
+    ]
+
+
+def _bad_exposures(document: Document, plan: Plan, rig: Rig) -> list[Problem]:
+    """What no order of shots could make right."""
+    if plan.trigger == "software" and rig.led_limits.on_us[1] < max(plan.exposure.exposures_us):
+        return [document.problem(("exposure",), "longer than the rig's LEDs may be on")]
+    return []

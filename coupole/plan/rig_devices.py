@@ -1,0 +1,162 @@
+"""What a rig's devices are opened with: driver and settings of each, in a run or in a rehearsal; and what is wrong
+with them.
+
+A device is opened as the rig names it, or as its twin in a dry run. A world, where there is one, fills in
+addresses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from pydantic import BaseModel
+
+from coupole.errors import Problem
+from coupole.kinematics import Arm
+from coupole.plan.registry import (
+    CAMERA_STAND_INS,
+    DEFAULT_TWINS,
+    RENAMED,
+    ROBOT_STAND_INS,
+    WORLD,
+    StandIn,
+    load_class,
+    settings_class,
+)
+from coupole.plan.rig import Device, DriverName, Rig
+from coupole.plan.yamlfile import Document
+
+DEVICES = ("ledbox", "camera", "robot")
+NOWHERE = {
+    "ledbox": {"port": "loop://"},
+    "camera": {"address": "/nowhere"},
+    "robot": {"listen": "127.0.0.1:0", "address": "127.0.0.1:0", "host": "127.0.0.1"},
+}
+"""Stands for what a world's endpoint will fill in, while settings are checked and no world runs yet."""
+_MOTION_SETTINGS = {
+    "speed_fraction": "speed_fraction",
+    "acceleration_deg_s2": "acceleration_deg_s2",
+    "jerk_deg_s3": "jerk_deg_s3",
+    "settle_dwell_s": "dwell_s",
+}
+"""Figures of the rig's `motion:` and the settings of a robot's driver that they become."""
+
+
+def planning_arm(rig: Rig) -> Arm | None:
+    """The arm that the robot's driver moves, at the speeds that the rig gives it; None where the driver knows no
+    model of it, so that neither postures nor collisions can be reckoned."""
+    driver, settings = device_for(rig, "robot", dry_run=False)
+    model = settings_class(driver)
+    described = model(**_known(NOWHERE["robot"], model) | settings)
+    arm: Arm | None = described.arm() if hasattr(described, "arm") else None
+    return arm
+
+
+def in_world(rig: Rig, *, dry_run: bool) -> bool:
+    """True if the rig's devices are stand-ins in a world."""
+    return dry_run or (rig.world is not None and rig.world.serves == "always")
+
+
+def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[str, Any]]:
+    """Driver and settings to open for a device: its twin in a dry run, itself otherwise."""
+    device: Device = getattr(rig, kind)
+    settings = dict(device.settings)
+    driver = device.driver
+    if dry_run and device.twin is not None:
+        driver, settings = device.twin.driver, dict(device.twin.settings)
+    elif dry_run and not (rig.world is not None and rig.world.serves == "always"):
+        driver = driver if driver in ROBOT_STAND_INS else DEFAULT_TWINS[kind]
+        settings = _known(settings, settings_class(driver))
+    if kind == "robot":
+        settings = _known(_motion_settings(rig), settings_class(driver)) | settings
+    return driver, settings
+
+
+def stand_in_for(rig: Rig, *, dry_run: bool) -> StandIn:
+    """What this rig's world has at the other end of the robot's wire: of its driver, or of its driver's twin where
+    the world takes no part but in dry runs. Of a driver that did not come with Coupole the rig must say it."""
+    driver, _ = device_for(rig, "robot", dry_run=dry_run or not in_world(rig, dry_run=False))
+    told = rig.world.settings.get("robot") if rig.world else None
+    return ROBOT_STAND_INS.get(driver) or StandIn(told.get("kind", "rsi") if isinstance(told, dict) else "rsi")
+
+
+def camera_kind(rig: Rig, *, dry_run: bool) -> str:
+    """Which camera this rig's world has at the other end of the driver's wire."""
+    driver, _ = device_for(rig, "camera", dry_run=dry_run or not in_world(rig, dry_run=False))
+    return CAMERA_STAND_INS.get(driver, "memory")
+
+
+def driver_problems(document: Document, rig: Rig) -> list[Problem]:
+    """Drivers that cannot be found and settings that their drivers do not take."""
+    problems = []
+    for kind in DEVICES:
+        device: Device = getattr(rig, kind)
+        for at, part, has_endpoint in (
+            ((kind,), device, in_world(rig, dry_run=False)),
+            ((kind, "twin"), device.twin, True),
+        ):
+            if part is not None:
+                given = NOWHERE[kind] if has_endpoint else {}
+                if kind == "robot":
+                    given = given | _motion_settings(rig)
+                problems += _settings_problems(document, at, part.driver, given)
+    if rig.world is not None:
+        problems += world_problems(document, rig, rig.world.settings)
+        told, kind = rig.world.settings.get("camera"), camera_kind(rig, dry_run=False)
+        if isinstance(told, dict) and told.get("kind", kind) != kind:
+            message = f"expected {kind}, which is at the other end of the camera's driver"
+            problems.append(document.problem(("world", "settings", "camera", "kind"), message))
+    return problems
+
+
+def world_problems(document: Document, rig: Rig, settings: Mapping[str, Any]) -> list[Problem]:
+    """What is wrong with the settings of the rig's world, with what follows from the rig filled in."""
+    stand_in, robot = stand_in_for(rig, dry_run=False), settings.get("robot", {})
+    if isinstance(robot, dict):
+        if robot.get("kind", stand_in.kind) != stand_in.kind:
+            message = f"expected {stand_in.kind}, which is at the other end of the robot's driver"
+            return [document.problem(("world", "settings", "robot", "kind"), message)]
+        robot = {"kind": stand_in.kind, **robot}
+    camera = settings.get("camera", {})
+    if isinstance(camera, dict):
+        camera = {"kind": camera_kind(rig, dry_run=False), **camera}
+    completed_settings = {**settings, "robot": robot, "camera": camera}
+    completed = replace(document, data={**document.data, "world": {"settings": completed_settings}})
+    return _settings_problems(completed, ("world",), rig.world.driver if rig.world else WORLD, {})
+
+
+def _settings_problems(
+    document: Document, at: tuple[str, ...], driver: DriverName, given: dict[str, Any]
+) -> list[Problem]:
+    try:
+        load_class(driver)
+        model = settings_class(driver)
+    except (ImportError, AttributeError) as error:
+        return [document.problem((*at, "driver"), f"cannot find `{driver}`: {error}")]
+    return document.problems(model, (*at, "settings"), given=_known(given, model))[1]
+
+
+def _motion_settings(rig: Rig) -> dict[str, Any]:
+    """What the rig's `motion:` says to a robot's driver."""
+    return {setting: getattr(rig.motion, figure) for figure, setting in _MOTION_SETTINGS.items()}
+
+
+def _known(settings: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
+    """Of these settings those that the model has."""
+    return {name: value for name, value in settings.items() if name in model.model_fields}
+
+
+def renamed_drivers(document: Document) -> list[str]:
+    """A remark for each class that the rig's file names as version 0.1 did."""
+    places: list[tuple[str | int, ...]] = [(*at, "driver") for at in (*((kind,) for kind in DEVICES), ("world",))]
+    places += [(kind, "twin", "driver") for kind in DEVICES]
+    remarks = []
+    for place in places:
+        value: Any = document.data
+        for key in place:
+            value = value.get(key) if isinstance(value, dict) else None
+        if isinstance(value, str) and value in RENAMED:
+            remarks.append(str(document.problem(place, f"`{value}` is now called `{RENAMED[value]}`")))
+    return remarks

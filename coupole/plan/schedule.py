@@ -1,0 +1,143 @@
+"""From plan to ordered views and their bursts. Pure: no device, no file."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from coupole.geometry import Transform, look_at
+from coupole.plan.bursts import FASTEST, MARKS, Burst, Pace, burst_timing, bursts_of_exposure
+from coupole.plan.led_table import LedTable
+from coupole.plan.lights import interleave, select_leds
+from coupole.plan.plan import Grid, Joints, Lights, LookAt, Panels, Plan, View
+from coupole.plan.shot_id import MAX_CHARACTERS, Led, Panel, PanelMark, ShotLabel
+
+
+@dataclass(frozen=True)
+class ViewPose:
+    """One place of the camera: where it looks from, or the joint angles that say so."""
+
+    name: str
+    support_from_camera: Transform | None
+    joints_deg: tuple[float, ...] | None
+    target_mm: tuple[float, float, float] | None
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Everything that a plan asks for, in order."""
+
+    views: tuple[ViewPose, ...]
+    bursts: tuple[tuple[Burst, ...], ...]
+    """Bursts of each view."""
+    labels: tuple[tuple[ShotLabel, ...], ...]
+    """Of all frames that each view can have, before any was left out, in the order of its bursts."""
+
+    @property
+    def shots(self) -> int:
+        """Frames under a light, darks and marks apart."""
+        return sum(int(b.is_light().sum()) for bursts in self.bursts for b in bursts)
+
+    @property
+    def frames(self) -> int:
+        return sum(len(b.labels) for bursts in self.bursts for b in bursts)
+
+    def without(self, hidden: Mapping[str, Collection[int]]) -> Schedule:
+        """The same without some LEDs in some views (LED ids by name of view)."""
+        return Schedule(
+            self.views,
+            tuple(
+                tuple(b.without(hidden[view.name]) for b in bursts) if hidden.get(view.name) else bursts
+                for view, bursts in zip(self.views, self.bursts, strict=True)
+            ),
+            self.labels,
+        )
+
+
+def expand_view(view: View) -> list[ViewPose]:
+    """The poses that one entry of a plan's views stands for: a grid has many."""
+    match view:
+        case LookAt():
+            pose = look_at(view.target_mm, view.distance_mm, view.azimuth_deg, view.elevation_deg, view.roll_deg)
+            return [ViewPose(view.name, pose, None, view.target_mm)]
+        case Grid():
+            return [
+                ViewPose(
+                    f"{view.name}-az{azimuth:g}-el{elevation:g}",
+                    look_at(view.target_mm, view.distance_mm, azimuth, elevation, view.roll_deg),
+                    None,
+                    view.target_mm,
+                )
+                for elevation in view.elevations_deg
+                for azimuth in view.azimuths_deg
+            ]
+        case Joints():
+            return [ViewPose(view.name, None, view.joints_deg, None)]
+
+
+def build_schedule(
+    plan: Plan,
+    leds: LedTable,
+    base_from_support: Transform,
+    *,
+    rise_us: int,
+    readout_us: float,
+    exposure_gap_us: int,
+    pace: Pace = FASTEST,
+) -> Schedule:
+    """All bursts of all views. Tables are shared between views: the box need not be loaded anew."""
+    bursts_of: dict[Lights, list[Burst]] = {}
+    views: list[ViewPose] = []
+    bursts: list[list[Burst]] = []
+    hardware = plan.trigger == "hardware"
+    for view in plan.views:
+        lights = view.lights or plan.lights
+        if lights not in bursts_of:
+            lit = _lit(lights, leds, base_from_support)
+            bursts_of[lights] = [
+                burst
+                for repeat in range(plan.repeats)
+                for index, exposure_us in enumerate(plan.exposure.exposures_us)
+                for burst in bursts_of_exposure(
+                    lit,
+                    burst_timing(
+                        exposure_us,
+                        rise_us=rise_us,
+                        readout_us=readout_us,
+                        exposure_gap_us=exposure_gap_us,
+                        hardware=hardware,
+                        pace=pace,
+                    ),
+                    index,
+                    repeat,
+                    darks=plan.darks_per_view if repeat == 0 else 0,
+                    hardware=hardware,
+                )
+            ]
+        for pose in expand_view(view):
+            views.append(pose)
+            bursts.append([replace(burst, view=pose.name) for burst in bursts_of[lights]])
+    labels = tuple(tuple(label for burst in own for label in burst.labels if label) for own in bursts)
+    return Schedule(tuple(views), tuple(map(tuple, bursts)), labels)
+
+
+def _lit(lights: Lights, leds: LedTable, base_from_support: Transform) -> list[Sequence[Led] | Panel]:
+    """What each burst of one exposure lights: one burst for all LEDs, neighbours in time on different boards, or
+    one for each panel."""
+    if isinstance(lights, Panels):
+        return [Panel(number) for number in lights.panels]
+    rows = select_leds(lights, leds, base_from_support)
+    return [[Led(int(led)) for led in leds.ids[rows[interleave(leds.boards[rows])]]]]
+
+
+def names_too_long(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
+    """Key path and message for each view whose shots' ids would not fit the frame table."""
+    longest_light = max(int(leds.ids.max()), 9999)
+    longest = ShotLabel(Led(longest_light), len(plan.exposure.exposures_us) - 1, plan.repeats - 1)
+    mark = ShotLabel(PanelMark(4, MARKS - 1), longest.exposure, longest.repeat)
+    room = MAX_CHARACTERS - 1 - max(len(str(longest)), len(str(mark)))
+    return [
+        (("views", number, "name"), f"{name}: a view's name may have {room} characters here, found {len(name)}")
+        for number, view in enumerate(plan.views)
+        if len(name := max((pose.name for pose in expand_view(view)), key=len)) > room
+    ]

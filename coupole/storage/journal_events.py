@@ -1,0 +1,202 @@
+"""What a run's journal can say: one frozen model for each event, told apart by its tag `event`.
+
+To add an event: write its model here, add it to `Event`, and handle it where `assert_never` then complains.
+Angles are in degrees, transforms 4x4 in mm. What version 0.1 did not write yet has a default.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
+
+from coupole.plan.shot_id import ShotId
+from coupole.storage.line_file import utc_now
+
+JOURNAL_VERSION = 2
+
+
+def _shot(value: object) -> object:
+    return ShotId.parse(value) if isinstance(value, str) else value
+
+
+Shot = Annotated[ShotId, BeforeValidator(_shot), PlainSerializer(str, return_type=str)]
+"""A shot's id, as text on disk."""
+Joints = tuple[float, ...]
+
+
+class JournalEvent(BaseModel):
+    """Frozen; unknown keys are errors."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+    t: str = Field(default_factory=utc_now)
+    """When, UTC, ISO 8601."""
+
+
+class JournalBegun(JournalEvent):
+    """The first line of a journal; those of 0.1 (version 1) lack it."""
+
+    event: Literal["journal"] = "journal"
+    version: int = JOURNAL_VERSION
+
+
+class SessionStarted(JournalEvent):
+    """The run's first session has its devices open."""
+
+    event: Literal["start"] = "start"
+    simulated: bool = False
+    room_c: float | None = None
+    """Temperature of the coolest LED board."""
+    acknowledged: str = ""
+    """The fault of the arm that the operator has said is mended."""
+
+
+class SessionResumed(JournalEvent):
+    """A later session of the run has its devices open (`--resume`)."""
+
+    event: Literal["resume"] = "resume"
+    simulated: bool = False
+    room_c: float | None = None
+    acknowledged: str = ""
+
+
+class ViewBegun(JournalEvent):
+    """The arm is about to go to a view."""
+
+    event: Literal["view"] = "view"
+    view: str
+    hidden_leds: tuple[int, ...] = ()
+    """LEDs that reach nothing of what this view sees."""
+
+
+class MoveBegun(JournalEvent):
+    """The arm sets out."""
+
+    event: Literal["move"] = "move"
+    view: str
+    joints_deg: tuple[Joints, ...]
+    """Joint angles of each waypoint, the view's own last."""
+
+
+class ArmSettled(JournalEvent):
+    """The arm stands still; where, as measured."""
+
+    event: Literal["settled"] = "settled"
+    view: str
+    joints_deg: Joints
+    base_from_camera: tuple[tuple[float, ...], ...]
+
+
+class FrameProven(JournalEvent):
+    """A shot is proven and its bytes are on disk; written once for each shot of a run."""
+
+    event: Literal["frame"] = "frame"
+    shot: Shot
+    file: str
+    """The view's file, relative to the run's folder."""
+    index: int
+    """Its slot in that file."""
+    frame_id: int
+    xxh3: str
+    """Of the frame's bytes, 16 hexadecimal digits."""
+
+
+class BurstEnded(JournalEvent):
+    """A burst is over, as a whole or not; what light it gave."""
+
+    event: Literal["burst"] = "burst"
+    view: str
+    steps: int
+    on_s: float
+    """Light of all its LEDs, summed."""
+    joints_before_deg: Joints | None = None
+    joints_after_deg: Joints | None = None
+    """None where the arm did not stand still."""
+    frames: int
+    table_s: float | None = None
+    clocks: dict[str, float] | None = None
+    """How the clocks of box and camera run against each other."""
+    camera: dict[str, int] | None = None
+    """The camera's own counters."""
+    hottest_board_c: float | None = None
+
+
+class GapFound(JournalEvent):
+    """Frames of a burst are not proven."""
+
+    event: Literal["gap"] = "gap"
+    view: str
+    shots: tuple[Shot, ...]
+    missing: int
+    lost_in_transfer: int
+    surplus: int
+    dead_leds: tuple[Shot, ...] = ()
+    """Shots whose LED drew no current."""
+    reason: str = ""
+
+
+class ReshootBegun(JournalEvent):
+    """Shots are taken again."""
+
+    event: Literal["reshoot"] = "reshoot"
+    view: str
+    attempt: int
+    shots: tuple[Shot, ...]
+
+
+class FaultNoted(JournalEvent):
+    """Something failed."""
+
+    event: Literal["fault"] = "fault"
+    kind: str
+    message: str
+    device: str = ""
+    """The device that failed, by its kind in the rig; empty if none did."""
+
+
+class Paused(JournalEvent):
+    """The operator asked to wait; lights are off."""
+
+    event: Literal["pause"] = "pause"
+
+
+class Continued(JournalEvent):
+    """The operator let the session go on after a pause."""
+
+    event: Literal["continue"] = "continue"
+
+
+class ViewSealed(JournalEvent):
+    """A view is complete as far as it will be in this session."""
+
+    event: Literal["seal"] = "seal"
+    view: str
+
+
+class SessionStopped(JournalEvent):
+    """The session's last line."""
+
+    event: Literal["stop"] = "stop"
+    outcome: Literal["done", "interrupted", "failed"]
+    robot: dict[str, Any] = Field(default_factory=dict)
+    """Figures of the robot's link."""
+
+
+Event: TypeAlias = (
+    JournalBegun
+    | SessionStarted
+    | SessionResumed
+    | ViewBegun
+    | MoveBegun
+    | ArmSettled
+    | FrameProven
+    | BurstEnded
+    | GapFound
+    | ReshootBegun
+    | FaultNoted
+    | Paused
+    | Continued
+    | ViewSealed
+    | SessionStopped
+)

@@ -1,0 +1,61 @@
+"""A file of lines that is appended to and never changed: whole lines, on disk when `append` returns."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from coupole.errors import DiskFull, StorageError
+
+
+def utc_now() -> str:
+    """Now, ISO 8601 with milliseconds, UTC."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+class LineFile:
+    """Opened for appending. Raises DiskFull or StorageError, then nothing of what was to be appended counts."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+            self.was_empty = os.fstat(self._fd).st_size == 0
+            self._end_torn_line()
+        except OSError as error:
+            raise _storage_error(path, error) from error
+
+    def _end_torn_line(self) -> None:
+        """After a crash the last line may be half written: close it, so that the next one is whole."""
+        size = os.fstat(self._fd).st_size
+        if size and os.pread(self._fd, 1, size - 1) != b"\n":
+            os.write(self._fd, b"\n")
+
+    def append(self, lines: Sequence[str]) -> None:
+        """Write lines, each with its line feed, and sync them."""
+        if not lines:
+            return
+        data = "".join(lines).encode()
+        start = os.fstat(self._fd).st_size
+        try:
+            view = memoryview(data)
+            while view:
+                view = view[os.write(self._fd, view) :]
+            os.fdatasync(self._fd)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, start)
+            raise _storage_error(self._path, error) from error
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+def _storage_error(path: Path, error: OSError) -> StorageError:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return DiskFull(f"{path}: the disk is full. Free space on it, then resume the run.")
+    return StorageError(f"{path}: {error.strerror}. Check the disk, then resume the run.")

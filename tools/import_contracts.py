@@ -1,0 +1,34 @@
+"""A contract for import-linter: a package, and all that it may import. What is not listed is forbidden."""
+
+from __future__ import annotations
+
+from grimp import ImportGraph
+from importlinter import Contract, ContractCheck, fields, output
+
+
+class AllowListContract(Contract):
+    """`package` and everything below it may import itself, `allowed_modules` and what lies below those; and the
+    package that it stands in, for its version.
+
+    Only the project's own packages count; other libraries are free.
+    """
+
+    package = fields.StringField()
+    allowed_modules = fields.SetField(subfield=fields.StringField(), required=False)
+
+    def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
+        """One line for each import that is not allowed."""
+        allowed = {str(self.package), *(self.allowed_modules or ())}
+        own = {str(self.package), *graph.find_descendants(str(self.package))}
+        wrong = [
+            (importer, imported)
+            for importer in sorted(own)
+            for imported in sorted(graph.find_modules_directly_imported_by(importer))
+            if imported != str(self.package).partition(".")[0]
+            and not any(imported == module or imported.startswith(f"{module}.") for module in allowed)
+        ]
+        return ContractCheck(kept=not wrong, metadata={"wrong": wrong})
+
+    def render_broken_contract(self, check: ContractCheck) -> None:
+        for importer, imported in check.metadata["wrong"]:
+            output.print_error(f"{importer} imports {imported}, which {self.package} may not use")

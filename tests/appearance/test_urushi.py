@@ -154,7 +154,8 @@ def test_flakes_too_steep_for_the_lacquer_are_refused() -> None:
 
 
 def test_flakes_are_closed_surfaces_that_face_outwards() -> None:
-    trimesh = pytest.importorskip("trimesh")
+    import trimesh
+
     found = nashiji.flakes(SMALL)
 
     mesh = trimesh.Trimesh(*nashiji.triangulate(found), process=False)

@@ -62,9 +62,8 @@ def test_each_method_solves_exact_motions_exactly(name: str) -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_each_method_agrees_with_opencvs(name: str) -> None:
-    cv2 = pytest.importorskip("cv2")
-    if not hasattr(cv2, "calibrateHandEye"):
-        pytest.skip("this OpenCV has no calibrateHandEye")
+    import cv2
+
     cell = make_cell(0)
     camera = calibrate_camera(cell.sightings, cell.size_px).camera_from_board
     ours = solve(cell.base_from_flange, camera, METHODS[name]).flange_from_camera

@@ -25,8 +25,6 @@ from coupole.errors import DeviceLost, DeviceRefused
 from drivers.camera.gentl.driver import GenTLCamera
 from drivers.camera.gentl.producer import Gaps
 
-pytest.importorskip("genicam", reason="the extra `gentl` is not installed")
-pytest.importorskip("harvesters", reason="the extra `gentl` is not installed")
 pytestmark = needs_compiler
 
 

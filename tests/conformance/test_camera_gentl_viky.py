@@ -13,6 +13,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Protocol
 
+import genicam
 import numpy as np
 import pytest
 from camera_conformance import A_MOMENT_S, BY_SOFTWARE, EXPOSURE, take
@@ -22,8 +23,6 @@ from coupole.errors import DeviceLost, DeviceRefused
 from drivers.camera.gentl.driver import GenTLCamera
 from drivers.camera.gentl.settings import Settings
 
-genicam = pytest.importorskip("genicam", reason="the extra `gentl` is not installed")
-pytest.importorskip("harvesters", reason="the extra `gentl` is not installed")
 PRODUCER = Path(genicam.__file__).with_name("viky.cti")
 SIZE_PX = 400
 VIKY = {

@@ -6,7 +6,6 @@ RSIPI runs in processes of its own: on import it writes a log into the working d
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import runpy
@@ -25,9 +24,6 @@ from cells import REPO, CellFolder, wait_until
 from coupole.devices import SystemClock
 from coupole.kinematics import KR10_R1100_SIXX, forward
 from drivers.kuka.rsi.driver import KukaRsi, Settings
-
-if importlib.util.find_spec("RSIPI") is None:
-    pytest.skip("RSIPI is not installed", allow_module_level=True)
 
 HOME_DEG = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
 _ECHO_PORT = 50000
@@ -78,18 +74,18 @@ def configuration(folder: Path, settings: Settings) -> Path:
 
 @pytest.mark.parametrize(
     ("corrects", "what", "values"),
-    [("axes", "update_joints", {"A1": 5.0, "A6": -3.0}), ("pose", "update_cartesian", {"X": 20.0, "Z": -10.0})],
+    [
+        ("axes", "update_joints", {"A1": 5.0, "A6": -3.0}),
+        pytest.param("pose", "update_cartesian", {"X": 20.0, "Z": -10.0}, marks=pytest.mark.full),
+    ],
 )
 def test_its_client_moves_our_stand_in(
     tmp_path: Path,
     port: int,
-    scale: Callable[[int, int], int],
     corrects: str,
     what: str,
     values: dict[str, float],
 ) -> None:
-    if corrects == "pose" and not scale(0, 1):
-        pytest.skip("at full scale only: a world takes seconds to start")
     settings = Settings.model_validate({"listen": f"127.0.0.1:{port}", "corrects": corrects})
     robot = {"sends_to": settings.listen, "sends_pose": True, "corrects": corrects}
     config = configuration(tmp_path, settings)

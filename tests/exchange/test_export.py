@@ -39,7 +39,8 @@ def random_pixels(height: int, width: int, most: int, seed: int = 1) -> Frame:
 
 def tags_of(content: bytes) -> dict[str, Any]:
     """Tags of a file's image by name, as tifffile reads them."""
-    tifffile = pytest.importorskip("tifffile")
+    import tifffile
+
     with tifffile.TiffFile(io.BytesIO(content)) as file:
         return {tag.name: tag.value for tag in file.pages[0].tags.values()}
 
@@ -69,7 +70,8 @@ def export(
 
 
 def as_libraw_reads(content: bytes) -> Any:
-    rawpy = pytest.importorskip("rawpy")
+    import rawpy
+
     return rawpy.imread(io.BytesIO(content))
 
 
@@ -143,7 +145,8 @@ def test_a_dng_holds_the_exposure_time() -> None:
 
 
 def test_tags_of_a_dng_stand_in_ascending_order() -> None:
-    tifffile = pytest.importorskip("tifffile")
+    import tifffile
+
     with tifffile.TiffFile(io.BytesIO(dng.encode(picture(random_pixels(64, 96, 4095))))) as file:
         codes = [tag.code for tag in file.pages[0].tags.values()]
     assert codes == sorted(set(codes))
@@ -151,7 +154,8 @@ def test_tags_of_a_dng_stand_in_ascending_order() -> None:
 
 @pytest.mark.skipif(not REFERENCE.exists(), reason="the reference DNG is not here")
 def test_the_frame_of_a_real_dng_survives_ours_bit_exact() -> None:
-    rawpy = pytest.importorskip("rawpy")
+    import rawpy
+
     with rawpy.imread(str(REFERENCE)) as raw:
         pixels, black_dn, white_dn = raw.raw_image.copy(), raw.black_level_per_channel[0], int(raw.white_level)
         letters = raw.color_desc.decode()
@@ -170,7 +174,8 @@ def test_the_frame_of_a_real_dng_survives_ours_bit_exact() -> None:
 @given(height=st.integers(1, 60), width=st.integers(1, 90))
 @settings(max_examples=20, deadline=None)
 def test_a_tiff_of_any_size_is_read_bit_exact(height: int, width: int) -> None:
-    tifffile = pytest.importorskip("tifffile")
+    import tifffile
+
     pixels = random_pixels(height, width, 65535)
     found = tifffile.imread(io.BytesIO(tiff.encode(picture(pixels))))
     assert np.array_equal(found.reshape(pixels.shape), pixels)
@@ -189,14 +194,14 @@ def test_a_tiff_says_what_it_shows() -> None:
 
 @pytest.mark.parametrize("to", ["dng", "tiff"])
 def test_each_frame_becomes_a_file_named_after_its_shot(made: MadeRun, out: Path, to: str) -> None:
-    pytest.importorskip("tifffile")
     names = export(made, to, out)
     assert names == sorted(f"{shot.replace('/', '_')}.{to}" for shot in made.frames)
     assert f"top_led0003_e0.{to}" in names
 
 
 def test_exported_frames_are_bit_exact_and_under_their_own_names(made: MadeRun, out: Path) -> None:
-    tifffile = pytest.importorskip("tifffile")
+    import tifffile
+
     export(made, "tiff", out)
     for shot, pixels in made.frames.items():
         assert np.array_equal(tifffile.imread(out / f"{shot.replace('/', '_')}.tiff"), pixels)

@@ -88,8 +88,6 @@ def test_rough_gold_spreads_light_but_does_not_make_any() -> None:
 
 
 def test_photons_and_the_path_tracer_see_the_same_light_on_the_wall(scale: Scale) -> None:
-    pytest.importorskip("mitsuba")
-    pytest.importorskip("colour")
     width_deg, lux, grey = 20.0, 1000.0, 1e-4
     way = np.array([0.9, 0.43, -0.03])
     black = {"kind": "diffuse", "reflectance": constant(grey)}

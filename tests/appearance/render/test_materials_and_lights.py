@@ -19,9 +19,6 @@ from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.errors import InputError
 from sim.render.emitter import irradiance, square
 
-pytest.importorskip("mitsuba")
-pytest.importorskip("colour")
-
 DOME = REPO / "configs" / "domes" / "coupole.csv"
 COSINES = np.cos(np.radians([0.0, 30.0, 60.0, 75.0]))
 

@@ -16,9 +16,6 @@ from coupole.appearance.render.rendering import opened
 from coupole.commands.render_scene import read_scene, render, render_scene
 from coupole.errors import InputError, StorageError
 
-pytest.importorskip("mitsuba")
-pytest.importorskip("colour")
-
 ROOT = REPO
 SHIPPED = sorted((ROOT / "configs" / "scenes").glob("*.yaml"))
 SMALL = """\

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import colour as colour_science
 import numpy as np
 import pytest
 from spectral_scenes import camera, constant, everywhere, illuminant, plane, rendered, scene
@@ -15,9 +16,6 @@ from coupole.appearance.render.rendering import Spectral, degree_of_linear_polar
 from coupole.appearance.render.spectra import luminous, scaled
 from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
-
-pytest.importorskip("mitsuba")
-colour_science = pytest.importorskip("colour")
 
 Scale = Callable[[int, int], int]
 GREY = {"kind": "diffuse", "reflectance": constant(0.5)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -15,9 +16,6 @@ from sim.optics.sensor_model import SensorModel
 from sim.render.camera_view import View, Viewer, tangents
 from sim.render.lens import Lens, sight
 from sim.scene.scene import build_scene
-
-cv2 = pytest.importorskip("cv2")
-pytest.importorskip("colour")
 
 BOARD = Charuco(7, 5)
 PITCH_UM = 22.0

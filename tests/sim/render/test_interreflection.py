@@ -15,8 +15,6 @@ from sim.render.interreflection import indirect_radiance, prepare
 from sim.scene.scene import Scene, build_scene
 from sim.scene.surface import Material, Surface
 
-pytest.importorskip("mitsuba")
-
 Scale = Callable[[int, int], int]
 
 

@@ -194,7 +194,6 @@ def test_a_dome_is_the_same_for_the_same_seed_alone() -> None:
 
 
 def test_leds_with_colours_of_their_own_tint_what_they_light(tmp_path: Path) -> None:
-    pytest.importorskip("colour")
     plain, tinted = photographer(tmp_path), photographer(tmp_path, {"leds": {"pump_spread_nm": 5.0}})
     shares = [
         [float(frame(by, {led: 0.004}, ABOVE)[0::2, 0::2].mean() - 64.0) for led in (0, 7)]

@@ -124,7 +124,6 @@ def test_samples_and_distortion_leave_brightness_as_it_is(tmp_path: Path, camera
 
 def test_light_goes_from_surface_to_surface_where_that_is_asked_for(tmp_path: Path) -> None:
     """Into the tile's shadow: from the bright support to the tile's underside, and back."""
-    pytest.importorskip("mitsuba")
     by = [photographer(tmp_path, world) for world in ({}, {"interreflection": {"bounces": 3, "samples": 64}})]
     plain, more = (frame(one, {9: 4.0})[15:23, 60:68].mean() for one in by)
     assert plain == pytest.approx(64.0, abs=2.0)

@@ -6,4 +6,4 @@ import os
 # two cores, adjusting a mesh's pose), and simulator and stream want the cores. Set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -1,0 +1,118 @@
+"""Draws the rooms of the project and which uses which, from the imports as they are: docs/pictures/rooms.svg.
+
+    python tools/make_architecture.py [--output docs/pictures/rooms.svg]
+
+Rooms stand on a staircase in the order of import-linter's layers (pyproject.toml). A line leaves a room to the
+right and comes down on a room that it uses; its width grows with the number of imports. Nothing may lead upwards.
+"""
+
+from __future__ import annotations
+
+import argparse
+import html
+import tomllib
+from collections import Counter
+from pathlib import Path
+
+import grimp
+
+ROOT = Path(__file__).resolve().parent.parent
+OUTPUT = ROOT / "docs" / "pictures" / "rooms.svg"
+CONTRACTS = ("devices", "errors", "geometry", "kinematics")
+BESIDE = ("drivers", "sim")
+_STEP_X, _STEP_Y, _BOX_W, _BOX_H, _MARGIN = 74, 46, 132, 34, 16
+
+
+def rooms_in_order() -> list[str]:
+    """From the top floor down, the four contracts as one, drivers and simulation between plan and appearance."""
+    config = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    contracts = config["tool"]["importlinter"]["contracts"]
+    layers = [name for name in contracts[0]["layers"] if name not in (*CONTRACTS, "cli")]
+    place = layers.index("appearance")
+    return [*layers[:place], *BESIDE, *layers[place:], "contracts"]
+
+
+def room_of(module: str) -> str:
+    """The room that a module stands in."""
+    parts = module.split(".")
+    if parts[0] in BESIDE or len(parts) == 1:
+        return parts[0]
+    if parts[1] in CONTRACTS:
+        return "contracts"
+    return "commands" if parts[1] == "cli" else parts[1]
+
+
+def arrows() -> Counter[tuple[str, str]]:
+    """How many imports lead from one room into another."""
+    graph = grimp.build_graph("coupole", *BESIDE, cache_dir=None)
+    found: Counter[tuple[str, str]] = Counter()
+    for module in graph.modules:
+        for used in graph.find_modules_directly_imported_by(module):
+            pair = room_of(module), room_of(used)
+            if pair[0] != pair[1] and "coupole" not in pair:
+                found[pair] += 1
+    return found
+
+
+def purpose(room: str) -> str:
+    """The first sentence of the room's own docstring."""
+    if room == "contracts":
+        return "What all rooms agree on: devices, errors, frames of reference, a described arm."
+    folder = ROOT / (room if room in BESIDE else f"coupole/{room}")
+    text = (folder / "__init__.py").read_text(encoding="utf-8").split('"""')[1]
+    return " ".join(text.split("\n\n")[0].split())
+
+
+def size(room: str) -> int:
+    """Lines of Python."""
+    if room == "contracts":
+        files = [ROOT / "coupole" / f"{name}.py" for name in CONTRACTS]
+    else:
+        files = sorted((ROOT / (room if room in BESIDE else f"coupole/{room}")).rglob("*.py"))
+    return sum(path.read_text(encoding="utf-8").count("\n") for path in files)
+
+
+def drawing() -> str:
+    """The SVG; its `desc` lists the arrows, one a line, for a test to compare."""
+    rooms, found = rooms_in_order(), arrows()
+    width = _MARGIN * 2 + _STEP_X * (len(rooms) - 1) + _BOX_W
+    height = _MARGIN * 2 + _STEP_Y * (len(rooms) - 1) + _BOX_H
+    listed = "\n".join(sorted(f"{a} uses {b}" for a, b in found))
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif">',
+        f"<title>Rooms of Coupole and which uses which</title><desc>{listed}</desc>",
+        f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
+    ]
+    for (user, used), count in sorted(found.items()):
+        i, j = rooms.index(user), rooms.index(used)
+        x, y = _MARGIN + i * _STEP_X + _BOX_W, _MARGIN + i * _STEP_Y + _BOX_H / 2
+        at = _MARGIN + j * _STEP_X + 20 + 92 * (i + 1) / (len(rooms) + 1)
+        end = _MARGIN + j * _STEP_Y
+        colour = "#b03030" if i > j else "#6d8fb3"
+        line = min(5.0, 0.6 + count**0.5 / 3)
+        parts.append(
+            f'<path d="M{x} {y:.1f} L{at:.1f} {y:.1f} L{at:.1f} {end:.1f}" fill="none" stroke="{colour}" '
+            f'stroke-width="{line:.2f}" stroke-opacity="0.55"/>'
+            f'<path d="M{at - 3:.1f} {end - 6} L{at:.1f} {end} L{at + 3:.1f} {end - 6}" fill="none" '
+            f'stroke="{colour}"/>'
+        )
+    for n, room in enumerate(rooms):
+        x, y = _MARGIN + n * _STEP_X, _MARGIN + n * _STEP_Y
+        fill = "#e7dcc5" if room in BESIDE else "#dfe8d8" if room == "contracts" else "#dbe6f2"
+        parts.append(
+            f'<g><title>{html.escape(purpose(room))}</title><rect x="{x}" y="{y}" width="{_BOX_W}" '
+            f'height="{_BOX_H}" rx="4" fill="{fill}" stroke="#44566b"/>'
+            f'<text x="{x + 8}" y="{y + 15}" font-size="13" fill="#14202c">{room}</text>'
+            f'<text x="{x + 8}" y="{y + 28}" font-size="10" fill="#4a5a6a">{size(room):,} lines</text></g>'
+        )
+    return "\n".join([*parts, "</svg>", ""])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--output", type=Path, default=OUTPUT)
+    parser.parse_args().output.write_text(drawing(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

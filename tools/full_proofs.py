@@ -1,0 +1,99 @@
+"""The long proofs, one after the other, and one table of how they ended: what `tools/test --full` runs.
+
+    python tools/full_proofs.py [--only NAME ...] [--list]
+
+Each proof is a command that anyone can run by itself. Ends with 1 if one of them failed; its output is in
+`runs/proofs/<name>.log`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+ROOT = Path(__file__).resolve().parent.parent
+LOGS = ROOT / "runs" / "proofs"
+_PYTEST = "-m pytest --full -q -n 2 --dist loadscope --timeout 3600"
+
+
+@dataclass(frozen=True)
+class Proof:
+    """A command and what it shows."""
+
+    name: str
+    shows: str
+    command: str
+    """Arguments for Python."""
+
+
+PROOFS = (
+    Proof("injection", "random faults: labels true, runs completed", f"{_PYTEST} tests/faults/test_injection.py"),
+    Proof("soak", "sixty runs in one world: nothing grows", f"{_PYTEST} tests/runs/test_soak.py"),
+    Proof("cells", "intervals of 100 random cells hold", "tools/prove_calibrations.py --cells 100"),
+    Proof("cells-absolute", "the same with the arm's absolute errors", "tools/prove_calibrations.py --absolute"),
+    Proof("paths", "500 random plans touch nothing, by python-fcl", "tools/replay_plans.py --plans 500 --seed 1"),
+    Proof("conformance", "every driver against its contract", f"{_PYTEST} tests/conformance"),
+    Proof(
+        "tests",
+        "all other tests at full scale",
+        f"{_PYTEST} tests --ignore tests/conformance --ignore tests/faults/test_injection.py "
+        "--ignore tests/runs/test_soak.py",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a proof ended."""
+
+    proof: Proof
+    minutes: float
+    code: int
+    last_line: str
+
+
+def run(proof: Proof) -> Ended:
+    """Run one proof, its output into a file."""
+    LOGS.mkdir(parents=True, exist_ok=True)
+    log = LOGS / f"{proof.name}.log"
+    started = time.monotonic()
+    with log.open("w") as file:
+        command = [sys.executable, *shlex.split(proof.command)]
+        code = subprocess.run(command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, check=False).returncode
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return Ended(proof, (time.monotonic() - started) / 60.0, code, lines[-1].strip("= ") if lines else "")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--only", nargs="+", choices=[proof.name for proof in PROOFS], help="these proofs alone")
+    parser.add_argument("--list", action="store_true", help="name the proofs and their commands, run nothing")
+    options = parser.parse_args()
+    console = Console(soft_wrap=True)
+    if options.list:
+        for proof in PROOFS:
+            console.print(f"{proof.name:15} {proof.shows}\n{'':15} python {proof.command}", highlight=False)
+        return 0
+    chosen = [proof for proof in PROOFS if not options.only or proof.name in options.only]
+    ended = []
+    for proof in chosen:
+        with console.status(f"{proof.name}: {proof.shows}"):
+            ended.append(run(proof))
+    table = Table("proof", "shows", "minutes", "ended", "last line", box=None)
+    for one in ended:
+        verdict = "[green]good[/]" if one.code == 0 else f"[red]exit {one.code}[/]"
+        table.add_row(one.proof.name, one.proof.shows, f"{one.minutes:.1f}", verdict, one.last_line)
+    console.print(table)
+    return int(any(one.code for one in ended))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from places import REPO
+from places import REPO, SHARED_DATA
 
 from coupole.errors import InputError
 from coupole.geometry import look_at
@@ -24,7 +24,7 @@ from coupole.plan.yamlfile import read
 from coupole.preflight.job import read_job
 
 ROOT = REPO
-LINK_MESHES = ROOT.parent / "shared/data/robot/kr10r1100sixx"
+LINK_MESHES = SHARED_DATA / "robot/kr10r1100sixx"
 RIG = read(ROOT / "configs/rigs/sim.yaml").validate(Rig)
 DOME = read_led_table(ROOT / "configs/domes/coupole.csv")
 HOME_DEG = RIG.motion.home_joints_deg

@@ -17,7 +17,7 @@ from cells import CellFolder
 from numpy.typing import NDArray
 from places import SHARED_DATA
 
-BUNNY = SHARED_DATA / "/bunny/bun_zipper.ply"
+BUNNY = SHARED_DATA / "bunny/bun_zipper.ply"
 SUPPORT_FROM_OBJECT = {"translation_mm": [16.8, 0.0, -33.0], "abc_deg": [0, 0, 90]}
 """The scan's y points up and its feet stand 33 mm above its origin; on the support z points up."""
 VIEWS = {"above": (-90, 80), "left": (-130, 25), "front": (-90, 20), "right": (-50, 30)}

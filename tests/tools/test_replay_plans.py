@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from places import REPO
+from places import REPO, SHARED_DATA
 
 from coupole.kinematics import KR10_R1100_SIXX, link_frames
 
 ROOT = REPO
-LINK_MESHES = ROOT.parent / "shared/data/robot/kr10r1100sixx"
+LINK_MESHES = SHARED_DATA / "robot/kr10r1100sixx"
 
 
 @pytest.fixture(autouse=True)

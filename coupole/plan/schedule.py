@@ -73,6 +73,8 @@ def expand_view(view: View) -> list[ViewPose]:
             ]
         case Joints():
             return [ViewPose(view.name, None, view.joints_deg, None)]
+        case _:
+            assert_never(view)
 
 
 def build_schedule(

@@ -173,6 +173,14 @@ def bench_archive(rounds: int) -> None:
         line(**figure)
 
 
+def bench_codecs(rounds: int) -> None:
+    """Packing, compression and Exif beside libraries that offer the same: same output, and how fast."""
+    from bench_codecs import figures
+
+    for figure in figures(ROOT, rounds):
+        line(**figure)
+
+
 def bench_mesh(rounds: int) -> None:
     """Reading a scan of 10 million triangles against numpy and trimesh; memory for 40 million."""
     from bench_mesh import figures
@@ -205,6 +213,7 @@ BENCHES: dict[str, Callable[[int], None]] = {
     "rsi": bench_rsi,
     "collisions": bench_collisions,
     "archive": bench_archive,
+    "codecs": bench_codecs,
     "render": bench_render,
     "mesh": bench_mesh,
     "calibration": bench_calibration,

@@ -34,8 +34,6 @@ from drivers.camera.raw.exif import read_exif
 from drivers.camera.raw.order import proven_order
 from drivers.camera.raw.picture import decode
 
-pytest.importorskip("rawpy", reason="the extra `real-data` is not installed")
-
 REAL_DNG = SHARED_DATA / "raw/colorchart.dng"
 HEIGHT_PX, WIDTH_PX = 24, 40
 EXPOSURE = Exposure(8_000)

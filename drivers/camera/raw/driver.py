@@ -1,7 +1,7 @@
 """A still camera whose RAW files a tethering program puts into a folder: `coupole.devices.Camera`.
 
 The box's edge (or a command) releases the shutter; the camera or its program writes CR2, NEF, ARW or DNG files;
-LibRaw (`rawpy`, extra `real-data`) decodes them. A file is taken as a frame when its size has stood still.
+LibRaw (`rawpy`) decodes them. A file is taken as a frame when its size has stood still.
 
 *Order and count are proven, never assumed.* The frame id is the number in the file's name, which the camera counts
 on with every picture and wraps from 9999 to 1: a picture that never comes leaves a gap. The timestamp is Exif's

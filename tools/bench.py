@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
-FULL_SIZE = (3072, 4096)
 
 
 def line(name: str, value: float, unit: str, peer: str, ratio: float, **more: Any) -> None:

@@ -5,14 +5,16 @@ Angles are degrees of the arm's six axes; speeds, accelerations and jerks are of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coupole.devices import Clock
-from coupole.errors import DeviceRefused
+from coupole.devices import Clock, Deadline
+from coupole.errors import DeviceRefused, DeviceTimeout
 
+State = TypeVar("State")
 _LIMIT_TOLERANCE_DEG = 1e-9
 
 
@@ -63,6 +65,37 @@ def farthest_stop_deg(
     brake_s = speeds_deg_s.max() / acceleration_deg_s2 + rise_s
     farthest_deg: NDArray[np.float64] = speeds_deg_s * (rise_s + 0.5 * brake_s + delay_s)
     return farthest_deg
+
+
+def wait_for(
+    read: Callable[[], State],
+    done: Callable[[State], bool],
+    deadline: Deadline,
+    expected: str,
+    *,
+    check: Callable[[State], None] | None,
+    pause: Callable[[], None],
+    describe: Callable[[State], str],
+    remedy: str,
+) -> None:
+    """Read and `check` the arm's state, with a `pause` between, until it is `done`; lets pass what these raise.
+
+    Raises DeviceTimeout at the deadline, with the last state as `describe` puts it.
+    """
+    while True:
+        state = read()
+        if check is not None:
+            check(state)
+        if done(state):
+            return
+        if deadline.expired:
+            raise DeviceTimeout(
+                "robot",
+                expected=f"{expected} within {deadline.seconds:.1f} s",
+                happened=describe(state),
+                remedy=remedy,
+            )
+        pause()
 
 
 class News:

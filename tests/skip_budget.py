@@ -9,9 +9,10 @@ from __future__ import annotations
 import shutil
 
 from places import SHARED_DATA
+from ur import NO_WHEEL
 
-ALLOWED = ("punx, the NeXus validator, is not installed: it wants Qt",)
-"""Reasons that stand for a thing that no machine of ours has."""
+ALLOWED = ("punx, the NeXus validator, is not installed: it wants Qt", NO_WHEEL)
+"""Reasons that stand for a thing that the machine cannot have."""
 
 
 def is_complete() -> bool:

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
-FULL_SIZE = (3072, 4096)
 
 
 def line(name: str, value: float, unit: str, peer: str, ratio: float, **more: Any) -> None:
@@ -61,7 +60,7 @@ def bench_check(rounds: int) -> None:
 def bench_sequencing(rounds: int) -> None:
     """A burst of 1080 LEDs at 100 frames/s, from INITiate to the last proven frame, against the table's own
     time; on the world's clock and on the machine's."""
-    from coupole.acquisition.cell import open_cell
+    from coupole.acquisition.opened_cell import open_cell
     from coupole.acquisition.recorder import RunRecorder
     from coupole.acquisition.sequencer import Sequencer
     from coupole.acquisition.session import about_run, metadata_of_views
@@ -173,6 +172,14 @@ def bench_archive(rounds: int) -> None:
         line(**figure)
 
 
+def bench_codecs(rounds: int) -> None:
+    """Packing, compression and Exif beside libraries that offer the same: same output, and how fast."""
+    from bench_codecs import figures
+
+    for figure in figures(ROOT, rounds):
+        line(**figure)
+
+
 def bench_mesh(rounds: int) -> None:
     """Reading a scan of 10 million triangles against numpy and trimesh; memory for 40 million."""
     from bench_mesh import figures
@@ -205,6 +212,7 @@ BENCHES: dict[str, Callable[[int], None]] = {
     "rsi": bench_rsi,
     "collisions": bench_collisions,
     "archive": bench_archive,
+    "codecs": bench_codecs,
     "render": bench_render,
     "mesh": bench_mesh,
     "calibration": bench_calibration,

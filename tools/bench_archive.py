@@ -37,12 +37,12 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
     from coupole.storage.bitshuffle import CODECS
 
     frames = min(FRAMES, int(shutil.disk_usage(root).free * 0.4 / FRAME_BYTES))
-    pictures = _pictures()
+    drawn = pictures(DISTINCT)
     with tempfile.TemporaryDirectory(dir=root) as folder:
         for name, codec in CODECS.items():
-            yield from _speeds(Path(folder) / "small.h5", pictures, name, codec, rounds)
+            yield from _speeds(Path(folder) / "small.h5", drawn, name, codec, rounds)
         path, kept = Path(folder) / "view.h5", Path(folder) / "kept"
-        proven = _write_view(path, pictures, frames)
+        proven = _write_view(path, drawn, frames)
         for name, codec in CODECS.items():
             _archive(path, proven, codec, kept)
             for what, read in (("tile_through_all_frames", _read_tile), ("one_frame", _read_frame)):
@@ -94,24 +94,24 @@ def _cpu_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def _pictures() -> NDArray[np.uint16]:
-    """Frames [DISTINCT, H, W] in page-aligned memory: photons and 13 electrons of read noise at 3.35 electrons a
+def pictures(count: int) -> NDArray[np.uint16]:
+    """Frames [count, H, W] in page-aligned memory: photons and 13 electrons of read noise at 3.35 electrons a
     DN, 64 DN black; the light comes from another side in each."""
-    memory = mmap.mmap(-1, DISTINCT * FRAME_BYTES)
-    pictures = np.frombuffer(memory, np.uint16).reshape(DISTINCT, HEIGHT_PX, WIDTH_PX)
+    memory = mmap.mmap(-1, count * FRAME_BYTES)
+    drawn = np.frombuffer(memory, np.uint16).reshape(count, HEIGHT_PX, WIDTH_PX)
     y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX].astype(np.float32)
     object_here = np.hypot(x - WIDTH_PX / 2, y - HEIGHT_PX / 2) < 1300
     relief = (0.6 + 0.4 * np.sin(x / 37) * np.sin(y / 53)) * object_here
     relief[::2, ::2] *= 0.8
     relief[1::2, ::2] *= 0.6
     random = np.random.default_rng(1)
-    for number, picture in enumerate(pictures):
-        angle = 2 * np.pi * number / DISTINCT
+    for number, picture in enumerate(drawn):
+        angle = 2 * np.pi * number / count
         away = np.hypot(x - WIDTH_PX * (0.5 + 0.2 * np.cos(angle)), y - HEIGHT_PX * (0.5 + 0.2 * np.sin(angle)))
         electrons = 3.35 * 700 * relief * np.exp(-0.5 * (away / 900) ** 2)
         noise = random.standard_normal((HEIGHT_PX, WIDTH_PX), np.float32) * np.sqrt(electrons + 13**2)
         picture[:] = np.clip(np.rint((electrons + noise) / 3.35 + 64), 0, 4095)
-    return pictures
+    return drawn
 
 
 def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[Any]:

@@ -246,8 +246,8 @@ def _burst(root: Path, folder: Path) -> dict[str, float]:
     """Figures of the second burst of a run, the first having filled the camera's memory with pictures."""
     from ruamel.yaml import YAML
 
-    from coupole.acquisition.cell import open_cell
     from coupole.acquisition.observer import Observer, Progress
+    from coupole.acquisition.opened_cell import open_cell
     from coupole.acquisition.recorder import RunRecorder
     from coupole.acquisition.sequencer import Sequencer
     from coupole.acquisition.session import about_run, metadata_of_views

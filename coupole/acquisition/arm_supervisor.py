@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from coupole.acquisition.cell import OpenedCell
 from coupole.acquisition.observer import Control
+from coupole.acquisition.opened_cell import OpenedCell
 from coupole.devices import ArmState, Deadline
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused, Interrupted, PreflightRefused
 from coupole.geometry import Transform

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.acquisition.arm_supervisor import ArmSupervisor
-from coupole.acquisition.cell import OpenedCell
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_grabber import FrameGrabber, buffers_for, memory_for_buffers
 from coupole.acquisition.frame_matching import UNLABELLED, FaultModel, Match, match
+from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.devices import (
     NO_LIGHT,

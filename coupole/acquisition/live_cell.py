@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from coupole.acquisition.cell import OpenedCell
+from coupole.acquisition.opened_cell import OpenedCell
 from coupole.devices import NO_LIGHT, STEP_DTYPE, Deadline, Exposure
 from coupole.errors import DeviceTimeout
 from coupole.plan.bursts import burst_timing

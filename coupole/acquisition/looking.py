@@ -8,9 +8,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from coupole.acquisition.cell import open_cell
 from coupole.acquisition.live_cell import CellSource
 from coupole.acquisition.observer import Control
+from coupole.acquisition.opened_cell import open_cell
 from coupole.acquisition.operator import (
     UNLIMITED_BYTES,
     ask_to_begin,
@@ -24,7 +24,7 @@ from coupole.acquisition.sequencer import Sequencer
 from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.plan.cell import Cell
-from coupole.plan.lights import leds_of_plan
+from coupole.plan.light_selection import leds_of_plan
 from coupole.preflight import exposure_advice
 from coupole.preflight.checking import check_job
 from coupole.preflight.job import Job, schedule_of

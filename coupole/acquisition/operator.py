@@ -10,8 +10,8 @@ from typing import Any
 
 from rich.console import Console
 
-from coupole.acquisition.cell import OpenedCell
 from coupole.acquisition.observer import Control
+from coupole.acquisition.opened_cell import OpenedCell
 from coupole.devices import Identity
 from coupole.errors import Interrupted, PreflightRefused
 from coupole.plan.bursts import EXPOSURE_MARGIN_US

@@ -2,7 +2,7 @@
 
 Only this module and its two hands, `arm` and `firing`, command devices. They keep to one order at all times:
 arm at rest and measured, camera armed, then lights; and backwards. On the way out, whatever the reason,
-`coupole.acquisition.cell` makes the devices safe.
+`coupole.acquisition.opened_cell` makes the devices safe.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 
 from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor, SettledPose
 from coupole.acquisition.burst_runner import NOTHING_TO_MATCH, BurstRunner, Verdict
-from coupole.acquisition.cell import OpenedCell
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_matching import compile_now
 from coupole.acquisition.observer import Control, Observer, Unwatched
+from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.devices import FrameFormat
 from coupole.errors import DeviceError, UnprovenError

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 
-from coupole.acquisition.cell import OpenedCell, open_cell
 from coupole.acquisition.observer import Control
+from coupole.acquisition.opened_cell import OpenedCell, open_cell
 from coupole.acquisition.operator import (
     UNLIMITED_BYTES,
     ask_to_begin,

@@ -71,11 +71,6 @@ def refusals(named: Sequence[InForce], here: Situation, needed: Sequence[str] = 
     return reasons
 
 
-def hashes(named: Sequence[InForce]) -> dict[str, str]:
-    """SHA-256 of the records in force by kind, to be stamped into a run."""
-    return {item.record.kind: item.record.sha256 for item in named}
-
-
 def _record_refusals(record: Record, here: Situation) -> list[str]:
     holds, reasons = record.validity, []
     if here.now >= holds.expires:

@@ -113,14 +113,3 @@ def project(points_camera_mm: ArrayLike, intrinsics: ArrayLike) -> Projected:
     by_y = np.stack([fx * crossed, fy * (g + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x)], axis=-1)
     by_point = np.stack([by_x, by_y, -(by_x * x[:, None] + by_y * y[:, None])], axis=-1) / depth[:, None, None]
     return Projected(np.stack([fx * xd + cx, fy * yd + cy], axis=-1), by_intrinsics, by_point)
-
-
-def field_monotone(intrinsics: Intrinsics, width_px: int, height_px: int) -> bool:
-    """True if radial distortion never folds back within the image: dr_d/dr > 0 out to its farthest corner."""
-    corners = [(u, v) for u in (0, width_px - 1) for v in (0, height_px - 1)]
-    reach = max(
-        np.hypot((u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy) for u, v in corners
-    )
-    r2 = np.linspace(0.0, 1.1 * reach, 100) ** 2
-    grows = 1 + r2 * (3 * intrinsics.k1 + r2 * (5 * intrinsics.k2 + r2 * 7 * intrinsics.k3))
-    return bool((grows > 0).all())

@@ -58,7 +58,7 @@ def devices(
     """Open each device of a rig, let it say who it is and test itself, close it."""
     from rich.table import Table
 
-    from coupole.acquisition.cell import open_cell
+    from coupole.acquisition.opened_cell import open_cell
     from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
 

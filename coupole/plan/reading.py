@@ -8,7 +8,7 @@ from pathlib import Path
 from coupole.errors import InputError, Problem
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell, read_cell
-from coupole.plan.lights import missing_lights
+from coupole.plan.light_selection import missing_lights
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
 from coupole.plan.schedule import names_too_long

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import assert_never
 
 from coupole.geometry import Transform, look_at
 from coupole.plan.bursts import FASTEST, MARKS, Burst, Pace, burst_timing, bursts_of_exposure
 from coupole.plan.led_table import LedTable
-from coupole.plan.lights import interleave, select_leds
+from coupole.plan.light_selection import interleave, select_leds
 from coupole.plan.plan import Grid, Joints, Lights, LookAt, Panels, Plan, View
 from coupole.plan.shot_id import MAX_CHARACTERS, Led, Panel, PanelMark, ShotLabel
 
@@ -93,7 +94,7 @@ def build_schedule(
     bursts: list[list[Burst]] = []
     hardware = plan.trigger == "hardware"
     for view in plan.views:
-        lights = view.lights or plan.lights
+        lights = view.lights or plan.light_selection
         if lights not in bursts_of:
             lit = _lit(lights, leds, base_from_support)
             bursts_of[lights] = [

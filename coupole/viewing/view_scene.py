@@ -20,7 +20,7 @@ from coupole.motion.collisions import CellBodies, Contact
 from coupole.motion.itinerary import Itinerary, Visit, arm_of, base_from_flange
 from coupole.motion.occlusion import Occlusion, Occlusions, Sight, capsule_axes, sight_of
 from coupole.motion.path_planner import Joints
-from coupole.plan.lights import leds_of_plan
+from coupole.plan.light_selection import leds_of_plan
 from coupole.plan.rig import KeepOutBox, Rig
 from coupole.plan.schedule import ViewPose
 from coupole.preflight.job import Job

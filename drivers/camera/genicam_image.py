@@ -1,4 +1,4 @@
-"""What a GenICam camera's features say of its images, and setting the region that it reads out.
+"""What a GenICam camera's features say of its images, and how they are set.
 
 For all drivers that reach such features, by whichever library.
 """
@@ -6,41 +6,23 @@ For all drivers that reach such features, by whichever library.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Protocol
-
-from pydantic import BaseModel, ConfigDict, Field
 
 from coupole.devices import FrameFormat
 from coupole.errors import DeviceRefused
+from drivers.camera.genicam_features import Features
+from drivers.camera.genicam_settings import GenICamSettings, Region
 from drivers.camera.pixel_formats import FORMATS, PixelFormat, pixels_in_a_group
 
 
-class Region(BaseModel):
-    """Part of the sensor, in pixels."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    width_px: Annotated[int, Field(gt=0)]
-    height_px: Annotated[int, Field(gt=0)]
-    left_px: Annotated[int, Field(ge=0)] = 0
-    top_px: Annotated[int, Field(ge=0)] = 0
+def set_image(features: Features, settings: GenICamSettings) -> None:
+    """What the rig sets before all else: its features in their order, the region, the pixels' format."""
+    features.write_all(settings.features)
+    if settings.region is not None:
+        _set_region(features, settings.region)
+    features.write("PixelFormat", settings.pixel_format)
 
 
-class Features(Protocol):
-    """Of an opened camera, by name; see the drivers' own."""
-
-    def has(self, name: str) -> bool: ...
-
-    def read(self, name: str) -> bool | int | float | str: ...
-
-    def number(self, name: str) -> float: ...
-
-    def bounds(self, name: str) -> tuple[float, float]: ...
-
-    def write(self, name: str, value: bool | int | float | str) -> None: ...
-
-
-def set_region(features: Features, region: Region) -> None:
+def _set_region(features: Features, region: Region) -> None:
     """Offsets go to zero first: they bound the size, and the size bounds them."""
     for name, value in (
         ("OffsetX", 0),

@@ -23,8 +23,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from coupole import geometry
 from coupole.devices import ArmState, Clock, Deadline, Identity
-from coupole.errors import DeviceLost, DeviceTimeout
-from drivers.arm_motion import News, checked_target, overtaken, refused
+from coupole.errors import DeviceLost
+from drivers.arm_motion import News, checked_target, overtaken, refused, wait_for
 from drivers.ur.messages import Ask, Config, Six, State
 from drivers.ur.process import UrProcess, raise_fault
 
@@ -195,21 +195,19 @@ class UrRobot:
     def _wait(
         self, done: Callable[[State], bool], deadline: Deadline, expected: str, *, faults: bool = True
     ) -> None:
-        while True:
-            state = self._state()
-            if faults:
-                raise_fault(state)
-            if done(state):
-                return
-            if deadline.expired:
-                raise DeviceTimeout(
-                    "robot",
-                    expected=f"{expected} within {deadline.seconds:.1f} s",
-                    happened=f"joints measured at {np.round(state.joints_deg, 3).tolist()} deg, "
-                    f"wanted at {np.round(state.wanted_deg, 3).tolist()} deg",
-                    remedy="See the controller's messages; its speed slider must not be moved during a motion",
-                )
-            self._clock.sleep(_POLL_S)
+        wait_for(
+            self._state,
+            done,
+            deadline,
+            expected,
+            check=raise_fault if faults else None,
+            pause=lambda: self._clock.sleep(_POLL_S),
+            describe=lambda state: (
+                f"joints measured at {np.round(state.joints_deg, 3).tolist()} deg, "
+                f"wanted at {np.round(state.wanted_deg, 3).tolist()} deg"
+            ),
+            remedy="See the controller's messages; its speed slider must not be moved during a motion",
+        )
 
     def _settled(self, state: State, number: int) -> bool:
         if self._number != number:

@@ -62,9 +62,11 @@ class Link:
     def __init__(self, config: Config) -> None:
         self.config = config
         model, serial, firmware = ready_controller(config)
-        from rtde_control import RTDEControlInterface  # type: ignore[import-not-found]
-        from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
-
+        try:
+            from rtde_control import RTDEControlInterface  # type: ignore[import-not-found]
+            from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
+        except ImportError as error:
+            raise CannotBegin("refused", "the package ur-rtde", str(error), "Install the extra `ur`") from error
         try:
             self._receive: Any = RTDEReceiveInterface(config.host, config.frequency_hz, _VARIABLES)
             self._control: Any = RTDEControlInterface(config.host, config.frequency_hz)

@@ -109,6 +109,20 @@ class Wire(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Surroundings:
+    """What the world makes of a camera: the speed of its sensor, and what is before it."""
+
+    readout_us: float
+    exposure_gap_us: float
+    lighting: Lighting
+    pose: Callable[[], Transform]
+    """`base_from_flange` of the arm that carries it, now."""
+    render: Render
+    arm: Callable[[], Capsules] = lambda: NONE
+    """What of the arm is in the way of light, now."""
+
+
 class CameraBody:
     """One camera without its wire; `edge(t_ns)` is the trigger cable."""
 
@@ -117,17 +131,13 @@ class CameraBody:
         reactor: Reactor,
         settings: Settings,
         wire: Wire,
-        *,
-        readout_us: float,
-        exposure_gap_us: float,
-        lighting: Lighting,
-        pose: Callable[[], Transform],
-        render: Render,
-        arm: Callable[[], Capsules] = lambda: NONE,
+        surroundings: Surroundings,
     ) -> None:
         self._reactor, self._settings, self._wire = reactor, settings, wire
-        self._lighting, self._pose, self._render, self._arm = lighting, pose, render, arm
-        self.readout_ns, self.gap_ns = round(readout_us * 1e3), round(exposure_gap_us * 1e3)
+        self._lighting, self._pose = surroundings.lighting, surroundings.pose
+        self._render, self._arm = surroundings.render, surroundings.arm
+        self.readout_ns = round(surroundings.readout_us * 1e3)
+        self.gap_ns = round(surroundings.exposure_gap_us * 1e3)
         self._random = random.Random(settings.seed)
         self._workers = ThreadPoolExecutor(1, "render")
         self._pending: deque[Shot] = deque()

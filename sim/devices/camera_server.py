@@ -15,7 +15,6 @@ import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,11 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from coupole.geometry import Transform
 from sim.devices import camera_body
-from sim.devices.arm_bodies import NONE, Capsules
-from sim.devices.camera_body import CameraBody, Render, Shot
-from sim.world.lighting import Lighting
+from sim.devices.camera_body import CameraBody, Shot, Surroundings
 from sim.world.reactor import Reactor
 
 FRAME_MESSAGE = struct.Struct("<IQQB")
@@ -61,25 +57,10 @@ class CameraServer:
         *,
         path: Path,
         frame_format: dict[str, Any],
-        readout_us: float,
-        exposure_gap_us: float,
-        lighting: Lighting,
-        pose: Callable[[], Transform],
-        render: Render,
-        arm: Callable[[], Capsules] = lambda: NONE,
+        surroundings: Surroundings,
     ) -> None:
         self._reactor, self._settings, self._format = reactor, settings, frame_format
-        self._body = CameraBody(
-            reactor,
-            settings,
-            self,
-            readout_us=readout_us,
-            exposure_gap_us=exposure_gap_us,
-            lighting=lighting,
-            pose=pose,
-            render=render,
-            arm=arm,
-        )
+        self._body = CameraBody(reactor, settings, self, surroundings)
         self.edge, self.ready = self._body.edge, self._body.ready
         self.lose_frames, self.ignore_edges = self._body.lose_frames, self._body.ignore_edges
         self._shape = (frame_format["height_px"], frame_format["width_px"])

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Protocol, assert_never
 
 from pydantic import Discriminator, Tag
 
 from sim.devices import camera_server, gige_camera
+from sim.devices.camera_body import Surroundings
 from sim.world import faults
 from sim.world.reactor import Reactor
 
@@ -56,15 +57,23 @@ def impossible(fault: faults.Fault, settings: CameraSettings) -> str:
 
 
 def build(
-    reactor: Reactor, settings: CameraSettings, folder: Path, **sensor: Any
+    reactor: Reactor,
+    settings: CameraSettings,
+    folder: Path,
+    *,
+    frame_format: dict[str, Any],
+    surroundings: Surroundings,
 ) -> tuple[CameraStandIn, dict[str, Any]]:
     """The stand-in, and what a client needs to know to reach it: under the names of our drivers' settings.
 
-    `sensor` is what every stand-in for a camera is made with (see `sim.devices.camera_body.CameraBody`).
+    `frame_format` has the fields of `coupole.devices.FrameFormat`.
     """
+    made: dict[str, Any] = {"frame_format": frame_format, "surroundings": surroundings}
     match settings:
         case camera_server.Settings():
             path = folder / "camera"
-            return camera_server.CameraServer(reactor, settings, path=path, **sensor), {"address": str(path)}
+            return camera_server.CameraServer(reactor, settings, path=path, **made), {"address": str(path)}
         case gige_camera.Settings():
-            return gige_camera.GigeCamera(reactor, settings, **sensor), {"address": settings.address}
+            return gige_camera.GigeCamera(reactor, settings, **made), {"address": settings.address}
+        case _:
+            assert_never(settings)

@@ -12,7 +12,6 @@ import ctypes
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -20,13 +19,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from coupole.errors import DeviceRefused, DeviceTimeout
-from coupole.geometry import Transform
 from sim.devices import camera_body
 from sim.devices import gige_registers as reg
-from sim.devices.arm_bodies import NONE, Capsules
-from sim.devices.camera_body import CameraBody, Render, Shot
+from sim.devices.camera_body import CameraBody, Shot, Surroundings
 from sim.devices.gige_pixels import LAYOUTS, encode
-from sim.world.lighting import Lighting
 from sim.world.reactor import Reactor
 
 _SLOTS = 6
@@ -63,25 +59,10 @@ class GigeCamera:
         settings: Settings,
         *,
         frame_format: dict[str, Any],
-        readout_us: float,
-        exposure_gap_us: float,
-        lighting: Lighting,
-        pose: Callable[[], Transform],
-        render: Render,
-        arm: Callable[[], Capsules] = lambda: NONE,
+        surroundings: Surroundings,
     ) -> None:
         self._reactor, self._settings, self._bit_depth = reactor, settings, frame_format["bit_depth"]
-        self._body = CameraBody(
-            reactor,
-            settings,
-            self,
-            readout_us=readout_us,
-            exposure_gap_us=exposure_gap_us,
-            lighting=lighting,
-            pose=pose,
-            render=render,
-            arm=arm,
-        )
+        self._body = CameraBody(reactor, settings, self, surroundings)
         self.lose_frames, self.ignore_edges = self._body.lose_frames, self._body.ignore_edges
         shape = (frame_format["height_px"], frame_format["width_px"])
         self._frames = [np.zeros(shape, np.uint16) for _ in range(_SLOTS)]

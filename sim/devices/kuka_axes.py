@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.devices.kuka_kinematics import AXIS_LIMITS_DEG, AXIS_SPEEDS_DEG_S, flange_pose
-from sim.devices.kuka_settings import Box, Settings, Workspace
+from sim.devices.kuka_settings import Box, Settings, Sphere, Workspace
 
 _NOWHERE: tuple[float, ...] = (0.0,) * 6
 _TOLERANCE_DEG = 2e-6
@@ -166,6 +167,10 @@ class Axes:
 
 
 def _inside(workspace: Workspace, point_mm: NDArray[np.float64]) -> bool:
-    if isinstance(workspace, Box):
-        return bool(np.all(point_mm >= workspace.min_mm) and np.all(point_mm <= workspace.max_mm))
-    return bool(np.linalg.norm(point_mm - workspace.centre_mm) <= workspace.radius_mm)
+    match workspace:
+        case Box():
+            return bool(np.all(point_mm >= workspace.min_mm) and np.all(point_mm <= workspace.max_mm))
+        case Sphere():
+            return bool(np.linalg.norm(point_mm - workspace.centre_mm) <= workspace.radius_mm)
+        case _:
+            assert_never(workspace)

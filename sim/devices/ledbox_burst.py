@@ -88,10 +88,6 @@ class Burst:
         """Steps whose LED went off and whose edge was sent: records in the log."""
         return len(self.log) // _LOG_RECORD.size
 
-    @property
-    def light_is_on(self) -> bool:
-        return self._lit is not None
-
     def records(self, first: int, count: int) -> bytes:
         """Log bytes of at most `count` records from record `first`."""
         return bytes(self.log[first * _LOG_RECORD.size : (first + count) * _LOG_RECORD.size])

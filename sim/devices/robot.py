@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Sequence
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Protocol, assert_never
 
 from pydantic import Discriminator, Tag
 
@@ -80,6 +80,8 @@ def build(reactor: Reactor, settings: RobotSettings) -> tuple[RobotStandIn, dict
         case ur_controller.Settings():
             ur = ur_controller.UrController(reactor, settings)
             return ur, {"host": ur.address}
+        case _:
+            assert_never(settings)
 
 
 def _with_free_port(address: str) -> str:

@@ -7,8 +7,7 @@ support. The controller knows nothing of them: keep views clear of what is tall.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Literal, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,9 +58,13 @@ class Sphere(_Thing):
     def surface(self) -> Surface:
         from sim.objects import shapes, standards
 
-        if self.kind == "chrome_ball":
-            return standards.chrome_ball(self.diameter_mm)
-        return shapes.glossy_sphere(self.diameter_mm / 2)
+        match self.kind:
+            case "chrome_ball":
+                return standards.chrome_ball(self.diameter_mm)
+            case "glossy_sphere":
+                return shapes.glossy_sphere(self.diameter_mm / 2)
+            case _:
+                assert_never(self.kind)
 
 
 class Stickers(BaseModel):
@@ -126,17 +129,25 @@ class Sample(_Thing):
         """Without its stickers."""
         from sim.objects import fabric, shapes, standards, urushi, wedges
 
-        generators: dict[str, Callable[[], Surface]] = {
-            "spectralon_tile": standards.spectralon_tile,
-            "grey_card": standards.grey_card,
-            "gilt_step_wedge": wedges.gilt_step_wedge,
-            "paint_wedge": wedges.paint_wedge,
-            "makie_tile": urushi.makie_tile,
-            "nashiji_slab": urushi.nashiji_slab,
-            "fabric": fabric.fabric,
-            "sculpted_relief": shapes.sculpted_relief,
-        }
-        return generators[self.kind]()
+        match self.kind:
+            case "spectralon_tile":
+                return standards.spectralon_tile()
+            case "grey_card":
+                return standards.grey_card()
+            case "gilt_step_wedge":
+                return wedges.gilt_step_wedge()
+            case "paint_wedge":
+                return wedges.paint_wedge()
+            case "makie_tile":
+                return urushi.makie_tile()
+            case "nashiji_slab":
+                return urushi.nashiji_slab()
+            case "fabric":
+                return fabric.fabric()
+            case "sculpted_relief":
+                return shapes.sculpted_relief()
+            case _:
+                assert_never(self.kind)
 
 
 Thing = Annotated[CharucoBoard | Sphere | Sample, Field(discriminator="kind")]

@@ -16,7 +16,7 @@ import sys
 import tempfile
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, assert_never
 
 import numpy as np
 from pydantic import BaseModel
@@ -24,7 +24,7 @@ from pydantic import BaseModel
 from coupole.devices import NO_LIGHT
 from sim.devices import camera_stand_in, gige_camera, kuka_controller, ledbox_firmware, robot
 from sim.devices.arm_bodies import NONE, Capsules, arm_capsules, tool_capsules
-from sim.devices.camera_body import Exposed
+from sim.devices.camera_body import Exposed, Surroundings
 from sim.optics.led_light import Flashes
 from sim.optics.photographer import Photographer
 from sim.world import faults as script
@@ -51,25 +51,7 @@ class World:
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
         self._tool, self._arm_shadows = config.scene.tool, settings.arm_shadows
         self.robot, robot_endpoint = robot.build(self.reactor, settings.robot)
-        self.camera, camera_endpoint = camera_stand_in.build(
-            self.reactor,
-            settings.camera,
-            folder,
-            frame_format={
-                "height_px": config.camera.height_px,
-                "width_px": config.camera.width_px,
-                "bit_depth": config.camera.bit_depth,
-                "bayer_pattern": config.camera.bayer_pattern,
-                "black_dn": config.camera.black_dn,
-                "white_dn": self._photographer.sensor.white_dn,
-            },
-            readout_us=1e6 / config.camera.max_frames_per_s,
-            exposure_gap_us=config.camera.exposure_gap_us,
-            lighting=self.lighting,
-            pose=self.robot.true_base_from_flange,
-            render=self._photographer.render,
-            arm=self._arm,
-        )
+        self.camera, camera_endpoint = self._build_camera(config.camera, folder)
         self.box = ledbox_firmware.LedBoxFirmware(
             self.reactor,
             settings.ledbox,
@@ -102,6 +84,26 @@ class World:
             "pid": os.getpid(),
         }
 
+    def _build_camera(
+        self, camera: CameraConfig, folder: Path
+    ) -> tuple[camera_stand_in.CameraStandIn, dict[str, Any]]:
+        names = ("height_px", "width_px", "bit_depth", "bayer_pattern", "black_dn")
+        frame_format = {name: getattr(camera, name) for name in names}
+        return camera_stand_in.build(
+            self.reactor,
+            self._camera_settings,
+            folder,
+            frame_format={**frame_format, "white_dn": self._photographer.sensor.white_dn},
+            surroundings=Surroundings(
+                readout_us=1e6 / camera.max_frames_per_s,
+                exposure_gap_us=camera.exposure_gap_us,
+                lighting=self.lighting,
+                pose=self.robot.true_base_from_flange,
+                render=self._photographer.render,
+                arm=self._arm,
+            ),
+        )
+
     def _warm_up(self, camera: CameraConfig) -> None:
         """Compile the renderer, and lay out what it keeps, before anybody waits for a frame."""
         led = int(self._photographer.leds.ids[0])
@@ -115,9 +117,13 @@ class World:
         if not self._arm_shadows:
             return NONE
         tool = tool_capsules(self.robot.true_base_from_flange(), self._tool)
-        if self._robot_settings.kind == "ur":
-            return tool
-        return np.concatenate([arm_capsules(self.robot.joints_deg), tool])
+        match self._robot_settings.kind:
+            case "ur":
+                return tool
+            case "rsi" | "eki":
+                return np.concatenate([arm_capsules(self.robot.joints_deg), tool])
+            case kind:
+                assert_never(kind)
 
     def _light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
         """The box drives an LED, which shines as bright as it can now."""
@@ -172,6 +178,8 @@ class World:
                 self.robot.lose_link(fault.seconds)
             case script.NudgeArm():
                 self.robot.nudge([fault.deg] * 6, fault.seconds)
+            case _:
+                assert_never(fault)
 
     # -- control ------------------------------------------------------------------------------------------
 

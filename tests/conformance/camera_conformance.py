@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from coupole.devices import Camera, Exposure, Frame
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused
-from sim.devices.camera_body import Exposed
+from sim.devices.camera_body import Exposed, Surroundings
 from sim.world.lighting import Lighting
 from sim.world.reactor import Reactor
 
@@ -57,11 +57,13 @@ def sensor(height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX) -> dict[str, An
             "black_dn": 64,
             "white_dn": 4095,
         },
-        "readout_us": 10_000,
-        "exposure_gap_us": 100,
-        "lighting": Lighting(),
-        "pose": lambda: np.eye(4),
-        "render": _render,
+        "surroundings": Surroundings(
+            readout_us=10_000,
+            exposure_gap_us=100,
+            lighting=Lighting(),
+            pose=lambda: np.eye(4),
+            render=_render,
+        ),
     }
 
 

@@ -10,7 +10,6 @@ import socket
 import struct
 import threading
 from collections import deque
-from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,10 @@ import numpy as np
 from camera_conformance import fire, in_world, sensor
 from numpy.typing import NDArray
 
-from coupole.geometry import Transform
 from sim.devices import camera_body
-from sim.devices.camera_body import CameraBody, Render, Shot
+from sim.devices.camera_body import CameraBody, Shot, Surroundings
 from sim.devices.gige_pixels import encode
 from sim.world.clock import ClockWriter
-from sim.world.lighting import Lighting
 from sim.world.reactor import Reactor
 
 DESCRIPTION_FILE = Path(__file__).with_name("gentl_producer") / "camera.xml"
@@ -63,24 +60,11 @@ class StandIn:
         tl_type: str,
         ticks_hz: int,
         frame_format: dict[str, Any],
-        readout_us: float,
-        exposure_gap_us: float,
-        lighting: Lighting,
-        pose: Callable[[], Transform],
-        render: Render,
+        surroundings: Surroundings,
     ) -> None:
         self._reactor, self._path, self._ticks_hz = reactor, path, ticks_hz
         self._depth = frame_format["bit_depth"]
-        self.body = CameraBody(
-            reactor,
-            settings,
-            self,
-            readout_us=readout_us,
-            exposure_gap_us=exposure_gap_us,
-            lighting=lighting,
-            pose=pose,
-            render=render,
-        )
+        self.body = CameraBody(reactor, settings, self, surroundings)
         self.torn: set[int] = set()
         """Ids of frames that arrive without their lower half."""
         height_px, width_px = frame_format["height_px"], frame_format["width_px"]
@@ -104,7 +88,7 @@ class StandIn:
         for address, real in (
             (EXPOSURE_US, 5_000.0),
             (BLACK_LEVEL_DN, frame_format["black_dn"]),
-            (READOUT_US, readout_us),
+            (READOUT_US, surroundings.readout_us),
             (TEMPERATURE_C, 41.5),
         ):
             struct.pack_into("<d", self._registers, address, real)

@@ -34,8 +34,6 @@ from drivers.camera.raw.exif import read_exif
 from drivers.camera.raw.order import proven_order
 from drivers.camera.raw.picture import decode
 
-pytest.importorskip("rawpy", reason="the extra `real-data` is not installed")
-
 REAL_DNG = SHARED_DATA / "raw/colorchart.dng"
 HEIGHT_PX, WIDTH_PX = 24, 40
 EXPOSURE = Exposure(8_000)
@@ -433,6 +431,12 @@ class TestExif:
         assert found.taken_ns == seconds * 10**9 + int(subseconds.ljust(9, "0"))
         assert found.resolution_us == 10 ** (6 - len(subseconds))
         assert found.exposure_us == pytest.approx(1e6 * exposure[0] / exposure[1])
+
+    @pytest.mark.parametrize("iso", [400, (400, 100)])
+    def test_the_first_sensitivity_counts(self, tmp_path: Path, iso: int | tuple[int, ...]) -> None:
+        path = tmp_path / "IMG_0001.DNG"
+        write_dng(path, np.zeros((2, 2), np.uint16), taken="2026:03:04 05:06:07", iso=iso)
+        assert read_exif(path).iso == 400
 
     @settings(deadline=None)
     @given(content=st.binary(max_size=400), cut=st.integers(0, 400))

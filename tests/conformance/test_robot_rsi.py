@@ -276,5 +276,5 @@ def test_packets_that_can_no_longer_be_read_are_a_lost_link(tmp_path: Path) -> N
 def test_a_session_without_delay_counter_that_may_be_running_is_not_taken_over(tmp_path: Path) -> None:
     with closing(KukaCell(tmp_path, delay_tag="")) as cell:
         with pytest.raises(DeviceTimeout, match="another program may have begun"):
-            cell.open(connect_timeout_s=0.5)
+            cell.open(connect_timeout_s=2.0)
         cell.assert_stands()

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from robot_conformance import AWAY_DEG, HOME_DEG, RobotCell, RobotConformance
+from ur import needs_ur_rtde
 
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout, InputError
 from drivers.ur.driver import Settings, UrRobot
@@ -27,7 +28,7 @@ from sim.devices.ur_controller import UrController
 from sim.world.clock import ClockWriter
 from sim.world.reactor import Reactor
 
-pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
+pytestmark = needs_ur_rtde
 
 _CYCLE_S = 0.002
 
@@ -319,6 +320,13 @@ def test_a_push_for_a_while_springs_back(cell: UrCell, robot: UrRobot) -> None:
     cell.clock.sleep(0.4)
     assert cell.joints_deg() == pytest.approx(HOME_DEG)
     assert robot.measured().fault == ""
+
+
+def test_a_missing_ur_rtde_is_named(cell: UrCell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "rtde_control.py").write_text("raise ImportError('there is none')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(DeviceRefused, match=r"the package ur-rtde.*there is none"):
+        cell.open()
 
 
 def test_statistics_can_be_asked_after_closing(cell: UrCell, robot: UrRobot) -> None:

@@ -20,7 +20,7 @@ def write_dng(
     taken: str,
     subseconds: str = "",
     exposure: tuple[int, int] = (1, 125),
-    iso: int = 100,
+    iso: int | tuple[int, ...] = 100,
     model: str = "Still",
     order: str = "<",
 ) -> None:
@@ -40,7 +40,7 @@ def write_dng(
     strip = pixels.astype(order + "u2").tobytes()
     exif = [
         (0x829A, 5, 1, struct.pack(order + "II", *exposure)),
-        short(0x8827, iso),
+        short(0x8827, *(iso if isinstance(iso, tuple) else (iso,))),
         text(0x9003, taken),
         *([text(0x9291, subseconds)] if subseconds else []),
         text(0xA431, "4711"),

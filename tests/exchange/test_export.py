@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rawpy
 from archives import Frame, MadeRun, make_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -70,8 +71,6 @@ def export(
 
 
 def as_libraw_reads(content: bytes) -> Any:
-    import rawpy
-
     return rawpy.imread(io.BytesIO(content))
 
 
@@ -154,8 +153,6 @@ def test_tags_of_a_dng_stand_in_ascending_order() -> None:
 
 @pytest.mark.skipif(not REFERENCE.exists(), reason="the reference DNG is not here")
 def test_the_frame_of_a_real_dng_survives_ours_bit_exact() -> None:
-    import rawpy
-
     with rawpy.imread(str(REFERENCE)) as raw:
         pixels, black_dn, white_dn = raw.raw_image.copy(), raw.black_level_per_channel[0], int(raw.white_level)
         letters = raw.color_desc.decode()

@@ -15,7 +15,7 @@ from coupole.devices import FLAG_NO_TRIGGER, NO_LIGHT
 from coupole.geometry import transform
 from coupole.plan.bursts import MARKS, START_MARK_EXTRA, Burst, burst_timing
 from coupole.plan.led_table import LedTable, read_led_table
-from coupole.plan.lights import interleave, missing_lights
+from coupole.plan.light_selection import interleave, missing_lights
 from coupole.plan.plan import Plan
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.shot_id import Led, ShotLabel

@@ -10,6 +10,7 @@ import cells
 import pytest
 from cells import SIDE, TOP, CellFolder
 from gige import gige_port, needs_aravis
+from ur import needs_ur_rtde
 
 from coupole.plan.cell import read_cell
 from coupole.plan.rig_devices import planning_arm
@@ -26,7 +27,10 @@ def eki(cell: CellFolder) -> CellFolder:
     return cell
 
 
-@pytest.mark.parametrize("name", ["sim", pytest.param("sim-gige", marks=needs_aravis), "sim-eki", "sim-ur"])
+@pytest.mark.parametrize(
+    "name",
+    ["sim", pytest.param("sim-gige", marks=needs_aravis), "sim-eki", pytest.param("sim-ur", marks=needs_ur_rtde)],
+)
 def test_the_devices_of_each_shipped_rig_open_and_test_themselves(name: str) -> None:
     with gige_port() if name == "sim-gige" else nullcontext():
         ended = cells.command("devices", "--rig", cells.REPO / f"configs/rigs/{name}.yaml")

@@ -58,13 +58,6 @@ class Linearity:
         corrected: Floats = signal_dn * (1.0 + x * (self.coefficients[0] + x * self.coefficients[1]))
         return corrected
 
-    def u_linear(self, signal_dn: Floats) -> Floats:
-        """Relative standard uncertainty that the curve adds to a signal."""
-        x = np.asarray(signal_dn) / self.range_dn
-        by = np.stack([x, x * x])
-        u: Floats = np.sqrt(np.maximum(np.einsum("i...,ij,j...->...", by, self.covariance, by), 0.0))
-        return u
-
 
 def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1e-3) -> Linearity:
     """Deviation from a line; its correction if a straight one would look like this less often than `significance`.

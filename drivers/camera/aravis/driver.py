@@ -21,17 +21,17 @@ from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.camera.aravis.discovery import name_of, open_controlled
 from drivers.camera.aravis.features import Features
 from drivers.camera.aravis.library import ON_CONTROL_LOST, call, is_a, require
-from drivers.camera.aravis.settings import Counter, Settings
+from drivers.camera.aravis.settings import Settings
 from drivers.camera.aravis.stream import Pool, Stream, StreamStatistics
-from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_region
+from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_image
+from drivers.camera.genicam_trigger import counts, frame_id_range, set_exposure, since
+from drivers.camera.misuse import misused
 from drivers.camera.pixel_formats import widen
 
 __all__ = ["AravisCamera", "Settings"]
 
 _PACKET_SOCKET_DISABLED = 1
 """ArvGvStreamOption (arvgvstream.h)."""
-_LAST_WIDE_ID = 2**62
-"""Stands for the end of 64-bit ids, which is never reached."""
 
 
 class AravisCamera:
@@ -61,7 +61,7 @@ class AravisCamera:
         self._features = Features(self._library, self._handle, self._name)
         try:
             self._set_up()
-            self.id_modulus = self._ids()
+            self.id_modulus = frame_id_range(self._features, gige=self._is_gige)
         except BaseException:
             self.close()
             raise
@@ -69,13 +69,9 @@ class AravisCamera:
     # -- opening and closing ------------------------------------------------------------------------------
 
     def _set_up(self) -> None:
-        settings, features = self._settings, self._features
         with contextlib.suppress(DeviceRefused):  # a client that died may have left it running
-            features.execute("AcquisitionStop")
-        features.write_all(settings.features)
-        if settings.region is not None:
-            set_region(features, settings.region)
-        features.write("PixelFormat", settings.pixel_format)
+            self._features.execute("AcquisitionStop")
+        set_image(self._features, self._settings)
         if self._is_gige:
             self._set_packets()
 
@@ -87,15 +83,6 @@ class AravisCamera:
             call(self._name, "a packet size that fits", library.arv_gv_device_auto_packet_size, handle)
         else:
             call(self._name, f"packets of {size} B", library.arv_gv_device_set_packet_size, handle, size)
-
-    def _ids(self) -> tuple[int, int]:
-        """The transport's frame ids: 64 bits on USB3 Vision, and on GigE Vision 2 where the camera says so."""
-        if not self._is_gige:
-            return (0, _LAST_WIDE_ID)
-        extended = "GevGVSPExtendedIDMode"
-        if self._features.has(extended) and self._features.read(extended) in {"On", True}:
-            return (1, _LAST_WIDE_ID)
-        return (1, 65535)
 
     def close(self) -> None:
         with contextlib.suppress(DeviceError):
@@ -146,24 +133,11 @@ class AravisCamera:
 
     def configure(self, exposure: Exposure) -> FrameFormat:
         if self._stream is not None:
-            raise self._misused("a disarmed camera", "configure() was called while it is armed")
+            raise misused(self._name, "a disarmed camera", "configure() was called while it is armed")
         self._check_link()
-        features, settings = self._features, self._settings
-        for name, entry in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("TriggerSelector", "FrameStart")):
-            if features.has(name):
-                features.write(name, entry)
-        features.write("TriggerMode", "On")
-        if exposure.hardware_trigger:
-            features.write("TriggerSource", settings.trigger_line)
-            if features.has("TriggerActivation"):
-                features.write("TriggerActivation", settings.trigger_activation)
-        else:
-            features.write("TriggerSource", settings.software_trigger)
-        features.write(features.first_of("ExposureTimeAbs") or "ExposureTime", float(exposure.exposure_us))
-        if exposure.gain_db or features.has("Gain"):
-            features.write("Gain", float(exposure.gain_db))
+        set_exposure(self._features, self._settings, exposure)
         self._exposure = exposure
-        self._format = frame_format(features, self._name, settings.black_dn)
+        self._format = frame_format(self._features, self._name, self._settings.black_dn)
         return self._format
 
     def min_period_us(self, exposure: Exposure) -> int:
@@ -175,14 +149,14 @@ class AravisCamera:
 
     def arm(self, buffers: int) -> None:
         if self._format is None:
-            raise self._misused("configure() before arm()", "no exposure is set")
+            raise misused(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
         self._check_link()
         self._allocate(max(buffers, self._settings.buffers))
         retention_us = self._settings.frame_retention_ms * 1000
         stream = Stream(self._library, self._handle, self._name, self._raw, frame_retention_us=retention_us)
         try:
-            self._counted_before = self._count()
+            self._counted_before = counts(self._features, self._settings)
             self._features.execute("AcquisitionStart")
         except BaseException:
             stream.close()
@@ -252,8 +226,8 @@ class AravisCamera:
 
     def trigger(self) -> None:
         if self._stream is None or self._exposure.hardware_trigger:
-            raise self._misused(
-                "a camera armed for the software trigger", "it is disarmed, or armed for the cable"
+            raise misused(
+                self._name, "a camera armed for the software trigger", "it is disarmed, or armed for the cable"
             )
         self._check_link()
         self._features.execute("TriggerSoftware")
@@ -278,26 +252,16 @@ class AravisCamera:
         return self._statistics(stream) if stream is not None else self._last[0]
 
     def _statistics(self, stream: Stream) -> CameraStatistics:
-        exposed, over_triggers = self._count()
+        exposed, over_triggers = counts(self._features, self._settings)
         found = stream.statistics()
         overflows = max(0, found.skipped - found.failed) if found.underruns else 0
         return CameraStatistics(
-            _since(exposed, self._counted_before[0]),
+            since(exposed, self._counted_before[0]),
             found.completed,
             found.skipped - overflows,
-            _since(over_triggers, self._counted_before[1]),
+            since(over_triggers, self._counted_before[1]),
             overflows,
         )
-
-    def _count(self) -> tuple[int, int]:
-        """The camera's own counts, -1 where it has none."""
-        return (self._read(self._settings.exposed_counter), self._read(self._settings.over_trigger_counter))
-
-    def _read(self, counter: Counter | None) -> int:
-        if counter is None:
-            return -1
-        self._features.write_all(counter.select)
-        return int(self._features.number(counter.read))
 
     def stream_statistics(self) -> StreamStatistics:
         """Figures of frames and packets since `arm`."""
@@ -317,15 +281,3 @@ class AravisCamera:
             happened=happened,
             remedy="Check cable and power, and that no other program uses the camera; then resume the run.",
         )
-
-    def _misused(self, expected: str, happened: str) -> DeviceRefused:
-        return DeviceRefused(
-            self._name,
-            expected=expected,
-            happened=happened,
-            remedy="This is a fault of the program that drives the camera.",
-        )
-
-
-def _since(count: int, before: int) -> int:
-    return count if count < 0 else (count - before) % 2**32

@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import ctypes
-import math
 import threading
 from collections.abc import Mapping
 from typing import Any, NoReturn
 
-from pydantic import StrictBool, StrictFloat, StrictInt, StrictStr
-
 from coupole.errors import DeviceRefused
 from drivers.camera.aravis.library import call, is_a
-
-Value = StrictBool | StrictInt | StrictFloat | StrictStr
-"""What a feature holds; an enumeration's is the name of its entry."""
+from drivers.camera.genicam_features import alike
+from drivers.camera.genicam_settings import Value
 
 _KINDS = ("command", "enumeration", "boolean", "integer", "float", "string")
 _READ_ONLY = 0
 """ArvGcAccessMode (arvgcenums.h)."""
-_READBACK_TOLERANCE = 0.01
-"""Cameras round: an exposure to their line time, a gain to their converter's steps."""
 
 
 class Features:
@@ -78,7 +72,7 @@ class Features:
             if kind == "command":
                 return
             held = self.read(name)
-        if not _alike(held, value):
+        if not alike(held, value):
             self._refuse(f"`{name}` to hold {value!r} once it is set", f"it holds {held!r}")
 
     def write_all(self, values: Mapping[str, Value]) -> None:
@@ -175,9 +169,3 @@ class Features:
             happened=happened,
             remedy="Correct the camera's settings in the rig (`arv-tool-0.8 features` lists what a camera has).",
         )
-
-
-def _alike(held: Value, wanted: Value) -> bool:
-    if isinstance(held, float) and not isinstance(wanted, str):
-        return math.isclose(held, wanted, rel_tol=_READBACK_TOLERANCE, abs_tol=1e-9)
-    return held == wanted

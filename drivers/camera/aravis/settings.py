@@ -6,17 +6,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from drivers.camera.aravis.features import Value
-from drivers.camera.genicam_image import Region
-
-
-class Counter(BaseModel):
-    """A counter of the camera: features to set first (selectors), and the one that holds the count."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    select: dict[str, Value] = Field(default_factory=dict)
-    read: str = "CounterValue"
+from drivers.camera.genicam_settings import Counter, Region, Value
 
 
 class Settings(BaseModel):

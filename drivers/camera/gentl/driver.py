@@ -19,11 +19,13 @@ from typing import Any
 from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceRefused
 from drivers.camera.frame_pool import FramePool, Slot
-from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_region
+from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_image
+from drivers.camera.genicam_trigger import counts, frame_id_range, set_exposure, since
 from drivers.camera.gentl.features import Features
 from drivers.camera.gentl.image import copy_pixels, timestamp_ns
 from drivers.camera.gentl.producer import Gaps, open_camera, reporting, told, when_incomplete
-from drivers.camera.gentl.settings import Counter, Settings
+from drivers.camera.gentl.settings import Settings
+from drivers.camera.misuse import misused
 from drivers.fair_lock import FairLock
 
 _A_LOOK_S = 1e-4
@@ -34,8 +36,6 @@ _SILENCE_S = 0.5
 """Without frames for so long, the camera is asked whether it is there: not every producer tells when it goes."""
 _IN_HAND = 16
 """Frames that are on their way to the disk at once."""
-_LAST_WIDE_ID = 2**62
-"""Stands for the end of 64-bit ids, which is never reached."""
 
 
 class GenTLCamera:
@@ -61,27 +61,13 @@ class GenTLCamera:
                 self._acquirer.Events.INCOMPLETE_BUFFER, when_incomplete(self._gaps.incomplete)
             )
             self._acquirer.timeout_period_on_update_event_data_call = 0
-            self._set_up()
-            self.id_modulus = self._ids()
+            set_image(self._features, settings)
+            self.id_modulus = frame_id_range(self._features, gige=self._info["tl_type"] == "GEV")
         except BaseException:
             self.close()
             raise
 
     # -- opening and closing ------------------------------------------------------------------------------
-
-    def _set_up(self) -> None:
-        self._features.write_all(self._settings.features)
-        if self._settings.region is not None:
-            set_region(self._features, self._settings.region)
-        self._features.write("PixelFormat", self._settings.pixel_format)
-
-    def _ids(self) -> tuple[int, int]:
-        """16 bits on GigE Vision, unless the camera says that it uses the extended ones; else 64."""
-        if self._info["tl_type"] != "GEV":
-            return (0, _LAST_WIDE_ID)
-        extended = "GevGVSPExtendedIDMode"
-        wide = self._features.has(extended) and self._features.read(extended) in {"On", True}
-        return (1, _LAST_WIDE_ID if wide else 65535)
 
     def close(self) -> None:
         with contextlib.suppress(DeviceError):
@@ -110,34 +96,23 @@ class GenTLCamera:
 
     def configure(self, exposure: Exposure) -> FrameFormat:
         if self._armed.is_set():
-            raise self._misused("a disarmed camera", "configure() was called while it is armed")
+            raise misused(self._name, "a disarmed camera", "configure() was called while it is armed")
         with self._lock:
             if not self._settings.free_running:
-                self._set_exposure(exposure)
+                self._expect_trigger()
+                set_exposure(self._features, self._settings, exposure)
             self._format = frame_format(self._features, self._name, self._settings.black_dn)
         self._exposure = exposure
         return self._format
 
-    def _set_exposure(self, exposure: Exposure) -> None:
-        features, settings = self._features, self._settings
-        if not features.has("TriggerMode"):
+    def _expect_trigger(self) -> None:
+        if not self._features.has("TriggerMode"):
             raise DeviceRefused(
                 self._name,
                 expected="a camera that can be triggered",
                 happened="it has no feature `TriggerMode`",
                 remedy="Use another camera, or set `free_running: true` to look through this one.",
             )
-        for name, entry in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("TriggerSelector", "FrameStart")):
-            if features.has(name):
-                features.write(name, entry)
-        features.write("TriggerMode", "On")
-        by_edges = exposure.hardware_trigger
-        features.write("TriggerSource", settings.trigger_line if by_edges else settings.software_trigger)
-        if by_edges and features.has("TriggerActivation"):
-            features.write("TriggerActivation", settings.trigger_activation)
-        features.write(features.first_of("ExposureTimeAbs") or "ExposureTime", float(exposure.exposure_us))
-        if exposure.gain_db or features.has("Gain"):
-            features.write("Gain", float(exposure.gain_db))
 
     def min_period_us(self, exposure: Exposure) -> int:
         with self._lock:
@@ -148,7 +123,7 @@ class GenTLCamera:
 
     def arm(self, buffers: int) -> None:
         if self._format is None:
-            raise self._misused("configure() before arm()", "no exposure is set")
+            raise misused(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
         wanted = max(buffers, self._settings.buffers, self._acquirer.min_num_buffers)
         slots = min(wanted, _IN_HAND)
@@ -158,7 +133,7 @@ class GenTLCamera:
         with self._lock:
             self._wire_format = pixel_format(self._features, self._name)
             self._gaps.begin(self.id_modulus)
-            self._counted_before = self._count()
+            self._counted_before = counts(self._features, self._settings)
             with reporting(self._name, "the acquisition to start"):
                 self._acquirer.num_buffers = wanted
                 self._acquirer.start()
@@ -210,7 +185,7 @@ class GenTLCamera:
 
     def trigger(self) -> None:
         if self._settings.free_running or self._exposure is None or self._exposure.hardware_trigger:
-            raise self._misused("hardware_trigger=False", "a software trigger while something else triggers")
+            raise misused(self._name, "hardware_trigger=False", "a software trigger while something else triggers")
         with self._lock:
             self._features.write("TriggerSoftware", True)
 
@@ -222,26 +197,16 @@ class GenTLCamera:
         return self._last
 
     def _statistics(self) -> CameraStatistics:
-        exposed, over_triggers = self._count()
+        exposed, over_triggers = counts(self._features, self._settings)
         missing = self._gaps.missing
         overflows = min(missing, int(told(self._acquirer.data_streams[0].module, "num_underrun") or 0))
         return CameraStatistics(
-            exposed=_since(exposed, self._counted_before[0]),
+            exposed=since(exposed, self._counted_before[0]),
             delivered=self._gaps.delivered,
             lost_transfers=missing - overflows,
-            over_triggers=_since(over_triggers, self._counted_before[1]),
+            over_triggers=since(over_triggers, self._counted_before[1]),
             overflows=overflows,
         )
-
-    def _count(self) -> tuple[int, int]:
-        """The camera's own counts, -1 where it has none."""
-        return (self._read(self._settings.exposed_counter), self._read(self._settings.over_trigger_counter))
-
-    def _read(self, counter: Counter | None) -> int:
-        if counter is None:
-            return -1
-        self._features.write_all(counter.select)
-        return int(self._features.number(counter.read))
 
     def disarm(self) -> None:
         if not self._armed.is_set():
@@ -252,17 +217,3 @@ class GenTLCamera:
             self._armed.clear()
             with self._lock, reporting(self._name, "the acquisition to stop"):
                 self._acquirer.stop()
-
-    # -- errors -------------------------------------------------------------------------------------------
-
-    def _misused(self, expected: str, happened: str) -> DeviceRefused:
-        return DeviceRefused(
-            self._name,
-            expected=expected,
-            happened=happened,
-            remedy="This is a fault of the program that drives the camera.",
-        )
-
-
-def _since(count: int, before: int) -> int:
-    return count if count < 0 else count - before

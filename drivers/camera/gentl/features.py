@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, NoReturn
 
 from coupole.errors import DeviceLost, DeviceRefused
-from drivers.camera.gentl.settings import Value
+from drivers.camera.genicam_features import alike
+from drivers.camera.genicam_settings import Value
 
-_READBACK_TOLERANCE = 0.01
-"""Cameras round: an exposure to their line time, a gain to their converter's steps."""
 _TYPES: dict[str, tuple[type, ...]] = {
     "IInteger": (int,),
     "IFloat": (int, float),
@@ -96,7 +94,7 @@ class Features:
             held = node.value
         except self._errors as error:
             self._failed(f"`{name}` to take {value!r}", error)
-        if not _alike(held, value):
+        if not alike(held, value):
             self._refuse(f"`{name}` to hold {value!r} once it is set", f"it holds {held!r}")
 
     def write_all(self, values: Mapping[str, Value]) -> None:
@@ -154,9 +152,3 @@ class Features:
             happened=happened,
             remedy="Correct the camera's settings in the rig; the maker's viewer shows its features.",
         )
-
-
-def _alike(held: Value, wanted: Value) -> bool:
-    if isinstance(held, float) and not isinstance(wanted, str):
-        return math.isclose(held, wanted, rel_tol=_READBACK_TOLERANCE, abs_tol=1e-9)
-    return held == wanted

@@ -5,21 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, StrictStr
+from pydantic import BaseModel, ConfigDict, Field
 
-from drivers.camera.genicam_image import Region
-
-Value = StrictBool | StrictInt | StrictFloat | StrictStr
-"""What a feature holds; an enumeration's is the name of its entry."""
-
-
-class Counter(BaseModel):
-    """A counter of the camera: features to set first (selectors), and the one that holds the count."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    select: dict[str, Value] = Field(default_factory=dict)
-    read: str = "CounterValue"
+from drivers.camera.genicam_settings import Counter, Region, Value
 
 
 class Settings(BaseModel):

@@ -1,7 +1,7 @@
 """A still camera whose RAW files a tethering program puts into a folder: `coupole.devices.Camera`.
 
 The box's edge (or a command) releases the shutter; the camera or its program writes CR2, NEF, ARW or DNG files;
-LibRaw (`rawpy`, extra `real-data`) decodes them. A file is taken as a frame when its size has stood still.
+LibRaw (`rawpy`) decodes them. A file is taken as a frame when its size has stood still.
 
 *Order and count are proven, never assumed.* The frame id is the number in the file's name, which the camera counts
 on with every picture and wraps from 9999 to 1: a picture that never comes leaves a gap. The timestamp is Exif's
@@ -28,6 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.camera.frame_pool import FramePool
+from drivers.camera.misuse import misused
 from drivers.camera.raw.exif import Exif
 from drivers.camera.raw.order import Order, file_number
 from drivers.camera.raw.picture import RawPicture, read_picture
@@ -140,7 +141,7 @@ class RawFiles:
     def configure(self, exposure: Exposure) -> FrameFormat:
         """The exposure is set on the camera, by hand: each picture is checked for it."""
         if self._armed.is_set():
-            raise self._misused("a disarmed camera", "configure() was called while it is armed")
+            raise misused(self._name, "a disarmed camera", "configure() was called while it is armed")
         if exposure.gain_db:
             raise DeviceRefused(
                 self._name,
@@ -167,7 +168,7 @@ class RawFiles:
     def arm(self, buffers: int) -> None:
         """Files that are there already are not of this burst. `buffers` is met by the disk."""
         if self._format is None:
-            raise self._misused("configure() before arm()", "no exposure is set")
+            raise misused(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
         self._order.begin()
         self._last_taken = None
@@ -235,7 +236,9 @@ class RawFiles:
 
     def trigger(self) -> None:
         if self._exposure is None or self._exposure.hardware_trigger:
-            raise self._misused("hardware_trigger=False", "a software trigger while the box releases the shutter")
+            raise misused(
+                self._name, "hardware_trigger=False", "a software trigger while the box releases the shutter"
+            )
         command = self._settings.release_command
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=_RELEASE_TIMEOUT_S, check=False)
@@ -276,12 +279,4 @@ class RawFiles:
             expected=f"{expected} in {path.name}",
             happened=happened,
             remedy="Set the camera to manual, let no other program write into the folder, then resume the run.",
-        )
-
-    def _misused(self, expected: str, happened: str) -> DeviceRefused:
-        return DeviceRefused(
-            self._name,
-            expected=expected,
-            happened=happened,
-            remedy="This is a fault of the program that drives the camera.",
         )

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.camera.frame_pool import FramePool, Slot
+from drivers.camera.misuse import misused
 from drivers.camera.xiapi.device import XiDevice
 from drivers.camera.xiapi.library import (
     API_SKIPPED,
@@ -177,7 +178,7 @@ class XiCamera:
 
     def configure(self, exposure: Exposure) -> FrameFormat:
         if self._armed.is_set():
-            raise self._misused("a disarmed camera", "configure() was called while it is armed")
+            raise misused(self._name, "a disarmed camera", "configure() was called while it is armed")
         device, settings = self._device, self._settings
         edge = TRIGGER_RISING if settings.trigger_edge == "rising" else TRIGGER_FALLING
         device.set("trigger_source", edge if exposure.hardware_trigger else TRIGGER_SOFTWARE)
@@ -236,7 +237,7 @@ class XiCamera:
 
     def arm(self, buffers: int) -> None:
         if self._format is None:
-            raise self._misused("configure() before arm()", "no exposure is set")
+            raise misused(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
         self._check_presence()
         wanted = max(buffers, self._settings.buffers)
@@ -316,7 +317,7 @@ class XiCamera:
 
     def trigger(self) -> None:
         if self._by_edges:  # xiAPI itself would fire (python-microscope/vendor-issues, issue 3)
-            raise self._misused("hardware_trigger=False", "a software trigger while edges trigger")
+            raise misused(self._name, "hardware_trigger=False", "a software trigger while edges trigger")
         self._device.set("trigger_software", 1)
 
     def statistics(self) -> CameraStatistics:
@@ -359,14 +360,6 @@ class XiCamera:
             self._device.stop()
 
     # -- errors -------------------------------------------------------------------------------------------
-
-    def _misused(self, expected: str, happened: str) -> DeviceRefused:
-        return DeviceRefused(
-            self._name,
-            expected=expected,
-            happened=happened,
-            remedy="This is a fault of the program that drives the camera.",
-        )
 
     def _surprised(self, expected: str, happened: str) -> DeviceRefused:
         return DeviceRefused(

@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.devices import ArmState, Clock, Deadline, Identity
-from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
-from coupole.kinematics import Arm, forward, limit_violations, move_duration_s
+from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceTimeout
+from coupole.kinematics import Arm, forward, move_duration_s
+from drivers.arm_motion import News, checked_target, longest_stop_s, overtaken, refused, wait_for
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.limits import correction_violations
 from drivers.kuka.rsi.pose import Geometry
@@ -52,7 +53,7 @@ class KukaRsi:
         self._motion_s = 0.0
         self._target_deg: shared_state.Six = (0.0,) * 6
         """Of the last motion."""
-        self._last_packets, self._last_news_ns = -1, 0
+        self._news = News(clock)
         self._process, self._block = _spawn(settings, self.arm)
         try:
             self._wait_for_session()
@@ -81,11 +82,7 @@ class KukaRsi:
         }
 
     def move_to(self, joints_deg: NDArray[np.float64]) -> None:
-        target_deg = np.asarray(joints_deg, dtype=np.float64)
-        if target_deg.shape != (6,) or not np.all(np.isfinite(target_deg)):
-            raise self._refused("six finite joint angles in degrees", f"got {joints_deg!r}")
-        if violations := limit_violations(self.arm, target_deg):
-            raise self._refused("joint angles within the arm's limits", violations)
+        target_deg = checked_target(joints_deg, self.arm.limits_deg)
         state = self._state()
         self._raise_fault(state)
         # Retargeted in motion, the arm sets out from anywhere on the rest of its line.
@@ -93,8 +90,8 @@ class KukaRsi:
         if violations := correction_violations(
             self.settings, self.arm, state.start_deg, on_the_way_deg, target_deg
         ):
-            raise self._refused("a motion that corrections can bring about", violations)
-        self._target_deg = tuple(float(angle) for angle in target_deg)
+            raise refused("a motion that corrections can bring about", violations)
+        self._target_deg = target_deg
         # It may first have to brake: as long as from the farthest point, twice.
         self._motion_s = move_duration_s(self.arm, state.measured_deg, target_deg) + self._stop_s()
         self._send(shared_state.MOVE, self._target_deg)
@@ -112,12 +109,10 @@ class KukaRsi:
     def measured(self) -> ArmState:
         state = self._state()
         joints = state.measured_deg
-        if state.packets != self._last_packets:
-            self._last_packets, self._last_news_ns = state.packets, self._clock.now_ns()
         return ArmState(
             joints_deg=(joints[0], joints[1], joints[2], joints[3], joints[4], joints[5]),
             base_from_flange=forward(self.arm, joints),
-            t_ns=self._last_news_ns,
+            t_ns=self._news.since_ns(state.packets),
             moving=self._moves(state),
             fault=state.fault_text.decode(errors="replace"),
         )
@@ -202,25 +197,23 @@ class KukaRsi:
     def _wait(
         self, done: Callable[[shared_state.State], bool], deadline: Deadline, expected: str, *, faults: bool = True
     ) -> None:
-        while True:
-            state = self._state()
-            if faults:
-                self._raise_fault(state)
-            if done(state):
-                return
-            if deadline.expired:
-                raise DeviceTimeout(
-                    "robot",
-                    expected=f"{expected} within {deadline.seconds:.1f} s",
-                    happened=f"axes measured at {np.round(state.measured_deg, 3).tolist()} deg, "
-                    f"commanded to {np.round(state.commanded_deg, 3).tolist()} deg",
-                    remedy="See the controller's messages; its override must stand at 100 %",
-                )
-            self._clock.sleep(_POLL_S)
+        wait_for(
+            self._state,
+            done,
+            deadline,
+            expected,
+            check=self._raise_fault if faults else None,
+            pause=lambda: self._clock.sleep(_POLL_S),
+            describe=lambda state: (
+                f"axes measured at {np.round(state.measured_deg, 3).tolist()} deg, "
+                f"commanded to {np.round(state.commanded_deg, 3).tolist()} deg"
+            ),
+            remedy="See the controller's messages; its override must stand at 100 %",
+        )
 
     def _settled(self, state: shared_state.State, command: shared_state.Command) -> bool:
         if self._command is not command:
-            raise self._refused("the arm to go on to its target", "another command ended the motion")
+            raise overtaken()
         return state.command == command.number and state.settled_cycles >= self.settings.settle_cycles
 
     def _moves(self, state: shared_state.State) -> bool:
@@ -232,9 +225,8 @@ class KukaRsi:
         return state.phase == shared_state.STANDING and state.command == self._command.number
 
     def _stop_s(self) -> float:
-        """Longest time that any axis needs to come to rest: v/a, and twice a/jerk to build it up."""
-        acceleration, jerk = self.settings.acceleration_deg_s2, self.settings.jerk_deg_s3
-        return max(self.arm.velocity_deg_s) / acceleration + 2.0 * acceleration / jerk
+        settings = self.settings
+        return longest_stop_s(self.arm.velocity_deg_s, settings.acceleration_deg_s2, settings.jerk_deg_s3)
 
     def _raise_fault(self, state: shared_state.State) -> None:
         if state.fault == shared_state.NO_FAULT:
@@ -246,10 +238,6 @@ class KukaRsi:
             happened=state.fault_text.decode(errors="replace"),
             remedy="See to the cell, acknowledge at the controller, restart its program, reopen the robot",
         )
-
-    @staticmethod
-    def _refused(expected: str, happened: str) -> DeviceRefused:
-        return DeviceRefused("robot", expected=expected, happened=happened, remedy="Ask for another pose")
 
 
 def _why_no_session(state: shared_state.State) -> str:

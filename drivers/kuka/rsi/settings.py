@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
 from coupole.kinematics import KR10_R1100_SIXX, Arm, slowed
+from drivers.arm_motion import farthest_stop_deg
 from drivers.kuka.rsi.corrections import TAGS
 
 _TAG = r"^[A-Za-z_]\w*$"
@@ -81,15 +82,7 @@ class Settings(BaseModel):
         return self.correction_tag or TAGS[self.corrects]
 
     def stopping_deg(self) -> NDArray[np.float64]:
-        """Farthest that each axis [6] turns after a stop: its highest speed times the time that it may still last.
-
-        Coming to rest from speed v takes v/a + a/j, at half the speed on average; an axis that still speeds up
-        needs a/j before that. All axes share the time of the one that takes longest. To this come two cycles
-        until the command is obeyed, one until its answer is applied, and how far the arm lags behind its command.
-        """
-        speeds_deg_s = np.array(self.arm().velocity_deg_s)
-        rise_s = self.acceleration_deg_s2 / self.jerk_deg_s3
-        brake_s = speeds_deg_s.max() / self.acceleration_deg_s2 + rise_s
+        """See `farthest_stop_deg`. Until the arm obeys, two cycles pass before the command is taken, one before
+        its answer is applied, and the arm lags behind its command."""
         delay_s = 3.0 * self.cycle_ms / 1e3 + self.follow_lag_s
-        stopping_deg: NDArray[np.float64] = speeds_deg_s * (rise_s + 0.5 * brake_s + delay_s)
-        return stopping_deg
+        return farthest_stop_deg(self.arm().velocity_deg_s, self.acceleration_deg_s2, self.jerk_deg_s3, delay_s)

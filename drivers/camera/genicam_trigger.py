@@ -1,0 +1,52 @@
+"""How a GenICam camera is told its exposure and what triggers it, and how it is asked what it counted."""
+
+from __future__ import annotations
+
+from coupole.devices import Exposure
+from drivers.camera.genicam_features import Features
+from drivers.camera.genicam_settings import Counter, GenICamSettings
+
+_LAST_WIDE_ID = 2**62
+"""Stands for the end of 64-bit ids, which is never reached."""
+
+
+def set_exposure(features: Features, settings: GenICamSettings, exposure: Exposure) -> None:
+    """Each frame starts at an edge of the box, or at a software trigger; nothing is left to the camera."""
+    for name, entry in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("TriggerSelector", "FrameStart")):
+        if features.has(name):
+            features.write(name, entry)
+    features.write("TriggerMode", "On")
+    by_edges = exposure.hardware_trigger
+    features.write("TriggerSource", settings.trigger_line if by_edges else settings.software_trigger)
+    if by_edges and features.has("TriggerActivation"):
+        features.write("TriggerActivation", settings.trigger_activation)
+    features.write(features.first_of("ExposureTimeAbs") or "ExposureTime", float(exposure.exposure_us))
+    if exposure.gain_db or features.has("Gain"):
+        features.write("Gain", float(exposure.gain_db))
+
+
+def frame_id_range(features: Features, *, gige: bool) -> tuple[int, int]:
+    """First and last frame id of the transport: 16 bits on GigE Vision, unless the camera says that it uses the
+    extended ids of version 2; else 64."""
+    if not gige:
+        return (0, _LAST_WIDE_ID)
+    extended = "GevGVSPExtendedIDMode"
+    wide = features.has(extended) and features.read(extended) in {"On", True}
+    return (1, _LAST_WIDE_ID if wide else 65535)
+
+
+def counts(features: Features, settings: GenICamSettings) -> tuple[int, int]:
+    """Exposures and edges that came too early, by the camera's own counters; -1 where it has none."""
+    return (_count(features, settings.exposed_counter), _count(features, settings.over_trigger_counter))
+
+
+def _count(features: Features, counter: Counter | None) -> int:
+    if counter is None:
+        return -1
+    features.write_all(counter.select)
+    return int(features.number(counter.read))
+
+
+def since(count: int, before: int) -> int:
+    """What a counter of 32 bits has counted since it stood at `before`; -1 where there is none."""
+    return count if count < 0 else (count - before) % 2**32

@@ -1,0 +1,15 @@
+"""The error of a camera whose methods are called in an order that its contract does not allow."""
+
+from __future__ import annotations
+
+from coupole.errors import DeviceRefused
+
+
+def misused(device: str, expected: str, happened: str) -> DeviceRefused:
+    """To be raised; `device` is the camera's name in the rig."""
+    return DeviceRefused(
+        device,
+        expected=expected,
+        happened=happened,
+        remedy="This is a fault of the program that drives the camera.",
+    )

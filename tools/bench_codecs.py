@@ -1,0 +1,157 @@
+"""Codecs of our own beside what libraries offer: is their output the same, and how fast are they.
+
+One full-size 12-bit frame on one core and, for the compression, on two threads at once; the small DNG of the
+conformance tests for the Exif reader. The libraries are those of the dependency group `bench`.
+"""
+
+from __future__ import annotations
+
+import statistics
+import struct
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FEWEST_ROUNDS = 9
+
+
+def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+    """`same_output` tells whether the peer's bytes or pixels are ours."""
+    rounds = max(rounds, FEWEST_ROUNDS)
+    from bench_archive import pictures
+
+    frame = pictures(1)[0]
+    yield from _packing(frame, rounds)
+    yield from _bitshuffle(frame, rounds)
+    yield from _exif(root, rounds)
+
+
+def _packing(frame: NDArray[np.uint16], rounds: int) -> Iterator[dict[str, Any]]:
+    """Twelve bits a pixel into reused memory and back, in both orders."""
+    import imagecodecs
+
+    from coupole.storage.packing import pack12, unpack12
+
+    for order, bitorder in (("lsb", "<"), ("msb", None)):
+        packed, out = pack12(frame, order), np.empty(frame.size * 3 // 2, np.uint8)
+        encode = partial(imagecodecs.packints_encode, frame.reshape(-1), 12, bitorder=bitorder, out=out)
+        decode = partial(imagecodecs.packints_decode, packed, np.uint16, 12, bitorder=bitorder)
+        ours = partial(pack12, frame, order, out=out.copy())
+        same = bool(np.array_equal(np.frombuffer(encode(), np.uint8), packed))
+        yield _figure(f"pack12_{order}", "imagecodecs", _medians_s(rounds, ours, encode), same)
+        same = bool(np.array_equal(decode(), unpack12(packed, order)))
+        yield _figure(
+            f"unpack12_{order}", "imagecodecs", _medians_s(rounds, partial(unpack12, packed, order), decode), same
+        )
+
+
+def _bitshuffle(frame: NDArray[np.uint16], rounds: int) -> Iterator[dict[str, Any]]:
+    """All tiles of a frame compressed, by one thread and by two that have a frame each."""
+    from coupole.storage.bitshuffle import CODECS, compressed_tiles, tile_shape
+
+    tile = tile_shape(*frame.shape)
+    for name, codec in CODECS.items():
+
+        def ours(codec: Any = codec) -> list[bytes]:
+            return [data for _, data in compressed_tiles(frame, tile, codec)]
+
+        def theirs(codec: Any = codec) -> list[bytes]:
+            return [_imagecodecs_tile(part, codec) for part in _tiles(frame, tile)]
+
+        same = ours() == theirs()
+        for threads in (1, 2):
+            times = _medians_s(rounds, partial(_at_once, ours, threads), partial(_at_once, theirs, threads))
+            yield _figure(f"bitshuffle_{name}_{threads}_threads", "imagecodecs", times, same)
+
+
+def _tiles(frame: NDArray[np.uint16], tile: tuple[int, int]) -> Iterator[NDArray[np.uint16]]:
+    rows, columns = tile
+    for top in range(0, frame.shape[0], rows):
+        for left in range(0, frame.shape[1], columns):
+            yield np.ascontiguousarray(frame[top : top + rows, left : left + columns])
+
+
+def _imagecodecs_tile(part: NDArray[np.uint16], codec: Any) -> bytes:
+    """HDF5's filter 32008 put together from imagecodecs' functions, which know the shuffle but not the format."""
+    import imagecodecs
+
+    from coupole.storage.bitshuffle import BLOCK_PIXELS
+
+    block_bytes = BLOCK_PIXELS * part.itemsize
+    shuffled = memoryview(
+        imagecodecs.bitshuffle_encode(part.tobytes(), itemsize=part.itemsize, blocksize=BLOCK_PIXELS)
+    )
+    pieces = [struct.pack(">QI", part.nbytes, block_bytes)]
+    for start in range(0, part.nbytes, block_bytes):
+        block = shuffled[start : start + block_bytes]
+        small = (
+            imagecodecs.lz4_encode(block)
+            if codec.level is None
+            else imagecodecs.zstd_encode(block, level=codec.level)
+        )
+        pieces += [struct.pack(">I", len(small)), small]
+    return b"".join(pieces)
+
+
+def _exif(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+    """Capture time and exposure of one file."""
+    import exifread
+
+    sys.path.insert(0, str(root / "tests/conformance"))
+    from tiny_dng import write_dng
+
+    from drivers.camera.raw.exif import read_exif
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "IMG_0001.DNG"
+        write_dng(path, np.zeros((2, 2), np.uint16), taken="2026:03:04 05:06:07", subseconds="12")
+
+        def theirs() -> dict[str, Any]:
+            with path.open("rb") as file:
+                return dict(exifread.process_file(file, details=False))
+
+        tags = theirs()
+        seen = (str(tags["EXIF DateTimeOriginal"]), str(tags["EXIF SubSecTimeOriginal"]))
+        same = seen == ("2026:03:04 05:06:07", "12") and read_exif(path).taken_ns % 10**9 == 120_000_000
+        yield _figure("read_exif", "exifread", _medians_s(10 * rounds, partial(read_exif, path), theirs), same)
+
+
+def _at_once(work: Callable[[], object], threads: int) -> None:
+    running = [threading.Thread(target=work) for _ in range(threads)]
+    for thread in running:
+        thread.start()
+    for thread in running:
+        thread.join()
+
+
+def _medians_s(rounds: int, ours: Callable[[], object], theirs: Callable[[], object]) -> tuple[float, float]:
+    """Of interleaved rounds, after one of each that is not counted: numba compiles, memory comes."""
+    times: tuple[list[float], list[float]] = ([], [])
+    for counted in range(-1, rounds):
+        for work, found in zip((ours, theirs), times, strict=True):
+            start_s = time.perf_counter()
+            work()
+            if counted >= 0:
+                found.append(time.perf_counter() - start_s)
+    return statistics.median(times[0]), statistics.median(times[1])
+
+
+def _figure(name: str, peer: str, times_s: tuple[float, float], same: bool) -> dict[str, Any]:
+    ours_s, theirs_s = times_s
+    return {
+        "name": name,
+        "value": 1e3 * ours_s,
+        "unit": "ms",
+        "peer": peer,
+        "ratio": theirs_s / ours_s,
+        "peer_value": round(1e3 * theirs_s, 4),
+        "same_output": same,
+    }

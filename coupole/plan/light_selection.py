@@ -24,7 +24,7 @@ from coupole.plan.plan import (
 
 def leds_of_plan(plan: Plan, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
     """Rows of the LED table that any view of the plan lights. Raises KeyError as `select_leds`."""
-    rows = [select_leds(view.lights or plan.light_selection, leds, base_from_support) for view in plan.views]
+    rows = [select_leds(view.lights or plan.lights, leds, base_from_support) for view in plan.views]
     return np.unique(np.concatenate(rows))
 
 
@@ -60,7 +60,7 @@ def missing_lights(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ..
     own = [(("views", i, "lights"), view.lights) for i, view in enumerate(plan.views) if view.lights is not None]
     return [
         (where + key, message)
-        for where, lights in [(("lights",), plan.light_selection), *own]
+        for where, lights in [(("lights",), plan.lights), *own]
         for key, message in _missing(lights, leds)
     ]
 

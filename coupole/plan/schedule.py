@@ -94,7 +94,7 @@ def build_schedule(
     bursts: list[list[Burst]] = []
     hardware = plan.trigger == "hardware"
     for view in plan.views:
-        lights = view.lights or plan.light_selection
+        lights = view.lights or plan.lights
         if lights not in bursts_of:
             lit = _lit(lights, leds, base_from_support)
             bursts_of[lights] = [

@@ -237,10 +237,12 @@ def children(pid: int) -> list[int]:
 
 
 def events(run: Path, kind: str | None = None) -> list[dict[str, Any]]:
-    """Lines of the journal, all or of one kind, read with nothing but json; a torn last line is left out."""
+    """Lines of the journal, all or of one kind, read with nothing but json; torn lines are left out."""
     path = run / "journal.jsonl"
-    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-    found = [json.loads(line) for line in lines if line.endswith("\n")]
+    found = []
+    for line in path.read_bytes().split(b"\n") if path.exists() else []:
+        with contextlib.suppress(json.JSONDecodeError, UnicodeDecodeError):
+            found.append(json.loads(line))
     return [event for event in found if kind in (None, event["event"])]
 
 

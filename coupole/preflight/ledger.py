@@ -30,7 +30,8 @@ def total_lux_h(storage_folder: Path, object_id: str) -> float:
     for line in lines:
         with contextlib.suppress(json.JSONDecodeError, UnicodeDecodeError):
             entry = json.loads(line)
-            total += float(entry["dose_lux_h"]) if entry["event"] == "dose" else 0.0
+            if isinstance(entry, dict) and entry.get("event") == "dose":
+                total += float(entry["dose_lux_h"])
     return total
 
 

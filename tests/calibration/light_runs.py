@@ -42,14 +42,14 @@ def write_light_run(folder: Path, frames: Sequence[Taken]) -> Path:
     folder.mkdir(parents=True)
     for name in ("plan.yaml", "rig.yaml"):
         (folder / name).write_text(f"# {name}\n")
-    views = list(dict.fromkeys(frame.shot.view for frame in frames))
+    views = list(dict.fromkeys(frame.shot.split("/")[0] for frame in frames))
     labels = list(dict.fromkeys(frame.shot.split("/", 1)[1] for frame in frames))
     about = {"views": views, "labels": labels, "simulated": True}
     run = Run.create(folder, "light", Inputs(folder / "plan.yaml", folder / "rig.yaml", ()), about)
     diary = Journal(run.journal_path)
     diary.write(SessionStarted())
     for view in views:
-        mine = [frame for frame in frames if frame.shot.view == view]
+        mine = [frame for frame in frames if frame.shot.split("/")[0] == view]
         path = run.view_path(view)
         metadata = {**METADATA, "title": view, "focus_distance_mm": 335.0, "pixel_pitch_um": PITCH_UM}
         frame_file.create(path, len(mine), FORMAT, metadata)

@@ -73,7 +73,7 @@ def test_every_shot_is_proven_once_and_verify_finds_it_whole(clean: Clean) -> No
 def test_the_journal_tells_each_view_from_move_to_seal(clean: Clean) -> None:
     kinds = [event["event"] for event in cells.events(clean.run)]
     told = [kind for kind in kinds if kind != "frame"]
-    assert told == ["start", *["view", "move", "settled", "burst", "seal"] * 2, "stop"]
+    assert told == ["journal", "start", *["view", "move", "settled", "burst", "seal"] * 2, "stop"]
     assert kinds.count("frame") == 2 * 66
 
 

@@ -323,7 +323,7 @@ def test_a_run_pauses_between_bursts_and_goes_on(standing: tuple[CellFolder, Wor
     process.send_signal(signal.SIGUSR1)
     assert cells.finish(process).code == 0
     kinds = [event["event"] for event in cells.events(run)]
-    assert kinds.index("pause") < kinds.index("resume") < kinds.index("stop")
+    assert kinds.index("pause") < kinds.index("continue") < kinds.index("stop")
     cells.assert_each_shot_proven_once(run)
 
 

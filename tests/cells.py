@@ -100,6 +100,14 @@ class CellFolder:
         if self.write_now:
             self.write()
 
+    def moved_by_ur(self, model: str) -> None:
+        """From now on the arm is a UR, where the rig that comes with it has it."""
+        shipped = YAML(typ="safe").load(
+            REPO / f"configs/rigs/{'sim-ur' if model == 'ur10e' else 'sim-' + model}.yaml"
+        )
+        self.rig_data |= {key: shipped[key] for key in ("robot", "motion", "support")}
+        self.rig_data["arm"] = str(REPO / f"configs/robots/{model}.yaml")
+
     @property
     def plan(self) -> Path:
         return self.folder / "plan.yaml"

@@ -56,12 +56,14 @@ def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | 
         return None
     import trimesh
 
-    from coupole.kinematics import KR10_R1100_SIXX, link_frames
-    from coupole.motion.collisions import ARM_CAPSULES, Capsule
+    from coupole.kinematics import link_frames
+    from coupole.motion.bodies import Capsule, capsules_of
+    from coupole.plan.rig import described_arm
 
     rig = job.cell.rig
     tool = tuple(Capsule(t.name, 7, tuple(t.from_mm), tuple(t.to_mm), t.radius_mm) for t in rig.tool)
-    capsules = [c for c in (*ARM_CAPSULES, *tool) if c.link]
+    described = described_arm(rig)
+    capsules = [c for c in (*capsules_of(described), *tool) if c.link]
     arm, around = trimesh.collision.CollisionManager(), trimesh.collision.CollisionManager()
     base_from_support = rig.support.base_from_support.matrix()
     corners = job.object_corners_mm.reshape(-1, 3) @ base_from_support[:3, :3].T + base_from_support[:3, 3]
@@ -70,7 +72,7 @@ def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | 
     around.add_object("support", disk.apply_translation(-25.0 * base_from_support[:3, 2]))
     for number, capsule in enumerate(capsules):
         arm.add_object(str(number), capsule_mesh(capsule))
-    places = link_frames(KR10_R1100_SIXX, poses_deg)
+    places = link_frames(described.arm, poses_deg)
 
     def check() -> None:
         for frames in places:

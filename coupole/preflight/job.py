@@ -22,9 +22,10 @@ from coupole.motion.collisions import CellBodies
 from coupole.motion.itinerary import Itinerary, bodies_of, plan_itinerary
 from coupole.motion.occlusion import Occlusion, Occlusions, occlusions_of
 from coupole.plan import yamlfile
+from coupole.plan.arm_description import arm_named
 from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.plan import MeasuredObject, Plan
-from coupole.plan.rig import Rig, driver_problems, in_world, planning_arm
+from coupole.plan.rig import Rig, described_arm, driver_problems, in_world
 from coupole.plan.shots import FASTEST, Pace, Schedule, ViewPose, build_schedule, missing_lights
 from coupole.plan.yamlfile import Document
 from coupole.preflight import ledger
@@ -53,6 +54,14 @@ class Cell:
     @property
     def leds_path(self) -> Path:
         return self.document.resolve(self.rig.dome.leds)
+
+    @property
+    def link_meshes(self) -> Path | None:
+        """Folder of the meshes that stand for the arm's links: the rig's, or else the arm's."""
+        if self.rig.link_meshes is not None:
+            return self.document.resolve(self.rig.link_meshes)
+        arm = described_arm(self.rig)
+        return arm.link_meshes if arm else None
 
     @property
     def storage_folder(self) -> Path:
@@ -129,9 +138,7 @@ class Job:
     @cached_property
     def bodies(self) -> CellBodies:
         """Arm, tool and everything that they must not touch."""
-        meshes = self.cell.rig.link_meshes
-        folder = self.cell.document.resolve(meshes) if meshes else None
-        return bodies_of(self.cell.rig, self.cell.leds, self.object_corners_mm, folder)
+        return bodies_of(self.cell.rig, self.cell.leds, self.object_corners_mm, self.cell.link_meshes)
 
     @property
     def inputs(self) -> Inputs:
@@ -146,6 +153,10 @@ def read_cell(path: Path) -> Cell:
     rig, problems = document.problems(Rig)
     if rig is None:
         raise InputError(problems)
+    arm, problems = arm_named(document, rig.arm, rig.robot.driver, rig.robot.settings)
+    if problems:
+        raise InputError(problems)
+    rig = rig.model_copy(update={"arm": arm})
     problems = driver_problems(document, rig)
     leds: LedTable | None = None
     leds_path = document.resolve(rig.dome.leds)
@@ -159,13 +170,13 @@ def read_cell(path: Path) -> Cell:
     if rig.storage.pixels == "packed12" and (rig.sensor.bit_depth > 12 or rig.sensor.width_px % 2):
         why = f"expected an even width and 12 bits at most, found {rig.sensor.width_px} and {rig.sensor.bit_depth}"
         problems.append(document.problem(("storage", "pixels"), f"frames cannot be packed: {why}"))
-    if rig.link_meshes is not None and (missing := missing_link_meshes(document.resolve(rig.link_meshes))):
-        problems.append(
-            document.problem(("link_meshes",), f"expected the links' meshes; there is no {missing[0]}")
-        )
     if problems or leds is None:
         raise InputError(problems)
-    return Cell(rig, document, leds)
+    cell = Cell(rig, document, leds)
+    if cell.link_meshes is not None and (missing := missing_link_meshes(cell.link_meshes)):
+        at = ("link_meshes",) if rig.link_meshes else ("arm",)
+        raise InputError([document.problem(at, f"expected the links' meshes; there is no {missing[0]}")])
+    return cell
 
 
 def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
@@ -184,6 +195,11 @@ def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
     if plan is None or cell is None:
         raise InputError(problems)
 
+    if cell.rig.arm is None:
+        message = (
+            f"expected the arm that `{cell.rig.robot.driver}` moves, as its file: what it touches must be known"
+        )
+        problems.append(cell.document.problem(("arm",), message))
     problems += [document.problem(key, message) for key, message in missing_lights(plan, cell.leds)]
     mesh_path = document.resolve(plan.object.mesh) if plan.object and plan.object.mesh else None
     corners, mesh_problem = _object_corners(plan, mesh_path)
@@ -341,9 +357,6 @@ def check_job(
 
     job, report = _cooled(*checked(Pace(disk_us=_disk_us(rig, storage))), checked)
     report.refusals += calibration_refusals(job)
-    if planning_arm(rig) is None:
-        why = "no model of this arm's links: whether it touches anything cannot be told"
-        report.refusals.insert(0, f"robot {rig.robot.driver}: {why}")
     return job, report
 
 

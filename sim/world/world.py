@@ -23,7 +23,7 @@ from pydantic import BaseModel
 
 from coupole.devices import NO_LIGHT
 from sim.devices import camera_stand_in, gige_camera, kuka_controller, ledbox_firmware, robot
-from sim.devices.arm_bodies import NONE, Capsules, arm_capsules, tool_capsules
+from sim.devices.arm_bodies import NONE, Capsules, arm_capsules, tool_capsules, ur_capsules
 from sim.devices.camera_body import Exposed
 from sim.optics.led_light import Flashes
 from sim.optics.photographer import Photographer
@@ -115,9 +115,9 @@ class World:
         if not self._arm_shadows:
             return NONE
         tool = tool_capsules(self.robot.true_base_from_flange(), self._tool)
-        if self._robot_settings.kind == "ur":
-            return tool
-        return np.concatenate([arm_capsules(self.robot.joints_deg), tool])
+        settings, joints_deg = self._robot_settings, self.robot.joints_deg
+        links = ur_capsules(settings.model, joints_deg) if settings.kind == "ur" else arm_capsules(joints_deg)
+        return np.concatenate([links, tool])
 
     def _light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
         """The box drives an LED, which shines as bright as it can now."""

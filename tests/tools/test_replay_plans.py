@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from arms import KR10_R1100_SIXX
 from places import REPO
 
-from coupole.kinematics import KR10_R1100_SIXX, link_frames
+from coupole.kinematics import link_frames
 
 ROOT = REPO
 LINK_MESHES = ROOT.parent / "shared/data/robot/kr10r1100sixx"

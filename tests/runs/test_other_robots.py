@@ -154,8 +154,7 @@ def test_a_plan_runs_on_a_ur(tmp_path: Path, model: str, views: list[dict[str, A
     assert ended.code == 0, ended.err
     cells.assert_each_shot_proven_once(cell.run_folder)
     assert cells.mislabelled(cell, cell.run_folder) == []
-    (start,) = cells.events(cell.run_folder, "start")
-    assert start["devices"]["robot"]["model"] == model.upper().removesuffix("E")
+    assert cells.about(cell.run_folder)["devices"]["robot"]["model"] == model.upper().removesuffix("E")
 
 
 def test_a_controller_of_another_arm_than_the_plans_is_refused(tmp_path: Path) -> None:

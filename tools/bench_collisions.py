@@ -90,6 +90,7 @@ def capsule_mesh(capsule: Any) -> Any:
     start, end = np.array(capsule.start_mm, dtype=float), np.array(capsule.end_mm, dtype=float)
     length_mm = float(np.linalg.norm(end - start))
     mesh = trimesh.creation.capsule(height=length_mm, radius=capsule.radius_mm, count=[16, 16])
+    mesh.apply_translation(-mesh.bounds.mean(axis=0))
     if length_mm > 0.0:
         mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], (end - start) / length_mm))
-    return mesh.apply_translation(start)
+    return mesh.apply_translation((start + end) / 2)

@@ -211,9 +211,11 @@ def _solids(capsules: Sequence[Capsule]) -> list[tuple[str, int, Any]]:
         start, end = np.array(capsule.start_mm, dtype=float), np.array(capsule.end_mm, dtype=float)
         length = float(np.linalg.norm(end - start))
         mesh = trimesh.creation.capsule(height=length, radius=capsule.radius_mm, count=[24, 24])
+        mesh.apply_translation(-mesh.bounds.mean(axis=0))
         if length > 0:
             mesh.apply_transform(trimesh.geometry.align_vectors((0, 0, 1), (end - start) / length))
-        solids.append((capsule.body, capsule.link, fcl.CollisionObject(_bvh(mesh.vertices + start, mesh.faces))))
+        mesh.apply_translation((start + end) / 2)
+        solids.append((capsule.body, capsule.link, fcl.CollisionObject(_bvh(mesh.vertices, mesh.faces))))
     return solids
 
 

@@ -21,8 +21,8 @@ _COLUMN_MM, _SHOULDER_MM, _UPPER_MM, _FOREARM_MM, _WRIST_MM = 140.0, 150.0, 110.
 """Radii, after KUKA's drawing of the KR10 R1100 sixx."""
 
 _UR_RADII_MM = {
-    "ur5e": {"column": 75.0, "shoulder": 65.0, "upper": 60.0, "forearm": 50.0, "wrist": 45.0},
-    "ur10e": {"column": 95.0, "shoulder": 85.0, "upper": 75.0, "forearm": 60.0, "wrist": 48.0},
+    "ur5e": {"column": 60.0, "shoulder": 65.0, "upper": 60.0, "forearm": 50.0, "wrist": 45.0},
+    "ur10e": {"column": 78.0, "shoulder": 85.0, "upper": 75.0, "forearm": 60.0, "wrist": 48.0},
 }
 """After the outlines in Universal Robots' data sheets; the widest parts of each link are its joints' housings."""
 _UR_ASIDE_MM = {"ur5e": (138.0, 7.0), "ur10e": (176.0, 39.0)}
@@ -64,13 +64,13 @@ def ur_capsules(model: UrModel, joints_deg: Sequence[float]) -> Capsules:
     radii = _UR_RADII_MM[model]
     upper, fore = (aside * axes[1] for aside in _UR_ASIDE_MM[model])
     parts = (
-        (np.zeros(3), origins[1], radii["column"]),
+        (radii["column"] * axes[0], origins[1], radii["column"]),
         (origins[1], origins[1] + upper, radii["shoulder"]),
         (origins[1] + upper, origins[2] + upper, radii["upper"]),
         (origins[2] + upper, origins[2] + fore, radii["upper"]),
         (origins[2] + fore, origins[3] + fore, radii["forearm"]),
         (origins[3] + fore, origins[4], radii["wrist"]),
         (origins[4], origins[5], radii["wrist"]),
-        (origins[5], base_from_flange[:3, 3], radii["wrist"]),
+        (origins[5], base_from_flange[:3, 3] - radii["wrist"] * base_from_flange[:3, 2], radii["wrist"]),
     )
     return np.array([[*a, *b, radius] for a, b, radius in parts])

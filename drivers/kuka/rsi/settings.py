@@ -83,7 +83,7 @@ class Settings(BaseModel):
         found = structure_of(self.arm_model)
         if not isinstance(found, SphericalWrist):
             raise ValueError(  # noqa: TRY004  for pydantic, which tells where
-                f"expected an arm with a spherical wrist, as RSI's are; {self.arm_model.name} has none"
+                f"expected an arm with a spherical wrist, as KUKA's have; {self.arm_model.name} has none"
             )
         return found
 

@@ -28,7 +28,7 @@ from places import REPO
 from ruamel.yaml import YAML
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from coupole import cli
+from coupole.commands import cli
 from coupole.preflight.job import read_job
 from coupole.preflight.simulated_world import world_config
 from sim.world.client import World
@@ -98,6 +98,14 @@ class CellFolder:
         }
         if self.write_now:
             self.write()
+
+    def moved_by_ur(self, model: str) -> None:
+        """From now on the arm is a UR, where the rig that comes with it has it."""
+        shipped = YAML(typ="safe").load(
+            REPO / f"configs/rigs/{'sim-ur' if model == 'ur10e' else 'sim-' + model}.yaml"
+        )
+        self.rig_data |= {key: shipped[key] for key in ("robot", "motion", "support")}
+        self.rig_data["arm"] = str(REPO / f"configs/robots/{model}.yaml")
 
     @property
     def plan(self) -> Path:
@@ -192,7 +200,7 @@ def start(*arguments: str | Path, **popen: Any) -> subprocess.Popen[str]:
         "cwd": REPO,
         **popen,
     }
-    return subprocess.Popen([sys.executable, "-m", "coupole.cli", *map(str, arguments)], **options)
+    return subprocess.Popen([sys.executable, "-m", "coupole.commands.cli", *map(str, arguments)], **options)
 
 
 def finish(process: subprocess.Popen[str]) -> Ended:

@@ -41,7 +41,14 @@ def cpu_s() -> float:
 def bench_check(rounds: int) -> None:
     """`coupole check --no-paths` of 30 views x 1080 LEDs x 3 exposures, against the 3 s it may take and against
     a Python that only imports numpy, pydantic and h5py."""
-    command = [sys.executable, "-m", "coupole.cli", "check", str(ROOT / "configs/plans/large.yaml"), "--no-paths"]
+    command = [
+        sys.executable,
+        "-m",
+        "coupole.commands.cli",
+        "check",
+        str(ROOT / "configs/plans/large.yaml"),
+        "--no-paths",
+    ]
     bare = [sys.executable, "-c", "import numpy, pydantic, h5py"]
     ours, peers = [], []
     for _ in range(rounds):

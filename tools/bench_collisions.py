@@ -56,12 +56,14 @@ def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | 
         return None
     import trimesh
 
-    from coupole.kinematics import KR10_R1100_SIXX, link_frames
-    from coupole.motion.collisions import ARM_CAPSULES, Capsule
+    from coupole.kinematics import link_frames
+    from coupole.motion.bodies import Capsule, capsules_of
+    from coupole.plan.rig_devices import described_arm
 
     rig = job.cell.rig
     tool = tuple(Capsule(t.name, 7, tuple(t.from_mm), tuple(t.to_mm), t.radius_mm) for t in rig.tool)
-    capsules = [c for c in (*ARM_CAPSULES, *tool) if c.link]
+    described = described_arm(rig)
+    capsules = [c for c in (*capsules_of(described), *tool) if c.link]
     arm, around = trimesh.collision.CollisionManager(), trimesh.collision.CollisionManager()
     base_from_support = rig.support.base_from_support.matrix()
     corners = job.shape.corners_mm.reshape(-1, 3) @ base_from_support[:3, :3].T + base_from_support[:3, 3]
@@ -70,7 +72,7 @@ def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | 
     around.add_object("support", disk.apply_translation(-25.0 * base_from_support[:3, 2]))
     for number, capsule in enumerate(capsules):
         arm.add_object(str(number), capsule_mesh(capsule))
-    places = link_frames(KR10_R1100_SIXX, poses_deg)
+    places = link_frames(described.arm, poses_deg)
 
     def check() -> None:
         for frames in places:
@@ -88,6 +90,7 @@ def capsule_mesh(capsule: Any) -> Any:
     start, end = np.array(capsule.start_mm, dtype=float), np.array(capsule.end_mm, dtype=float)
     length_mm = float(np.linalg.norm(end - start))
     mesh = trimesh.creation.capsule(height=length_mm, radius=capsule.radius_mm, count=[16, 16])
+    mesh.apply_translation(-mesh.bounds.mean(axis=0))
     if length_mm > 0.0:
         mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], (end - start) / length_mm))
-    return mesh.apply_translation(start)
+    return mesh.apply_translation((start + end) / 2)

@@ -89,10 +89,16 @@ def free_port() -> int:
 def our_responder() -> Iterator[tuple[Controller, bool]]:
     """The driver's process with a session, and whether it runs under SCHED_FIFO."""
     from coupole.devices import SystemClock
+    from coupole.plan.arm_description import shipped_arm
     from drivers.kuka.rsi.driver import KukaRsi, Settings
 
     port = free_port()
-    settings = Settings(listen=f"127.0.0.1:{port}", delay_limit=10**9, link_timeout_s=1e6)
+    settings = Settings(
+        arm_model=shipped_arm("kr10_r1100_sixx").arm,
+        listen=f"127.0.0.1:{port}",
+        delay_limit=10**9,
+        link_timeout_s=1e6,
+    )
     opened: list[KukaRsi] = []
     opening = threading.Thread(target=lambda: opened.append(KukaRsi(settings, SystemClock())))
     opening.start()

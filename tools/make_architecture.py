@@ -18,7 +18,7 @@ import grimp
 
 ROOT = Path(__file__).resolve().parent.parent
 OUTPUT = ROOT / "docs" / "pictures" / "rooms.svg"
-CONTRACTS = ("devices", "errors", "geometry", "kinematics")
+CONTRACTS = ("devices", "errors", "geometry", "joint_chain", "kinematics")
 BESIDE = ("drivers", "sim")
 _STEP_X, _STEP_Y, _BOX_W, _BOX_H, _MARGIN = 74, 46, 132, 34, 16
 
@@ -27,7 +27,7 @@ def rooms_in_order() -> list[str]:
     """From the top floor down, the four contracts as one, drivers and simulation between plan and appearance."""
     config = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = config["tool"]["importlinter"]["contracts"]
-    layers = [name for name in contracts[0]["layers"] if name not in (*CONTRACTS, "cli")]
+    layers = [name for name in contracts[0]["layers"] if name not in CONTRACTS]
     place = layers.index("appearance")
     return [*layers[:place], *BESIDE, *layers[place:], "contracts"]
 
@@ -39,7 +39,7 @@ def room_of(module: str) -> str:
         return parts[0]
     if parts[1] in CONTRACTS:
         return "contracts"
-    return "commands" if parts[1] == "cli" else parts[1]
+    return parts[1]
 
 
 def arrows() -> Counter[tuple[str, str]]:

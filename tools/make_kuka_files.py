@@ -11,10 +11,12 @@ How to install them: docs/how-to/kuka-controller.md.
 from __future__ import annotations
 
 import argparse
+import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from coupole.plan.arm_description import shipped_arm
 from drivers.kuka import eki as kuka_eki
 from drivers.kuka import rsi as kuka_rsi
 from drivers.kuka.eki import wire
@@ -163,7 +165,7 @@ def correction_rows(settings: kuka_rsi.Settings) -> str:
         "pose": ("POSCORR1", "POSCORRMON1", "CorrX, CorrY, CorrZ, CorrA, CorrB, CorrC"),
     }[settings.corrects]
     if settings.corrects == "axes":
-        most = settings.axis_correction_deg
+        most = settings.most_correction_deg
         clamped = "; ".join(f"A{axis} +-{limit + 1:g}" for axis, limit in enumerate(most, start=1))
         clamped = f"`LowerLimA1` to `UpperLimA6`, deg: {clamped}"
         watched = "; ".join(f"`MaxA{axis}` = {limit:g}" for axis, limit in enumerate(most, start=1))
@@ -230,8 +232,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--eki", default="{}", help="settings of drivers.kuka.eki, JSON")
     parser.add_argument("--load", type=int, default=1, help="number of the camera's LOAD_DATA")
     options = parser.parse_args(arguments)
-    rsi = kuka_rsi.Settings.model_validate_json(options.rsi)
-    eki = kuka_eki.Settings.model_validate_json(options.eki)
+    arm = {"arm_model": shipped_arm("kr10_r1100_sixx").arm}
+    rsi = kuka_rsi.Settings.model_validate(arm | json.loads(options.rsi))
+    eki = kuka_eki.Settings.model_validate(arm | json.loads(options.eki))
     for path, text in files(rsi, eki, options.pc_address, options.load):
         target = options.output / path
         target.parent.mkdir(parents=True, exist_ok=True)

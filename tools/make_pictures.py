@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole import kinematics
-from coupole.geometry import apply, inverse, transform
+from coupole.geometry import apply, inverse
 from coupole.motion.itinerary import plan_itinerary
+from coupole.plan.arm_description import shipped_arm
 from coupole.preflight.job import Job, read_job
 from coupole.preflight.simulated_world import world_config
 from coupole.viewing.raw_preview import develop, png
@@ -25,8 +26,7 @@ PICTURES = ROOT / "docs/pictures"
 SHOWN_VIEW, SHOWN_LED = 1, 640
 _WIDTH, _HEIGHT, _SCALE = 900, 600, 0.26
 _EYE_AZIMUTH_DEG, _EYE_ELEVATION_DEG = -62.0, 16.0
-_LINKS_MM = ((0, 0, 400), (25, 0, 0), (560, 0, 0), (0, 0, 35), (515, 0, 0), (80, 0, 0))
-"""Joint origins of the KR10 R1100 sixx, each in the frame of the joint before (facts/robot)."""
+ARM = shipped_arm("kr10_r1100_sixx").arm
 
 
 def project(points_support_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -43,14 +43,7 @@ def project(points_support_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def elbow_points(joints_deg: NDArray[np.float64]) -> NDArray[np.float64]:
     """Joint origins [8, 3] of the arm in the base frame, mm, from base to flange."""
-    a = [*(-joints_deg[:1]), *joints_deg[1:3], -joints_deg[3], joints_deg[4], -joints_deg[5]]
-    turns = [(a[0], 0, 0), (0, a[1], 0), (0, a[2], 0), (0, 0, a[3]), (0, a[4], 0), (0, 0, a[5])]
-    pose, points = np.eye(4), [np.zeros(3)]
-    for offset, turn in zip(_LINKS_MM, turns, strict=True):
-        pose = pose @ transform(offset, turn)
-        points.append(pose[:3, 3])
-    points.append(kinematics.forward(kinematics.KR10_R1100_SIXX, joints_deg)[:3, 3])
-    return np.array(points)
+    return kinematics.link_frames(ARM, joints_deg)[:, :3, 3]
 
 
 def polyline(points: NDArray[np.float64], style: str) -> str:
@@ -72,7 +65,7 @@ def draw_cell(job: Job) -> str:
     support_from_base = inverse(rig.support.base_from_support.matrix())
     there = joints_of_shown_view(job)
     arm = apply(support_from_base, elbow_points(there))
-    flange = support_from_base @ kinematics.forward(kinematics.KR10_R1100_SIXX, there)
+    flange = support_from_base @ kinematics.forward(ARM, there)
     camera = flange @ rig.flange_from_camera.matrix()
     half = rig.lens.focus_distance_mm * rig.sensor.pixel_pitch_um * 1e-3 / rig.lens.focal_length_mm / 2
     corners = [
@@ -122,7 +115,7 @@ def synthetic_frame(job: Job) -> bytes:
     fine = {"width_px": 1024, "height_px": 768, "pixel_pitch_um": rig.sensor.pixel_pitch_um / 2}
     config = Config.model_validate(world_config(job.cell, job, rig.sensor.model_copy(update=fine)))
     photographer = Photographer(config.scene, config.camera, config.settings)
-    flange = kinematics.forward(kinematics.KR10_R1100_SIXX, joints_of_shown_view(job))
+    flange = kinematics.forward(ARM, joints_of_shown_view(job))
     raw = np.zeros((768, 1024), np.uint16)
     photographer.render(raw, Exposed({SHOWN_LED: 8e-3}, [], 8e-3, 1.0, 0, flange))
     sensor = photographer.sensor

@@ -1,8 +1,8 @@
 """The cell as python-fcl sees it: an independent check of motions that Coupole's own checker has called clear.
 
 Nothing of `coupole.kinematics`, `motion.collisions` or `motion.path_planner` is used (but the sizes of the arm's
-capsules, where its meshes are not at hand): the chain of joints is the data sheet's, profiles are ruckig's, bodies
-are triangle meshes and fcl's own shapes.
+capsules, where its meshes are not at hand): the chains of joints are the data sheets', profiles are ruckig's,
+bodies are triangle meshes and fcl's own shapes.
 """
 
 from __future__ import annotations
@@ -18,14 +18,50 @@ import trimesh
 from numpy.typing import NDArray
 from ruckig import InputParameter, Ruckig, Trajectory
 
-from coupole.motion.bodies import ARM_CAPSULES, Capsule
+from coupole.motion.bodies import Capsule, capsules_of
 from coupole.plan.rig import KeepOutSphere
+from coupole.plan.rig_devices import described_arm
 from coupole.preflight.job import Job
 
 STEP_S = 0.004
-JOINTS_MM = ((0, 0, 400), (25, 0, 0), (560, 0, 0), (0, 0, 35), (515, 0, 0), (80, 0, 0))
-AXES = ((0, 0, -1), (0, 1, 0), (0, 1, 0), (-1, 0, 0), (0, 1, 0), (-1, 0, 0))
-"""KR10 R1100 sixx: origins and axes of the joints with all angles 0."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What the checker knows of an arm by itself."""
+
+    joints_mm: tuple[tuple[float, float, float], ...]
+    axes: tuple[tuple[int, int, int], ...]
+    """Origins and axes of the joints with all angles 0, each in the frame of the one before."""
+    flange_mm: tuple[float, float, float]
+    flange_axis: tuple[int, int, int]
+    """From link 6 to the flange: where it is, and the axis that it is turned about by 90 deg."""
+    top_deg_s: tuple[float, ...]
+    """What motions are timed with, before the rig's share."""
+    has_jerk: bool = True
+    """False: motions are trapezoids of speed."""
+
+
+def _of_ur(top_deg_s: float, d1: float, a2: float, a3: float, d4: float, d5: float, d6: float) -> Figures:
+    """After Universal Robots' table of Denavit and Hartenberg's parameters, mm."""
+    joints = ((0, 0, d1), (0, 0, 0), (a2, 0, 0), (a3, 0, 0), (0, -d4, 0), (0, 0, -d5))
+    axes = ((0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1), (0, -1, 0))
+    return Figures(joints, axes, (0, -d6, 0), (1, 0, 0), (top_deg_s,) * 6, has_jerk=False)
+
+
+ARMS = {
+    "KR10 R1100 sixx": Figures(
+        ((0, 0, 400), (25, 0, 0), (560, 0, 0), (0, 0, 35), (515, 0, 0), (80, 0, 0)),
+        ((0, 0, -1), (0, 1, 0), (0, 1, 0), (-1, 0, 0), (0, 1, 0), (-1, 0, 0)),
+        (0, 0, 0),
+        (0, 1, 0),
+        (300, 225, 225, 381, 311, 492),
+    ),
+    "UR5e": _of_ur(179.9, 162.5, -425.0, -392.2, 133.3, 99.7, 99.6),
+    "UR10e": _of_ur(120.0, 180.7, -612.7, -571.55, 174.15, 119.85, 116.55),
+}
+"""By the names of their descriptions."""
+KR10 = ARMS["KR10 R1100 sixx"]
 _DISK_MM, _SHELL_MM = 50.0, 4
 FLANGE = 7
 Floats = NDArray[np.float64]
@@ -40,18 +76,18 @@ class Touch:
     joints_deg: tuple[float, ...]
 
 
-def link_poses(joints_deg: Floats) -> Floats:
+def link_poses(joints_deg: Floats, arm: Figures = KR10) -> Floats:
     """[n, 8, 4, 4] poses of the base, the six links and the flange, in the base's frame."""
     poses = np.tile(np.eye(4), (len(joints_deg), 8, 1, 1))
-    for k, (origin_mm, axis) in enumerate(zip(JOINTS_MM, AXES, strict=True)):
+    for k, (origin_mm, axis) in enumerate(zip(arm.joints_mm, arm.axes, strict=True)):
         step = np.tile(np.eye(4), (len(joints_deg), 1, 1))
         step[:, :3, :3] = _rotations(np.array(axis, dtype=float), np.radians(joints_deg[:, k]))
         step[:, :3, 3] = origin_mm
         poses[:, k + 1] = poses[:, k] @ step
-    poses[:, FLANGE] = poses[:, 6]
-    poses[:, FLANGE, :3, :3] = (
-        poses[:, 6, :3, :3] @ _rotations(np.array((0.0, 1.0, 0.0)), np.array([np.pi / 2]))[0]
-    )
+    flange = np.eye(4)
+    flange[:3, :3] = _rotations(np.array(arm.flange_axis, dtype=float), np.array([np.pi / 2]))[0]
+    flange[:3, 3] = arm.flange_mm
+    poses[:, FLANGE] = poses[:, 6] @ flange
     return poses
 
 
@@ -63,19 +99,28 @@ def _rotations(axis: Floats, angles: Floats) -> Floats:
     return rotations
 
 
+def arm_of(job: Job) -> Figures:
+    """What the checker knows of the arm of a job's rig."""
+    described = described_arm(job.cell.rig)
+    assert described is not None
+    return ARMS[described.name]
+
+
 def motion(job: Job, start_deg: Floats, goal_deg: Floats) -> Floats:
     """[n, 6] the straight motion from rest to rest in steps of 4 ms, by ruckig."""
     way_deg = goal_deg - start_deg
     moved = np.abs(way_deg) > 0
     if not moved.any():
         return goal_deg[None]
-    asked = job.cell.rig.motion
-    top_deg_s = asked.speed_fraction * np.array((300, 225, 225, 381, 311, 492))
+    asked, arm = job.cell.rig.motion, arm_of(job)
+    top_deg_s = asked.speed_fraction * np.array(arm.top_deg_s)
+    way = float(np.abs(way_deg).max())
     profile = InputParameter(1)
     profile.current_position, profile.target_position = [0.0], [1.0]
     profile.max_velocity = [float(np.min(top_deg_s[moved] / np.abs(way_deg[moved])))]
-    profile.max_acceleration = [asked.acceleration_deg_s2 / float(np.abs(way_deg).max())]
-    profile.max_jerk = [asked.jerk_deg_s3 / float(np.abs(way_deg).max())]
+    profile.max_acceleration = [asked.acceleration_deg_s2 / way]
+    if arm.has_jerk:
+        profile.max_jerk = [asked.jerk_deg_s3 / way]
     course = Trajectory(1)
     Ruckig(1).calculate(profile, course)
     times = np.append(np.arange(0.0, course.duration, STEP_S), course.duration)
@@ -90,7 +135,10 @@ class ReplayCell:
         rig = job.cell.rig
         self._support_from_base = np.linalg.inv(rig.support.base_from_support.matrix())
         tool = [Capsule(body.name, FLANGE, body.from_mm, body.to_mm, body.radius_mm) for body in rig.tool]
-        links = _links_of_meshes(meshes) if meshes else _solids(ARM_CAPSULES)
+        described = described_arm(rig)
+        assert described is not None
+        self._arm = arm_of(job)
+        links = _links_of_meshes(meshes) if meshes else _solids(capsules_of(described))
         self._moving = [*links, *_solids(tool)]
         self._around = self._surroundings(job)
         least_apart = 2 if meshes else 3  # fat capsules of next neighbours but one overlap by their making
@@ -129,7 +177,9 @@ class ReplayCell:
     def touches(self, joints_deg: Floats) -> list[Touch]:
         """What overlaps anywhere on [n, 6]; each pair once, where it does first."""
         found: dict[tuple[str, str], Touch] = {}
-        for joints, links in zip(joints_deg, self._support_from_base @ link_poses(joints_deg), strict=True):
+        for joints, links in zip(
+            joints_deg, self._support_from_base @ link_poses(joints_deg, self._arm), strict=True
+        ):
             for _, link, solid in self._moving:
                 solid.setTransform(fcl.Transform(links[link][:3, :3], links[link][:3, 3]))
             pairs = [
@@ -162,9 +212,11 @@ def _solids(capsules: Sequence[Capsule]) -> list[tuple[str, int, Any]]:
         start, end = np.array(capsule.start_mm, dtype=float), np.array(capsule.end_mm, dtype=float)
         length = float(np.linalg.norm(end - start))
         mesh = trimesh.creation.capsule(height=length, radius=capsule.radius_mm, count=[24, 24])
+        mesh.apply_translation(-mesh.bounds.mean(axis=0))
         if length > 0:
             mesh.apply_transform(trimesh.geometry.align_vectors((0, 0, 1), (end - start) / length))
-        solids.append((capsule.body, capsule.link, fcl.CollisionObject(_bvh(mesh.vertices + start, mesh.faces))))
+        mesh.apply_translation((start + end) / 2)
+        solids.append((capsule.body, capsule.link, fcl.CollisionObject(_bvh(mesh.vertices, mesh.faces))))
     return solids
 
 

@@ -1,6 +1,6 @@
 """Random plans, checked by preflight; each that passes is replayed every 4 ms by an independent checker.
 
-    python tools/replay_plans.py [--plans 500] [--seed 1] [--meshes DIR] [--check-meshes]
+    python tools/replay_plans.py [--arm ur10e] [--plans 500] [--seed 1] [--meshes DIR] [--check-meshes]
 
 `--meshes` is a folder with the links' meshes (base_link.stl, link_1.stl to link_6.stl); without it the replay has
 meshes made of the arm's capsules. With `--check-meshes` preflight uses those meshes too. Prints one JSON line: how
@@ -23,15 +23,22 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from coupole.kinematics import KR10_R1100_SIXX
-from coupole.motion.itinerary import Itinerary, bodies_of, plan_itinerary
+from coupole.motion.itinerary import Itinerary, arm_of, bodies_of, plan_itinerary
 from coupole.plan.plan import Plan
+from coupole.plan.rig import Rig
 from coupole.preflight.job import Job, motion_of, read_job, schedule_of
 from replay_cell import ReplayCell, Touch, motion
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "configs/plans/demo.yaml"
 RELIEF = ROOT / "configs/objects/relief.ply"
+RIGS = {"kr10": "sim", "ur5e": "sim-ur5e", "ur10e": "sim-ur"}
+AROUND_DEG = {
+    "simulated-cell": (0.0, -120.0, 110.0, 0.0, -60.0, 0.0),
+    "simulated-cell-ur": (0.0, -90.0, 90.0, -90.0, -90.0, 0.0),
+    "simulated-cell-ur5e": (0.0, -90.0, 90.0, -90.0, -90.0, 0.0),
+}
+"""Of each rig, the joint angles that views by joints are drawn round."""
 REASONS = {
     "touches the object": "the object;",
     "touches the dome": "the dome;",
@@ -74,13 +81,12 @@ def bunny(random: np.random.Generator, body_mm: float) -> Any:
     return trimesh.util.concatenate([body, head, *ears])
 
 
-def random_view(random: np.random.Generator, name: str, target_mm: list[float]) -> dict[str, Any]:
+def random_view(random: np.random.Generator, name: str, target_mm: list[float], rig: Rig) -> dict[str, Any]:
     """A view of any kind: mostly of the object, sometimes of another place, or given by joints."""
+    limits_deg, around_deg = np.array(arm_of(rig).limits_deg).T, np.array(AROUND_DEG[rig.name])
     kind = random.choice(["look_at", "grid", "joints"], p=[0.6, 0.25, 0.15])
     if kind == "joints":
-        around_deg = np.array((0.0, -120.0, 110.0, 0.0, -60.0, 0.0))
-        low, high = np.array(KR10_R1100_SIXX.limits_deg).T
-        joints_deg = np.clip(around_deg + random.uniform(-70, 70, 6), low - 1, high + 1)
+        joints_deg = np.clip(around_deg + random.uniform(-70, 70, 6), limits_deg[0] - 1, limits_deg[1] + 1)
         return {"kind": "joints", "name": name, "joints_deg": joints_deg.tolist()}
     looks = {
         "kind": str(kind),
@@ -104,7 +110,7 @@ def random_job(random: np.random.Generator, demo: Job) -> Job:
             "schema_version": 1,
             "name": "replay",
             "rig": demo.plan.rig,
-            "views": [random_view(random, f"v{k}", at_mm) for k in range(random.integers(3, 7))],
+            "views": [random_view(random, f"v{k}", at_mm, demo.cell.rig) for k in range(random.integers(3, 7))],
             "order": str(random.choice(["fastest", "as_written"])),
             "lights": {"kind": "none"},
             "exposure": {"kind": "fixed", "exposure_us": 8000},
@@ -186,9 +192,10 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--meshes", type=Path)
     parser.add_argument("--check-meshes", action="store_true", help="preflight has the links' meshes as well")
-    parser.add_argument("--rig", type=Path, help="another than the demo's")
+    parser.add_argument("--arm", choices=RIGS, default="kr10", help="whose simulated cell it is")
     asked = parser.parse_args()
-    found = run(asked.plans, asked.seed, asked.meshes, asked.rig, check_meshes=asked.check_meshes, tell=True)
+    rig = ROOT / f"configs/rigs/{RIGS[asked.arm]}.yaml"
+    found = run(asked.plans, asked.seed, asked.meshes, rig, check_meshes=asked.check_meshes, tell=True)
     print(json.dumps(found))
     return 1 if found["touches"] else 0
 

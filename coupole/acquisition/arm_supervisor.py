@@ -141,7 +141,7 @@ class ArmSupervisor:
 
     def _keep_to(self, way: Sequence[Joints], arm: ArmState, when: str) -> None:
         """Stop an arm that is not where its leg was found clear."""
-        off_mm = path_deviation_mm(way, np.array(arm.joints_deg))
+        off_mm = path_deviation_mm(way, np.array(arm.joints_deg), self._job.motion.bodies.reach_mm)
         if off_mm <= PATH_TOLERANCE_MM:
             return
         self._robot.stop()

@@ -3,7 +3,7 @@
 The box logs when each step really sent its edge, on its own clock; the camera stamps each frame that reaches
 the host, on another clock. A *hypothesis* is one alignment of the two clocks: frame `a` was fired by step `i`.
 It then says of every other frame which step fired it, or that no step did (*surplus*). Alignments that differ
-by whole periods look alike on the LED steps and differ on the coded dark marks (`coupole.plan.shots`).
+by whole periods look alike on the LED steps and differ on the coded dark marks (`coupole.plan.bursts`).
 
 **Fault model.** Any number of frames may be missing (lost in transfer, trigger missed, at the start, at the
 end, anywhere). At most `max_surplus` frames of a burst were fired by something other than a step (a bounce, an

@@ -11,11 +11,12 @@ import numpy as np
 
 from coupole.errors import InputError
 from coupole.geometry import apply
-from coupole.kinematics import JOINT_AXES, Arm, joint_origins_mm, link_frames
+from coupole.joint_chain import FLANGE
+from coupole.kinematics import Arm, link_frames
 from coupole.motion.sphere_tree import Floats, Spheres, spheres_of, surface_points
+from coupole.plan.arm_description import ArmDescription
 from coupole.plan.link_meshes import LINKS, link_mesh_path
 
-FLANGE = 7
 LINK_MESH_STEP_MM = 12.0
 """Spacing of the points on a link's mesh, when meshes are asked for instead of capsules."""
 _METRES_BELOW = 10.0
@@ -42,25 +43,13 @@ class Body:
     spheres: Spheres
 
 
-ARM_CAPSULES = (
-    Capsule("base", 0, (-93, 1, 133), (-93, 1, 93), 144),
-    Capsule("base", 0, (3, 0, 148), (21, 0, 36), 130),
-    Capsule("link 1", 1, (22, 57, -17), (27, 61, -17), 119),
-    Capsule("link 1", 1, (-10, 4, -124), (15, 1, -132), 127),
-    Capsule("link 1", 1, (18, -60, -14), (24, -63, -20), 119),
-    Capsule("link 2", 2, (-2, -4, -1), (65, -6, 13), 113),
-    Capsule("link 2", 2, (379, -2, 12), (210, -2, 5), 100),
-    Capsule("link 2", 2, (478, 0, 2), (561, -1, -1), 135),
-    Capsule("link 3", 3, (0, 0, -12), (-13, 2, 6), 90),
-    Capsule("link 3", 3, (34, 0, 47), (64, 0, 18), 83),
-    Capsule("link 4", 4, (147, 0, 0), (223, 0, 0), 73),
-    Capsule("link 4", 4, (344, -6, 9), (282, -7, 0), 85),
-    Capsule("link 4", 4, (413, 1, 0), (511, 0, 1), 71),
-    Capsule("link 5", 5, (0, 2, 0), (40, 1, 0), 52),
-    Capsule("link 6", 6, (-7, 0, -1), (-7, 0, -1), 23),
-)
-"""KR10 R1100 sixx, mm, in the links' frames: fitted round the collision meshes of kuka_experimental
-(ros-industrial), radii rounded up; a test checks that they enclose every vertex where the meshes are at hand."""
+def capsules_of(arm: ArmDescription) -> tuple[Capsule, ...]:
+    """The arm's own, from the base outwards as its description lists them."""
+    return tuple(
+        Capsule(link.name, link.link, part.from_mm, part.to_mm, part.radius_mm)
+        for link in arm.links
+        for part in link.capsules
+    )
 
 
 def bodies_of_capsules(capsules: Sequence[Capsule]) -> list[Body]:
@@ -73,14 +62,16 @@ def bodies_of_capsules(capsules: Sequence[Capsule]) -> list[Body]:
     return bodies
 
 
-def bodies_of_meshes(folder: Path) -> list[Body]:
+def bodies_of_meshes(folder: Path, arm: ArmDescription) -> list[Body]:
     """The base and the six links from `base_link.stl` and `link_1.stl` to `link_6.stl`, in the links' frames, in
-    metres or mm. Raises InputError where one of them cannot be read."""
+    metres or mm, under the names that the arm's description gives them. Raises InputError where one of them cannot
+    be read."""
+    names = {link.link: link.name for link in arm.links}
     bodies = []
     for link in range(LINKS):
         points = surface_points(link_corners(folder, link), LINK_MESH_STEP_MM)
         spheres = Spheres(points, np.full(len(points), LINK_MESH_STEP_MM))
-        bodies.append(Body(f"link {link}" if link else "base", link, spheres))
+        bodies.append(Body(names.get(link, "base"), link, spheres))
     return bodies
 
 
@@ -106,11 +97,11 @@ def reach_mm(arm: Arm, body: Body, from_link: int = 0) -> Floats:
     if link == FLANGE:
         frames = link_frames(arm, np.zeros(6))
         centers, link = apply(np.linalg.inv(frames[6]) @ frames[FLANGE], centers), 6
-    origins = np.array(joint_origins_mm(arm))
+    origins = np.array(arm.chain.origins_mm)
     farthest = float((np.linalg.norm(centers, axis=1) + body.spheres.radii_mm).max())
     reach = np.zeros(6)
     for k in range(from_link, link):
-        across = [i for i in range(3) if i != JOINT_AXES[k]]
+        across = [i for i in range(3) if i != arm.chain.axis_numbers[k]]
         if k == link - 1:
             reach[k] = (np.linalg.norm(centers[:, across], axis=1) + body.spheres.radii_mm).max()
         else:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -38,9 +37,8 @@ class CellMotion:
     @cached_property
     def bodies(self) -> CellBodies:
         """Arm, tool and everything that they must not touch."""
-        meshes = self._cell.rig.link_meshes
-        folder: Path | None = self._cell.document.resolve(meshes) if meshes else None
-        return bodies_of(self._cell.rig, self._cell.leds, self._object_corners_mm, folder)
+        cell = self._cell
+        return bodies_of(cell.rig, cell.leds, self._object_corners_mm, cell.link_meshes)
 
     @cached_property
     def occlusions(self) -> Occlusions:

@@ -1,6 +1,6 @@
 """Distances between the bodies of the cell: what the arm must not touch, and by how much.
 
-The arm is a set of capsules that enclose the vendor's link meshes, or those meshes themselves; the camera and an
+The arm is a set of capsules that enclose its links, or meshes of the links themselves; the camera and an
 allowance for its cables are capsules too. Around it stand the object (its scanned mesh), the support disk, the
 dome seen from inside, and keep-out volumes. All distances are conservative: bodies are unions of spheres
 (`motion.sphere_tree`) that enclose what they stand for, and of motions nothing between two checked places is
@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +20,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coupole.geometry import Transform, inverse
-from coupole.kinematics import JOINT_AXES, Arm, axis_senses, joint_origins_mm
 from coupole.motion.bodies import (
-    ARM_CAPSULES,
     Body,
     Capsule,
     bodies_of_capsules,
     bodies_of_meshes,
+    capsules_of,
     part_apart,
     reach_mm,
 )
 from coupole.motion.sphere_tree import MESH_STEP_MM, Floats, Spheres, sphere_trees_of
+from coupole.plan.arm_description import TOOL, ArmDescription
 
-REACH_MM = (1600.0, 1500.0, 1000.0, 420.0, 420.0, 250.0)
-"""Farthest that any point of arm and tool may be from axis 1 to 6 (links stretched out, tool of 300 mm)."""
+_NEIGHBOURLY_MM = 25.0
+"""What comes no nearer than this in the postures that bodies are near in by design is kept apart all the same."""
 
 
 @dataclass(frozen=True)
@@ -79,27 +80,6 @@ class Surroundings:
     keep_out_boxes: tuple[tuple[str, tuple[float, float, float], tuple[float, float, float]], ...] = ()
 
 
-_SELF_PAIRS = {
-    "link 2": ("base",),
-    "link 3": ("base",),
-    "link 4": ("base", "link 1"),
-    "link 5": ("base", "link 1", "link 2"),
-    "link 6": ("base", "link 1", "link 2"),
-    "tool": ("base", "link 1", "link 2", "link 3", "link 4"),
-}
-"""Bodies of the arm that can meet. The others cannot within the joints' limits, with A3's drawn in as
-`coupole.motion.itinerary` does (seen on the vendor's meshes)."""
-
-
-_EVERYDAY_DEG: dict[tuple[str, str], list[tuple[float, ...]]] = {
-    ("link 2", "base"): [(0, -170, 0, 0, 0, 0), (0, 20, 0, 0, 0, 0)],
-    ("tool", "link 4"): [(0, 0, 0, 0, a5, a6) for a5 in (-90, 0, 90) for a6 in range(0, 360, 15)],
-}
-"""Pairs next to each other: what is near in these postures stays so by the joint between them, or is drawn too
-large (an allowance for a camera reaches back over the wrist). The rest can meet when they bend further."""
-_NEIGHBOURLY_MM = 25.0
-
-
 @dataclass(frozen=True)
 class _Pair:
     """A body and what it is kept from: a solid (`kind`, `figures`) or another body (`SHAPE`)."""
@@ -125,15 +105,16 @@ class CellBodies:
 
     def __init__(
         self,
-        arm: Arm,
+        arm: ArmDescription,
         surroundings: Surroundings,
         tool: Sequence[Capsule],
         clearances: Clearances | None = None,
         link_meshes: Path | None = None,
     ) -> None:
-        self._arm, self._around, self._keep = arm, surroundings, clearances or Clearances()
+        self._described, self._arm = arm, arm.arm
+        self._around, self._keep = surroundings, clearances or Clearances()
         self._has_meshes = link_meshes is not None
-        self._links = bodies_of_meshes(link_meshes) if link_meshes else bodies_of_capsules(ARM_CAPSULES)
+        self._links = bodies_of_meshes(link_meshes, arm) if link_meshes else bodies_of_capsules(capsules_of(arm))
         self._tools = bodies_of_capsules(tool)
         self._pairs = [*self._pairs_with_surroundings(), *self._pairs_of_the_arm()]
 
@@ -221,25 +202,30 @@ class CellBodies:
         from coupole.motion.distances import SHAPE
 
         pairs = []
+        kept_apart = {(pair.body, pair.other): pair.near_by_design_deg for pair in self._described.kept_apart}
         for body in (*self._tools, *self._links):
-            kind = "tool" if body in self._tools else body.name
+            kind = TOOL if body in self._tools else body.name
             for other in self._links:
-                if other.name not in _SELF_PAIRS.get(kind, ()):
+                if (kind, other.name) not in kept_apart:
                     continue
-                drawn_large = kind == "tool" or not self._has_meshes
-                everyday = _EVERYDAY_DEG.get((kind, other.name)) if drawn_large else None
-                part = part_apart(self._arm, body, other, everyday, _NEIGHBOURLY_MM) if everyday else body
+                near_deg = kept_apart[kind, other.name]
+                postures_deg = list(product(*near_deg)) if near_deg and self._drawn_large(kind) else []
+                part = part_apart(self._arm, body, other, postures_deg, _NEIGHBOURLY_MM) if postures_deg else body
                 if part is not None:
                     reach = reach_mm(self._arm, part, from_link=other.link)
                     required_mm = self._required_mm(self._keep.self_mm, reach)
                     pairs.append(_Pair(part, f"the arm's {other.name}", required_mm, reach, SHAPE, other=other))
         return pairs
 
+    def _drawn_large(self, kind: str) -> bool:
+        return kind == TOOL or not self._has_meshes
+
     def _required_mm(self, keep_mm: float, reach: Floats) -> float:
         """What a pair must keep: the rig's clearance, and in any case what an arm off its way by the tube's width
-        could take from it. `path_deviation_mm` counts each axis' deviation times REACH_MM, the pair feels it times
-        its own reach."""
-        return max(keep_mm, self._keep.path_tolerance_mm * float((reach / np.array(REACH_MM)).max()))
+        could take from it. `path_deviation_mm` counts each axis' deviation times `reach_mm`, the pair feels it
+        times its own reach."""
+        share = np.divide(reach, self.reach_mm, out=np.zeros(6), where=self.reach_mm > 0.0)
+        return max(keep_mm, self._keep.path_tolerance_mm * float(share.max()))
 
     @cached_property
     def _model(self) -> Any:
@@ -257,9 +243,11 @@ class CellBodies:
             numbers.append((trees[0], pair.body.link, pair.kind, trees[1], other.link, on_link))
             row[0], row[1:7] = pair.required_mm, pair.reach_mm
             row[7 : 7 + len(pair.figures)] = pair.figures
+        chain = self._arm.chain
         return Model(
             inverse(self._around.base_from_support),
-            np.column_stack([joint_origins_mm(self._arm), axis_senses(self._arm), JOINT_AXES]),
+            np.column_stack([chain.origins_mm, chain.senses, chain.axis_numbers]),
+            np.array(chain.link_6_from_flange),
             *sphere_trees_of([body.spheres for body in bodies]),
             np.array(numbers),
             figures,

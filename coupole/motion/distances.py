@@ -31,6 +31,8 @@ class Model(NamedTuple):
     joints: NDArray[np.float64]
     """[6, 5] of each joint its origin in the frame of the link before (mm), its sense (1 or -1), its axis (0 x,
     1 y, 2 z)."""
+    flange: NDArray[np.float64]
+    """[4, 4] `link_6_from_flange`, mm."""
     nodes: NDArray[np.float64]
     trees: NDArray[np.int64]
     """The `SphereTrees` of all shapes."""
@@ -47,7 +49,7 @@ class Model(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def place_links(base, joints, joints_deg, frames):  # type: ignore[no-untyped-def]
+def place_links(base, joints, flange, joints_deg, frames):  # type: ignore[no-untyped-def]
     """Fill `frames` [9, 3, 4], rotation and origin of each link's frame in the support's."""
     for r in range(3):
         for q in range(4):
@@ -65,9 +67,11 @@ def place_links(base, joints, joints_deg, frames):  # type: ignore[no-untyped-de
             frames[k + 1, r, 3] = frames[k, r, 3]
             for q in range(3):
                 frames[k + 1, r, 3] += frames[k, r, q] * joints[k, q]
-    for r in range(3):  # the flange's z axis is link 6's x axis, its x axis points against link 6's z axis
-        frames[7, r, 0], frames[7, r, 1] = -frames[6, r, 2], frames[6, r, 1]
-        frames[7, r, 2], frames[7, r, 3] = frames[6, r, 0], frames[6, r, 3]
+    for r in range(3):
+        for q in range(4):
+            frames[7, r, q] = frames[6, r, 3] if q == 3 else 0.0
+            for p in range(3):
+                frames[7, r, q] += frames[6, r, p] * flange[p, q]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -210,7 +214,7 @@ def margins_at(model, joints_deg, far_mm):  # type: ignore[no-untyped-def]
     frames = np.empty((9, 3, 4))
     margins = np.empty((joints_deg.shape[0], model.numbers.shape[0]))
     for n in range(margins.shape[0]):
-        place_links(model.base, model.joints, joints_deg[n], frames)
+        place_links(model.base, model.joints, model.flange, joints_deg[n], frames)
         for pair in range(margins.shape[1]):
             margins[n, pair] = _margin(
                 model.nodes, model.trees, model.numbers, model.figures, frames, pair, far_mm, False
@@ -244,7 +248,7 @@ def blocked_at(model, start_deg, end_deg):  # type: ignore[no-untyped-def]
         for m in range(count):
             for k in range(6):
                 here_deg[k] = start_deg[k] + middles[m] * (end_deg[k] - start_deg[k])
-            place_links(model.base, model.joints, here_deg, frames)
+            place_links(model.base, model.joints, model.flange, here_deg, frames)
             for pair in range(numbers.shape[0]):
                 first = pair == 0 or numbers[pair, 0] != numbers[pair - 1, 0]
                 if first or numbers[pair, 5] != numbers[pair - 1, 5]:

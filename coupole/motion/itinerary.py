@@ -11,21 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole import kinematics
+from coupole.errors import InputError
 from coupole.geometry import Transform, inverse
 from coupole.motion import singularities
 from coupole.motion.bodies import Capsule
-from coupole.motion.collisions import REACH_MM, CellBodies, Clearances, Surroundings
+from coupole.motion.collisions import CellBodies, Clearances, Surroundings
 from coupole.motion.ordering import shortest_tour
 from coupole.motion.path_deviation import PATH_TOLERANCE_MM
 from coupole.motion.path_planner import Joints, Leg, PathPlanner
 from coupole.motion.sphere_tree import surface_points
 from coupole.plan.led_table import LedTable
 from coupole.plan.rig import KeepOutBox, KeepOutSphere, Rig
+from coupole.plan.rig_devices import described_arm, planning_arm
 from coupole.plan.schedule import ViewPose
 
-ELBOW_LIMITS_DEG = (-115.0, 154.0)
-"""A3's limits, closer than the data sheet's: beyond them link 4 comes too near to link 2 (seen on the vendor's
-meshes: 6 mm at these angles, 9 mm at 150 deg, touching at -119 deg), and capsules are too coarse to tell."""
 POSTURE_COST_S = 0.3
 """So much time a posture may cost that is farther from limits and singularities."""
 
@@ -50,14 +49,18 @@ class Itinerary:
 
 
 def arm_of(rig: Rig) -> kinematics.Arm:
-    """The rig's arm with the speeds and limits that plans are run at."""
-    arm = kinematics.slowed(
-        kinematics.KR10_R1100_SIXX,
-        speed_fraction=rig.motion.speed_fraction,
-        acceleration_deg_s2=rig.motion.acceleration_deg_s2,
-        jerk_deg_s3=rig.motion.jerk_deg_s3,
-    )
-    return replace(arm, limits_deg=(*arm.limits_deg[:2], ELBOW_LIMITS_DEG, *arm.limits_deg[3:]))
+    """The rig's arm with the speeds and limits that plans are run at: those of its driver, within the posture
+    limits of its description. Raises InputError where nothing describes it."""
+    arm, described = planning_arm(rig), described_arm(rig)
+    if arm is None or described is None:
+        raise undescribed(rig)
+    limits_deg = zip(arm.limits_deg, described.posture_limits_deg, strict=True)
+    return replace(arm, limits_deg=tuple((max(a[0], b[0]), min(a[1], b[1])) for a, b in limits_deg))
+
+
+def undescribed(rig: Rig) -> InputError:
+    """The error of a rig whose arm nothing describes."""
+    return InputError(f"nothing describes the arm that `{rig.robot.driver}` moves: name its file under `arm:`")
 
 
 def bodies_of(
@@ -66,8 +69,11 @@ def bodies_of(
     """The rig's arm, tool and surroundings, with the object's mesh ([triangles, 3, 3], support frame).
 
     `link_meshes` is a folder of meshes that stand for the arm's links instead of capsules round them; InputError
-    if they cannot be read.
+    if they cannot be read, or if nothing describes the arm.
     """
+    arm = described_arm(rig)
+    if arm is None:
+        raise undescribed(rig)
     base_from_support = rig.support.base_from_support.matrix()
     support_from_base = inverse(base_from_support)
     leds_mm = leds.positions_mm @ support_from_base[:3, :3].T + support_from_base[:3, 3]
@@ -75,7 +81,7 @@ def bodies_of(
     elevation_deg = np.degrees(np.arcsin(leds_mm[:, 2] / radius_mm))
     keep = rig.clearances
     return CellBodies(
-        kinematics.KR10_R1100_SIXX,
+        arm,
         Surroundings(
             base_from_support,
             rig.support.diameter_mm / 2,
@@ -114,7 +120,7 @@ def plan_itinerary(
     """
     arm = arm_of(rig)
     planner = PathPlanner(arm, bodies, [rig.motion.home_joints_deg])
-    refusals = _rig_refusals(rig, bodies)
+    refusals = _rig_refusals(rig)
     choices: dict[int, NDArray[np.float64]] = {}
     for index, view in enumerate(views):
         postures, why_not = _postures(view, rig, bodies)
@@ -145,17 +151,11 @@ def plan_itinerary(
     return Itinerary(tuple(visits), tuple(refusals), tuple(visited))
 
 
-def _rig_refusals(rig: Rig, bodies: CellBodies | None) -> list[str]:
+def _rig_refusals(rig: Rig) -> list[str]:
     """What no plan on this rig could make good."""
     refusals = []
     if violation := kinematics.limit_violations(arm_of(rig), rig.motion.home_joints_deg):
         refusals.append(f"rig: at home {violation}")
-    if bodies is not None:
-        refusals += [
-            f"rig: a part of arm or tool may be {reach:.0f} mm from axis A{axis}; at most {most:g} mm are watched"
-            for axis, (reach, most) in enumerate(zip(bodies.reach_mm, REACH_MM, strict=True), start=1)
-            if reach > most
-        ]
     return refusals
 
 

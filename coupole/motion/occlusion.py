@@ -17,12 +17,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coupole.geometry import Transform, apply, inverse
+from coupole.joint_chain import FLANGE
 from coupole.kinematics import link_frames
-from coupole.motion.bodies import ARM_CAPSULES, FLANGE, Capsule
-from coupole.motion.itinerary import arm_of
+from coupole.motion.bodies import Capsule, capsules_of
+from coupole.motion.itinerary import undescribed
 from coupole.motion.patches import PATCHES, Patches, patches_at, patches_of
+from coupole.plan.arm_description import ArmDescription
 from coupole.plan.led_table import LedTable
 from coupole.plan.rig import Rig
+from coupole.plan.rig_devices import described_arm
 
 REACHED, AWAY, BY_OBJECT, BY_ARM, BY_TOOL = range(5)
 """Codes of a patch and an LED. AWAY: the LED is below the patch's horizon, or the patch is behind the LED. Where
@@ -103,6 +106,7 @@ class Occlusions:
     """What is the same in all views, and the rig that makes the rest."""
 
     rig: Rig
+    arm: ArmDescription
     patches: Patches
     mesh: Any
     """The object's, ready for rays (`ray_mesh`)."""
@@ -117,14 +121,15 @@ class Occlusions:
         The camera's own bodies and what else the flange carries are taken to leave the view of its lens free.
         """
         support_from_base = inverse(self.rig.support.base_from_support.matrix())
-        frames = support_from_base @ link_frames(arm_of(self.rig), joints_deg)
+        frames = support_from_base @ link_frames(self.arm.arm, joints_deg)
+        links = capsules_of(self.arm)
         tool = [Capsule(body.name, FLANGE, body.from_mm, body.to_mm, body.radius_mm) for body in self.rig.tool]
-        axes_mm, radii_mm = capsule_axes((*ARM_CAPSULES, *tool), frames)
+        axes_mm, radii_mm = capsule_axes((*links, *tool), frames)
         by = hidden_by(ray_starts(self.patches), self.leds_mm, axes_mm, radii_mm, self.object_codes == REACHED)
         codes = self.object_codes.copy()
-        codes[(by >= 0) & (by < len(ARM_CAPSULES))] = BY_ARM
-        codes[by >= len(ARM_CAPSULES)] = BY_TOOL
-        arm = slice(len(ARM_CAPSULES))
+        codes[(by >= 0) & (by < len(links))] = BY_ARM
+        codes[by >= len(links)] = BY_TOOL
+        arm = slice(len(links))
         seen = self._seen(
             sight_of(self.rig, frames[FLANGE] @ self.rig.flange_from_camera.matrix()), axes_mm[arm], radii_mm[arm]
         )
@@ -152,14 +157,17 @@ def occlusions_of(
     """Everything about an object's shadows that does not depend on the arm.
 
     `corners_mm` [triangles, 3, 3] is its mesh in the support frame; without triangles `targets_mm` [n, 3]
-    stand for it.
+    stand for it. Raises InputError where nothing describes the rig's arm.
     """
+    arm = described_arm(rig)
+    if arm is None:
+        raise undescribed(rig)
     patches = patches_of(corners_mm, count) if len(corners_mm) else patches_at(targets_mm)
     support_from_base = inverse(rig.support.base_from_support.matrix())
     leds_mm = apply(support_from_base, leds.positions_mm)
     mesh = ray_mesh(corners_mm)
     codes = own_codes(patches, mesh, leds_mm, leds.normals @ support_from_base[:3, :3].T)
-    return Occlusions(rig, patches, mesh, leds_mm, codes)
+    return Occlusions(rig, arm, patches, mesh, leds_mm, codes)
 
 
 def own_codes(

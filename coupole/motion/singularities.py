@@ -1,9 +1,11 @@
 """Postures in which an axis would have to race for a small motion of the camera, and how far others are from them.
 
-An arm of this kind has three (Siciliano et al., "Robotics", 2009, sec. 3.3): the wrist stretched, so that axes 4
-and 6 turn about one line; the elbow stretched or folded, so that the arm cannot reach farther or nearer; and the
-wrist's centre on axis 1, which then may stand anyhow. Motions run straight in joint space and cross such places
-unharmed; views do not stay there, because what is corrected, or measured from the joints, loses its footing.
+An arm with a spherical wrist has three (Siciliano et al., "Robotics", 2009, sec. 3.3): the wrist stretched, so
+that axes 4 and 6 turn about one line; the elbow stretched or folded, so that the arm cannot reach farther or
+nearer; and the wrist's centre on axis 1, which then may stand anyhow. So has an arm with three parallel axes: axis
+6 parallel to them; the elbow; and the crossing of axes 5 and 6 in the plane of axes 1 and 2. Motions run straight
+in joint space and cross such places unharmed; views do not stay there, because what is corrected, or measured from
+the joints, loses its footing.
 """
 
 from __future__ import annotations
@@ -13,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coupole.kinematics import Arm, axis_senses, limit_margin_deg
+from coupole.joint_chain import SphericalWrist
+from coupole.kinematics import Arm, limit_margin_deg, structure_of
 
 
 @dataclass(frozen=True)
@@ -21,11 +24,11 @@ class SingularityMargin:
     """How far a view's posture stays from singularities."""
 
     wrist_deg: float = 5.0
-    """Least angle of A5."""
+    """Least angle of A5 from where the wrist is stretched."""
     elbow_deg: float = 5.0
     """Least angle between upper arm and forearm, from stretched and from folded."""
     shoulder_mm: float = 20.0
-    """Least distance of the wrist's centre from axis 1."""
+    """Least distance of the wrist's centre from axis 1, or from the plane of axes 1 and 2."""
 
 
 SINGULARITY_MARGIN = SingularityMargin()
@@ -36,15 +39,27 @@ _FREE_LIMIT_MARGIN_DEG = 10.0
 
 def distances(arm: Arm, joints_deg: ArrayLike) -> tuple[NDArray[np.float64], ...]:
     """How far joint angles [..., 6] are from the wrist's (deg), the elbow's (deg) and the shoulder's (mm)
-    singularity, [...] each."""
-    joints = np.asarray(joints_deg, dtype=np.float64)
-    theta = np.radians(np.array(axis_senses(arm)) * joints - np.asarray(arm.offsets_deg))
-    wrist_deg = np.abs(joints[..., 4])
-    bend_deg = np.degrees(theta[..., 2] + np.arctan2(arm.a2_mm, arm.c3_mm))
-    elbow_deg = np.abs((bend_deg + 90.0) % 180.0 - 90.0)
-    s23, c23 = np.sin(theta[..., 1] + theta[..., 2]), np.cos(theta[..., 1] + theta[..., 2])
-    out_mm = arm.c2_mm * np.sin(theta[..., 1]) + arm.c3_mm * s23 + arm.a2_mm * c23 + arm.a1_mm
-    return wrist_deg, elbow_deg, np.hypot(out_mm, arm.b_mm)
+    singularity, [...] each. Raises ValueError for an arm without `structure_of`."""
+    found = structure_of(arm)
+    if found is None:
+        raise ValueError(f"the singularities of {arm.name} are not known: its chain has no closed solution")
+    theta = found.theta(joints_deg)
+    _, t2, t3, t4, t5, _ = np.moveaxis(theta, -1, 0)
+    if isinstance(found, SphericalWrist):
+        bend, fore = t3 + np.arctan2(found.a2_mm, found.c3_mm), t2 + t3
+        out_mm = found.c2_mm * np.sin(t2) + found.c3_mm * np.sin(fore) + found.a2_mm * np.cos(fore) + found.a1_mm
+        shoulder_mm = np.hypot(out_mm, found.b_mm)
+    else:
+        bend = t3
+        out_mm = found.a2_mm * np.cos(t2) + found.a3_mm * np.cos(t2 + t3) + found.d5_mm * np.sin(t2 + t3 + t4)
+        shoulder_mm = np.abs(out_mm)
+    return _from_half_turn_deg(t5), _from_half_turn_deg(bend), shoulder_mm
+
+
+def _from_half_turn_deg(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far an angle in radians is from the nearest whole number of half turns, degrees."""
+    off: NDArray[np.float64] = np.abs((np.degrees(angle) + 90.0) % 180.0 - 90.0)
+    return off
 
 
 def margin(arm: Arm, joints_deg: ArrayLike, kept: SingularityMargin = SINGULARITY_MARGIN) -> NDArray[np.float64]:
@@ -69,8 +84,9 @@ def reason(arm: Arm, joints_deg: ArrayLike, kept: SingularityMargin = SINGULARIT
             f"{kept.elbow_deg:g} deg must be kept"
         )
     if shoulder_mm < kept.shoulder_mm:
+        where = "axis 1" if isinstance(structure_of(arm), SphericalWrist) else "the plane of axes 1 and 2"
         return (
-            f"the wrist's centre would be {shoulder_mm:.1f} mm from axis 1, the shoulder's singularity; "
+            f"the wrist's centre would be {shoulder_mm:.1f} mm from {where}, the shoulder's singularity; "
             f"{kept.shoulder_mm:g} mm must be kept"
         )
     return ""

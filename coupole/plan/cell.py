@@ -7,10 +7,11 @@ from pathlib import Path
 
 from coupole.errors import InputError
 from coupole.plan import yamlfile
+from coupole.plan.arm_description import arm_named
 from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.link_meshes import missing_link_meshes
 from coupole.plan.rig import Rig
-from coupole.plan.rig_devices import driver_problems, renamed_drivers
+from coupole.plan.rig_devices import described_arm, driver_problems, renamed_drivers
 from coupole.plan.yamlfile import Document
 
 
@@ -29,6 +30,14 @@ class Cell:
         return self.document.resolve(self.rig.dome.leds)
 
     @property
+    def link_meshes(self) -> Path | None:
+        """Folder of the meshes that stand for the arm's links: the rig's, or else the arm's."""
+        if self.rig.link_meshes is not None:
+            return self.document.resolve(self.rig.link_meshes)
+        arm = described_arm(self.rig)
+        return arm.link_meshes if arm else None
+
+    @property
     def storage_folder(self) -> Path:
         return self.document.resolve(self.rig.storage.folder)
 
@@ -39,6 +48,10 @@ def read_cell(path: Path) -> Cell:
     rig, problems = document.problems(Rig)
     if rig is None:
         raise InputError(problems)
+    arm, problems = arm_named(document, rig.arm, rig.robot.driver, rig.robot.settings)
+    if problems:
+        raise InputError(problems)
+    rig = rig.model_copy(update={"arm": arm})
     problems = driver_problems(document, rig)
     leds: LedTable | None = None
     leds_path = document.resolve(rig.dome.leds)
@@ -52,10 +65,10 @@ def read_cell(path: Path) -> Cell:
     if rig.storage.pixels == "packed12" and (rig.sensor.bit_depth > 12 or rig.sensor.width_px % 2):
         why = f"expected an even width and 12 bits at most, found {rig.sensor.width_px} and {rig.sensor.bit_depth}"
         problems.append(document.problem(("storage", "pixels"), f"frames cannot be packed: {why}"))
-    if rig.link_meshes is not None and (missing := missing_link_meshes(document.resolve(rig.link_meshes))):
-        problems.append(
-            document.problem(("link_meshes",), f"expected the links' meshes; there is no {missing[0]}")
-        )
     if problems or leds is None:
         raise InputError(problems)
-    return Cell(rig, document, leds, tuple(renamed_drivers(document)))
+    cell = Cell(rig, document, leds, tuple(renamed_drivers(document)))
+    if cell.link_meshes is not None and (missing := missing_link_meshes(cell.link_meshes)):
+        at = ("link_meshes",) if rig.link_meshes else ("arm",)
+        raise InputError([document.problem(at, f"expected the links' meshes; there is no {missing[0]}")])
+    return cell

@@ -43,6 +43,11 @@ def read_plan(plan_path: Path, rig_path: Path | None = None) -> PlanFiles:
             problems += error.problems
     if plan is None or cell is None:
         raise InputError(problems)
+    if cell.rig.arm is None:
+        message = (
+            f"expected the arm that `{cell.rig.robot.driver}` moves, as its file: what it touches must be known"
+        )
+        problems.append(cell.document.problem(("arm",), message))
     wrong = missing_lights(plan, cell.leds) + names_too_long(plan, cell.leds)
     problems += [document.problem(key, message) for key, message in wrong]
     mesh_path = document.resolve(plan.object.mesh) if plan.object and plan.object.mesh else None

@@ -50,9 +50,13 @@ ROBOT_STAND_INS = {
     "drivers.kuka.eki:KukaEki": StandIn(
         "eki", ("controller_is", "status_ms", "full_acceleration_deg_s2", "jerk_deg_s3")
     ),
-    "drivers.ur:UrRobot": StandIn("ur"),
+    "drivers.ur:UrRobot": StandIn("ur", ("model",)),
 }
 """For the robot drivers that come with Coupole; all choose an address that is free."""
+ARMS_OF_DRIVERS = {"drivers.kuka.rsi:KukaRsi": "kr10_r1100_sixx", "drivers.kuka.eki:KukaEki": "kr10_r1100_sixx"}
+"""The arm (in `configs/robots`) that a driver moves where the rig does not say it."""
+UR = "drivers.ur:UrRobot"
+"""Moves the arm that its setting `model` names."""
 CAMERA_STAND_INS = {"drivers.camera.aravis:AravisCamera": "gige"}
 """For camera drivers whose stand-in is not the camera in shared memory: `world.settings.camera.kind`."""
 

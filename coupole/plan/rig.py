@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from coupole.plan.arm_description import ArmDescription
 from coupole.plan.plan import Model, Name, Pose, Vector
 from coupole.plan.registry import WORLD, current_name
 
@@ -171,6 +172,9 @@ class Rig(Model):
     ledbox: Device
     camera: Device
     robot: Device
+    arm: Path | ArmDescription | None = None
+    """What the robot is: the file that describes it, or the description itself. Without it, what its driver
+    moves."""
     sensor: Sensor
     lens: Lens
     flange_from_camera: Pose

@@ -8,13 +8,14 @@ addresses.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from pydantic import BaseModel
 
 from coupole.errors import Problem
-from coupole.kinematics import Arm
+from coupole.kinematics import Arm, slowed
+from coupole.plan.arm_description import ArmDescription, arm_of_driver, read_arm
 from coupole.plan.registry import (
     CAMERA_STAND_INS,
     DEFAULT_TWINS,
@@ -44,14 +45,32 @@ _MOTION_SETTINGS = {
 """Figures of the rig's `motion:` and the settings of a robot's driver that they become."""
 
 
+def described_arm(rig: Rig) -> ArmDescription | None:
+    """What the rig says of its arm, or else the arm of its driver; None where neither tells. A path is taken from
+    the working folder: who reads a rig's file puts the description in its place. Raises InputError."""
+    if isinstance(rig.arm, ArmDescription):
+        return rig.arm
+    return read_arm(rig.arm) if rig.arm else arm_of_driver(rig.robot.driver, rig.robot.settings)
+
+
 def planning_arm(rig: Rig) -> Arm | None:
-    """The arm that the robot's driver moves, at the speeds that the rig gives it; None where the driver knows no
-    model of it, so that neither postures nor collisions can be reckoned."""
+    """The arm that the robot's driver moves, at the speeds that the rig gives it; None where nothing describes it,
+    so that neither postures nor collisions can be reckoned."""
+    description = described_arm(rig)
+    if description is None:
+        return None
     driver, settings = device_for(rig, "robot", dry_run=False)
     model = settings_class(driver)
-    described = model(**_known(NOWHERE["robot"], model) | settings)
-    arm: Arm | None = described.arm() if hasattr(described, "arm") else None
-    return arm
+    if hasattr(model, "arm"):
+        arm: Arm = model(**_known(NOWHERE["robot"], model) | settings).arm()  # type: ignore[attr-defined]
+        return arm
+    motion = rig.motion
+    return slowed(
+        description.arm,
+        speed_fraction=motion.speed_fraction,
+        acceleration_deg_s2=motion.acceleration_deg_s2,
+        jerk_deg_s3=motion.jerk_deg_s3,
+    )
 
 
 def in_world(rig: Rig, *, dry_run: bool) -> bool:
@@ -70,7 +89,7 @@ def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[
         driver = driver if driver in ROBOT_STAND_INS else DEFAULT_TWINS[kind]
         settings = _known(settings, settings_class(driver))
     if kind == "robot":
-        settings = _known(_motion_settings(rig), settings_class(driver)) | settings
+        settings = _known(_robot_settings(rig), settings_class(driver)) | settings
     return driver, settings
 
 
@@ -100,7 +119,7 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
             if part is not None:
                 given = NOWHERE[kind] if has_endpoint else {}
                 if kind == "robot":
-                    given = given | _motion_settings(rig)
+                    given = given | _robot_settings(rig)
                 problems += _settings_problems(document, at, part.driver, given)
     if rig.world is not None:
         problems += world_problems(document, rig, rig.world.settings)
@@ -138,9 +157,11 @@ def _settings_problems(
     return document.problems(model, (*at, "settings"), given=_known(given, model))[1]
 
 
-def _motion_settings(rig: Rig) -> dict[str, Any]:
-    """What the rig's `motion:` says to a robot's driver."""
-    return {setting: getattr(rig.motion, figure) for figure, setting in _MOTION_SETTINGS.items()}
+def _robot_settings(rig: Rig) -> dict[str, Any]:
+    """What the rig says to a robot's driver: of its `motion:`, and which arm it moves."""
+    description = described_arm(rig)
+    arm = {"arm_model": asdict(description.arm)} if description else {}
+    return arm | {setting: getattr(rig.motion, figure) for figure, setting in _MOTION_SETTINGS.items()}
 
 
 def _known(settings: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:

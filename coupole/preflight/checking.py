@@ -13,7 +13,7 @@ from pathlib import Path
 from coupole.errors import StorageError
 from coupole.plan.bursts import Pace
 from coupole.plan.rig import Rig
-from coupole.plan.rig_devices import in_world, planning_arm
+from coupole.plan.rig_devices import in_world
 from coupole.preflight import ledger
 from coupole.preflight.job import Job, at_pace
 from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, check
@@ -74,9 +74,6 @@ def check_job(
     job, report = _cooled(*checked(Pace(disk_us=_disk_us(rig, storage))), checked)
     report.refusals += calibration_refusals(job)
     report.warnings += job.cell.remarks
-    if planning_arm(rig) is None:
-        why = "no model of this arm's links: whether it touches anything cannot be told"
-        report.refusals.insert(0, f"robot {rig.robot.driver}: {why}")
     return job, report
 
 

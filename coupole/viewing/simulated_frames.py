@@ -17,8 +17,8 @@ import coupole
 from coupole.devices import NO_LIGHT
 from coupole.errors import InputError, StorageError
 from coupole.geometry import Transform
-from coupole.kinematics import KR10_R1100_SIXX, forward
-from coupole.motion.itinerary import base_from_flange
+from coupole.kinematics import forward
+from coupole.motion.itinerary import arm_of, base_from_flange
 from coupole.plan.bursts import Burst
 from coupole.plan.registry import STILLS, load_class
 from coupole.plan.schedule import ViewPose
@@ -93,7 +93,7 @@ def simulate(job: Job, folder: Path, count: int, *, width_px: int | None, progre
 def flange_at(view: ViewPose, job: Job) -> Transform:
     """Where the flange is at a view: as its camera pose or its joints say, no error of the arm in it."""
     if view.joints_deg is not None:
-        return forward(KR10_R1100_SIXX, np.asarray(view.joints_deg, dtype=np.float64))
+        return forward(arm_of(job.cell.rig), np.asarray(view.joints_deg, dtype=np.float64))
     return base_from_flange(view, job.cell.rig)
 
 

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from coupole import kinematics
 from coupole.geometry import inverse
+from coupole.joint_chain import FLANGE
 from coupole.motion import singularities
-from coupole.motion.bodies import ARM_CAPSULES, FLANGE, Capsule
+from coupole.motion.bodies import Capsule, capsules_of
 from coupole.motion.collisions import CellBodies, Contact
 from coupole.motion.itinerary import Itinerary, Visit, arm_of, base_from_flange
 from coupole.motion.occlusion import Occlusion, Occlusions, Sight, capsule_axes, sight_of
@@ -94,6 +95,8 @@ class Scene:
     used: NDArray[np.bool_]
     """[leds] True for those that the plan lights."""
     paths_checked: bool
+    links: tuple[Capsule, ...]
+    """The arm's own bodies, without the tool."""
 
     @property
     def home_deg(self) -> Joints:
@@ -123,7 +126,7 @@ class Scene:
     def arm(self, joints_deg: Joints, around: int = 24) -> list[Solid]:
         """The arm's and the tool's bodies, each a solid, at joint angles [6]."""
         capsules = [
-            *ARM_CAPSULES,
+            *self.links,
             *(Capsule(b.name, FLANGE, b.from_mm, b.to_mm, b.radius_mm) for b in self.rig.tool),
         ]
         axes_mm, radii_mm = capsule_axes(capsules, _frames(self.rig, joints_deg))
@@ -171,6 +174,7 @@ def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals
         job.cell.leds.ids,
         used,
         bodies is not None,
+        capsules_of(shadows.arm),
     )
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Literal
 
 import numpy as np
@@ -23,7 +23,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from coupole import geometry
 from coupole.devices import ArmState, Clock, Deadline, Identity
-from coupole.errors import DeviceLost
+from coupole.errors import DeviceLost, DeviceRefused
+from coupole.kinematics import Arm
 from drivers.arm_motion import News, checked_target, overtaken, refused, wait_for
 from drivers.ur.messages import Ask, Config, Six, State
 from drivers.ur.process import UrProcess, raise_fault
@@ -38,6 +39,10 @@ class Settings(BaseModel):
 
     host: str = Field(min_length=1)
     """Address of the controller; the ports are UR's own (29999, 30003, 30004)."""
+    model: str = Field(default="ur10e", pattern=r"^ur\d+e?$")
+    """Which arm it is; the controller must say the same, without the e."""
+    arm_model: Arm | None = None
+    """The arm as a rig describes it; plans are made with it, this driver does without."""
     limits_deg: tuple[tuple[float, float], ...] = Field(default=((-360.0, 360.0),) * 6, min_length=6, max_length=6)
     """Lowest and highest angle of each joint; narrower than the arm's own where the cell asks for it."""
     joint_speed_deg_s: float = Field(default=120.0, gt=0, le=179.9)
@@ -62,6 +67,20 @@ class Settings(BaseModel):
     follow_deg: float = Field(default=1.0, gt=0)
     follow_samples: int = Field(default=10, ge=1)
     """The arm does not follow: farther than that from where its controller wants it for so many samples."""
+
+    def arm(self) -> Arm | None:
+        """The arm with the limits and speeds that this driver moves it at; preflight computes durations with it.
+        Motions are trapezoids of the leading joint's speed: there is no limit to the jerk."""
+        if self.arm_model is None:
+            return None
+        limits_deg = zip(self.limits_deg, self.arm_model.limits_deg, strict=True)
+        return replace(
+            self.arm_model,
+            limits_deg=tuple((max(a[0], b[0]), min(a[1], b[1])) for a, b in limits_deg),
+            velocity_deg_s=(self.speed_deg_s,) * 6,
+            acceleration_deg_s2=(self.acceleration_deg_s2,) * 6,
+            jerk_deg_s3=(math.inf,) * 6,
+        )
 
     @property
     def speed_deg_s(self) -> float:
@@ -92,9 +111,20 @@ class UrRobot:
         try:
             self._last = self._process.first_word(settings.connect_timeout_s)
             raise_fault(self._last)
+            self._check_model(self._last.model)
         except BaseException:
             self.close()
             raise
+
+    def _check_model(self, told: str) -> None:
+        """Plans are reckoned for one arm: another must not run them. The dashboard calls a UR10e `UR10`."""
+        if told.lower().removesuffix("e") != self.settings.model.removesuffix("e"):
+            raise DeviceRefused(
+                "robot",
+                expected=f"a {self.settings.model.upper().replace('E', 'e')}, as the rig has it",
+                happened=f"the controller says that it moves a {told}",
+                remedy="Correct `model` in the robot's settings, and `arm`, if the rig names one",
+            )
 
     def identify(self) -> Identity:
         last = self._last

@@ -1,10 +1,12 @@
-"""The stand-in's UR10e: where its flange is, which joints bring it there, and how it moves on lines of both."""
+"""The stand-in's UR: where its flange is, which joints bring it there, and how it moves on lines of both."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,32 +17,45 @@ from sim.devices.newton import joints_near
 
 Six = tuple[float, ...]
 
-_DH = (
-    (0.0, 180.7, math.pi / 2),
-    (-612.7, 0.0, 0.0),
-    (-571.55, 0.0, 0.0),
-    (0.0, 174.15, math.pi / 2),
-    (0.0, 119.85, -math.pi / 2),
-    (0.0, 116.55, 0.0),
-)
+UrModel = Literal["ur5e", "ur10e"]
+_DH = {
+    "ur5e": (
+        (0.0, 162.5, math.pi / 2),
+        (-425.0, 0.0, 0.0),
+        (-392.2, 0.0, 0.0),
+        (0.0, 133.3, math.pi / 2),
+        (0.0, 99.7, -math.pi / 2),
+        (0.0, 99.6, 0.0),
+    ),
+    "ur10e": (
+        (0.0, 180.7, math.pi / 2),
+        (-612.7, 0.0, 0.0),
+        (-571.55, 0.0, 0.0),
+        (0.0, 174.15, math.pi / 2),
+        (0.0, 119.85, -math.pi / 2),
+        (0.0, 116.55, 0.0),
+    ),
+}
 """Of each joint a and d in mm and alpha in rad, after Denavit and Hartenberg. Source: Universal Robots, "DH
-Parameters for calculations of kinematics and dynamics", UR10e."""
+Parameters for calculations of kinematics and dynamics"."""
 
 
 _LINE_STEP_MM, _LINE_STEP_RAD = 5.0, 0.02
 """How far apart the places of a line are that joints are computed for; between them they go straight."""
 
 
-def flange_pose(joints_deg: Sequence[float]) -> Transform:
+def flange_pose(model: UrModel, joints_deg: Sequence[float]) -> Transform:
     """`base_from_flange` of six joint angles."""
-    return _chain(joints_deg)[0]
+    return chain(model, joints_deg)[0]
 
 
-def _chain(joints_deg: Sequence[float]) -> tuple[Transform, NDArray[np.float64], NDArray[np.float64]]:
+def chain(
+    model: UrModel, joints_deg: Sequence[float]
+) -> tuple[Transform, NDArray[np.float64], NDArray[np.float64]]:
     """`base_from_flange`, and in the base frame the joints' origins in mm and their axes, each [6, 3]."""
     base_from_link = np.eye(4)
     origins_mm, axes = np.zeros((6, 3)), np.zeros((6, 3))
-    for k, (angle_deg, (a, d, alpha)) in enumerate(zip(joints_deg, _DH, strict=True)):
+    for k, (angle_deg, (a, d, alpha)) in enumerate(zip(joints_deg, _DH[model], strict=True)):
         origins_mm[k], axes[k] = base_from_link[:3, 3], base_from_link[:3, 2]
         s, c = math.sin(math.radians(angle_deg)), math.cos(math.radians(angle_deg))
         sa, ca = math.sin(alpha), math.cos(alpha)
@@ -116,6 +131,7 @@ def movej(start_deg: Six, end_deg: Six, speed_deg_s: float, acceleration_deg_s2:
 
 
 def movel(
+    model: UrModel,
     start_deg: Six,
     base_from_tool: Transform,
     flange_from_tool: Transform,
@@ -125,7 +141,7 @@ def movel(
 ) -> Motion | None:
     """From rest to rest, the tool on a straight line and turning at a steady rate about one axis, as URScript's
     movel; None where the arm cannot follow. A turn on the spot counts radians as metres."""
-    start = flange_pose(start_deg) @ flange_from_tool
+    start = flange_pose(model, start_deg) @ flange_from_tool
     line_mm = base_from_tool[:3, 3] - start[:3, 3]
     turned_rad = np.array(rotation_vector(start[:3, :3].T @ base_from_tool[:3, :3]))
     length_mm, angle_rad = float(np.linalg.norm(line_mm)), float(np.linalg.norm(turned_rad))
@@ -138,7 +154,7 @@ def movel(
         if angle_rad > 0.0:
             axis = (turned_rad / angle_rad).tolist()
             tool[:3, :3] = start[:3, :3] @ turn(axis, math.degrees(share * angle_rad))
-        place_deg = joints_near(_chain, tool @ tool_from_flange, places_deg[-1])
+        place_deg = joints_near(partial(chain, model), tool @ tool_from_flange, places_deg[-1])
         if place_deg is None:
             return None
         places_deg.append(place_deg)

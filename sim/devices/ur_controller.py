@@ -1,4 +1,4 @@
-"""The stand-in for a UR10e and its controller, at the other end of ur-rtde: RTDE, dashboard, script upload.
+"""The stand-in for a UR and its controller, at the other end of ur-rtde: RTDE, dashboard, script upload.
 
 It runs what ur-rtde's uploaded program does (`ur_script`), moves its arm on trapezoids of speed, and stops
 for what the real one stops for: emergency stop, protective stop, a silent watchdog. The ports are UR's own,
@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from coupole.errors import InputError
 from coupole.geometry import Transform
 from sim.devices.kuka_kinematics import turn
-from sim.devices.ur_arm import Motion, Six, brake, flange_pose, movej, movel, rotation_vector
+from sim.devices.ur_arm import Motion, Six, UrModel, brake, flange_pose, movej, movel, rotation_vector
 from sim.devices.ur_rtde_session import RtdeSession
 from sim.devices.ur_rtde_wire import Value
 from sim.devices.ur_script import ControlScript
@@ -56,6 +56,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["ur"] = "ur"
+    model: UrModel = "ur10e"
     address: str = Field(default=_ANY, pattern=r"^127\.\d+\.\d+\.\d+$")
     """Loopback address to listen at; the default chooses one that is free, see `UrController.address`."""
     start_joints_deg: tuple[float, float, float, float, float, float] = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
@@ -119,7 +120,7 @@ class UrController:
 
     def true_base_from_flange(self) -> Transform:
         """Where the flange is."""
-        return flange_pose(self.joints_deg)
+        return flange_pose(self._settings.model, self.joints_deg)
 
     def estop(self) -> None:
         """Emergency stop: the arm brakes and loses power, the program ends."""
@@ -180,7 +181,7 @@ class UrController:
     def start_movel(self, tool_pose_m_rad: Six, speed_m_s: float, acceleration_m_s2: float) -> None:
         tool = _transform(tool_pose_m_rad), _transform(self._settings.tcp_offset_m_rad)
         now_ns = self._reactor.now_ns
-        self._start(movel(self._commanded_deg, *tool, speed_m_s, acceleration_m_s2, now_ns))
+        self._start(movel(self._settings.model, self._commanded_deg, *tool, speed_m_s, acceleration_m_s2, now_ns))
 
     def start_stopj(self, deceleration_deg_s2: float) -> None:
         if self.moving:
@@ -278,7 +279,7 @@ class UrController:
         answers = {
             "PolyscopeVersion": "URSoftware 5.15.0.126600 (simulated)",
             "get serial number": "20245500001",
-            "get robot model": "UR10",
+            "get robot model": self._settings.model.upper().removesuffix("E"),
             "is in remote control": str(self.remote_control).lower(),
             "robotmode": f"Robotmode: {'RUNNING' if self._robot_mode == _ROBOT_MODE_RUNNING else 'POWER_OFF'}",
             "safetystatus": f"Safetystatus: {safety[self._safety_bits]}",

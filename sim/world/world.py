@@ -23,7 +23,7 @@ from pydantic import BaseModel
 
 from coupole.devices import NO_LIGHT
 from sim.devices import camera_stand_in, gige_camera, kuka_controller, ledbox_firmware, robot
-from sim.devices.arm_bodies import NONE, Capsules, arm_capsules, tool_capsules
+from sim.devices.arm_bodies import NONE, Capsules, arm_capsules, tool_capsules, ur_capsules
 from sim.devices.camera_body import Exposed, Surroundings
 from sim.optics.led_light import Flashes
 from sim.optics.photographer import Photographer
@@ -117,11 +117,12 @@ class World:
         if not self._arm_shadows:
             return NONE
         tool = tool_capsules(self.robot.true_base_from_flange(), self._tool)
-        match self._robot_settings.kind:
+        settings, joints_deg = self._robot_settings, self.robot.joints_deg
+        match settings.kind:
             case "ur":
-                return tool
+                return np.concatenate([ur_capsules(settings.model, joints_deg), tool])
             case "rsi" | "eki":
-                return np.concatenate([arm_capsules(self.robot.joints_deg), tool])
+                return np.concatenate([arm_capsules(joints_deg), tool])
             case kind:
                 assert_never(kind)
 

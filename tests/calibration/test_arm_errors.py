@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from arms import KR10_R1100_SIXX
 from synthesis import Array, TrueLens, board_points, frame, looking_at_board
 
 from coupole.calibration.arm_errors import axis_sensitivity
@@ -12,7 +13,7 @@ from coupole.calibration.lens.board import Sighting
 from coupole.calibration.lens.bundle import HandEyeCalibration, Poses, RobotNoise, calibrate_hand_eye
 from coupole.calibration.lens.camera import calibrate_camera
 from coupole.calibration.rotations import between
-from coupole.kinematics import KR10_R1100_SIXX, forward, inverse, nearest
+from coupole.kinematics import forward, inverse, nearest
 from sim.devices.kuka_kinematics import PoseErrors
 
 ABSOLUTE_DEG = 0.02

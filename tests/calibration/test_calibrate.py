@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from arms import KR10_R1100_SIXX
 from photographed import BOARD_YAML, FLANGE_FROM_CAMERA, LENS, SIZE_PX, shoot, write_folder, write_run
 from synthesis import Array
 from typer.testing import CliRunner, Result
@@ -21,7 +22,7 @@ from coupole.calibration.rotations import between
 from coupole.calibration.sources import open_sources
 from coupole.commands.calibrate import calibrate_app
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
-from coupole.kinematics import KR10_R1100_SIXX, forward
+from coupole.kinematics import forward
 
 CHARUCO = Board(kind="charuco", corners=(9, 6), square_mm=16.0, marker_mm=10.0)
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from arms import KR10_R1100_SIXX
 from scipy.spatial.transform import Rotation
 from synthesis import Array, TrueLens, frame, looking_at_board
 from test_point_sets import layout
@@ -16,7 +17,7 @@ from coupole.calibration.optics import Intrinsics
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.rotations import moved
 from coupole.calibration.stickers.mesh_to_robot import Stated, mesh_to_robot
-from coupole.kinematics import KR10_R1100_SIXX, forward, inverse, nearest
+from coupole.kinematics import forward, inverse, nearest
 
 LENS = TrueLens((1740.0, 1740.0), (511.5, 383.5), (0.0, 0.0, 0.0, 0.0, 0.0))
 SIZE_PX = (1024, 768)

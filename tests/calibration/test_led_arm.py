@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from arms import KR10_R1100_SIXX
 from domes import Dome, dome
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
@@ -15,7 +16,7 @@ from test_led_record import REQUEST, images
 from coupole.calibration.calibrated_arm import CalibratedArm
 from coupole.calibration.leds.equations import Stated
 from coupole.calibration.leds.workflow import LedsFound, leds_from
-from coupole.kinematics import KR10_R1100_SIXX, forward
+from coupole.kinematics import forward
 
 ZEROS_DEG = np.array([0.0, 0.03, -0.02, 0.025, -0.03, 0.02])
 VIEWS = 24

@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from arms import KR10_R1100_SIXX
 from numpy.typing import NDArray
 
 from coupole.devices import Robot
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused
-from coupole.kinematics import KR10_R1100_SIXX, forward
+from coupole.kinematics import forward
 from drivers.kuka.rsi.driver import KukaRsi, Settings
 from sim.devices.kuka_controller import ALIKE, KukaController
 from sim.devices.kuka_controller import Settings as ControllerSettings
@@ -121,7 +122,7 @@ class KukaCell(RobotCell):
         arm = KukaController(reactor, ControllerSettings.model_validate(theirs | delay | controller))
         ours = {"listen": self.address, "cycle_ms": cycle_ms, "link_timeout_s": 0.5, "connect_timeout_s": 20.0}
         alike = {name: value for name, value in controller.items() if name in ALIKE}
-        self.settings = Settings.model_validate(ours | delay | alike)
+        self.settings = Settings.model_validate({"arm_model": KR10_R1100_SIXX} | ours | delay | alike)
         super().__init__(folder / "clock", reactor, arm, cycle_ms)
 
     def open(self, **settings: object) -> KukaRsi:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from arms import KR10_R1100_SIXX
 from numpy.typing import NDArray
 from pydantic import ValidationError
 from robot_conformance import AWAY_DEG, HOME_DEG, RobotCell, RobotConformance
@@ -62,6 +63,7 @@ class EkiCell(RobotCell):
         )
         self.settings = Settings.model_validate(
             {
+                "arm_model": KR10_R1100_SIXX,
                 "address": arm.address,
                 "controller_is": controller.get("controller_is", "server"),
                 "link_timeout_s": 3.0 if speed == 1.0 else 1.0,
@@ -344,10 +346,10 @@ def test_closing_twice_raises_nothing_and_a_closed_driver_moves_nothing(cell: Ek
 )
 def test_speeds_that_the_controller_cannot_be_given_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(ValidationError, match="from 1 to 100 %"):
-        Settings.model_validate(settings)
+        Settings.model_validate({"arm_model": KR10_R1100_SIXX, **settings})
 
 
 def test_the_arm_moves_at_the_whole_percents_that_the_controller_is_given() -> None:
-    settings = Settings(speed_fraction=0.299, acceleration_deg_s2=305.0)
+    settings = Settings(arm_model=KR10_R1100_SIXX, speed_fraction=0.299, acceleration_deg_s2=305.0)
     assert settings.arm().velocity_deg_s[0] == pytest.approx(0.29 * 300.0)
     assert settings.arm().acceleration_deg_s2[0] == pytest.approx(300.0)

@@ -99,7 +99,7 @@ class TestUrRobot(RobotConformance):
             state = robot.wait_settled()
             assert not state.moving
             assert np.allclose(state.joints_deg, target_deg, atol=1e-3)
-            assert np.allclose(state.base_from_flange, flange_pose(target_deg.tolist()), atol=1e-6)
+            assert np.allclose(state.base_from_flange, flange_pose("ur10e", target_deg.tolist()), atol=1e-6)
             assert np.allclose(cell.controller.true_base_from_flange(), state.base_from_flange, atol=1e-6)
 
     def test_an_emergency_stop_is_a_fault_that_only_a_new_driver_leaves_behind(
@@ -304,7 +304,7 @@ def _tool_pose(joints_deg: Sequence[float] | NDArray[np.float64]) -> NDArray[np.
     flange_from_tool = np.eye(4)
     flange_from_tool[:3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.5]).as_matrix()
     flange_from_tool[2, 3] = 100.0
-    base_from_tool: NDArray[np.float64] = flange_pose(list(joints_deg)) @ flange_from_tool
+    base_from_tool: NDArray[np.float64] = flange_pose("ur10e", list(joints_deg)) @ flange_from_tool
     return base_from_tool
 
 
@@ -353,4 +353,4 @@ def test_rotation_vectors_of_the_stand_in_are_those_of_scipy(turn_deg: float) ->
 
 def test_the_stand_in_stands_where_universal_robots_own_figures_say() -> None:
     # All joints at 0: the arm lies along -x. a2 + a3 = 1184.25 mm; d4 + d6 = 290.7 mm; d1 - d5 = 60.85 mm.
-    assert np.allclose(flange_pose([0.0] * 6)[:3, 3], [-1184.25, -290.7, 60.85], atol=1e-9)
+    assert np.allclose(flange_pose("ur10e", [0.0] * 6)[:3, 3], [-1184.25, -290.7, 60.85], atol=1e-9)

@@ -19,10 +19,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from arms import KR10_R1100_SIXX
 from cells import REPO, CellFolder, wait_until
 
 from coupole.devices import SystemClock
-from coupole.kinematics import KR10_R1100_SIXX, forward
+from coupole.kinematics import forward
 from drivers.kuka.rsi.driver import KukaRsi, Settings
 
 HOME_DEG = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
@@ -86,7 +87,9 @@ def test_its_client_moves_our_stand_in(
     what: str,
     values: dict[str, float],
 ) -> None:
-    settings = Settings.model_validate({"listen": f"127.0.0.1:{port}", "corrects": corrects})
+    settings = Settings.model_validate(
+        {"arm_model": KR10_R1100_SIXX, "listen": f"127.0.0.1:{port}", "corrects": corrects}
+    )
     robot = {"sends_to": settings.listen, "sends_pose": True, "corrects": corrects}
     config = configuration(tmp_path, settings)
     arguments = [sys.executable, "-c", _CLIENT, str(config), what, json.dumps(values)]
@@ -120,7 +123,9 @@ def test_its_echo_server_takes_every_answer_of_our_driver(
             probe.bind(("0.0.0.0", _ECHO_PORT))
         except OSError:
             pytest.skip(f"port {_ECHO_PORT}, the echo server's, is in use")
-    settings = Settings.model_validate({"listen": f"127.0.0.1:{port}", "delay_limit": 1_000_000})
+    settings = Settings.model_validate(
+        {"arm_model": KR10_R1100_SIXX, "listen": f"127.0.0.1:{port}", "delay_limit": 1_000_000}
+    )
     config = configuration(tmp_path, settings)
     arguments = [sys.executable, "-c", _ECHO_SERVER, str(config)]
     with (

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from arms import KR10_R1100_SIXX
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from coupole.geometry import abc_from_rotation, transform
 from coupole.kinematics import (
-    KR10_R1100_SIXX,
     forward,
     inverse,
     limit_margin_deg,

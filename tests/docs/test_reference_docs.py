@@ -9,12 +9,12 @@ from types import ModuleType
 import pytest
 from places import REPO
 
-from coupole.plan import plan, rig
+from coupole.plan import arm_description, plan, rig
 
 REFERENCE = REPO / "docs" / "reference"
 
 
-@pytest.mark.parametrize(("module", "page"), [(plan, "plan.md"), (rig, "rig.md")])
+@pytest.mark.parametrize(("module", "page"), [(plan, "plan.md"), (rig, "rig.md"), (arm_description, "robot.md")])
 def test_the_reference_names_every_key(module: ModuleType, page: str) -> None:
     text = (REFERENCE / page).read_text(encoding="utf-8")
     models = [

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arms import KR10_R1100_SIXX
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused
-from coupole.kinematics import KR10_R1100_SIXX, move_duration_s, slowed
+from coupole.kinematics import move_duration_s, slowed
 from drivers.arm_motion import farthest_stop_deg
 from drivers.kuka.eki import wire
 from drivers.kuka.eki.watch import Tolerances, Watch

@@ -8,10 +8,11 @@ from random import Random
 
 import numpy as np
 import pytest
+from arms import KR10_R1100_SIXX
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coupole.kinematics import KR10_R1100_SIXX
+from coupole.kinematics import structure_of
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.pose import Geometry
 from drivers.kuka.rsi.rsi_session import Config, RsiSession
@@ -28,7 +29,7 @@ CONFIG = Config(
     correction_tag="AKorr",
     corrects="axes",
     mode="absolute",
-    geometry=Geometry(*(getattr(KR10_R1100_SIXX, name) for name in Geometry._fields)),
+    geometry=Geometry(*(getattr(structure_of(KR10_R1100_SIXX), name) for name in Geometry._fields)),
     velocity_deg_s=(100.0,) * 6,
     acceleration_deg_s2=(300.0,) * 6,
     jerk_deg_s3=(3000.0,) * 6,

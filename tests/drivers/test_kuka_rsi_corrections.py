@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from arms import KR10_R1100_SIXX
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from coupole.geometry import rotation_from_abc
-from coupole.kinematics import KR10_R1100_SIXX, forward
+from coupole.kinematics import forward, structure_of
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.corrections import Corrections
 from drivers.kuka.rsi.driver import Settings
@@ -18,7 +19,7 @@ from drivers.kuka.rsi.pose import Geometry, Pose, corrected, correction, flange_
 from drivers.kuka.rsi.trajectory import Motion
 
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
-GEOMETRY = Geometry(*(getattr(KR10_R1100_SIXX, name) for name in Geometry._fields))
+GEOMETRY = Geometry(*(getattr(structure_of(KR10_R1100_SIXX), name) for name in Geometry._fields))
 joints = st.tuples(*[st.floats(low, high) for low, high in KR10_R1100_SIXX.limits_deg])
 
 
@@ -80,7 +81,11 @@ def test_an_increment_that_was_not_applied_is_said_again_with_the_next() -> None
 
 def violations(target_deg: shared_state.Six, *on_the_way_deg: shared_state.Six, **settings: object) -> str:
     return correction_violations(
-        Settings.model_validate(settings), KR10_R1100_SIXX, HOME_DEG, on_the_way_deg or (HOME_DEG,), target_deg
+        Settings.model_validate({"arm_model": KR10_R1100_SIXX, **settings}),
+        KR10_R1100_SIXX,
+        HOME_DEG,
+        on_the_way_deg or (HOME_DEG,),
+        target_deg,
     )
 
 
@@ -137,7 +142,7 @@ def test_a_new_target_in_mid_motion_is_checked_from_the_whole_rest_of_the_way() 
 )
 def test_settings_that_make_no_sense_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
-        Settings.model_validate(settings)
+        Settings.model_validate({"arm_model": KR10_R1100_SIXX, **settings})
 
 
 @given(
@@ -155,6 +160,7 @@ def test_the_stopping_distance_holds_for_every_motion(
     jerk_deg_s3: float,
 ) -> None:
     settings = Settings(
+        arm_model=KR10_R1100_SIXX,
         speed_fraction=speed_fraction,
         acceleration_deg_s2=acceleration_deg_s2,
         jerk_deg_s3=jerk_deg_s3,

@@ -6,14 +6,15 @@ from functools import cache
 
 import numpy as np
 import pytest
+from arms import KR10, KR10_R1100_SIXX
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from places import SHARED_DATA
 
 from coupole.geometry import apply, inverse, transform
-from coupole.kinematics import KR10_R1100_SIXX, forward, link_frames
-from coupole.motion.bodies import ARM_CAPSULES, Capsule
+from coupole.kinematics import forward, link_frames
+from coupole.motion.bodies import Capsule, capsules_of
 from coupole.motion.collisions import CellBodies, Clearances, Surroundings
 from coupole.motion.sphere_tree import MESH_STEP_MM, spheres_of, surface_points
 
@@ -40,9 +41,7 @@ def cell(
         (("sphere", (300.0, 200.0, 100.0), 120.0),),
         (("block", (-600.0, -500.0, 0.0), (-400.0, -300.0, 200.0)),),
     )
-    return CellBodies(
-        KR10_R1100_SIXX, around, TOOL, Clearances(**clearances), LINK_MESHES if link_meshes else None
-    )
+    return CellBodies(KR10, around, TOOL, Clearances(**clearances), LINK_MESHES if link_meshes else None)
 
 
 def box_corners(size_mm: tuple[float, float, float]) -> NDArray[np.float64]:
@@ -68,7 +67,7 @@ def test_the_capsules_of_a_link_enclose_its_mesh(link: int) -> None:
     mesh = trimesh.load(LINK_MESHES / f"{name}.stl", process=False, force="mesh")
     points = 1000 * np.concatenate([mesh.vertices, trimesh.sample.sample_surface(mesh, 5000, seed=1)[0]])
     outside = np.full(len(points), np.inf)
-    for capsule in (c for c in ARM_CAPSULES if c.link == link):
+    for capsule in (c for c in capsules_of(KR10) if c.link == link):
         start, end = np.array(capsule.start_mm, float), np.array(capsule.end_mm, float)
         along = end - start
         share = np.clip((points - start) @ along / max(along @ along, 1e-9), 0, 1)

@@ -211,9 +211,10 @@ def test_shadows_are_those_that_an_independent_checker_finds(
     demo: Job, demo_shadows: Occlusions, scale: Callable[[int, int], int]
 ) -> None:
     import fcl
+    from arms import KR10, KR10_R1100_SIXX
 
-    from coupole.kinematics import KR10_R1100_SIXX, link_frames
-    from coupole.motion.bodies import ARM_CAPSULES
+    from coupole.kinematics import link_frames
+    from coupole.motion.bodies import capsules_of
 
     rig, patches, leds_mm = demo.cell.rig, demo_shadows.patches, demo_shadows.leds_mm
     view = demo.schedule.views[1]
@@ -221,7 +222,7 @@ def test_shadows_are_those_that_an_independent_checker_finds(
     assert visit is not None
     shadow = demo_shadows.at(visit.joints_deg)
     frames = inverse(rig.support.base_from_support.matrix()) @ link_frames(KR10_R1100_SIXX, visit.joints_deg)
-    arm = [(c.link, c.start_mm, c.end_mm, c.radius_mm) for c in ARM_CAPSULES]
+    arm = [(c.link, c.start_mm, c.end_mm, c.radius_mm) for c in capsules_of(KR10)]
     tool = [(7, body.from_mm, body.to_mm, body.radius_mm) for body in rig.tool]
 
     def capsule(link: int, start: Points, end: Points, radius_mm: float) -> object:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+from arms import KR10, KR10_R1100_SIXX
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from coupole.kinematics import KR10_R1100_SIXX, link_frames
-from coupole.motion.collisions import ARM_CAPSULES
+from coupole.kinematics import link_frames
+from coupole.motion.bodies import Capsule, capsules_of
+from coupole.motion.collisions import CellBodies, Surroundings
 from coupole.motion.path_deviation import path_deviation_mm
 
+TOOL = Capsule("tool", 7, (0, 0, 0), (0, 0, 120), 1)
+REACH_MM = CellBodies(KR10, Surroundings(np.eye(4), 740.0, 1500.0, 74.0, np.zeros((0, 3))), [TOOL]).reach_mm
 LOW, HIGH = np.array(KR10_R1100_SIXX.limits_deg).T
 places = st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).uniform(LOW, HIGH))
 shares = st.floats(0.0, 1.0)
@@ -19,14 +23,14 @@ shares = st.floats(0.0, 1.0)
 def _points_mm(joints_deg: NDArray[np.float64]) -> NDArray[np.float64]:
     """[..., n, 3] ends of all capsules of the arm, and of a tool of 120 mm, in the base frame."""
     frames = link_frames(KR10_R1100_SIXX, joints_deg)
-    ends = [(c.link, end) for c in ARM_CAPSULES for end in (c.start_mm, c.end_mm)] + [(7, (0.0, 0.0, 120.0))]
+    ends = [(c.link, end) for c in capsules_of(KR10) for end in (c.start_mm, c.end_mm)] + [(7, (0.0, 0.0, 120.0))]
     return np.stack([frames[..., k, :3, :3] @ np.array(end) + frames[..., k, :3, 3] for k, end in ends], axis=-2)
 
 
 @given(places, places, places, shares)
 def test_on_the_way_it_is_zero(start: NDArray, via: NDArray, goal: NDArray, share: float) -> None:  # type: ignore[type-arg]
     way = [start, via, goal]
-    assert path_deviation_mm(way, via + share * (goal - via)) < 1e-9
+    assert path_deviation_mm(way, via + share * (goal - via), REACH_MM) < 1e-9
 
 
 @settings(max_examples=60)
@@ -43,10 +47,10 @@ def test_it_is_never_less_than_the_farthest_point_is_off(
     on_the_way = start + np.linspace(0, 1, 2001)[:, None] * (goal - start)
     apart_mm = np.linalg.norm(_points_mm(joints_deg) - _points_mm(on_the_way), axis=-1).max(axis=-1).min()
     step_mm = np.linalg.norm(np.diff(_points_mm(on_the_way), axis=0), axis=-1).max()
-    assert path_deviation_mm([start, goal], joints_deg) >= apart_mm - step_mm
+    assert path_deviation_mm([start, goal], joints_deg, REACH_MM) >= apart_mm - step_mm
 
 
 def test_an_arm_that_has_no_way_to_go_is_off_by_where_it_stands() -> None:
     here = np.zeros(6)
-    assert path_deviation_mm([here], here) == 0.0
-    assert path_deviation_mm([here], np.array([0.1, 0, 0, 0, 0, 0])) > 2.0
+    assert path_deviation_mm([here], here, REACH_MM) == 0.0
+    assert path_deviation_mm([here], np.array([0.1, 0, 0, 0, 0, 0]), REACH_MM) > 2.0

@@ -6,10 +6,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from arms import KR10, KR10_R1100_SIXX
 from numpy.typing import NDArray
 
 from coupole.geometry import transform
-from coupole.kinematics import KR10_R1100_SIXX, move_duration_s, slowed
+from coupole.kinematics import move_duration_s, slowed
 from coupole.motion.bodies import Capsule
 from coupole.motion.collisions import CellBodies, Clearances, Surroundings
 from coupole.motion.path_planner import PathPlanner
@@ -25,7 +26,7 @@ def cell(*boxes: tuple[str, tuple[float, float, float], tuple[float, float, floa
     around = Surroundings(
         transform((200, 0, 1450), (0, 0, 180)), 740.0, 1500.0, 74.0, np.zeros((0, 3)), keep_out_boxes=boxes
     )
-    return CellBodies(ARM, around, (Capsule("camera", 7, (0, 0, 20), (0, 0, 100), 60),), Clearances())
+    return CellBodies(KR10, around, (Capsule("camera", 7, (0, 0, 20), (0, 0, 100), 60),), Clearances())
 
 
 def planner(*boxes: tuple[str, tuple[float, float, float], tuple[float, float, float]]) -> PathPlanner:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cells
 import h5py
 import numpy as np
@@ -80,9 +82,14 @@ def test_a_run_is_resumed_without_what_it_began_without(hidden: CellFolder) -> N
     assert cells.here("verify", run).code == 0
 
 
-def test_an_led_that_preflight_calls_hidden_gives_a_dark_frame(cell: CellFolder) -> None:
+@pytest.mark.parametrize("arm", ["kuka", "ur10e"])
+def test_an_led_that_preflight_calls_hidden_gives_a_dark_frame(tmp_path: Path, arm: str) -> None:
     """The world's arm and the controller's are two pictures of one thing: where the controller finds that an LED
     reaches nothing of what is seen, the simulated frame has hardly any light."""
+    cell = CellFolder(tmp_path, speed=1.0 if arm == "ur10e" else 5.0)
+    if arm == "ur10e":
+        pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
+        cell.moved_by_ur(arm)
     cell.world_settings["arm_shadows"] = True
     cell.write(views=[STEEP], lights={"kind": "every", "every": 5})
     assert cell.acquire().code == 0

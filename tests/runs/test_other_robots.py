@@ -1,4 +1,4 @@
-"""Runs with the arm on another wire: EthernetKRL is as good as RSI; an arm without a model is not moved."""
+"""Runs with the arm on another wire, or with another arm: each is as good as RSI; what nothing describes stays."""
 
 from __future__ import annotations
 
@@ -29,7 +29,13 @@ def eki(cell: CellFolder) -> CellFolder:
 
 @pytest.mark.parametrize(
     "name",
-    ["sim", pytest.param("sim-gige", marks=needs_aravis), "sim-eki", pytest.param("sim-ur", marks=needs_ur_rtde)],
+    [
+        "sim",
+        pytest.param("sim-gige", marks=needs_aravis),
+        "sim-eki",
+        pytest.param("sim-ur", marks=needs_ur_rtde),
+        pytest.param("sim-ur5e", marks=needs_ur_rtde),
+    ],
 )
 def test_the_devices_of_each_shipped_rig_open_and_test_themselves(name: str) -> None:
     with gige_port() if name == "sim-gige" else nullcontext():
@@ -144,13 +150,38 @@ def test_a_world_with_a_ur_does_not_run_at_another_speed_than_life(cell: CellFol
     assert "ur-rtde lives in real time" in ended.err
 
 
-def test_a_plan_for_an_arm_without_a_model_is_refused_before_a_device_is_touched(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("model", "views"), [("ur5e", [TOP]), ("ur10e", [TOP, SIDE])])
+def test_a_plan_runs_on_a_ur(tmp_path: Path, model: str, views: list[dict[str, Any]]) -> None:
+    pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
     cell = CellFolder(tmp_path, speed=1.0)
-    cell.rig_data["robot"] = {"driver": UR}
+    cell.moved_by_ur(model)
+    cell.write(views=views)
+    ended = cell.acquire()
+    assert ended.code == 0, ended.err
+    cells.assert_each_shot_proven_once(cell.run_folder)
+    assert cells.mislabelled(cell, cell.run_folder) == []
+    assert cells.about(cell.run_folder)["devices"]["robot"]["model"] == model.upper().removesuffix("E")
+
+
+def test_a_controller_of_another_arm_than_the_plans_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
+    cell = CellFolder(tmp_path, speed=1.0)
+    cell.moved_by_ur("ur10e")
+    cell.world_settings["robot"] = {"model": "ur5e"}
     cell.write()
     ended = cell.acquire()
-    assert ended.code == 3
-    assert "no model of this arm" in ended.err
+    assert ended.code == 4
+    assert "expected a UR10e, as the rig has it; the controller says that it moves a UR5" in ended.err
+
+
+def test_a_plan_for_an_arm_that_nothing_describes_is_refused_before_a_device_is_touched(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path, speed=1.0)
+    cell.rig_data["robot"] = {"driver": "drivers.ur.driver:UrRobot"}
+    cell.world_settings["robot"] = {"kind": "ur"}
+    cell.write()
+    ended = cell.acquire()
+    assert ended.code == 2
+    assert "arm: expected the arm that `drivers.ur.driver:UrRobot` moves, as its file" in ended.err
 
 
 def test_the_planned_arm_has_the_speeds_of_rig_and_driver() -> None:
@@ -158,4 +189,12 @@ def test_the_planned_arm_has_the_speeds_of_rig_and_driver() -> None:
     arm = planning_arm(rig)
     assert arm is not None
     assert arm.velocity_deg_s[0] == pytest.approx(0.3 * 300)
-    assert planning_arm(read_cell(cells.REPO / "configs/rigs/sim-ur.yaml").rig) is None
+
+
+def test_the_planned_ur_has_the_leading_joints_speed_and_the_limits_of_its_driver() -> None:
+    rig = read_cell(cells.REPO / "configs/rigs/sim-ur.yaml").rig
+    narrowed = {**rig.robot.settings, "limits_deg": [[-170, 200], *[[-360, 360]] * 5]}
+    arm = planning_arm(rig.model_copy(update={"robot": rig.robot.model_copy(update={"settings": narrowed})}))
+    assert arm is not None
+    assert arm.velocity_deg_s == pytest.approx((0.3 * 120.0,) * 6)
+    assert arm.limits_deg[0] == (-170.0, 200.0)

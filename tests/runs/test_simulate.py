@@ -10,6 +10,7 @@ import pytest
 from cells import SIDE, TOP, CellFolder
 from PIL import Image
 
+from coupole.preflight.job import read_job
 from coupole.storage import frame_file
 from coupole.viewing.raw_preview import develop
 
@@ -71,3 +72,24 @@ def test_a_wrong_plan_is_refused_at_its_line(cell: CellFolder) -> None:
     ended = cells.here("simulate", cell.plan)
     assert ended.code == 2
     assert "plan.yaml:" in ended.err
+
+
+def test_a_view_by_the_joints_of_a_ur_is_rendered_from_where_its_flange_is(tmp_path: Path) -> None:
+    """The same view, once as the camera's pose and once as joints of a UR10e that lead there, in two cells."""
+    pictures = []
+    for by_joints in (False, True):
+        cell = CellFolder(tmp_path, speed=1.0)
+        cell.moved_by_ur("ur10e")
+        cell.write(views=[TOP])
+        job = read_job(cell.plan)
+        (visit,) = job.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg).visits
+        assert visit is not None
+        if by_joints:
+            cell.write(views=[{"kind": "joints", "name": "top", "joints_deg": visit.joints_deg.tolist()}])
+        out = tmp_path / str(by_joints)
+        ended = cells.here("simulate", cell.plan, "--frames", "1", "--out", out, "--json")
+        assert ended.code == 0, ended.err
+        with Image.open(out / ended.document["frames"][0]["file"]) as picture:
+            pictures.append(np.asarray(picture).astype(float))
+    assert pictures[0].max() > 60
+    assert np.abs(pictures[0] - pictures[1]).mean() < 1.0

@@ -126,6 +126,29 @@ def test_the_page_tells_why_views_are_refused(bad: Seen) -> None:
     assert re.search(r"close: camera \d+ mm (from|inside) the", bad.html)
 
 
+def test_a_ur_is_drawn_with_its_own_links(cell: CellFolder) -> None:
+    cell.moved_by_ur("ur10e")
+    cell.world_settings["speed"] = 1.0
+    cell.write(views=[TOP])
+    job = read_job(cell.plan)
+    itinerary = job.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg)
+    scene = scene_of(job, itinerary, job.motion.bodies, [])
+    stop = scene.stops[0]
+    assert stop.joints_deg is not None
+    names = [solid.name for solid in scene.arm(stop.joints_deg)]
+    assert names == [
+        "base",
+        "shoulder",
+        "upper arm",
+        "forearm",
+        "wrist 1",
+        "wrist 2",
+        "wrist 3",
+        "camera",
+        "cables",
+    ]
+
+
 def test_without_json_refusals_and_files_are_told(cell: CellFolder) -> None:
     cell.write(views=[CLOSE])
     ended = cells.here("view", cell.plan, "--out", cell.folder)

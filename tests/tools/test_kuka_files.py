@@ -9,6 +9,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+from arms import KR10_R1100_SIXX
 from places import REPO
 
 from drivers.kuka import eki as kuka_eki
@@ -47,7 +48,7 @@ def test_the_committed_files_are_what_the_tool_writes(tool: dict[str, Any], tmp_
 
 
 def test_rsi_names_the_port_the_type_and_asks_for_answers(rsi: ElementTree.Element) -> None:
-    settings = kuka_rsi.Settings()
+    settings = kuka_rsi.Settings(arm_model=KR10_R1100_SIXX)
     assert rsi.tag == "ROOT"
     assert rsi.findtext("CONFIG/PORT") == settings.listen.rsplit(":", 1)[1]
     assert rsi.findtext("CONFIG/SENTYPE") == settings.sen_type
@@ -55,7 +56,7 @@ def test_rsi_names_the_port_the_type_and_asks_for_answers(rsi: ElementTree.Eleme
 
 
 def test_rsi_sends_what_the_driver_reads(rsi: ElementTree.Element) -> None:
-    settings = kuka_rsi.Settings()
+    settings = kuka_rsi.Settings(arm_model=KR10_R1100_SIXX)
     elements = [element.attrib for element in rsi.iterfind("SEND/ELEMENTS/ELEMENT")]
     assert {f"DEF_{settings.measured_tag}", f"DEF_{settings.delay_tag}"} <= {e["TAG"] for e in elements}
     assert {element["INDX"] for element in elements} == {"INTERNAL"}
@@ -66,7 +67,7 @@ def test_rsi_sends_what_the_driver_reads(rsi: ElementTree.Element) -> None:
 def test_rsi_receives_what_the_driver_sends_and_holds_what_may_be_held(
     tool: dict[str, Any], corrects: str, mode: str, hold_on: str
 ) -> None:
-    settings = kuka_rsi.Settings.model_validate({"corrects": corrects, "mode": mode})
+    settings = kuka_rsi.Settings.model_validate({"arm_model": KR10_R1100_SIXX, "corrects": corrects, "mode": mode})
     template = answer_template(settings.sen_type, settings.tag, NAMES[corrects])
     sent = ElementTree.fromstring(template % (*(0.0,) * 6, b"1"))
     corrections = [f"{child.tag}.{name}" for child in sent for name in child.attrib]
@@ -96,11 +97,15 @@ def test_the_context_says_the_limits_and_the_meaning_of_the_settings(
 
 def test_the_monitor_stops_rsi_before_the_correction_is_clamped(tool: dict[str, Any]) -> None:
     stand_in = Limits()
-    assert kuka_rsi.Settings().axis_correction_deg == stand_in.axis_monitor_deg
+    assert kuka_rsi.Settings(arm_model=KR10_R1100_SIXX).most_correction_deg == stand_in.axis_monitor_deg
     assert stand_in.axis_clamp_deg == tuple(limit + 1 for limit in stand_in.axis_monitor_deg)
     for axis, clamp in enumerate(stand_in.axis_clamp_deg, start=1):
-        assert f"A{axis} +-{clamp:g}" in tool["correction_rows"](kuka_rsi.Settings())
-    assert kuka_rsi.Settings().pose_correction_mm == stand_in.pose_monitor_mm < stand_in.pose_clamp_mm
+        assert f"A{axis} +-{clamp:g}" in tool["correction_rows"](kuka_rsi.Settings(arm_model=KR10_R1100_SIXX))
+    assert (
+        kuka_rsi.Settings(arm_model=KR10_R1100_SIXX).pose_correction_mm
+        == stand_in.pose_monitor_mm
+        < stand_in.pose_clamp_mm
+    )
 
 
 @pytest.mark.parametrize(("mode", "word"), [("absolute", "#ABSOLUTE"), ("relative", "#RELATIVE")])
@@ -119,7 +124,7 @@ def test_rsi_runs_in_the_cycle_of_the_settings(
     program = (tmp_path / "rsi" / "coupole_rsi.src").read_text()
     assert f"RSI_ON(#ABSOLUTE,{mode})" in program
     committed = (KUKA / "rsi" / "coupole_rsi.src").read_text()
-    assert (committed == program) == (kuka_rsi.Settings().cycle_ms == cycle_ms)
+    assert (committed == program) == (kuka_rsi.Settings(arm_model=KR10_R1100_SIXX).cycle_ms == cycle_ms)
 
 
 def test_rsi_starts_where_the_arm_stands() -> None:
@@ -132,12 +137,15 @@ def test_eki_listens_where_the_driver_connects(eki: ElementTree.Element) -> None
     internal = eki.find("CONFIGURATION/INTERNAL")
     assert internal is not None
     assert eki.findtext("CONFIGURATION/EXTERNAL/TYPE") == "Client"
-    assert f"{internal.findtext('IP')}:{internal.findtext('PORT')}" == kuka_eki.Settings().address
+    assert (
+        f"{internal.findtext('IP')}:{internal.findtext('PORT')}"
+        == kuka_eki.Settings(arm_model=KR10_R1100_SIXX).address
+    )
     assert internal.findtext("PROTOCOL") == "TCP"
 
 
 def test_eki_connects_where_the_driver_listens(tool: dict[str, Any]) -> None:
-    settings = kuka_eki.Settings(controller_is="client", address="192.168.1.10:54601")
+    settings = kuka_eki.Settings(arm_model=KR10_R1100_SIXX, controller_is="client", address="192.168.1.10:54601")
     configuration = ElementTree.fromstring(tool["eki_xml"](settings))
     external = configuration.find("CONFIGURATION/EXTERNAL")
     assert external is not None
@@ -167,7 +175,7 @@ def test_eki_sends_every_element_that_a_status_is_read_from(eki: ElementTree.Ele
 
 def test_eki_statuses_come_at_the_rate_of_the_settings() -> None:
     program = (KUKA / "eki" / "coupole_link.src").read_text()
-    assert f"$ROB_TIMER-CP_SENT_MS>={kuka_eki.Settings().status_ms})" in program
+    assert f"$ROB_TIMER-CP_SENT_MS>={kuka_eki.Settings(arm_model=KR10_R1100_SIXX).status_ms})" in program
 
 
 def test_the_eki_programs_touch_just_the_elements_that_are_configured(eki: ElementTree.Element) -> None:

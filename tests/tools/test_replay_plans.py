@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from arms import KR10, UR5E, UR10E
 from places import REPO, SHARED_DATA
 
-from coupole.kinematics import KR10_R1100_SIXX, link_frames
+from coupole.kinematics import link_frames
+from coupole.plan.arm_description import ArmDescription
 
 ROOT = REPO
 LINK_MESHES = SHARED_DATA / "robot/kr10r1100sixx"
@@ -23,20 +25,23 @@ def tools(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         sys.modules.pop(name, None)
 
 
-def test_random_plans_that_pass_touch_nothing(scale: Callable[[int, int], int]) -> None:
+@pytest.mark.parametrize("arm", ["kr10", "ur5e", "ur10e"])
+def test_random_plans_that_pass_touch_nothing(arm: str, scale: Callable[[int, int], int]) -> None:
     import replay_plans
 
-    found = replay_plans.run(scale(20, 500), 1, LINK_MESHES if LINK_MESHES.is_dir() else None)
+    meshes = LINK_MESHES if arm == "kr10" and LINK_MESHES.is_dir() else None
+    found = replay_plans.run(scale(20, 500), 1, meshes, ROOT / f"configs/rigs/{replay_plans.RIGS[arm]}.yaml")
     assert found["touches"] == []
     assert found["passed"] >= 3
     assert sum(found["refused"].values()) == found["plans"] - found["passed"]
 
 
-def test_the_checkers_chain_of_joints_agrees_with_ours() -> None:
-    from replay_cell import link_poses
+@pytest.mark.parametrize("arm", [KR10, UR5E, UR10E], ids=lambda arm: arm.name)
+def test_the_checkers_chain_of_joints_agrees_with_ours(arm: ArmDescription) -> None:
+    from replay_cell import ARMS, link_poses
 
     joints_deg = np.random.default_rng(1).uniform(-100, 100, (50, 6))
-    assert np.allclose(link_poses(joints_deg), link_frames(KR10_R1100_SIXX, joints_deg), atol=1e-9)
+    assert np.allclose(link_poses(joints_deg, ARMS[arm.name]), link_frames(arm.arm, joints_deg), atol=1e-9)
 
 
 def test_the_checker_sees_an_arm_in_the_object_the_support_and_the_dome() -> None:

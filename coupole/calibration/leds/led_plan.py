@@ -115,7 +115,7 @@ def _candidates(rig: Rig, boards: Boards, bodies: CellBodies, random: np.random.
 def _cameras(rig: Rig, joints_deg: Floats) -> Floats:
     """[n, 4, 4] base_from_camera."""
     flange_from_camera = rig.flange_from_camera.matrix()
-    return np.array([kinematics.forward(arm_of(rig), joints) @ flange_from_camera for joints in joints_deg])
+    return kinematics.forward(arm_of(rig), joints_deg) @ flange_from_camera
 
 
 def _camera(rig: Rig) -> tuple[Intrinsics, tuple[int, int], float]:

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from coupole.devices import ArmState, Clock, Identity
 from coupole.errors import DeviceError, DeviceLost, DeviceTimeout
 from coupole.geometry import transform
-from coupole.kinematics import KR10_R1100_SIXX, Arm, forward, move_duration_s, slowed
+from coupole.kinematics import Arm, forward, move_duration_s, slowed
 from drivers.arm_motion import News, checked_target, farthest_stop_deg, longest_stop_s, overtaken, refused
 from drivers.kuka.eki import wire
 from drivers.kuka.eki.link import Link, connect
@@ -36,6 +36,8 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    arm_model: Arm
+    """The arm that the controller moves; a rig fills in what it describes."""
     address: str = Field(default="172.31.1.147:54600", pattern=r"^[^:]+:\d+$")
     """host:port of the controller, or of this machine where the controller is the client."""
     controller_is: Literal["server", "client"] = "server"
@@ -80,7 +82,7 @@ class Settings(BaseModel):
     def arm(self) -> Arm:
         """The arm with the speeds that this driver moves it at; preflight computes durations with it."""
         return slowed(
-            KR10_R1100_SIXX,
+            self.arm_model,
             speed_fraction=self.velocity_percent() / 100.0,
             acceleration_deg_s2=self.acceleration_percent() / 100.0 * self.full_acceleration_deg_s2,
             jerk_deg_s3=self.jerk_deg_s3,

@@ -257,7 +257,7 @@ def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], share
     derived: dict[str, Any] = {
         "cycle_s": settings.cycle_ms / 1e3,
         "correction_tag": settings.tag,
-        "geometry": Geometry(*(getattr(arm, name) for name in Geometry._fields)),
+        "geometry": Geometry(*(getattr(settings.wrist, name) for name in Geometry._fields)),
         "velocity_deg_s": arm.velocity_deg_s,
         "acceleration_deg_s2": arm.acceleration_deg_s2,
         "jerk_deg_s3": arm.jerk_deg_s3,

@@ -24,11 +24,11 @@ def correction_violations(
     if settings.corrects == "axes":
         return "; ".join(
             f"A{axis} would be {away:.3f} deg from where RSI was started, {limit:g} deg are allowed"
-            for axis, (away, limit) in enumerate(zip(target - start, settings.axis_correction_deg, strict=True), 1)
+            for axis, (away, limit) in enumerate(zip(target - start, settings.most_correction_deg, strict=True), 1)
             if abs(away) > limit
         )
     ways = np.concatenate([_way(place, target) for place in _places(np.asarray(on_the_way_deg, dtype=np.float64))])
-    return _too_far(settings, arm, start, ways) or _singular(settings.singularity_margin_deg, arm, ways)
+    return _too_far(settings, arm, start, ways) or _singular(settings, ways)
 
 
 def _places(on_the_way_deg: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -63,10 +63,11 @@ def _too_far(settings: Settings, arm: Arm, start_deg: NDArray[np.float64], ways_
     return ""
 
 
-def _singular(margin_deg: float, arm: Arm, ways_deg: NDArray[np.float64]) -> str:
+def _singular(settings: Settings, ways_deg: NDArray[np.float64]) -> str:
     """Near a singularity the pose leaves axes open, or asks for any speed of them, and beyond it the controller's
     axes are not those that were planned."""
-    theta = np.radians(np.where(arm.flip_axes, -ways_deg, ways_deg) - np.asarray(arm.offsets_deg))
+    arm, margin_deg = settings.wrist, settings.singularity_margin_deg
+    theta = arm.theta(ways_deg)
     upper, fore = theta[:, 1], theta[:, 1] + theta[:, 2]
     elbow = theta[:, 2] + np.arctan2(arm.a2_mm, arm.c3_mm)
     out_mm = arm.c2_mm * np.sin(upper) + arm.c3_mm * np.sin(fore) + arm.a2_mm * np.cos(fore) + arm.a1_mm

@@ -19,7 +19,7 @@ _GIMBAL_LOCK = 1e-9
 
 
 class Geometry(NamedTuple):
-    """The lengths and joint conventions of `coupole.kinematics.Arm`, which explains them."""
+    """The lengths and joint conventions of `coupole.joint_chain.SphericalWrist`, which explains them."""
 
     a1_mm: float
     a2_mm: float
@@ -40,7 +40,7 @@ class Pose(NamedTuple):
 
 
 def flange_pose(arm: Geometry, joints_deg: Six) -> Pose:
-    """Pose at joint angles [6]; the formula is that of `coupole.kinematics.forward`."""
+    """Pose at joint angles [6]; Brandstoetter 2014, eq. 1 to 5 (`SphericalWrist`)."""
     t1, t2, t3, t4, t5, t6 = (
         radians((-angle if flip else angle) - offset)
         for angle, flip, offset in zip(joints_deg, arm.flip_axes, arm.offsets_deg, strict=True)

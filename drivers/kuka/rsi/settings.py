@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
-from coupole.kinematics import KR10_R1100_SIXX, Arm, slowed
+from coupole.kinematics import Arm, SphericalWrist, slowed, structure_of
 from drivers.arm_motion import farthest_stop_deg
 from drivers.kuka.rsi.corrections import TAGS
 
@@ -20,6 +20,8 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    arm_model: Arm
+    """The arm that the controller moves; a rig fills in what it describes."""
     listen: str = Field(default="0.0.0.0:49152", pattern=r"^[^:]+:\d+$")
     """host:port to bind; the controller's RSI configuration names it (IP_NUMBER, PORT)."""
     cycle_ms: Literal[4, 12] = 4
@@ -35,11 +37,9 @@ class Settings(BaseModel):
     straight lines of the axes either way; where a pose does not tell the axes, they are refused."""
     mode: Literal["absolute", "relative"] = "absolute"
     """As in RSI_ON: corrections count from where RSI was started, or add up from cycle to cycle."""
-    axis_correction_deg: tuple[PositiveFloat, ...] = Field(
-        default=tuple(high - low for low, high in KR10_R1100_SIXX.limits_deg), min_length=6, max_length=6
-    )
+    axis_correction_deg: tuple[PositiveFloat, ...] | None = Field(default=None, min_length=6, max_length=6)
     """How far each axis may be from where RSI was started: MaxA1 to MaxA6 of the context's AXISCORRMON. The
-    controller stops RSI beyond it, so a target there is refused. The default is each axis' whole range."""
+    controller stops RSI beyond it, so a target there is refused. Without it, each axis' whole range."""
     pose_correction_mm: float = Field(default=2300.0, gt=0)
     pose_correction_deg: float = Field(default=180.0, gt=0, le=180)
     """The same for corrections of the pose: MaxTrans and MaxRotAngle of POSCORRMON. The defaults forbid nothing:
@@ -67,14 +67,40 @@ class Settings(BaseModel):
     """The arm does not follow: farther than `follow_deg` plus `follow_lag_s` times the commanded speed from
     the commanded axes for so many cycles."""
 
+    @model_validator(mode="after")
+    def _pose_is_known(self) -> Self:
+        """The process that answers reckons poses with the formula of a spherical wrist and KUKA's flange."""
+        standard = np.allclose(self.wrist.opw_from_flange, np.eye(4), rtol=0.0, atol=1e-9)
+        if self.corrects == "pose" and not standard:
+            raise ValueError(
+                f"corrections of the pose need KUKA's flange, its z axis along axis 6, not that of "
+                f"{self.arm_model.name}; correct the axes"
+            )
+        return self
+
+    @property
+    def wrist(self) -> SphericalWrist:
+        """The arm's lengths. Raises ValueError for an arm without spherical wrist."""
+        found = structure_of(self.arm_model)
+        if not isinstance(found, SphericalWrist):
+            raise ValueError(  # noqa: TRY004  for pydantic, which tells where
+                f"expected an arm with a spherical wrist, as KUKA's have; {self.arm_model.name} has none"
+            )
+        return found
+
     def arm(self) -> Arm:
         """The arm with the speeds that this driver moves it at; preflight computes durations with it."""
         return slowed(
-            KR10_R1100_SIXX,
+            self.arm_model,
             speed_fraction=self.speed_fraction,
             acceleration_deg_s2=self.acceleration_deg_s2,
             jerk_deg_s3=self.jerk_deg_s3,
         )
+
+    @property
+    def most_correction_deg(self) -> tuple[float, ...]:
+        """`axis_correction_deg`, or each axis' whole range."""
+        return self.axis_correction_deg or tuple(high - low for low, high in self.arm_model.limits_deg)
 
     @property
     def tag(self) -> str:

@@ -10,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_picture import ABOVE, photographer
 
-from sim.devices.arm_bodies import NONE, Capsules, ToolBody, arm_capsules, tool_capsules
+from sim.devices import ur_arm
+from sim.devices.arm_bodies import NONE, Capsules, ToolBody, arm_capsules, tool_capsules, ur_capsules
 from sim.devices.camera_body import Exposed
 from sim.devices.kuka_kinematics import flange_pose
+from sim.devices.ur_arm import UrModel
 from sim.render.arm_shadow import cast, distance_mm
 
 points = st.tuples(*[st.floats(-500, 500)] * 3).map(np.array)
@@ -56,6 +58,16 @@ def test_the_arms_capsules_reach_from_the_column_to_the_flange() -> None:
     assert np.array_equal(capsules[:-1, 3:6], capsules[1:, :3])
     wrist_to_flange = np.linalg.norm(capsules[-1, 3:6] - flange_pose(joints_deg)[:3, 3])
     assert wrist_to_flange == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("model", ["ur5e", "ur10e"])
+def test_a_urs_capsules_reach_from_the_column_to_the_flange_without_a_gap(model: UrModel) -> None:
+    joints_deg = (10.0, -80.0, 95.0, 20.0, 40.0, -30.0)
+    capsules: Capsules = ur_capsules(model, joints_deg)
+    assert np.array_equal(capsules[:-1, 3:6], capsules[1:, :3])
+    to_flange_mm = np.linalg.norm(capsules[-1, 3:6] - ur_arm.flange_pose(model, joints_deg)[:3, 3])
+    assert to_flange_mm == pytest.approx(capsules[-1, 6])
+    assert np.all(np.linalg.norm(capsules[:, 3:6] - capsules[:, :3], axis=1) > 1.0)
 
 
 def test_a_tool_goes_with_the_flange() -> None:

@@ -1,0 +1,215 @@
+"""An arm, described: its chain of joints, how far and fast they turn, the bodies of its links.
+
+The files that come with Coupole lie in `configs/robots` of the project and in `coupole/robots` of an installed
+wheel (pyproject.toml puts them there); `shipped_arm` finds them in either. A rig names its arm's file under
+`arm:`, or leaves it to the robot's driver which of these it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from coupole.errors import InputError, Problem
+from coupole.joint_chain import Axis, JointChain
+from coupole.kinematics import Arm, structure_of
+from coupole.plan import yamlfile
+from coupole.plan.plan import Model, Pose, Vector
+from coupole.plan.registry import ARMS_OF_DRIVERS, UR
+from coupole.plan.validation_messages import KeyPath
+from coupole.plan.yamlfile import Document
+
+TOOL = "tool"
+"""Stands for all that the flange carries."""
+_PACKAGE = Path(__file__).resolve().parents[1]
+FOLDERS = (_PACKAGE / "robots", _PACKAGE.parent / "configs" / "robots")
+"""Where the arms lie that come with Coupole: in a wheel, and in a checkout."""
+UR_MODEL = "ur10e"
+"""What a UR's driver moves where its settings do not say it."""
+
+BodyName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}$")]
+Positive = Annotated[float, Field(gt=0)]
+Range = tuple[Annotated[float, Field(ge=-720, le=720)], Annotated[float, Field(ge=-720, le=720)]]
+
+
+class JointDescription(Model):
+    """One joint, in the frame of the link before it; with all angles 0 that frame is parallel to the base's."""
+
+    origin_mm: Vector
+    axis: Axis
+    """What it turns about, right-handed."""
+    limits_deg: Range
+    """Lowest and highest angle, by the data sheet."""
+    posture_limits_deg: Range | None = None
+    """The same for what is planned: narrower where links come near each other, or cables would wind up."""
+    speed_deg_s: Positive
+    acceleration_deg_s2: Positive
+    jerk_deg_s3: Positive = 3000.0
+
+
+class CapsuleDescription(Model):
+    """All points within `radius_mm` of a segment, in the frame of one link."""
+
+    from_mm: Vector
+    to_mm: Vector
+    radius_mm: Positive
+
+
+class LinkDescription(Model):
+    """The body of a link: capsules that enclose it."""
+
+    name: BodyName
+    link: Annotated[int, Field(ge=0, le=6)]
+    """0 is the base, which stands still; link k turns with joint k."""
+    capsules: Annotated[tuple[CapsuleDescription, ...], Field(min_length=1)]
+
+
+class KeptApart(Model):
+    """Two bodies of the arm that could touch. Those that are not listed touch by design, or cannot."""
+
+    body: BodyName
+    other: BodyName
+    """Nearer to the base than `body`."""
+    near_by_design_deg: Annotated[
+        tuple[Annotated[tuple[float, ...], Field(min_length=1)], ...] | None, Field(min_length=6, max_length=6)
+    ] = None
+    """Angles of each joint: in all their combinations what is near stays near by the joint between the two, or is
+    drawn too large; those parts of `body` are not kept from `other`."""
+
+
+class ArmDescription(Model):
+    """One arm. Link frames lie in the joints and are parallel to the base's with all angles 0."""
+
+    schema_version: Literal[1]
+    name: Annotated[str, Field(min_length=1, max_length=64)]
+    joints: Annotated[tuple[JointDescription, ...], Field(min_length=6, max_length=6)]
+    link_6_from_flange: Pose
+    links: Annotated[tuple[LinkDescription, ...], Field(min_length=1)]
+    kept_apart: tuple[KeptApart, ...] = ()
+    link_meshes: Path | None = None
+    """Folder of meshes that stand for the links in place of their capsules; relative to the file."""
+
+    @cached_property
+    def arm(self) -> Arm:
+        """Its kinematics, with limits, speeds and accelerations of the data sheet."""
+        flange = self.link_6_from_flange.matrix().round(15) + 0.0
+        chain = JointChain(
+            tuple(joint.origin_mm for joint in self.joints),
+            tuple(joint.axis for joint in self.joints),
+            tuple(tuple(row) for row in flange.tolist()),
+        )
+        return Arm(
+            self.name,
+            chain,
+            tuple(joint.limits_deg for joint in self.joints),
+            tuple(joint.speed_deg_s for joint in self.joints),
+            tuple(joint.acceleration_deg_s2 for joint in self.joints),
+            tuple(joint.jerk_deg_s3 for joint in self.joints),
+        )
+
+    @property
+    def posture_limits_deg(self) -> tuple[tuple[float, float], ...]:
+        """What plans keep to: of each joint its posture limits, or else its limits."""
+        return tuple(joint.posture_limits_deg or joint.limits_deg for joint in self.joints)
+
+
+def read_arm(path: Path) -> ArmDescription:
+    """Read an arm's file. Raises InputError with all problems, each at its line and column."""
+    document = yamlfile.read(path)
+    description, problems = document.problems(ArmDescription)
+    if description is not None:
+        problems = description_problems(document, description)
+    if description is None or problems:
+        raise InputError(problems)
+    if description.link_meshes is None:
+        return description
+    return description.model_copy(update={"link_meshes": document.resolve(description.link_meshes)})
+
+
+def description_problems(document: Document, description: ArmDescription, at: KeyPath = ()) -> list[Problem]:
+    """What no single key shows to be wrong with a description at key path `at` of a document."""
+    problems = []
+    for k, joint in enumerate(description.joints):
+        (low, high), planned = joint.limits_deg, joint.posture_limits_deg or joint.limits_deg
+        if not low < high:
+            message = f"expected the lower limit first, found {low:g} and {high:g} deg"
+            problems.append(document.problem((*at, "joints", k, "limits_deg"), message))
+        elif not low <= planned[0] < planned[1] <= high:
+            message = f"expected a part of the joint's limits, {low:g} to {high:g} deg"
+            problems.append(document.problem((*at, "joints", k, "posture_limits_deg"), message))
+    if structure_of(description.arm) is None:
+        message = (
+            "no closed solution for this chain: expected axes 2 and 3 parallel and axes 4, 5 and 6 that meet in a "
+            "point, or axes 2, 3 and 4 parallel with axis 1 meeting 2, 4 meeting 5 and 5 meeting 6 at right angles"
+        )
+        problems.append(document.problem((*at, "joints"), message))
+    return problems + _body_problems(document, description, at)
+
+
+def _body_problems(document: Document, description: ArmDescription, at: KeyPath) -> list[Problem]:
+    problems, links = [], {TOOL: 7}
+    for k, link in enumerate(description.links):
+        if link.name in links:
+            message = f"expected a name of its own, `{link.name}` is taken"
+            problems.append(document.problem((*at, "links", k, "name"), message))
+        links[link.name] = link.link
+    for number in sorted(set(range(1, 7)) - set(links.values())):
+        message = f"expected a body for each link, there is none of link {number}"
+        problems.append(document.problem((*at, "links"), message))
+    for k, pair in enumerate(description.kept_apart):
+        unknown = [(key, name) for key, name in (("body", pair.body), ("other", pair.other)) if name not in links]
+        for key, name in unknown:
+            message = f"expected a body of `links` or `{TOOL}`, there is no `{name}`"
+            problems.append(document.problem((*at, "kept_apart", k, key), message))
+        if not unknown and links[pair.other] >= links[pair.body]:
+            message = f"expected a body nearer to the base than `{pair.body}`"
+            problems.append(document.problem((*at, "kept_apart", k, "other"), message))
+    return problems
+
+
+@cache
+def shipped_arm(name: str) -> ArmDescription:
+    """The arm that comes with Coupole under this name. Raises InputError where there is none."""
+    for folder in FOLDERS:
+        if (path := folder / f"{name}.yaml").is_file():
+            return read_arm(path)
+    found = sorted(path.stem for folder in FOLDERS for path in folder.glob("*.yaml"))
+    why = f"expected one of {', '.join(found)}; another arm is named by its file, under the rig's `arm:`"
+    raise InputError(f"no description of the arm `{name}` comes with Coupole: {why}")
+
+
+def arm_named(
+    document: Document, named: Path | ArmDescription | None, driver: str, settings: Mapping[str, Any]
+) -> tuple[ArmDescription | None, list[Problem]]:
+    """The arm that a rig's document gives under `arm:`, or else its driver's, and what is wrong with it."""
+    if isinstance(named, ArmDescription):
+        if named.link_meshes is not None:
+            named = named.model_copy(update={"link_meshes": document.resolve(named.link_meshes)})
+        return named, description_problems(document, named, ("arm",))
+    if named is None:
+        try:
+            return arm_of_driver(driver, settings), []
+        except InputError as error:
+            return None, list(error.problems) or [document.problem(("robot", "settings", "model"), str(error))]
+    path = document.resolve(named)
+    if not path.is_file():
+        return None, [document.problem(("arm",), f"expected the arm's file; there is no {path}")]
+    try:
+        return read_arm(path), []
+    except InputError as error:
+        return None, list(error.problems)
+
+
+def arm_of_driver(driver: str, settings: Mapping[str, Any]) -> ArmDescription | None:
+    """The arm that a driver moves where the rig does not say it; None of a driver that did not come with Coupole.
+
+    Raises InputError where a UR's `model` is none of those described.
+    """
+    if driver == UR:
+        return shipped_arm(str(settings.get("model", UR_MODEL)))
+    name = ARMS_OF_DRIVERS.get(driver)
+    return shipped_arm(name) if name else None

@@ -110,14 +110,15 @@ def _acquire_into(
             recorder.close()
 
 
-def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float:
+def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float | None:
     """What only devices can tell of the records in force: whose camera they are of, and how warm it may be.
 
-    Returns the temperature of the coolest LED board, which is nearest to the room's.
+    Returns the temperature of the coolest LED board, which is nearest to the room's; None if the box knows none.
     """
     boards = np.unique(job.cell.leds.boards)
     some = boards[np.unique(np.linspace(0, len(boards) - 1, _ASKED_BOARDS).astype(int))]
-    room_c = min(cell.ledbox.board_temperature_c(int(board)) for board in some)
+    known = [c for board in some if (c := cell.ledbox.board_temperature_c(int(board))) is not None]
+    room_c = min(known, default=None)
     if reasons := calibration_refusals(job, camera=_camera_name(cell), temperature_c=room_c):
         raise PreflightRefused(reasons)
     return room_c

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from coupole.errors import ChecksumMismatch, DiskFull, InputError, StorageError
 from coupole.storage import frame_file
 from coupole.storage.run import ProvenFrame, Run
-
-NO_LED = 65535
+from coupole.storage.step_fields import STORED_NO_LED, board_temperature_c
 
 
 @dataclass(frozen=True)
@@ -124,9 +123,9 @@ def _pictures(run: Run, frames: list[ProvenFrame]) -> Iterator[Picture]:
             about = {
                 "shot": frame.shot,
                 "run": run.folder.name,
-                "led": None if record["led"] == NO_LED else int(record["led"]),
+                "led": None if record["led"] == STORED_NO_LED else int(record["led"]),
                 "exposure_us": int(record["exposure_us"]),
-                "board_temperature_c": int(record["board_temperature_dc"]) / 10,
+                "board_temperature_c": board_temperature_c(record),
                 "led_current_ma": int(record["led_current_ma"]),
                 "frame_id": frame.frame_id,
                 "xxh3": frame.xxh3,

@@ -274,6 +274,19 @@ def planning_arm(rig: Rig) -> Arm | None:
     return arm
 
 
+def runs_tables(rig: Rig) -> bool:
+    """True if the rig's LED box runs tables and triggers the camera (`coupole.devices.LedBox.runs_tables`)."""
+    found: bool = load_class(rig.ledbox.driver).runs_tables
+    return found
+
+
+def upload_s(rig: Rig, steps: int) -> float:
+    """Time to bring a table of so many steps into the rig's LED box, as its driver says; 0 if it does not."""
+    model = settings_class(rig.ledbox.driver)
+    described = model(**_known(NOWHERE["ledbox"], model) | rig.ledbox.settings)
+    return float(described.upload_s(steps)) if hasattr(described, "upload_s") else 0.0
+
+
 def in_world(rig: Rig, *, dry_run: bool) -> bool:
     """True if the rig's devices are stand-ins in a world."""
     return dry_run or (rig.world is not None and rig.world.serves == "always")

@@ -1,22 +1,24 @@
 """From plan to ordered views, shots and bursts. Pure: no device, no file.
 
-A *burst* is what one table in the box fires without the host: coded dark marks, dark frames, lights, marks
-again. All frames of a burst have one exposure. A shot's id is `<view>/<light>/e<exposure>`, for repeats after
-the first with `/r<repeat>` behind: `top/led0417/e0`, `top/dark0/e0`, `top/panel2/e1/r3`.
+A *burst* is what one table in the box fires without the host, or the host light by light: dark marks, dark
+frames, lights, marks again (`coupole.plan.marks`). All frames of a burst have one exposure. A shot's id is
+`<view>/<light>/e<exposure>`, for repeats after the first with `/r<repeat>` behind: `top/led0417/e0`,
+`top/dark0/e0`, `top/panel2/e1/r3`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.devices import FLAG_NO_TRIGGER, NO_LIGHT, STEP_DTYPE
+from coupole.devices import NO_LED, STEP_DTYPE, Step
 from coupole.geometry import Transform, direction, inverse, look_at
 from coupole.plan.led_table import LedTable
+from coupole.plan.marks import MARKS_AT_ENDS, Marks, with_marks
 from coupole.plan.plan import (
     AllLights,
     EveryLight,
@@ -32,13 +34,6 @@ from coupole.plan.plan import (
     View,
 )
 
-MARK_UNITS = 16
-START_MARK_EXTRA = (5, 1, 4, 2, 3)
-"""Sixteenths of the burst's period that each start mark takes longer. Counted back from the first light the
-marks stand at phases 13, 11, 7, 6, 1 of 16: nowhere on the lights' grid, and all different."""
-END_MARK_EXTRA = (2, 5, 1, 3, 1)
-"""The same for the last light and the end marks but one: phases 2, 7, 8, 11, 12 behind the grid."""
-MARKS = len(START_MARK_EXTRA) + len(END_MARK_EXTRA)
 EXPOSURE_MARGIN_US = 200
 """An LED stays on this long after the exposure's nominal end: the camera's exposure may start late."""
 PERIOD_MARGIN_US, PERIOD_MARGIN_PPM = 10, 200
@@ -87,7 +82,7 @@ class BurstTiming:
 
 @dataclass(frozen=True)
 class Burst:
-    """One table for the box and the shots that its frames are.
+    """The steps of one burst and the shots that its frames are.
 
     `labels[i]` is the id, without its view, of the frame that step i fires; empty for a mark whose frame is
     not wanted any more (in a re-shot burst).
@@ -98,14 +93,23 @@ class Burst:
     repeat: int
     panel: int
     hardware: bool
+    """The box triggers the camera; else the host does, light by light."""
+    marks: Marks
     timing: BurstTiming
     table: NDArray[np.void]
+    """STEP_DTYPE [steps]."""
     labels: tuple[str, ...]
 
     @cached_property
     def duration_s(self) -> float:
         """The table's own time."""
-        return float(self.table["period_us"].sum(dtype=np.int64)) / 1e6
+        return float(self.table["period_us"].sum()) / 1e6
+
+    @property
+    def inner(self) -> range:
+        """Steps between the marks."""
+        start, end = MARKS_AT_ENDS[self.marks]
+        return range(start, len(self.labels) - end)
 
     @property
     def shot_ids(self) -> list[str]:
@@ -118,22 +122,17 @@ class Burst:
 
     def without(self, leds: Collection[int]) -> Burst:
         """The same burst without the shots under these LEDs."""
-        dropped = np.isin(self.table["led"], list(leds)) & (self.table["led"] != NO_LIGHT)
+        dropped = np.isin(self.table["led"], list(leds)) & (self.table["led"] != NO_LED)
         return self.only({label for label, drop in zip(self.labels, dropped, strict=True) if not drop})
 
     def only(self, wanted: set[str]) -> Burst:
         """The same burst with those shots only (ids without view), and marks anew."""
-        marked = self.hardware
-        inner = (
-            range(len(START_MARK_EXTRA), len(self.labels) - len(END_MARK_EXTRA))
-            if marked
-            else range(len(self.labels))
-        )
+        inner = self.inner
         keep = [i for i in inner if self.labels[i] in wanted]
         marks = [label if label in wanted else "" for i, label in enumerate(self.labels) if i not in inner]
         table, labels = self.table[keep], [self.labels[i] for i in keep]
-        if marked:
-            table, labels = _with_marks(table, labels, marks, self.timing)
+        dark = _dark_step(self.timing, sends_edge=self.hardware)
+        table, labels = with_marks(self.marks, table, labels, marks, dark)
         return replace(self, table=table, labels=tuple(labels))
 
 
@@ -294,12 +293,17 @@ def build_schedule(
     readout_us: float,
     exposure_gap_us: int,
     pace: Pace = FASTEST,
+    runs_tables: bool = True,
 ) -> Schedule:
-    """All bursts of all views. Tables are shared between views: the box need not be loaded anew."""
+    """All bursts of all views. Tables are shared between views: the box need not be loaded anew.
+
+    Of a box that does not run tables, and so keeps no log, only marks can tell that its lights went off.
+    """
     bursts_of: dict[Lights, list[Burst]] = {}
     views: list[ViewPose] = []
     bursts: list[list[Burst]] = []
     hardware = plan.trigger == "hardware"
+    marks: Marks = "coded" if hardware else "none" if runs_tables else "plain"
     for view in plan.views:
         lights = view.lights or plan.lights
         if lights not in bursts_of:
@@ -324,7 +328,7 @@ def build_schedule(
                     index,
                     repeat,
                     darks=plan.darks_per_view if repeat == 0 else 0,
-                    hardware=hardware,
+                    marks=marks,
                 )
             ]
         for pose in expand_view(view):
@@ -341,19 +345,19 @@ def _bursts(
     repeat: int,
     *,
     darks: int,
-    hardware: bool,
+    marks: Marks,
 ) -> Iterator[Burst]:
     """The bursts of one exposure; dark frames are the first one's."""
     ending = f"/e{exposure_index}" + (f"/r{repeat}" if repeat else "")
     for number, (panel, lit) in enumerate(steps):
         own_darks = darks if number == 0 else 0
-        yield _burst(lit, own_darks, ending, timing, exposure_index, repeat, panel=panel, hardware=hardware)
+        yield _burst(lit, own_darks, ending, timing, exposure_index, repeat, panel=panel, marks=marks)
 
 
 def _steps(lights: Lights, lit: list[tuple[int, str]]) -> list[tuple[int, list[tuple[int, str]]]]:
     """Panel and (led, label) of the lit steps of each burst: one burst for LEDs, one for each panel."""
     if isinstance(lights, Panels):
-        return [(panel, [(NO_LIGHT, f"panel{panel}")]) for panel in lights.panels]
+        return [(panel, [(NO_LED, f"panel{panel}")]) for panel in lights.panels]
     return [(0, lit)]
 
 
@@ -366,39 +370,23 @@ def _burst(
     repeat: int,
     *,
     panel: int,
-    hardware: bool,
+    marks: Marks,
 ) -> Burst:
-    # A panel shines all through its burst: what would be dark there is one more picture of the panel.
+    # A panel shines all through a burst that the box runs: what would be dark is one more picture of the panel.
     mark = f"panel{panel}-mark" if panel else "dark"
-    first_dark = MARKS if hardware and not panel else 0
-    dark_steps = [(NO_LIGHT, f"dark{first_dark + k}") for k in range(0 if panel else darks)]
-    records = np.zeros(len(dark_steps) + len(steps), STEP_DTYPE)
+    hardware, mark_count = marks == "coded", sum(MARKS_AT_ENDS[marks])
+    first_dark = 0 if panel else mark_count
+    dark_steps = [(NO_LED, f"dark{first_dark + k}") for k in range(0 if panel else darks)]
+    dark = _dark_step(timing, sends_edge=hardware)
+    records = np.repeat(dark, len(dark_steps) + len(steps))
     records["led"] = [led for led, _ in dark_steps + steps]
-    records["on_us"], records["trigger_delay_us"] = timing.on_us, timing.trigger_delay_us
-    records["period_us"] = timing.period_us
     labels = [label + ending for _, label in dark_steps + steps]
-    if hardware:
-        marks = [f"{mark}{k}{ending}" for k in range(MARKS)]
-        records, labels = _with_marks(records, labels, marks, timing)
-    else:
-        records["flags"] = FLAG_NO_TRIGGER
-    return Burst("", exposure_index, repeat, panel, hardware, timing, records, tuple(labels))
+    named = [f"{mark}{k}{ending}" for k in range(mark_count)]
+    records, labels = with_marks(marks, records, labels, named, dark)
+    return Burst("", exposure_index, repeat, panel, hardware, marks, timing, records, tuple(labels))
 
 
-def _with_marks(
-    records: NDArray[np.void], labels: list[str], marks: list[str], timing: BurstTiming
-) -> tuple[NDArray[np.void], list[str]]:
-    """Put the coded dark steps round a burst's own steps."""
-    unit_us = -(-timing.period_us // MARK_UNITS)
-    inner = records.copy()
-    inner["period_us"] = timing.period_us
-    dark = np.zeros(1, STEP_DTYPE)
-    dark["led"], dark["on_us"] = NO_LIGHT, timing.on_us
-    dark["trigger_delay_us"], dark["period_us"] = timing.trigger_delay_us, timing.period_us
-    start, end = np.repeat(dark, len(START_MARK_EXTRA)), np.repeat(dark, len(END_MARK_EXTRA))
-    start["period_us"] += np.array(START_MARK_EXTRA, np.uint32) * np.uint32(unit_us)
-    table = np.concatenate([start, inner, end])
-    first_end = len(table) - len(end)
-    coded = slice(first_end - 1, len(table) - 1)
-    table["period_us"][coded] += np.array(END_MARK_EXTRA, np.uint32) * np.uint32(unit_us)
-    return table, marks[: len(start)] + labels + marks[len(start) :]
+def _dark_step(timing: BurstTiming, *, sends_edge: bool) -> NDArray[np.void]:
+    """One step (STEP_DTYPE [1]) without light."""
+    step = Step(NO_LED, timing.on_us, timing.trigger_delay_us, timing.period_us, sends_edge)
+    return np.array([astuple(step)], STEP_DTYPE)

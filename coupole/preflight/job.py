@@ -24,7 +24,7 @@ from coupole.motion.occlusion import Occlusion, Occlusions, occlusions_of
 from coupole.plan import yamlfile
 from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.plan import MeasuredObject, Plan
-from coupole.plan.rig import Rig, driver_problems, in_world, planning_arm
+from coupole.plan.rig import Rig, driver_problems, in_world, planning_arm, runs_tables
 from coupole.plan.shots import FASTEST, Pace, Schedule, ViewPose, build_schedule, missing_lights
 from coupole.plan.yamlfile import Document
 from coupole.preflight import ledger
@@ -240,6 +240,7 @@ def schedule_of(plan: Plan, cell: Cell, pace: Pace = FASTEST) -> Schedule:
         readout_us=1e6 / cell.rig.sensor.max_frames_per_s,
         exposure_gap_us=cell.rig.sensor.exposure_gap_us,
         pace=pace,
+        runs_tables=runs_tables(cell.rig),
     )
 
 
@@ -341,6 +342,9 @@ def check_job(
 
     job, report = _cooled(*checked(Pace(disk_us=_disk_us(rig, storage))), checked)
     report.refusals += calibration_refusals(job)
+    if job.plan.trigger == "hardware" and not runs_tables(rig):
+        why = "cannot trigger the camera: it runs no tables. Set `trigger: software` in the plan"
+        report.refusals.insert(0, f"led box {rig.ledbox.driver}: {why}")
     if planning_arm(rig) is None:
         why = "no model of this arm's links: whether it touches anything cannot be told"
         report.refusals.insert(0, f"robot {rig.robot.driver}: {why}")

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from coupole.devices import STEP_DTYPE
 from sim.devices.ledbox_burst import Boards, Burst, Quartz, Wiring
-from sim.devices.ledbox_table import MAX_RECORDS, check_table, read_table
+from sim.devices.ledbox_table import MAX_RECORDS, STEP, check_table, read_table
 from sim.devices.pty_port import PtyPort
 from sim.devices.scpi_parser import (
     Argument,
@@ -122,7 +121,7 @@ class LedBoxFirmware:
         self._watchdog_timer: Timer | None = None
         self._block_timer: Timer | None = None
         self._reset()
-        self._scpi = Interpreter(self._commands(), MAX_RECORDS * STEP_DTYPE.itemsize)
+        self._scpi = Interpreter(self._commands(), MAX_RECORDS * STEP.itemsize)
         self._link: Link = link or PtyPort(reactor, settings.baud)
         self.port = self._link.port
         self._link.listen(self._receive)
@@ -223,7 +222,7 @@ class LedBoxFirmware:
         self._burst = None
         self._fault = ""
         self._bank = 0
-        empty: NDArray[np.void] = np.empty(0, STEP_DTYPE)
+        empty: NDArray[np.void] = np.empty(0, STEP)
         self._tables = [empty, empty]
         self._watchdog_s = 0.0
         self._width_us, self._polarity, self._ready_source = 50, "NORM", "NONE"

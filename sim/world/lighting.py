@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 
-from coupole.devices import NO_LIGHT
-
 _KEEP_NS = 10_000_000_000
 
 
@@ -19,8 +17,6 @@ class Lighting:
     def light(self, led: int, t_on_ns: int, t_off_ns: int, flux: float = 1.0) -> None:
         """LED `led` is switched on at `t_on_ns` and will go off at `t_off_ns` unless `dark` comes first; it gives
         `flux` times what its table says."""
-        if led == NO_LIGHT:
-            return
         while self._lit and self._lit[0][2] < t_on_ns - _KEEP_NS:
             self._lit.popleft()
         self._lit.append((led, t_on_ns, t_off_ns, flux))

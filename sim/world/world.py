@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from coupole.devices import NO_LIGHT
 from sim.devices import camera_stand_in, gige_camera, kuka_controller, ledbox_firmware, robot
 from sim.devices.arm_bodies import NONE, Capsules, arm_capsules, tool_capsules
 from sim.devices.camera_body import Exposed
@@ -121,9 +120,8 @@ class World:
 
     def _light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
         """The box drives an LED, which shines as bright as it can now."""
-        if led != NO_LIGHT:
-            flux = self._flashes.flux(led, self.box.temperature_of_led_c(led))
-            self.lighting.light(led, t_on_ns, t_off_ns, flux)
+        flux = self._flashes.flux(led, self.box.temperature_of_led_c(led))
+        self.lighting.light(led, t_on_ns, t_off_ns, flux)
 
     def _edge_counted(self, number: int) -> None:
         """The box sent, or should have sent, edge `number`: faults that wait for it happen."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from coupole.devices import NO_LIGHT, STEP_DTYPE
+from coupole.devices import NO_LED, STEP_DTYPE
 from drivers.ledbox import LedBox, Settings
 from sim.devices import ledbox_firmware
 from sim.world.clock import ClockWriter, SharedClock
@@ -91,12 +91,13 @@ def table(
     steps = np.zeros(count, STEP_DTYPE)
     steps["led"] = led + np.arange(count)
     steps["on_us"], steps["trigger_delay_us"], steps["period_us"] = on_us, delay_us, period_us
+    steps["sends_edge"] = True
     return steps
 
 
 def dark_table(count: int = 4) -> Any:
     steps = table(count)
-    steps["led"], steps["on_us"] = NO_LIGHT, 0
+    steps["led"], steps["on_us"] = NO_LED, 0
     return steps
 
 

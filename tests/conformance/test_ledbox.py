@@ -14,7 +14,7 @@ import usb.backend.libusb1
 from fake_usb import Backend, UsbLink
 from ledbox_world import LedBoxWorld, dark_table, ledbox_world, opened, run_to_end, table
 
-from coupole.devices import FLAG_NO_TRIGGER, NO_LIGHT, STATUS_NO_EDGE
+from coupole.devices import NO_LED
 from coupole.errors import DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.ledbox.driver import LedBox
 from sim.world.reactor import Reactor
@@ -135,16 +135,16 @@ class TestLedBox:
         box.load(steps)
         box.start(steps)
         records = run_to_end(box, world)
-        assert (records["led"] == NO_LIGHT).all()
+        assert (records["led"] == NO_LED).all()
         assert (len(world.lights), len(world.edges_ns)) == (0, 3)
 
     def test_steps_without_trigger_send_no_edge(self, box: LedBox, world: LedBoxWorld) -> None:
         steps = table(3)
-        steps["flags"] = FLAG_NO_TRIGGER
+        steps["sends_edge"] = False
         box.load(steps)
         box.start(steps)
         records = run_to_end(box, world)
-        assert (records["status"] == STATUS_NO_EDGE).all()
+        assert not records["edge_sent"].any()
         assert (world.edges_ns, box.edges()) == ([], 0)
 
     def test_a_burst_drifts_by_less_than_a_thousandth(self, box: LedBox, world: LedBoxWorld) -> None:
@@ -176,7 +176,6 @@ class TestLedBox:
         ("field", "value", "words"),
         [
             ("led", 1080, "led must be below 1080"),
-            ("flags", 2, "flags has bits"),
             ("on_us", 999, "on_us must be 1000 to 2000000"),
             ("trigger_delay_us", 8001, "trigger_delay_us must not exceed on_us"),
             ("period_us", 7999, "period_us must cover"),
@@ -252,7 +251,7 @@ class TestLedBox:
             world.clock.sleep(0.5)
             assert world.lights == []
             world.ready = True
-            assert run_to_end(box, world)["status"].tolist() == [8, 0]
+            assert run_to_end(box, world)["waited"].tolist() == [True, False]
 
     def test_a_mute_box_times_out(self, box: LedBox, world: LedBoxWorld) -> None:
         world.do(world.box.mute)

@@ -11,13 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from places import REPO
 
-from coupole.devices import FLAG_NO_TRIGGER, NO_LIGHT
+from coupole.devices import NO_LED
 from coupole.geometry import transform
 from coupole.plan.led_table import LedTable, read_led_table
+from coupole.plan.marks import MARKS, START_MARK_EXTRA
 from coupole.plan.plan import Plan
 from coupole.plan.shots import (
-    MARKS,
-    START_MARK_EXTRA,
     Burst,
     Schedule,
     build_schedule,
@@ -50,7 +49,7 @@ def schedule_of(plan: Plan, leds: LedTable = DOME, readout_us: float = 10_000.0)
 
 
 def lit_leds(burst: Burst) -> list[int]:
-    return [int(led) for led in burst.table["led"] if led != NO_LIGHT]
+    return [int(led) for led in burst.table["led"] if led != NO_LED]
 
 
 def first_burst(lights: dict[str, Any] | None = None, **changes: Any) -> Burst:
@@ -91,8 +90,8 @@ def test_marks_are_the_dark_frames_that_begin_and_end_a_burst() -> None:
 def test_the_led_of_a_step_is_that_of_its_id() -> None:
     burst = first_burst()
     for led, label in zip(burst.table["led"], burst.labels, strict=True):
-        assert label == (f"led{led:04d}/e0" if led != NO_LIGHT else label)
-        assert label.startswith("dark") == (led == NO_LIGHT)
+        assert label == (f"led{led:04d}/e0" if led != NO_LED else label)
+        assert label.startswith("dark") == (led == NO_LED)
 
 
 def test_all_ids_of_a_plan_differ() -> None:
@@ -105,7 +104,7 @@ def test_all_ids_of_a_plan_differ() -> None:
 
 def test_darks_of_a_view_are_added_to_the_marks() -> None:
     burst = first_burst(darks_per_view=7)
-    assert int(np.sum(burst.table["led"] == NO_LIGHT)) == MARKS + 7
+    assert int(np.sum(burst.table["led"] == NO_LED)) == MARKS + 7
 
 
 def test_repeats_take_no_more_darks_than_their_marks() -> None:
@@ -287,7 +286,7 @@ def test_no_step_of_a_burst_is_shorter_than_the_bursts_period() -> None:
 
 def test_with_software_trigger_no_step_sends_an_edge_and_there_are_no_marks() -> None:
     burst = first_burst(trigger="software", darks_per_view=2)
-    assert np.all(burst.table["flags"] == FLAG_NO_TRIGGER)
+    assert not burst.table["sends_edge"].any()
     assert len(burst.table) == 1080 + 2
 
 
@@ -296,10 +295,9 @@ def assert_legal_for_the_box(table: np.ndarray[Any, Any], edge_width_us: int = 5
     assert 1 <= len(table) <= 4096
     last_off: dict[int, tuple[int, int]] = {}
     t_on = 0
-    for led, flags, on, delay, period in table.tolist():
-        lit, edge = led != 65535, not flags & 1
-        assert led <= 1079 or not lit
-        assert flags in {0, 1}
+    for led, on, delay, period, edge in table.tolist():
+        lit = led != NO_LED
+        assert -1 <= led <= 1079
         assert (1000 if lit else 0) <= on <= 2_000_000
         assert not (lit and edge) or delay <= on
         assert period >= max(on, 100, delay + edge_width_us if edge else 0)

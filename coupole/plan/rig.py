@@ -240,6 +240,11 @@ STAND_INS = {
     "drivers.ur:UrRobot": StandIn("ur"),
 }
 """For the robot drivers that come with Coupole; all choose an address that is free."""
+LEDBOX_STAND_INS = {
+    "drivers.ledbox:LedBox": StandIn("scpi"),
+    "drivers.ledbox.text_lines:TextLineBox": StandIn("text", ("baud", "led_count", "first_led")),
+}
+"""For the LED boxes' drivers that come with Coupole: `world.settings.ledbox.kind`."""
 CAMERA_KINDS = {"drivers.camera.aravis:AravisCamera": "gige"}
 """For camera drivers whose stand-in is not the camera in shared memory: `world.settings.camera.kind`."""
 _MOTION_SETTINGS = {
@@ -300,7 +305,8 @@ def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[
     if dry_run and device.twin is not None:
         driver, settings = device.twin.driver, dict(device.twin.settings)
     elif dry_run and not (rig.world is not None and rig.world.serves == "always"):
-        driver = driver if driver in STAND_INS else DEFAULT_TWINS[kind]
+        known = driver in STAND_INS or driver in LEDBOX_STAND_INS
+        driver = driver if known else DEFAULT_TWINS[kind]
         settings = _known(settings, settings_class(driver))
     if kind == "robot":
         settings = _known(_motion_settings(rig), settings_class(driver)) | settings
@@ -313,6 +319,12 @@ def stand_in_for(rig: Rig, *, dry_run: bool) -> StandIn:
     driver, _ = device_for(rig, "robot", dry_run=dry_run or not in_world(rig, dry_run=False))
     told = rig.world.settings.get("robot") if rig.world else None
     return STAND_INS.get(driver) or StandIn(told.get("kind", "rsi") if isinstance(told, dict) else "rsi")
+
+
+def ledbox_stand_in(rig: Rig, *, dry_run: bool) -> StandIn:
+    """What this rig's world has at the other end of the LED box's wire."""
+    driver, _ = device_for(rig, "ledbox", dry_run=dry_run or not in_world(rig, dry_run=False))
+    return LEDBOX_STAND_INS.get(driver) or StandIn("scpi")
 
 
 def camera_kind(rig: Rig, *, dry_run: bool) -> str:
@@ -337,10 +349,12 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
                 problems += _settings_problems(document, at, part.driver, given)
     if rig.world is not None:
         problems += world_problems(document, rig, rig.world.settings)
-        told, kind = rig.world.settings.get("camera"), camera_kind(rig, dry_run=False)
-        if isinstance(told, dict) and told.get("kind", kind) != kind:
-            message = f"expected {kind}, which is at the other end of the camera's driver"
-            problems.append(document.problem(("world", "settings", "camera", "kind"), message))
+        kinds = {"camera": camera_kind(rig, dry_run=False), "ledbox": ledbox_stand_in(rig, dry_run=False).kind}
+        for name, other_end in kinds.items():
+            told = rig.world.settings.get(name)
+            if isinstance(told, dict) and told.get("kind", other_end) != other_end:
+                message = f"expected {other_end}, which is at the other end of the {name}'s driver"
+                problems.append(document.problem(("world", "settings", name, "kind"), message))
     return problems
 
 
@@ -355,7 +369,10 @@ def world_problems(document: Document, rig: Rig, settings: Mapping[str, Any]) ->
     camera = settings.get("camera", {})
     if isinstance(camera, dict):
         camera = {"kind": camera_kind(rig, dry_run=False), **camera}
-    completed_settings = {**settings, "robot": robot, "camera": camera}
+    ledbox = settings.get("ledbox", {})
+    if isinstance(ledbox, dict):
+        ledbox = {"kind": ledbox_stand_in(rig, dry_run=False).kind, **ledbox}
+    completed_settings = {**settings, "robot": robot, "camera": camera, "ledbox": ledbox}
     completed = replace(document, data={**document.data, "world": {"settings": completed_settings}})
     return _settings_problems(completed, ("world",), rig.world.driver if rig.world else DEFAULT_WORLD, {})
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from coupole.devices import STEP_DTYPE, Clock, Deadline, Identity, Step, StepRecord
-from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
+from coupole.errors import DeviceError, DeviceFault, DeviceRefused, DeviceTimeout
 from drivers.ledbox.scpi import REPLY_MARGIN_S, Link, ScpiSession
-from drivers.ledbox.serial_link import SerialLink
+from drivers.ledbox.serial_link import no_port, open_serial
 from drivers.ledbox.usbtmc import UsbtmcLink
 from drivers.ledbox.wire import RECORD_BYTES, STEP_BYTES, pack, unpack_log
 
@@ -203,18 +203,13 @@ class LedBox:
 
     def _open(self) -> Link:
         settings = self._settings
+        if not settings.port.startswith("usbtmc:"):
+            return open_serial(settings.name, settings.port, settings.baud, self._clock)
         try:
-            if settings.port.startswith("usbtmc:"):
-                vendor, product, *serial = settings.port.split(":")[1:]
-                return UsbtmcLink(int(vendor, 16), int(product, 16), ":".join(serial) or None, self._clock)
-            return SerialLink(settings.port, settings.baud, self._clock)
+            vendor, product, *serial = settings.port.split(":")[1:]
+            return UsbtmcLink(int(vendor, 16), int(product, 16), ":".join(serial) or None, self._clock)
         except (ConnectionError, ValueError) as error:
-            raise DeviceLost(
-                settings.name,
-                expected=f"a port {settings.port}",
-                happened=str(error),
-                remedy="Check the cable, the port's name in the rig, and that no other program has it open.",
-            ) from error
+            raise no_port(settings.name, settings.port, error) from error
 
     def _greet(self) -> Identity:
         """Bring both ends into step, whatever a former program left on the line, and ask who is there."""

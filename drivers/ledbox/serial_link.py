@@ -12,6 +12,7 @@ import select
 from typing import Any
 
 from coupole.devices import Clock, Deadline
+from coupole.errors import DeviceLost
 
 _LOOK_S = 0.02
 """Machine time between two looks at the rig's clock."""
@@ -70,6 +71,14 @@ class SerialLink:
             if late:
                 raise TimeoutError("nothing came")
 
+    def waiting(self) -> bytes:
+        """What has come already, without waiting; maybe nothing."""
+        try:
+            data: bytes = self._port.read(count) if (count := self._port.in_waiting) else b""
+        except self._lost as error:
+            raise ConnectionError(str(error)) from error
+        return data
+
     def clear(self) -> None:
         """Forget what is on its way from the device: read until the line is quiet."""
         deadline = Deadline(self._clock, _DRAIN_S)
@@ -85,3 +94,21 @@ class SerialLink:
             self._port.close()
         if socket is not None:
             socket.close()  # pyserial 3.5 forgets to, where the other side of a socket:// hung up
+
+
+def open_serial(name: str, url: str, baud: int, clock: Clock) -> SerialLink:
+    """The link to the device `name`. Raises DeviceLost if there is no such port, or if it is in use."""
+    try:
+        return SerialLink(url, baud, clock)
+    except ConnectionError as error:
+        raise no_port(name, url, error) from error
+
+
+def no_port(name: str, url: str, error: Exception) -> DeviceLost:
+    """The error to raise where the device `name` cannot be opened."""
+    return DeviceLost(
+        name,
+        expected=f"a port {url}",
+        happened=str(error),
+        remedy="Check the cable, the port's name in the rig, and that no other program has it open.",
+    )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    kind: Literal["scpi"] = "scpi"
     baud: int = Field(default=115200, ge=0)
     """Pace of the serial line, world time; 0 for none."""
     led_count: int = Field(default=1080, ge=1, le=65535)

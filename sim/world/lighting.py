@@ -25,6 +25,12 @@ class Lighting:
         """All LEDs go off now."""
         self._lit = deque((led, on, min(off, t_ns), flux) for led, on, off, flux in self._lit if on < t_ns)
 
+    def darken_one(self, led: int, t_ns: int) -> None:
+        """One LED goes off now, others stay as they are."""
+        self._lit = deque(
+            (one, on, min(off, t_ns) if one == led else off, flux) for one, on, off, flux in self._lit
+        )
+
     def panel(self, panel: int, on: bool, t_ns: int) -> None:
         if on:
             self._panels_since_ns.setdefault(panel, t_ns)

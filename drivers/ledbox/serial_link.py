@@ -46,6 +46,7 @@ class SerialLink:
 
     def write(self, data: bytes, deadline: Deadline) -> None:
         """Send all of `data`."""
+        self._refuse_closed()
         rest = memoryview(data)
         while rest:
             try:
@@ -60,6 +61,7 @@ class SerialLink:
 
     def read(self, deadline: Deadline) -> bytes:
         """At least one byte, and what else has come."""
+        self._refuse_closed()
         while True:
             late = deadline.expired  # looked at before reading: what has come in time is taken however late
             try:
@@ -73,6 +75,7 @@ class SerialLink:
 
     def waiting(self) -> bytes:
         """What has come already, without waiting; maybe nothing."""
+        self._refuse_closed()
         try:
             data: bytes = self._port.read(count) if (count := self._port.in_waiting) else b""
         except self._lost as error:
@@ -87,6 +90,9 @@ class SerialLink:
                 self.read(Deadline(self._clock, _QUIET_S))
 
     def close(self) -> None:
+        """Give the port back; a second call does nothing."""
+        if not self._port.is_open:
+            return
         with contextlib.suppress(*self._lost):
             self._port.reset_output_buffer()  # else close() may wait for a dead line to drain
         socket = getattr(self._port, "_socket", None)
@@ -94,6 +100,10 @@ class SerialLink:
             self._port.close()
         if socket is not None:
             socket.close()  # pyserial 3.5 forgets to, where the other side of a socket:// hung up
+
+    def _refuse_closed(self) -> None:
+        if not self._port.is_open:
+            raise ConnectionError("the port was closed")
 
 
 def open_serial(name: str, url: str, baud: int, clock: Clock) -> SerialLink:

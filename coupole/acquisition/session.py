@@ -23,6 +23,7 @@ from coupole.acquisition.operator import (
 )
 from coupole.acquisition.recorder import DryRecorder, RunRecorder
 from coupole.acquisition.sequencer import Sequencer
+from coupole.acquisition.verdict import PROOF_BY
 from coupole.errors import (
     CoupoleError,
     DeviceError,
@@ -152,6 +153,7 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
     """What stands in run.json beside the inputs."""
     return {
         "simulated": cell.simulated,
+        "proof": _proof(job),
         "object": job.plan.object.id if job.plan.object else None,
         "calibrations": {item.record.kind: item.record.sha256 for item in job.calibrations or ()} or "none",
         "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
@@ -170,6 +172,11 @@ def _labels(schedule: Schedule) -> list[str] | dict[str, list[str]]:
     return {view.name: list(labels) for view, labels in zip(schedule.views, schedule.labels, strict=True)}
 
 
+def _proof(job: Job) -> str:
+    """What the identity of the run's frames rests on."""
+    return PROOF_BY[job.schedule.bursts[0][0].marks]
+
+
 def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
     """Attributes of every view's file."""
     rig = job.cell.rig
@@ -177,6 +184,7 @@ def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
         "program_name": "coupole",
         "sample": job.plan.object.id if job.plan.object else "none",
         "simulated": cell.simulated,
+        "proof": _proof(job),
         "pixel_pitch_um": cell.sensor.pixel_pitch_um,
         "focal_length_mm": rig.lens.focal_length_mm,
         "f_number": rig.lens.f_number,

@@ -1,4 +1,4 @@
-"""What is said of one burst after its end."""
+"""What is said of one burst after its end, and what that rests on."""
 
 from __future__ import annotations
 
@@ -7,6 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from coupole.acquisition.frame_matching import Match
+from coupole.plan.marks import Marks
+
+PROOF_BY: dict[Marks, str] = {
+    "coded": "box log and camera counters",
+    "none": "one light, one exposure, one frame; box log",
+    "plain": "one light, one exposure, one frame; host's clock",
+}
+"""What a run says of its proof, by the marks of its bursts; from the strongest to the weakest
+(docs/reference/run-folder.md)."""
 
 
 @dataclass(frozen=True)

@@ -136,6 +136,12 @@ class Run:
         found: dict[str, list[int]] = self.about.get("hidden_leds", {})
         return found
 
+    @property
+    def proof(self) -> str:
+        """What the identity of the run's frames rests on, in the words of run.json."""
+        found: str = self.about.get("proof", "not recorded")
+        return found
+
     def proven(self) -> dict[str, ProvenFrame]:
         """Proven shots by id, as the journal says."""
         if not self.journal_path.exists():
@@ -227,6 +233,8 @@ class Status:
     """How far a run is, by its journal alone."""
 
     state: str = "created"
+    proof: str = ""
+    """What the identity of its frames rests on."""
     shots: int = 0
     proven: int = 0
     darks_proven: int = 0
@@ -243,7 +251,7 @@ class Status:
 
 def status(run: Run) -> Status:
     """Progress of a run, also while it goes on."""
-    found = Status()
+    found = Status(proof=run.proof)
     expected = list(run.expected_shots())
     found.shots = sum(map(is_shot, expected))
     per_view = Counter(shot.split("/")[0] for shot in expected)

@@ -44,8 +44,11 @@ def plan_of(lights: dict[str, Any] | None = None, **changes: Any) -> Plan:
     return Plan.model_validate(asked | changes)
 
 
-def schedule_of(plan: Plan, leds: LedTable = DOME, readout_us: float = 10_000.0) -> Schedule:
-    return build_schedule(plan, leds, BASE_FROM_SUPPORT, rise_us=1000, readout_us=readout_us, exposure_gap_us=100)
+def schedule_of(
+    plan: Plan, leds: LedTable = DOME, readout_us: float = 10_000.0, *, runs_tables: bool = True
+) -> Schedule:
+    times: dict[str, Any] = {"rise_us": 1000, "readout_us": readout_us, "exposure_gap_us": 100}
+    return build_schedule(plan, leds, BASE_FROM_SUPPORT, **times, runs_tables=runs_tables)
 
 
 def lit_leds(burst: Burst) -> list[int]:
@@ -288,6 +291,31 @@ def test_with_software_trigger_no_step_sends_an_edge_and_there_are_no_marks() ->
     burst = first_burst(trigger="software", darks_per_view=2)
     assert not burst.table["sends_edge"].any()
     assert len(burst.table) == 1080 + 2
+
+
+def by_host(**changes: Any) -> Burst:
+    """The first burst of a plan for a box that runs no tables and keeps no log."""
+    return schedule_of(plan_of(trigger="software", **changes), runs_tables=False).bursts[0][0]
+
+
+def test_without_a_log_a_burst_has_a_dark_mark_at_each_end() -> None:
+    burst = by_host(darks_per_view=2)
+    assert not burst.table["sends_edge"].any()
+    assert len(burst.table) == 1 + 2 + 1080 + 1
+    assert np.flatnonzero(burst.table["led"] == NO_LED).tolist() == [0, 1, 2, 1083]
+    assert [burst.labels[i] for i in (0, 1, 2, -1)] == ["dark0/e0", "dark2/e0", "dark3/e0", "dark1/e0"]
+    assert np.all(burst.table["period_us"] == burst.timing.period_us)
+
+
+def test_the_marks_of_a_panels_burst_have_names_of_their_own() -> None:
+    burst = by_host(lights={"kind": "panels", "panels": [2]})
+    assert burst.labels == ("panel2-mark0/e0", "panel2/e0", "panel2-mark1/e0")
+
+
+def test_a_burst_without_a_log_that_is_shot_again_has_its_marks_anew() -> None:
+    burst = by_host(darks_per_view=0).only({"led0007/e0"})
+    assert burst.labels == ("", "led0007/e0", "")
+    assert burst.table["led"].tolist() == [NO_LED, 7, NO_LED]
 
 
 def assert_legal_for_the_box(table: np.ndarray[Any, Any], edge_width_us: int = 50) -> None:

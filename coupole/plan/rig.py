@@ -281,8 +281,7 @@ def planning_arm(rig: Rig) -> Arm | None:
 
 def runs_tables(rig: Rig) -> bool:
     """True if the rig's LED box runs tables and triggers the camera (`coupole.devices.LedBox.runs_tables`)."""
-    found: bool = load_class(rig.ledbox.driver).runs_tables
-    return found
+    return bool(load_class(rig.ledbox.driver).runs_tables)
 
 
 def upload_s(rig: Rig, steps: int) -> float:
@@ -347,6 +346,9 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
                 if kind == "robot":
                     given = given | _motion_settings(rig)
                 problems += _settings_problems(document, at, part.driver, given)
+    if not problems and not hasattr(load_class(rig.ledbox.driver), "runs_tables"):
+        message = "expected a class that declares `runs_tables`, as `coupole.devices.LedBox` asks"
+        problems.append(document.problem(("ledbox", "driver"), message))
     if rig.world is not None:
         problems += world_problems(document, rig, rig.world.settings)
         kinds = {"camera": camera_kind(rig, dry_run=False), "ledbox": ledbox_stand_in(rig, dry_run=False).kind}

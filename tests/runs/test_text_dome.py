@@ -193,6 +193,18 @@ def test_a_plan_that_wants_a_trigger_cable_is_refused_with_what_to_do(tmp_path: 
     assert "cannot trigger the camera: it runs no tables. Set `trigger: software` in the plan" in ended.err
 
 
+def test_a_driver_that_does_not_say_what_its_box_can_do_is_refused(cell: CellFolder) -> None:
+    """Whose box it is cannot be told from its methods."""
+    cell.rig_data["ledbox"] = {
+        "driver": "sim.devices.memory_camera:MemoryCamera",
+        "settings": {"address": "/here"},
+    }
+    cell.write()
+    ended = cell.acquire()
+    assert ended.code == 2
+    assert "expected a class that declares `runs_tables`" in ended.err
+
+
 def test_panels_that_the_box_does_not_have_end_the_run_with_four(tmp_path: Path) -> None:
     cell = text_cell(tmp_path, lights={"kind": "panels", "panels": [1]})
     ended = cell.acquire()

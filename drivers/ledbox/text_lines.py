@@ -163,7 +163,10 @@ class TextLineBox:
                 raise
 
     def lit(self) -> bool:
-        return self._flash is not None and not self._flash.ended.is_set()
+        """Past its time a light is not believed, though the thread that is to end it may be late: the box may have
+        ended it by itself."""
+        flash = self._flash
+        return flash is not None and not flash.ended.is_set() and not flash.deadline.expired
 
     def end_flash(self) -> StepRecord:
         """End the light now, if its time has not ended it. `on_us` runs from the command to the box's word."""
@@ -271,7 +274,7 @@ class TextLineBox:
         """Send a line and return the box's answer without its ending, empty if it gives none."""
         settings, link = self._settings, self._link
         data = (line + _ENDINGS[settings.line_ending]).encode("ascii")
-        deadline = Deadline(self._clock, _REPLY_MARGIN_S + (len(data) + _SHORT_REPLY_BYTES) / link.bytes_per_s)
+        seconds = _REPLY_MARGIN_S + (len(data) + _SHORT_REPLY_BYTES) / link.bytes_per_s
         try:
             if not self._in_step:
                 link.clear()
@@ -283,6 +286,7 @@ class TextLineBox:
                     "See whether it started anew, and whether it answers each command with one line.",
                 )
             self._in_step = False
+            deadline = Deadline(self._clock, seconds)
             link.write(data, deadline)
             if not answers:
                 self._clock.sleep(len(data) / link.bytes_per_s + settings.obeys_ms * 1e-3)
@@ -291,7 +295,7 @@ class TextLineBox:
         except TimeoutError as error:
             raise DeviceTimeout(
                 settings.name,
-                expected=f"an answer to `{line}` within {deadline.seconds:.2f} s",
+                expected=f"an answer to `{line}` within {seconds:.2f} s",
                 happened=str(error),
                 remedy=f"See that the box at {settings.port} has power and the rig's baud rate, then resume.",
             ) from error

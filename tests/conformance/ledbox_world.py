@@ -20,6 +20,8 @@ from sim.world.lighting import Lighting
 from sim.world.reactor import Reactor
 
 SPEED = 8.0
+TEXT_SPEED = 4.0
+"""Slower: its driver's own thread, on a busy machine, is what ends its lights."""
 
 
 @dataclass
@@ -109,7 +111,7 @@ def ledbox_world(
 
 @contextmanager
 def text_world(
-    folder: Path, driver: dict[str, Any] | None = None, speed: float = SPEED, **settings: Any
+    folder: Path, driver: dict[str, Any] | None = None, speed: float = TEXT_SPEED, **settings: Any
 ) -> Iterator[LedBoxWorld]:
     """The same with a box of text lines; `driver` are settings of its driver, `settings` the stand-in's."""
     clock_path = folder / "clock"

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from ledbox_conformance import FLASH_US, LONG_US, LedBoxConformance
+from ledbox_conformance import FLASH_US, LedBoxConformance
 from ledbox_world import LedBoxWorld, text_world, wait_until
 from pydantic import ValidationError
 
@@ -19,6 +19,7 @@ from coupole.devices import table_box
 from coupole.errors import DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.ledbox.text_lines import Settings, TextLineBox, read_reply
 
+LONG_US = 20_000_000
 DIALECTS: dict[str, dict[str, Any]] = {
     "plain": {},
     "counts-from-1": {"driver": {"first_led": 1}, "first_led": 1},
@@ -54,6 +55,8 @@ def say(world: LedBoxWorld, words: bytes) -> None:
 
 class TestTextLineBox(LedBoxConformance):
     """The contract, in each dialect."""
+
+    long_us = LONG_US
 
     def test_it_runs_no_tables_and_says_what_to_do(self, box: TextLineBox) -> None:
         with pytest.raises(DeviceRefused, match="Set `trigger: software` in the plan"):
@@ -109,6 +112,15 @@ def test_the_light_goes_out_though_the_caller_hangs_and_the_box_knows_no_time(pl
         plain.wait_until_dark()  # the caller does nothing at all
         assert not box.lit()
         assert box.end_flash().on_us >= FLASH_US
+
+
+def test_past_its_time_a_light_is_not_believed_though_nothing_has_ended_it(plain: LedBoxWorld) -> None:
+    with plain.opener() as box:
+        box.flash(5, FLASH_US)
+        with box._lock:  # the thread that is to end it is held up
+            plain.clock.sleep(2e-6 * FLASH_US)
+            assert plain.shining() == [5]
+            assert not box.lit()
 
 
 def test_a_light_that_could_not_be_ended_in_time_is_not_hidden(plain: LedBoxWorld) -> None:
@@ -167,7 +179,7 @@ def test_a_stuck_led_shines_on_though_the_box_confirms_that_it_is_off(plain: Led
 
 
 def test_a_box_that_says_nothing_is_given_time_to_obey(tmp_path: Path) -> None:
-    settings = {"expected_reply": None, "identify": None, "obeys_ms": 100}
+    settings = {"expected_reply": None, "identify": None, "obeys_ms": 1000}
     with text_world(tmp_path, settings, answers=False) as world, world.opener() as box:
         box.flash(5, LONG_US)
         assert world.shining() == [5]

@@ -97,7 +97,7 @@ def test_marks_stand_at_both_ends_of_a_burst_and_darks_come_after_them(done: tup
 
 def test_a_box_that_says_nothing_can_be_used_too(tmp_path: Path) -> None:
     cell = text_cell(tmp_path, lights={"kind": "ids", "ids": [9, 26]})
-    cell.rig_data["ledbox"]["settings"] |= {"expected_reply": None, "identify": None, "obeys_ms": 5}
+    cell.rig_data["ledbox"]["settings"] |= {"expected_reply": None, "identify": None, "obeys_ms": 400}
     cell.world_settings["ledbox"] = {"answers": False}
     cell.write()
     ended = cell.acquire()

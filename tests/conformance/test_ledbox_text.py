@@ -97,6 +97,48 @@ def test_a_flash_refused_by_the_box_ends_what_shone_before(plain: LedBoxWorld) -
         assert plain.shining() == []
 
 
+def test_an_led_beyond_the_rigs_count_is_refused_though_the_box_has_it(plain: LedBoxWorld) -> None:
+    with (
+        plain.opener(led_count=8) as box,
+        pytest.raises(DeviceRefused, match="an LED from 0 to 7; 8 was asked for"),
+    ):
+        box.flash(8, FLASH_US)
+    assert plain.lights == []
+
+
+def test_a_second_flash_ends_the_first(plain: LedBoxWorld) -> None:
+    with plain.opener() as box:
+        box.flash(5, LONG_US)
+        box.flash(7, LONG_US)
+        assert plain.shining() == [7]
+
+
+def test_a_light_that_was_not_confirmed_is_ended(plain: LedBoxWorld) -> None:
+    with plain.opener() as box:
+        silent = plain.box._settings.model_copy(update={"answers": False})
+        plain.do(lambda: setattr(plain.box, "_settings", silent))  # it obeys, but its answers are lost
+        with pytest.raises(DeviceTimeout):
+            box.flash(5, LONG_US)
+        assert [led for led, _, _ in plain.lights] == [5]
+        plain.wait_until_dark()
+
+
+def test_a_box_that_refuses_to_end_a_light_is_quoted_and_all_is_switched_off(plain: LedBoxWorld) -> None:
+    with plain.opener(off="DARK {led}") as box:
+        box.flash(5, LONG_US)
+        with pytest.raises(DeviceRefused, match=r"it said `ERR what\? DARK 5`"):
+            box.end_flash()
+        assert plain.shining() == []
+
+
+def test_the_same_is_said_where_the_drivers_own_thread_ended_it(plain: LedBoxWorld) -> None:
+    with plain.opener(off="DARK {led}") as box:
+        box.flash(5, FLASH_US)
+        plain.wait_until_dark()
+        with pytest.raises(DeviceRefused, match=r"it said `ERR what\? DARK 5`"):
+            box.end_flash()
+
+
 def test_a_box_that_confirms_with_other_words_is_refused_and_dark(plain: LedBoxWorld) -> None:
     with (
         pytest.raises(DeviceRefused, match="expected `ready` in answer to `ALL OFF`; it said `OK`"),

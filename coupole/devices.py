@@ -9,53 +9,83 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import astuple, dataclass, field
+from typing import Any, Protocol, cast, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.errors import DeviceRefused
 from coupole.geometry import Transform
 
-NO_LIGHT = 0xFFFF
-"""The `led` of a dark step."""
+NO_LED = -1
+"""The `led` of a step or a flash without light."""
+UNKNOWN_NS = -1
+"""A time that a box cannot tell: it has no clock, or nothing happened at that time."""
 
-FLAG_NO_TRIGGER = 1
-"""Step flag: light the LED but send no trigger edge."""
 
-STEP_DTYPE = np.dtype(
-    [
-        ("led", "<u2"),
-        ("flags", "<u2"),
-        ("on_us", "<u4"),
-        ("trigger_delay_us", "<u4"),
-        ("period_us", "<u4"),
-    ]
-)
-"""One record of the box's table, 16 bytes as on the wire. `trigger_delay_us` runs from LED on to edge."""
+@dataclass(frozen=True)
+class Step:
+    """One step of a table that a box runs by itself."""
 
-STEP_RECORD_DTYPE = np.dtype(
-    [
-        ("step", "<u4"),
-        ("led", "<u2"),
-        ("status", "<u2"),
-        ("t_on_ns", "<u8"),
-        ("t_trigger_ns", "<u8"),
-        ("board_temperature_dc", "<i2"),
-        ("led_current_ma", "<u2"),
-    ]
-)
-"""One record of the box's log, 28 bytes as on the wire: what a step really did, on the box's clock.
-`board_temperature_dc` is in tenths of a degree Celsius."""
+    led: int
+    """The LED that it lights, NO_LED for none."""
+    on_us: int
+    """How long the LED is lit; of a dark step, how long it would be."""
+    trigger_delay_us: int
+    """From LED on to the trigger edge."""
+    period_us: int
+    """From this step's LED on to the next one's."""
+    sends_edge: bool = True
+    """Whether the camera is triggered in this step."""
 
-STATUS_LED_OPEN = 1
-"""Log status: the LED drew no current though it was switched on (dead LED or broken wire)."""
-STATUS_OVER_TEMPERATURE = 2
-"""Log status: the board was over its limit; the burst ends with this step."""
-STATUS_NO_EDGE = 4
-"""Log status: no trigger edge was sent in this step."""
-STATUS_WAITED = 8
-"""Log status: the step was held back until the camera's exposure-ready line rose."""
+
+@dataclass(frozen=True)
+class StepRecord:
+    """What a step of a table, or a flash, really did: as the box's log says, or its driver saw."""
+
+    step: int
+    """Place in the table, from 0; 0 of a flash."""
+    led: int
+    """As in `Step`."""
+    edge_sent: bool
+    """A trigger edge was sent."""
+    led_open: bool
+    """The LED drew no current though it was switched on (dead LED, broken wire); False if the box cannot tell."""
+    over_temperature: bool
+    """The board was over its limit; a burst ends with this step. False if the box cannot tell."""
+    waited: bool
+    """The step was held back until the camera's exposure-ready line rose."""
+    on_us: float
+    """How long the LED was lit, at the longest; 0 without light."""
+    t_on_ns: int
+    """When the LED was switched on, on the box's clock; UNKNOWN_NS of a box without one."""
+    t_trigger_ns: int
+    """When the edge was sent, on the box's clock; UNKNOWN_NS if none was, or of a box without clock."""
+    board_temperature_c: float
+    """Of the LED's board, C; NaN if the box cannot tell."""
+    led_current_ma: float
+    """Through the LED, mA; NaN if the box cannot tell."""
+
+    @property
+    def invalid_exposure(self) -> bool:
+        """True if a picture under this light must not be used."""
+        return self.led != NO_LED and (self.led_open or self.over_temperature)
+
+
+def _dtype_of(described: type[Step | StepRecord]) -> np.dtype[np.void]:
+    return np.dtype([(name, np.dtype(kind)) for name, kind in get_type_hints(described).items()])
+
+
+STEP_DTYPE = _dtype_of(Step)
+"""Tables are arrays [n] of this: the fields of `Step`, as int64 and bool."""
+STEP_RECORD_DTYPE = _dtype_of(StepRecord)
+"""Logs are arrays [n] of this: the fields of `StepRecord`, as int64, bool and float64."""
+
+
+def record_array(record: StepRecord) -> NDArray[np.void]:
+    """One record as a log [1] of STEP_RECORD_DTYPE."""
+    return np.array([astuple(record)], STEP_RECORD_DTYPE)
 
 
 class Clock(Protocol):
@@ -122,15 +152,63 @@ class Identity:
 
 
 class LedBox(Protocol):
-    """The LED control box: runs a table of steps by itself, lights LEDs and sends trigger edges."""
+    """The LED control box, as far as every one can go: it lights one LED at a time when it is told to.
 
+    Each call may raise a DeviceError; whatever was lit is dark then, as far as the box still obeys.
+    """
+
+    runs_tables: bool
+    """True of a `TableLedBox`. Declared by the driver's class, so that a rig is judged before a box is opened."""
     led_count: int
+    """LEDs are numbered from 0 to one less."""
+    panel_count: int
+    """Flat white panels that it switches, numbered from 1; 0 for none."""
 
     def identify(self) -> Identity: ...
 
     def self_test(self) -> Mapping[str, str]:
         """What the box reports of itself, for `coupole devices`; raises where it is not fit for use."""
         ...
+
+    def flash(self, led: int, on_us: int) -> None:
+        """Light one LED (NO_LED: none) for `on_us`; returns as soon as the box has confirmed that it shines.
+
+        Box or driver end the light at that time by themselves, whatever the caller does meanwhile. Nothing is
+        triggered. Raises DeviceRefused for an LED that the box does not have.
+        """
+        ...
+
+    def lit(self) -> bool:
+        """True only if the light of the last `flash` has shone without a break since that call returned. Without
+        light: as it would be with it."""
+        ...
+
+    def end_flash(self) -> StepRecord:
+        """See the last `flash` end: it may be cut short. Returns what it did; its `led` is dark.
+
+        Raises DeviceTimeout if the box does not say in time that it has ended.
+        """
+        ...
+
+    def lights_off(self) -> None:
+        """Abort what runs, all LEDs and panels dark. Safe to call at any time."""
+        ...
+
+    def panel(self, panel: int, on: bool) -> None:
+        """Switch a flat white panel (1 to `panel_count`); raises DeviceRefused for another."""
+        ...
+
+    def board_temperature_c(self, board: int) -> float | None:
+        """Of an LED board, C; None if the box cannot tell."""
+        ...
+
+    def close(self) -> None:
+        """Lights off if the box still listens; never raises for a link that is dead."""
+        ...
+
+
+class TableLedBox(LedBox, Protocol):
+    """A box that runs a table of steps by itself, sends trigger edges and keeps a log: bursts at full speed."""
 
     def load(self, table: NDArray[np.void]) -> None:
         """Bring a table (STEP_DTYPE [n]) into the bank that is not running; a no-op if it is there already.
@@ -141,7 +219,7 @@ class LedBox(Protocol):
         ...
 
     def start(self, table: NDArray[np.void]) -> None:
-        """Run a loaded table, after reading its CRC back. Returns at once."""
+        """Run a loaded table, after making sure that the box still has it as it was loaded. Returns at once."""
         ...
 
     def poll_log(self) -> NDArray[np.void]:
@@ -159,17 +237,17 @@ class LedBox(Protocol):
         """Trigger edges sent since the last `start`."""
         ...
 
-    def lights_off(self) -> None:
-        """Abort what runs, all LEDs and panels dark. Safe to call at any time."""
-        ...
 
-    def panel(self, panel: int, on: bool) -> None:
-        """Switch a flat white panel (1 to 4)."""
-        ...
-
-    def board_temperature_c(self, board: int) -> float: ...
-
-    def close(self) -> None: ...
+def table_box(box: LedBox) -> TableLedBox:
+    """The box as one that runs tables. Raises DeviceRefused if it does not."""
+    if not box.runs_tables:
+        raise DeviceRefused(
+            "led box",
+            expected="a box that runs tables and triggers the camera, for `trigger: hardware`",
+            happened="this one only lights one LED when it is told to",
+            remedy="Set `trigger: software` in the plan: then the host triggers the camera.",
+        )
+    return cast(TableLedBox, box)
 
 
 @dataclass(frozen=True)

@@ -126,16 +126,16 @@ def bench_matching(rounds: int) -> None:
     compile_now()
     table = read_job(ROOT / "configs/plans/demo.yaml").schedule.bursts[0][0].table
     log = np.zeros(len(table), STEP_RECORD_DTYPE)
-    log["step"], log["led"] = np.arange(len(table)), table["led"]
+    log["step"], log["led"], log["edge_sent"] = np.arange(len(table)), table["led"], True
     log["t_trigger_ns"] = 1_000_000 + 1000 * np.concatenate([[0], np.cumsum(table["period_us"][:-1])])
     random = np.random.default_rng(7)
     here = random.random(len(log)) > 0.02
-    stamps = (log["t_trigger_ns"].astype(np.int64) * (1 + 3e-5) + 5e9).astype(np.int64)
+    stamps = (log["t_trigger_ns"] * (1 + 3e-5) + 5e9).astype(np.int64)
     frame_ids, stamps = (np.arange(len(log)) + 1)[here], stamps[here]
     ours, peers = [], []
 
     def pair() -> None:
-        nearest = np.searchsorted(log["t_trigger_ns"].astype(np.int64), stamps - 5_000_000_000)
+        nearest = np.searchsorted(log["t_trigger_ns"], stamps - 5_000_000_000)
         nearest.clip(0, len(log) - 1)
 
     def prove() -> None:

@@ -1,4 +1,4 @@
-"""One burst: run a table, take its frames, prove them while it runs."""
+"""One burst: run it, take its frames, prove them; here while the box runs it, in `host_burst` light by light."""
 
 from __future__ import annotations
 
@@ -14,23 +14,25 @@ from coupole.acquisition.arm_supervisor import ArmSupervisor
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_grabber import FrameGrabber, buffers_for, memory_for_buffers
 from coupole.acquisition.frame_matching import UNLABELLED, FaultModel, Match, match
+from coupole.acquisition.host_burst import HostBurst
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
+from coupole.acquisition.verdict import Verdict
 from coupole.devices import (
-    NO_LIGHT,
-    STATUS_LED_OPEN,
-    STATUS_OVER_TEMPERATURE,
+    NO_LED,
     STEP_RECORD_DTYPE,
     ArmState,
     CameraStatistics,
     Deadline,
     Exposure,
-    Frame,
+    StepRecord,
+    table_box,
 )
 from coupole.errors import CoupoleError, DeviceError, DeviceTimeout
 from coupole.plan.bursts import Burst
 from coupole.plan.shot_id import ShotId
 from coupole.storage.journal_events import BurstEnded, Joints
+from coupole.storage.step_fields import step_fields
 from coupole.viewing.progress import Outcome
 
 _POLL_S = 0.05
@@ -39,23 +41,6 @@ _STALL_S = 5.0
 _LAST_STRETCH_S = 0.3
 """Of a burst: time enough for a host that fell behind in a hurry to catch up before the end."""
 _BOX_JITTER_US = 20.0
-_ONE_SHOT_BUFFERS = 8
-_UNCOUNTED = -1
-"""A camera that does not count its exposures: one frame came while the light shone, which must do."""
-_INVALID_EXPOSURE = STATUS_LED_OPEN | STATUS_OVER_TEMPERATURE
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Of one burst, after its end."""
-
-    match: Match
-    dead: list[ShotId]
-    """Shots whose LED drew no current."""
-
-
-_NONE = np.zeros(0, np.int64)
-NOTHING_TO_MATCH = Match(_NONE, _NONE > 0, _NONE > 0, _NONE > 0, ambiguous=False, reason="", clocks=None)
 
 
 @dataclass
@@ -91,7 +76,8 @@ class BurstRunner:
     ) -> None:
         self._cell, self._recorder, self._arm, self._dose = cell, recorder, arm, dose
         self._outcome, self._gain_db, self._max_frames_per_s = outcome, gain_db, max_frames_per_s
-        self._tell, self._wait_while_paused = tell, wait_while_paused
+        self._tell = tell
+        self._by_host = HostBurst(cell, recorder, arm, tell, wait_while_paused, self._note)
         self._buffer_memory_bytes = memory_for_buffers()
         self._buffers = 0
         """Never fewer than the burst before had: a ring that changes its size is memory to be touched anew."""
@@ -102,15 +88,20 @@ class BurstRunner:
         """How the camera must be configured for a burst."""
         return Exposure(burst.timing.exposure_us, self._gain_db, burst.hardware)
 
+    def prepare(self, burst: Burst) -> None:
+        """Bring into the box what can be brought while the arm is on its way."""
+        if burst.hardware:
+            table_box(self._cell.ledbox).load(burst.table)
+
     def fire(self, burst: Burst, following: Burst | None) -> Verdict:
-        """Run one table and prove its frames; whatever happens, note what light was given and what was seen.
+        """Run one burst and prove its frames; whatever happens, note what light was given and what was seen.
 
         The table of the burst that is `following` is brought into the box meanwhile. Raises ArmMovedError.
         """
         frame_format = self._cell.camera.configure(self.exposure(burst))
-        self._cell.ledbox.load(burst.table)
         if not burst.hardware:
-            return self._by_software(burst)
+            return self._by_host.fire(burst, frame_format)
+        self.prepare(burst)
         needed_us = self._cell.camera.min_period_us(self.exposure(burst))
         if burst.timing.period_us < needed_us:
             raise DeviceError(
@@ -124,10 +115,8 @@ class BurstRunner:
         self._buffers = max(self._buffers, wanted)
         return self._by_cable(burst, following, self._buffers)
 
-    # -- the box triggers the camera ----------------------------------------------------------------------
-
     def _by_cable(self, burst: Burst, following: Burst | None, buffers: int) -> Verdict:
-        box, camera, clock = self._cell.ledbox, self._cell.camera, self._cell.clock
+        box, camera, clock = table_box(self._cell.ledbox), self._cell.camera, self._cell.clock
         grabber = FrameGrabber(camera, lambda frame: self._recorder.put(frame, burst.timing.exposure_us))
         running = _RunningBurst(burst, grabber, self._cell.robot.measured())
         camera.arm(buffers)
@@ -154,13 +143,13 @@ class BurstRunner:
         camera.disarm()
         self._end(running, camera=statistics)
         log = running.log
-        dark = (log["led"] != NO_LIGHT) & ((log["status"] & STATUS_LED_OPEN) != 0)
+        dark = (log["led"] != NO_LED) & log["led_open"]
         assert running.judged is not None
         return Verdict(running.judged, [shot for i in np.flatnonzero(dark) if (shot := burst.shots[i])])
 
     def _follow(self, running: _RunningBurst) -> None:
         """Read log and frames until the burst is over, proving as it goes."""
-        box, clock, burst, grabber = self._cell.ledbox, self._cell.clock, running.burst, running.grabber
+        box, clock, burst, grabber = table_box(self._cell.ledbox), self._cell.clock, running.burst, running.grabber
         readout_s = 1.0 / self._max_frames_per_s + burst.timing.exposure_us * 1e-6
         step_s = burst.timing.period_us * 1e-6
         next_step = Deadline(clock, step_s + _STALL_S)
@@ -220,12 +209,11 @@ class BurstRunner:
         for frame in np.flatnonzero(judged.step_of_frame != UNLABELLED).tolist():
             if frame in running.proven or frame >= confirmed or not (complete or grabber.kept(frame)):
                 continue
-            record = log[judged.step_of_frame[frame]]
-            label = running.burst.labels[int(record["step"])]
-            invalid = record["led"] != NO_LIGHT and record["status"] & _INVALID_EXPOSURE
-            if label and not invalid:
+            record = StepRecord(*log[judged.step_of_frame[frame]].tolist())
+            label = running.burst.labels[record.step]
+            if label and not record.invalid_exposure:
                 shot = ShotId(running.burst.view, label)
-                self._recorder.prove(grabber.slot(frame), shot, _fields(record, int(record["t_trigger_ns"])))
+                self._recorder.prove(grabber.slot(frame), shot, step_fields(record, record.t_trigger_ns))
                 running.proven.add(frame)
 
     def _end(self, running: _RunningBurst, camera: CameraStatistics | None) -> None:
@@ -248,84 +236,8 @@ class BurstRunner:
             table_s=running.burst.duration_s,
             clocks=None if clocks is None else vars(clocks),
             camera=None if camera is None else vars(camera),
-            hottest_board_c=float(log["board_temperature_dc"].max()) / 10 if len(log) else None,
+            hottest_board_c=_hottest_c(log),
         )
-
-    # -- the host triggers the camera ---------------------------------------------------------------------
-
-    def _by_software(self, burst: Burst) -> Verdict:
-        """One light at a time, fired by the host: a frame is proven by being the only one, taken while the box
-        says that this very step is running, from before the trigger until after the frame has come."""
-        logs = []
-        dead: list[ShotId] = []
-        arm_before, arm_after = self._cell.robot.measured(), None
-        try:
-            for index, shot in enumerate(burst.shots):
-                assert shot is not None
-                self._arm.attend()
-                self._wait_while_paused()
-                frame, record, lit_throughout = self._fire_one(burst, burst.table[index : index + 1])
-                logs.append(record)
-                step = record[0]
-                if step["led"] != NO_LIGHT and step["status"] & _INVALID_EXPOSURE:
-                    dead.append(shot)
-                    lit_throughout = False
-                arm_after = None
-                arm_after = self._arm.await_news()
-                if frame is not None:
-                    self._keep(frame, burst, shot, step, proven=lit_throughout)
-                self._tell(burst, index)
-                self._recorder.commit(now=False)
-        finally:
-            log = np.concatenate([np.zeros(0, STEP_RECORD_DTYPE), *logs])
-            self._note(burst, log, arm_before, arm_after, frames=len(log))
-        return Verdict(NOTHING_TO_MATCH, dead)
-
-    def _keep(self, frame: Frame, burst: Burst, shot: ShotId, step: np.void, *, proven: bool) -> None:
-        slot = self._recorder.put(frame, burst.timing.exposure_us)
-        frame.release()
-        if not proven:
-            self._recorder.free(slot)
-            return
-        t_trigger_ns = int(step["t_on_ns"]) + burst.timing.trigger_delay_us * 1000
-        self._recorder.prove(slot, shot, _fields(step, t_trigger_ns))
-
-    def _fire_one(self, burst: Burst, single: NDArray[np.void]) -> tuple[Frame | None, NDArray[np.void], bool]:
-        """Light one step, trigger the camera; the frame, the step's record, and whether the one frame that was
-        exposed came while the step was running."""
-        box, camera, clock = self._cell.ledbox, self._cell.camera, self._cell.clock
-        camera.arm(_ONE_SHOT_BUFFERS)
-        try:
-            if burst.panel:
-                box.panel(burst.panel, True)
-            box.load(single)
-            box.start(single)
-            clock.sleep(burst.timing.trigger_delay_us * 1e-6)
-            camera.trigger()
-            frame = camera.next_frame(burst.timing.on_us * 1e-6 + camera.delivery_s)
-            lit_throughout = box.running() and camera.statistics().exposed in (1, _UNCOUNTED)
-            end = Deadline(clock, burst.timing.period_us * 1e-6 + _STALL_S)
-            while box.running():
-                if end.expired:
-                    raise DeviceTimeout(
-                        "led box",
-                        expected=f"a step of {burst.timing.period_us} us to end within {end.seconds:.1f} s",
-                        happened="the box says that it is running still",
-                        remedy="Check the box, then resume the run.",
-                    )
-                clock.sleep(burst.timing.on_us * 1e-7)
-            record = box.poll_log()
-        finally:
-            box.lights_off()
-            camera.disarm()
-        if len(record) != 1:
-            raise DeviceError(
-                "led box",
-                expected="one record in the log of a table with one step",
-                happened=f"{len(record)} came",
-                remedy="Check the box, then resume the run.",
-            )
-        return frame, record, lit_throughout
 
     def _note(
         self,
@@ -349,10 +261,10 @@ class BurstRunner:
         self._recorder.commit(now=True)
 
 
-def _fields(record: np.void, t_trigger_ns: int) -> dict[str, int]:
-    """What the frame table keeps of a step's record."""
-    names = ("led", "step", "board_temperature_dc", "led_current_ma", "status")
-    return {"t_trigger_ns": t_trigger_ns, **{name: int(record[name]) for name in names}}
+def _hottest_c(log: NDArray[np.void]) -> float | None:
+    """The highest temperature that a log tells; None if it tells none."""
+    known = log["board_temperature_c"][np.isfinite(log["board_temperature_c"])]
+    return float(known.max()) if len(known) else None
 
 
 def _rounded(arm: ArmState) -> Joints:

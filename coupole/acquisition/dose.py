@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.devices import NO_LIGHT
+from coupole.devices import NO_LED
 from coupole.geometry import apply
 from coupole.plan.bursts import Burst
 from coupole.preflight.job import Job
@@ -29,9 +29,9 @@ class DoseMeter:
 
     def add(self, burst: Burst, log: NDArray[np.void]) -> float:
         """Add what a burst gave, of which `log` (STEP_RECORD_DTYPE [n]) tells; returns seconds of LED light."""
-        rows = [self._row_of_led[int(led)] for led in log["led"][log["led"] != NO_LIGHT]]
-        on_s = burst.timing.on_us * 1e-6
-        self._given_lux_h += self._lux[:, rows].sum(axis=1) * on_s / 3600.0
+        lit = log[log["led"] != NO_LED]
+        rows = [self._row_of_led[int(led)] for led in lit["led"]]
+        self._given_lux_h += self._lux[:, rows] @ lit["on_us"] / 3.6e9
         if burst.panel:
             self._given_lux_h += self._panel_lux * burst.duration_s / 3600.0
-        return round(len(rows) * on_s, 6)
+        return round(float(lit["on_us"].sum()) * 1e-6, 6)

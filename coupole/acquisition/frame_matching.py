@@ -34,7 +34,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.devices import STATUS_NO_EDGE, STEP_RECORD_DTYPE
+from coupole.devices import STEP_RECORD_DTYPE
 
 UNLABELLED = -1
 _SURPLUS, _PENDING, _UNDECIDABLE, _DOUBTFUL = -1, -2, -3, -4
@@ -280,7 +280,7 @@ def match(
     def unproven(reason: str) -> Match:
         return Match(steps, *nothing, ambiguous=n_frames > 0, reason=reason, clocks=None)
 
-    edged = np.flatnonzero((log["status"] & STATUS_NO_EDGE) == 0)
+    edged = np.flatnonzero(log["edge_sent"])
     if n_frames == 0:
         missing = np.zeros(n_steps, np.bool_)
         missing[edged] = True
@@ -298,7 +298,7 @@ def match(
     if n_frames <= model.max_surplus + in_flight:
         return unproven("too few frames: all of them may be surplus, or of steps that are not in the log yet")
 
-    step_ns = log["t_trigger_ns"][edged].astype(np.int64)
+    step_ns = log["t_trigger_ns"][edged]
     agreed, agrees = steps.copy(), np.zeros(n_frames, np.bool_)
     candidates = _agree(
         timestamps_ns - timestamps_ns[0],
@@ -338,13 +338,14 @@ def match(
         _lost_in_transfer(steps, frame_ids, id_steps, missing),
         ambiguous=bool(undecided.any()),
         reason="; ".join(reasons),
-        clocks=_fit_clocks(log["t_trigger_ns"].astype(np.int64), timestamps_ns, steps),
+        clocks=_fit_clocks(log["t_trigger_ns"], timestamps_ns, steps),
     )
 
 
 def compile_now() -> None:
     """Compile the alignment kernels (seconds on a fresh machine), lest the first burst wait for it."""
     log = np.zeros(16, STEP_RECORD_DTYPE)
+    log["edge_sent"] = True
     log["t_trigger_ns"] = 10_000_000 * np.arange(16)
     match(log, np.arange(16), 10_000_000 * np.arange(16), complete=True)
     assert _agree.signatures, "the kernels were not reached"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import astuple
 
 import numpy as np
 
 from coupole.acquisition.opened_cell import OpenedCell
-from coupole.devices import NO_LIGHT, STEP_DTYPE, Deadline, Exposure
+from coupole.devices import NO_LED, STEP_DTYPE, Deadline, Exposure, Frame, Step, table_box
 from coupole.errors import DeviceTimeout
-from coupole.plan.bursts import burst_timing
+from coupole.plan.bursts import BurstTiming, burst_timing
 from coupole.plan.led_table import LedTable
 from coupole.plan.rig import Rig
 from coupole.viewing.live import Choice, FrameRate, Shown, Studio
@@ -42,29 +43,21 @@ class CellSource:
                 rise_us=limits.rise_us,
                 readout_us=1e6 / sensor.max_frames_per_s,
                 exposure_gap_us=sensor.exposure_gap_us,
-                hardware=True,
+                hardware=cell.ledbox.runs_tables,
             )
             if armed_for != choice:
                 cell.camera.disarm()
-                made = cell.camera.configure(Exposure(choice.exposure_us))
+                made = cell.camera.configure(
+                    Exposure(choice.exposure_us, hardware_trigger=cell.ledbox.runs_tables)
+                )
                 coding = Coding(made.bayer_pattern, made.black_dn, made.white_dn)
                 cell.camera.arm(_BUFFERS)
                 armed_for = choice
-            table = np.zeros(1, STEP_DTYPE)
-            table["led"] = NO_LIGHT if choice.led is None else choice.led
-            table["on_us"], table["trigger_delay_us"] = timing.on_us, timing.trigger_delay_us
             rest_us = int(timing.on_us * (1.0 + limits.cooldown_ratio))
-            table["period_us"] = max(timing.period_us, rest_us, int(self._every_s * 1e6))
-            cell.ledbox.load(table)
-            cell.ledbox.start(table)
-            frame = cell.camera.next_frame(timing.on_us * 1e-6 + _FRAME_S)
-            if frame is None:
-                raise DeviceTimeout(
-                    "camera",
-                    expected=f"a frame within {timing.on_us * 1e-6 + _FRAME_S:.1f} s of its trigger",
-                    happened="none came",
-                    remedy="Check the trigger cable.",
-                )
+            period_us = max(timing.period_us, rest_us, int(self._every_s * 1e6))
+            led = NO_LED if choice.led is None else choice.led
+            next_ns = cell.clock.now_ns() + period_us * 1000
+            frame = (self._by_cable if cell.ledbox.runs_tables else self._by_host)(led, timing, period_us)
             raw = frame.pixels.copy()
             frame.release()
             if choice.led is not None:
@@ -75,12 +68,46 @@ class CellSource:
             studio.show(
                 Shown(number, light, raw, coding, choice.exposure_us, choice.led, seen, pace.beat(), dose_lux_h)
             )
-            self._wait_for_the_box(float(table["period_us"][0]) * 1e-6)
+            if cell.ledbox.runs_tables:
+                self._wait_for_the_box(period_us * 1e-6)
+            else:
+                cell.clock.sleep(max(0.0, (next_ns - cell.clock.now_ns()) / 1e9))
+
+    def _by_cable(self, led: int, timing: BurstTiming, period_us: int) -> Frame:
+        """The box lights the LED and triggers the camera."""
+        box = table_box(self._cell.ledbox)
+        step = Step(led, timing.on_us, timing.trigger_delay_us, period_us)
+        table = np.array([astuple(step)], STEP_DTYPE)
+        box.load(table)
+        box.start(table)
+        return self._frame(timing, "Check the trigger cable.")
+
+    def _by_host(self, led: int, timing: BurstTiming, period_us: int) -> Frame:
+        """The box lights the LED when it is told to, and the host triggers the camera."""
+        self._cell.ledbox.flash(led, timing.on_us)
+        self._cell.clock.sleep(timing.trigger_delay_us * 1e-6)
+        self._cell.camera.trigger()
+        frame = self._frame(timing, "Check the camera.")
+        self._cell.ledbox.end_flash()
+        return frame
+
+    def _frame(self, timing: BurstTiming, remedy: str) -> Frame:
+        seconds = timing.on_us * 1e-6 + _FRAME_S
+        frame = self._cell.camera.next_frame(seconds)
+        if frame is None:
+            raise DeviceTimeout(
+                "camera",
+                expected=f"a frame within {seconds:.1f} s of its trigger",
+                happened="none came",
+                remedy=remedy,
+            )
+        return frame
 
     def _wait_for_the_box(self, period_s: float) -> None:
+        box = table_box(self._cell.ledbox)
         deadline = Deadline(self._cell.clock, 2.0 * period_s + _FRAME_S)
-        while self._cell.ledbox.running():
-            self._cell.ledbox.poll_log()
+        while box.running():
+            box.poll_log()
             if deadline.expired:
                 raise DeviceTimeout(
                     "led box",
@@ -89,4 +116,4 @@ class CellSource:
                     remedy="Check the box.",
                 )
             self._cell.clock.sleep(0.01)
-        self._cell.ledbox.poll_log()
+        box.poll_log()

@@ -12,12 +12,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor, SettledPose
-from coupole.acquisition.burst_runner import NOTHING_TO_MATCH, BurstRunner, Verdict
+from coupole.acquisition.burst_runner import BurstRunner
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_matching import compile_now
 from coupole.acquisition.observer import Control, Observer, Unwatched
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
+from coupole.acquisition.verdict import NOTHING_TO_MATCH, Verdict
 from coupole.devices import FrameFormat
 from coupole.errors import DeviceError, UnprovenError
 from coupole.motion.itinerary import Visit
@@ -125,7 +126,7 @@ class Sequencer:
         self.outcome.ideal_s += motion_s + sum(burst.duration_s for burst in left)
         waypoints_deg = tuple(tuple(np.round(place, 6).tolist()) for place in visit.leg.waypoints)
         self._recorder.note(MoveBegun(view=view.name, joints_deg=waypoints_deg))
-        settled = self._arm.go(visit, lambda: self._cell.ledbox.load(left[0].table))
+        settled = self._arm.go(visit, lambda: self._burst_runner.prepare(left[0]))
         frame_format = self._cell.camera.configure(self._burst_runner.exposure(left[0]))
         self._check_format(frame_format)
         frames = sum(len(burst.labels) for burst in all_bursts)

@@ -23,6 +23,7 @@ from coupole.acquisition.operator import (
 )
 from coupole.acquisition.recorder import DryRecorder, RunRecorder
 from coupole.acquisition.sequencer import Sequencer
+from coupole.acquisition.verdict import PROOF_BY
 from coupole.errors import (
     CoupoleError,
     DeviceError,
@@ -113,14 +114,15 @@ def _acquire_into(
             recorder.close()
 
 
-def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float:
+def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float | None:
     """What only devices can tell of the records in force: whose camera they are of, and how warm it may be.
 
-    Returns the temperature of the coolest LED board, which is nearest to the room's.
+    Returns the temperature of the coolest LED board, which is nearest to the room's; None if the box knows none.
     """
     boards = np.unique(job.cell.leds.boards)
     some = boards[np.unique(np.linspace(0, len(boards) - 1, _ASKED_BOARDS).astype(int))]
-    room_c = min(cell.ledbox.board_temperature_c(int(board)) for board in some)
+    known = [c for board in some if (c := cell.ledbox.board_temperature_c(int(board))) is not None]
+    room_c = min(known, default=None)
     if reasons := calibration_refusals(job, camera=_camera_name(cell), temperature_c=room_c):
         raise PreflightRefused(reasons)
     return room_c
@@ -154,6 +156,7 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
     """What stands in run.json beside the inputs."""
     return {
         "simulated": cell.simulated,
+        "proof": _proof(job),
         "object": job.plan.object.id if job.plan.object else None,
         "calibrations": {item.record.kind: item.record.sha256 for item in job.calibrations or ()} or "none",
         "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
@@ -174,6 +177,11 @@ def _labels(schedule: Schedule) -> list[str] | dict[str, list[str]]:
     }
 
 
+def _proof(job: Job) -> str:
+    """What the identity of the run's frames rests on."""
+    return PROOF_BY[job.schedule.bursts[0][0].marks]
+
+
 def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
     """Attributes of every view's file."""
     rig = job.cell.rig
@@ -181,6 +189,7 @@ def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
         "program_name": "coupole",
         "sample": job.plan.object.id if job.plan.object else "none",
         "simulated": cell.simulated,
+        "proof": _proof(job),
         "pixel_pitch_um": cell.sensor.pixel_pitch_um,
         "focal_length_mm": rig.lens.focal_length_mm,
         "f_number": rig.lens.f_number,

@@ -27,6 +27,7 @@ from coupole.errors import InputError, StorageError
 from coupole.storage import frame_file
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run, sha256
+from coupole.storage.step_fields import temperature_range_c
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
 POSES_NAME, BOARD_NAME = "poses.yaml", "board.yaml"
@@ -136,7 +137,7 @@ def _of_run(run: Run) -> Sources:
         by_view.setdefault(shot.view, []).append(frame)
     images, flanges, inputs = [], [], [(f"{run.folder.name}/run.json", sha256(run.folder / "run.json"))]
     about = About(simulated=bool(run.about["simulated"]))
-    temperatures: list[float] = []
+    lit_records: list[np.void] = []
     for view, frames in by_view.items():
         path = run.view_path(view)
         table = frame_file.read_frames(path)
@@ -147,7 +148,7 @@ def _of_run(run: Run) -> Sources:
         dark = [frame for frame in frames if frame.shot.is_dark]
         records = table[[frame.index for frame in lit]]
         pose = poses[int(records["pose"][0])]
-        temperatures += (records["board_temperature_dc"] / 10.0).tolist()
+        lit_records += list(records)
         read = partial(_mean_frame, view, path, lit, dark, table)
         images.append(Source(view, read, tuple(map(float, pose["joints_deg"]))))
         flanges.append(np.array(pose["base_from_flange"], dtype=np.float64))
@@ -155,7 +156,7 @@ def _of_run(run: Run) -> Sources:
         about = about_of(run, attributes)
     if not images:
         raise InputError(f"{run.folder}: no proven frame under light; acquire the plan first")
-    about = replace(about, temperature_c=(min(temperatures), max(temperatures)), begun=run.created)
+    about = replace(about, temperature_c=temperature_range_c(lit_records), begun=run.created)
     return Sources(tuple(images), reported(np.stack(flanges)), about, tuple(inputs))
 
 

@@ -43,12 +43,13 @@ def verify(run: RunPath, as_json: JsonOption = False) -> None:
     if found.missing:
         console.print(f"[red]missing:[/] {len(found.missing)} frames, the first {found.missing[0]}")
     if as_json:
-        print(json.dumps({"ok": found.ok, "frames": found.frames, "bad": found.bad, "missing": found.missing}))
+        document = {"ok": found.ok, "proof": opened.proof, "frames": found.frames}
+        print(json.dumps({**document, "bad": found.bad, "missing": found.missing}))
     if found.bad:
         raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames are not as they were written")
     if found.missing:
         raise UnprovenError(f"{len(found.missing)} frames of the plan are missing; resume the run")
-    console.print(f"ok: {found.frames} frames, each of them once, all checksums right")
+    console.print(f"ok: {found.frames} frames, each of them once, all checksums right; proof: {opened.proof}")
 
 
 def archive(

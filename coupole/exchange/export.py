@@ -20,8 +20,7 @@ from coupole.errors import ChecksumMismatch, DiskFull, InputError, StorageError
 from coupole.storage import frame_file
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
-
-NO_LED = 65535
+from coupole.storage.step_fields import STORED_NO_LED, board_temperature_c
 
 
 @dataclass(frozen=True)
@@ -125,9 +124,9 @@ def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
             about = {
                 "shot": str(frame.shot),
                 "run": run.folder.name,
-                "led": None if record["led"] == NO_LED else int(record["led"]),
+                "led": None if record["led"] == STORED_NO_LED else int(record["led"]),
                 "exposure_us": int(record["exposure_us"]),
-                "board_temperature_c": int(record["board_temperature_dc"]) / 10,
+                "board_temperature_c": board_temperature_c(record),
                 "led_current_ma": int(record["led_current_ma"]),
                 "frame_id": frame.frame_id,
                 "xxh3": frame.xxh3,

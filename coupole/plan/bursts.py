@@ -1,30 +1,21 @@
-"""Bursts: what one table in the box fires without the host.
+"""Bursts: what one table in the box fires without the host, or the host light by light.
 
-Coded dark marks, dark frames, lights, marks again; all frames of a burst have one exposure.
+Dark marks, dark frames, lights, marks again (`plan.marks`); all frames of a burst have one exposure.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.devices import FLAG_NO_TRIGGER, NO_LIGHT, STEP_DTYPE
+from coupole.devices import NO_LED, STEP_DTYPE, Step
+from coupole.plan.marks import MARKS_AT_ENDS, Marks, with_marks
 from coupole.plan.shot_id import Dark, Led, Light, Panel, PanelMark, ShotId, ShotLabel
 
-L = TypeVar("L", bound=ShotLabel | None)
-
-MARK_UNITS = 16
-START_MARK_EXTRA = (5, 1, 4, 2, 3)
-"""Sixteenths of the burst's period that each start mark takes longer. Counted back from the first light the
-marks stand at phases 13, 11, 7, 6, 1 of 16: nowhere on the lights' grid, and all different."""
-END_MARK_EXTRA = (2, 5, 1, 3, 1)
-"""The same for the last light and the end marks but one: phases 2, 7, 8, 11, 12 behind the grid."""
-MARKS = len(START_MARK_EXTRA) + len(END_MARK_EXTRA)
 EXPOSURE_MARGIN_US = 200
 """An LED stays on this long after the exposure's nominal end: the camera's exposure may start late."""
 PERIOD_MARGIN_US, PERIOD_MARGIN_PPM = 10, 200
@@ -63,22 +54,31 @@ class BurstTiming:
 
 @dataclass(frozen=True)
 class Burst:
-    """One table for the box, and which shots its frames are."""
+    """The steps of one burst, and which shots its frames are."""
 
     view: str
     exposure_index: int
     repeat: int
     panel: int
     hardware: bool
+    """The box triggers the camera; else the host does, light by light."""
+    marks: Marks
     timing: BurstTiming
     table: NDArray[np.void]
+    """STEP_DTYPE [steps]."""
     labels: tuple[ShotLabel | None, ...]
     """Of the frame that each step triggers; None for a mark whose frame is not wanted (in a burst taken again)."""
 
     @cached_property
     def duration_s(self) -> float:
         """The table's own time."""
-        return float(self.table["period_us"].sum(dtype=np.int64)) / 1e6
+        return float(self.table["period_us"].sum()) / 1e6
+
+    @property
+    def inner(self) -> range:
+        """Steps between the marks."""
+        start, end = MARKS_AT_ENDS[self.marks]
+        return range(start, len(self.labels) - end)
 
     @property
     def shots(self) -> list[ShotId | None]:
@@ -91,22 +91,17 @@ class Burst:
 
     def without(self, leds: Collection[int]) -> Burst:
         """The same burst without the shots under these LEDs."""
-        dropped = np.isin(self.table["led"], list(leds)) & (self.table["led"] != NO_LIGHT)
+        dropped = np.isin(self.table["led"], list(leds)) & (self.table["led"] != NO_LED)
         return self.only({label for label, drop in zip(self.labels, dropped, strict=True) if label and not drop})
 
     def only(self, wanted: Collection[ShotLabel]) -> Burst:
         """The same burst with those shots only, and marks anew."""
-        marked = self.hardware
-        inner = (
-            range(len(START_MARK_EXTRA), len(self.labels) - len(END_MARK_EXTRA))
-            if marked
-            else range(len(self.labels))
-        )
+        inner = self.inner
         keep = [i for i in inner if self.labels[i] in wanted]
         marks = [label if label in wanted else None for i, label in enumerate(self.labels) if i not in inner]
-        table, labels = self.table[keep], [self.labels[i] for i in keep]
-        if marked:
-            table, labels = _with_marks(table, labels, marks, self.timing)
+        dark = _dark_step(self.timing, sends_edge=self.hardware)
+        own = [self.labels[i] for i in keep]
+        table, labels = with_marks(self.marks, self.table[keep], own, marks, dark)
         return replace(self, table=table, labels=tuple(labels))
 
 
@@ -146,13 +141,13 @@ def bursts_of_exposure(
     repeat: int,
     *,
     darks: int,
-    hardware: bool,
+    marks: Marks,
 ) -> Iterator[Burst]:
     """The bursts of one exposure, without a view: one for each list of LEDs, one for each panel. Dark frames are
     the first one's."""
     for number, lit in enumerate(lights):
         own_darks = darks if number == 0 else 0
-        yield _burst(lit, own_darks, timing, exposure_index, repeat, hardware=hardware)
+        yield _burst(lit, own_darks, timing, exposure_index, repeat, marks=marks)
 
 
 def _burst(
@@ -162,44 +157,27 @@ def _burst(
     exposure_index: int,
     repeat: int,
     *,
-    hardware: bool,
+    marks: Marks,
 ) -> Burst:
-    # A panel shines all through its burst: what would be dark there is one more picture of the panel.
+    # A panel shines all through a burst that the box runs: what would be dark is one more picture of the panel.
     panel = lit.number if isinstance(lit, Panel) else 0
-    first_dark = MARKS if hardware else 0
-    lights: list[Light] = [lit] if isinstance(lit, Panel) else [*_dark(first_dark, darks), *lit]
-    marks: list[Light] = [PanelMark(panel, k) for k in range(MARKS)] if panel else [*_dark(0, MARKS)]
-    records = np.zeros(len(lights), STEP_DTYPE)
-    records["led"] = [light.id if isinstance(light, Led) else NO_LIGHT for light in lights]
-    records["on_us"], records["trigger_delay_us"] = timing.on_us, timing.trigger_delay_us
-    records["period_us"] = timing.period_us
-    labels = [ShotLabel(light, exposure_index, repeat) for light in lights]
-    if hardware:
-        mark_labels = [ShotLabel(mark, exposure_index, repeat) for mark in marks]
-        records, labels = _with_marks(records, labels, mark_labels, timing)
-    else:
-        records["flags"] = FLAG_NO_TRIGGER
-    return Burst("", exposure_index, repeat, panel, hardware, timing, records, tuple(labels))
+    hardware, mark_count = marks == "coded", sum(MARKS_AT_ENDS[marks])
+    lights: list[Light] = [lit] if isinstance(lit, Panel) else [*_darks(mark_count, darks), *lit]
+    mark_lights: list[Light] = [PanelMark(panel, k) if panel else Dark(k) for k in range(mark_count)]
+    dark = _dark_step(timing, sends_edge=hardware)
+    steps = np.repeat(dark, len(lights))
+    steps["led"] = [light.id if isinstance(light, Led) else NO_LED for light in lights]
+    own = [ShotLabel(light, exposure_index, repeat) for light in lights]
+    mark_labels = [ShotLabel(light, exposure_index, repeat) for light in mark_lights]
+    table, labels = with_marks(marks, steps, own, mark_labels, dark)
+    return Burst("", exposure_index, repeat, panel, hardware, marks, timing, table, tuple(labels))
 
 
-def _dark(first: int, count: int) -> list[Dark]:
+def _darks(first: int, count: int) -> list[Dark]:
     return [Dark(first + k) for k in range(count)]
 
 
-def _with_marks(
-    records: NDArray[np.void], labels: Sequence[L], marks: Sequence[L], timing: BurstTiming
-) -> tuple[NDArray[np.void], list[L]]:
-    """Put the coded dark steps round a burst's own steps."""
-    unit_us = -(-timing.period_us // MARK_UNITS)
-    inner = records.copy()
-    inner["period_us"] = timing.period_us
-    dark = np.zeros(1, STEP_DTYPE)
-    dark["led"], dark["on_us"] = NO_LIGHT, timing.on_us
-    dark["trigger_delay_us"], dark["period_us"] = timing.trigger_delay_us, timing.period_us
-    start, end = np.repeat(dark, len(START_MARK_EXTRA)), np.repeat(dark, len(END_MARK_EXTRA))
-    start["period_us"] += np.array(START_MARK_EXTRA, np.uint32) * np.uint32(unit_us)
-    table = np.concatenate([start, inner, end])
-    first_end = len(table) - len(end)
-    coded = slice(first_end - 1, len(table) - 1)
-    table["period_us"][coded] += np.array(END_MARK_EXTRA, np.uint32) * np.uint32(unit_us)
-    return table, [*marks[: len(start)], *labels, *marks[len(start) :]]
+def _dark_step(timing: BurstTiming, *, sends_edge: bool) -> NDArray[np.void]:
+    """One step (STEP_DTYPE [1]) without light."""
+    step = Step(NO_LED, timing.on_us, timing.trigger_delay_us, timing.period_us, sends_edge)
+    return np.array([astuple(step)], STEP_DTYPE)

@@ -31,10 +31,10 @@ DEFAULT_TWINS = {
 
 @dataclass(frozen=True)
 class StandIn:
-    """What a world has at the other end of a robot driver's wire."""
+    """What a world has at the other end of a driver's wire."""
 
     kind: str
-    """In `world.settings.robot`."""
+    """In `world.settings.robot` or `world.settings.ledbox`."""
     alike: tuple[str, ...] = ()
     """Settings of the driver that must be the stand-in's too."""
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -57,6 +57,11 @@ ARMS_OF_DRIVERS = {"drivers.kuka.rsi:KukaRsi": "kr10_r1100_sixx", "drivers.kuka.
 """The arm (in `configs/robots`) that a driver moves where the rig does not say it."""
 UR = "drivers.ur:UrRobot"
 """Moves the arm that its setting `model` names."""
+LEDBOX_STAND_INS = {
+    "drivers.ledbox:LedBox": StandIn("scpi"),
+    "drivers.ledbox.text_lines:TextLineBox": StandIn("text", ("baud", "led_count", "first_led")),
+}
+"""For the LED boxes' drivers that come with Coupole: `world.settings.ledbox.kind`."""
 CAMERA_STAND_INS = {"drivers.camera.aravis:AravisCamera": "gige"}
 """For camera drivers whose stand-in is not the camera in shared memory: `world.settings.camera.kind`."""
 

@@ -19,6 +19,7 @@ from coupole.plan.arm_description import ArmDescription, arm_of_driver, read_arm
 from coupole.plan.registry import (
     CAMERA_STAND_INS,
     DEFAULT_TWINS,
+    LEDBOX_STAND_INS,
     RENAMED,
     ROBOT_STAND_INS,
     WORLD,
@@ -73,6 +74,18 @@ def planning_arm(rig: Rig) -> Arm | None:
     )
 
 
+def runs_tables(rig: Rig) -> bool:
+    """True if the rig's LED box runs tables and triggers the camera (`coupole.devices.LedBox.runs_tables`)."""
+    return bool(load_class(rig.ledbox.driver).runs_tables)
+
+
+def upload_s(rig: Rig, steps: int) -> float:
+    """Time to bring a table of so many steps into the rig's LED box, as its driver says; 0 if it does not."""
+    model = settings_class(rig.ledbox.driver)
+    described = model(**_known(NOWHERE["ledbox"], model) | rig.ledbox.settings)
+    return float(described.upload_s(steps)) if hasattr(described, "upload_s") else 0.0
+
+
 def in_world(rig: Rig, *, dry_run: bool) -> bool:
     """True if the rig's devices are stand-ins in a world."""
     return dry_run or (rig.world is not None and rig.world.serves == "always")
@@ -86,7 +99,8 @@ def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[
     if dry_run and device.twin is not None:
         driver, settings = device.twin.driver, dict(device.twin.settings)
     elif dry_run and not (rig.world is not None and rig.world.serves == "always"):
-        driver = driver if driver in ROBOT_STAND_INS else DEFAULT_TWINS[kind]
+        known = driver in ROBOT_STAND_INS or driver in LEDBOX_STAND_INS
+        driver = driver if known else DEFAULT_TWINS[kind]
         settings = _known(settings, settings_class(driver))
     if kind == "robot":
         settings = _known(_robot_settings(rig), settings_class(driver)) | settings
@@ -99,6 +113,12 @@ def stand_in_for(rig: Rig, *, dry_run: bool) -> StandIn:
     driver, _ = device_for(rig, "robot", dry_run=dry_run or not in_world(rig, dry_run=False))
     told = rig.world.settings.get("robot") if rig.world else None
     return ROBOT_STAND_INS.get(driver) or StandIn(told.get("kind", "rsi") if isinstance(told, dict) else "rsi")
+
+
+def ledbox_stand_in(rig: Rig, *, dry_run: bool) -> StandIn:
+    """What this rig's world has at the other end of the LED box's wire."""
+    driver, _ = device_for(rig, "ledbox", dry_run=dry_run or not in_world(rig, dry_run=False))
+    return LEDBOX_STAND_INS.get(driver) or StandIn("scpi")
 
 
 def camera_kind(rig: Rig, *, dry_run: bool) -> str:
@@ -121,12 +141,17 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
                 if kind == "robot":
                     given = given | _robot_settings(rig)
                 problems += _settings_problems(document, at, part.driver, given)
+    if not problems and not hasattr(load_class(rig.ledbox.driver), "runs_tables"):
+        message = "expected a class that declares `runs_tables`, as `coupole.devices.LedBox` asks"
+        problems.append(document.problem(("ledbox", "driver"), message))
     if rig.world is not None:
         problems += world_problems(document, rig, rig.world.settings)
-        told, kind = rig.world.settings.get("camera"), camera_kind(rig, dry_run=False)
-        if isinstance(told, dict) and told.get("kind", kind) != kind:
-            message = f"expected {kind}, which is at the other end of the camera's driver"
-            problems.append(document.problem(("world", "settings", "camera", "kind"), message))
+        kinds = {"camera": camera_kind(rig, dry_run=False), "ledbox": ledbox_stand_in(rig, dry_run=False).kind}
+        for name, other_end in kinds.items():
+            told = rig.world.settings.get(name)
+            if isinstance(told, dict) and told.get("kind", other_end) != other_end:
+                message = f"expected {other_end}, which is at the other end of the {name}'s driver"
+                problems.append(document.problem(("world", "settings", name, "kind"), message))
     return problems
 
 
@@ -141,7 +166,10 @@ def world_problems(document: Document, rig: Rig, settings: Mapping[str, Any]) ->
     camera = settings.get("camera", {})
     if isinstance(camera, dict):
         camera = {"kind": camera_kind(rig, dry_run=False), **camera}
-    completed_settings = {**settings, "robot": robot, "camera": camera}
+    ledbox = settings.get("ledbox", {})
+    if isinstance(ledbox, dict):
+        ledbox = {"kind": ledbox_stand_in(rig, dry_run=False).kind, **ledbox}
+    completed_settings = {**settings, "robot": robot, "camera": camera, "ledbox": ledbox}
     completed = replace(document, data={**document.data, "world": {"settings": completed_settings}})
     return _settings_problems(completed, ("world",), rig.world.driver if rig.world else WORLD, {})
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from typing import assert_never
 
 from coupole.geometry import Transform, look_at
-from coupole.plan.bursts import FASTEST, MARKS, Burst, Pace, burst_timing, bursts_of_exposure
+from coupole.plan.bursts import FASTEST, Burst, Pace, burst_timing, bursts_of_exposure
 from coupole.plan.led_table import LedTable
 from coupole.plan.light_selection import interleave, select_leds
+from coupole.plan.marks import MARKS, Marks
 from coupole.plan.plan import Grid, Joints, Lights, LookAt, Panels, Plan, View
 from coupole.plan.shot_id import MAX_CHARACTERS, Led, Panel, PanelMark, ShotLabel
 
@@ -87,12 +88,17 @@ def build_schedule(
     readout_us: float,
     exposure_gap_us: int,
     pace: Pace = FASTEST,
+    runs_tables: bool = True,
 ) -> Schedule:
-    """All bursts of all views. Tables are shared between views: the box need not be loaded anew."""
+    """All bursts of all views. Tables are shared between views: the box need not be loaded anew.
+
+    Of a box that does not run tables, and so keeps no log, only marks can tell that its lights went off.
+    """
     bursts_of: dict[Lights, list[Burst]] = {}
     views: list[ViewPose] = []
     bursts: list[list[Burst]] = []
     hardware = plan.trigger == "hardware"
+    marks: Marks = "coded" if hardware else "none" if runs_tables else "plain"
     for view in plan.views:
         lights = view.lights or plan.lights
         if lights not in bursts_of:
@@ -114,7 +120,7 @@ def build_schedule(
                     index,
                     repeat,
                     darks=plan.darks_per_view if repeat == 0 else 0,
-                    hardware=hardware,
+                    marks=marks,
                 )
             ]
         for pose in expand_view(view):

@@ -13,7 +13,7 @@ from pathlib import Path
 from coupole.errors import StorageError
 from coupole.plan.bursts import Pace
 from coupole.plan.rig import Rig
-from coupole.plan.rig_devices import in_world
+from coupole.plan.rig_devices import in_world, runs_tables
 from coupole.preflight import ledger
 from coupole.preflight.job import Job, at_pace
 from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, check
@@ -73,6 +73,9 @@ def check_job(
 
     job, report = _cooled(*checked(Pace(disk_us=_disk_us(rig, storage))), checked)
     report.refusals += calibration_refusals(job)
+    if job.plan.trigger == "hardware" and not runs_tables(rig):
+        why = "cannot trigger the camera: it runs no tables. Set `trigger: software` in the plan"
+        report.refusals.insert(0, f"led box {rig.ledbox.driver}: {why}")
     report.warnings += job.cell.remarks
     return job, report
 

@@ -20,6 +20,7 @@ from coupole.plan.bursts import FASTEST, Pace
 from coupole.plan.cell import Cell
 from coupole.plan.plan import Plan
 from coupole.plan.reading import read_plan
+from coupole.plan.rig_devices import runs_tables
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.yamlfile import Document
 from coupole.preflight.object_shape import ObjectShape, read_object
@@ -84,6 +85,7 @@ def schedule_of(plan: Plan, cell: Cell, pace: Pace = FASTEST) -> Schedule:
         readout_us=1e6 / cell.rig.sensor.max_frames_per_s,
         exposure_gap_us=cell.rig.sensor.exposure_gap_us,
         pace=pace,
+        runs_tables=runs_tables(cell.rig),
     )
 
 

@@ -12,21 +12,20 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.devices import NO_LIGHT
+from coupole.devices import NO_LED
 from coupole.geometry import apply
 from coupole.motion.itinerary import Itinerary
 from coupole.plan.bursts import Burst, BurstTiming
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
 from coupole.plan.rig import BoardThermal, LedLimits, Rig
+from coupole.plan.rig_devices import upload_s
 from coupole.plan.schedule import Schedule
 
 BURST_OVERHEAD_S = 0.14
 """Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""
 SETTLE_CHECK_S = 0.1
 """From the end of a motion to 'settled', dwell apart (measured on the simulated cell)."""
-STEP_BYTES, BITS_PER_BYTE = 16, 10
-UPLOAD_OVERHEAD_S = 0.1
 DISK_SHARE = 0.9
 """Of the disk's measured speed, that frames may come at."""
 PAGE_BYTES = 4096
@@ -128,7 +127,7 @@ def _refuse_on_times(bursts: Sequence[Burst], limits: LedLimits) -> list[str]:
     low_us, high_us = limits.on_us
     refusals = []
     for burst in bursts:
-        lit = burst.table["led"] != NO_LIGHT
+        lit = burst.table["led"] != NO_LED
         wrong = lit & ((burst.table["on_us"] < low_us) | (burst.table["on_us"] > high_us))
         if wrong.any():
             first = int(np.flatnonzero(wrong)[0])
@@ -142,11 +141,6 @@ def _refuse_on_times(bursts: Sequence[Burst], limits: LedLimits) -> list[str]:
 def _order(itinerary: Itinerary) -> list[int]:
     """Views as they are visited, then those that cannot be."""
     return [*itinerary.order, *sorted(set(range(len(itinerary.visits))) - set(itinerary.order))]
-
-
-def upload_s(burst: Burst, baud: int) -> float:
-    """Time to bring a burst's table into the box over a serial line."""
-    return STEP_BYTES * len(burst.table) * BITS_PER_BYTE / baud + UPLOAD_OVERHEAD_S if baud else 0.0
 
 
 def _time_and_dose(
@@ -164,7 +158,6 @@ def _time_and_dose(
     row_of_id = {int(led): row for row, led in enumerate(leds.ids)}
     dose_of_table: dict[int, NDArray[np.float64]] = {}
     total = np.zeros(len(points_support_mm))
-    baud = int(rig.ledbox.settings.get("baud", 115_200))
     for index in _order(itinerary):
         view, visit, bursts = schedule.views[index], itinerary.visits[index], schedule.bursts[index]
         move_s = (visit.leg.duration_s if visit and visit.leg.waypoints else 0.0) + rig.motion.settle_dwell_s
@@ -172,14 +165,14 @@ def _time_and_dose(
         dose = np.zeros(len(total))
         for burst in bursts:
             if id(burst.table) not in dose_of_table:
-                lit = burst.table[burst.table["led"] != NO_LIGHT]
+                lit = burst.table[burst.table["led"] != NO_LED]
                 rows = [row_of_id[int(led)] for led in lit["led"]]
                 dose_of_table[id(burst.table)] = lux[:, rows] @ lit["on_us"] / 3.6e9
             dose += dose_of_table[id(burst.table)]
             if burst.panel:
                 dose += rig.dome.panel_lux * (burst.duration_s + BURST_OVERHEAD_S) / 3600.0
         total += dose
-        waiting_s = max(0.0, upload_s(bursts[0], baud) - move_s) if not report.views else 0.0
+        waiting_s = max(0.0, upload_s(rig, len(bursts[0].table)) - move_s) if not report.views else 0.0
         report.ideal_s += move_s + burst_s
         report.duration_s += move_s + SETTLE_CHECK_S + waiting_s + burst_s + BURST_OVERHEAD_S * len(bursts)
         report.views.append(
@@ -217,8 +210,8 @@ def _thermal(
         t_s += view.move_s
         for burst in bursts:
             starts_s = np.concatenate([[0.0], np.cumsum(burst.table["period_us"][:-1], dtype=np.int64)]) / 1e6
-            lit = np.flatnonzero(burst.table["led"] != NO_LIGHT)
-            led = burst.table["led"][lit].astype(np.int64)
+            lit = np.flatnonzero(burst.table["led"] != NO_LED)
+            led = burst.table["led"][lit]
             on_s = burst.table["on_us"][lit] / 1e6
             rest_s = t_s + starts_s[lit] - off_since[led]
             short = rest_s < limits.cooldown_ratio * on_s

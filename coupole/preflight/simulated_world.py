@@ -8,7 +8,7 @@ from typing import Any
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
 from coupole.plan.rig import Rig, Sensor
-from coupole.plan.rig_devices import camera_kind, device_for, stand_in_for, world_problems
+from coupole.plan.rig_devices import camera_kind, device_for, ledbox_stand_in, stand_in_for, world_problems
 from coupole.preflight.job import Job
 
 DRY_RUN_WIDTH_PX = 128
@@ -39,6 +39,7 @@ def world_config(
         settings |= {"speed": speed, "hurry_only_when_told": dry_run}
     settings["robot"] = _robot_config(rig, settings.get("robot", {}), dry_run=dry_run)
     settings["camera"] = _camera_config(rig, settings.get("camera", {}), job if dry_run else None, dry_run=dry_run)
+    settings["ledbox"] = _ledbox_config(rig, settings.get("ledbox", {}), dry_run=dry_run)
     if problems := world_problems(cell.document, rig, settings):
         raise InputError(problems)
     exposures_us = job.plan.exposure.exposures_us if job else (8000,)
@@ -81,6 +82,14 @@ def _robot_config(rig: Rig, given: Mapping[str, Any], *, dry_run: bool) -> dict[
     alike = {name: settings[name] for name in stand_in.alike if name in settings}
     start = {"start_joints_deg": list(rig.motion.home_joints_deg)}
     return {"kind": stand_in.kind, **start, **stand_in.settings, **alike, **given}
+
+
+def _ledbox_config(rig: Rig, given: Mapping[str, Any], *, dry_run: bool) -> dict[str, Any]:
+    """The LED box's stand-in: what the rig says of it, and what follows from the driver at the other end."""
+    _, settings = device_for(rig, "ledbox", dry_run=dry_run)
+    stand_in = ledbox_stand_in(rig, dry_run=dry_run)
+    alike = {name: settings[name] for name in stand_in.alike if name in settings}
+    return {"kind": stand_in.kind, **alike, **given}
 
 
 def _camera_config(rig: Rig, given: Mapping[str, Any], rehearsed: Job | None, *, dry_run: bool) -> dict[str, Any]:

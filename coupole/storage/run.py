@@ -146,6 +146,12 @@ class Run:
         found: dict[str, list[int]] = self.about.get("hidden_leds", {})
         return found
 
+    @property
+    def proof(self) -> str:
+        """What the identity of the run's frames rests on, in the words of run.json."""
+        found: str = self.about.get("proof", "not recorded")
+        return found
+
     def proven(self) -> dict[ShotId, FrameProven]:
         """Proven shots, as the journal says."""
         return {event.shot: event for event in journal.read(self.journal_path) if isinstance(event, FrameProven)}
@@ -231,6 +237,8 @@ class Status:
     """How far a run is, by its journal alone."""
 
     state: str = "created"
+    proof: str = ""
+    """What the identity of its frames rests on."""
     shots: int = 0
     proven: int = 0
     darks_proven: int = 0
@@ -247,7 +255,7 @@ class Status:
 
 def status(run: Run) -> Status:
     """Progress of a run, also while it goes on."""
-    found = Status()
+    found = Status(proof=run.proof)
     expected = list(run.expected_shots())
     found.shots = sum(shot.is_shot for shot in expected)
     per_view = Counter(shot.view for shot in expected)

@@ -45,6 +45,7 @@ def _page(run: Run) -> str:
         "object": about["object"] or "none",
         "devices": "; ".join(f"{k}: {d['model']} {d['serial']}" for k, d in about["devices"].items()),
         "state": found.state,
+        "proof": found.proof,
         "shots": f"<span class={whole}>{found.proven} of {found.shots} proven</span>, {found.reshot} re-shot, "
         f"{found.darks_proven} dark frames",
     }

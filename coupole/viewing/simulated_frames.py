@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import coupole
-from coupole.devices import NO_LIGHT
+from coupole.devices import NO_LED
 from coupole.errors import InputError, StorageError
 from coupole.geometry import Transform
 from coupole.kinematics import forward
@@ -68,7 +68,7 @@ def simulate(job: Job, folder: Path, count: int, *, width_px: int | None, progre
             led = int(burst.table["led"][step])
             raw: NDArray[np.uint16] = stills.take(
                 flange_at(view, job),
-                leds=[] if led == NO_LIGHT else [led],
+                leds=[] if led == NO_LED else [led],
                 panels=[burst.panel] if burst.panel else [],
                 exposure_s=burst.timing.exposure_us * 1e-6,
                 gain=10 ** (job.plan.gain_db / 20),

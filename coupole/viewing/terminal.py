@@ -154,6 +154,7 @@ def show_status(console: Console, status: Status) -> None:
         f"{status.state}: {status.proven} of {status.shots} shots proven, {status.darks_proven} dark frames, "
         f"{status.reshot} re-shot; last event {status.last_event or 'none'}"
     )
+    console.print(f"  proof: {status.proof}")
     for view, (proven, expected) in status.views.items():
         console.print(f"  {view}: {proven} of {expected} frames")
     for fault in status.faults:

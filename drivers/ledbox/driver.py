@@ -9,23 +9,29 @@ from __future__ import annotations
 import contextlib
 import zlib
 from collections.abc import Mapping
+from dataclasses import astuple
 from typing import Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from coupole.devices import STEP_DTYPE, STEP_RECORD_DTYPE, Clock, Identity
-from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
+from coupole.devices import STEP_DTYPE, Clock, Deadline, Identity, Step, StepRecord
+from coupole.errors import DeviceError, DeviceFault, DeviceRefused, DeviceTimeout
 from drivers.ledbox.scpi import REPLY_MARGIN_S, Link, ScpiSession
-from drivers.ledbox.serial_link import SerialLink
+from drivers.ledbox.serial_link import no_port, open_serial
 from drivers.ledbox.usbtmc import UsbtmcLink
+from drivers.ledbox.wire import RECORD_BYTES, STEP_BYTES, pack, unpack_log
 
 _BLOCK_TIMEOUT_S = 2.2
 """After this silence the box has forgotten a block that was cut off (its own limit is 2 s)."""
 _POLL_S, _POLL_OVERHEAD_BYTES = 0.055, 130
 """A poll's time on the line while a burst runs, and its bytes apart from records."""
 _MAX_RECORDS_PER_POLL = 512
+_UPLOAD_OVERHEAD_S, _BITS_PER_BYTE = 0.1, 10
+_SHORTEST_PERIOD_US = 100
+_FLASH_MARGIN_S = 5.0
+"""A light that lasts so much longer than was asked has not ended."""
 
 
 class Settings(BaseModel):
@@ -47,13 +53,20 @@ class Settings(BaseModel):
     """Hold each step back until the camera's exposure-ready line is up; needs that cable."""
     name: str = "led box"
 
+    def upload_s(self, steps: int) -> float:
+        """Time to bring a table of so many steps into the box over a serial line."""
+        return STEP_BYTES * steps * _BITS_PER_BYTE / self.baud + _UPLOAD_OVERHEAD_S
+
 
 class LedBox:
-    """The box: a `coupole.devices.LedBox`.
+    """The box: a `coupole.devices.TableLedBox`.
 
     Opening it resets it. A latched fault of the box (watchdog, over-temperature) ends with opening it anew.
     Each call may raise DeviceTimeout, DeviceLost, DeviceRefused (the box's error is quoted) or DeviceFault.
     """
+
+    runs_tables = True
+    panel_count = 4
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
         self._settings, self._clock = settings, clock
@@ -88,7 +101,7 @@ class LedBox:
     def load(self, table: NDArray[np.void]) -> None:
         """Upload into the bank that is not running. At 115200 baud 1080 records take 1.5 s, during which
         nothing is polled; the box keeps the log."""
-        payload = _payload(table)
+        payload = self._payload(table)
         if payload in self._banks:
             return
         bank = 1 - (self._last_loaded if self._running_bank is None else self._running_bank)
@@ -96,7 +109,7 @@ class LedBox:
 
     def start(self, table: NDArray[np.void]) -> None:
         """Run a loaded table. A bank whose CRC-32 is not the table's is uploaded once more, then refused."""
-        payload = _payload(table)
+        payload = self._payload(table)
         if payload not in self._banks:
             self._refuse("a loaded table", "neither bank holds this one", "Call load() before.")
         bank = self._banks.index(payload)
@@ -111,7 +124,7 @@ class LedBox:
                 )
         self._scpi.ask("INIT", 0)
         self._running_bank, self._next_record = bank, 0
-        self._started = np.frombuffer(payload, STEP_DTYPE)
+        self._started = table.copy()
 
     def poll_log(self) -> NDArray[np.void]:
         """New records, STEP_RECORD_DTYPE [k]: of every step that had finished when the last round trip of this
@@ -130,6 +143,34 @@ class LedBox:
     def edges(self) -> int:
         (count,) = self._scpi.ask("TRIG:COUN?", 1)
         return int(self._scpi.number(count))
+
+    def flash(self, led: int, on_us: int) -> None:
+        """A table of one step without edge, which the box times by itself: it runs as long as the LED is lit."""
+        step = Step(led, on_us, 0, max(on_us, _SHORTEST_PERIOD_US), sends_edge=False)
+        table = np.array([astuple(step)], STEP_DTYPE)
+        self.load(table)
+        self.start(table)
+
+    def lit(self) -> bool:
+        return self.running()
+
+    def end_flash(self) -> StepRecord:
+        """Wait until the box says that the step is over, and read its record."""
+        on_s = float(self._started["on_us"].sum()) * 1e-6
+        deadline = Deadline(self._clock, on_s + _FLASH_MARGIN_S)
+        while self.running():
+            if deadline.expired:
+                raise DeviceTimeout(
+                    self._settings.name,
+                    expected=f"a light of {on_s:.3f} s to end within {deadline.seconds:.1f} s",
+                    happened="the box says that it is running still",
+                    remedy="Check the box, then resume the run.",
+                )
+            self._clock.sleep(on_s / 10)
+        records = self.poll_log()
+        if len(records) != 1:
+            self._scpi.unexpected("one record in the log of a table with one step", f"{len(records)} came")
+        return StepRecord(*records[0].tolist())
 
     def lights_off(self) -> None:
         """Abort, and see the box confirm it; raises only after a second try, which a box that was waiting for
@@ -162,18 +203,13 @@ class LedBox:
 
     def _open(self) -> Link:
         settings = self._settings
+        if not settings.port.startswith("usbtmc:"):
+            return open_serial(settings.name, settings.port, settings.baud, self._clock)
         try:
-            if settings.port.startswith("usbtmc:"):
-                vendor, product, *serial = settings.port.split(":")[1:]
-                return UsbtmcLink(int(vendor, 16), int(product, 16), ":".join(serial) or None, self._clock)
-            return SerialLink(settings.port, settings.baud, self._clock)
+            vendor, product, *serial = settings.port.split(":")[1:]
+            return UsbtmcLink(int(vendor, 16), int(product, 16), ":".join(serial) or None, self._clock)
         except (ConnectionError, ValueError) as error:
-            raise DeviceLost(
-                settings.name,
-                expected=f"a port {settings.port}",
-                happened=str(error),
-                remedy="Check the cable, the port's name in the rig, and that no other program has it open.",
-            ) from error
+            raise no_port(settings.name, settings.port, error) from error
 
     def _greet(self) -> Identity:
         """Bring both ends into step, whatever a former program left on the line, and ask who is there."""
@@ -215,6 +251,13 @@ class LedBox:
         self._scpi.ask(f"SEQ:BANK {bank};DATA ".encode("ascii") + block, 0)
         self._banks[bank], self._last_loaded = payload, bank
 
+    def _payload(self, table: NDArray[np.void]) -> bytes:
+        """The bytes that travel."""
+        try:
+            return pack(table)
+        except ValueError as error:
+            self._refuse("a table that the wire can carry", str(error), "Correct the figure that it names.")
+
     def _crc(self, bank: int) -> int:
         (crc,) = self._scpi.ask(f"SEQ:BANK {bank};CRC?", 1)
         return int(self._scpi.number(crc))
@@ -222,17 +265,20 @@ class LedBox:
     def _poll(self) -> tuple[bool, NDArray[np.void]]:
         """Whether there are more records of finished steps to fetch, and the next ones."""
         bytes_wanted = self._scpi.bytes_per_s * _POLL_S - _POLL_OVERHEAD_BYTES
-        limit = max(1, min(_MAX_RECORDS_PER_POLL, int(bytes_wanted / STEP_RECORD_DTYPE.itemsize)))
+        limit = max(1, min(_MAX_RECORDS_PER_POLL, int(bytes_wanted / RECORD_BYTES)))
         command = f"SEQ:STAT?;INDex?;LOG? {self._next_record},{limit}"
-        state, index, log = self._scpi.ask(command, 3, reply_bytes=limit * STEP_RECORD_DTYPE.itemsize)
+        state, index, log = self._scpi.ask(command, 3, reply_bytes=limit * RECORD_BYTES)
         self._note_state(str(state))
-        if not isinstance(log, bytes) or len(log) % STEP_RECORD_DTYPE.itemsize:
-            self._scpi.unexpected("a block of whole log records", f"{len(log)} bytes came")
-        records = np.frombuffer(log, STEP_RECORD_DTYPE)
-        steps = np.arange(self._next_record, self._next_record + len(records))
+        if not isinstance(log, bytes):
+            self._scpi.unexpected("a block of log records", repr(log))
+        try:
+            records = unpack_log(log, self._started)
+        except ValueError as error:
+            self._scpi.unexpected(f"the log of a table of {len(self._started)} steps", str(error))
         finished = int(self._scpi.number(index))
         if finished > len(self._started) or self._next_record + len(records) > len(self._started):
             self._scpi.unexpected(f"at most {len(self._started)} records", f"the box claims {finished}")
+        steps = np.arange(self._next_record, self._next_record + len(records))
         wrong = (records["step"] != steps) | (records["led"] != self._started["led"][steps])
         if wrong.any():
             first = int(np.flatnonzero(wrong)[0])
@@ -259,10 +305,3 @@ class LedBox:
 
     def _refuse(self, expected: str, happened: str, remedy: str) -> NoReturn:
         raise DeviceRefused(self._settings.name, expected=expected, happened=happened, remedy=remedy)
-
-
-def _payload(table: NDArray[np.void]) -> bytes:
-    """The bytes that travel; a table of another layout is a mistake of the caller's."""
-    if table.dtype != STEP_DTYPE or table.ndim != 1:
-        raise TypeError(f"a table is one row of STEP_DTYPE records, not {table.dtype} {table.shape}")
-    return np.ascontiguousarray(table).tobytes()

@@ -12,6 +12,7 @@ import select
 from typing import Any
 
 from coupole.devices import Clock, Deadline
+from coupole.errors import DeviceLost
 
 _LOOK_S = 0.02
 """Machine time between two looks at the rig's clock."""
@@ -45,6 +46,7 @@ class SerialLink:
 
     def write(self, data: bytes, deadline: Deadline) -> None:
         """Send all of `data`."""
+        self._refuse_closed()
         rest = memoryview(data)
         while rest:
             try:
@@ -59,6 +61,7 @@ class SerialLink:
 
     def read(self, deadline: Deadline) -> bytes:
         """At least one byte, and what else has come."""
+        self._refuse_closed()
         while True:
             late = deadline.expired  # looked at before reading: what has come in time is taken however late
             try:
@@ -70,6 +73,15 @@ class SerialLink:
             if late:
                 raise TimeoutError("nothing came")
 
+    def waiting(self) -> bytes:
+        """What has come already, without waiting; maybe nothing."""
+        self._refuse_closed()
+        try:
+            data: bytes = self._port.read(count) if (count := self._port.in_waiting) else b""
+        except self._lost as error:
+            raise ConnectionError(str(error)) from error
+        return data
+
     def clear(self) -> None:
         """Forget what is on its way from the device: read until the line is quiet."""
         deadline = Deadline(self._clock, _DRAIN_S)
@@ -78,6 +90,9 @@ class SerialLink:
                 self.read(Deadline(self._clock, _QUIET_S))
 
     def close(self) -> None:
+        """Give the port back; a second call does nothing."""
+        if not self._port.is_open:
+            return
         with contextlib.suppress(*self._lost):
             self._port.reset_output_buffer()  # else close() may wait for a dead line to drain
         socket = getattr(self._port, "_socket", None)
@@ -85,3 +100,25 @@ class SerialLink:
             self._port.close()
         if socket is not None:
             socket.close()  # pyserial 3.5 forgets to, where the other side of a socket:// hung up
+
+    def _refuse_closed(self) -> None:
+        if not self._port.is_open:
+            raise ConnectionError("the port was closed")
+
+
+def open_serial(name: str, url: str, baud: int, clock: Clock) -> SerialLink:
+    """The link to the device `name`. Raises DeviceLost if there is no such port, or if it is in use."""
+    try:
+        return SerialLink(url, baud, clock)
+    except ConnectionError as error:
+        raise no_port(name, url, error) from error
+
+
+def no_port(name: str, url: str, error: Exception) -> DeviceLost:
+    """The error to raise where the device `name` cannot be opened."""
+    return DeviceLost(
+        name,
+        expected=f"a port {url}",
+        happened=str(error),
+        remedy="Check the cable, the port's name in the rig, and that no other program has it open.",
+    )

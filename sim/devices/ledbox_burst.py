@@ -18,17 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.devices import (
-    FLAG_NO_TRIGGER,
-    NO_LIGHT,
-    STATUS_LED_OPEN,
-    STATUS_NO_EDGE,
-    STATUS_OVER_TEMPERATURE,
-    STATUS_WAITED,
-)
+from sim.devices.ledbox_table import FLAG_NO_TRIGGER, NO_LIGHT
 from sim.world.reactor import Reactor, Timer
 
 _LOG_RECORD = struct.Struct("<IHHQQhH")
+STATUS_LED_OPEN, STATUS_OVER_TEMPERATURE, STATUS_NO_EDGE, STATUS_WAITED = 1, 2, 4, 8
+"""Bits of a log record's status: the LED drew no current; its board was too hot, and the burst ends; no edge was
+sent; the step was held back until the camera was ready."""
 _START_LEAD_NS = 200_000
 """From INITiate to the first t_on."""
 _READY_SAMPLE_NS = 100_000
@@ -59,7 +55,7 @@ class _Done(NamedTuple):
 
 
 class Burst:
-    """Runs `table` (STEP_DTYPE [n]) once. `state` is RUN, then IDLE, ABORTED or FAULT."""
+    """Runs `table` (STEP [n]) once. `state` is RUN, then IDLE, ABORTED or FAULT."""
 
     def __init__(
         self,

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from coupole.devices import STEP_DTYPE
 from sim.devices.ledbox_burst import Boards, Burst, Quartz, Wiring
-from sim.devices.ledbox_table import MAX_RECORDS, check_table, read_table
+from sim.devices.ledbox_table import MAX_RECORDS, STEP, check_table, read_table
 from sim.devices.pty_port import PtyPort
 from sim.devices.scpi_parser import (
     Argument,
@@ -41,6 +40,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    kind: Literal["scpi"] = "scpi"
     baud: int = Field(default=115200, ge=0)
     """Pace of the serial line, world time; 0 for none."""
     led_count: int = Field(default=1080, ge=1, le=65535)
@@ -122,7 +122,7 @@ class LedBoxFirmware:
         self._watchdog_timer: Timer | None = None
         self._block_timer: Timer | None = None
         self._reset()
-        self._scpi = Interpreter(self._commands(), MAX_RECORDS * STEP_DTYPE.itemsize)
+        self._scpi = Interpreter(self._commands(), MAX_RECORDS * STEP.itemsize)
         self._link: Link = link or PtyPort(reactor, settings.baud)
         self.port = self._link.port
         self._link.listen(self._receive)
@@ -223,7 +223,7 @@ class LedBoxFirmware:
         self._burst = None
         self._fault = ""
         self._bank = 0
-        empty: NDArray[np.void] = np.empty(0, STEP_DTYPE)
+        empty: NDArray[np.void] = np.empty(0, STEP)
         self._tables = [empty, empty]
         self._watchdog_s = 0.0
         self._width_us, self._polarity, self._ready_source = 50, "NORM", "NONE"

@@ -5,9 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.devices import FLAG_NO_TRIGGER, NO_LIGHT, STEP_DTYPE
 from sim.devices.scpi_parser import ScpiError
 
+NO_LIGHT = 0xFFFF
+"""The `led` of a dark step."""
+FLAG_NO_TRIGGER = 1
+"""Bit of `flags`: no trigger edge in this step."""
+STEP = np.dtype(
+    [
+        ("led", "<u2"),
+        ("flags", "<u2"),
+        ("on_us", "<u4"),
+        ("trigger_delay_us", "<u4"),
+        ("period_us", "<u4"),
+    ]
+)
+"""One record of the table, 16 bytes as on the wire."""
 MAX_RECORDS = 4096
 MIN_ON_US, MAX_ON_US = 1_000, 2_000_000
 MIN_PERIOD_US = 100
@@ -16,12 +29,12 @@ REST_PER_ON = 2
 
 
 def read_table(payload: bytes, led_count: int, edge_width_us: int) -> NDArray[np.void]:
-    """The records (STEP_DTYPE [n]) of an uploaded block; raises ScpiError for one that is out of limits."""
-    if len(payload) % STEP_DTYPE.itemsize:
-        raise ScpiError(-161, f"{len(payload)} bytes are not a multiple of {STEP_DTYPE.itemsize}")
-    if len(payload) > MAX_RECORDS * STEP_DTYPE.itemsize:
-        raise ScpiError(-222, f"{len(payload) // STEP_DTYPE.itemsize} records exceed {MAX_RECORDS}")
-    table = np.frombuffer(payload, STEP_DTYPE)
+    """The records (STEP [n]) of an uploaded block; raises ScpiError for one that is out of limits."""
+    if len(payload) % STEP.itemsize:
+        raise ScpiError(-161, f"{len(payload)} bytes are not a multiple of {STEP.itemsize}")
+    if len(payload) > MAX_RECORDS * STEP.itemsize:
+        raise ScpiError(-222, f"{len(payload) // STEP.itemsize} records exceed {MAX_RECORDS}")
+    table = np.frombuffer(payload, STEP)
     check_table(table, led_count, edge_width_us)
     return table
 

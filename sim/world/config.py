@@ -12,6 +12,8 @@ from sim.devices import camera_server, kuka_controller, ledbox_firmware
 from sim.devices.arm_bodies import ToolBody
 from sim.devices.camera_stand_in import CameraSettings
 from sim.devices.camera_stand_in import impossible as impossible_for_camera
+from sim.devices.ledbox_stand_in import LedBoxSettings
+from sim.devices.ledbox_stand_in import impossible as impossible_for_box
 from sim.devices.robot import RobotSettings, impossible
 from sim.optics.dome import DomeErrors
 from sim.optics.led_light import STEADY, LedModel
@@ -127,7 +129,7 @@ class Settings(_Model):
     hurry_only_when_told: bool = False
     """Real time, but `speed` while the controller says that it merely waits (dry runs)."""
     seed: int = 1
-    ledbox: ledbox_firmware.Settings = ledbox_firmware.Settings()
+    ledbox: LedBoxSettings = ledbox_firmware.Settings()
     robot: RobotSettings = kuka_controller.Settings()
     camera: CameraSettings = camera_server.Settings()
     faults: tuple[script.Fault, ...] = ()
@@ -151,7 +153,11 @@ class Settings(_Model):
     @model_validator(mode="after")
     def _possible(self) -> Settings:
         for fault in self.faults:
-            if why := impossible(fault, self.robot) or impossible_for_camera(fault, self.camera):
+            if why := (
+                impossible(fault, self.robot)
+                or impossible_for_camera(fault, self.camera)
+                or impossible_for_box(fault, self.ledbox)
+            ):
                 raise ValueError(why)
         if self.robot.kind == "ur" and self.speed != 1.0:
             raise ValueError("a world with a robot of kind `ur` has speed 1: ur-rtde lives in real time")

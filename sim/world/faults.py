@@ -93,6 +93,13 @@ class DeadLed(_Model):
     led: Count
 
 
+class StuckLed(When):
+    """An LED that does not go out any more, once it is lit."""
+
+    kind: Literal["stuck_led"]
+    led: Count
+
+
 class FlickeringLed(_Model):
     """An LED whose flux varies from flash to flash by `rms`."""
 
@@ -139,6 +146,7 @@ Fault = Annotated[
     | CameraControlLoss
     | OverTemperature
     | DeadLed
+    | StuckLed
     | FlickeringLed
     | EmergencyStop
     | LateRsi

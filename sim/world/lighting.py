@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 
-from coupole.devices import NO_LIGHT
-
 _KEEP_NS = 10_000_000_000
 
 
@@ -19,8 +17,6 @@ class Lighting:
     def light(self, led: int, t_on_ns: int, t_off_ns: int, flux: float = 1.0) -> None:
         """LED `led` is switched on at `t_on_ns` and will go off at `t_off_ns` unless `dark` comes first; it gives
         `flux` times what its table says."""
-        if led == NO_LIGHT:
-            return
         while self._lit and self._lit[0][2] < t_on_ns - _KEEP_NS:
             self._lit.popleft()
         self._lit.append((led, t_on_ns, t_off_ns, flux))
@@ -28,6 +24,12 @@ class Lighting:
     def dark(self, t_ns: int) -> None:
         """All LEDs go off now."""
         self._lit = deque((led, on, min(off, t_ns), flux) for led, on, off, flux in self._lit if on < t_ns)
+
+    def darken_one(self, led: int, t_ns: int) -> None:
+        """One LED goes off now, others stay as they are."""
+        self._lit = deque(
+            (one, on, min(off, t_ns) if one == led else off, flux) for one, on, off, flux in self._lit
+        )
 
     def panel(self, panel: int, on: bool, t_ns: int) -> None:
         if on:

@@ -21,10 +21,11 @@ from typing import Any, assert_never
 import numpy as np
 from pydantic import BaseModel
 
-from coupole.devices import NO_LIGHT
-from sim.devices import camera_stand_in, gige_camera, kuka_controller, ledbox_firmware, robot
+from sim.devices import camera_stand_in, gige_camera, kuka_controller, ledbox_stand_in, robot
 from sim.devices.arm_bodies import NONE, Capsules, arm_capsules, tool_capsules, ur_capsules
 from sim.devices.camera_body import Exposed, Surroundings
+from sim.devices.ledbox_firmware import LedBoxFirmware
+from sim.devices.text_box import TextBox
 from sim.optics.led_light import Flashes
 from sim.optics.photographer import Photographer
 from sim.world import faults as script
@@ -49,23 +50,19 @@ class World:
         self._photographer = Photographer(config.scene, config.photographed, settings)
         self._flashes = Flashes(settings.leds)
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
+        self._ledbox_settings = settings.ledbox
         self._tool, self._arm_shadows = config.scene.tool, settings.arm_shadows
         self.robot, robot_endpoint = robot.build(self.reactor, settings.robot)
         self.camera, camera_endpoint = self._build_camera(config.camera, folder)
-        self.box = ledbox_firmware.LedBoxFirmware(
-            self.reactor,
-            settings.ledbox,
-            on_edge=self.camera.edge,
-            on_light=self._light,
-            on_dark=self.lighting.dark,
-            on_panel=self.lighting.panel,
-            ready=self.camera.ready,
+        self.box = ledbox_stand_in.build(
+            self.reactor, settings.ledbox, camera=self.camera, lighting=self.lighting, on_light=self._light
         )
         self._control = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.bind(str(folder / "control"))
         self._control.listen(4)
         self.reactor.add_reader(self._control, self._accept)
-        self.box.on_edge_counted = self._edge_counted
+        if isinstance(self.box, LedBoxFirmware):
+            self.box.on_edge_counted = self._edge_counted
         self._faults_at_edge: dict[int, list[script.Fault]] = {}
         for fault in settings.faults:
             self._schedule(fault)
@@ -128,9 +125,8 @@ class World:
 
     def _light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
         """The box drives an LED, which shines as bright as it can now."""
-        if led != NO_LIGHT:
-            flux = self._flashes.flux(led, self.box.temperature_of_led_c(led))
-            self.lighting.light(led, t_on_ns, t_off_ns, flux)
+        flux = self._flashes.flux(led, self.box.temperature_of_led_c(led))
+        self.lighting.light(led, t_on_ns, t_off_ns, flux)
 
     def _edge_counted(self, number: int) -> None:
         """The box sent, or should have sent, edge `number`: faults that wait for it happen."""
@@ -150,9 +146,9 @@ class World:
     def _happen(self, fault: script.Fault) -> None:  # noqa: PLR0912
         match fault:
             case script.DropTrigger():
-                self.box.drop_edge(fault.edge)
+                self._scpi_box.drop_edge(fault.edge)
             case script.DoubleTrigger():
-                self.box.double_edge(fault.edge, fault.delay_us)
+                self._scpi_box.double_edge(fault.edge, fault.delay_us)
             case script.LostTransfer():
                 self.camera.lose_frames.add(fault.frame)
             case script.MuteBox():
@@ -165,9 +161,12 @@ class World:
                 assert isinstance(self.camera, gige_camera.GigeCamera)  # others are refused before
                 self.camera.lose_control()
             case script.OverTemperature():
-                self.box.over_temperature(fault.board)
+                self._scpi_box.over_temperature(fault.board)
             case script.DeadLed():
                 self.box.kill_led(fault.led)
+            case script.StuckLed():
+                assert isinstance(self.box, TextBox)  # others are refused before
+                self.box.stick_led(fault.led)
             case script.FlickeringLed():
                 self._flashes.unsteady[fault.led] = fault.rms
             case script.EmergencyStop():
@@ -181,6 +180,12 @@ class World:
                 self.robot.nudge([fault.deg] * 6, fault.seconds)
             case _:
                 assert_never(fault)
+
+    @property
+    def _scpi_box(self) -> LedBoxFirmware:
+        """The box, for faults that only this kind can have: others are refused before."""
+        assert isinstance(self.box, LedBoxFirmware)
+        return self.box
 
     # -- control ------------------------------------------------------------------------------------------
 
@@ -213,8 +218,10 @@ class World:
                 }
             case "fault":
                 fault = OneFault.model_validate({"fault": command["fault"]}).fault
-                if why := robot.impossible(fault, self._robot_settings) or camera_stand_in.impossible(
-                    fault, self._camera_settings
+                if why := (
+                    robot.impossible(fault, self._robot_settings)
+                    or camera_stand_in.impossible(fault, self._camera_settings)
+                    or ledbox_stand_in.impossible(fault, self._ledbox_settings)
                 ):
                     return {"error": why}
                 self._schedule(fault)

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from coupole.acquisition.frame_matching import FaultModel, Match, match
 from coupole.devices import STEP_RECORD_DTYPE
-from coupole.plan.bursts import END_MARK_EXTRA, START_MARK_EXTRA, Burst
+from coupole.plan.bursts import Burst
 from coupole.plan.led_table import LedTable
+from coupole.plan.marks import END_MARK_EXTRA, START_MARK_EXTRA
 from coupole.plan.plan import Plan
 from coupole.plan.schedule import build_schedule
 
@@ -120,7 +121,7 @@ def take(
     camera_rate = box_rate * (1 + relative_ppm * 1e-6)
 
     log = np.zeros(steps, STEP_RECORD_DTYPE)
-    log["step"], log["led"] = np.arange(steps), table["led"]
+    log["step"], log["led"], log["edge_sent"] = np.arange(steps), table["led"], True
     log["t_on_ns"] = 7_000_000_000_123 + on_us * 1e3 * box_rate
     log["t_trigger_ns"] = 7_000_000_000_123 + edges_us * 1e3 * box_rate
 

@@ -19,7 +19,7 @@ from matching_takes import (
 )
 
 from coupole.acquisition.frame_matching import UNLABELLED
-from coupole.devices import STATUS_NO_EDGE
+from coupole.devices import UNKNOWN_NS
 
 LIGHT = START + 2 + 3  # a step in the middle of the lights, behind two dark frames
 
@@ -152,8 +152,8 @@ def test_frames_without_a_log_prove_nothing() -> None:
 
 def test_a_step_that_sent_no_edge_is_neither_labelled_nor_missing() -> None:
     what = take(whole_burst(12), missed=(LIGHT,))
-    what.log["status"][LIGHT] = STATUS_NO_EDGE
-    what.log["t_trigger_ns"][LIGHT] = 0
+    what.log["edge_sent"][LIGHT] = False
+    what.log["t_trigger_ns"][LIGHT] = UNKNOWN_NS
     verdict = what.verdict()
     assert_all_proven(what, verdict)
     assert not verdict.missing.any()

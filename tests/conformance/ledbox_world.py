@@ -1,23 +1,27 @@
-"""A world with nothing but the LED box in it, on a thread of its own, for tests."""
+"""Worlds with nothing but an LED box in them, each on a thread of its own, for tests."""
 
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from coupole.devices import NO_LIGHT, STEP_DTYPE
-from drivers.ledbox import LedBox, Settings
-from sim.devices import ledbox_firmware
+from coupole.devices import NO_LED, STEP_DTYPE
+from drivers.ledbox import LedBox, Settings, text_lines
+from sim.devices import ledbox_firmware, text_box
 from sim.world.clock import ClockWriter, SharedClock
+from sim.world.lighting import Lighting
 from sim.world.reactor import Reactor
 
 SPEED = 8.0
+TEXT_SPEED = 4.0
+"""Slower: its driver's own thread, on a busy machine, is what ends its lights."""
 
 
 @dataclass
@@ -26,23 +30,60 @@ class LedBoxWorld:
 
     reactor: Reactor
     clock: SharedClock
-    box: ledbox_firmware.LedBoxFirmware = field(init=False)
+    box: Any = field(init=False)
+    """The stand-in: a `sim.devices.ledbox_stand_in.LedBoxStandIn`."""
+    opener: Callable[..., AbstractContextManager[Any]] = field(init=False)
+    """Opens the driver on the box, with settings that differ from the usual ones."""
+    lighting: Lighting = field(default_factory=Lighting)
     edges_ns: list[int] = field(default_factory=list)
     lights: list[tuple[int, int, int]] = field(default_factory=list)
     darkened_ns: list[int] = field(default_factory=list)
     panels: list[tuple[int, bool]] = field(default_factory=list)
     ready: bool = True
 
-    def do(self, action: Callable[[], Any]) -> None:
-        """Run `action` on the world's thread and wait until it is done."""
+    def do(self, action: Callable[[], Any]) -> Any:
+        """Run `action` on the world's thread and wait until it is done; what it gave."""
         done = threading.Event()
+        given: list[Any] = []
 
         def act() -> None:
-            action()
+            given.append(action())
             done.set()
 
         self.reactor.call_threadsafe(act)
         assert done.wait(10)
+        return given[0]
+
+    def shining(self) -> list[int]:
+        """LEDs that shine now."""
+        found: list[int] = self.do(lambda: self.lighting.shining(self.reactor.now_ns))
+        return found
+
+    def wait_until_dark(self) -> None:
+        """Fails if something shines on and on."""
+        wait_until(lambda: not self.shining(), "darkness")
+
+    def lit_us(self, number: int) -> float:
+        """How long light number `number` (from 0) has really shone."""
+        _, on_ns, _ = self.lights[number]
+        (seconds,) = self.do(lambda: self.lighting.exposure_s(on_ns, self.reactor.now_ns)).values()
+        return 1e6 * float(seconds)
+
+    def light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
+        self.lights.append((led, t_on_ns, t_off_ns))
+        self.lighting.light(led, t_on_ns, t_off_ns)
+
+    def dark(self, t_ns: int) -> None:
+        self.darkened_ns.append(t_ns)
+        self.lighting.dark(t_ns)
+
+
+def wait_until(condition: Callable[[], bool], what: str) -> None:
+    """Fails if it does not come; only a broken box or driver lets the time run out."""
+    end_s = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < end_s, f"waited in vain for {what}"
+        time.sleep(0.005)
 
 
 @contextmanager
@@ -57,18 +98,47 @@ def ledbox_world(
         reactor,
         ledbox_firmware.Settings(**settings),
         on_edge=world.edges_ns.append,
-        on_light=lambda led, t_on_ns, t_off_ns: world.lights.append((led, t_on_ns, t_off_ns)),
-        on_dark=world.darkened_ns.append,
+        on_light=world.light,
+        on_dark=world.dark,
         on_panel=lambda panel, on, t_ns: world.panels.append((panel, on)),
         ready=lambda: world.ready,
         link=link(reactor),
     )
-    thread = threading.Thread(target=reactor.run)
+    world.opener = lambda **changed: opened(world, **changed)
+    with _running(world):
+        yield world
+
+
+@contextmanager
+def text_world(
+    folder: Path, driver: dict[str, Any] | None = None, speed: float = TEXT_SPEED, **settings: Any
+) -> Iterator[LedBoxWorld]:
+    """The same with a box of text lines; `driver` are settings of its driver, `settings` the stand-in's."""
+    clock_path = folder / "clock"
+    reactor = Reactor(ClockWriter(clock_path, speed))
+    world = LedBoxWorld(reactor, SharedClock(clock_path))
+    world.box = text_box.TextBox(
+        reactor, text_box.Settings(**settings), on_light=world.light, on_dark=world.lighting.darken_one
+    )
+    usual = {"led_count": 64, "settle_ms": 0, "identify": "ID", **(driver or {})}
+    world.opener = lambda **changed: closing(
+        text_lines.TextLineBox(
+            text_lines.Settings(**{"port": world.box.port, **usual, **changed}),
+            world.clock,
+        )
+    )
+    with _running(world):
+        yield world
+
+
+@contextmanager
+def _running(world: LedBoxWorld) -> Iterator[None]:
+    thread = threading.Thread(target=world.reactor.run)
     thread.start()
     try:
-        yield world
+        yield
     finally:
-        reactor.stop()
+        world.reactor.stop()
         thread.join()
         world.box.close()
 
@@ -91,12 +161,13 @@ def table(
     steps = np.zeros(count, STEP_DTYPE)
     steps["led"] = led + np.arange(count)
     steps["on_us"], steps["trigger_delay_us"], steps["period_us"] = on_us, delay_us, period_us
+    steps["sends_edge"] = True
     return steps
 
 
 def dark_table(count: int = 4) -> Any:
     steps = table(count)
-    steps["led"], steps["on_us"] = NO_LIGHT, 0
+    steps["led"], steps["on_us"] = NO_LED, 0
     return steps
 
 

@@ -8,13 +8,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from ledbox_world import LedBoxWorld, ledbox_world, opened, run_to_end, table
 
-from coupole.devices import NO_LIGHT, STATUS_LED_OPEN, STATUS_OVER_TEMPERATURE
+from coupole.devices import NO_LED
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused
+from drivers.ledbox import wire
 from drivers.ledbox.driver import LedBox
 from sim.devices import ledbox_firmware
+
+OVER_TEMPERATURE = 2
+"""In the status of a log record, as on the wire."""
 
 
 @pytest.fixture
@@ -43,7 +48,7 @@ def test_a_dead_led_draws_no_current_and_gives_no_light(box: LedBox, world: LedB
     box.load(steps)
     box.start(steps)
     records = run_to_end(box, world)
-    assert records["status"].tolist() == [0, 0, 0, 0, STATUS_LED_OPEN, 0, 0, 0]
+    assert np.flatnonzero(records["led_open"]).tolist() == [4]
     assert records["led_current_ma"][4] == 0
     assert 4 not in [led for led, _, _ in world.lights]
 
@@ -98,7 +103,7 @@ def test_the_last_record_before_a_fault_says_over_temperature(tmp_path: Path) ->
         world.clock.sleep(1.5)
         assert world.box._scpi.receive(b"SEQ:STAT?;IND?\n") == b"FAULT;1\n"
         log = world.box._scpi.receive(b"SEQ:LOG? 0,9\n")
-        assert int.from_bytes(log[4 + 6 : 4 + 8], "little") == STATUS_OVER_TEMPERATURE
+        assert int.from_bytes(log[4 + 6 : 4 + 8], "little") == OVER_TEMPERATURE
 
 
 def test_a_hot_board_keeps_the_box_from_starting(box: LedBox, world: LedBoxWorld) -> None:
@@ -217,7 +222,7 @@ def test_a_log_of_another_burst_is_not_taken_for_ours(box: LedBox, world: LedBox
     steps, other = table(30), table(30, led=300)
     box.load(steps)
     box.start(steps)
-    payload = other.tobytes()
+    payload = wire.pack(other)
     send_behind_its_back(world, b"ABOR;SEQ:BANK 1;DATA #3%d" % len(payload) + payload + b";:INIT\n")
     with pytest.raises(DeviceError, match="the log's record of step"):
         run_to_end(box, world)
@@ -236,7 +241,7 @@ def test_garbage_on_the_line_does_not_keep_the_driver_out(world: LedBoxWorld) ->
 
 def test_a_dark_step_is_no_step_of_an_led(box: LedBox, world: LedBoxWorld) -> None:
     steps = table(3)
-    steps["led"][1] = NO_LIGHT
+    steps["led"][1] = NO_LED
     box.load(steps)
     box.start(steps)
     assert run_to_end(box, world)["led_current_ma"].tolist() == [700, 0, 700]

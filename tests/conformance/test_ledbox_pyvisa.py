@@ -6,15 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pyvisa
-from ledbox_world import ledbox_world, table
+from ledbox_world import ledbox_world
 from pyvisa.resources import SerialInstrument
 
-from coupole.devices import STEP_RECORD_DTYPE
+STEP = np.dtype("<u2, <u2, <u4, <u4, <u4")
+"""LED, flags, on, trigger delay and period in us: as docs/reference/ledbox-protocol.md has them."""
+RECORD = np.dtype("<u4, <u2, <u2, <u8, <u8, <i2, <u2")
+"""Step, LED, status, times of light and edge in ns, tenths of a degree, mA."""
 
 
 def test_pyvisa_uploads_a_table_starts_it_and_reads_the_log(tmp_path: Path) -> None:
-    steps = table(10)  # its bytes hold LF: led 10 is there
-    steps["led"] = np.arange(1, 11)
+    steps = np.array([(led, 0, 8000, 100, 10_000) for led in range(1, 11)], STEP)  # its bytes hold LF: led 10
     manager = pyvisa.ResourceManager("@py")
     with ledbox_world(tmp_path) as world:
         visa = manager.open_resource(f"ASRL{world.box.port}::INSTR", resource_pyclass=SerialInstrument)
@@ -31,6 +33,6 @@ def test_pyvisa_uploads_a_table_starts_it_and_reads_the_log(tmp_path: Path) -> N
 
         visa.close()
     manager.close()
-    records = np.frombuffer(log, STEP_RECORD_DTYPE)
-    assert records["led"].tolist() == list(range(1, 11))
+    records = np.frombuffer(log, RECORD)
+    assert records["f1"].tolist() == list(range(1, 11))
     assert len(world.edges_ns) == 10

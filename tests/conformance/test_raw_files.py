@@ -110,7 +110,7 @@ def _log_of_a_burst(period_us: int) -> NDArray[np.void]:
     limits = {"rise_us": 1000, "readout_us": float(period_us), "exposure_gap_us": 0}
     table = build_schedule(plan, leds, np.eye(4), **limits).bursts[0][0].table
     log = np.zeros(len(table), STEP_RECORD_DTYPE)
-    log["step"] = np.arange(len(table))
+    log["step"], log["edge_sent"] = np.arange(len(table)), True
     log["t_trigger_ns"] = 10**9 + 1000 * np.cumsum([0, *table["period_us"][:-1].astype(np.int64)])
     log["t_on_ns"] = log["t_trigger_ns"] - 10**6
     return log

@@ -11,11 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from places import REPO
 
-from coupole.devices import FLAG_NO_TRIGGER, NO_LIGHT
+from coupole.devices import NO_LED
 from coupole.geometry import transform
-from coupole.plan.bursts import MARKS, START_MARK_EXTRA, Burst, burst_timing
+from coupole.plan.bursts import Burst, burst_timing
 from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.light_selection import interleave, missing_lights
+from coupole.plan.marks import MARKS, START_MARK_EXTRA
 from coupole.plan.plan import Plan
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.shot_id import Led, ShotLabel
@@ -39,12 +40,15 @@ def plan_of(lights: dict[str, Any] | None = None, **changes: Any) -> Plan:
     return Plan.model_validate(asked | changes)
 
 
-def schedule_of(plan: Plan, leds: LedTable = DOME, readout_us: float = 10_000.0) -> Schedule:
-    return build_schedule(plan, leds, BASE_FROM_SUPPORT, rise_us=1000, readout_us=readout_us, exposure_gap_us=100)
+def schedule_of(
+    plan: Plan, leds: LedTable = DOME, readout_us: float = 10_000.0, *, runs_tables: bool = True
+) -> Schedule:
+    times: dict[str, Any] = {"rise_us": 1000, "readout_us": readout_us, "exposure_gap_us": 100}
+    return build_schedule(plan, leds, BASE_FROM_SUPPORT, **times, runs_tables=runs_tables)
 
 
 def lit_leds(burst: Burst) -> list[int]:
-    return [int(led) for led in burst.table["led"] if led != NO_LIGHT]
+    return [int(led) for led in burst.table["led"] if led != NO_LED]
 
 
 def first_burst(lights: dict[str, Any] | None = None, **changes: Any) -> Burst:
@@ -85,7 +89,7 @@ def test_marks_are_the_dark_frames_that_begin_and_end_a_burst() -> None:
 def test_the_led_of_a_step_is_that_of_its_id() -> None:
     burst = first_burst()
     for led, label in zip(burst.table["led"], burst.labels, strict=True):
-        assert label.light == Led(led) if led != NO_LIGHT else label.is_dark
+        assert label.light == Led(led) if led != NO_LED else label.is_dark
 
 
 def test_all_ids_of_a_plan_differ() -> None:
@@ -98,7 +102,7 @@ def test_all_ids_of_a_plan_differ() -> None:
 
 def test_darks_of_a_view_are_added_to_the_marks() -> None:
     burst = first_burst(darks_per_view=7)
-    assert int(np.sum(burst.table["led"] == NO_LIGHT)) == MARKS + 7
+    assert int(np.sum(burst.table["led"] == NO_LED)) == MARKS + 7
 
 
 def test_repeats_take_no_more_darks_than_their_marks() -> None:
@@ -284,8 +288,33 @@ def test_no_step_of_a_burst_is_shorter_than_the_bursts_period() -> None:
 
 def test_with_software_trigger_no_step_sends_an_edge_and_there_are_no_marks() -> None:
     burst = first_burst(trigger="software", darks_per_view=2)
-    assert np.all(burst.table["flags"] == FLAG_NO_TRIGGER)
+    assert not burst.table["sends_edge"].any()
     assert len(burst.table) == 1080 + 2
+
+
+def by_host(**changes: Any) -> Burst:
+    """The first burst of a plan for a box that runs no tables and keeps no log."""
+    return schedule_of(plan_of(trigger="software", **changes), runs_tables=False).bursts[0][0]
+
+
+def test_without_a_log_a_burst_has_a_dark_mark_at_each_end() -> None:
+    burst = by_host(darks_per_view=2)
+    assert not burst.table["sends_edge"].any()
+    assert len(burst.table) == 1 + 2 + 1080 + 1
+    assert np.flatnonzero(burst.table["led"] == NO_LED).tolist() == [0, 1, 2, 1083]
+    assert [burst.labels[i] for i in (0, 1, 2, -1)] == ["dark0/e0", "dark2/e0", "dark3/e0", "dark1/e0"]
+    assert np.all(burst.table["period_us"] == burst.timing.period_us)
+
+
+def test_the_marks_of_a_panels_burst_have_names_of_their_own() -> None:
+    burst = by_host(lights={"kind": "panels", "panels": [2]})
+    assert burst.labels == ("panel2-mark0/e0", "panel2/e0", "panel2-mark1/e0")
+
+
+def test_a_burst_without_a_log_that_is_shot_again_has_its_marks_anew() -> None:
+    burst = by_host(darks_per_view=0).only({"led0007/e0"})
+    assert burst.labels == ("", "led0007/e0", "")
+    assert burst.table["led"].tolist() == [NO_LED, 7, NO_LED]
 
 
 def assert_legal_for_the_box(table: np.ndarray[Any, Any], edge_width_us: int = 50) -> None:
@@ -293,10 +322,9 @@ def assert_legal_for_the_box(table: np.ndarray[Any, Any], edge_width_us: int = 5
     assert 1 <= len(table) <= 4096
     last_off: dict[int, tuple[int, int]] = {}
     t_on = 0
-    for led, flags, on, delay, period in table.tolist():
-        lit, edge = led != 65535, not flags & 1
-        assert led <= 1079 or not lit
-        assert flags in {0, 1}
+    for led, on, delay, period, edge in table.tolist():
+        lit = led != NO_LED
+        assert -1 <= led <= 1079
         assert (1000 if lit else 0) <= on <= 2_000_000
         assert not (lit and edge) or delay <= on
         assert period >= max(on, 100, delay + edge_width_us if edge else 0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from places import REPO
 
-from coupole.devices import NO_LIGHT
+from coupole.devices import NO_LED
 from coupole.plan.bursts import FASTEST, Pace
 from coupole.plan.rig import BoardThermal, LedLimits
 from coupole.preflight.checking import check_job
@@ -86,5 +86,5 @@ def test_a_job_at_another_pace_has_the_same_shots_without_the_same_hidden_lights
     slower = at_pace(skipping, Pace(disk_us=20_000))
     assert slower.schedule.bursts[0][0].labels == skipping.schedule.bursts[0][0].labels
     lit = slower.schedule.bursts[0][0].table["led"]
-    assert not np.isin(lit[lit != NO_LIGHT], [3, 5]).any()
+    assert not np.isin(lit[lit != NO_LED], [3, 5]).any()
     assert at_pace(slower, FASTEST).schedule.bursts[0][0].duration_s == skipping.schedule.bursts[0][0].duration_s

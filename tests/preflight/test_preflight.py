@@ -13,16 +13,17 @@ import numpy as np
 import pytest
 from places import REPO
 
-from coupole.devices import NO_LIGHT
+from coupole.devices import NO_LED
 from coupole.motion.itinerary import bodies_of, plan_itinerary
-from coupole.plan.bursts import MARKS
 from coupole.plan.led_table import LedTable, read_led_table
+from coupole.plan.marks import MARKS
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
+from coupole.plan.rig_devices import upload_s
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.yamlfile import read
 from coupole.preflight import ledger
-from coupole.preflight.preflight import BURST_OVERHEAD_S, SETTLE_CHECK_S, Report, StorageFacts, check, upload_s
+from coupole.preflight.preflight import BURST_OVERHEAD_S, SETTLE_CHECK_S, Report, StorageFacts, check
 
 ROOT = REPO
 RIG, _ = read(ROOT / "configs/rigs/sim.yaml").problems(Rig)
@@ -211,8 +212,8 @@ def integrated_peak_c(
     for bursts, view in zip(schedule.bursts, report.views, strict=True):
         run(view.move_s, None)
         for burst in bursts:
-            for led, _, on_us, _, period_us in burst.table.tolist():
-                run(on_us / 1e6, None if led == NO_LIGHT else board_of[led])
+            for led, on_us, _, period_us, _ in burst.table.tolist():
+                run(on_us / 1e6, None if led == NO_LED else board_of[led])
                 run((period_us - on_us) / 1e6, None)
     return model.ambient_c + peak
 
@@ -384,7 +385,7 @@ def test_the_duration_is_the_sum_of_moves_upload_bursts_and_overheads() -> None:
     schedule = schedule_of(plan, rig_of(), DOME)
     table_s = sum(int(b.table["period_us"].sum(dtype=np.int64)) for v in schedule.bursts for b in v) / 1e6
     moves_s = sum(view.move_s for view in report.views)
-    upload = max(0.0, upload_s(schedule.bursts[0][0], 115_200) - report.views[0].move_s)
+    upload = max(0.0, upload_s(RIG, len(schedule.bursts[0][0].table)) - report.views[0].move_s)
     others_s = 6 * BURST_OVERHEAD_S + 3 * SETTLE_CHECK_S
     assert sum(view.burst_s for view in report.views) == pytest.approx(table_s)
     assert report.ideal_s == pytest.approx(moves_s + table_s)

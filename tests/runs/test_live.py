@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from cells import CellFolder
 from PIL import Image
+from text_cells import text_cell
 
 
 class Viewer:
@@ -166,6 +167,24 @@ def test_the_cell_is_safe_when_the_live_view_ends(cell: CellFolder) -> None:
         with live(cell.plan, "--led", "500", "--fps", "20") as (viewer, _):
             cells.wait_until(lambda: viewer.figures()["shown"], "the first frame")
         cells.wait_until(lambda: cells.safe(world), "a safe cell")
+
+
+def test_a_cell_without_trigger_cable_is_looked_through_too(tmp_path: Path) -> None:
+    cell = text_cell(tmp_path)
+    cell.join()
+    with cell.world() as world:
+        with live(cell.plan, "--led", "26", "--fps", "5") as (viewer, _):
+            cells.wait_until(lambda: _title(viewer) == "LED 26", "a picture under LED 26")
+            bright = viewer.figures()["shown"]["brightest"]
+            viewer.choose({"led": None})
+            cells.wait_until(lambda: _title(viewer) == "no light", "a dark picture")
+            assert viewer.figures()["shown"]["brightest"] < 0.3 * bright
+        cells.wait_until(lambda: cells.safe(world), "a safe cell")
+
+
+def _title(viewer: Viewer) -> str:
+    shown = viewer.figures()["shown"]
+    return str(shown["title"]) if shown else ""
 
 
 def test_a_run_is_watched_through_its_folder_and_never_slowed(cell: CellFolder) -> None:

@@ -45,6 +45,12 @@ def test_the_committed_dome_is_what_the_tool_writes(tmp_path: Path) -> None:
     assert (tmp_path / "dome.csv").read_bytes() == DOME.read_bytes()
 
 
+def test_the_committed_small_dome_is_what_the_tool_writes(tmp_path: Path) -> None:
+    made = tmp_path / "dome.csv"
+    tool("make_dome.py")["main"](["--output", str(made), "--boards", "64", "--rows", "1", "--columns", "1"])
+    assert made.read_bytes() == (ROOT / "configs/domes/text-dome.csv").read_bytes()
+
+
 def test_the_committed_relief_is_what_the_tool_writes(tmp_path: Path) -> None:
     tool("make_relief.py")["main"](["--output", str(tmp_path / "relief.ply")])
     assert (tmp_path / "relief.ply").read_bytes() == RELIEF.read_bytes()

@@ -19,6 +19,7 @@ from coupole.plan.shot_id import Led, ShotId
 from coupole.storage import frame_file
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run, sha256
+from coupole.storage.step_fields import temperature_range_c
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def find_leds(
     inputs = [(f"{run.folder.name}/run.json", sha256(run.folder / "run.json")) for run in runs]
     about: About | None = None
     size_px: tuple[int, int] | None = None
-    temperatures: list[float] = []
+    lit_records: list[np.void] = []
     done = 0
     for run, view, proven in work:
         path = run.view_path(view)
@@ -103,7 +104,7 @@ def find_leds(
             views.append(view if len(runs) == 1 else f"{run.folder.name}/{view}")
             poses.append(np.array(reported[pose]["base_from_flange"], dtype=np.float64))
             joints.append(np.array(reported[pose]["joints_deg"], dtype=np.float64))
-        temperatures += (records["board_temperature_dc"][[f.frame.index for f in lit]] / 10.0).tolist()
+        lit_records += [records[f.frame.index] for f in lit]
         facts, darks = frame_file.read_facts(path), _darks(path, layout, proven, records)
         for frame in lit:
             pixels = frame_file.read_frame(path, layout, frame.frame.index)
@@ -127,7 +128,7 @@ def find_leds(
         tuple(collected.left_out),
         replace(
             about,
-            temperature_c=(min(temperatures), max(temperatures)),
+            temperature_c=temperature_range_c(lit_records),
             begun=max(run.created for run in runs),
         ),
         tuple(inputs),

@@ -1,0 +1,174 @@
+"""A burst that the host fires, light by light, with any box and any camera that takes a software trigger.
+
+**Proof.** A frame is a light's if it is the only one that was exposed, and it was taken wholly while that light
+shone. The camera is armed in the dark, the light is switched on, and when the box has confirmed it the camera is
+triggered; the light must shine still, without a break, when the frame has come. Of a box that keeps no log
+(`Burst.marks` is `plain`) that is known by the host's clock and the box's word alone, and an LED that does not go
+out would shine into every frame after its own. So dark frames stand as marks at both ends, and until both have
+been seen to be dark no frame of the burst is proven.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.acquisition.arm_supervisor import ArmSupervisor
+from coupole.acquisition.opened_cell import OpenedCell
+from coupole.acquisition.recorder import Recorder
+from coupole.acquisition.verdict import NOTHING_TO_MATCH, Verdict
+from coupole.devices import (
+    STEP_RECORD_DTYPE,
+    UNKNOWN_NS,
+    Frame,
+    FrameFormat,
+    StepRecord,
+    record_array,
+)
+from coupole.plan.bursts import Burst
+from coupole.plan.shot_id import ShotId
+from coupole.storage.step_fields import step_fields
+
+_ONE_SHOT_BUFFERS = 8
+_UNCOUNTED = -1
+"""A camera that does not count its exposures: no other frame came while the light shone, which must do."""
+DARK_QUANTILE, DARK_SHARE = 0.99, 0.02
+"""A mark is dark if this share of its pixels is less than this share of the camera's range above black. Noise
+stays far below it; of an LED that lights a hundredth of the picture, whatever reaches it shows in that light."""
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """One light and what the camera made of it."""
+
+    frame: Frame | None
+    record: StepRecord
+    alone: bool
+    """The frame is the only one, and came while the light shone without a break."""
+    t_trigger_ns: int
+    """When the camera was triggered, on the box's clock, or on the host's where the box has none."""
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A frame that stands in its slot until the burst's marks have been seen."""
+
+    slot: int
+    shot: ShotId
+    fields: dict[str, int]
+
+
+class HostBurst:
+    """Fires bursts without `hardware`. `tell(burst, step)` is called as it goes, `note` writes a burst's line."""
+
+    def __init__(
+        self,
+        cell: OpenedCell,
+        recorder: Recorder,
+        arm: ArmSupervisor,
+        tell: Callable[[Burst, int], None],
+        wait_while_paused: Callable[[], None],
+        note: Callable[..., None],
+    ) -> None:
+        self._cell, self._recorder, self._arm = cell, recorder, arm
+        self._tell, self._wait_while_paused, self._note = tell, wait_while_paused, note
+
+    def fire(self, burst: Burst, frame_format: FrameFormat) -> Verdict:
+        """Light after light; whatever happens, note what light was given. Raises ArmMovedError."""
+        logs: list[NDArray[np.void]] = []
+        dead: list[ShotId] = []
+        kept: list[_Kept] = []
+        marks = set(range(len(burst.labels))) - set(burst.inner)
+        reason = ""
+        arm_before, arm_after = self._cell.robot.measured(), None
+        try:
+            for index, shot in enumerate(burst.shots):
+                self._arm.attend()
+                self._wait_while_paused()
+                taken = self._fire_one(burst, index)
+                logs.append(record_array(taken.record))
+                if shot is not None and taken.record.invalid_exposure:
+                    dead.append(shot)
+                arm_after = None
+                arm_after = self._arm.await_news()
+                if taken.frame is not None:
+                    if index in marks and taken.alone:
+                        marks.remove(index)
+                        reason = reason or too_bright(taken.frame, frame_format)
+                    kept += self._keep(taken, taken.frame, burst, shot)
+                if burst.marks == "none":
+                    self._prove(kept)
+                self._tell(burst, index)
+                self._recorder.commit(now=False)
+            reason = reason or ("a dark mark was not seen" if marks else "")
+            if not reason:
+                self._prove(kept)
+        finally:
+            for one in kept:
+                self._recorder.free(one.slot)
+            log = np.concatenate([np.zeros(0, STEP_RECORD_DTYPE), *logs])
+            self._note(burst, log, arm_before, arm_after, frames=len(log))
+        return Verdict(replace(NOTHING_TO_MATCH, reason=reason), dead)
+
+    def _keep(self, taken: _Taken, frame: Frame, burst: Burst, shot: ShotId | None) -> list[_Kept]:
+        """The frame, stored but not proven yet; nothing if it can prove nothing."""
+        if shot is None or not taken.alone or taken.record.invalid_exposure:
+            frame.release()
+            return []
+        slot = self._recorder.put(frame, burst.timing.exposure_us)
+        frame.release()
+        return [_Kept(slot, shot, step_fields(taken.record, taken.t_trigger_ns))]
+
+    def _prove(self, kept: list[_Kept]) -> None:
+        while kept:
+            one = kept.pop(0)
+            self._recorder.prove(one.slot, one.shot, one.fields)
+
+    def _fire_one(self, burst: Burst, index: int) -> _Taken:
+        """Light one step, trigger the camera, see the light end, and keep the burst's pace."""
+        box, camera, clock = self._cell.ledbox, self._cell.camera, self._cell.clock
+        step, timing = burst.table[index], burst.timing
+        camera.arm(_ONE_SHOT_BUFFERS)
+        try:
+            if burst.panel and index in burst.inner:
+                box.panel(burst.panel, True)
+            started_ns = clock.now_ns()
+            box.flash(int(step["led"]), int(step["on_us"]))
+            clock.sleep(timing.trigger_delay_us * 1e-6)
+            t_trigger_ns = clock.now_ns()
+            camera.trigger()
+            frame = camera.next_frame(timing.on_us * 1e-6 + camera.delivery_s)
+            alone = box.lit() and self._alone()
+            record = box.end_flash()
+        finally:
+            box.lights_off()
+            camera.disarm()
+        clock.sleep(max(0.0, timing.period_us * 1e-6 - (clock.now_ns() - started_ns) / 1e9))
+        if record.t_on_ns != UNKNOWN_NS:
+            t_trigger_ns = record.t_on_ns + timing.trigger_delay_us * 1000
+        return _Taken(frame, record, alone, t_trigger_ns)
+
+    def _alone(self) -> bool:
+        """No exposure but one since the camera was armed."""
+        exposed = self._cell.camera.statistics().exposed
+        if exposed != _UNCOUNTED:
+            return exposed == 1
+        other = self._cell.camera.next_frame(0.0)
+        if other is not None:
+            other.release()
+        return other is None
+
+
+def too_bright(frame: Frame, frame_format: FrameFormat) -> str:
+    """Why a mark's frame is not dark; empty if it is, or if it holds no picture (in a rehearsal)."""
+    if not frame.rendered:
+        return ""
+    black_dn, white_dn = frame_format.black_dn, frame_format.white_dn
+    limit_dn = black_dn + DARK_SHARE * (white_dn - black_dn)
+    bright_dn = float(np.quantile(frame.pixels, DARK_QUANTILE))
+    if bright_dn < limit_dn:
+        return ""
+    return f"a dark mark shows light ({bright_dn:.0f} DN, {limit_dn:.0f} at most): a lamp shines that should not"

@@ -1,0 +1,32 @@
+"""What is said of one burst after its end, and what that rests on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coupole.acquisition.frame_matching import Match
+from coupole.plan.marks import Marks
+from coupole.plan.shot_id import ShotId
+
+PROOF_BY: dict[Marks, str] = {
+    "coded": "box log and camera counters",
+    "none": "one light, one exposure, one frame; box log",
+    "plain": "one light, one exposure, one frame; host's clock",
+}
+"""What a run says of its proof, by the marks of its bursts; from the strongest to the weakest
+(docs/reference/run-folder.md)."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Of one burst, after its end."""
+
+    match: Match
+    dead: list[ShotId]
+    """Shots whose LED drew no current."""
+
+
+_NONE = np.zeros(0, np.int64)
+NOTHING_TO_MATCH = Match(_NONE, _NONE > 0, _NONE > 0, _NONE > 0, ambiguous=False, reason="", clocks=None)

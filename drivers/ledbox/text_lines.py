@@ -1,0 +1,339 @@
+"""An LED box that knows nothing but lines of text: a dome that somebody built round a microcontroller.
+
+Each command is a line made from a template of the rig, and the box answers each with one line, or with none. Such
+a box has no table, no log, no clock and no watchdog. So light is bounded here: a thread of the driver ends each
+flash in time, whatever its caller does, and everything is switched off at opening, at closing, after any failure.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import string
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal, NoReturn, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from coupole.devices import NO_LED, UNKNOWN_NS, Clock, Deadline, Identity, StepRecord
+from coupole.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.ledbox.serial_link import SerialLink, open_serial
+
+_REPLY_MARGIN_S = 2.0
+"""What a box may take to answer, the bytes' own time apart."""
+_SHORT_REPLY_BYTES, _LONGEST_REPLY_BYTES = 100, 1000
+_LOOK_S = 0.001
+"""Machine time between two looks at the rig's clock while a light shines."""
+_ENDINGS = {"lf": "\n", "crlf": "\r\n", "cr": "\r"}
+_FIELDS: dict[str, tuple[frozenset[str], frozenset[str]]] = {
+    "on": (frozenset({"led"}), frozenset({"led", "on_ms"})),
+    "off": (frozenset({"led"}), frozenset({"led"})),
+    "all_off": (frozenset(), frozenset()),
+    "identify": (frozenset(), frozenset()),
+}
+"""Of each template the fields that it must have, and those that it may have."""
+
+
+class Settings(BaseModel):
+    """Settings of such a box in a rig. Templates are Python's format strings."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    port: str
+    """A pyserial URL: `/dev/ttyACM0`, `COM3`, `socket://host:port`, `rfc2217://host:port`."""
+    baud: int = Field(default=115200, ge=300)
+    led_count: int = Field(ge=1, le=65535)
+    """LEDs that the box has; Coupole numbers them from 0."""
+    first_led: int = Field(default=0, ge=0)
+    """The box's own number of LED 0: 1 for a box that counts from 1."""
+    on: str = "LED {led} ON"
+    """Lights one LED. `{on_ms}` may stand in it for a time after which the box ends the light by itself."""
+    off: str | None = "LED {led} OFF"
+    """Ends one LED's light; none for a box that knows `all_off` alone."""
+    all_off: str = "ALL OFF"
+    identify: str | None = None
+    """Makes the box say who it is, in one line; none for a box that does not know."""
+    expected_reply: str | None = "OK"
+    """The whole line with which the box confirms that it has obeyed; none for a box that says nothing."""
+    line_ending: Literal["lf", "crlf", "cr"] = "lf"
+    """Of commands. A reply ends in LF, or in CR where commands do."""
+    settle_ms: float = Field(default=2000, ge=0, le=60_000)
+    """From opening the port until the box listens: many microcontrollers start anew when it is opened."""
+    obeys_ms: float = Field(default=50, ge=0, le=10_000)
+    """Time in which a box that says nothing has obeyed a command that reached it."""
+    name: str = "led box"
+
+    @model_validator(mode="after")
+    def _templates_are_right(self) -> Self:
+        for name in _FIELDS:
+            template = getattr(self, name)
+            if template is not None:
+                _check_template(name, template)
+        return self
+
+
+def _check_template(name: str, template: str) -> None:
+    """Raise ValueError for a template that does not make one line of ASCII of the fields that it may have."""
+    must, may = _FIELDS[name]
+    try:
+        found = {
+            field_name for _, field_name, _, _ in string.Formatter().parse(template) if field_name is not None
+        }
+        if missing := must - found:
+            raise ValueError(f"it lacks {{{min(missing)}}}")
+        if unknown := found - may:
+            allowed = ", ".join(f"{{{one}}}" for one in sorted(may)) or "no field"
+            raise ValueError(f"it has {{{min(unknown)}}}; allowed: {allowed}")
+        line = template.format(led=0, on_ms=1)
+    except (ValueError, IndexError, KeyError) as error:
+        raise ValueError(f"`{name}`: `{template}` is no template of a command: {error}") from error
+    if not line.isascii() or not line.isprintable() or not line:
+        raise ValueError(f"`{name}`: expected one line of printable ASCII, found {line!r}")
+
+
+@dataclass
+class _Flash:
+    """A light that was asked for."""
+
+    led: int
+    sent_ns: int
+    """When its command was sent, on the rig's clock: it cannot have shone earlier."""
+    deadline: Deadline
+    ended: threading.Event = field(default_factory=threading.Event)
+    """Set before the command that ends the light is sent."""
+    off_ns: int | None = None
+    """When the box confirmed that; None until then."""
+    failure: DeviceError | None = None
+    """Why the driver's own thread could not end it."""
+
+
+class TextLineBox:
+    """The box: a `coupole.devices.LedBox`.
+
+    Each call may raise DeviceTimeout, DeviceLost, or DeviceRefused, which quotes the box.
+    """
+
+    runs_tables = False
+    panel_count = 0
+
+    def __init__(self, settings: Settings, clock: Clock) -> None:
+        self._settings, self._clock = settings, clock
+        self.led_count = settings.led_count
+        self._lock = threading.RLock()
+        self._flash: _Flash | None = None
+        self._in_step = False
+        """What comes next from the box is the answer to what is sent next."""
+        self._link: SerialLink = open_serial(settings.name, settings.port, settings.baud, clock)
+        try:
+            clock.sleep(settings.settle_ms * 1e-3)
+            self.lights_off()
+            self._identity = self._greet()
+        except BaseException:
+            self.close()
+            raise
+
+    def identify(self) -> Identity:
+        return self._identity
+
+    def self_test(self) -> Mapping[str, str]:
+        """What is known of it; raises if it does not obey."""
+        self.lights_off()
+        reply = self._settings.expected_reply
+        return {"LEDs": str(self.led_count), "confirms": "nothing" if reply is None else f"with `{reply}`"}
+
+    def flash(self, led: int, on_us: int) -> None:
+        """Light an LED. Where the box says nothing, it is taken to have obeyed after `obeys_ms`."""
+        if led != NO_LED and not 0 <= led < self.led_count:
+            self._refuse(
+                f"an LED from 0 to {self.led_count - 1}", f"{led} was asked for", "Correct the LED table."
+            )
+        on_ms = math.ceil(on_us * 1.5e-3) + 100  # for the box's own clock: only if the host is gone
+        with self._lock:
+            try:
+                self._end()
+                sent_ns = self._clock.now_ns()
+                if led != NO_LED:
+                    self._command(self._settings.on.format(led=led + self._settings.first_led, on_ms=on_ms))
+                self._flash = _Flash(led, sent_ns, Deadline(self._clock, on_us * 1e-6))
+                threading.Thread(target=self._watch, args=(self._flash,), name="led box", daemon=True).start()
+            except BaseException:
+                self._darken_somehow()
+                raise
+
+    def lit(self) -> bool:
+        """Past its time a light is not believed, though the thread that is to end it may be late: the box may have
+        ended it by itself."""
+        flash = self._flash
+        return flash is not None and not flash.ended.is_set() and not flash.deadline.expired
+
+    def end_flash(self) -> StepRecord:
+        """End the light now, if its time has not ended it. `on_us` runs from the command to the box's word."""
+        flash = self._flash
+        if flash is None:
+            self._refuse("a flash to end", "none was begun", "This is a fault of the program that drives the box.")
+        with self._lock:
+            self._end()
+            if flash.failure is not None:
+                raise flash.failure
+            if flash.off_ns is None:  # lights_off() failed
+                self.lights_off()
+        assert flash.off_ns is not None
+        return StepRecord(
+            step=0,
+            led=flash.led,
+            edge_sent=False,
+            led_open=False,
+            over_temperature=False,
+            waited=False,
+            on_us=0.0 if flash.led == NO_LED else (flash.off_ns - flash.sent_ns) / 1e3,
+            t_on_ns=UNKNOWN_NS,
+            t_trigger_ns=UNKNOWN_NS,
+            board_temperature_c=math.nan,
+            led_current_ma=math.nan,
+        )
+
+    def lights_off(self) -> None:
+        """All off, confirmed by the box; raises only after a second try, which a box understands that had half a
+        line from before on its hands."""
+        with self._lock:
+            if self._flash is not None:
+                self._flash.ended.set()
+            try:
+                self._command(self._settings.all_off)
+            except (DeviceTimeout, DeviceRefused):
+                self._command(self._settings.all_off)
+            if self._flash is not None and self._flash.off_ns is None:
+                self._flash.off_ns = self._clock.now_ns()
+
+    def panel(self, panel: int, on: bool) -> None:
+        self._refuse("a panel that the box has", f"panel {panel} was asked for, it has none", "Leave panels out.")
+
+    def board_temperature_c(self, board: int) -> float | None:
+        return None
+
+    def close(self) -> None:
+        """Lights off if the box still listens; never raises for a link that is dead."""
+        self._darken_somehow()
+        self._link.close()
+
+    # How a light ends.
+
+    def _watch(self, flash: _Flash) -> None:
+        """End a flash when its time is over. Runs on a thread of its own."""
+        while not flash.deadline.expired:
+            if flash.ended.wait(_LOOK_S):
+                return
+        with self._lock:
+            if not flash.ended.is_set():
+                with contextlib.suppress(DeviceError):  # in flash.failure, for the caller
+                    self._end()
+
+    def _end(self) -> None:
+        """End the present flash, if it has not ended."""
+        flash = self._flash
+        if flash is None or flash.ended.is_set():
+            return
+        flash.ended.set()
+        try:
+            if flash.led != NO_LED:
+                settings = self._settings
+                self._command((settings.off or settings.all_off).format(led=flash.led + settings.first_led))
+            flash.off_ns = self._clock.now_ns()
+        except DeviceError as error:
+            flash.failure = error
+            self._darken_somehow()
+            raise
+
+    def _darken_somehow(self) -> None:
+        """All off, if the box still listens."""
+        with contextlib.suppress(DeviceError):
+            self.lights_off()
+
+    # Lines.
+
+    def _greet(self) -> Identity:
+        """What the box says of itself: `vendor,model,serial,firmware`, or other words, its model."""
+        if self._settings.identify is None:
+            return Identity("unknown", "box of text lines", "unknown", "unknown")
+        text = self._exchange(self._settings.identify, answers=True)
+        fields = [one.strip() for one in text.split(",")]
+        vendor, model, serial, firmware = fields if len(fields) == 4 else ("unknown", text, "unknown", "unknown")
+        return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
+
+    def _command(self, line: str) -> None:
+        """Have a command obeyed. Raises DeviceRefused if the box says anything but that it was."""
+        expected = self._settings.expected_reply
+        reply = self._exchange(line, answers=expected is not None)
+        if expected is not None and reply != expected:
+            self._in_step = False
+            self._refuse(f"`{expected}` in answer to `{line}`", f"it said `{reply}`", "See to what the box says.")
+
+    def _exchange(self, line: str, *, answers: bool) -> str:
+        """Send a line and return the box's answer without its ending, empty if it gives none."""
+        settings, link = self._settings, self._link
+        data = (line + _ENDINGS[settings.line_ending]).encode("ascii")
+        seconds = _REPLY_MARGIN_S + (len(data) + _SHORT_REPLY_BYTES) / link.bytes_per_s
+        try:
+            if not self._in_step:
+                link.clear()
+            elif (unasked := link.waiting().strip()) and settings.expected_reply is not None:
+                self._in_step = False
+                self._refuse(
+                    f"silence before `{line}`",
+                    f"the box said `{_shown(unasked)}` unasked",
+                    "See whether it started anew, and whether it answers each command with one line.",
+                )
+            self._in_step = False
+            deadline = Deadline(self._clock, seconds)
+            link.write(data, deadline)
+            if not answers:
+                self._clock.sleep(len(data) / link.bytes_per_s + settings.obeys_ms * 1e-3)
+            reply = read_reply(lambda: link.read(deadline), settings.line_ending) if answers else ""
+            self._in_step = True
+        except TimeoutError as error:
+            raise DeviceTimeout(
+                settings.name,
+                expected=f"an answer to `{line}` within {seconds:.2f} s",
+                happened=str(error),
+                remedy=f"See that the box at {settings.port} has power and the rig's baud rate, then resume.",
+            ) from error
+        except ConnectionError as error:
+            raise DeviceLost(
+                settings.name,
+                expected=f"an answer to `{line}`",
+                happened=str(error),
+                remedy=f"Check the cable at {settings.port} and the box's power, then resume.",
+            ) from error
+        except ValueError as error:
+            self._refuse(f"one line in answer to `{line}`", str(error), "Make the box answer with one short line.")
+        return reply
+
+    def _refuse(self, expected: str, happened: str, remedy: str) -> NoReturn:
+        raise DeviceRefused(self._settings.name, expected=expected, happened=happened, remedy=remedy)
+
+
+def read_reply(read: Callable[[], bytes], line_ending: str) -> str:
+    """One line of a box's reply, without its ending, from `read`, which gives the next bytes each time.
+
+    Raises ValueError for a line too long, and for bytes behind it; TimeoutError, with what came, as `read` does.
+    """
+    ending = b"\r" if line_ending == "cr" else b"\n"
+    data = b""
+    while ending not in data:
+        if len(data) > _LONGEST_REPLY_BYTES:
+            raise ValueError(f"{len(data)} bytes came without an end: `{_shown(data[:40])}`...")
+        try:
+            data += read()
+        except TimeoutError as error:
+            raise TimeoutError(f"only `{_shown(data)}` came" if data else str(error)) from error
+    line, _, rest = data.partition(ending)
+    if rest.strip():
+        raise ValueError(f"it said `{_shown(data)}`")
+    return _shown(line.strip())
+
+
+def _shown(data: bytes) -> str:
+    """The box's words, as far as they can be printed."""
+    return data.decode("ascii", "backslashreplace").replace("\r", "\\r").replace("\n", "\\n")

@@ -1,0 +1,89 @@
+"""The LED box's stand-in, whichever it is: what the world asks of it, and how a rig's choice is built."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any, Protocol
+
+from pydantic import Discriminator, Tag
+
+from sim.devices import ledbox_firmware, text_box
+from sim.devices.camera_stand_in import CameraStandIn
+from sim.world import faults
+from sim.world.lighting import Lighting
+from sim.world.reactor import Reactor
+
+
+def _kind(settings: Any) -> str:
+    """Which stand-in these settings are for; the box that speaks SCPI where they do not say."""
+    return str(settings.get("kind", "scpi") if isinstance(settings, dict) else settings.kind)
+
+
+LedBoxSettings = Annotated[
+    Annotated[ledbox_firmware.Settings, Tag("scpi")] | Annotated[text_box.Settings, Tag("text")],
+    Discriminator(_kind),
+]
+
+
+class LedBoxStandIn(Protocol):
+    """All methods are called on the reactor's thread. Each kind has more of its own: see `impossible`."""
+
+    port: str
+    """What a client opens."""
+
+    def temperature_of_led_c(self, led: int) -> float: ...
+
+    def mute(self) -> None:
+        """It neither hears nor answers any more."""
+        ...
+
+    def unplug(self) -> None:
+        """Its cable to the host is pulled."""
+        ...
+
+    def kill_led(self, led: int) -> None:
+        """The LED gives no light any more."""
+        ...
+
+    def close(self) -> None: ...
+
+
+_EDGE_FAULTS = (faults.DropTrigger, faults.DoubleTrigger, faults.OverTemperature)
+
+
+def impossible(fault: faults.Fault, settings: LedBoxSettings) -> str:
+    """Why this stand-in cannot have the fault; empty if it can."""
+    if settings.kind == "text":
+        if isinstance(fault, _EDGE_FAULTS):
+            return (
+                f"`{fault.kind}` cannot happen to an LED box of kind `text`: it sends no edges and feels no heat"
+            )
+        if isinstance(fault, faults.When) and fault.at_edge is not None:
+            return "`at_edge`: an LED box of kind `text` sends no edges. Use `at_s`"
+    elif isinstance(fault, faults.StuckLed):
+        return f"`{fault.kind}` cannot happen to an LED box of kind `{settings.kind}`: it switches all current off"
+    return ""
+
+
+def build(
+    reactor: Reactor,
+    settings: LedBoxSettings,
+    *,
+    camera: CameraStandIn,
+    lighting: Lighting,
+    on_light: Callable[[int, int, int], None],
+) -> LedBoxStandIn:
+    """The stand-in, wired to the trigger cable and to what it lights."""
+    match settings:
+        case ledbox_firmware.Settings():
+            return ledbox_firmware.LedBoxFirmware(
+                reactor,
+                settings,
+                on_edge=camera.edge,
+                on_light=on_light,
+                on_dark=lighting.dark,
+                on_panel=lighting.panel,
+                ready=camera.ready,
+            )
+        case text_box.Settings():
+            return text_box.TextBox(reactor, settings, on_light=on_light, on_dark=lighting.darken_one)

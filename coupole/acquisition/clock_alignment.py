@@ -108,8 +108,8 @@ def _misfit(box_ns, excess_ns, left_out, jitter_ns, triple):  # type: ignore[no-
 
 @numba.njit(cache=True, nogil=True)
 def _leave_out(frame_ns, step_ns, view, may_leave_out, jitter_ns):  # type: ignore[no-untyped-def]  # noqa: PLR0912
-    """Mark as DOUBTFUL in `view` the frames that some solution leaves out so that the others fit one line; False if
-    there is no solution that leaves out `may_leave_out` frames or fewer."""
+    """Mark as DOUBTFUL in `view` the frames that some solution leaves out so that the others fit one line; False
+    if no solution leaves out `may_leave_out` frames or fewer."""
     n_frames = len(view)
     frames = np.empty(n_frames, np.int64)
     n = 0

@@ -8,8 +8,8 @@ equally well and are distinguished by the coded dark marks (`coupole.plan.shots`
 **Fault model.** Any number of frames may be missing (lost in transfer, trigger missed, at the start, at the
 end, anywhere). At most `max_surplus` frames of a burst were fired by something other than a step (a bounce, an
 interference); one that starts within twice the jitter of an edge whose own frame is missing gets that step's
-label, and was exposed under that step's light. Timestamps deviate from their edges by at most `jitter_us`, clocks from each other by at
-most `drift_ppm`, and steadily.
+label, and was exposed under that step's light. Timestamps deviate from their edges by at most `jitter_us`; the
+clocks drift apart steadily, by at most `drift_ppm`.
 
 **Proof.** Under that model the true alignment leaves at most `max_surplus` frames unexplained. So it is among
 the hypotheses that do, the *candidates*; and a label on which all candidates agree is true. Frames on which

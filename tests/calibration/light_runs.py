@@ -12,11 +12,12 @@ from archives import METADATA
 from numpy.typing import NDArray
 
 from coupole.devices import ArmState, FrameFormat
-from coupole.storage import frame_file
-from coupole.storage.frame_file import ViewWriter
+from coupole.plan.shot_id import ShotId
+from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
 from coupole.storage.run import Inputs, Run
+from coupole.storage.view_writer import ViewWriter
 
 SIZE_PX = (128, 96)
 FORMAT = FrameFormat(
@@ -42,17 +43,17 @@ def write_light_run(folder: Path, frames: Sequence[Taken]) -> Path:
     folder.mkdir(parents=True)
     for name in ("plan.yaml", "rig.yaml"):
         (folder / name).write_text(f"# {name}\n")
-    views = list(dict.fromkeys(frame.shot.view for frame in frames))
+    views = list(dict.fromkeys(ShotId.parse(frame.shot).view for frame in frames))
     labels = list(dict.fromkeys(frame.shot.split("/", 1)[1] for frame in frames))
     about = {"views": views, "labels": labels, "simulated": True}
     run = Run.create(folder, "light", Inputs(folder / "plan.yaml", folder / "rig.yaml", ()), about)
     diary = Journal(run.journal_path)
     diary.write(SessionStarted())
     for view in views:
-        mine = [frame for frame in frames if frame.shot.view == view]
+        mine = [frame for frame in frames if ShotId.parse(frame.shot).view == view]
         path = run.view_path(view)
         metadata = {**METADATA, "title": view, "focus_distance_mm": 335.0, "pixel_pitch_um": PITCH_UM}
-        frame_file.create(path, len(mine), FORMAT, metadata)
+        create(path, len(mine), FORMAT, metadata)
         writer = ViewWriter(path, {})
         arm = ArmState((0, -90, 90, 0, 90, 0), np.eye(4), 7, moving=False)
         pose = writer.add_pose(arm, mine[0].base_from_camera)

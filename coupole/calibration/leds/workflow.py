@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import h5py
@@ -67,6 +67,77 @@ def leds_from(
         poses, prior = calibrated_poses(images.base_from_flange, images.joints_deg, arm, prior)
         images = replace(images, base_from_flange=poses)
     boards = boards_of(table)
+    matching = _matched(images, table, boards, prior, stated)
+    sightings = matching.sightings.only(np.flatnonzero(matching.place_of[matching.sightings.led] >= 0))
+    place = matching.place_of[sightings.led]
+    start = placed(boards, matching.by_place_mm)
+    geometry = adjust_leds(sightings, place, images.base_from_flange, boards, start, prior, stated)
+    leds = _in_table_order(geometry, matching, boards)
+    new_table = LedTable(
+        table.ids,
+        table.boards[leds.place],
+        geometry.centres_mm[leds.place],
+        geometry.normals[boards.board_of[leds.place]],
+        table.flux_lm,
+    )
+    files = {
+        f"{request.name}.csv": led_csv(new_table, request.name).encode("ascii"),
+        f"{request.name}.h5": _h5(geometry, matching, boards, leds.place, place, len(table.ids)),
+    }
+    limits = judged(LEDS, request.limits, _figures(geometry, leds.found, leds.u_mm, leds.u_deg))
+    faults = (*matching.faults, *_moved_boards(boards, geometry, place))
+    record = _record(
+        images,
+        request,
+        geometry,
+        leds,
+        stated,
+        files=files,
+        lines=_views(images.views, sightings.view, geometry),
+        limits=limits,
+        remarks=(
+            *fault_lines(faults),
+            *_of_records(geometry, prior, limits),
+            *_of_spots(images.left_out),
+            *_of_the_arm(arm),
+        ),
+    )
+    return LedsFound(
+        record,
+        files,
+        table,
+        new_table,
+        geometry,
+        matching,
+        np.where(leds.found, leds.u_mm, np.nan),
+        np.where(leds.found, leds.u_deg, np.nan),
+        _view_errors(geometry, images.base_from_flange),
+    )
+
+
+@dataclass(frozen=True)
+class _InTableOrder:
+    """The dome's LEDs by row of the table [n]."""
+
+    found: NDArray[np.bool_]
+    place: NDArray[np.intp]
+    """Place on the boards at which the LED was found; that of its row where it was not found."""
+    u_mm: Floats
+    """Standard uncertainty of the centre at that place."""
+    u_deg: Floats
+    """And of the normal."""
+
+
+def _in_table_order(geometry: LedGeometry, matching: Matching, boards: Boards) -> _InTableOrder:
+    found = matching.place_of >= 0
+    place = np.where(found, matching.place_of, np.arange(len(found)))
+    u_mm = np.sqrt(np.trace(geometry.centre_covariance, axis1=1, axis2=2))
+    u_deg = np.sqrt(np.trace(geometry.normal_covariance, axis1=1, axis2=2))[boards.board_of]
+    return _InTableOrder(found, place, u_mm[place], u_deg[place])
+
+
+def _matched(images: LedImages, table: LedTable, boards: Boards, prior: CameraPrior, stated: Stated) -> Matching:
+    """Spots assigned to LEDs. Raises InputError if no spot belongs to a place of the table."""
     base_from_camera = images.base_from_flange @ prior.flange_from_camera
     matching = match_leds(
         images.seen,
@@ -76,69 +147,44 @@ def leds_from(
         boards,
         tolerance_px=tolerance_px(prior, stated, table, base_from_camera),
     )
-    used = np.flatnonzero(matching.place_of[matching.sightings.led] >= 0)
-    if not len(used):
+    if not np.any(matching.place_of[matching.sightings.led] >= 0):
         lines = "\n".join(fault_lines(matching.faults)[:5])
         raise InputError(f"LEDs: none was found near its place of the table:\n{lines}")
-    sightings = matching.sightings.only(used)
-    place = matching.place_of[sightings.led]
-    start = placed(boards, matching.by_place_mm)
-    geometry = adjust_leds(sightings, place, images.base_from_flange, boards, start, prior, stated)
-    faults = (*matching.faults, *_moved_boards(boards, geometry, place))
-    u_mm = np.sqrt(np.trace(geometry.centre_covariance, axis1=1, axis2=2))
-    u_deg = np.sqrt(np.trace(geometry.normal_covariance, axis1=1, axis2=2))[boards.board_of]
-    found = matching.place_of >= 0
-    where = np.where(found, matching.place_of, np.arange(len(table.ids)))
-    new_table = LedTable(
-        table.ids,
-        table.boards[where],
-        geometry.centres_mm[where],
-        geometry.normals[boards.board_of[where]],
-        table.flux_lm,
-    )
-    files = {
-        f"{request.name}.csv": led_csv(new_table, request.name).encode("ascii"),
-        f"{request.name}.h5": _h5(geometry, matching, boards, where, place, len(table.ids)),
-    }
-    views = len(images.base_from_flange)
-    limits = judged(LEDS, request.limits, _figures(geometry, found, u_mm[where], u_deg[where]))
-    record = sealed(
+    return matching
+
+
+def _record(
+    images: LedImages,
+    request: Request,
+    geometry: LedGeometry,
+    leds: _InTableOrder,
+    stated: Stated,
+    *,
+    files: Mapping[str, bytes],
+    lines: tuple[ImageResidual, ...],
+    limits: Sequence[Limit],
+    remarks: tuple[str, ...],
+) -> Record:
+    median_u_mm, median_u_deg = float(np.median(leds.u_mm[leds.found])), float(np.median(leds.u_deg[leds.found]))
+    return sealed(
         kind="leds",
         **request.head(),
         simulated=images.about.simulated,
         validity=Validity(expires=request.expires),
         transforms={},
-        **_parameters(
-            geometry, stated, float(np.median(u_mm[where][found])), float(np.median(u_deg[where][found]))
-        ),
+        **_parameters(geometry, stated, median_u_mm, median_u_deg),
         fixed={
-            "leds": float(len(table.ids)),
-            "leds_found": float(found.sum()),
-            "views": float(views),
+            "leds": float(len(leds.found)),
+            "leds_found": float(leds.found.sum()),
+            "views": float(len(images.base_from_flange)),
             "images": float(len(images.seen.frames)),
         },
         files=tuple(Input(name=name, sha256=hashlib.sha256(data).hexdigest()) for name, data in files.items()),
         noise=_noise(geometry, stated),
-        images=_views(images.views, sightings.view, geometry),
+        images=lines,
         limits=limits,
-        remarks=(
-            *fault_lines(faults),
-            *_of_records(geometry, prior, limits),
-            *_of_spots(images.left_out),
-            *_of_the_arm(arm),
-        ),
+        remarks=remarks,
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in images.inputs),
-    )
-    return LedsFound(
-        record,
-        files,
-        table,
-        new_table,
-        geometry,
-        matching,
-        np.where(found, u_mm[where], np.nan),
-        np.where(found, u_deg[where], np.nan),
-        _view_errors(geometry, images.base_from_flange),
     )
 
 

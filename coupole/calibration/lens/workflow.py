@@ -94,16 +94,7 @@ def camera_from(found: Found, sources: Sources, model: str, request: Request) ->
         images=image_lines(kept, residuals, fit.sightings),
         **content_of(found, sources, request),
     )
-    shown = Shown(
-        record,
-        found.size_px,
-        tuple(s.name for s in kept),
-        tuple(s.pixels for s in kept),
-        residuals,
-        fit.sigma_px,
-        None,
-    )
-    return fit, shown
+    return fit, _shown(record, found, kept, residuals, fit.sigma_px, None)
 
 
 def hand_eye_from(
@@ -132,17 +123,7 @@ def hand_eye_from(
     joints = [sources.images[i].joints_deg for i in found.chosen]
     known = [j for j in joints if j is not None]
     axes = axis_sensitivity(arm, known) if arm is not None and len(known) == len(joints) else None
-    stated = robot.pose_sigmas(axes_known=False)
-    expected = expected_scatter(
-        fit.camera_from_board,
-        pixel_px=fit.sigma_px,
-        focal_px=fit.intrinsics.fx,
-        robot_mm=stated[0],
-        robot_deg=float(np.degrees(stated[1])),
-    )
-    diagnosis = diagnose(chosen, fit.camera_from_board, expected, [s.name for s in kept])
-    if diagnosis.cause is not None:
-        raise InputError("hand-eye: " + ".\n".join(diagnosis.sentences()[:2]) + ".")
+    diagnosis = _refused_if_contradicting(fit, chosen, robot, [s.name for s in kept])
     result = calibrate_hand_eye(
         kept,
         Poses(chosen.base_from_flange, axes),
@@ -166,16 +147,38 @@ def hand_eye_from(
         images=image_lines(kept, result.residuals_px, fit.sightings),
         **content_of(found, sources, request),
     )
-    shown = Shown(
-        record,
-        found.size_px,
-        tuple(s.name for s in kept),
-        tuple(s.pixels for s in kept),
-        result.residuals_px,
-        result.noise.pixel_px,
-        result.pose_errors,
-    )
+    shown = _shown(record, found, kept, result.residuals_px, result.noise.pixel_px, result.pose_errors)
     return result, diagnosis, shown
+
+
+def _refused_if_contradicting(
+    fit: CameraCalibration, reported: ReportedPoses, robot: RobotNoise, names: Sequence[str]
+) -> Diagnosis:
+    """How well robot and camera agree. Raises InputError if they do not and the cause is known."""
+    robot_mm, robot_rad = robot.pose_sigmas(axes_known=False)
+    expected = expected_scatter(
+        fit.camera_from_board,
+        pixel_px=fit.sigma_px,
+        focal_px=fit.intrinsics.fx,
+        robot_mm=robot_mm,
+        robot_deg=float(np.degrees(robot_rad)),
+    )
+    diagnosis = diagnose(reported, fit.camera_from_board, expected, names)
+    if diagnosis.cause is not None:
+        raise InputError("hand-eye: " + ".\n".join(diagnosis.sentences()[:2]) + ".")
+    return diagnosis
+
+
+def _shown(
+    record: Record,
+    found: Found,
+    kept: Sequence[Sighting],
+    residuals_px: tuple[Floats, ...],
+    pixel_px: float,
+    pose_errors: Floats | None,
+) -> Shown:
+    names, pixels = tuple(s.name for s in kept), tuple(s.pixels for s in kept)
+    return Shown(record, found.size_px, names, pixels, residuals_px, pixel_px, pose_errors)
 
 
 def ray_u_px(fit: CameraCalibration) -> float:

@@ -28,7 +28,6 @@ Everything here is a pure function of its arguments and is run again on all fram
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -162,11 +161,14 @@ def _obstacle(
     return ""
 
 
-def _unlabelled(n_frames: int, n_steps: int, *, missing: Sequence[int] = (), reason: str = "") -> Match:
+def _unlabelled(
+    n_frames: int, n_steps: int, *, missing: NDArray[np.intp] | None = None, reason: str = ""
+) -> Match:
     """The verdict where no frame gets a label; `missing` are rows of the log."""
     no_step = np.zeros(n_steps, np.bool_)
     is_missing = no_step.copy()
-    is_missing[np.asarray(missing, np.int64)] = True
+    if missing is not None:
+        is_missing[missing] = True
     return Match(
         np.full(n_frames, UNLABELLED, np.int64),
         np.zeros(n_frames, np.bool_),

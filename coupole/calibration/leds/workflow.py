@@ -73,12 +73,9 @@ def leds_from(
     start = placed(boards, matching.by_place_mm)
     geometry = adjust_leds(sightings, place, images.base_from_flange, boards, start, prior, stated)
     leds = _in_table_order(geometry, matching, boards)
+    normals = geometry.normals[boards.board_of[leds.place]]
     new_table = LedTable(
-        table.ids,
-        table.boards[leds.place],
-        geometry.centres_mm[leds.place],
-        geometry.normals[boards.board_of[leds.place]],
-        table.flux_lm,
+        table.ids, table.boards[leds.place], geometry.centres_mm[leds.place], normals, table.flux_lm
     )
     files = {
         f"{request.name}.csv": led_csv(new_table, request.name).encode("ascii"),

@@ -18,15 +18,10 @@ from coupole.calibration.adjustment import Component
 from coupole.calibration.arm_errors import axis_sensitivity
 from coupole.calibration.lens.acceptance import CAMERA, HAND_EYE
 from coupole.calibration.lens.board import Board, Sighting
-from coupole.calibration.lens.bundle import (
-    EarlierLens,
-    HandEyeCalibration,
-    Poses,
-    RobotNoise,
-    calibrate_hand_eye,
-)
+from coupole.calibration.lens.bundle import HandEyeCalibration, RobotNoise, calibrate_hand_eye
 from coupole.calibration.lens.camera import CameraCalibration, calibrate_camera, without_gross_errors
 from coupole.calibration.lens.diagnosis import Diagnosis, diagnose, expected_scatter
+from coupole.calibration.lens.equations import EarlierLens, Poses
 from coupole.calibration.lens.images import Found
 from coupole.calibration.poses import ReportedPoses
 from coupole.calibration.record import (

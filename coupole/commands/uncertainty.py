@@ -59,9 +59,9 @@ def budget(
     out: Annotated[Path | None, typer.Option("--out", help="Write this PNG, and HTML and JSON beside it.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """What a reflectance is uncertain by, what dominates it, and our accuracies beside the paper's.
+    """Uncertainty of a reflectance, what dominates it, and our accuracies beside the paper's.
 
-    Monte Carlo (JCGM 101) gives the intervals, the linear formula checks them.
+    The intervals are by Monte Carlo (JCGM 101); the linear formula checks them.
     """
     from coupole.calibration.budget.budget import Geometry, Known
     from coupole.calibration.budget.propagation import COVERAGES
@@ -75,8 +75,9 @@ def budget(
             _refuse_target(out)
         given = _with_plan(read_records(records or []), plan)
         with console.status("propagating distributions"):
-            geometry = Geometry(incidence_deg)
-            result = _propagated(given, beside or [], start, geometry, emission, coverage or COVERAGES)
+            result = _propagated(
+                given, beside or [], start, Geometry(incidence_deg), emission, coverage or COVERAGES
+            )
         if out is not None:
             _write_report(out, result)
     except CoupoleError as error:
@@ -84,9 +85,9 @@ def budget(
         raise
     if as_json:
         print(json.dumps(result.document))
-    else:
-        _show(console, result.budget)
-        _show_accuracies(console, result)
+        return
+    _show(console, result.budget)
+    _show_accuracies(console, result)
 
 
 # -- helpers --------------------------------------------------------------------------------------------------
@@ -228,17 +229,13 @@ def _show(console: Console, found: Budget) -> None:
 def _show_accuracies(console: Console, result: _Result) -> None:
     from rich.table import Table
 
+    cases = result.cases
     table = Table(
-        "accuracy",
-        "seed 003",
-        *(case.name for case in result.cases),
-        box=None,
-        padding=(0, 1, 0, 0),
-        pad_edge=False,
+        "accuracy", "seed 003", *(case.name for case in cases), box=None, padding=(0, 1, 0, 0), pad_edge=False
     )
-    table.add_row("robot's noise, found", "", *(case.robot for case in result.cases))
+    table.add_row("robot's noise, found", "", *(case.robot for case in cases))
     for line in result.table:
-        table.add_row(line.what, line.paper, *(line.cell(number) for number in range(len(result.cases))))
+        table.add_row(line.what, line.paper, *(line.cell(number) for number in range(len(cases))))
     console.print()
     console.print(table)
     console.print("standard uncertainties, all directions together; samples over a dome: their 68 % intervals")

@@ -34,8 +34,8 @@ _MAX_ROUNDS = 30
 _SETTLED = 1e-3
 """Noise factors have converged when they change by less than this, relative."""
 _SINGULAR = 1e-6
-"""Least pivot of the scaled normal matrix: the share of a parameter's information that is left when all others are
-estimated along."""
+"""Least diagonal element of the Cholesky factor of the scaled normal matrix; its square is the share of a
+parameter's information that is left when the parameters before it are unknown too."""
 _LEAST_REDUNDANCY = 3.0
 """With less redundancy the residuals do not determine the noise."""
 _LEAST_FACTOR = 1e-4

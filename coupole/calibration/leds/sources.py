@@ -1,4 +1,4 @@
-"""From runs to spots: each frame under a single LED is looked at once, with its view's pose and dark frames."""
+"""From runs to spots: frames under a single LED, with the pose and dark frames of their view."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from coupole.storage.run import Run, sha256
 
 @dataclass(frozen=True)
 class LedImages:
-    """All that a run says of LEDs."""
+    """Spots and poses of some runs."""
 
     seen: LedSightings
     base_from_flange: Floats
@@ -33,7 +33,7 @@ class LedImages:
     """[v] names."""
     size_px: tuple[int, int]
     left_out: tuple[str, ...]
-    """One line for each bright thing that was no spot."""
+    """One line for each bright region that is not a spot."""
     about: About
     inputs: tuple[tuple[str, str], ...]
     """Name and SHA-256 of every file that was read."""
@@ -43,12 +43,12 @@ class LedImages:
 
 @dataclass(frozen=True)
 class _LedFrame:
-    """One frame under one LED, the shortest exposed where there are several."""
+    """One frame under one LED, that of the shortest exposure if there are several."""
 
     shot: ShotId
     led: int
     pose: tuple[str, int]
-    """View's name, and number of the pose in it: an arm that was pushed aside has two."""
+    """Name of the view and number of the pose in it: there are two if the arm was moved during the view."""
     exposure_us: int
     frame: FrameProven
 
@@ -73,8 +73,8 @@ class _Collected:
 def find_leds(
     paths: Sequence[Path], table: LedTable, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> LedImages:
-    """Look for spots in all frames of runs under single LEDs. Raises InputError: no such frames, LEDs that the
-    dome does not have, runs of different cameras."""
+    """Find spots in all frames under single LEDs. Raises InputError: no such frames, LEDs that the dome does not
+    have, runs of different cameras."""
     row_of = {int(led): row for row, led in enumerate(table.ids)}
     runs = [Run(path) for path in paths]
     work = [(run, view, frames) for run in runs for view, frames in _by_view(run).items()]
@@ -172,7 +172,7 @@ def _by_view(run: Run) -> dict[str, list[FrameProven]]:
 
 
 def _single_leds(proven: Sequence[FrameProven], records: Any, view: str) -> list[_LedFrame]:
-    """Frames under LEDs, of those of one LED at one pose the shortest exposed: spots are white in all of them."""
+    """Frames under LEDs: of one LED at one pose that of the shortest exposure, as spots are saturated in all."""
     shortest: dict[tuple[int, int], _LedFrame] = {}
     for frame in proven:
         if not isinstance(frame.shot.light, Led):

@@ -27,7 +27,7 @@ from coupole.errors import InputError
 from coupole.plan.led_table import COLUMNS, LedTable
 
 MOVED_MM, MOVED_DEG = 5.0, 1.0
-"""A board farther from its table than this is named: it was mounted anew, or pushed."""
+"""A board farther from its place by the table is reported: it was remounted, or pushed."""
 _COVARIANCE_OF_SINGLE = 1e-12
 
 
@@ -38,7 +38,7 @@ class LedsFound:
     record: Record
     files: dict[str, bytes]
     table: LedTable
-    """As it was known before."""
+    """Before the calibration."""
     new_table: LedTable
     geometry: LedGeometry
     matching: Matching
@@ -47,7 +47,7 @@ class LedsFound:
     u_deg: Floats
     """[n] of its normal."""
     view_errors: Floats
-    """[v, 6] what the arm was off, mm and degrees."""
+    """[v, 6] error of the arm at each view, mm and degrees."""
 
 
 def leds_from(
@@ -186,8 +186,8 @@ def _record(
 
 
 def tolerance_px(prior: CameraPrior, stated: Stated, table: LedTable, base_from_camera: Floats) -> float:
-    """How far spots of one LED may be from one point: 4 sigma of the camera's poses at the dome's distance, and
-    3 px for the rest."""
+    """Largest distance of the spots of one LED from one point: 4 sigma of the camera's poses at the dome's
+    distance, and 3 px for all other errors."""
     eyes_mm = base_from_camera[:, :3, 3].mean(axis=0)
     distance_mm = float(np.median(np.linalg.norm(table.positions_mm - eyes_mm, axis=1)))
     hand_eye = np.sqrt(np.diag(prior.hand_eye_covariance))
@@ -218,7 +218,7 @@ def _h5(
     place: NDArray[np.intp],
     count: int,
 ) -> bytes:
-    """Uncertainties by LED, in the table's order; the same numbers give the same bytes."""
+    """Uncertainties by LED, in the table's order; equal numbers give equal bytes."""
     kept = geometry.kept
     views = np.bincount(place[kept], minlength=count)
     square = np.bincount(place[kept], np.sum(geometry.residuals_px[kept] ** 2, axis=1), minlength=count)
@@ -315,7 +315,7 @@ def _noise(geometry: LedGeometry, stated: Stated) -> tuple[Noise, ...]:
 
 
 def _views(names: Sequence[str], view: NDArray[np.intp], geometry: LedGeometry) -> tuple[ImageResidual, ...]:
-    """One line for each view: its spots are the corners of a board's image."""
+    """One line for each view; its spots take the place of the corners of a board's image."""
     lines = []
     for number, name in enumerate(names):
         rows = np.flatnonzero(view == number)
@@ -327,7 +327,7 @@ def _views(names: Sequence[str], view: NDArray[np.intp], geometry: LedGeometry) 
 
 
 def _figures(geometry: LedGeometry, found: NDArray[np.bool_], u_mm: Floats, u_deg: Floats) -> dict[str, float]:
-    """What `limits.LEDS` are held against."""
+    """The figures that `acceptance.LEDS` limits."""
     return {
         "missing": float(1 - found.mean()),
         "centre_mm": float(np.median(u_mm[found])),
@@ -345,7 +345,7 @@ def _of_records(geometry: LedGeometry, prior: CameraPrior, limits: Sequence[Limi
     worst = int(np.argmax(np.abs(geometry.prior_step)))
     return [
         f"{names[worst]} would have to be {abs(geometry.prior_step[worst]):.0f} standard uncertainties from its "
-        "record: a record of another focus, or a camera that was pushed since. Calibrate camera and hand-eye anew"
+        "record: it was made at another focus, or the camera was pushed since. Calibrate camera and hand-eye anew"
     ]
 
 
@@ -358,7 +358,7 @@ def _of_the_arm(arm: CalibratedArm | None) -> list[str]:
 def _of_spots(left_out: Sequence[str]) -> list[str]:
     if not left_out:
         return []
-    return [f"{len(left_out)} bright things were no spots, e.g. {left_out[0]}"]
+    return [f"{len(left_out)} bright regions are not spots, e.g. {left_out[0]}"]
 
 
 def _view_errors(geometry: LedGeometry, reported: Floats) -> Floats:

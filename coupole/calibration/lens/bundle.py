@@ -39,14 +39,14 @@ _LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 1e-3, 1e-6
 
 @dataclass(frozen=True)
 class RobotNoise:
-    """What is stated of a robot: standard deviations of each coordinate."""
+    """Stated noise of a robot: standard deviations of each coordinate."""
 
     repeatability_mm: float = 0.03
     repeatability_deg: float = 0.003
     absolute_mm: float = 0.3
-    """Off the true place, beside repeatability. Where axes are known, that of their zeros takes its place."""
+    """Absolute error beside repeatability. Not used where axes are known: their zeros are estimated instead."""
     absolute_deg: float = 0.02
-    """Of orientation, or of each axis' zero where axes are known."""
+    """Of orientation; of each axis zero where axes are known."""
 
     def pose_sigmas(self, *, axes_known: bool) -> tuple[float, float]:
         """Stated noise of one pose: mm, radians."""
@@ -60,7 +60,7 @@ class RobotNoise:
 
 @dataclass(frozen=True)
 class HandEyeCalibration:
-    """Hand-eye and all that was estimated with it."""
+    """Hand-eye and everything that was estimated with it."""
 
     flange_from_camera: Floats
     base_from_board: Floats
@@ -68,23 +68,23 @@ class HandEyeCalibration:
     names: tuple[str, ...]
     """[s] of the parameters that all images share, with units."""
     covariance: Floats
-    """[s, s] in these units, poses' own errors integrated out."""
+    """[s, s] in these units, marginalised over the errors of the poses."""
     degrees: Floats
-    """[s] degrees of freedom behind each."""
+    """[s] effective degrees of freedom."""
     shares: Floats
-    """[groups, s] of each parameter's variance, by cause."""
+    """[groups, s] contribution of each group to each parameter's variance."""
     components: tuple[Component, ...]
     """[groups]."""
     board_scale: float
-    """Relative: the board is so much larger than described."""
+    """Relative excess of the board's size over its description."""
     axis_zeros_deg: Floats
-    """[axes] by which the true angles exceed the reported ones; empty if axes were not known."""
+    """[axes] excess of the true over the reported angles; empty if axes were not known."""
     pose_errors: Floats
     """[n, 6] of each pose in the flange's frame, mm and degrees."""
     residuals_px: tuple[Floats, ...]
     """[k, 2] of each image, observed minus computed."""
     start: Solution
-    """Park's, which the adjustment began from."""
+    """Park's solution, from which the adjustment started."""
     noise: RobotFound
     sightings: tuple[Sighting, ...]
     steps: int
@@ -97,7 +97,7 @@ class HandEyeCalibration:
 
 @dataclass(frozen=True)
 class RobotFound:
-    """Noise as the residuals show it, beside what was stated."""
+    """Noise by the residuals, and as stated."""
 
     pixel_px: float
     position_mm: float
@@ -115,9 +115,9 @@ def calibrate_hand_eye(
     robot: RobotNoise,
     board_scale_u_ppm: float = 0.0,
 ) -> HandEyeCalibration:
-    """Hand-eye and board from images [n] and the robot's poses, intrinsics adjusted along.
+    """Hand-eye, board and intrinsics from images [n] and the robot's poses.
 
-    `lens` is where its adjustment starts (all parameters of `model` free), or an earlier calibration, whose
+    `lens` is a start for the intrinsics (all parameters of `model` free), or an earlier calibration, whose
     covariance then counts as an observation. `sightings` are without gross errors (`camera.without_gross_errors`).
     Raises InputError: too few poses, or poses that do not determine the result.
     """

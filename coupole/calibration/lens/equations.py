@@ -51,12 +51,12 @@ class Poses:
 
 @dataclass(frozen=True)
 class EarlierLens:
-    """A lens that is known already, to be held or improved."""
+    """A lens from an earlier calibration, held or improved."""
 
     intrinsics: Intrinsics
     free: tuple[str, ...] = ()
     covariance: Floats | None = None
-    """[free, free]; None if the lens is taken as exact."""
+    """[free, free]; None if the lens is taken to be exact."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class State:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each shared parameter stands among the columns: lens, hand-eye, board, board's scale, axes' zeros."""
+    """Columns of the shared parameters: lens, hand-eye, board, board's scale, axis zeros."""
 
     free: tuple[str, ...]
     axes: int
@@ -107,7 +107,7 @@ class Layout:
 
     @property
     def units(self) -> Floats:
-        """[s] by which the adjustment's steps (mm, radians) become those of `names`."""
+        """[s] factors from the adjustment's units (mm, radians) to those of `names`."""
         return np.concatenate(
             [np.ones(len(self.free)), _STEP_UNITS, _STEP_UNITS, np.ones(self.shared - self.scale)]
         )
@@ -121,7 +121,7 @@ class Bundle:
     corners: Corners
     poses: Poses
     sigmas: tuple[float, float]
-    """Of the robot's positions and orientations to begin with: mm, radians."""
+    """Initial noise of the robot's positions and orientations: mm, radians."""
     scale_sigma: float
     zero_sigma_deg: float
     earlier: EarlierLens | None
@@ -159,8 +159,8 @@ class Bundle:
         )
 
     def _corner_blocks(self, state: State) -> list[Block]:
-        """p goes from the board to the base, the reported flange, the flange without axes' errors, the true flange
-        and the camera; each derivative is taken back along the same way."""
+        """p is transformed from the board to the base, the reported flange, the flange with corrected axis zeros,
+        the true flange and the camera; derivatives follow the same chain backwards."""
         at, view = self.layout, self.corners.view
         printed_mm = self.corners.board_mm
         board_mm = printed_mm * (1 + state.scale)
@@ -206,7 +206,8 @@ class Bundle:
         ]
 
     def _robot_blocks(self, state: State) -> list[Block]:
-        """Each pose is off by nothing, within its noise. Turns are small: the derivative of the logarithm is 1."""
+        """The error of each pose is zero within its noise. Rotations are small: the derivative of the logarithm is
+        1."""
         turned = rotation_vector(state.pose_errors[:, :3, :3])
         position_mm, orientation_rad = self.sigmas
         blocks = []
@@ -218,7 +219,7 @@ class Bundle:
         return blocks
 
     def _held_blocks(self, state: State, names: list[str]) -> list[Block]:
-        """What is known beforehand: the board's scale, the axes' zeros, an earlier lens."""
+        """Priors: the board's scale, the axis zeros, an earlier lens."""
         at, blocks = self.layout, []
         if at.scaled:
             sigma = self.scale_sigma
@@ -242,7 +243,7 @@ class Bundle:
         return slice(first, first + 6)
 
     def _zero_steps(self, state: State) -> Floats:
-        """[n, 4, 4] by which the axes' zero errors move the flange, in its own frame."""
+        """[n, 4, 4] motion of the flange by the axis zeros, in its own frame."""
         steps = np.broadcast_to(np.eye(4), (len(self.poses.base_from_flange), 4, 4)).copy()
         if self.poses.axis_sensitivity is not None:
             vectors = self.poses.axis_sensitivity @ state.axis_zeros_deg
@@ -251,6 +252,6 @@ class Bundle:
 
 
 def _into(a_from_b: Floats, points_a: Floats) -> Floats:
-    """Points [k, 3] of frames a in frames b, each with a transform of its own [k, 4, 4]."""
+    """Points [k, 3] from frames a into frames b, each with its own transform [k, 4, 4]."""
     away = points_a - a_from_b[:, :3, 3]
     return np.asarray(np.einsum("kij,ki->kj", a_from_b[:, :3, :3], away))

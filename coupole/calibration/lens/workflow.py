@@ -1,7 +1,7 @@
-"""From images and poses to a record and what the report shows: what the commands call.
+"""From images and poses to a record and the report's data: the functions that the commands call.
 
-Each function ends in a sealed record. A contradiction whose cause is known is refused with that cause, as its
-numbers would be nonsense; one without a simple cause goes into the record as a remark, and fails its limits.
+Each function makes a sealed record. A contradiction with a known cause raises an error with that cause, as the
+result would be meaningless; one without a simple cause becomes a remark of the record, which exceeds its limits.
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ def hand_eye_from(
     arm: Arm | None = None,
     lens: EarlierLens | None = None,
 ) -> tuple[HandEyeCalibration, Diagnosis, Shown]:
-    """Calibrate where the camera sits on the flange. Raises InputError with the likely cause where robot and
-    camera contradict each other and one is known."""
+    """Calibrate the camera's pose on the flange. Raises InputError with the likely cause if robot and camera
+    contradict each other and a cause is known."""
     if sources.poses is None:
         raise InputError("hand-eye: the images have no poses; give a pose file with --poses")
     if not board.has_a_top:
@@ -177,9 +177,10 @@ def _shown(
 
 
 def ray_u_px(fit: CameraCalibration) -> float:
-    """Largest standard uncertainty, at the corners and edges of the field, of where a direction is seen, px.
+    """Largest standard uncertainty of the image of a direction at the corners and edges of the field, px.
 
-    A turn of the camera that the intrinsics can be traded for is not counted: the board's poses take it up.
+    Changes of the intrinsics that are equivalent to a rotation of the camera do not count: the board's poses
+    absorb them.
     """
     width, height = fit.size_px
     steps = np.linspace(0.0, 1.0, 9)
@@ -207,7 +208,7 @@ def field_without_corners(sightings: Sequence[Sighting], size_px: tuple[int, int
 def image_lines(
     kept: Sequence[Sighting], residuals: Sequence[Floats], all_seen: Sequence[Sighting]
 ) -> tuple[ImageResidual, ...]:
-    """How each image fits."""
+    """Number of corners and residual of each image."""
     return tuple(
         ImageResidual(
             name=seen.name,
@@ -220,7 +221,7 @@ def image_lines(
 
 
 def content_of(found: Found, sources: Sources, request: Request) -> dict[str, object]:
-    """What all records made from a board's images have."""
+    """The content that all records from a board's images share."""
     about = sources.about
     return {
         **request.head(),
@@ -236,7 +237,7 @@ def held(intrinsics: optics.Intrinsics, free: Sequence[str]) -> dict[str, float]
 
 
 def image_figures(fit: CameraCalibration, found: Found) -> dict[str, float]:
-    """What `limits.IMAGES` are held against."""
+    """The figures that `acceptance.IMAGES` limits."""
     rejected = np.concatenate([~keep for keep in fit.kept])
     clipped = sum(": clipped" in line for line in found.left_out)
     return {

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from coupole.devices import ArmState, FrameFormat
-from coupole.storage import frame_file
-from coupole.storage.frame_file import ViewWriter
+from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
 from coupole.storage.run import Inputs, Run
+from coupole.storage.view_writer import ViewWriter
 
 FORMAT = FrameFormat(height_px=96, width_px=128, bit_depth=12, bayer_pattern="GBRG", black_dn=64, white_dn=4095)
 METADATA = {
@@ -71,7 +71,7 @@ def make_run(
     diary.write(SessionStarted())
     for place, view in enumerate(views):
         path = run.view_path(view)
-        frame_file.create(path, shots + 3, of, {**METADATA, "title": view}, packed=packed)
+        create(path, shots + 3, of, {**METADATA, "title": view}, packed=packed)
         writer = ViewWriter(path, {})
         pose = writer.add_pose(ArmState((1, 2, 3, 4, 5, 6), np.eye(4), 7, moving=False), 2 * np.eye(4))
         writer.put(noisy_frame(999, of), frame_id=999, camera_ns=999, exposure_us=8000)

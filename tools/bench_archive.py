@@ -117,8 +117,9 @@ def pictures(count: int) -> NDArray[np.uint16]:
 def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[Any]:
     """A view whose frames are all proven; returns what its journal would say of them."""
     from coupole.devices import FrameFormat
-    from coupole.storage.frame_file import ViewWriter, create
+    from coupole.storage.frame_file_creation import create
     from coupole.storage.journal_events import FrameProven
+    from coupole.storage.view_writer import ViewWriter
 
     metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}
     create(path, frames, FrameFormat(HEIGHT_PX, WIDTH_PX, 12, "GBRG", 64, 4095), metadata)

@@ -122,7 +122,8 @@ def _scene(
 def _bundle(rounds: int) -> dict[str, Any]:
     """Lens, hand-eye and board from 45 images of 88 corners."""
     from coupole.calibration.lens.board import Sighting
-    from coupole.calibration.lens.bundle import Poses, RobotNoise, calibrate_hand_eye
+    from coupole.calibration.lens.bundle import RobotNoise, calibrate_hand_eye
+    from coupole.calibration.lens.equations import Poses
     from coupole.calibration.optics import Intrinsics
 
     random = np.random.default_rng(1)

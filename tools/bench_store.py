@@ -102,7 +102,8 @@ def _cpu_s() -> float:
 
 def _coupole(folder: Path, pixels: NDArray[np.uint16], frames: int, *, packed: bool = False) -> None:
     from coupole.devices import FrameFormat
-    from coupole.storage.frame_file import ViewWriter, create
+    from coupole.storage.frame_file_creation import create
+    from coupole.storage.view_writer import ViewWriter
 
     view = folder / "view.h5"
     metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}

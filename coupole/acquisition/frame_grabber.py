@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.devices import Camera, Frame
-from coupole.storage.frame_file import WRITERS
+from coupole.storage.view_writer import WRITERS
 
 _TAKE_TIMEOUT_S = 0.05
 _STALL_S = 2.0

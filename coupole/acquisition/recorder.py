@@ -14,10 +14,11 @@ from coupole.devices import ArmState, Frame, FrameFormat
 from coupole.errors import StorageError
 from coupole.geometry import Transform
 from coupole.plan.shot_id import ShotId
-from coupole.storage.frame_file import Collections, ViewWriter, create
+from coupole.storage.frame_file_creation import Collections, create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import Event, FrameProven
 from coupole.storage.run import Run
+from coupole.storage.view_writer import ViewWriter
 from coupole.viewing.progress import ViewExposure
 
 COMMIT_EVERY_S = 0.5

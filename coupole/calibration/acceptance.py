@@ -1,7 +1,7 @@
-"""Acceptance limits: which a calibration has, and how an operator sets one.
+"""Acceptance limits of a calibration, and how an operator sets one.
 
-A calibration lists its limits once, as `Allowed`; its command takes the list for `--limit NAME=VALUE` and for its
-help, its workflow for the record (`judged`). The record keeps what was usual beside what was asked.
+A calibration lists its limits once, as `Allowed`. Its command uses the list for `--limit NAME=VALUE` and for its
+help, its workflow for the record (`judged`). The record keeps the default beside the limit that was asked for.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Allowed:
-    """One limit: the most that a figure may be."""
+    """One limit: the largest value that a figure may have."""
 
     name: str
     """For `--limit`, with its unit."""
@@ -57,8 +57,8 @@ def asked(words: Sequence[str], limits: Sequence[Allowed]) -> dict[str, float]:
 def judged(
     limits: Sequence[Allowed], wanted: Mapping[str, float], found: Mapping[str, float]
 ) -> tuple[Limit, ...]:
-    """How a calibration stands against its limits, as the record keeps it. `wanted` are those that the operator
-    set; `found` has a figure for each limit."""
+    """Figures compared with their limits, as the record keeps them. `wanted` are the limits that the operator set;
+    `found` has a figure for each limit."""
     from coupole.calibration.record import Limit
 
     return tuple(

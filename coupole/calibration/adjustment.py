@@ -1,13 +1,13 @@
-"""Least squares with variance components: values, covariance, and what dominates it.
+"""Least squares with variance components: values, covariance, and the dominant sources of uncertainty.
 
-Observations come in blocks: each has its residuals over their stated noise, the derivatives for the few parameters
+Observations come in blocks. A block has residuals divided by their stated noise, derivatives by the few parameters
 that it depends on, and belongs to one group (corners, robot's positions, robot's orientations, ...). The normal
-matrix is added up block by block, so no Jacobian of the whole is ever built. After convergence each group's noise
-is estimated from its own residuals and its redundancy (Foerstner, Photogrammetric Engineering 1979; the iterated
-estimate is REML), and the adjustment repeated, until stated and seen noise agree.
+matrix is summed block by block, so the full Jacobian is never built. After convergence the noise of each group is
+estimated from its residuals and its redundancy (Foerstner, Photogrammetric Engineering 1979; the iterated estimate
+is REML), and the adjustment is repeated until the estimates no longer change.
 
-Two more things are read off the normal matrix: how much each group contributes to each parameter's variance (from
-C = C N C with N the sum over the groups), and the degrees of freedom that stand behind each standard uncertainty
+Two more results follow from the normal matrix: the contribution of each group to each parameter's variance (from C
+= C N C with N the sum over the groups), and the effective degrees of freedom of each standard uncertainty
 (Welch-Satterthwaite, GUM annex G.4).
 """
 
@@ -28,17 +28,18 @@ S = TypeVar("S")
 
 HUBER = 2.0
 REJECT_SIGMA = 5.0
-"""An image point with normal noise lies farther off once in 270,000."""
+"""The norm of an image point's residual with normal noise exceeds this once in 270,000 points."""
 _MAX_STEPS = 60
 _MAX_ROUNDS = 30
 _SETTLED = 1e-3
-"""Noise factors are estimated no finer than to a thousandth."""
+"""Noise factors have converged when they change by less than this, relative."""
 _SINGULAR = 1e-6
-"""Share of a parameter's own precision that may be left of it after all others are known."""
+"""Least diagonal element of the Cholesky factor of the scaled normal matrix; its square is the share of a
+parameter's information that is left when the parameters before it are unknown too."""
 _LEAST_REDUNDANCY = 3.0
-"""With less the residuals say nothing of the noise."""
+"""With less redundancy the residuals do not determine the noise."""
 _LEAST_FACTOR = 1e-4
-"""Of the stated noise; a group without any would outweigh all others by no right."""
+"""Of the stated noise: a lower bound, as residuals of nearly zero would give a group unlimited weight."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +48,17 @@ class Group:
 
     name: str
     estimated: bool
-    """False if the stated noise is to be believed; else it is where the observations are too few to tell."""
+    """Estimate the noise from residuals. Where False, or where observations are too few, the stated noise is
+    used."""
     rejects: int = 0
-    """Residuals of one observation (2 for an image point), if single observations may be rejected; else 0."""
+    """Number of residuals of one observation (2 for an image point) if single observations may be rejected; else
+    0."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Some observations: residuals [m] (observed minus computed, over the stated noise), derivatives of what was
-    computed [m, k], the k parameters that they are for, and the group's number."""
+    """Some observations: residuals [m] (observed minus computed, over the stated noise), derivatives of the
+    computed values [m, k], the columns of the k parameters, and the number of the group."""
 
     residuals: Floats
     jacobian: Floats
@@ -65,11 +68,11 @@ class Block:
 
 @dataclass(frozen=True)
 class Component:
-    """What the residuals say of one group's noise."""
+    """Estimate of one group's noise from its residuals."""
 
     name: str
     factor: float
-    """Noise seen over noise stated; 1 where it was not to be estimated."""
+    """Estimated over stated noise; 1 where it was not to be estimated."""
     observations: int
     rejected: int
     redundancy: float
@@ -79,7 +82,7 @@ class Component:
 
 @dataclass(frozen=True)
 class Adjusted(Generic[S]):
-    """The result: state, covariance [p, p] of the steps in its parameters, and what is known of the noise."""
+    """The result: state, covariance [p, p] of a step of its parameters, and the estimated noise."""
 
     state: S
     covariance: Floats
@@ -117,11 +120,11 @@ def adjust(
     *,
     what: str,
 ) -> Adjusted[S]:
-    """Minimise the sum of squared residuals from a start on (Levenberg-Marquardt), estimate the noise, reject.
+    """Minimise the sum of squared residuals (Levenberg-Marquardt), estimate the noise, reject gross errors.
 
-    First Huber's weights hold gross errors off; then what exceeds `REJECT_SIGMA` is left out, and the rest is
-    weighted by its noise alone. `what` names the calibration in errors. Raises InputError if the observations do
-    not determine all parameters.
+    Huber's weights first limit the influence of gross errors; then residuals beyond `REJECT_SIGMA` are left out
+    and the others are weighted by their noise alone. `what` names the calibration in errors. Raises InputError if
+    the observations do not determine all parameters.
     """
     factors = np.ones(len(groups))
     blocks = evaluate(state)
@@ -181,7 +184,7 @@ def _descend(
     parameters: int,
     what: str,
 ) -> tuple[S, list[Block], int]:
-    """Levenberg-Marquardt with fixed weights, until a step gains nothing."""
+    """Levenberg-Marquardt with fixed weights, until a step no longer lowers the cost."""
     damping, cost = 1e-6, _cost(blocks, weights, factors)
     for step in range(1, _MAX_STEPS + 1):
         matrices, sides = _normals(blocks, weights, len(factors), parameters)
@@ -209,7 +212,7 @@ def _descend(
 
 
 def _factored(normal: Floats, what: str) -> tuple[Floats, bool]:
-    """Cholesky factor of the normal matrix, scaled to units of its diagonal for the test of rank."""
+    """Cholesky factor of the normal matrix, scaled to a unit diagonal for the test of its rank."""
     diagonal = np.diag(normal)
     if (diagonal > 0).all():
         scale = diagonal**-0.5
@@ -227,7 +230,7 @@ def _factored(normal: Floats, what: str) -> tuple[Floats, bool]:
 
 
 def _observations(values: Floats, size: int) -> Floats:
-    """Norms of observations of `size` residuals each, scaled to the share of one residual."""
+    """Root mean square of the residuals of each observation, which has `size` of them."""
     return np.asarray(np.sqrt(np.mean(values.reshape(-1, size) ** 2, axis=1)))
 
 
@@ -239,7 +242,8 @@ def _huber(block: Block, size: int, factor: float) -> Floats:
 
 
 def _robust_factors(blocks: Sequence[Block], groups: Sequence[Group], factors: Floats) -> Floats:
-    """Noise from the median of absolute residuals, for groups with gross errors; others wait."""
+    """Noise from the median of absolute residuals, for groups that may have gross errors; unchanged for the
+    others."""
     seen = factors.copy()
     for number, group in enumerate(groups):
         if group.rejects and group.estimated:
@@ -289,7 +293,7 @@ def _reject(
     kept: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]],
     factors: Floats,
 ) -> list[np.ndarray[tuple[int], np.dtype[np.bool_]]] | None:
-    """Which residuals are within `REJECT_SIGMA`, None if none is out that was not before."""
+    """Which residuals are within `REJECT_SIGMA`; None if no further one was rejected."""
     result = []
     for block, before in zip(blocks, kept, strict=True):
         size = groups[block.group].rejects

@@ -1,8 +1,8 @@
 """The arm as a hand-eye calibration found it: zero errors of its axes, with the hand-eye's own uncertainty.
 
-A hand-eye record that was made with the arm's model (`coupole calibrate hand-eye --rig`) holds for poses that its
-axis zeros correct. Left as reported, an absolute error of 0.02 degrees in an axis puts all that the camera sees
-aside by a third of a millimetre, the same way in every view: no residual tells.
+A hand-eye record that was made with the arm's model (`coupole calibrate hand-eye --rig`) holds for poses that are
+corrected by its axis zeros. In poses as reported, an error of 0.02 degrees in the zero of an axis shifts
+everything that the camera sees by a third of a millimetre, alike in every view, so no residual shows it.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from coupole.calibration.rotations import Floats, rotation
 from coupole.kinematics import Arm
 
 ZEROS = tuple(f"axis_zero.a{axis}_deg" for axis in range(2, 7))
-"""Not A1's: it turns all about the base, and nothing seen from the arm tells it from the base's own x axis."""
+"""Not A1's: it is a rotation of everything about the base and cannot be distinguished from the direction of the
+base's x axis."""
 
 
 @dataclass(frozen=True)
 class CalibratedArm:
-    """An arm's model and what a hand-eye record says of its axes."""
+    """An arm's model with the axis zeros of a hand-eye record."""
 
     model: Arm
     zeros_deg: Floats
@@ -53,8 +54,8 @@ def read_arm(hand_eye: Path, model: Arm) -> CalibratedArm:
 def calibrated_poses(
     base_from_flange: Floats, joints_deg: Floats, arm: CalibratedArm, prior: CameraPrior
 ) -> tuple[Floats, CameraPrior]:
-    """Poses [v, 4, 4] as the axis zeros make them of the reported ones, and what is known of the camera at these:
-    with the uncertainty of the zeros."""
+    """Reported poses [v, 4, 4] corrected by the axis zeros, and the camera's prior for them, which includes the
+    uncertainty of the zeros."""
     sensitivity = axis_sensitivity(arm.model, joints_deg)
     steps = sensitivity @ arm.zeros_deg
     moves = np.broadcast_to(np.eye(4), base_from_flange.shape).copy()

@@ -1,4 +1,4 @@
-"""Records that a calibration is made with: they must be accepted, and hold for the images at hand."""
+"""Earlier records that a calibration uses: they must be accepted and hold for its images."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ _SAME_FIGURE = 1e-3
 def read_earlier(path: Path, kind: Kind, about: About, size_px: tuple[int, int]) -> Record:
     """A record of this kind for images that `about` and `size_px` (width, height) describe.
 
-    Raises InputError: another kind, one that missed its limits or had expired, another camera, focus, aperture,
-    size or warmth, a simulated one for a real cell.
+    Raises InputError: another kind, limits exceeded, expired, another camera, focus, aperture, frame size or
+    temperature, a simulated record for a real cell.
     """
     record = read_accepted(path, kind)
     _refuse_other(path, record, about, size_px)
@@ -24,7 +24,7 @@ def read_earlier(path: Path, kind: Kind, about: About, size_px: tuple[int, int])
 
 
 def read_accepted(path: Path, kind: Kind) -> Record:
-    """A record of this kind that met its limits. Raises InputError."""
+    """A record of this kind that met its limits. Raises InputError for another."""
     record = read_record(path)
     if record.kind != kind:
         raise InputError(f"{path}: expected a record of the kind `{kind}`, found one of `{record.kind}`")
@@ -46,7 +46,8 @@ def refuse_same_images(path: Path, record: Record, inputs: Sequence[tuple[str, s
 
 
 def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, int]) -> None:
-    """Raise InputError unless a record holds for these images: their time, camera, lens, focus, size, warmth."""
+    """Raise InputError unless a record holds for these images: their time, camera, lens, focus, frame size and
+    temperature."""
     holds = record.validity
     if about.begun is not None and record.simulated != about.simulated:
         made, taken = ("a simulated cell" if one.simulated else "a real cell" for one in (record, about))
@@ -77,7 +78,7 @@ def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, 
         )
     if holds.temperature_c is not None and about.temperature_c is not None:
         low, high = holds.temperature_c
-        room = about.temperature_c[0]  # of all LED boards the coolest, which is nearest to the room and the camera
+        room = about.temperature_c[0]  # of the coolest LED board, which is nearest to that of room and camera
         if not low <= room <= high:
             raise InputError(
                 f"{path}: holds from {low:g} to {high:g} C; the coolest LED board of these images had {room:g} C. "

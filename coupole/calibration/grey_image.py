@@ -1,4 +1,4 @@
-"""An image as calibrations look at it: RAW, grey or in three colours, one colour at a time."""
+"""An image as calibrations use it: RAW, grey or in three colours, one colour at a time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MONO, COLOUR = "MONO", "COLOUR"
 
 @dataclass(frozen=True)
 class Picture:
-    """What one camera image holds, black subtracted."""
+    """The values of one camera image, black level subtracted."""
 
     values: NDArray[Any]
     """[H, W]; of pattern `COLOUR` [H, W, 3]: red, green, blue."""
@@ -30,7 +30,7 @@ class Picture:
 
     @staticmethod
     def of_grey(values: NDArray[Any], *, white: float | None = None, name: str = "picture") -> Picture:
-        """A grey image [H, W]; white is the greatest number that its type holds, if not given."""
+        """A grey image [H, W]; without `white`, the largest number of its type."""
         if white is None:
             white = float(np.iinfo(values.dtype).max) if np.issubdtype(values.dtype, np.integer) else float("inf")
         return Picture(values, MONO, white, name)
@@ -50,8 +50,8 @@ class Picture:
         return plane(self.values, self.pattern, channel)
 
     def measured(self, channel: Channel = "green") -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """The values [H, W] that one colour's pixels really had, and which pixels those are: a tile [h, w] to be
-        repeated over the image."""
+        """The values [H, W] with the pixels of one colour not interpolated, and which pixels these are: a tile [h,
+        w] that repeats over the image."""
         if self.pattern in (COLOUR, MONO):
             return self.plane(channel), np.ones((1, 1), np.bool_)
         known = np.array([letter == channel[0].upper() for letter in self.pattern]).reshape(2, 2)
@@ -68,9 +68,10 @@ class Picture:
 def plane(frame: NDArray[Any], pattern: str, channel: Channel = "green") -> NDArray[np.float32]:
     """One channel of a RAW frame [H, W] at full size [H, W], DN: edges in it are edges in the frame.
 
-    `pattern` is the names of the four pixels at the frame's top left, row by row; `MONO` has one channel. Pixels
-    of other colours are left out of a mean with the weights 1 2 1 in both directions. Of green pixels it always
-    finds a weight of 8, of red and blue of 4, and both lie evenly about each pixel: nothing is shifted.
+    `pattern` is the names of the four pixels at the frame's top left, row by row; `MONO` has one channel. The
+    value is a mean over the channel's pixels with the weights 1 2 1 in both directions. The weights of green
+    pixels always sum to 8, those of red and blue to 4, and are symmetric about each pixel, so the image is not
+    shifted.
     """
     import cv2
 
@@ -81,5 +82,5 @@ def plane(frame: NDArray[Any], pattern: str, channel: Channel = "green") -> NDAr
         if letter == channel[0].upper():
             sparse[place // 2 :: 2, place % 2 :: 2] = frame[place // 2 :: 2, place % 2 :: 2]
     weights = np.array([1.0, 2.0, 1.0]) / np.sqrt(8.0 if channel == "green" else 4.0)
-    # The border is mirrored about its pixels, which keeps the colours in step.
+    # The border is mirrored about its pixels, which keeps the colour pattern.
     return np.asarray(cv2.sepFilter2D(sparse, -1, weights, weights, borderType=cv2.BORDER_REFLECT_101))

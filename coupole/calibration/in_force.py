@@ -1,4 +1,5 @@
-"""Which calibrations a plan may be acquired with: pure functions, and every reason why not."""
+"""Whether a plan may be acquired with the calibrations that it names: pure functions that give all reasons
+against."""
 
 from __future__ import annotations
 
@@ -12,14 +13,14 @@ from coupole.calibration.record import Record, read_record
 from coupole.errors import InputError, Problem
 
 NEEDED = ("camera", "hand-eye")
-"""Kinds that a pixel needs to become a ray in the robot's base."""
+"""Kinds that are needed to compute the ray of a pixel in the robot's base."""
 _SAME = 1e-3
-"""Relative difference of figures that people write down."""
+"""Relative difference up to which figures from a rig and a record count as equal."""
 
 
 @dataclass(frozen=True)
 class Situation:
-    """What is there to be photographed with. What is None is not known, and not checked."""
+    """The cell that is to take the pictures. What is None is not known and not checked."""
 
     now: datetime
     """With a time zone."""
@@ -32,7 +33,7 @@ class Situation:
     camera: str | None = None
     """Model and serial number, once the camera is open."""
     temperature_c: float | None = None
-    """Of the coolest LED board, which is nearest to the room's."""
+    """Of the coolest LED board, which is nearest to the room's temperature."""
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from coupole.calibration.calibrated_arm import CalibratedArm
     from coupole.calibration.report import Outcome
     from coupole.calibration.request import Request
+    from coupole.geometry import Transform
     from coupole.plan.cell import Cell
 
 Runs = Annotated[list[Path], typer.Argument(help="Runs.", show_default=False, metavar="RUN...")]
@@ -99,7 +100,6 @@ def mesh(
     from coupole.calibration.stickers.mesh_to_robot import Stated
     from coupole.calibration.stickers.sources import find_all_stickers, read_scan
     from coupole.calibration.stickers.workflow import mesh_from
-    from coupole.geometry import transform
 
     def work(console: Console, request: Request) -> Outcome:
         known, sources = read_scan(scan), open_sources(runs, None)
@@ -113,12 +113,8 @@ def mesh(
                 sources, prior.lens, diameter_mm=diameter_mm, depth_mm=depth_mm, progress=progress
             )
         console.print(f"{sum(map(len, images.stickers))} stickers in {len(images.names)} images")
-        support, arm = None, None
-        if rig is not None:
-            place = _cell(rig, runs).rig.support.base_from_support
-            support = transform(place.translation_mm, place.abc_deg)
-        if has_axis_zeros(hand_eye):
-            arm = _arm(_cell(rig, runs), hand_eye)
+        support = _base_from_support(_cell(rig, runs)) if rig is not None else None
+        arm = _arm(_cell(rig, runs), hand_eye) if has_axis_zeros(hand_eye) else None
         stated = Stated(scanner_mm=scanner_mm, robot_mm=repeatability_mm, robot_deg=repeatability_deg)
         found = mesh_from(
             images,
@@ -134,6 +130,13 @@ def mesh(
         return Outcome(found.record, partial(draw_mesh, found))
 
     return work
+
+
+def _base_from_support(cell: Cell) -> Transform:
+    from coupole.geometry import transform
+
+    place = cell.rig.support.base_from_support
+    return transform(place.translation_mm, place.abc_deg)
 
 
 def _arm(cell: Cell, hand_eye: Path) -> CalibratedArm | None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from coupole.calibration.lens.board import Board
-    from coupole.calibration.lens.bundle import EarlierLens
+    from coupole.calibration.lens.equations import EarlierLens
     from coupole.calibration.lens.images import Found
     from coupole.calibration.lens.workflow import Shown
     from coupole.calibration.report import Outcome
@@ -148,7 +148,7 @@ def _earlier_lens(path: Path | None, sources: Sources, found: Found) -> EarlierL
     """The lens of a camera's record, with its covariance. Raises InputError for a record that does not hold for
     these images."""
     from coupole.calibration.earlier import read_earlier, refuse_same_images
-    from coupole.calibration.lens.bundle import EarlierLens
+    from coupole.calibration.lens.equations import EarlierLens
     from coupole.calibration.record import intrinsics_of
 
     if path is None:

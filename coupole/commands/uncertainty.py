@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from coupole.calibration.budget.accuracy import Accuracy, Case
-    from coupole.calibration.budget.budget import Budget, Known, Spread
+    from coupole.calibration.budget.budget import Budget, Geometry, Known, Spread
     from coupole.calibration.in_force import InForce
 
 _SAMPLES = 24
@@ -58,17 +59,13 @@ def budget(
     out: Annotated[Path | None, typer.Option("--out", help="Write this PNG, and HTML and JSON beside it.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """What a reflectance is uncertain by, what dominates it, and our accuracies beside the paper's.
+    """Uncertainty of a reflectance, what dominates it, and our accuracies beside the paper's.
 
-    Monte Carlo (JCGM 101) gives the intervals, the linear formula checks them.
+    The intervals are by Monte Carlo (JCGM 101); the linear formula checks them.
     """
-    from coupole.calibration.budget.accuracy import Case, accuracies
-    from coupole.calibration.budget.budget import Geometry, Known, budget_of
-    from coupole.calibration.budget.page import page
+    from coupole.calibration.budget.budget import Geometry, Known
     from coupole.calibration.budget.propagation import COVERAGES
-    from coupole.calibration.budget.records import doubts, known_from, read_records
-    from coupole.calibration.budget.report import as_json as figures_of
-    from coupole.calibration.budget.report import draw_budget
+    from coupole.calibration.budget.records import read_records
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
@@ -76,46 +73,80 @@ def budget(
     try:
         if out is not None:
             _refuse_target(out)
-        ours = _with_plan(read_records(records or []), plan)
-        known = known_from(ours, start)
+        given = _with_plan(read_records(records or []), plan)
         with console.status("propagating distributions"):
-            found = budget_of(
-                known,
-                Geometry(incidence_deg),
-                emission=emission_of(emission),
-                coverages=coverage or COVERAGES,
+            result = _propagated(
+                given, beside or [], start, Geometry(incidence_deg), emission, coverage or COVERAGES
             )
-            cases = [Case(_folder(ours), ours, _spread(known))]
-            if beside:
-                others = read_records(beside)
-                cases.append(Case(_folder(others), others, _spread(known_from(others, start))))
-        spread, table = cases[0].spread, accuracies(cases)
-        assert spread is not None
-        doubted = doubts([item for case in cases for item in case.records], datetime.now(UTC))
-        document = figures_of(found, spread, cases, table) | {"doubts": doubted}
         if out is not None:
-            picture = draw_budget(found, spread)
-            text = page(found, spread, cases, table, picture, doubted)
-            _write(
-                {
-                    out: picture,
-                    out.with_suffix(".html"): text.encode(),
-                    out.with_suffix(".json"): f"{json.dumps(document, indent=1)}\n".encode(),
-                }
-            )
+            _write_report(out, result)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
     if as_json:
-        print(json.dumps(document))
-    else:
-        _show(console, found)
-        _show_accuracies(console, cases, table)
-        for line in doubted:
-            console.print(f"[yellow]{line}[/]")
+        print(json.dumps(result.document))
+        return
+    _show(console, result.budget)
+    _show_accuracies(console, result)
 
 
 # -- helpers --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Result:
+    budget: Budget
+    spread: Spread
+    """Of the first case."""
+    cases: list[Case]
+    """Our records, then those of `--beside`."""
+    table: tuple[Accuracy, ...]
+    doubts: tuple[str, ...]
+    document: dict[str, Any]
+    """As `--json` prints it."""
+
+
+def _propagated(
+    ours: tuple[InForce, ...],
+    beside: list[Path],
+    start: Known,
+    geometry: Geometry,
+    emission: str,
+    coverages: Sequence[float],
+) -> _Result:
+    """The budget by our records, and the table that compares them with those of `beside`."""
+    from coupole.calibration.budget.accuracy import Case, accuracies
+    from coupole.calibration.budget.budget import budget_of
+    from coupole.calibration.budget.records import doubts, known_from, read_records
+    from coupole.calibration.budget.report import as_json as figures_of
+
+    known = known_from(ours, start)
+    found = budget_of(known, geometry, emission=emission_of(emission), coverages=coverages)
+    spread = _spread(known)
+    cases = [Case(_folder(ours), ours, spread)]
+    if beside:
+        others = read_records(beside)
+        cases.append(Case(_folder(others), others, _spread(known_from(others, start))))
+    table = accuracies(cases)
+    doubted = doubts([item for case in cases for item in case.records], datetime.now(UTC))
+    document = figures_of(found, spread, cases, table) | {"doubts": doubted}
+    return _Result(found, spread, cases, table, doubted, document)
+
+
+def _write_report(out: Path, result: _Result) -> None:
+    """The picture, and HTML and JSON beside it."""
+    from coupole.calibration.budget.page import page
+    from coupole.calibration.budget.report import draw_budget
+
+    picture = draw_budget(result.budget, result.spread)
+    text = page(result.budget, result.spread, result.cases, result.table, picture, result.doubts)
+    _write(
+        {
+            out: picture,
+            out.with_suffix(".html"): text.encode(),
+            out.with_suffix(".json"): f"{json.dumps(result.document, indent=1)}\n".encode(),
+        }
+    )
 
 
 def _with_plan(given: tuple[InForce, ...], plan: Path | None) -> tuple[InForce, ...]:
@@ -195,15 +226,18 @@ def _show(console: Console, found: Budget) -> None:
         console.print(f"  at {v.coverage:.0%}, to digit {v.digits} of u (JCGM 101, section 8): it {verdict(v)}")
 
 
-def _show_accuracies(console: Console, cases: list[Case], lines: tuple[Accuracy, ...]) -> None:
+def _show_accuracies(console: Console, result: _Result) -> None:
     from rich.table import Table
 
+    cases = result.cases
     table = Table(
         "accuracy", "seed 003", *(case.name for case in cases), box=None, padding=(0, 1, 0, 0), pad_edge=False
     )
     table.add_row("robot's noise, found", "", *(case.robot for case in cases))
-    for line in lines:
+    for line in result.table:
         table.add_row(line.what, line.paper, *(line.cell(number) for number in range(len(cases))))
     console.print()
     console.print(table)
     console.print("standard uncertainties, all directions together; samples over a dome: their 68 % intervals")
+    for doubt in result.doubts:
+        console.print(f"[yellow]{doubt}[/]")

@@ -17,7 +17,7 @@ from coupole.plan.rig_devices import in_world, runs_tables
 from coupole.preflight import ledger
 from coupole.preflight.job import Job, at_pace
 from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, check
-from coupole.storage.frame_file import measure_write_speed
+from coupole.storage.write_speed import measure_write_speed
 
 _DISK_GRAIN_US = 100
 _LED_DUTIES = tuple(0.9**k for k in range(1, 33))

@@ -24,7 +24,7 @@ from coupole.geometry import Transform
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import BracketExposure, FixedExposure, LightIds, Plan
 from coupole.plan.shot_id import Light, ShotId
-from coupole.storage.frame_file import Collections
+from coupole.storage.frame_file_creation import Collections
 from coupole.storage.journal_events import Event
 
 METERING_LIGHTS = 12

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from coupole.errors import DiskFull, StorageError
+from coupole.storage.disk_errors import disk_error
 
 
 def utc_now() -> str:
@@ -27,7 +26,7 @@ class LineFile:
             self.was_empty = os.fstat(self._fd).st_size == 0
             self._end_torn_line()
         except OSError as error:
-            raise _storage_error(path, error) from error
+            raise disk_error(path, error) from error
 
     def _end_torn_line(self) -> None:
         """After a crash the last line may be half written: close it, so that the next one is whole."""
@@ -49,13 +48,7 @@ class LineFile:
         except OSError as error:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, start)
-            raise _storage_error(self._path, error) from error
+            raise disk_error(self._path, error) from error
 
     def close(self) -> None:
         os.close(self._fd)
-
-
-def _storage_error(path: Path, error: OSError) -> StorageError:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return DiskFull(f"{path}: the disk is full. Free space on it, then resume the run.")
-    return StorageError(f"{path}: {error.strerror}. Check the disk, then resume the run.")

@@ -12,11 +12,11 @@ from archives import METADATA
 from numpy.typing import NDArray
 
 from coupole.devices import ArmState, FrameFormat
-from coupole.storage import frame_file
-from coupole.storage.frame_file import ViewWriter
+from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
 from coupole.storage.run import Inputs, Run
+from coupole.storage.view_writer import ViewWriter
 
 SIZE_PX = (128, 96)
 FORMAT = FrameFormat(
@@ -52,7 +52,7 @@ def write_light_run(folder: Path, frames: Sequence[Taken]) -> Path:
         mine = [frame for frame in frames if frame.shot.split("/")[0] == view]
         path = run.view_path(view)
         metadata = {**METADATA, "title": view, "focus_distance_mm": 335.0, "pixel_pitch_um": PITCH_UM}
-        frame_file.create(path, len(mine), FORMAT, metadata)
+        create(path, len(mine), FORMAT, metadata)
         writer = ViewWriter(path, {})
         arm = ArmState((0, -90, 90, 0, 90, 0), np.eye(4), 7, moving=False)
         pose = writer.add_pose(arm, mine[0].base_from_camera)

@@ -16,11 +16,11 @@ from synthesis import Array, TrueLens, frame, looking_at_board, render
 
 from coupole.calibration.lens.board import Board
 from coupole.devices import ArmState, FrameFormat
-from coupole.storage import frame_file
-from coupole.storage.frame_file import ViewWriter
+from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
 from coupole.storage.run import Inputs, Run
+from coupole.storage.view_writer import ViewWriter
 
 BOARD = Board(kind="charuco", corners=(9, 6), square_mm=16.0, marker_mm=10.0)
 BOARD_YAML = "kind: charuco\ncorners: [9, 6]\nsquare_mm: 16.0\nmarker_mm: 10.0\n"
@@ -109,7 +109,7 @@ def write_run(
     diary.write(SessionStarted())
     for view, picture, pose, bright in zip(views, made.pictures, made.base_from_flange, lights, strict=True):
         path = run.view_path(view)
-        frame_file.create(path, len(labels), FORMAT, {**METADATA, "title": view, "focus_distance_mm": 335.0})
+        create(path, len(labels), FORMAT, {**METADATA, "title": view, "focus_distance_mm": 335.0})
         writer = ViewWriter(path, {})
         at = writer.add_pose(ArmState((0, -90, 90, 0, 90, 0), pose, 7, moving=False), pose @ FLANGE_FROM_CAMERA)
         for number, label in enumerate(labels):

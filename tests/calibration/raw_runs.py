@@ -25,11 +25,11 @@ from coupole.devices import ArmState, FrameFormat
 from coupole.geometry import abc_from_rotation
 from coupole.plan.led_table import COLUMNS, LedTable
 from coupole.plan.plan import Pose
-from coupole.storage import frame_file
-from coupole.storage.frame_file import ViewWriter
+from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
 from coupole.storage.run import Inputs, Run
+from coupole.storage.view_writer import ViewWriter
 
 FLANGE_FROM_CAMERA = frame(np.array([31.0, -42.0, 118.0]), np.array([4.0, -3.0, 60.0]))
 
@@ -70,7 +70,7 @@ def write_raw_run(folder: Path, frames: Sequence[Frame], *, pattern: str = "GBRG
     for view in views:
         mine = [one for one in frames if one.view == view]
         path = run.view_path(view)
-        frame_file.create(path, len(mine), of, {**METADATA, "title": view, "focus_distance_mm": 335.0})
+        create(path, len(mine), of, {**METADATA, "title": view, "focus_distance_mm": 335.0})
         writer = ViewWriter(path, {})
         flange = mine[0].base_from_flange
         arm = ArmState((0, -90, 90, 0, 90, 0), flange, 7, moving=False)

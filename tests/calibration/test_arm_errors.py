@@ -10,8 +10,9 @@ from synthesis import Array, TrueLens, board_points, frame, looking_at_board
 
 from coupole.calibration.arm_errors import axis_sensitivity
 from coupole.calibration.lens.board import Sighting
-from coupole.calibration.lens.bundle import HandEyeCalibration, Poses, RobotNoise, calibrate_hand_eye
+from coupole.calibration.lens.bundle import HandEyeCalibration, RobotNoise, calibrate_hand_eye
 from coupole.calibration.lens.camera import calibrate_camera
+from coupole.calibration.lens.equations import Poses
 from coupole.calibration.rotations import between
 from coupole.kinematics import forward, inverse, nearest
 from sim.devices.kuka_kinematics import PoseErrors

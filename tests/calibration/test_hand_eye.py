@@ -9,8 +9,9 @@ import pytest
 from synthesis import Array, Cell, frame, make_cell
 
 from coupole.calibration.adjustment import coverage_factor
-from coupole.calibration.lens.bundle import EarlierLens, HandEyeCalibration, Poses, RobotNoise, calibrate_hand_eye
+from coupole.calibration.lens.bundle import HandEyeCalibration, RobotNoise, calibrate_hand_eye
 from coupole.calibration.lens.camera import calibrate_camera, without_gross_errors
+from coupole.calibration.lens.equations import EarlierLens, Poses
 from coupole.calibration.lens.hand_eye import METHODS, motions, solve
 from coupole.calibration.rotations import between
 from coupole.errors import InputError

@@ -15,11 +15,11 @@ from coupole.calibration.leds.sources import find_leds
 from coupole.devices import ArmState, FrameFormat
 from coupole.errors import InputError
 from coupole.plan.led_table import LedTable
-from coupole.storage import frame_file
-from coupole.storage.frame_file import ViewWriter
+from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
 from coupole.storage.run import Inputs, Run
+from coupole.storage.view_writer import ViewWriter
 
 SHAPE = (96, 128)
 FORMAT = FrameFormat(
@@ -41,7 +41,7 @@ def write_run(folder: Path, labels: tuple[str, ...], *, hot: bool = False) -> Ru
     diary.write(SessionStarted())
     for number, view in enumerate(views):
         path = run.view_path(view)
-        frame_file.create(path, len(labels), FORMAT, {**METADATA, "title": view, "focus_distance_mm": 335.0})
+        create(path, len(labels), FORMAT, {**METADATA, "title": view, "focus_distance_mm": 335.0})
         writer = ViewWriter(path, {})
         pose = np.eye(4)
         pose[0, 3] = 100.0 * number

@@ -17,9 +17,10 @@ from synthesis import Array
 from coupole.calibration.adjustment import coverage_factor
 from coupole.calibration.grey_image import Picture
 from coupole.calibration.lens.board import Board, Sighting, detect
-from coupole.calibration.lens.bundle import Poses, RobotNoise, calibrate_hand_eye
+from coupole.calibration.lens.bundle import RobotNoise, calibrate_hand_eye
 from coupole.calibration.lens.camera import board_pose, calibrate_camera, without_gross_errors
 from coupole.calibration.lens.diagnosis import diagnose, expected_scatter
+from coupole.calibration.lens.equations import Poses
 from coupole.calibration.lens.hand_eye import METHODS, solve
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.poses import Convention, ReportedPoses

@@ -14,7 +14,8 @@ from cells import CellFolder
 
 from coupole.errors import StorageError
 from coupole.storage import frame_file
-from coupole.storage.frame_file import ViewWriter
+from coupole.storage.frame_file_creation import create
+from coupole.storage.view_writer import ViewWriter
 
 
 @pytest.fixture
@@ -77,7 +78,7 @@ def test_packed_frames_are_exported(made: MadeRun, tmp_path: Path) -> None:
 
 def test_a_frame_that_has_more_bits_is_not_packed_and_not_cut(tmp_path: Path) -> None:
     path = tmp_path / "view.h5"
-    frame_file.create(path, 2, FORMAT, {**METADATA, "title": "view"}, packed=True)
+    create(path, 2, FORMAT, {**METADATA, "title": "view"}, packed=True)
     writer = ViewWriter(path, {})
     pixels = noisy_frame(1, FORMAT)
     pixels[0, 0] = 4096

@@ -26,8 +26,8 @@ from coupole.storage import frame_file
 from coupole.storage import run as run_module
 from coupole.storage.archive import KEPT_FOLDER, Archived, archive_run
 from coupole.storage.bitshuffle import CODECS, FILL_DN, codec_of, compressed_tiles, tile_shape
-from coupole.storage.frame_file import ViewWriter
 from coupole.storage.run import Run
+from coupole.storage.view_writer import ViewWriter
 
 LZ4 = CODECS["lz4"]
 

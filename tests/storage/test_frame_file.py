@@ -13,7 +13,8 @@ from view_files import DATA, FORMAT, FRAMES, METADATA, ODD, SLOTS, frame, write_
 from coupole.devices import ArmState
 from coupole.errors import StorageError
 from coupole.storage import frame_file
-from coupole.storage.frame_file import ViewWriter
+from coupole.storage.frame_file_creation import create
+from coupole.storage.view_writer import ViewWriter
 
 
 def test_frames_are_read_by_plain_h5py(tmp_path: Path) -> None:
@@ -33,7 +34,7 @@ def test_the_frame_table_is_read_by_plain_h5py(tmp_path: Path) -> None:
 
 
 def test_measured_poses_are_read_by_plain_h5py(tmp_path: Path) -> None:
-    frame_file.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
+    create(tmp_path / "top.h5", 1, FORMAT, METADATA)
     writer = ViewWriter(tmp_path / "top.h5", {})
     flange, camera = np.diag([1.0, 2.0, 3.0, 1.0]), np.diag([4.0, 5.0, 6.0, 1.0])
     assert writer.add_pose(ArmState((1, 2, 3, 4, 5, 6), flange, 77, moving=False), camera) == 0
@@ -47,7 +48,7 @@ def test_measured_poses_are_read_by_plain_h5py(tmp_path: Path) -> None:
 
 
 def test_poses_of_a_reopened_view_are_added_behind_those_it_has(tmp_path: Path) -> None:
-    frame_file.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
+    create(tmp_path / "top.h5", 1, FORMAT, METADATA)
     for number in range(2):
         writer = ViewWriter(tmp_path / "top.h5", {})
         assert writer.add_pose(ArmState((0,) * 6, np.eye(4), 5, moving=False), np.eye(4)) == number
@@ -133,7 +134,7 @@ def test_frames_written_after_reopening_overwrite_nothing_proven(tmp_path: Path)
 
 
 def test_a_freed_slot_is_used_again(tmp_path: Path) -> None:
-    frame_file.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
+    create(tmp_path / "top.h5", 1, FORMAT, METADATA)
     writer = ViewWriter(tmp_path / "top.h5", {})
     slot = writer.put(frame(0), frame_id=1, camera_ns=1, exposure_us=8000)
     writer.free(slot)
@@ -142,7 +143,7 @@ def test_a_freed_slot_is_used_again(tmp_path: Path) -> None:
 
 
 def test_more_frames_than_slots_are_an_error_that_says_so(tmp_path: Path) -> None:
-    frame_file.create(tmp_path / "top.h5", 1, FORMAT, METADATA)
+    create(tmp_path / "top.h5", 1, FORMAT, METADATA)
     writer = ViewWriter(tmp_path / "top.h5", {})
     writer.put(frame(0), frame_id=1, camera_ns=1, exposure_us=8000)
     with pytest.raises(StorageError, match="no slot is free"):

@@ -14,10 +14,11 @@ import pytest
 from view_files import FORMAT, METADATA, SLOTS, frame
 
 from coupole.errors import DiskFull
-from coupole.storage import frame_file, journal
-from coupole.storage.frame_file import ViewWriter
+from coupole.storage import journal
+from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FaultNoted, SessionStarted, SessionStopped
+from coupole.storage.view_writer import ViewWriter
 
 
 @pytest.fixture
@@ -43,12 +44,12 @@ def fill(disk: Path, leave_bytes: int) -> None:
 
 def test_a_view_for_which_there_is_no_room_is_refused_and_leaves_no_file(small_disk: Path) -> None:
     with pytest.raises(DiskFull, match="the disk is full"):
-        frame_file.create(small_disk / "top.h5", 200, FORMAT, METADATA)
+        create(small_disk / "top.h5", 200, FORMAT, METADATA)
     assert list(small_disk.iterdir()) == []
 
 
 def test_the_space_of_a_view_is_its_own_though_the_disk_fills_up(small_disk: Path) -> None:
-    frame_file.create(small_disk / "top.h5", SLOTS, FORMAT, METADATA)
+    create(small_disk / "top.h5", SLOTS, FORMAT, METADATA)
     fill(small_disk, 0)
     writer = ViewWriter(small_disk / "top.h5", {})
     for number in range(SLOTS):

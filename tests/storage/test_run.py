@@ -11,10 +11,10 @@ from view_files import frame, write_view
 from coupole.errors import InputError
 from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file, run
-from coupole.storage.frame_file import ViewWriter
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted
 from coupole.storage.run import Inputs, Run
+from coupole.storage.view_writer import ViewWriter
 
 
 @pytest.fixture

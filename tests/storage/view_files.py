@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from coupole.devices import FrameFormat
-from coupole.storage import frame_file
-from coupole.storage.frame_file import ViewWriter
+from coupole.storage.frame_file_creation import create
+from coupole.storage.view_writer import ViewWriter
 
 FORMAT = FrameFormat(height_px=64, width_px=128, bit_depth=12, bayer_pattern="GBRG", black_dn=64, white_dn=4095)
 ODD = FrameFormat(height_px=30, width_px=50, bit_depth=12, bayer_pattern="GBRG", black_dn=64, white_dn=4095)
@@ -29,7 +29,7 @@ def frame(number: int, of: FrameFormat = FORMAT) -> np.ndarray[Any, np.dtype[np.
 
 def write_view(path: Path, proven: int = 3, stored: int = 1, of: FrameFormat = FORMAT) -> dict[str, int]:
     """A view's file with proven and merely stored frames; returns the checksums of the proven shots."""
-    frame_file.create(path, SLOTS, of, METADATA)
+    create(path, SLOTS, of, METADATA)
     writer = ViewWriter(path, {})
     checksums = {}
     try:

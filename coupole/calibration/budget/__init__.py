@@ -1,9 +1,9 @@
-"""What a reflectance is uncertain by (JCGM 100 and 101).
+"""Uncertainty budget of a reflectance (JCGM 100 and 101).
 
 ::
 
     measurement.py  the measurement equation
-    propagation.py  Monte Carlo and the linear formula, and whether that would do
-    records.py      what records say of each input; accuracy.py: beside the paper's figures
-    budget.py       shares of the sources; report.py, page.py: as table, picture and page
+    propagation.py  Monte Carlo and the linear formula, and the test of the latter
+    records.py      uncertainties of the inputs from records; accuracy.py: comparison with the paper
+    budget.py       contributions of the sources; report.py, page.py: table, picture and page
 """

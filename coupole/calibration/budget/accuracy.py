@@ -1,7 +1,7 @@
-"""The accuracies of seed 003 beside those that records say, for one cell or several.
+"""The accuracies of seed 003 beside those by calibration records, for one cell or several.
 
-All figures of ours are computed from records: standard uncertainties, all directions together. The paper does not
-say which coverage its own have.
+Our figures are computed from records: standard uncertainties, all directions together. The paper does not state
+the coverage of its own.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Case:
 
     @property
     def robot(self) -> str:
-        """The greatest noise of the robot that its records found, in words."""
+        """The largest noise of the robot by its records, as text."""
         found = [{line.name: line.found for line in item.record.noise} for item in self.records]
         found = [noise for noise in found if {"robot position", "robot orientation"} <= set(noise)]
         if not found:
@@ -49,12 +49,12 @@ class Accuracy:
     unit: str
     """Empty for relative intervals."""
     paper: str
-    """The paper's figure with its own words."""
+    """The paper's figure in its own words."""
     ours: tuple[tuple[float, ...] | None, ...]
-    """By case: one figure or an interval's two ends; None where no record says."""
+    """By case: one figure, or the two ends of an interval; None without a record."""
 
     def cell(self, case: int) -> str:
-        """Our figure in words."""
+        """Our figure as text."""
         found = self.ours[case]
         if found is None:
             return "no record"
@@ -64,7 +64,7 @@ class Accuracy:
 
 
 def accuracies(cases: Sequence[Case]) -> tuple[Accuracy, ...]:
-    """The table, of records whose files stand beside them as `read_records` has checked."""
+    """The table. `read_records` has checked that the records' files exist."""
     lines = [
         Accuracy(what, unit, paper, tuple(_by_record(case, kind, figure) for case in cases))
         for what, unit, paper, kind, figure in _LINES
@@ -86,8 +86,8 @@ def _camera_on_flange(item: InForce) -> float:
 
 
 def _camera_in_base(item: InForce) -> float:
-    """At any pose: hand-eye and the robot's noise there. A turn of the whole base is none of it: LEDs and mesh are
-    found in the same one."""
+    """At any pose: hand-eye and the robot's noise. A common rotation of the base does not count, as LEDs and mesh
+    are calibrated in the same base."""
     noise = {line.name: line.found for line in item.record.noise}
     turned_mm = np.radians(noise["robot orientation"]) * camera_reach_mm(item.record)
     pose_mm2 = 3.0 * noise["robot position"] ** 2 + 2.0 * turned_mm**2

@@ -1,9 +1,10 @@
-"""The uncertainty budget of one reflectance: every input with its source, propagated twice, and what dominates.
+"""The uncertainty budget of one reflectance: all inputs with their sources, propagated by two methods, and ranked.
 
-Monte Carlo (JCGM 101) gives the result, since a mesh of 200 um edges whose vertices are known to 30 um makes the
-normal uncertain by degrees, and 1 / cos is then far from linear; GUM's linear formula cross-checks it, and JCGM
-101 (section 8) says whether it would do. What dominates is told in three ways: each source's share of the linear
-variance, the width that is left without the source (the paper's way), and the width of the source alone.
+The result is by Monte Carlo (JCGM 101): in a mesh of 200 um edges with vertices known to 30 um the normal is
+uncertain by degrees, and 1 / cos is then far from linear. GUM's linear formula is the cross-check, and section 8
+of JCGM 101 tests whether it is sufficient. The importance of a source is given in three ways: its share of the
+linear variance, the width of the interval without the source (the paper's way), and the width of the interval from
+the source alone.
 """
 
 from __future__ import annotations
@@ -54,17 +55,18 @@ STATED = {
     "LED power, common": "assumed",
     "drift": "assumed",
 }
-"""All sources of uncertainty, and what says how large each is where no record does."""
+"""All sources of uncertainty, and where each one's size comes from without a record."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """Standard uncertainties of all that enters, and where each comes from. Defaults are seed 003's figures, or
-    ours where it has none."""
+    """Standard uncertainties of all inputs, and the source of each. Defaults are seed 003's figures, or ours where
+    it has none."""
 
     vertex_mm: float = 0.030
-    """Limit of each coordinate of each vertex: a maker's accuracy is a bound, so its distribution is rectangular
-    (GUM 4.3.7). As a standard uncertainty it would let normals turn by 12 degrees."""
+    """Bound of the error of each coordinate of each vertex: a manufacturer's accuracy is a bound, so its
+    distribution is rectangular (GUM 4.3.7). Taken as a standard uncertainty it would make normals uncertain by 12
+    degrees."""
     edge_mm: float = 0.2
     led_mm: float = 0.7
     """Of an LED's centre, all directions together."""
@@ -73,11 +75,11 @@ class Known:
     """Of mesh to robot, all directions together."""
     mesh_deg: float = 0.02
     robot_mm: float = 0.03
-    """Of the robot's common error: it shifts LEDs and mesh alike, and so correlates them."""
+    """Of the robot's common error, which shifts LEDs and mesh alike and so correlates them."""
     camera_mm: float = 0.3
     """Of the camera's ray where it meets the object, both directions across it together."""
     lens_px: float = 0.3
-    """Of where the lens sees a direction, both directions together."""
+    """Of the image of a direction by the lens's calibration, both coordinates together."""
     pixel_mm: float = 0.047
     """Side of a pixel on the object."""
     contrast_per_mm: float = 0.02
@@ -91,15 +93,15 @@ class Known:
     gain_dn_per_e: float = 0.31
     full_scale_dn: float = 4031.0
     pixels: int = 5
-    """That a triangle covers in one channel, of which the mean is taken."""
+    """Pixels of one channel that a triangle covers; their mean is used."""
     sources: tuple[tuple[str, str], ...] = ()
-    """Source of uncertainty and the record that says so."""
+    """Source of uncertainty and the record that its figure comes from."""
 
     def source(self, group: str) -> str:
         return dict(self.sources).get(group, STATED[group])
 
     def figure(self, group: str) -> str:
-        """What a source was taken to be, in words."""
+        """The figures used for a source, as text."""
         return {
             "vertices": f"{self.vertex_mm:.3g} mm, edges {self.edge_mm:.3g}",
             "pixel value": f"{self.read_noise_dn:.2g} DN, {self.pixels} pixels",
@@ -126,23 +128,23 @@ class Geometry:
     """Between the LED's normal and the sample."""
     distance_mm: float = 1000.0
     exposure_share: float = 0.6
-    """Of full scale that a white target facing the LED would give."""
+    """Share of full scale at which a white target facing the LED would be exposed."""
     reflectance: float = 0.5
     """Albedo of the sample."""
 
 
 @dataclass(frozen=True)
 class Share:
-    """What one source does."""
+    """Contribution of one source."""
 
     source: str
     figure: str
-    """What it was taken to be, in words."""
+    """Figures used for it, as text."""
     said_by: str
     linear: float
     """Share of the linear variance."""
     removed: float
-    """By how much the width of the 68 % interval falls without it, relative."""
+    """Relative decrease of the width of the 68 % interval without it."""
     alone: float
     """Half the width of its own 68 % interval, relative to the value."""
 
@@ -226,7 +228,7 @@ def budget_of(
     most_trials: int = 500_000,
     seed: int = 1,
 ) -> Budget:
-    """Propagate one sample's uncertainty, and take each source away in turn and alone."""
+    """Propagate one sample's uncertainty: with all sources, without each of them, and with each alone."""
     inputs, led_normal = sample_inputs(known, geometry, emission=emission)
     model = partial(_model, led_normal=led_normal, emission=emission)
     numeric = monte_carlo(model, inputs, coverages=coverages, digits=digits, most_trials=most_trials, seed=seed)
@@ -245,8 +247,8 @@ def budget_of(
 def shares_of(
     model: Model, inputs: Inputs, linearly: Linear, known: Known, *, seed: int = 1, trials: int = 20_000
 ) -> tuple[Share, ...]:
-    """What each group of inputs does, the greatest first. All propagations draw the same numbers, so that their
-    differences have little noise."""
+    """Contribution of each group of inputs, the largest first. All propagations use the same random numbers, so
+    that their differences have little noise."""
     groups = list(dict.fromkeys(q.source_group for q in inputs.quantities if q.u > 0.0))
 
     def half_width(fixed: frozenset[str]) -> float:
@@ -273,7 +275,7 @@ class Spread:
 
     best: tuple[float, float]
     half: tuple[float, float]
-    """Half of all samples are not wider than this, end by end."""
+    """Median of each end over all samples."""
     most: tuple[float, float]
     """95 % of all."""
     ends: Floats

@@ -5,10 +5,10 @@ Eq. 1, pi among them, stand in numerator and denominator alike, and
 
     f = V / (t g Phi_k e(x, n, l_k, n_k)),        e = E / Phi of `coupole.calibration.light.irradiance`, in m^-2,
 
-with V the signal above dark made linear (DN), t the exposure (s), g the flat field, Phi_k the LED's power
-(DN s^-1 m^2 sr). The emission profile is e's: `lambertian`, or `paper`, which takes the emitter's cosine twice. A
-pixel that is laid on the mesh beside its place brings its neighbour's value, so that a change of albedo along the
-surface goes into f as well.
+with V the linearised signal above dark (DN), t the exposure (s), g the flat field, Phi_k the LED's power (DN s^-1
+m^2 sr). The emission profile enters through e: `lambertian`, or `paper`, which has the emitter's cosine twice. A
+pixel that is projected onto the wrong place of the mesh brings its neighbour's value, so a change of albedo along
+the surface enters f as well.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ VERTICES = tuple(f"vertex{i}.{axis}_mm" for i in range(3) for axis in "xyz")
 LED_PLACE = tuple(f"led.{axis}_mm" for axis in "xyz")
 LED_TURN = ("led.turn1_deg", "led.turn2_deg")
 SEEN_OFF = ("lens.x_mm", "camera.x_mm")
-"""How far beside its place a pixel is laid on the mesh, along the surface's steepest change of albedo."""
+"""Error of a pixel's place on the mesh, along the steepest change of albedo."""
 MESH_STEP = (*(f"mesh.{axis}_mm" for axis in "xyz"), *(f"mesh.r{axis}_deg" for axis in "xyz"))
 
 
@@ -51,13 +51,13 @@ def reflectance(
 
 
 def reflectance_of(q: Mapping[str, Floats], led_normal: Floats, *, emission: Emission = "lambertian") -> Floats:
-    """The measurement equation of a triangle's sample, of quantities [trials] by name.
+    """The measurement equation for a sample on a triangle; `q` has the quantities [trials] by name.
 
-    Point and normal are made from the triangle's `VERTICES` in the base frame, moved by `MESH_STEP` (a small step
-    of base_from_mesh about the triangle's middle); the LED's normal [3] is turned by `LED_TURN` about two axes
-    across it. `response`, `flat_field`, `power.own`, `power.common` and `drift` are factors about 1. The mesh's
-    step along x and `SEEN_OFF` say how far beside its place the surface is seen, whose albedo changes there by
-    `contrast_per_mm`.
+    Point and normal are computed from the triangle's `VERTICES` in the base frame, moved by `MESH_STEP` (a small
+    step of base_from_mesh about the triangle's middle); the LED's normal [3] is turned by `LED_TURN` about two
+    axes across it. `response`, `flat_field`, `power.own`, `power.common` and `drift` are factors about 1. The
+    mesh's step along x and `SEEN_OFF` are the error of the place at which the surface is seen; its albedo changes
+    there by `contrast_per_mm`.
     """
     corners = np.stack([q[name] for name in VERTICES], axis=-1)
     corners = corners.reshape(*corners.shape[:-1], 3, 3)

@@ -1,4 +1,4 @@
-"""The uncertainty budget as a page (HTML): result, what dominates, accuracies beside the paper's, every input."""
+"""The uncertainty budget as an HTML page: result, dominant sources, accuracies beside the paper's, all inputs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def page(
     picture: bytes,
     doubts: Sequence[str] = (),
 ) -> str:
-    """The whole page; `picture` is the PNG, `doubts` what speaks against the records."""
+    """The whole page; `picture` is the PNG, `doubts` are reasons not to rely on the records."""
     data = base64.b64encode(picture).decode()
     warned = "".join(f"<p class=bad>{html.escape(doubt)}" for doubt in doubts)
     return (
@@ -38,7 +38,7 @@ def page(
 
 
 def verdict(validation: Validation) -> str:
-    """Of the linear formula, in words."""
+    """Whether the linear formula is sufficient, as text."""
     if not validation.sure:
         return "may do or not: more trials would tell"
     return "will do" if validation.passed else "will not do"

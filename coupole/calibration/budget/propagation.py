@@ -1,8 +1,8 @@
-"""Propagation of distributions: GUM's linear formula and Monte Carlo, and whether the first will do.
+"""Propagation of distributions: GUM's linear formula and Monte Carlo, and a test of the linear formula.
 
 JCGM 100:2008 (GUM) section 5 for the linear formula; JCGM 101:2008 (Supplement 1) for Monte Carlo: adaptive number
-of trials (7.9), coverage intervals (7.7), test of the linear formula (8). A model is a function of arrays: it gets
-one array [trials] for each quantity and gives one back, so a million trials are one call on arrays.
+of trials (7.9), coverage intervals (7.7), test of the linear formula (8). A model is a function of arrays: it
+takes one array [trials] for each quantity and returns one, so a million trials are one call.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Shape = Literal["normal", "student", "rectangular", "triangular", "arcsine"]
 Model = Callable[[Mapping[str, Floats]], Floats]
 _LEAST_BATCH = 10_000
 _ADVISED = 0.2
-"""Of the tolerance: how well Monte Carlo's ends should be known for a validation (JCGM 101, 8.2)."""
+"""Of the tolerance: numerical accuracy of Monte Carlo's ends for a validation (JCGM 101, 8.2)."""
 _STEP = 1e-3
 """Of a standard uncertainty: for central differences."""
 COVERAGES = (0.68, 0.95)
@@ -38,9 +38,9 @@ class Quantity:
     """Standard uncertainty, in the name's unit."""
     shape: Shape = "normal"
     source: str = ""
-    """Which record or document says so."""
+    """The record or document that value and u come from."""
     group: str = ""
-    """Inputs of one group count as one source in the table of what dominates; the name if empty."""
+    """Inputs of one group count as one source of uncertainty; if empty, the input is a group by itself."""
     degrees_of_freedom: float = np.inf
     """Of Student's distribution."""
 
@@ -58,8 +58,8 @@ class Inputs:
     """Coefficients of pairs of normal quantities; all others are independent."""
 
     def matrix(self) -> Floats:
-        """[n, n] of correlation. Raises InputError for a pair that is not there or not normal, and if there can be
-        no such correlations."""
+        """Correlation matrix [n, n]. Raises InputError for a pair that does not exist or is not normal, and if the
+        matrix is not positive semidefinite."""
         names = [q.name for q in self.quantities]
         matrix = np.eye(len(names))
         for one, other, coefficient in self.correlations:
@@ -90,12 +90,12 @@ class Interval:
     kind: Literal["symmetric", "shortest", "normal"]
     """Probabilistically symmetric, shortest, or from the linear formula."""
     numerical: float = 0.0
-    """Twice the standard deviation of the worse end, as the trials' batches scatter; 0 for the linear formula."""
+    """Twice the standard deviation of the worse end, from the scatter of the batches; 0 for the linear formula."""
 
 
 @dataclass(frozen=True)
 class Propagated:
-    """What a propagation says of the output."""
+    """Distribution of the output by one propagation."""
 
     estimate: float
     u: float
@@ -105,7 +105,7 @@ class Propagated:
     samples: Floats
     """[trials] sorted; empty for the linear formula."""
     stable: bool = True
-    """False if the number of trials was not enough for the asked digits."""
+    """False if the number of trials was too small for the digits asked for."""
 
     def interval(self, coverage: float, kind: str) -> Interval:
         return next(i for i in self.intervals if i.coverage == coverage and i.kind == kind)
@@ -113,30 +113,31 @@ class Propagated:
 
 @dataclass(frozen=True)
 class Linear:
-    """GUM's propagation, with what each input adds."""
+    """GUM's propagation, with the contribution of each input."""
 
     result: Propagated
     sensitivities: Floats
     """[inputs] derivative of the output by each input."""
     shares: Floats
-    """[inputs] of the variance; with correlations the pair's part is halved between both. They sum to 1."""
+    """[inputs] of the variance; the term of a correlated pair is divided equally between both. They sum to 1."""
     degrees_of_freedom: float
     """Effective (Welch-Satterthwaite, GUM G.4); independent inputs only."""
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Whether the linear formula will do (JCGM 101, section 8), for u with so many significant digits."""
+    """Whether the linear formula is sufficient (JCGM 101, section 8), for u with a number of significant
+    digits."""
 
     coverage: float
     digits: int
     d_low: float
     d_high: float
-    """How far the ends of the linear interval are from Monte Carlo's."""
+    """Distance of the linear interval's ends from Monte Carlo's."""
     tolerance: float
-    """That of u at so many digits (7.9.2)."""
+    """Numerical tolerance of u with that number of digits (7.9.2)."""
     numerical: float
-    """How well Monte Carlo's ends are known; 8.2 advises a fifth of the tolerance."""
+    """Numerical accuracy of Monte Carlo's ends; 8.2 advises a fifth of the tolerance."""
 
     @property
     def passed(self) -> bool:
@@ -191,9 +192,9 @@ def monte_carlo(
 ) -> Propagated:
     """JCGM 101, 7.9.4: batches of trials until mean, u and the ends of the intervals are stable.
 
-    Stable is what scatters, at two standard deviations of the mean over batches, by no more than `within` times
-    the numerical tolerance of u at so many significant `digits`; a validation asks for 0.2 (8.2). Raises
-    InputError if the model gives a number that is none.
+    A figure is stable if two standard deviations of its mean over the batches are at most `within` times the
+    numerical tolerance of u for the number of significant `digits`; a validation asks for 0.2 (8.2). Raises
+    InputError if the model returns NaN.
     """
     batch = max(_LEAST_BATCH, int(np.ceil(100.0 / (1.0 - max(coverages)))))
     random = np.random.default_rng(seed)
@@ -221,16 +222,16 @@ def monte_carlo(
 
 
 def _pooled(means: Floats, us: Floats) -> float:
-    """u by all trials so far (7.9.4, step j), from mean and u of batches of one size."""
+    """u of all trials so far (7.9.4, step j), from means and u of batches of equal size."""
     return float(np.sqrt(np.mean(us**2) + np.var(means)))
 
 
 def trials_of(
     model: Model, inputs: Inputs, trials: int, seed: int = 1, fixed: frozenset[str] = frozenset()
 ) -> Floats:
-    """[trials] sorted values of the output. Inputs of the groups `fixed` keep their values; the others are drawn
-    as they would be without. A few may be infinite: ends of intervals stay what they are. Raises InputError if
-    more than 1 % are, or one is no number."""
+    """[trials] sorted values of the output. Inputs of the groups `fixed` keep their values; the others get the
+    same random numbers as if none were fixed. Up to 1 % of the values may be infinite, which leaves the ends of
+    intervals as they are. Raises InputError if there are more, or a NaN."""
     random = np.random.default_rng(seed)
     return _sorted(model(draw(inputs, _root(inputs.matrix()), trials, random, fixed)), infinite=0.01)
 
@@ -286,7 +287,7 @@ def draw(
 
 
 def _sorted(values: Floats, *, infinite: float = 0.0) -> Floats:
-    """Values in order. Raises InputError if more than a share of `infinite` is so, or any is no number."""
+    """Sorted values. Raises InputError if more than the share `infinite` of them is infinite, or one is NaN."""
     if np.isnan(values).any() or float(np.mean(np.isinf(values))) > infinite:
         raise InputError(
             f"budget: {np.mean(~np.isfinite(values)):.2%} of the trials give no finite value: an input's "

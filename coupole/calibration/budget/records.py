@@ -1,4 +1,4 @@
-"""What calibration records say to the uncertainty budget."""
+"""Inputs of the uncertainty budget from calibration records."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from coupole.calibration.rotations import Floats, skew
 from coupole.errors import InputError
 
 WORKING_MM = 334.0
-"""From camera to object, where a record does not say for which focus it holds (seed 003's field and pixels)."""
+"""From camera to object, for a record that has no focus distance (by seed 003's field and pixels)."""
 _FIELD = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])
 _SEEN_FROM_HAND_EYE = "flange_from_camera"
 
 
 @dataclass(frozen=True)
 class Said:
-    """What one record says: figures of `Known` by name, and the sources that it settles."""
+    """What one record contributes: figures of `Known` by name, and the sources of uncertainty that they
+    describe."""
 
     figures: dict[str, float]
     sources: tuple[str, ...]
 
 
 def read_records(paths: Sequence[Path]) -> tuple[InForce, ...]:
-    """Records, and those of use to a budget in folders. Raises InputError: no such file, nothing of use in a
-    folder, a record of a kind that says nothing here, two of one kind."""
+    """The records at `paths`; of a folder, those of the kinds that a budget uses. Raises InputError: no such file,
+    no such record in a folder, a record of a kind that a budget does not use, two of one kind."""
     found: list[InForce] = []
     for path in paths:
         if path.is_dir():
@@ -55,12 +56,12 @@ def read_records(paths: Sequence[Path]) -> tuple[InForce, ...]:
 
 
 def of_use(items: Sequence[InForce]) -> tuple[InForce, ...]:
-    """Those that say something to a budget."""
+    """Those of the kinds that a budget uses."""
     return tuple(item for item in items if item.record.kind in READERS)
 
 
 def doubts(items: Sequence[InForce], now: datetime) -> tuple[str, ...]:
-    """What speaks against records: limits that were missed, an expired validity."""
+    """Reasons not to rely on records: limits that were exceeded, an expired validity."""
     missed = [
         f"{item.path}: not accepted: {limit.what} is {limit.found:.3g} {limit.unit}, at most {limit.limit:.3g}"
         for item in items
@@ -76,7 +77,7 @@ def doubts(items: Sequence[InForce], now: datetime) -> tuple[str, ...]:
 
 
 def known_from(items: Sequence[InForce], start: Known) -> Known:
-    """What records say, in place of what is stated."""
+    """`start` with the figures of records in place of its own."""
     changes: dict[str, Any] = {}
     sources: list[tuple[str, str]] = []
     kinds = {item.record.kind for item in items}
@@ -87,8 +88,8 @@ def known_from(items: Sequence[InForce], start: Known) -> Known:
         changes |= said.figures
         sources += [(group, _called(item.record)) for group in said.sources]
     if {"leds", "mesh"} <= kinds:
-        # What both have of the hand-eye's error no record keeps, so they count as independent. A tenth of a
-        # millimetre between LED and mesh, which is more than that, changes an irradiance by 0.02 %.
+        # No record keeps the share of the hand-eye's error in LEDs and mesh, so they count as independent. A tenth
+        # of a millimetre between LED and mesh, which is more than that share, changes an irradiance by 0.02 %.
         changes["robot_mm"] = 0.0
     return replace(start, **changes, sources=tuple(sources))
 
@@ -164,7 +165,7 @@ def _of_camera(record: Record, path: Path) -> Said:
 
 
 def _of_hand_eye(record: Record, path: Path) -> Said:
-    """Lens and hand-eye together, whose errors make up for each other, and the robot's noise at one pose."""
+    """Lens and hand-eye together, whose errors partly cancel, and the robot's noise at one pose."""
     lens, _ = intrinsics_of(record)
     distance_mm = record.validity.focus_distance_mm or WORKING_MM
     noise = {line.name: line.found for line in record.noise}
@@ -196,10 +197,10 @@ def camera_reach_mm(record: Record) -> float:
 
 
 def ray_mm(record: Record, distance_mm: float) -> float:
-    """Standard uncertainty of where a ray meets an object so far away, across the ray, both directions together,
-    root mean square over the field: of lens and hand-eye with their common covariance. The zeros of the arm's axes
-    are left out, as a record knows no posture: with them it is up to half as much (the last axis' zero is traded
-    for a turn of the camera).
+    """Standard uncertainty of the point where a ray meets an object at this distance: across the ray, both
+    directions together, root mean square over the field, by lens and hand-eye with their common covariance. The
+    zeros of the arm's axes are left out, as a record has no posture: with them the uncertainty falls by up to half
+    (the zero of the last axis is correlated with a rotation of the camera).
 
     A step of flange_from_camera by t (flange's axes) and r (camera's axes) moves a point p of the camera's frame
     by -(R^T t + r x p).

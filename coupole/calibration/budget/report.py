@@ -79,7 +79,7 @@ def as_json(
 
 
 def draw_budget(budget: Budget, spread: Spread) -> bytes:
-    """PNG, 1600 x 1200: the distribution, what dominates, and how uncertainty grows with incidence."""
+    """PNG, 1600 x 1200: the distribution, the dominant sources, and the uncertainty over the incidence."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -2,9 +2,9 @@
 
 ::
 
-    plan.py         which views see all of them, and which lights each view needs
+    led_plan.py     the plan: views that see all LEDs, and the lights of each view
     spots.py        a lit LED in a frame; sources.py, views.py: in all frames of a run
-    matching.py     which spot is which LED: dead, swapped and mis-wired ones
-    boards.py       LEDs on rigid boards; equations.py, adjustment.py: all in one adjustment with the robot's noise
-    workflow.py     runs to record and table; limits.py, drawing.py: what is accepted and shown
+    matching.py     assigns spots to LEDs; names dead, swapped and mis-wired ones
+    boards.py       LEDs on rigid boards; equations.py, adjustment.py: one adjustment with the robot's noise
+    workflow.py     from runs to record and table; acceptance.py, drawing.py: acceptance limits and picture
 """

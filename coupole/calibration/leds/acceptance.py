@@ -1,4 +1,4 @@
-"""What is accepted of the LEDs' places."""
+"""Acceptance limits of the LEDs' positions."""
 
 from __future__ import annotations
 

@@ -1,15 +1,16 @@
-"""All LEDs in one adjustment: rigid boards, the arm's noise at each view, camera, hand-eye and axes with theirs.
+"""All LEDs in one adjustment, with rigid boards, the arm's error at each view, camera, hand-eye and axis zeros.
 
     pixel = project((base_from_flange_i . E_i . flange_from_camera)^-1 . base_from_board_b . (q_j + d_j))
 
-with q_j a place on the board by the table, d_j what the LED is off it, E_i what the arm is off at view i; camera,
+with q_j a place on the board by the table, d_j the LED's offset from it, E_i the arm's error at view i. Camera,
 hand-eye and the zeros of the arm's axes are observed by their record, with its covariance. (Seed 003, section 4
-triangulates each LED by itself.) The arm's error at one view moves all LEDs seen from it alike, so the LEDs
-themselves tell it.
+triangulates each LED by itself.) The arm's error at one view shifts all LEDs seen from it alike, so it can be
+estimated from the LEDs.
 
-A board touches only its own six parameters, its LEDs' and what the views share. So boards are eliminated one by
-one (Schur's complement; Triggs et al., Bundle adjustment - a modern synthesis, 2000, section 6): the rest is as
-small as the number of views. Noise is estimated as in `adjustment`, from residuals and redundancy.
+A board's equations have only its own six parameters, its LEDs' offsets and the parameters that views share. So
+boards are eliminated one by one (Schur complement; Triggs et al., Bundle adjustment - a modern synthesis, 2000,
+section 6), and the size of the reduced system depends on the number of views alone. Noise is estimated as in
+`adjustment`, from residuals and redundancy.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ _LEAST_REDUNDANCY, _LEAST_FACTOR = 3.0, 0.03
 
 @dataclass(frozen=True)
 class LedGeometry:
-    """Where all LEDs are."""
+    """Positions of all LEDs."""
 
     state: LedState
     centres_mm: Floats
@@ -68,7 +69,7 @@ class LedGeometry:
     shared_part: Floats
     """[n] share of the centre's variance that comes from poses, hand-eye and lens."""
     noise: Floats
-    """[groups] seen over stated."""
+    """[groups] estimated over stated."""
     redundancy: Floats
     """[groups]."""
     residuals_px: Floats
@@ -76,7 +77,7 @@ class LedGeometry:
     kept: NDArray[np.bool_]
     """[k] spots that are no gross errors."""
     prior_step: Floats
-    """[free + 6 + k] of lens, hand-eye and axes over the standard deviations of their record."""
+    """[free + 6 + k] change of lens, hand-eye and axes, over the standard uncertainties of their record."""
     steps: int
 
     @property
@@ -96,8 +97,8 @@ def adjust_leds(
 ) -> LedGeometry:
     """Adjust boards, LEDs, poses [v, 4, 4] as reported, lens and hand-eye.
 
-    `place` [k] is that of each spot; `start` [b, 4, 4] is roughly where the boards stand.
-    Raises InputError if the spots contradict each other so that it does not converge.
+    `place` [k] is that of each spot; `start` [b, 4, 4] is the approximate pose of each board. Raises InputError if
+    the adjustment does not converge, as with contradicting spots.
     """
     state = LedState(
         start,
@@ -135,8 +136,8 @@ def adjust_leds(
 
 @dataclass(frozen=True)
 class _BoardPart:
-    """One board's share of the normal equations: its own parameters (pose, then its LEDs' offsets) and how they
-    hang together with the shared ones in `columns`."""
+    """One board's part of the normal equations: its own parameters (pose, then its LEDs' offsets) and their
+    coupling with the shared ones in `columns`."""
 
     own: Floats
     """[m, m]."""
@@ -152,7 +153,7 @@ class _BoardPart:
 def _board_parts(
     problem: Problem, state: LedState, linear: Linear, factors: Floats, weights: Floats
 ) -> Iterator[tuple[_BoardPart, Floats]]:
-    """For each board its part, and the residuals [2 k] of its spots."""
+    """The part of each board, and the residuals [2 k] of its spots."""
     off_table = between(state.base_from_board, problem.boards.base_from_board)
     tolerance = problem.stated.tolerance_mm * factors[TOLERANCE]
     root = np.sqrt(weights)[:, None] / factors[SPOTS]
@@ -181,8 +182,8 @@ def _board_parts(
 def _normal(
     problem: Problem, state: LedState, factors: Floats, weights: Floats
 ) -> tuple[list[_BoardPart], list[Floats], Floats, Floats]:
-    """Boards' parts with G = own^-1 [cross, side] of each, and the reduced normal matrix and side of what they
-    share."""
+    """The boards' parts with G = own^-1 [cross, side] of each; the reduced normal matrix and right-hand side of
+    the shared parameters."""
     parts: list[_BoardPart] = []
     eliminated: list[Floats] = []
     views, axes = 6 * len(problem.reported), slice(6 * len(problem.reported) + problem.of_camera, None)
@@ -212,7 +213,7 @@ def _normal(
 def _descend(
     problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_], huber: float
 ) -> tuple[LedState, int]:
-    """Gauss-Newton with Huber's weights, steps halved where they gain nothing, until one changes nothing."""
+    """Gauss-Newton with Huber's weights; a step that does not lower the cost is halved."""
     cost = cost_of(problem, state, factors, kept, huber)
     for step in range(1, _MOST_STEPS + 1):
         off = np.sqrt(np.sum(whitened(problem, state) ** 2, axis=1)) / factors[SPOTS]
@@ -253,12 +254,12 @@ def _factored(matrix: Floats) -> tuple[Floats, bool]:
 
 @dataclass(frozen=True)
 class _Solved:
-    """Covariances at the solution, and what residuals say of the noise."""
+    """Covariances at the solution, and the noise by the residuals."""
 
     own: list[Floats]
     """[b] of each board's own parameters."""
     alone: list[Floats]
-    """[b] the same if all that views share were known."""
+    """[b] the same if the shared parameters were known."""
     seen: Floats
     redundancy: Floats
 
@@ -297,7 +298,7 @@ def _solved(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np
 
 
 def _of_pose_errors(problem: Problem, shared: Floats) -> Floats:
-    """[v, 6] variance of `pose_errors`, by the covariance of all shared parameters."""
+    """[v, 6] variance of `pose_errors` by the covariance of the shared parameters."""
     views, axes = 6 * len(problem.reported), slice(6 * len(problem.reported) + problem.of_camera, None)
     with_axes = shared[:views, axes].reshape(*problem.by_axes.shape)
     by = problem.by_axes

@@ -1,4 +1,4 @@
-"""The dome's boards as rigid bodies, taken from its table: what stands on each, and where each is said to be."""
+"""The dome's boards as rigid bodies, by its table: the LEDs on each, and its nominal pose."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coupole.errors import InputError
 from coupole.plan.led_table import LedTable
 
 _PLANE = 2
-"""Rank of points that do not stand in one line."""
+"""Rank of points that do not lie on one line."""
 _PARALLEL = np.cos(np.radians(2.0))
 
 
@@ -22,7 +22,7 @@ class Boards:
     """Boards [b] and the places [n] of LEDs on them; a place is a row of the dome's table.
 
     A board's frame has its origin in the middle of its LEDs, z along their normal (into the dome) and x from its
-    first LED towards its last, laid into the board.
+    first LED towards its last, projected into the board's plane.
     """
 
     numbers: NDArray[np.int64]
@@ -39,15 +39,15 @@ class Boards:
         return np.flatnonzero(self.board_of == board)
 
     def in_base(self, base_from_board: Floats, offsets_mm: Floats | float = 0.0) -> Floats:
-        """Centres [n, 3] of LEDs if the boards stand so and LEDs are off by so much on them."""
+        """Centres [n, 3] of LEDs for these poses of the boards and offsets of the LEDs on them."""
         pose = base_from_board[self.board_of]
         turned: Floats = np.einsum("nij,nj->ni", pose[:, :3, :3], self.places_mm + offsets_mm)
         return turned + pose[:, :3, 3]
 
 
 def placed(boards: Boards, found_mm: Floats) -> Floats:
-    """`base_from_board` [b, 4, 4] by LEDs found at places [n, 3] (NaN where none was), by the table where fewer
-    than three were."""
+    """`base_from_board` [b, 4, 4] by the LEDs found at places [n, 3] (NaN where none was found); by the table for
+    a board with fewer than three."""
     poses = boards.base_from_board.copy()
     for board in range(len(poses)):
         rows = boards.rows_of(board)
@@ -58,7 +58,7 @@ def placed(boards: Boards, found_mm: Floats) -> Floats:
 
 
 def boards_of(table: LedTable) -> Boards:
-    """Derive the boards from a dome's table. Raises InputError if one has LEDs of different normals."""
+    """The boards of a dome's table. Raises InputError if the LEDs of one have different normals."""
     numbers, board_of = np.unique(table.boards, return_inverse=True)
     poses = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
     places_mm = np.empty_like(table.positions_mm)

@@ -1,4 +1,4 @@
-"""The picture of a dome's geometry: how well each LED is known, and how far it is from where the table had it."""
+"""The picture of a dome's geometry: uncertainty of each LED, and its distance from the place by the table."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def draw_leds(found: LedsFound, figure: Figure) -> None:
 
 
 def _draw_dome(ax: Axes, found: LedsFound, across: int, up: int, title: str) -> None:
-    """LEDs by uncertainty; arrows of boards from table to found, enlarged; red rings where none was found."""
+    """LEDs by uncertainty; arrows from the table's place of a board to the one found, enlarged; red rings for LEDs
+    not found."""
     place = found.new_table.positions_mm
     known = np.isfinite(found.u_mm)
     order = np.argsort(np.nan_to_num(found.u_mm))
@@ -73,7 +74,7 @@ def _draw_uncertainty(ax: Axes, found: LedsFound) -> None:
 
 
 def _draw_residuals(ax: Axes, found: LedsFound) -> None:
-    """Residuals of all spots; those left out red, at the rim if they are farther off."""
+    """Residuals of all spots; those left out in red, at the rim if they are larger."""
     residuals, kept = found.geometry.residuals_px, found.geometry.kept
     reach = 6.0 * float(np.sqrt(np.mean(residuals[kept] ** 2)))
     x, y = np.clip(residuals, -reach, reach).T
@@ -89,18 +90,18 @@ def _draw_residuals(ax: Axes, found: LedsFound) -> None:
 
 
 def _draw_robot(ax: Axes, found: LedsFound) -> None:
-    """What the arm was off at each view."""
+    """Errors of the arm at each view."""
     views = np.arange(len(found.view_errors))
     ax.plot(
         views, 1e3 * np.linalg.norm(found.view_errors[:, :3], axis=1), "o", color=BLUE, ms=4, label="position (um)"
     )
     turn = 1e3 * np.linalg.norm(found.view_errors[:, 3:], axis=1)
     ax.plot(views, turn, "s", color=RED, ms=4, label="orientation (mdeg)")
-    ax.set(title="What the arm was off", xlabel="view", ylim=(0, None))
+    ax.set(title="Errors of the arm", xlabel="view", ylim=(0, None))
     ax.legend(frameon=False)
 
 
 def _round(value: float) -> float:
-    """1, 2 or 5 times a power of ten, at most the value."""
+    """The largest of 1, 2 and 5 times a power of ten that does not exceed the value."""
     ten = 10.0 ** np.floor(np.log10(value))
     return float(ten * max(step for step in (1, 2, 5) if step * ten <= value * (1 + 1e-9)))

@@ -1,4 +1,4 @@
-"""What the LEDs' adjustment is about: its unknowns, its residuals by the stated noise, and their derivatives."""
+"""Equations of the LEDs' adjustment: its unknowns, its residuals over the stated noise, and their derivatives."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from coupole.calibration.rotations import Floats, between, inverses, moved, skew
 
 SPOTS, TOLERANCE, POSITION, ORIENTATION = range(4)
 GROUPS = ("spots", "LEDs on their boards", "robot position", "robot orientation")
-"""Observations whose noise is estimated. Table, lens and hand-eye are believed."""
+"""Observations whose noise is estimated; that of table, lens and hand-eye is taken as stated."""
 
 
 @dataclass(frozen=True)
 class Stated:
-    """What is known of the noise beforehand, standard deviations of each coordinate."""
+    """Stated noise: standard deviations of each coordinate."""
 
     tolerance_mm: float = 0.05
     """Of LEDs on their boards."""
     robot_mm: float = 0.03
     robot_deg: float = 0.003
     table_mm: float = 10.0
-    """Of boards against their table: so wide that it decides only where nothing was seen."""
+    """Of boards against their table: so wide that it matters only for a board that was not seen."""
     table_deg: float = 2.0
     side_mm: float = 7.0
     """Of an LED."""
@@ -46,12 +46,12 @@ class LedState:
     flange_from_camera: Floats
     lens: Floats
     axis_zeros_deg: Floats
-    """[k] what the arm's axes are off their record."""
+    """[k] deviation of the arm's axis zeros from their record."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What stays the same through all steps."""
+    """What does not change between iterations."""
 
     boards: Boards
     place: Indices
@@ -59,31 +59,31 @@ class Problem:
     view: Indices
     observed: Floats
     whiten: Floats
-    """[k, 2, 2] that bring residuals to unit variance."""
+    """[k, 2, 2] factors that bring residuals to unit variance."""
     reported: Floats
     prior: CameraPrior
     prior_whiten: Floats
     by_axes: Floats
-    """[v, 6, k] step of each pose for each degree of the arm's axes."""
+    """[v, 6, k] step of each pose per degree of each axis of the arm."""
     stated: Stated
     sightings_of: tuple[Indices, ...]
     """[b] spots on each board."""
     columns_of: tuple[Indices, ...]
-    """[b] shared parameters that these depend on."""
+    """[b] columns of the shared parameters that these depend on."""
 
     @property
     def sigmas(self) -> Floats:
-        """[6] of one pose's step."""
+        """[6] stated noise of one pose's step."""
         return np.repeat([self.stated.robot_mm, np.radians(self.stated.robot_deg)], 3)
 
     @property
     def shared(self) -> int:
-        """Shared parameters: six for each view, then lens, hand-eye and axes."""
+        """Number of shared parameters: six for each view, then lens, hand-eye and axes."""
         return 6 * len(self.reported) + len(self.prior_whiten)
 
     @property
     def of_camera(self) -> int:
-        """Of these, lens and hand-eye: what a spot depends on beside its view."""
+        """Number of these that belong to lens and hand-eye, on which each spot depends beside its view."""
         return len(self.prior.free) + 6
 
 
@@ -116,7 +116,7 @@ def problem_of(
 
 
 def at_centres(problem: Problem, state: LedState) -> Problem:
-    """The same with spots moved from the middle of the LEDs' outlines to where their centres are."""
+    """The same with spots corrected from the centroid of the LED's outline to the image of its centre."""
     board_pose = state.base_from_board[problem.boards.board_of[problem.place]]
     centres = problem.boards.in_base(state.base_from_board, state.offsets_mm)[problem.place]
     camera_from_base = inverses(state.base_from_flange @ state.flange_from_camera)[problem.view]
@@ -128,7 +128,7 @@ def at_centres(problem: Problem, state: LedState) -> Problem:
 
 
 def points_seen(problem: Problem, state: LedState) -> tuple[Floats, Floats, Floats]:
-    """Points [k, 3] on their boards, in the flange's and in the camera's frame."""
+    """Points [k, 3] in the frames of their boards, of the flange and of the camera."""
     on_board = (problem.boards.places_mm + state.offsets_mm)[problem.place]
     pose = state.base_from_board[problem.boards.board_of[problem.place]]
     in_base = np.einsum("kij,kj->ki", pose[:, :3, :3], on_board) + pose[:, :3, 3]
@@ -139,7 +139,7 @@ def points_seen(problem: Problem, state: LedState) -> tuple[Floats, Floats, Floa
 
 
 def whitened(problem: Problem, state: LedState) -> Floats:
-    """Residuals [k, 2] of unit variance by the stated noise."""
+    """Residuals [k, 2] over the stated noise."""
     projected = optics.project(points_seen(problem, state)[2], state.lens)
     result: Floats = np.einsum("kij,kj->ki", problem.whiten, problem.observed - projected.pixels)
     return result
@@ -183,13 +183,13 @@ def linearised(problem: Problem, state: LedState) -> Linear:
 
 
 def pose_errors(problem: Problem, state: LedState) -> Floats:
-    """[v, 6] what the arm is off at each view, beside what its axes are off."""
+    """[v, 6] error of the arm at each view, without that of its axis zeros."""
     off: Floats = between(problem.reported, state.base_from_flange) - problem.by_axes @ state.axis_zeros_deg
     return off
 
 
 def camera_step(problem: Problem, state: LedState) -> Floats:
-    """[free + 6 + k] from the records to the state."""
+    """[free + 6 + k] step from the records' values to those of the state."""
     free = [optics.NAMES.index(name) for name in problem.prior.free]
     hand_eye = between(problem.prior.flange_from_camera, state.flange_from_camera)
     return np.concatenate([(state.lens - problem.prior.lens.vector())[free], hand_eye, state.axis_zeros_deg])

@@ -1,8 +1,8 @@
-"""The plan that a dome's LEDs are calibrated with: postures from which all boards are seen often enough, and which
-boards are lit at each.
+"""The plan for the calibration of a dome's LEDs: postures from which all boards are seen often enough, and the
+boards that are lit at each.
 
-Postures are drawn at random and kept if the arm may stand there and the camera sees some boards whole;
-`led_views` chooses among them. A view that no way leads to is left out, and another one chosen in its place.
+Postures are drawn at random and kept if the arm may take them and the camera sees some boards completely;
+`led_views` chooses among them. A view to which no path is found is replaced by another one.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ _MOST_CANDIDATES = 2_000
 _LEAST_BOARDS = 2
 _ROUNDS = 6
 _WRIST_DEG, _TURN_DEG = 120.0, 90.0
-"""Axes 4 and 6 are not turned farther: cables."""
+"""Axes 4 and 6 are not turned farther, because of cables."""
 _MARGIN = 0.025
-"""Of the frame's width: a spot nearer to the edge may be cut."""
+"""Of the frame's width: a spot nearer to the edge may be cut off."""
 
 _HEAD = """\
 # Views of the dome's LEDs themselves, for `coupole calibrate leds` (docs/how-to/calibrate-leds.md): {views} views,
@@ -76,7 +76,7 @@ def led_plan(
                 f"leds: expected to see each board {enough} times; of {len(joints_deg)} postures too few see "
                 f"boards {', '.join(map(str, chosen.few[:12]))}. Draw more, or another --seed"
             )
-        tell(f"ways to {len(chosen.views)} views")
+        tell(f"planning paths to {len(chosen.views)} views")
         views = [
             ViewPose(f"l{number:03d}", None, tuple(joints_deg[view.candidate].tolist()), None)
             for number, view in enumerate(chosen.views)
@@ -92,7 +92,7 @@ def led_plan(
 
 
 def _candidates(rig: Rig, boards: Boards, bodies: CellBodies, random: np.random.Generator, drawn: int) -> Floats:
-    """[n, 6] postures that touch nothing, are no singularity, and see some boards whole."""
+    """[n, 6] postures without collision and singularity from which some boards are seen completely."""
     arm = arm_of(rig)
     low, high = np.array(arm.limits_deg).T
     low[3], high[3] = max(low[3], -_WRIST_DEG), min(high[3], _WRIST_DEG)
@@ -105,7 +105,7 @@ def _candidates(rig: Rig, boards: Boards, bodies: CellBodies, random: np.random.
     tightest_mm = [bodies.tightest_mm(joints_deg[part]) for part in np.array_split(keep, -(-len(keep) // 500))]
     keep = keep[np.concatenate(tightest_mm) >= 0.0] if len(keep) else keep
     seen = seen[keep]
-    # Some because they see many boards, some because they see what few others do.
+    # Some are kept because they see many boards, some because they see boards that few others see.
     rare = seen @ (1.0 / np.maximum(seen.sum(axis=0), 1))
     half = _MOST_CANDIDATES // 2
     best = np.unique(np.concatenate([np.argsort(-rare)[:half], np.argsort(-seen.sum(axis=1))[:half]]))
@@ -119,7 +119,7 @@ def _cameras(rig: Rig, joints_deg: Floats) -> Floats:
 
 
 def _camera(rig: Rig) -> tuple[Intrinsics, tuple[int, int], float]:
-    """Lens as the rig describes it, frame size, and how near to the edge a spot may be."""
+    """Lens as the rig describes it, frame size, and least distance of a spot from the edge."""
     lens, sensor = rig.lens, rig.sensor
     focal_px = 1e3 / sensor.pixel_pitch_um / (1.0 / lens.focal_length_mm - 1.0 / lens.focus_distance_mm)
     size = (sensor.width_px, sensor.height_px)

@@ -1,9 +1,8 @@
-"""Which spots are an LED, seen from several poses; and what is wrong with those that are at another place.
+"""Assigns spots to LEDs, from views at several poses, and names the fault of an LED found at another place.
 
 Each LED is lit alone, so a frame's spots are the LED and its reflections. Every two spots of different views give
-a point in space; the one that most views agree with is the LED, if it lies near the place of some LED of the table
-(a mirror image lies behind the mirror). No table is needed to say where an LED is, so an LED that lights at
-another's place is found there, and that says how it is wired.
+a point in space. The point that most views agree with is the LED, if it lies near a place of the table (a mirror
+image lies behind the mirror). An LED that lights at another's place is found there, which shows how it is wired.
 """
 
 from __future__ import annotations
@@ -22,13 +21,13 @@ from coupole.calibration.point_sets import Indices, rigid_motion
 from coupole.calibration.rotations import Floats, rotation_vector
 
 LEAST_VIEWS = 3
-"""Two rays always nearly meet; a third tells whether they mean the same thing."""
+"""Two rays often nearly intersect by chance; a third one confirms the point."""
 _NEAREST_MM, _FARTHEST_MM = 150.0, 4000.0
 _LEAST_SINE = 0.02
 _RIGID_MM = 5.0
-"""Points that fit a board's layout so well are that board in its own order."""
+"""Points that fit a board's layout within this are that board, its LEDs in the right order."""
 _MOST_TURN_DEG = 60.0
-"""A board of 2 x 3 turned by half a turn looks like one that is wired backwards; the latter is likelier."""
+"""A board of 2 x 3 LEDs rotated by 180 degrees looks like one that is wired backwards, which is more likely."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class LedSightings:
     covariance: Floats
     """[k, 2, 2], px^2."""
     frames: NDArray[np.intp]
-    """[m, 2] view and LED of every frame that was taken, whatever it showed."""
+    """[m, 2] view and LED of every frame, with or without spots."""
 
     def only(self, keep: Indices) -> LedSightings:
         return LedSightings(self.view[keep], self.led[keep], self.pixels[keep], self.covariance[keep], self.frames)
@@ -50,19 +49,19 @@ class LedSightings:
 
 @dataclass(frozen=True)
 class Matching:
-    """Which LED is at which place."""
+    """The place of each LED."""
 
     found_mm: Floats
     """[n, 3] in the base, by the order of the table; NaN where not found."""
     place_of: Indices
-    """[n] place that each LED lights at, -1 if none."""
+    """[n] place at which each LED lights, -1 if none."""
     sightings: LedSightings
     """Spots that agree, their `led` still the one that was lit."""
     faults: tuple[Fault, ...]
 
     @property
     def by_place_mm(self) -> Floats:
-        """[n, 3] what was found at each place; NaN where nothing was."""
+        """[n, 3] position found at each place; NaN where no LED was found."""
         there = np.full_like(self.found_mm, np.nan)
         rows = np.flatnonzero(self.place_of >= 0)
         there[self.place_of[rows]] = self.found_mm[rows]
@@ -71,7 +70,7 @@ class Matching:
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that a person should look at."""
+    """Something that the operator should check."""
 
     kind: str
     """`dead`, `few`, `astray`, `swapped`, `miswired` or `moved`."""
@@ -92,7 +91,8 @@ def match_leds(
 ) -> Matching:
     """Find each LED in space and at a place of the table.
 
-    `base_from_camera` [v, 4, 4] are the views' poses. `reach_mm`: LEDs stand so near to some place of the table.
+    `base_from_camera` [v, 4, 4] are the views' poses; `reach_mm` is the largest distance of an LED from a place of
+    the table.
     """
     table_mm = boards.in_base(boards.base_from_board)
     rays = np.einsum("kij,kj->ki", base_from_camera[seen.view, :3, :3], unproject(seen.pixels, lens))
@@ -116,7 +116,7 @@ def match_leds(
 def _agreeing(
     rays: Floats, eyes_mm: Floats, views: Indices, spread: float, near: cKDTree, reach_mm: float
 ) -> Indices:
-    """Spots of one LED, at most one a view, that one point explains; empty if there is no such point."""
+    """Spots of one LED, at most one of each view, that agree with one point; empty if there is no such point."""
     a, b = np.triu_indices(len(rays), 1)
     apart = views[a] != views[b]
     a, b = a[apart], b[apart]
@@ -139,7 +139,8 @@ def _agreeing(
 
 
 def _crossings(rays_a: Floats, eyes_a: Floats, rays_b: Floats, eyes_b: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Midpoints [n, 3] where pairs of rays are nearest, and which are in front of both and well crossed."""
+    """Midpoints [n, 3] of the shortest connections of pairs of rays, and which lie in front of both cameras at a
+    sufficient angle of intersection."""
     apart = eyes_b - eyes_a
     cosine = np.einsum("ni,ni->n", rays_a, rays_b)
     along_a, along_b = np.einsum("ni,ni->n", rays_a, apart), np.einsum("ni,ni->n", rays_b, apart)
@@ -151,7 +152,7 @@ def _crossings(rays_a: Floats, eyes_a: Floats, rays_b: Floats, eyes_b: Floats) -
 
 
 def _off(points: Floats, rays: Floats, eyes_mm: Floats) -> Floats:
-    """Tangents [points, rays] of the angles under which points lie beside rays."""
+    """Tangents [points, rays] of the angles between points and rays, seen from the camera."""
     to_point = points[:, None] - eyes_mm[None]
     along = np.einsum("pki,ki->pk", to_point, rays)
     across = np.linalg.norm(to_point - along[..., None] * rays, axis=2)
@@ -167,7 +168,7 @@ def _nearest_of_each_view(off: Floats, views: Indices) -> Indices:
 
 
 def _meeting(rays: Floats, eyes_mm: Floats) -> Floats:
-    """The point [3] nearest to rays (least squares of angles, by one step of weights)."""
+    """The point [3] nearest to rays (least squares of angles, weights from one iteration)."""
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     weight = np.ones(len(rays))
     for _ in range(2):
@@ -202,7 +203,7 @@ def _unseen(seen: LedSightings, found_mm: Floats, ids: NDArray[np.int64]) -> Ite
             yield Fault(
                 "astray",
                 (led,),
-                f"LED {led}: the spots of {views[row]} views are of no one point near the dome: reflections, or "
+                f"LED {led}: the spots of {views[row]} views agree on no point near the dome: reflections, or "
                 "the camera's poses are wrong",
             )
 
@@ -210,7 +211,7 @@ def _unseen(seen: LedSightings, found_mm: Floats, ids: NDArray[np.int64]) -> Ite
 def _places(
     found_mm: Floats, table_mm: Floats, ids: NDArray[np.int64], boards: Boards
 ) -> tuple[Indices, list[Fault]]:
-    """Place that each LED lights at, and what that says of boards and wires."""
+    """The place at which each LED lights, and the faults of boards and wires that follow."""
     here = np.where(np.isfinite(found_mm[:, 0]), np.arange(len(ids)), -1)
     tree = cKDTree(table_mm)
     spacing_mm = float(np.median(tree.query(table_mm, 2)[0][:, 1])) if len(table_mm) > 1 else np.inf
@@ -243,7 +244,8 @@ def _places(
 
 
 def _moved(rows: Indices, found_mm: Floats, table_mm: Floats) -> bool:
-    """True if LEDs of a board stand to each other as its table says, in their order: then it is not the wires."""
+    """True if the LEDs of a board have the table's layout in the right order: then the board was moved and its
+    wiring is right."""
     rows = rows[np.isfinite(found_mm[rows, 0])]
     if len(rows) < LEAST_VIEWS:
         return False
@@ -254,7 +256,7 @@ def _moved(rows: Indices, found_mm: Floats, table_mm: Floats) -> bool:
 
 
 def _on_another(board: int, found_mm: Floats, tree: cKDTree, near_mm: float, boards: Boards) -> bool:
-    """True if all LEDs of a board light at places of another: their plugs were taken for each other."""
+    """True if all LEDs of a board light at places of another one: their plugs are exchanged."""
     rows = boards.rows_of(board)
     off_mm, place = tree.query(found_mm[rows[np.isfinite(found_mm[rows, 0])]])
     there = np.unique(boards.board_of[place])
@@ -262,7 +264,7 @@ def _on_another(board: int, found_mm: Floats, tree: cKDTree, near_mm: float, boa
 
 
 def _wiring(here: Indices, ids: NDArray[np.int64], boards: Boards) -> Iterator[Fault]:
-    """Rings of LEDs that light at each other's places: of two, they are swapped; of more, a board is mis-wired."""
+    """Cycles of LEDs that light at each other's places: two are swapped; more are a mis-wired board."""
     for ring in _rings(here):
         leds = tuple(int(ids[row]) for row in ring)
         on = sorted({int(boards.numbers[boards.board_of[row]]) for row in (*ring, int(here[ring[-1]]))})
@@ -275,7 +277,7 @@ def _wiring(here: Indices, ids: NDArray[np.int64], boards: Boards) -> Iterator[F
 
 
 def _rings(here: Indices) -> Iterator[list[int]]:
-    """Rows that light at each other's places; an open chain where one of them was not found."""
+    """Cycles of rows that light at each other's places; an open chain where one LED was not found."""
     todo = {int(row) for row in np.flatnonzero((here >= 0) & (here != np.arange(len(here))))}
     while todo:
         ring = [min(todo - {int(here[row]) for row in todo}, default=min(todo))]
@@ -286,7 +288,7 @@ def _rings(here: Indices) -> Iterator[list[int]]:
 
 
 def fault_lines(faults: Sequence[Fault]) -> tuple[str, ...]:
-    """For people: what is one fault of many LEDs comes in one line."""
+    """The faults as text; all dead LEDs share one line."""
     dead = [fault.leds[0] for fault in faults if fault.kind == "dead"]
     if len(dead) < 4:
         return tuple(fault.text for fault in faults)

@@ -1,9 +1,10 @@
-"""From runs to spots: each frame under a single LED is looked at once, with its view's pose and dark frames."""
+"""From runs to spots: frames under a single LED, with the pose and dark frames of their view."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from coupole.calibration.sources import About, about_of, frames_sha256, poses_an
 from coupole.errors import InputError
 from coupole.plan.led_table import LedTable
 from coupole.plan.shot_id import Led, ShotId
-from coupole.storage import frame_file
+from coupole.storage.frame_file import Layout, read_facts, read_frame, read_frames, read_layout
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run, sha256
 from coupole.storage.step_fields import temperature_range_c
@@ -24,7 +25,7 @@ from coupole.storage.step_fields import temperature_range_c
 
 @dataclass(frozen=True)
 class LedImages:
-    """All that a run says of LEDs."""
+    """Spots and poses of some runs."""
 
     seen: LedSightings
     base_from_flange: Floats
@@ -33,7 +34,7 @@ class LedImages:
     """[v] names."""
     size_px: tuple[int, int]
     left_out: tuple[str, ...]
-    """One line for each bright thing that was no spot."""
+    """One line for each bright region that is not a spot."""
     about: About
     inputs: tuple[tuple[str, str], ...]
     """Name and SHA-256 of every file that was read."""
@@ -43,12 +44,12 @@ class LedImages:
 
 @dataclass(frozen=True)
 class _LedFrame:
-    """One frame under one LED, the shortest exposed where there are several."""
+    """One frame under one LED, that of the shortest exposure if there are several."""
 
     shot: ShotId
     led: int
     pose: tuple[str, int]
-    """View's name, and number of the pose in it: an arm that was pushed aside has two."""
+    """Name of the view and number of the pose in it: there are two if the arm was moved during the view."""
     exposure_us: int
     frame: FrameProven
 
@@ -57,16 +58,24 @@ class _LedFrame:
 class _Collected:
     """Grows view by view."""
 
-    spots: list[tuple[int, int, Floats, Floats]]
-    frames: list[tuple[int, int]]
-    left_out: list[str]
+    inputs: list[tuple[str, str]]
+    camera: tuple[About, tuple[int, int]] | None = None
+    """What the run says of the camera, and the width and height of its frames, px."""
+    views: list[str] = field(default_factory=list)
+    poses: list[Floats] = field(default_factory=list)
+    joints_deg: list[Floats] = field(default_factory=list)
+    lit_records: list[np.void] = field(default_factory=list)
+    frames: list[tuple[int, int]] = field(default_factory=list)
+    """Number of the view and row of the LED."""
+    spots: list[tuple[int, int, Floats, Floats]] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
 
 
 def find_leds(
     paths: Sequence[Path], table: LedTable, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> LedImages:
-    """Look for spots in all frames of runs under single LEDs. Raises InputError: no such frames, LEDs that the
-    dome does not have, runs of different cameras."""
+    """Find spots in all frames under single LEDs. Raises InputError: no such frames, LEDs that the dome does not
+    have, runs of different cameras."""
     row_of = {int(led): row for row, led in enumerate(table.ids)}
     runs = [Run(path) for path in paths]
     work = [(run, view, frames) for run in runs for view, frames in _by_view(run).items()]
@@ -75,65 +84,72 @@ def find_leds(
         raise InputError(
             f"{', '.join(map(str, paths))}: no proven frame under a single LED; acquire the plan first"
         )
-    collected = _Collected([], [], [])
-    poses: list[Floats] = []
-    joints: list[Floats] = []
-    views: list[str] = []
-    inputs = [(f"{run.folder.name}/run.json", sha256(run.folder / "run.json")) for run in runs]
-    about: About | None = None
-    size_px: tuple[int, int] | None = None
-    lit_records: list[np.void] = []
-    done = 0
+    collected = _Collected([(f"{run.folder.name}/run.json", sha256(run.folder / "run.json")) for run in runs])
+    done = count(1)
     for run, view, proven in work:
-        path = run.view_path(view)
-        layout, records = frame_file.read_layout(path), frame_file.read_frames(path)
-        reported, attributes = poses_and_attributes(path)
-        here, size = about_of(run, attributes), (layout.width_px, layout.height_px)
-        if about is not None and (here != about or size != size_px):
-            raise InputError(
-                f"{path}: another camera, lens or focus than in the frames before it: {here}, {about}"
-            )
-        about, size_px = here, size
-        lit = _single_leds(proven, records, view)
-        unknown = sorted({f.led for f in lit} - set(row_of))
-        if unknown:
-            raise InputError(f"{path}: LEDs {unknown[:5]} are not in the dome's table; name the rig of this run")
-        number_of: dict[int, int] = {}
-        for pose in sorted({frame.pose[1] for frame in lit}):
-            number_of[pose] = len(views)
-            views.append(view if len(runs) == 1 else f"{run.folder.name}/{view}")
-            poses.append(np.array(reported[pose]["base_from_flange"], dtype=np.float64))
-            joints.append(np.array(reported[pose]["joints_deg"], dtype=np.float64))
-        lit_records += [records[f.frame.index] for f in lit]
-        facts, darks = frame_file.read_facts(path), _darks(path, layout, proven, records)
-        for frame in lit:
-            pixels = frame_file.read_frame(path, layout, frame.frame.index)
-            dark = darks.get(frame.exposure_us, float(facts["black_dn"]))
-            spots = find_spots(pixels, dark, facts["pattern"], facts["white_dn"])
-            key = number_of[frame.pose[1]], row_of[frame.led]
-            collected.frames.append(key)
-            collected.spots += [(*key, spot.pixel, spot.covariance) for spot in spots.good]
-            collected.left_out += [f"{frame.shot} {reason}" for reason in spots.rejected]
-            done += 1
-            progress(done, total)
-        digest = frames_sha256([*(f.frame for f in lit), *_dark_frames(proven)])
-        inputs.append((f"{run.folder.name}/views/{path.name}", digest))
-    assert about is not None
-    assert size_px is not None
+        name = view if len(runs) == 1 else f"{run.folder.name}/{view}"
+        _collect(collected, run, view, name, proven, row_of, lambda: progress(next(done), total))
+    assert collected.camera is not None, "every view has a camera"
+    about, size_px = collected.camera
     return LedImages(
         _sightings(collected),
-        np.stack(poses),
-        tuple(views),
+        np.stack(collected.poses),
+        tuple(collected.views),
         size_px,
         tuple(collected.left_out),
         replace(
             about,
-            temperature_c=temperature_range_c(lit_records),
+            temperature_c=temperature_range_c(collected.lit_records),
             begun=max(run.created for run in runs),
         ),
-        tuple(inputs),
-        np.stack(joints),
+        tuple(collected.inputs),
+        np.stack(collected.joints_deg),
     )
+
+
+def _collect(
+    collected: _Collected,
+    run: Run,
+    view: str,
+    name: str,
+    proven: Sequence[FrameProven],
+    row_of: Mapping[int, int],
+    frame_done: Callable[[], None],
+) -> None:
+    """Add one view's poses and the spots of its frames under single LEDs."""
+    path = run.view_path(view)
+    layout, records = read_layout(path), read_frames(path)
+    reported, attributes = poses_and_attributes(path)
+    camera = about_of(run, attributes), (layout.width_px, layout.height_px)
+    if collected.camera is not None and camera != collected.camera:
+        raise InputError(
+            f"{path}: another camera, lens or focus than in the frames before it: {camera[0]}, "
+            f"{collected.camera[0]}"
+        )
+    collected.camera = camera
+    lit = _single_leds(proven, records, view)
+    unknown = sorted({f.led for f in lit} - set(row_of))
+    if unknown:
+        raise InputError(f"{path}: LEDs {unknown[:5]} are not in the dome's table; name the rig of this run")
+    number_of: dict[int, int] = {}
+    for pose in sorted({frame.pose[1] for frame in lit}):
+        number_of[pose] = len(collected.views)
+        collected.views.append(name)
+        collected.poses.append(np.array(reported[pose]["base_from_flange"], dtype=np.float64))
+        collected.joints_deg.append(np.array(reported[pose]["joints_deg"], dtype=np.float64))
+    collected.lit_records += [records[frame.frame.index] for frame in lit]
+    facts, darks = read_facts(path), _darks(path, layout, proven, records)
+    for frame in lit:
+        pixels = read_frame(path, layout, frame.frame.index)
+        dark = darks.get(frame.exposure_us, float(facts["black_dn"]))
+        spots = find_spots(pixels, dark, facts["pattern"], facts["white_dn"])
+        key = number_of[frame.pose[1]], row_of[frame.led]
+        collected.frames.append(key)
+        collected.spots += [(*key, spot.pixel, spot.covariance) for spot in spots.good]
+        collected.left_out += [f"{frame.shot} {reason}" for reason in spots.rejected]
+        frame_done()
+    digest = frames_sha256([*(f.frame for f in lit), *_dark_frames(proven)])
+    collected.inputs.append((f"{run.folder.name}/views/{path.name}", digest))
 
 
 def _sightings(collected: _Collected) -> LedSightings:
@@ -156,7 +172,7 @@ def _by_view(run: Run) -> dict[str, list[FrameProven]]:
 
 
 def _single_leds(proven: Sequence[FrameProven], records: Any, view: str) -> list[_LedFrame]:
-    """Frames under LEDs, of those of one LED at one pose the shortest exposed: spots are white in all of them."""
+    """Frames under LEDs: of one LED at one pose that of the shortest exposure, as spots are saturated in all."""
     shortest: dict[tuple[int, int], _LedFrame] = {}
     for frame in proven:
         if not isinstance(frame.shot.light, Led):
@@ -175,13 +191,11 @@ def _dark_frames(proven: Sequence[FrameProven]) -> list[FrameProven]:
     return [frame for frame in proven if frame.shot.is_dark]
 
 
-def _darks(
-    path: Path, layout: frame_file.Layout, proven: Sequence[FrameProven], records: Any
-) -> dict[int, Floats]:
+def _darks(path: Path, layout: Layout, proven: Sequence[FrameProven], records: Any) -> dict[int, Floats]:
     """Mean dark frame [H, W] for each exposure that has some, DN."""
     sums: dict[int, tuple[Floats, int]] = {}
     for frame in _dark_frames(proven):
         exposure_us = int(records[frame.index]["exposure_us"])
-        before, count = sums.get(exposure_us, (np.zeros((layout.height_px, layout.width_px)), 0))
-        sums[exposure_us] = before + frame_file.read_frame(path, layout, frame.index), count + 1
-    return {exposure_us: total / count for exposure_us, (total, count) in sums.items()}
+        before, n_before = sums.get(exposure_us, (np.zeros((layout.height_px, layout.width_px)), 0))
+        sums[exposure_us] = before + read_frame(path, layout, frame.index), n_before + 1
+    return {exposure_us: total / n_frames for exposure_us, (total, n_frames) in sums.items()}

@@ -1,14 +1,15 @@
-"""Where lit LEDs stand in RAW frames: centres of bright spots, with what they are known to.
+"""Lit LEDs in RAW frames: centres of bright spots, with covariance.
 
-A camera that looks into an LED sees some 1e5 times what a white target sends back: the spot is white to its rim at
-the shortest exposure, and as wide as the LED and the blur of defocus together. Only the rim tells where it is. So
-the signal is clipped into a narrow band about half of white, and the spot's centre is the centroid of that:
+A camera that looks into an LED receives some 1e5 times the light of a white target: even at the shortest exposure
+the spot is saturated to its rim, and as wide as the LED and the blur of defocus together. Only the rim has
+information on its position. So the signal is clipped to a narrow band about half of white, and the spot's centre
+is the centroid of the result:
 
     w = clip((signal / white - 1/4) / (1/2), 0, 1)
 
-Blur of a round aperture and glare widen the spot to all sides alike, which leaves a centroid where it is. Colours
-differ in how far out their rim lies, but the pixels of each lie evenly about the centre: all are taken as they
-are. What is left is perspective within the LED itself: `outline_offsets`.
+Blur of a round aperture and glare widen the spot symmetrically, which does not shift a centroid. The rim has
+another radius in each colour, but the pixels of each colour are distributed evenly about the centre, so all are
+used alike. The effect of perspective within the LED itself is corrected by `outline_offsets`.
 """
 
 from __future__ import annotations
@@ -22,19 +23,20 @@ from coupole.calibration import optics
 from coupole.calibration.rotations import Floats
 
 LOW, HIGH = 0.25, 0.75
-"""Of white: below it is no spot, above it is all of it."""
+"""Of white: a pixel below has weight 0, one above weight 1."""
 LEAST_AREA_PX = 9.0
-"""Smaller ones are hot pixels and sparks."""
+"""Smaller regions are hot pixels or sparks."""
 LEAST_FILL, MOST_FILL, MOST_STRETCH = 0.935, 1.04, 4.0
 """Of a disk the fill is 1, of a square 3/pi = 0.955; two spots that touch have less. An LED seen at 75 degrees is
 four times as wide as high."""
 MOST_SPOTS = 12
-"""In a frame with more something else shines."""
+"""A frame with more has another source of light."""
 _COARSE = 0.4
-"""By how much the fill of a small spot is off, made of whole pixels as it is; times its width."""
+"""Error of the fill of a small spot, which consists of whole pixels; times its width."""
 _MARGIN_PX = 8
 _CROSSING = 0.25
-"""Variance of a rim pixel's share: half a pixel either way, as neighbours along a straight side err alike."""
+"""Variance of the covered share of a rim pixel: half a pixel either way, as errors along a straight side are
+alike."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Spots:
     good: tuple[Spot, ...]
     """Largest first."""
     rejected: tuple[str, ...]
-    """Why other bright things were no spots."""
+    """Why other bright regions are not spots."""
     brightest: float
     """Largest green signal over white."""
 
@@ -92,7 +94,7 @@ def find_spots(frame: NDArray[np.uint16], dark: Floats | float, pattern: str, wh
 def outline_offsets(
     base_from_board: Floats, centres_mm: Floats, camera_from_base: Floats, lens: Floats, side_mm: float
 ) -> Floats:
-    """How far the centroid of each LED's outline lies from its centre's picture [n, 2], px.
+    """Offset of the centroid of each LED's outline from the image of its centre [n, 2], px.
 
     LEDs are squares of `side_mm` about `centres_mm` [n, 3] (base frame) in the plane of their boards [n, 4, 4].
     The centroid of a quadrangle is that of its two triangles, weighted by area.
@@ -110,10 +112,10 @@ def outline_offsets(
 
 
 def _spot(signal: Floats) -> Spot | str:
-    """The largest spot in a part of a frame, signal over white; or why it is none.
+    """The largest spot in a part of a frame, signal over white; or the reason why it is not a spot.
 
-    How far into a rim's pixel the spot reaches is not known, as any part of it makes it white. The centroid's
-    covariance is what that makes of it over the whole rim.
+    A rim pixel is white if any part of it is covered, so the covered share is not known. The covariance of the
+    centroid is propagated from this over the whole rim.
     """
     import cv2
 

@@ -1,9 +1,9 @@
-"""From where to look at a dome's LEDs: the fewest views that see each board often enough, from sides that differ.
+"""Views of a dome's LEDs: few views that see each board often enough and from different directions.
 
-An image shows one LED, so six sightings of 1080 LEDs are 6480 images, whatever the views; fewer views make fewer
-moves, and views that see many boards at once tie them together. Views are chosen one by one: each time the one
-that adds most to what is known of boards that need more (log det of the information on a board's place; sequential
-D-optimal design, Fedorov, Theory of Optimal Experiments, 1972).
+An image shows one LED, so six sightings of 1080 LEDs are 6480 images with any choice of views; fewer views need
+fewer moves, and views that see many boards at once determine their relative positions. Views are chosen one by
+one: each time the one with the largest gain of information on boards that need more (log det of the information
+matrix of a board's position; sequential D-optimal design, Fedorov, Theory of Optimal Experiments, 1972).
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from coupole.calibration.rotations import Floats, inverses
 ENOUGH = 6
 """Sightings of each LED (seed 003)."""
 MOST_ANGLE_DEG = 65.0
-"""Between an LED's normal and the direction to the camera; seen flatter, boards' edges hide it."""
+"""Between an LED's normal and the direction to the camera; at larger angles edges of boards hide it."""
 NEAREST_MM, FARTHEST_MM = 400.0, 2600.0
 _START_MM = 50.0
-"""How well a board's place is known from the table."""
+"""Standard uncertainty of a board's position by the table."""
 _ANGLE_SIGMA = np.radians(0.004)
-"""Of one sighting, most of it the arm's."""
+"""Of one sighting, mostly by the arm."""
 
 
 @dataclass(frozen=True)
 class LedView:
-    """One of the candidates, and the boards to be lit there."""
+    """A candidate that was chosen, and the boards that are lit there."""
 
     candidate: int
     boards: tuple[int, ...]
@@ -44,12 +44,12 @@ class LedViews:
 
     views: tuple[LedView, ...]
     images: int
-    """LEDs of the boards of each view, added up."""
+    """Sum over the views of the LEDs on their boards."""
     few: tuple[int, ...]
-    """Boards that the candidates see fewer times than wanted."""
+    """Boards that too few candidates see."""
     u_mm: Floats
-    """[b] expected standard uncertainty of each board's place, all directions together, without what ties boards
-    to each other."""
+    """[b] expected standard uncertainty of each board's position, all directions together, without correlations
+    between boards."""
 
 
 def led_views(
@@ -61,7 +61,7 @@ def led_views(
     enough: int = ENOUGH,
     margin_px: float = 80.0,
 ) -> LedViews:
-    """Choose among candidates [c, 4, 4] until each board is seen `enough` times by all its LEDs."""
+    """Choose among candidates [c, 4, 4] until each board is seen completely `enough` times."""
     visible, information = _sightings(boards, base_from_camera, lens, size_px, margin_px)
     needed = np.full(len(boards.numbers), enough)
     known = np.tile(np.eye(3) / _START_MM**2, (len(needed), 1, 1))
@@ -89,19 +89,20 @@ def led_views(
 def boards_seen(
     boards: Boards, base_from_camera: Floats, lens: Intrinsics, size_px: tuple[int, int], margin_px: float
 ) -> NDArray[np.bool_]:
-    """[c, b] which boards each of the poses [c, 4, 4] sees whole."""
+    """[c, b] boards that are seen completely from each of the poses [c, 4, 4]."""
     return _sightings(boards, base_from_camera, lens, size_px, margin_px)[0]
 
 
 def _gain(known: Floats, information: Floats) -> Floats:
-    """What each view [c] adds to each board [b]: growth of log det."""
+    """Gain of each board [b] by each view [c]: growth of log det."""
     return np.asarray(np.linalg.slogdet(known[None] + information)[1] - np.linalg.slogdet(known)[1])
 
 
 def _sightings(
     boards: Boards, base_from_camera: Floats, lens: Intrinsics, size_px: tuple[int, int], margin_px: float
 ) -> tuple[NDArray[np.bool_], Floats]:
-    """Which boards [c, b] each candidate sees whole, and what that tells of their places [c, b, 3, 3], 1/mm^2."""
+    """Boards [c, b] that each candidate sees completely, and the information on their positions [c, b, 3, 3],
+    1/mm^2."""
     leds_mm = boards.in_base(boards.base_from_board)
     normals = boards.base_from_board[boards.board_of, :3, 2]
     camera_from_base = inverses(base_from_camera)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import h5py
@@ -27,7 +27,7 @@ from coupole.errors import InputError
 from coupole.plan.led_table import COLUMNS, LedTable
 
 MOVED_MM, MOVED_DEG = 5.0, 1.0
-"""A board farther from its table than this is named: it was mounted anew, or pushed."""
+"""A board farther from its place by the table is reported: it was remounted, or pushed."""
 _COVARIANCE_OF_SINGLE = 1e-12
 
 
@@ -38,7 +38,7 @@ class LedsFound:
     record: Record
     files: dict[str, bytes]
     table: LedTable
-    """As it was known before."""
+    """Before the calibration."""
     new_table: LedTable
     geometry: LedGeometry
     matching: Matching
@@ -47,7 +47,7 @@ class LedsFound:
     u_deg: Floats
     """[n] of its normal."""
     view_errors: Floats
-    """[v, 6] what the arm was off, mm and degrees."""
+    """[v, 6] error of the arm at each view, mm and degrees."""
 
 
 def leds_from(
@@ -67,6 +67,74 @@ def leds_from(
         poses, prior = calibrated_poses(images.base_from_flange, images.joints_deg, arm, prior)
         images = replace(images, base_from_flange=poses)
     boards = boards_of(table)
+    matching = _matched(images, table, boards, prior, stated)
+    sightings = matching.sightings.only(np.flatnonzero(matching.place_of[matching.sightings.led] >= 0))
+    place = matching.place_of[sightings.led]
+    start = placed(boards, matching.by_place_mm)
+    geometry = adjust_leds(sightings, place, images.base_from_flange, boards, start, prior, stated)
+    leds = _in_table_order(geometry, matching, boards)
+    normals = geometry.normals[boards.board_of[leds.place]]
+    new_table = LedTable(
+        table.ids, table.boards[leds.place], geometry.centres_mm[leds.place], normals, table.flux_lm
+    )
+    files = {
+        f"{request.name}.csv": led_csv(new_table, request.name).encode("ascii"),
+        f"{request.name}.h5": _h5(geometry, matching, boards, leds.place, place, len(table.ids)),
+    }
+    limits = judged(LEDS, request.limits, _figures(geometry, leds.found, leds.u_mm, leds.u_deg))
+    faults = (*matching.faults, *_moved_boards(boards, geometry, place))
+    record = _record(
+        images,
+        request,
+        geometry,
+        leds,
+        stated,
+        files=files,
+        lines=_views(images.views, sightings.view, geometry),
+        limits=limits,
+        remarks=(
+            *fault_lines(faults),
+            *_of_records(geometry, prior, limits),
+            *_of_spots(images.left_out),
+            *_of_the_arm(arm),
+        ),
+    )
+    return LedsFound(
+        record,
+        files,
+        table,
+        new_table,
+        geometry,
+        matching,
+        np.where(leds.found, leds.u_mm, np.nan),
+        np.where(leds.found, leds.u_deg, np.nan),
+        _view_errors(geometry, images.base_from_flange),
+    )
+
+
+@dataclass(frozen=True)
+class _InTableOrder:
+    """The dome's LEDs by row of the table [n]."""
+
+    found: NDArray[np.bool_]
+    place: NDArray[np.intp]
+    """Place on the boards at which the LED was found; that of its row where it was not found."""
+    u_mm: Floats
+    """Standard uncertainty of the centre at that place."""
+    u_deg: Floats
+    """And of the normal."""
+
+
+def _in_table_order(geometry: LedGeometry, matching: Matching, boards: Boards) -> _InTableOrder:
+    found = matching.place_of >= 0
+    place = np.where(found, matching.place_of, np.arange(len(found)))
+    u_mm = np.sqrt(np.trace(geometry.centre_covariance, axis1=1, axis2=2))
+    u_deg = np.sqrt(np.trace(geometry.normal_covariance, axis1=1, axis2=2))[boards.board_of]
+    return _InTableOrder(found, place, u_mm[place], u_deg[place])
+
+
+def _matched(images: LedImages, table: LedTable, boards: Boards, prior: CameraPrior, stated: Stated) -> Matching:
+    """Spots assigned to LEDs. Raises InputError if no spot belongs to a place of the table."""
     base_from_camera = images.base_from_flange @ prior.flange_from_camera
     matching = match_leds(
         images.seen,
@@ -76,75 +144,50 @@ def leds_from(
         boards,
         tolerance_px=tolerance_px(prior, stated, table, base_from_camera),
     )
-    used = np.flatnonzero(matching.place_of[matching.sightings.led] >= 0)
-    if not len(used):
+    if not np.any(matching.place_of[matching.sightings.led] >= 0):
         lines = "\n".join(fault_lines(matching.faults)[:5])
         raise InputError(f"LEDs: none was found near its place of the table:\n{lines}")
-    sightings = matching.sightings.only(used)
-    place = matching.place_of[sightings.led]
-    start = placed(boards, matching.by_place_mm)
-    geometry = adjust_leds(sightings, place, images.base_from_flange, boards, start, prior, stated)
-    faults = (*matching.faults, *_moved_boards(boards, geometry, place))
-    u_mm = np.sqrt(np.trace(geometry.centre_covariance, axis1=1, axis2=2))
-    u_deg = np.sqrt(np.trace(geometry.normal_covariance, axis1=1, axis2=2))[boards.board_of]
-    found = matching.place_of >= 0
-    where = np.where(found, matching.place_of, np.arange(len(table.ids)))
-    new_table = LedTable(
-        table.ids,
-        table.boards[where],
-        geometry.centres_mm[where],
-        geometry.normals[boards.board_of[where]],
-        table.flux_lm,
-    )
-    files = {
-        f"{request.name}.csv": led_csv(new_table, request.name).encode("ascii"),
-        f"{request.name}.h5": _h5(geometry, matching, boards, where, place, len(table.ids)),
-    }
-    views = len(images.base_from_flange)
-    limits = judged(LEDS, request.limits, _figures(geometry, found, u_mm[where], u_deg[where]))
-    record = sealed(
+    return matching
+
+
+def _record(
+    images: LedImages,
+    request: Request,
+    geometry: LedGeometry,
+    leds: _InTableOrder,
+    stated: Stated,
+    *,
+    files: Mapping[str, bytes],
+    lines: tuple[ImageResidual, ...],
+    limits: Sequence[Limit],
+    remarks: tuple[str, ...],
+) -> Record:
+    median_u_mm, median_u_deg = float(np.median(leds.u_mm[leds.found])), float(np.median(leds.u_deg[leds.found]))
+    return sealed(
         kind="leds",
         **request.head(),
         simulated=images.about.simulated,
         validity=Validity(expires=request.expires),
         transforms={},
-        **_parameters(
-            geometry, stated, float(np.median(u_mm[where][found])), float(np.median(u_deg[where][found]))
-        ),
+        **_parameters(geometry, stated, median_u_mm, median_u_deg),
         fixed={
-            "leds": float(len(table.ids)),
-            "leds_found": float(found.sum()),
-            "views": float(views),
+            "leds": float(len(leds.found)),
+            "leds_found": float(leds.found.sum()),
+            "views": float(len(images.base_from_flange)),
             "images": float(len(images.seen.frames)),
         },
         files=tuple(Input(name=name, sha256=hashlib.sha256(data).hexdigest()) for name, data in files.items()),
         noise=_noise(geometry, stated),
-        images=_views(images.views, sightings.view, geometry),
+        images=lines,
         limits=limits,
-        remarks=(
-            *fault_lines(faults),
-            *_of_records(geometry, prior, limits),
-            *_of_spots(images.left_out),
-            *_of_the_arm(arm),
-        ),
+        remarks=remarks,
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in images.inputs),
-    )
-    return LedsFound(
-        record,
-        files,
-        table,
-        new_table,
-        geometry,
-        matching,
-        np.where(found, u_mm[where], np.nan),
-        np.where(found, u_deg[where], np.nan),
-        _view_errors(geometry, images.base_from_flange),
     )
 
 
 def tolerance_px(prior: CameraPrior, stated: Stated, table: LedTable, base_from_camera: Floats) -> float:
-    """How far spots of one LED may be from one point: 4 sigma of the camera's poses at the dome's distance, and
-    3 px for the rest."""
+    """Largest distance of the spots of one LED from one point: 4 sigma of the camera's poses at the dome's
+    distance, and 3 px for all other errors."""
     eyes_mm = base_from_camera[:, :3, 3].mean(axis=0)
     distance_mm = float(np.median(np.linalg.norm(table.positions_mm - eyes_mm, axis=1)))
     hand_eye = np.sqrt(np.diag(prior.hand_eye_covariance))
@@ -175,7 +218,7 @@ def _h5(
     place: NDArray[np.intp],
     count: int,
 ) -> bytes:
-    """Uncertainties by LED, in the table's order; the same numbers give the same bytes."""
+    """Uncertainties by LED, in the table's order; equal numbers give equal bytes."""
     kept = geometry.kept
     views = np.bincount(place[kept], minlength=count)
     square = np.bincount(place[kept], np.sum(geometry.residuals_px[kept] ** 2, axis=1), minlength=count)
@@ -272,7 +315,7 @@ def _noise(geometry: LedGeometry, stated: Stated) -> tuple[Noise, ...]:
 
 
 def _views(names: Sequence[str], view: NDArray[np.intp], geometry: LedGeometry) -> tuple[ImageResidual, ...]:
-    """One line for each view: its spots are the corners of a board's image."""
+    """One line for each view; its spots take the place of the corners of a board's image."""
     lines = []
     for number, name in enumerate(names):
         rows = np.flatnonzero(view == number)
@@ -284,7 +327,7 @@ def _views(names: Sequence[str], view: NDArray[np.intp], geometry: LedGeometry) 
 
 
 def _figures(geometry: LedGeometry, found: NDArray[np.bool_], u_mm: Floats, u_deg: Floats) -> dict[str, float]:
-    """What `limits.LEDS` are held against."""
+    """The figures that `acceptance.LEDS` limits."""
     return {
         "missing": float(1 - found.mean()),
         "centre_mm": float(np.median(u_mm[found])),
@@ -302,7 +345,7 @@ def _of_records(geometry: LedGeometry, prior: CameraPrior, limits: Sequence[Limi
     worst = int(np.argmax(np.abs(geometry.prior_step)))
     return [
         f"{names[worst]} would have to be {abs(geometry.prior_step[worst]):.0f} standard uncertainties from its "
-        "record: a record of another focus, or a camera that was pushed since. Calibrate camera and hand-eye anew"
+        "record: it was made at another focus, or the camera was pushed since. Calibrate camera and hand-eye anew"
     ]
 
 
@@ -315,7 +358,7 @@ def _of_the_arm(arm: CalibratedArm | None) -> list[str]:
 def _of_spots(left_out: Sequence[str]) -> list[str]:
     if not left_out:
         return []
-    return [f"{len(left_out)} bright things were no spots, e.g. {left_out[0]}"]
+    return [f"{len(left_out)} bright regions are not spots, e.g. {left_out[0]}"]
 
 
 def _view_errors(geometry: LedGeometry, reported: Floats) -> Floats:

@@ -7,7 +7,7 @@
     camera.py       intrinsics and distortion, with covariance
     chromatic*.py   a lens for each colour channel: lateral chromatic aberration
     hand_eye.py     A X = X B in closed form: Park, Tsai, Daniilidis
-    bundle.py       camera, hand-eye, board and errors of the robot in one adjustment
-    diagnosis.py    why robot and camera contradict each other; hypotheses.py: what may have gone wrong
-    workflow.py     images to record; limits.py, drawing.py: what is accepted and shown
+    bundle.py       camera, hand-eye, board and errors of the robot in one adjustment; equations.py: its equations
+    diagnosis.py    why robot and camera contradict each other; hypotheses.py: the possible causes
+    workflow.py     from images to record; acceptance.py, drawing.py: acceptance limits and picture
 """

@@ -1,4 +1,4 @@
-"""What is accepted of a lens and of a camera on a robot."""
+"""Acceptance limits of a lens and of a camera on a robot."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ IMAGES = (
 )
 """`bare_field`: share of the field's 8 x 6 cells. `rejected`: share of the corners left out as gross errors."""
 CAMERA = (*IMAGES, Allowed("ray_px", "uncertainty at the field's corners", 0.5, "px"))
-"""`ray_px`: standard uncertainty of where the calibrated lens sees a point at the field's corners."""
+"""`ray_px`: standard uncertainty of the image of a direction at the field's corners."""
 HAND_EYE = (
     *IMAGES,
     Allowed("centre_mm", "camera centre on the flange", 0.3, "mm"),

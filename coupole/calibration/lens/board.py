@@ -1,8 +1,8 @@
-"""The board: what is printed on it, and its corners in an image.
+"""The board: its pattern, and its corners in an image.
 
 A board's frame is OpenCV's: x along the rows of squares, y along the columns, z into the board; the origin is the
-outer corner of a ChArUco board, the first inner corner of a chess board. Corners are found by OpenCV in 8 bits of
-one colour, and then fitted to that colour's own pixels in all the bits they have (`corner_fit`).
+outer corner of a ChArUco board, the first inner corner of a chess board. OpenCV finds the corners in an 8-bit
+image of one colour; they are then fitted to the pixels of that colour with their full bit depth (`corner_fit`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Millimetres = Annotated[float, Field(gt=0, le=1000)]
 
 LEAST_CORNERS = 8
 CLIPPED_SHARE = 0.02
-"""Where more pixels than this about the corners are white, edges are eaten: such an image is left out."""
+"""An image with a larger share of white pixels about the corners is left out: clipping shifts edges."""
 
 
 class Board(Model):
@@ -38,12 +38,12 @@ class Board(Model):
     """Inner corners along x and y: one less than squares."""
     square_mm: Millimetres
     scale_u_ppm: Annotated[float, Field(ge=0, le=20_000)] = 50.0
-    """Standard uncertainty of all its lengths together: print, measurement, warmth."""
+    """Standard uncertainty of its scale: print, measurement, temperature."""
     marker_mm: Millimetres | None = None
     dictionary: str = "DICT_5X5_250"
     """OpenCV's name of the markers' dictionary."""
     legacy_pattern: bool = False
-    """ChArUco as OpenCV before 4.6 printed it, which starts with a marker where rows are even in number."""
+    """ChArUco as printed by OpenCV before 4.6, which starts with a marker if the number of rows is even."""
 
     @field_validator("dictionary")
     @classmethod
@@ -72,7 +72,7 @@ class Board(Model):
 
     @property
     def has_a_top(self) -> bool:
-        """False for a chess board that looks the same upside down; its pose is then known up to half a turn."""
+        """False for a chess board that looks the same upside down; its pose is then ambiguous by half a turn."""
         return self.kind == "charuco" or sum(self.corners) % 2 == 1
 
 
@@ -96,7 +96,7 @@ def read_board(path: Path) -> Board:
 
 
 def detect(board: Board, picture: Picture) -> Sighting | str:
-    """The board's corners in a picture, of a coloured one in green, or why it cannot be used."""
+    """The board's corners in a picture (in green if it has colours), or the reason why it cannot be used."""
     import cv2
 
     image = picture.plane()
@@ -117,13 +117,13 @@ def detect(board: Board, picture: Picture) -> Sighting | str:
 
 
 def in_channel(board: Board, picture: Picture, channel: Channel, green: Sighting) -> Sighting:
-    """The corners of a sighting in green, found in another colour of its picture."""
+    """The corners of a sighting in green, fitted in another colour of its picture."""
     return _refined(green, board, picture, channel)
 
 
 def _refined(rough: Sighting, board: Board, picture: Picture, channel: Channel) -> Sighting:
-    """The corners to a fraction of a pixel, without those that turn out to be none. Where they are too close
-    together for a fit, they are where OpenCV sees all gradients point away or along."""
+    """The corners to a fraction of a pixel, without false ones. Corners that are too close together for a fit are
+    located by OpenCV's gradient method."""
     window_px = _window_px(board, rough.ids, rough.pixels)
     values, known = picture.measured(channel)
     if not enough_pixels(known, window_px):
@@ -146,7 +146,7 @@ def refine(image: NDArray[Any], corners: Floats, window_px: int) -> Floats:
 
 
 def _eight_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """8 bits for the search alone: dark to white as the image's own extremes."""
+    """8 bits for the search alone, scaled to the image's extremes."""
     import cv2
 
     if image.dtype == np.uint8:
@@ -154,13 +154,14 @@ def _eight_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
     step = max(1, image.shape[0] // 500)
     low, high = np.percentile(image[::step, ::step], [0.5, 99.5])
     scale = 255.0 / max(float(high - low), 1e-9)
-    # A weighted sum of one, since it saturates at 0 and 255.
+    # `addWeighted` of one image, because it saturates at 0 and 255.
     return np.asarray(cv2.addWeighted(image, scale, image, 0.0, -scale * low, dtype=cv2.CV_8U), dtype=np.uint8)
 
 
 def _window_px(board: Board, ids: NDArray[np.intp], corners: Floats) -> float:
-    """Radius of the window that a corner is found in, 2 to 11 px: a third of the way to the nearest corner, and
-    short of a ChArUco board's markers, whose corners stand on the diagonals and would pull by half a pixel."""
+    """Radius of the window about a corner, 2 to 11 px: a third of the distance to the nearest corner, and less
+    than that to a ChArUco board's markers, whose corners lie on the diagonals and would shift the result by half a
+    pixel."""
     apart = np.linalg.norm(corners[:, None] - corners[None], axis=-1)
     np.fill_diagonal(apart, np.inf)
     steps = np.linalg.norm(board.points_mm[ids][:, None] - board.points_mm[ids][None], axis=-1)
@@ -206,7 +207,8 @@ def _chess(board: Board, picture: NDArray[np.uint8]) -> tuple[NDArray[np.intp], 
 
 
 def _starts_dark(board: Board, picture: NDArray[np.uint8], points: Floats) -> bool:
-    """True if the square between the first four corners is darker than the next: so all images begin alike."""
+    """True if the square between the first four corners is darker than the next; it fixes the order of the
+    corners."""
     across = board.corners[0]
     centre = points[[0, 1, across, across + 1]].mean(axis=0)
     beside = points[[1, 2, across + 1, across + 2]].mean(axis=0)

@@ -1,57 +1,52 @@
-"""Camera, hand-eye, board and the robot's errors in one adjustment.
+"""Camera, hand-eye, board and the robot's errors in one adjustment (its equations: `lens.equations`).
 
-A corner at p on the board is seen through
+Corners, positions and orientations of the robot each have a noise that is estimated from their residuals. The zero
+errors of the axes and the error of the board's scale have priors with the stated standard deviations.
 
-    p_camera = (base_from_flange_i . T(S_i a) . E_i . flange_from_camera)^-1 . base_from_board . (1 + s) p
-
-with base_from_flange_i as the robot reports it, E_i what the arm is off at this pose alone (repeatability, and
-whatever else differs from pose to pose), a the zero errors of its axes (the part of its absolute error that all
-poses share; S_i is the arm's Jacobian), s the error of the board's scale. Corners, positions and orientations of
-the robot each have a noise that is estimated from their residuals; a and s are held by what is stated of them.
-
-What such images cannot tell, intervals say: a constant error in the base goes into base_from_board, one in the
-flange into flange_from_camera, where it belongs, as only their product with reported poses is ever used.
+Two errors cannot be determined from such images and are not needed: a constant error of the base becomes part of
+base_from_board, and one of the flange part of flange_from_camera. Both are only ever used in a product with
+reported poses, in which they cancel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from coupole.calibration import optics
-from coupole.calibration.adjustment import Adjusted, Block, Component, Group, adjust
+from coupole.calibration.adjustment import Adjusted, Component, adjust
 from coupole.calibration.lens.board import Sighting
 from coupole.calibration.lens.camera import PIXEL_SIGMA_PX, Corners, board_pose
+from coupole.calibration.lens.equations import (
+    CORNERS,
+    ORIENTATION,
+    POSITION,
+    Bundle,
+    EarlierLens,
+    Layout,
+    Poses,
+    State,
+)
 from coupole.calibration.lens.hand_eye import Solution, solve
 from coupole.calibration.optics import Intrinsics
-from coupole.calibration.record import step_names
-from coupole.calibration.rotations import Floats, moved, rotation, rotation_vector, skew
+from coupole.calibration.rotations import Floats, rotation_vector
 from coupole.errors import InputError
 
-CORNERS, POSITION, ORIENTATION, BOARD_SCALE, AXIS_ZEROS, EARLIER = (
-    "corners",
-    "robot position",
-    "robot orientation",
-    "board scale",
-    "axis zeros",
-    "camera record",
-)
 _LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 1e-3, 1e-6
-_STEP_UNITS = np.array([1.0, 1.0, 1.0, *np.degrees([1.0, 1.0, 1.0])])
 
 
 @dataclass(frozen=True)
 class RobotNoise:
-    """What is stated of a robot: standard deviations of each coordinate."""
+    """Stated noise of a robot: standard deviations of each coordinate."""
 
     repeatability_mm: float = 0.03
     repeatability_deg: float = 0.003
     absolute_mm: float = 0.3
-    """Off the true place, beside repeatability. Where axes are known, that of their zeros takes its place."""
+    """Absolute error beside repeatability. Not used where axes are known: their zeros are estimated instead."""
     absolute_deg: float = 0.02
-    """Of orientation, or of each axis' zero where axes are known."""
+    """Of orientation; of each axis zero where axes are known."""
 
     def pose_sigmas(self, *, axes_known: bool) -> tuple[float, float]:
         """Stated noise of one pose: mm, radians."""
@@ -64,33 +59,8 @@ class RobotNoise:
 
 
 @dataclass(frozen=True)
-class Poses:
-    """The robot's poses, one for each image."""
-
-    base_from_flange: Floats
-    """[n, 4, 4] as reported."""
-    axis_sensitivity: Floats | None = None
-    """[n, 6, axes] step of the flange in its own frame (mm, rad) for each degree of each axis; None if the axes
-    were not reported."""
-
-    def only(self, keep: Sequence[int] | np.ndarray[tuple[int], np.dtype[np.intp]]) -> Poses:
-        sensitivity = None if self.axis_sensitivity is None else self.axis_sensitivity[keep]
-        return Poses(self.base_from_flange[keep], sensitivity)
-
-
-@dataclass(frozen=True)
-class EarlierLens:
-    """A lens that is known already, to be held or improved."""
-
-    intrinsics: Intrinsics
-    free: tuple[str, ...] = ()
-    covariance: Floats | None = None
-    """[free, free]; None if the lens is taken as exact."""
-
-
-@dataclass(frozen=True)
 class HandEyeCalibration:
-    """Hand-eye and all that was estimated with it."""
+    """Hand-eye and everything that was estimated with it."""
 
     flange_from_camera: Floats
     base_from_board: Floats
@@ -98,23 +68,23 @@ class HandEyeCalibration:
     names: tuple[str, ...]
     """[s] of the parameters that all images share, with units."""
     covariance: Floats
-    """[s, s] in these units, poses' own errors integrated out."""
+    """[s, s] in these units, marginalised over the errors of the poses."""
     degrees: Floats
-    """[s] degrees of freedom behind each."""
+    """[s] effective degrees of freedom."""
     shares: Floats
-    """[groups, s] of each parameter's variance, by cause."""
+    """[groups, s] contribution of each group to each parameter's variance."""
     components: tuple[Component, ...]
     """[groups]."""
     board_scale: float
-    """Relative: the board is so much larger than described."""
+    """Relative excess of the board's size over its description."""
     axis_zeros_deg: Floats
-    """[axes] by which the true angles exceed the reported ones; empty if axes were not known."""
+    """[axes] excess of the true over the reported angles; empty if axes were not known."""
     pose_errors: Floats
     """[n, 6] of each pose in the flange's frame, mm and degrees."""
     residuals_px: tuple[Floats, ...]
     """[k, 2] of each image, observed minus computed."""
     start: Solution
-    """Park's, which the adjustment began from."""
+    """Park's solution, from which the adjustment started."""
     noise: RobotFound
     sightings: tuple[Sighting, ...]
     steps: int
@@ -127,24 +97,13 @@ class HandEyeCalibration:
 
 @dataclass(frozen=True)
 class RobotFound:
-    """Noise as the residuals show it, beside what was stated."""
+    """Noise by the residuals, and as stated."""
 
     pixel_px: float
     position_mm: float
     orientation_deg: float
     stated_position_mm: float
     stated_orientation_deg: float
-
-
-@dataclass(frozen=True)
-class _State:
-    intrinsics: Floats
-    flange_from_camera: Floats
-    base_from_board: Floats
-    scale: float
-    axis_zeros_deg: Floats
-    pose_errors: Floats
-    """[n, 4, 4]."""
 
 
 def calibrate_hand_eye(
@@ -156,9 +115,9 @@ def calibrate_hand_eye(
     robot: RobotNoise,
     board_scale_u_ppm: float = 0.0,
 ) -> HandEyeCalibration:
-    """Hand-eye and board from images [n] and the robot's poses, intrinsics adjusted along.
+    """Hand-eye, board and intrinsics from images [n] and the robot's poses.
 
-    `lens` is where its adjustment starts (all parameters of `model` free), or an earlier calibration, whose
+    `lens` is a start for the intrinsics (all parameters of `model` free), or an earlier calibration, whose
     covariance then counts as an observation. `sightings` are without gross errors (`camera.without_gross_errors`).
     Raises InputError: too few poses, or poses that do not determine the result.
     """
@@ -178,11 +137,11 @@ def calibrate_hand_eye(
         max(stated[0], start.scatter_mm / 3**0.5, _LEAST_SIGMA_MM),
         max(stated[1], float(np.radians(start.scatter_deg)) / 3**0.5, _LEAST_SIGMA_RAD),
     )
-    layout = _Layout(free, axes, board_scale_u_ppm > 0)
-    problem = _Bundle(
+    layout = Layout(free, axes, board_scale_u_ppm > 0)
+    problem = Bundle(
         layout, Corners.of(sightings), poses, sigmas, board_scale_u_ppm * 1e-6, robot.absolute_deg, earlier
     )
-    state = _State(
+    state = State(
         intrinsics.vector(),
         start.flange_from_camera,
         start.base_from_board,
@@ -201,195 +160,9 @@ def calibrate_hand_eye(
     return _result(found, problem, start, stated, tuple(sightings))
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Where each shared parameter stands among the columns: lens, hand-eye, board, board's scale, axes' zeros."""
-
-    free: tuple[str, ...]
-    axes: int
-    scaled: bool
-
-    @property
-    def hand_eye(self) -> int:
-        return len(self.free)
-
-    @property
-    def board(self) -> int:
-        return self.hand_eye + 6
-
-    @property
-    def scale(self) -> int:
-        return self.board + 6
-
-    @property
-    def zeros(self) -> int:
-        return self.scale + int(self.scaled)
-
-    @property
-    def shared(self) -> int:
-        return self.zeros + self.axes
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        lens = tuple(name + ("_px" if name[0] in "fc" else "") for name in self.free)
-        scale = ("board_scale",) if self.scaled else ()
-        zeros = tuple(f"axis_zero.a{axis + 1}_deg" for axis in range(self.axes))
-        return (*lens, *step_names("flange_from_camera"), *step_names("base_from_board"), *scale, *zeros)
-
-    @property
-    def units(self) -> Floats:
-        """[s] by which the adjustment's steps (mm, radians) become those of `names`."""
-        return np.concatenate(
-            [np.ones(len(self.free)), _STEP_UNITS, _STEP_UNITS, np.ones(self.shared - self.scale)]
-        )
-
-
-@dataclass(frozen=True)
-class _Bundle:
-    """The observations, and how they depend on the state."""
-
-    layout: _Layout
-    corners: Corners
-    poses: Poses
-    sigmas: tuple[float, float]
-    """Of the robot's positions and orientations to begin with: mm, radians."""
-    scale_sigma: float
-    zero_sigma_deg: float
-    earlier: EarlierLens | None
-
-    @property
-    def groups(self) -> list[Group]:
-        groups = [Group(CORNERS, True), Group(POSITION, True), Group(ORIENTATION, True)]
-        groups += [Group(BOARD_SCALE, False)] if self.layout.scaled else []
-        groups += [Group(AXIS_ZEROS, False)] if self.layout.axes else []
-        return groups + ([Group(EARLIER, False)] if self._lens_weight is not None else [])
-
-    @property
-    def _lens_weight(self) -> Floats | None:
-        """W [free, free] with W'W the inverse covariance of an earlier lens."""
-        if self.earlier is None or not self.earlier.free or self.earlier.covariance is None:
-            return None
-        return np.asarray(np.linalg.cholesky(np.linalg.inv(self.earlier.covariance)).T)
-
-    def evaluate(self, state: _State) -> list[Block]:
-        names = [group.name for group in self.groups]
-        return [*self._corner_blocks(state), *self._robot_blocks(state), *self._held_blocks(state, names)]
-
-    def move(self, state: _State, change: Floats) -> _State:
-        at = self.layout
-        intrinsics = state.intrinsics.copy()
-        intrinsics[[optics.NAMES.index(name) for name in at.free]] += change[: at.hand_eye]
-        return replace(
-            state,
-            intrinsics=intrinsics,
-            flange_from_camera=moved(state.flange_from_camera, change[at.hand_eye : at.board]),
-            base_from_board=moved(state.base_from_board, change[at.board : at.scale]),
-            scale=state.scale + float(change[at.scale]) if at.scaled else state.scale,
-            axis_zeros_deg=state.axis_zeros_deg + change[at.zeros : at.shared],
-            pose_errors=moved(state.pose_errors, change[at.shared :].reshape(-1, 6)),
-        )
-
-    def _corner_blocks(self, state: _State) -> list[Block]:
-        """p goes from the board to the base, the reported flange, the flange without axes' errors, the true flange
-        and the camera; each derivative is taken back along the same way."""
-        at, view = self.layout, self.corners.view
-        printed_mm = self.corners.board_mm
-        board_mm = printed_mm * (1 + state.scale)
-        board, hand_eye = state.base_from_board, state.flange_from_camera
-        reported = self.poses.base_from_flange[view]
-        zeroed = self._zero_steps(state)[view]
-        error = state.pose_errors[view]
-
-        in_base = board_mm @ board[:3, :3].T + board[:3, 3]
-        in_reported = _into(reported, in_base)
-        in_zeroed = _into(zeroed, in_reported)
-        in_flange = _into(error, in_zeroed)
-        in_camera = (in_flange - hand_eye[:3, 3]) @ hand_eye[:3, :3]
-        seen = optics.project(in_camera, state.intrinsics)
-
-        by_flange = seen.by_point @ hand_eye[:3, :3].T
-        by_zeroed = by_flange @ np.swapaxes(error[:, :3, :3], -1, -2)
-        by_reported = by_zeroed @ np.swapaxes(zeroed[:, :3, :3], -1, -2)
-        by_base = by_reported @ np.swapaxes(reported[:, :3, :3], -1, -2)
-        columns = [
-            seen.by_intrinsics[:, :, [optics.NAMES.index(name) for name in at.free]],
-            -by_flange,
-            seen.by_point @ skew(in_camera),
-            by_base,
-            -by_base @ (board[:3, :3] @ skew(board_mm)),
-        ]
-        if at.scaled:
-            columns.append(by_base @ (printed_mm @ board[:3, :3].T)[:, :, None])
-        if self.poses.axis_sensitivity is not None:
-            by_step = np.concatenate([-by_reported, by_zeroed @ skew(in_zeroed)], axis=-1)
-            columns.append(by_step @ self.poses.axis_sensitivity[view])
-        columns += [-by_zeroed, by_flange @ skew(in_flange)]
-        jacobian = np.concatenate(columns, axis=-1) / PIXEL_SIGMA_PX
-        residuals = (self.corners.pixels - seen.pixels) / PIXEL_SIGMA_PX
-        return [
-            Block(
-                residuals[part].ravel(),
-                jacobian[part].reshape(-1, at.shared + 6),
-                np.r_[0 : at.shared, self._own(number)],
-                0,
-            )
-            for number, part in enumerate(self.corners.parts)
-        ]
-
-    def _robot_blocks(self, state: _State) -> list[Block]:
-        """Each pose is off by nothing, within its noise. Turns are small: the derivative of the logarithm is 1."""
-        turned = rotation_vector(state.pose_errors[:, :3, :3])
-        position_mm, orientation_rad = self.sigmas
-        blocks = []
-        for number in range(len(turned)):
-            own = np.arange(*self._own(number).indices(2**31))
-            shift = state.pose_errors[number, :3, 3]
-            blocks.append(Block(-shift / position_mm, np.eye(3) / position_mm, own[:3], 1))
-            blocks.append(Block(-turned[number] / orientation_rad, np.eye(3) / orientation_rad, own[3:], 2))
-        return blocks
-
-    def _held_blocks(self, state: _State, names: list[str]) -> list[Block]:
-        """What is known beforehand: the board's scale, the axes' zeros, an earlier lens."""
-        at, blocks = self.layout, []
-        if at.scaled:
-            sigma = self.scale_sigma
-            held = Block(np.array([-state.scale / sigma]), np.eye(1) / sigma, np.array([at.scale]), 3)
-            blocks.append(replace(held, group=names.index(BOARD_SCALE)))
-        if at.axes:
-            sigma = self.zero_sigma_deg
-            columns = np.arange(at.zeros, at.shared)
-            weight = np.eye(at.axes) / sigma
-            blocks.append(Block(-state.axis_zeros_deg / sigma, weight, columns, names.index(AXIS_ZEROS)))
-        weight_of_lens = self._lens_weight
-        if weight_of_lens is not None and self.earlier is not None:
-            picked = [optics.NAMES.index(name) for name in at.free]
-            off = self.earlier.intrinsics.vector()[picked] - state.intrinsics[picked]
-            columns = np.arange(at.hand_eye)
-            blocks.append(Block(weight_of_lens @ off, weight_of_lens, columns, names.index(EARLIER)))
-        return blocks
-
-    def _own(self, number: int) -> slice:
-        first = self.layout.shared + 6 * number
-        return slice(first, first + 6)
-
-    def _zero_steps(self, state: _State) -> Floats:
-        """[n, 4, 4] by which the axes' zero errors move the flange, in its own frame."""
-        steps = np.broadcast_to(np.eye(4), (len(self.poses.base_from_flange), 4, 4)).copy()
-        if self.poses.axis_sensitivity is not None:
-            vectors = self.poses.axis_sensitivity @ state.axis_zeros_deg
-            steps[:, :3, :3], steps[:, :3, 3] = rotation(vectors[:, 3:]), vectors[:, :3]
-        return steps
-
-
-def _into(a_from_b: Floats, points_a: Floats) -> Floats:
-    """Points [k, 3] of frames a in frames b, each with a transform of its own [k, 4, 4]."""
-    away = points_a - a_from_b[:, :3, 3]
-    return np.asarray(np.einsum("kij,ki->kj", a_from_b[:, :3, :3], away))
-
-
 def _result(
-    found: Adjusted[_State],
-    problem: _Bundle,
+    found: Adjusted[State],
+    problem: Bundle,
     start: Solution,
     stated: tuple[float, float],
     sightings: tuple[Sighting, ...],

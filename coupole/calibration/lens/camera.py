@@ -1,7 +1,7 @@
 """Intrinsics and distortion from images of a board, with covariance.
 
-OpenCV's Zhang calibration gives the start; one adjustment of all images follows, in which corners off by gross
-errors are left out and the noise of the rest is estimated from their own residuals.
+OpenCV's calibration (Zhang) gives the start. One adjustment of all images follows, in which corners with gross
+errors are left out and the noise of the others is estimated from their residuals.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from coupole.errors import InputError
 
 LEAST_VIEWS, MOST_VIEWS = 4, 400
 PIXEL_SIGMA_PX = 0.1
-"""Stated noise of a corner, per coordinate; the adjustment finds what it is."""
+"""Stated noise of a corner, per coordinate; the adjustment estimates the true one."""
 _START_VIEWS = 20
 
 
 @dataclass(frozen=True)
 class CameraState:
-    """What the adjustment moves: intrinsics [9] and `camera_from_board` [views, 4, 4]."""
+    """The unknowns: intrinsics [9] and `camera_from_board` [views, 4, 4]."""
 
     intrinsics: Floats
     camera_from_board: Floats
@@ -34,14 +34,14 @@ class CameraState:
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """A camera with the uncertainty of its parameters, and what each image left over."""
+    """A camera with the uncertainty of its parameters, and the residuals of each image."""
 
     intrinsics: Intrinsics
     free: tuple[str, ...]
     covariance: Floats
     """[free, free] of the free parameters, in their order."""
     degrees: Floats
-    """Degrees of freedom behind each [free]."""
+    """[free] effective degrees of freedom."""
     sigma_px: float
     """Noise of a corner, per coordinate, estimated."""
     camera_from_board: Floats
@@ -147,7 +147,8 @@ class Corners:
 
 
 def first_guess(sightings: Sequence[Sighting], size_px: tuple[int, int], model: str) -> CameraState:
-    """OpenCV's calibration from up to 20 images (Zhang, PAMI 22(11), 2000), and all images' poses with it."""
+    """OpenCV's calibration from up to 20 images (Zhang, PAMI 22(11), 2000), and the poses of all images with
+    it."""
     import cv2
 
     chosen = [sightings[i] for i in np.unique(np.linspace(0, len(sightings) - 1, _START_VIEWS).astype(int))]

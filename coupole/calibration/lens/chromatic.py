@@ -1,9 +1,9 @@
 """Lateral chromatic aberration: a lens for each colour channel, all from the same images.
 
-The board's poses are shared, so what the lenses have in common (focal length against distance, principal point
-against tilt) cancels out of their differences, which are known far better than each lens alone. Colours differ in
-scale, centre and the first term of radial distortion; the higher terms, which few corners at the field's rim tell,
-are one for all.
+All lenses share the board's poses, so their common errors (focal length correlated with distance, principal point
+with tilt) cancel in their differences, which are known far better than each lens alone. Colours differ in scale,
+centre and the first term of radial distortion; the higher terms, which few corners at the field's rim determine,
+are common to all.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from coupole.calibration.rotations import Floats, moved, skew
 from coupole.errors import InputError
 
 OWN = ("fx", "fy", "cx", "cy", "k1")
-"""Parameters that each colour has for itself, where the lens model has them."""
+"""Parameters that are estimated for each colour separately, if the lens model has them."""
 SHARED = "shared"
 
 
@@ -41,8 +41,8 @@ class ChannelLenses:
     """Noise of a corner by channel."""
 
     def shift(self, channel: str, against: str, pixels: Floats) -> tuple[Floats, Floats]:
-        """How far a channel sees directions from where another sees them, px [k, 2], and the covariance of that,
-        px^2 [k, 2, 2]. `pixels` [k, 2] say where in the field, as an undistorted lens would see the directions.
+        """Shift of a channel's image against another's, px [k, 2], and its covariance, px^2 [k, 2, 2]. `pixels`
+        [k, 2] are the places in the field at which a lens without distortion would image the directions.
         """
         one, other = self.intrinsics[channel], self.intrinsics[against]
         directions = (pixels - (other.cx, other.cy)) / (other.fx, other.fy)

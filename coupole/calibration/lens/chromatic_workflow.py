@@ -37,7 +37,7 @@ class ChromaticFound:
     lenses: ChannelLenses
     size_px: tuple[int, int]
     field_px: Floats
-    """[k, 2] where shifts are told."""
+    """[k, 2] places in the field at which shifts are given."""
     shifts: dict[str, tuple[Floats, Floats]]
     """By channel: shift against green, px [k, 2], and its covariance, px^2 [k, 2, 2]."""
 
@@ -88,7 +88,7 @@ def chromatic_from(found: Found, sources: Sources, board: Board, model: str, req
 def _in_channel(
     channel: Channel, kept: tuple[Sighting, ...], found: Found, sources: Sources, board: Board
 ) -> list[Sighting]:
-    """The sightings, which are those in green, in a channel."""
+    """The sightings in a channel, from those in green."""
     if channel == "green":
         return list(kept)
     return [
@@ -98,7 +98,7 @@ def _in_channel(
 
 
 def _field(size_px: tuple[int, int]) -> Floats:
-    """[k, 2] all over the field, rim included."""
+    """[k, 2] a grid over the field, rim included."""
     across, down = (np.linspace(0.0, size - 1.0, count) for size, count in zip(size_px, _STEPS, strict=True))
     return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
 
@@ -122,7 +122,7 @@ def _parameters(lenses: ChannelLenses) -> tuple[Parameter, ...]:
 
 
 def _redundancy(kept: tuple[Sighting, ...], free: tuple[str, ...]) -> float:
-    """Of one channel, which has the images' poses in common with the others."""
+    """Redundancy of one channel, which shares the poses of the images with the others."""
     return float(sum(2 * len(seen.ids) for seen in kept) - len(free) - 6 * len(kept) / len(CHANNELS))
 
 

@@ -1,17 +1,16 @@
-"""Corners of a board to a few thousandths of a pixel: the picture of two crossing edges, fitted to RAW pixels.
+"""Corners of a board to a few thousandths of a pixel: a model of two crossing edges, fitted to RAW pixels.
 
-About a corner at q the values are, with S_k the picture of edge k as a pixel's square sees it,
+About a corner at q the values are, with S_k the image of edge k integrated over a pixel's square,
 
     (m + c ((2 S_1 - 1) (2 S_2 - 1) + r)) (1 + g (p - q))
 
 for level m, contrast c and a gradient g of the light. An edge under the angle a, blurred by a Gaussian of sigma,
 is seen by a square pixel as S(d) = [G(d + s) - G(d + t) - G(d - t) + G(d - s)] / (|cos a| |sin a|), where d is the
 distance of pixel and edge, s and t are half the sum and the difference of |cos a| and |sin a|, and G'' is the
-normal distribution (two boxes, then a Gaussian). So edges finer than a pixel have no error that comes and goes
-with their place between pixels, and no colour need be interpolated: pixels of other colours take no part. The rest
-r is what blur does where edges cross at another angle than 90 degrees: of the sign's expectation over two normal
-variables with the correlation k = n_1 n_2 of the edges' normals, the terms up to k^3 of the tetrachoric series
-(Pearson 1900).
+normal distribution (two boxes, then a Gaussian). So sharp edges have no error that depends on their place between
+pixels, and no colour needs to be interpolated: pixels of other colours are not used. The term r is the effect of
+blur where edges do not cross at 90 degrees: of the sign's expectation over two normal variables with the
+correlation k = n_1 n_2 of the edges' normals, the terms up to k^3 of the tetrachoric series (Pearson 1900).
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _X, _Y, _FIRST, _SECOND, _SIGMA, _LEVEL, _CONTRAST, _ALONG_X, _ALONG_Y = range(_
 _MOST_STEPS = 40
 _CLOSE_PX = 1e-5
 _WORST = 0.2
-"""Of the contrast: a fit that leaves a greater rms is of something else than a corner."""
+"""Of the contrast: with a larger rms residual the image is not that of a corner."""
 _LEAST_SIGMA_PX = 0.05
 _THIN = 0.01
 """Least width of a box: an edge along the pixels' rows."""
@@ -46,13 +45,13 @@ class Corners:
     pixels: Floats
     """[n, 2], centre of the first pixel (0, 0)."""
     fits: NDArray[np.bool_]
-    """[n] False where no corner was found; `pixels` are then where the search began."""
+    """[n] False where no corner was found; `pixels` are then those of the start."""
     sigma_px: Floats
-    """[n] blur of the picture."""
+    """[n] blur of the image."""
 
 
 def enough_pixels(known: NDArray[np.bool_], radius_px: float) -> bool:
-    """Whether a window of that radius has pixels enough for a fit."""
+    """Whether a window of that radius has enough pixels for a fit."""
     return bool(np.pi * radius_px**2 * known.mean() >= _LEAST_PIXELS)
 
 
@@ -75,10 +74,10 @@ def _fit_all(image, known, rough, radius, found):  # type: ignore[no-untyped-def
         unknowns[_X], unknowns[_Y] = rough[n]
         if not _start(image, known, radius, unknowns):
             continue
-        # Again about the corner found: only a window that lies evenly about it is fair to both sides.
+        # Again about the corner found: a window that is not centred on it would bias the result.
         fits = _fit(image, known, rough[n, 0], rough[n, 1], radius, unknowns)
         if fits and _fit(image, known, unknowns[_X], unknowns[_Y], radius, unknowns):
-            # Blur mixes light and edges: p F, blurred, is p F + sigma^2 grad F, as if the corner stood elsewhere.
+            # A gradient of light shifts blurred edges: p F, blurred, is p F + sigma^2 grad F.
             spread2 = unknowns[_SIGMA] ** 2 + 1.0 / 12.0
             unknowns[_X] += spread2 * unknowns[_ALONG_X]
             unknowns[_Y] += spread2 * unknowns[_ALONG_Y]
@@ -98,7 +97,7 @@ def _start(image, known, radius, unknowns):  # type: ignore[no-untyped-def]
                 continue
             angle = math.atan2(row - y, col - x) % (2.0 * math.pi)
             sector = int(angle / (2.0 * math.pi) * _SECTORS) % _SECTORS
-            # Spread over neighbours, so that few pixels leave no gap.
+            # Spread over neighbours, so that there is no gap where pixels are few.
             for step in range(-2, 3):
                 weight = 3.0 - abs(step)
                 sums[(sector + step) % _SECTORS] += weight * image[row, col]
@@ -132,7 +131,7 @@ def _start(image, known, radius, unknowns):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _fit(image, known, x, y, radius, unknowns):  # type: ignore[no-untyped-def]
-    """Levenberg and Marquardt's descent; False where it leads away or what it leaves is too much."""
+    """Levenberg-Marquardt; False if it diverges or the residual is too large."""
     squares, count, normal, right = _equations(image, known, x, y, radius, unknowns)
     damping = 1e-3
     for _ in range(_MOST_STEPS):
@@ -161,7 +160,7 @@ def _fit(image, known, x, y, radius, unknowns):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _equations(image, known, middle_x, middle_y, radius, unknowns):  # type: ignore[no-untyped-def]
-    """Sum of squares left, number of pixels, normal equations [9, 9] and right side [9] of one step."""
+    """Sum of squared residuals, number of pixels, normal matrix [9, 9] and right-hand side [9] of one step."""
     x, y, sigma = unknowns[_X], unknowns[_Y], unknowns[_SIGMA]
     level, contrast = unknowns[_LEVEL], unknowns[_CONTRAST]
     cos1, sin1 = math.cos(unknowns[_FIRST]), math.sin(unknowns[_FIRST])

@@ -1,8 +1,8 @@
-"""Why robot and camera contradict each other: the likely cause, by name.
+"""Why robot and camera contradict each other: the most likely cause.
 
-If the board seems to stand somewhere else in each pose by more than noise explains, something is wrong. Each
-hypothesis (another unit, other angles, the inverse pose, a board that was moved, a wrong pair) says how the data
-would have to be read; the one under which the contradiction goes away is the likely cause.
+If the board's position scatters from pose to pose by more than noise explains, the data are wrong. Each hypothesis
+(another unit, other angles, the inverse pose, a board that was moved, a wrong pair) is another interpretation of
+the data; one that removes the contradiction is a likely cause.
 """
 
 from __future__ import annotations
@@ -21,23 +21,24 @@ from coupole.calibration.rotations import Floats, between, inverses, moved
 from coupole.errors import InputError
 
 CONTRADICTION = 3.0
-"""Scatter beyond so many times what noise explains is none of noise."""
+"""Scatter over that expected from noise, beyond which it has another cause."""
 CURE = 3.0
-"""A hypothesis that makes the scatter so many times smaller is a likely cause."""
+"""A hypothesis that reduces the scatter by this factor is a likely cause."""
 _NO_WORSE = 0.7
 _WORTH_A_LOOK = 0.3
-"""With a share of the expected scatter like this a moved board may still hide in what a bad robot is allowed."""
+"""Share of the expected scatter above which hypotheses are tried: a moved board may be hidden in the noise that is
+stated for a poor robot."""
 _AS_GOOD = 1.5
-"""Hypotheses this near to the best are told apart by how much they change."""
+"""Hypotheses whose scatter is within this factor of the best are ranked by how little they change."""
 _DEPTH_WORSE = 5.0
-"""A board's distance is seen so many times worse than its place across the image."""
+"""Uncertainty of a board's distance over that of its position across the image."""
 _FALSE_ALARMS = 0.01
 _RESAMPLED = 24
 
 
 @dataclass(frozen=True)
 class Disagreement:
-    """By how much the results of two methods differ."""
+    """Difference of the results of two methods."""
 
     methods: tuple[str, str]
     distance_mm: float
@@ -45,7 +46,7 @@ class Disagreement:
     sigmas: float
     """Largest of the six components' differences over their uncertainty."""
     beyond_noise: bool
-    """They differ by more than their poses' noise makes them differ."""
+    """They differ by more than the noise of the poses explains."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Diagnosis:
         return " and ".join(self.likely[0].causes) if self.likely else None
 
     def sentences(self) -> tuple[str, ...]:
-        """What an operator should know; empty if robot and camera agree."""
+        """The findings as text; empty if robot and camera agree."""
         found = []
         if self.contradicts:
             found.append(
@@ -94,7 +95,7 @@ class Diagnosis:
         return tuple(found)
 
     def of_methods(self) -> str:
-        """How far the closed forms are apart, alarming or not; empty if there are too few poses to tell."""
+        """Differences of the closed forms, significant or not; empty with too few poses."""
         if not self.disagreements:
             return ""
         apart = ", ".join(
@@ -108,7 +109,7 @@ class Diagnosis:
 def expected_scatter(
     camera_from_board: Floats, *, pixel_px: float, focal_px: float, robot_mm: float, robot_deg: float
 ) -> Expected:
-    """From the corners' noise and the robot's stated one, at the distance that the board has."""
+    """By the corners' noise and the robot's stated noise, at the board's distance."""
     distance_mm = float(np.median(np.linalg.norm(camera_from_board[:, :3, 3], axis=1)))
     seen_rad = _DEPTH_WORSE * pixel_px / focal_px
     turned_rad = np.radians(robot_deg)
@@ -119,7 +120,7 @@ def expected_scatter(
 def diagnose(
     poses: ReportedPoses, camera_from_board: Floats, expected: Expected, names: Sequence[str]
 ) -> Diagnosis:
-    """Judge poses [n] against the board as seen [n, 4, 4]; `names` of the images."""
+    """Compare poses [n] with the board's poses by the images [n, 4, 4]; `names` are those of the images."""
     given = scatter_of(poses.base_from_flange, camera_from_board)
     found, score = Diagnosis(*given, expected, (), ()), expected.score(*given)
     if score > _WORTH_A_LOOK:
@@ -135,11 +136,11 @@ def diagnose(
 def disagreements(
     base_from_flange: Floats, camera_from_board: Floats, expected: Expected
 ) -> tuple[Disagreement, ...]:
-    """How far each two methods are apart, and whether that is more than expected noise makes them differ.
+    """Difference of each two methods, and whether it is larger than expected noise explains.
 
-    What noise does is seen on resampled poses: those that Park's result makes consistent, with noise drawn anew
-    (parametric bootstrap; Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 6). Empty where
-    the poses have no solution.
+    The effect of noise is simulated: poses made consistent by Park's result, with noise drawn anew (parametric
+    bootstrap; Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 6). Empty where the poses have
+    no solution.
     """
     try:
         given = _by_method(base_from_flange, camera_from_board)
@@ -174,10 +175,10 @@ def _by_method(base_from_flange: Floats, camera_from_board: Floats) -> dict[str,
 
 
 def _likely(tried: list[Hypothesis], expected: Expected, given: tuple[float, float]) -> tuple[Hypothesis, ...]:
-    """Hypotheses that cure, those that change least first among the equally good.
+    """Hypotheses that remove the contradiction; equally good ones ordered by how little they change.
 
-    A cure makes the scatter of places or of turns so much smaller, and the other no larger; or it explains what
-    noise cannot.
+    Such a hypothesis reduces the scatter of positions or of orientations by the factor `CURE` and does not
+    increase the other; or it explains what noise cannot.
     """
     cures = []
     for h in tried:

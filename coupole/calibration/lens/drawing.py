@@ -1,8 +1,8 @@
 """The picture of a lens and hand-eye calibration.
 
-It asks the four questions that residuals can answer: do they follow a pattern over the field (then the lens model
-is too poor), is the whole field covered, does one image stand out, are they normal (then intervals hold)? For a
-hand-eye calibration the robot's errors by pose take the place of the last.
+It shows four properties of the residuals: a pattern over the field (then the lens model is insufficient), coverage
+of the field, single bad images, and normality (without it intervals do not hold). For a hand-eye calibration the
+robot's errors by pose take the place of the last.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def _draw_coverage(ax: Axes, shown: Shown) -> None:
 
 
 def _draw_images(ax: Axes, shown: Shown) -> None:
-    """Root mean square residual of each image, and what noise alone gives."""
+    """Root mean square residual of each image, and that expected from noise alone."""
     rms = [np.sqrt(np.mean(np.sum(r**2, axis=1))) for r in shown.residuals_px]
     expected = shown.pixel_px * np.sqrt(2)
     place = np.arange(len(rms))
@@ -114,7 +114,7 @@ def _draw_distribution(ax: Axes, shown: Shown) -> None:
 
 
 def _draw_robot(ax: Axes, shown: Shown) -> None:
-    """What each pose is off by, position to the left and turn to the right."""
+    """Error of each pose, position on the left and rotation on the right."""
     assert shown.pose_errors is not None
     off_mm = np.linalg.norm(shown.pose_errors[:, :3], axis=1)
     off_deg = np.linalg.norm(shown.pose_errors[:, 3:], axis=1)

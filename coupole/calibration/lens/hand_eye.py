@@ -2,8 +2,8 @@
 
 X is `flange_from_camera`. The board and the base stand still, so base_from_flange_i X camera_from_board_i is the
 same for all poses i, and each pair of poses gives one equation A X = X B with the motions A of the flange and B of
-the camera. The methods differ in how they weigh errors: where they disagree by more than noise explains, something
-other than noise is wrong (`coupole.calibration.lens.diagnosis`).
+the camera. The methods weigh errors differently: if they disagree by more than noise explains, the data have
+another error (`coupole.calibration.lens.diagnosis`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from coupole.errors import InputError
 LEAST_POSES = 3
 _LEAST_TURN_RAD = 0.02
 _NEAR_HALF_TURN = 0.05
-"""cos(half the angle): beyond it the signs of axes are noise."""
+"""cos(half the angle): below it the sign of the rotation axis is determined by noise."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class Motions:
 
 @dataclass(frozen=True)
 class Solution:
-    """Both unknown transforms, and how far each pose is from agreeing with them."""
+    """Both unknown transforms, and the deviation of each pose from them."""
 
     flange_from_camera: Floats
     base_from_board: Floats
     scatter: Floats
-    """[n, 6] of the board's place as each pose has it, from the mean: mm, radians."""
+    """[n, 6] deviation from the mean of the board's pose by each pose: mm, radians."""
 
     @property
     def scatter_mm(self) -> float:
@@ -59,9 +59,10 @@ class Solution:
 
 
 def motions(base_from_flange: Floats, camera_from_board: Floats) -> Motions:
-    """Of all pairs of poses [n, 4, 4], but those turned by nearly half a turn, whose axes have no sign.
+    """Of all pairs of poses [n, 4, 4], without those with a rotation of nearly 180 degrees, whose axes have no
+    sign.
 
-    Raises InputError if no two motions turn about different axes: then X cannot be known.
+    Raises InputError if all motions have the same rotation axis: then X is not determined.
     """
     count = len(base_from_flange)
     if count < LEAST_POSES:
@@ -121,7 +122,7 @@ def daniilidis(pairs: Motions) -> Floats:
     seventh, eighth = np.linalg.svd(rows.reshape(-1, 8), full_matrices=False)[2][-2:]
     u, u_dual, v, v_dual = seventh[:4], seventh[4:], eighth[:4], eighth[4:]
     coefficients = np.array([u @ u_dual, u @ v_dual + v @ u_dual, v @ v_dual])
-    flipped = abs(coefficients[2]) > abs(coefficients[0])  # so that the quadratic keeps its leading term
+    flipped = abs(coefficients[2]) > abs(coefficients[0])  # avoids division by a small leading coefficient
     ratios = np.real(np.roots(coefficients[::-1] if flipped else coefficients))
     pairs_of_weights = [(1.0, r) if flipped else (r, 1.0) for r in ratios]
     weights = max(pairs_of_weights, key=lambda w: _norm2(w, u, v) / (w[0] ** 2 + w[1] ** 2))
@@ -146,7 +147,7 @@ def solve(
 
 
 def solution(base_from_flange: Floats, camera_from_board: Floats, flange_from_camera: Floats) -> Solution:
-    """What a hand-eye transform makes of the poses."""
+    """Board's pose and scatter for a given hand-eye transform."""
     boards = base_from_flange @ flange_from_camera @ camera_from_board
     mean = np.eye(4)
     mean[:3, :3], mean[:3, 3] = nearest_rotation(boards[:, :3, :3].mean(axis=0)), boards[:, :3, 3].mean(axis=0)

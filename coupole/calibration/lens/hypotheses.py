@@ -1,7 +1,8 @@
-"""What may be wrong with the poses of a robot or the images of a board, and what would be left of it if so.
+"""What may be wrong with the poses of a robot or the images of a board, and the scatter that remains if it is.
 
-Each hypothesis reads the data in its way (other units or angles, the inverse pose, another pairing, a board in two
-places) and says how far the board's place then still scatters. `coupole.calibration.lens.diagnosis` judges them.
+Each hypothesis is another interpretation of the data (other units or angles, the inverse pose, another pairing, a
+board in two places) with the scatter of the board's position under it. `coupole.calibration.lens.diagnosis` ranks
+them.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from coupole.errors import InputError
 _LEAST_SEGMENT = 3
 _SUSPECTS = 6
 _PLAUSIBLE_MM = (5.0, 5000.0)
-"""Distances between camera and board, and ways of the robot, that a cell may have."""
+"""Distances between camera and board, and travels of the robot, that are possible in a cell."""
 _SURE = 1e-4
-"""Probability that a step of the board is noise, below which the board was moved however small the step is."""
+"""Probability that a step of the board is noise; below it the board was moved, however small the step."""
 
 UNITS, ANGLES, INVERSE, MOVED_BOARD, WRONG_PAIR, SHIFTED = (
     "wrong unit",
@@ -37,19 +38,19 @@ UNITS, ANGLES, INVERSE, MOVED_BOARD, WRONG_PAIR, SHIFTED = (
 
 @dataclass(frozen=True)
 class Expected:
-    """What scatter of the board noise explains, root mean square."""
+    """Scatter of the board that noise explains, root mean square."""
 
     position_mm: float
     orientation_deg: float
 
     def score(self, scatter_mm: float, scatter_deg: float) -> float:
-        """Scatter over what is expected, the worse of both."""
+        """Scatter over the expected one, the worse of position and orientation."""
         return max(scatter_mm / self.position_mm, scatter_deg / self.orientation_deg)
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What may be wrong, and what the scatter would be if it is."""
+    """What may be wrong, and the scatter if it is."""
 
     causes: tuple[str, ...]
     """Names, as in this module's constants."""
@@ -70,7 +71,7 @@ def scatter_of(base_from_flange: Floats, camera_from_board: Floats) -> tuple[flo
 
 
 def rereadings(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypothesis]:
-    """All numbers mean something else."""
+    """Hypotheses on the convention of all poses."""
     yield from _other_conventions(poses, camera_from_board)
     yield from _other_board_unit(poses.base_from_flange, camera_from_board)
 
@@ -78,7 +79,7 @@ def rereadings(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypo
 def faults(
     base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str], expected: Expected
 ) -> Iterator[Hypothesis]:
-    """Some poses do not belong to the others."""
+    """Hypotheses on single poses and images."""
     yield from _wrong_pairs(base_from_flange, camera_from_board, names)
     yield from _moved_board(base_from_flange, camera_from_board, names, expected)
 
@@ -166,7 +167,8 @@ def _wrong_pairs(
 
 
 def _worst(base_from_flange: Floats, camera_from_board: Floats) -> list[int]:
-    """The poses that put the board farthest from its middle place; few, as each two of them are tried."""
+    """The poses with the largest deviation of the board from its median position; few, as all pairs of them are
+    tried."""
     try:
         boards = (
             base_from_flange @ solve(base_from_flange, camera_from_board).flange_from_camera @ camera_from_board
@@ -181,7 +183,7 @@ def _worst(base_from_flange: Floats, camera_from_board: Floats) -> list[int]:
 def _moved_board(
     base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str], expected: Expected
 ) -> Iterator[Hypothesis]:
-    """The board stood in two places: motions within each part are true, those between them are not."""
+    """The board was in two places: motions within each part are valid, those between the parts are not."""
     count = len(base_from_flange)
     for change in range(_LEAST_SEGMENT, count - _LEAST_SEGMENT + 1):
         parts = slice(None, change), slice(change, None)
@@ -205,7 +207,7 @@ def _moved_board(
 
 
 def _by_chance(before: Solution, after: Solution) -> float:
-    """Probability that noise makes so great a step from one part's board to the other's.
+    """Probability that noise alone causes a step as large as that between the boards of the two parts.
 
     Hotelling's T^2 of two samples with a common covariance (Anderson, An Introduction to Multivariate Statistical
     Analysis, 3rd ed., 2003, section 5.3.4), less six degrees of freedom for the hand-eye that both parts share.

@@ -15,7 +15,7 @@ from coupole.errors import InputError
 
 @dataclass(frozen=True)
 class Found:
-    """The board in the images, and what became of the others."""
+    """The board in the images, and why other images were left out."""
 
     sightings: tuple[Sighting, ...]
     chosen: NDArray[np.intp]
@@ -29,7 +29,7 @@ class Found:
 def find_board(
     board: Board, sources: Sources, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Found:
-    """Look for the board in all images. Raises InputError if they differ in size, or none shows it."""
+    """Find the board in all images. Raises InputError if they differ in size, or none shows it."""
     sightings, chosen, left_out = [], [], []
     size_px: tuple[int, int] | None = None
     for number, source in enumerate(sources.images):

@@ -1,7 +1,7 @@
-"""From images and poses to a record and what the report shows: what the commands call.
+"""From images and poses to a record and the report's data: the functions that the commands call.
 
-Each function ends in a sealed record. A contradiction whose cause is known is refused with that cause, as its
-numbers would be nonsense; one without a simple cause goes into the record as a remark, and fails its limits.
+Each function makes a sealed record. A contradiction with a known cause raises an error with that cause, as the
+result would be meaningless; one without a simple cause becomes a remark of the record, which exceeds its limits.
 """
 
 from __future__ import annotations
@@ -18,15 +18,10 @@ from coupole.calibration.adjustment import Component
 from coupole.calibration.arm_errors import axis_sensitivity
 from coupole.calibration.lens.acceptance import CAMERA, HAND_EYE
 from coupole.calibration.lens.board import Board, Sighting
-from coupole.calibration.lens.bundle import (
-    EarlierLens,
-    HandEyeCalibration,
-    Poses,
-    RobotNoise,
-    calibrate_hand_eye,
-)
+from coupole.calibration.lens.bundle import HandEyeCalibration, RobotNoise, calibrate_hand_eye
 from coupole.calibration.lens.camera import CameraCalibration, calibrate_camera, without_gross_errors
 from coupole.calibration.lens.diagnosis import Diagnosis, diagnose, expected_scatter
+from coupole.calibration.lens.equations import EarlierLens, Poses
 from coupole.calibration.lens.images import Found
 from coupole.calibration.poses import ReportedPoses
 from coupole.calibration.record import (
@@ -94,16 +89,7 @@ def camera_from(found: Found, sources: Sources, model: str, request: Request) ->
         images=image_lines(kept, residuals, fit.sightings),
         **content_of(found, sources, request),
     )
-    shown = Shown(
-        record,
-        found.size_px,
-        tuple(s.name for s in kept),
-        tuple(s.pixels for s in kept),
-        residuals,
-        fit.sigma_px,
-        None,
-    )
-    return fit, shown
+    return fit, _shown(record, found, kept, residuals, fit.sigma_px, None)
 
 
 def hand_eye_from(
@@ -117,8 +103,8 @@ def hand_eye_from(
     arm: Arm | None = None,
     lens: EarlierLens | None = None,
 ) -> tuple[HandEyeCalibration, Diagnosis, Shown]:
-    """Calibrate where the camera sits on the flange. Raises InputError with the likely cause where robot and
-    camera contradict each other and one is known."""
+    """Calibrate the camera's pose on the flange. Raises InputError with the likely cause if robot and camera
+    contradict each other and a cause is known."""
     if sources.poses is None:
         raise InputError("hand-eye: the images have no poses; give a pose file with --poses")
     if not board.has_a_top:
@@ -132,17 +118,7 @@ def hand_eye_from(
     joints = [sources.images[i].joints_deg for i in found.chosen]
     known = [j for j in joints if j is not None]
     axes = axis_sensitivity(arm, known) if arm is not None and len(known) == len(joints) else None
-    stated = robot.pose_sigmas(axes_known=False)
-    expected = expected_scatter(
-        fit.camera_from_board,
-        pixel_px=fit.sigma_px,
-        focal_px=fit.intrinsics.fx,
-        robot_mm=stated[0],
-        robot_deg=float(np.degrees(stated[1])),
-    )
-    diagnosis = diagnose(chosen, fit.camera_from_board, expected, [s.name for s in kept])
-    if diagnosis.cause is not None:
-        raise InputError("hand-eye: " + ".\n".join(diagnosis.sentences()[:2]) + ".")
+    diagnosis = _refused_if_contradicting(fit, chosen, robot, [s.name for s in kept])
     result = calibrate_hand_eye(
         kept,
         Poses(chosen.base_from_flange, axes),
@@ -166,22 +142,45 @@ def hand_eye_from(
         images=image_lines(kept, result.residuals_px, fit.sightings),
         **content_of(found, sources, request),
     )
-    shown = Shown(
-        record,
-        found.size_px,
-        tuple(s.name for s in kept),
-        tuple(s.pixels for s in kept),
-        result.residuals_px,
-        result.noise.pixel_px,
-        result.pose_errors,
-    )
+    shown = _shown(record, found, kept, result.residuals_px, result.noise.pixel_px, result.pose_errors)
     return result, diagnosis, shown
 
 
-def ray_u_px(fit: CameraCalibration) -> float:
-    """Largest standard uncertainty, at the corners and edges of the field, of where a direction is seen, px.
+def _refused_if_contradicting(
+    fit: CameraCalibration, reported: ReportedPoses, robot: RobotNoise, names: Sequence[str]
+) -> Diagnosis:
+    """How well robot and camera agree. Raises InputError if they do not and the cause is known."""
+    robot_mm, robot_rad = robot.pose_sigmas(axes_known=False)
+    expected = expected_scatter(
+        fit.camera_from_board,
+        pixel_px=fit.sigma_px,
+        focal_px=fit.intrinsics.fx,
+        robot_mm=robot_mm,
+        robot_deg=float(np.degrees(robot_rad)),
+    )
+    diagnosis = diagnose(reported, fit.camera_from_board, expected, names)
+    if diagnosis.cause is not None:
+        raise InputError("hand-eye: " + ".\n".join(diagnosis.sentences()[:2]) + ".")
+    return diagnosis
 
-    A turn of the camera that the intrinsics can be traded for is not counted: the board's poses take it up.
+
+def _shown(
+    record: Record,
+    found: Found,
+    kept: Sequence[Sighting],
+    residuals_px: tuple[Floats, ...],
+    pixel_px: float,
+    pose_errors: Floats | None,
+) -> Shown:
+    names, pixels = tuple(s.name for s in kept), tuple(s.pixels for s in kept)
+    return Shown(record, found.size_px, names, pixels, residuals_px, pixel_px, pose_errors)
+
+
+def ray_u_px(fit: CameraCalibration) -> float:
+    """Largest standard uncertainty of the image of a direction at the corners and edges of the field, px.
+
+    Changes of the intrinsics that are equivalent to a rotation of the camera do not count: the board's poses
+    absorb them.
     """
     width, height = fit.size_px
     steps = np.linspace(0.0, 1.0, 9)
@@ -209,7 +208,7 @@ def field_without_corners(sightings: Sequence[Sighting], size_px: tuple[int, int
 def image_lines(
     kept: Sequence[Sighting], residuals: Sequence[Floats], all_seen: Sequence[Sighting]
 ) -> tuple[ImageResidual, ...]:
-    """How each image fits."""
+    """Number of corners and residual of each image."""
     return tuple(
         ImageResidual(
             name=seen.name,
@@ -222,7 +221,7 @@ def image_lines(
 
 
 def content_of(found: Found, sources: Sources, request: Request) -> dict[str, object]:
-    """What all records made from a board's images have."""
+    """The content that all records from a board's images share."""
     about = sources.about
     return {
         **request.head(),
@@ -238,7 +237,7 @@ def held(intrinsics: optics.Intrinsics, free: Sequence[str]) -> dict[str, float]
 
 
 def image_figures(fit: CameraCalibration, found: Found) -> dict[str, float]:
-    """What `limits.IMAGES` are held against."""
+    """The figures that `acceptance.IMAGES` limits."""
     rejected = np.concatenate([~keep for keep in fit.kept])
     clipped = sum(": clipped" in line for line in found.left_out)
     return {

@@ -123,29 +123,14 @@ def calibrate_dark(
     if not pairs:
         raise InputError("dark: expected two frames or more of one exposure; set `darks_per_view: 20` in the plan")
     offset, current, noise, cofactor = sums.lines()
-    at_s, within, row = np.array(pairs).T
-    height = offset.shape[0]
-    row_var = max(float(row.mean()), 0.0)
-    # Variances of n numbers scatter by sqrt(2/n); neighbouring pairs share a frame, which halves their count.
-    independent = max(1.0, (len(pairs) + 1) / 2)
-    sigma = float(within.mean()) * np.sqrt(2.0 * len(pairs) / (independent * offset.size))
-    # Dark current has shot noise, which grows with time: read noise is what is left at none.
-    design = np.column_stack([np.ones_like(at_s), at_s])
-    of_lines = np.linalg.pinv(design.T @ design)
-    read_var = max(float((of_lines @ design.T @ within)[0]) - _ROUNDING, 1e-6)
-    read_var_u = sigma * float(np.sqrt(of_lines[0, 0]))
-    row_var_u = (row_var + float(within.mean()) / offset.shape[1]) * np.sqrt(2.0 / (independent * height))
-    row_noise = float(np.sqrt(row_var))
+    height, width = offset.shape
     return Dark(
         offset,
         current,
         noise,
         cofactor,
         len(listed) - 2,
-        float(np.sqrt(read_var)),
-        float(read_var_u / (2 * np.sqrt(read_var))),
-        row_noise,
-        float(row_var_u / (2 * max(row_noise, np.sqrt(row_var_u)))),
+        *_noises(pairs, height, width),
         hot_pixels(current),
         reference_c,
         doubling_k,
@@ -160,6 +145,31 @@ def hot_pixels(current_dn_per_s: Maps, sigma: float = HOT_SIGMA) -> NDArray[np.i
     places = np.argwhere(current_dn_per_s > median + sigma * max(spread, 1e-9))
     order = np.argsort(-current_dn_per_s[places[:, 0], places[:, 1]], kind="stable")
     return np.asarray(places[order], dtype=np.int64)
+
+
+def _noises(pairs: list[tuple[float, float, float]], height: int, width: int) -> tuple[float, float, float, float]:
+    """Read noise and its uncertainty, row noise and its uncertainty, DN.
+
+    `pairs` are exposure time (s), variance within rows and variance of the rows (DN^2) of two successive frames.
+    """
+    at_s, within, row = np.array(pairs).T
+    row_var = max(float(row.mean()), 0.0)
+    # Variances of n numbers scatter by sqrt(2/n); neighbouring pairs share a frame, which halves their count.
+    independent = max(1.0, (len(pairs) + 1) / 2)
+    sigma = float(within.mean()) * np.sqrt(2.0 * len(pairs) / (independent * height * width))
+    # The shot noise of dark current grows with time: read noise is the line's value at time zero.
+    design = np.column_stack([np.ones_like(at_s), at_s])
+    of_lines = np.linalg.pinv(design.T @ design)
+    read_var = max(float((of_lines @ design.T @ within)[0]) - _ROUNDING, 1e-6)
+    read_var_u = sigma * float(np.sqrt(of_lines[0, 0]))
+    row_var_u = (row_var + float(within.mean()) / width) * np.sqrt(2.0 / (independent * height))
+    row_noise = float(np.sqrt(row_var))
+    return (
+        float(np.sqrt(read_var)),
+        float(read_var_u / (2 * np.sqrt(read_var))),
+        row_noise,
+        float(row_var_u / (2 * max(row_noise, np.sqrt(row_var_u)))),
+    )
 
 
 class _Sums:

@@ -95,23 +95,8 @@ def drift_outcome(
         raise InputError("drift: no frame under an LED in this run")
     read = TileReader(frames, setting, lit[0].read().shape)
     shown = [found for found in _by_view(lit) if read.sees(found[0].base_from_camera)]
-    if not shown:
-        raise InputError(
-            "drift: no view shows the whole reference tile where its description has it; correct the description, "
-            "or add a view of the tile to the plan"
-        )
     remarks: list[str] = []
-    readings: list[Reading] = []
-    tell = counter(progress, sum(map(len, shown)))
-    for found in shown:
-        view = read.view(found, tell)[CHANNEL]
-        rows, _ = rows_of(0, view, setting.positions, setting.tile, setting.emission, remarks=remarks)
-        frame_of = {frame.led: frame for frame in found if frame.led is not None}
-        readings += [
-            _reading(frame_of[row.led], row.value, row.u, row.design, powers)
-            for row in rows
-            if powers.row.get(row.led) is not None and powers.power[powers.row[row.led]] > 0
-        ]
+    readings = _readings(shown, read, setting, powers, remarks, progress)
     dark = [reading for reading in readings if reading.ratio < _DARK]
     if dark:
         remarks.append(f"{len(dark)} readings are dark (shadow, or a dead LED), not used: {_list(dark)}")
@@ -149,6 +134,37 @@ def drift_outcome(
 
 
 # -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _readings(
+    shown: Sequence[Sequence[LightFrame]],
+    read: TileReader,
+    setting: Setting,
+    powers: Powers,
+    remarks: list[str],
+    progress: Progress,
+) -> list[Reading]:
+    """The tile under each LED of known power, from the frames of the views that show it.
+
+    Observations that cannot be used are added to `remarks`. Raises InputError if no view shows the tile.
+    """
+    if not shown:
+        raise InputError(
+            "drift: no view shows the whole reference tile where its description has it; correct the description, "
+            "or add a view of the tile to the plan"
+        )
+    readings: list[Reading] = []
+    frame_done = counter(progress, sum(map(len, shown)))
+    for found in shown:
+        view = read.view(found, frame_done)[CHANNEL]
+        rows, _ = rows_of(0, view, setting.positions, setting.tile, setting.emission, remarks=remarks)
+        frame_of = {frame.led: frame for frame in found if frame.led is not None}
+        readings += [
+            _reading(frame_of[row.led], row.value, row.u, row.design, powers)
+            for row in rows
+            if powers.row.get(row.led) is not None and powers.power[powers.row[row.led]] > 0
+        ]
+    return readings
 
 
 def _by_view(lit: Sequence[LightFrame]) -> list[list[LightFrame]]:

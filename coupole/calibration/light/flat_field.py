@@ -118,23 +118,84 @@ def fit_flat_field(
             f"{len(views)} with {least} or more; photograph the panel, shifted and turned, filling the field, "
             "unsaturated"
         )
+    blocks = _gathered(views, used, panel_scale_mm)
+    fit = _fit(blocks, len(views), focal_px, size_px)
+    covariance = _clustered(fit.design, fit.weight, fit.left, blocks.pixels)
+    parts = np.split(fit.left, np.cumsum([int(u.sum()) for u in used])[:-1])
+    residuals = []
+    for use, part in zip(used, parts, strict=True):
+        whole = np.full(len(use), np.nan)
+        whole[use] = part
+        residuals.append(whole)
+    clusters = len(np.unique(blocks.pixels, axis=0))
+    return FlatField(
+        channel,
+        fit.parameters,
+        covariance[:5, :5],
+        focal_px,
+        size_px,
+        fit.panel,
+        covariance[-5:, -5:],
+        fit.sigma,
+        tuple(residuals),
+        float(np.mean(fit.weight == 0.0)),
+        tuple(view.name for view in views),
+        float(max(1, clusters - fit.design.shape[1])),
+    )
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """The usable blocks of all views."""
+
+    pixels: Floats
+    """[b, 2] centres."""
+    logs: Floats
+    """[b] logarithms of their signals."""
+    view: NDArray[np.intp]
+    """[b] number of the view."""
+    panel_terms: Floats
+    """[b, 5] derivatives of ln s by `PANEL_NAMES`."""
+
+
+def _gathered(views: Sequence[FlatView], used: Sequence[NDArray[np.bool_]], panel_scale_mm: float) -> _Blocks:
     pixels = np.concatenate([view.pixels[u] for view, u in zip(views, used, strict=True)])
     logs = np.log(np.concatenate([view.signal[u] for view, u in zip(views, used, strict=True)]))
     places = np.concatenate([view.panel_mm[u] for view, u in zip(views, used, strict=True)]) / panel_scale_mm
     number = np.concatenate([np.full(int(u.sum()), i) for i, u in enumerate(used)])
     x, y = places.T
-    even = np.column_stack([x, y, x * x, x * y, y * y])
-    brightness = np.eye(len(views))[number]
+    return _Blocks(pixels, logs, number, np.column_stack([x, y, x * x, x * y, y * y]))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    parameters: Floats
+    """[5] as `G_NAMES`."""
+    panel: Floats
+    """[5] as `PANEL_NAMES`."""
+    design: Floats
+    """[b, 10 + views] derivatives of the logarithms."""
+    left: Floats
+    """[b] residuals."""
+    weight: Floats
+    """[b] Tukey's."""
+    sigma: float
+    """Robust standard deviation of the residuals."""
+
+
+def _fit(blocks: _Blocks, views: int, focal_px: float, size_px: tuple[int, int]) -> _Fit:
+    """Gauss-Newton with Tukey's weights. Raises InputError if panel and lens cannot be separated."""
+    brightness = np.eye(views)[blocks.view]
     p = np.concatenate([np.array([size_px[0] - 1, size_px[1] - 1]) / 2.0, np.zeros(3)])
-    rest = np.zeros(len(views) + 5)
-    weight = np.ones(len(logs))
-    sigma, left = 0.0, logs
-    design = np.zeros((len(logs), 0))
+    rest = np.zeros(views + 5)
+    weight = np.ones(len(blocks.logs))
+    sigma, left = 0.0, blocks.logs
+    design = np.zeros((len(blocks.logs), 0))
     for _ in range(_ROUNDS):
-        radial, by_centre = _radial(pixels, p[:2], focal_px, size_px)
+        radial, by_centre = _radial(blocks.pixels, p[:2], focal_px, size_px)
         moved = by_centre[:, 0] + np.einsum("k,ckn->cn", p[2:], by_centre[:, 1:])
-        design = np.column_stack([moved.T, radial[1:].T, brightness, even])
-        left = logs - radial[0] - radial[1:].T @ p[2:] - design[:, 5:] @ rest
+        design = np.column_stack([moved.T, radial[1:].T, brightness, blocks.panel_terms])
+        left = blocks.logs - radial[0] - radial[1:].T @ p[2:] - design[:, 5:] @ rest
         scale = np.linalg.norm(design, axis=0)
         normal = (design / scale).T @ ((design / scale) * weight[:, None])
         if np.linalg.cond(normal) > _INDEFINITE:
@@ -151,28 +212,7 @@ def fit_flat_field(
         weight = np.clip(1.0 - (left / (_TUKEY * sigma)) ** 2, 0.0, None) ** 2
         if np.abs(step[:2]).max() < 1e-3 and np.abs(step[2:5]).max() < 1e-7:
             break
-    covariance = _clustered(design, weight, left, pixels)
-    parts = np.split(left, np.cumsum([int(u.sum()) for u in used])[:-1])
-    residuals = []
-    for use, part in zip(used, parts, strict=True):
-        whole = np.full(len(use), np.nan)
-        whole[use] = part
-        residuals.append(whole)
-    clusters = len(np.unique(pixels, axis=0))
-    return FlatField(
-        channel,
-        p,
-        covariance[:5, :5],
-        focal_px,
-        size_px,
-        rest[-5:],
-        covariance[-5:, -5:],
-        sigma,
-        tuple(residuals),
-        float(np.mean(weight == 0.0)),
-        tuple(view.name for view in views),
-        float(max(1, clusters - design.shape[1])),
-    )
+    return _Fit(p, rest[-5:], design, left, weight, sigma)
 
 
 def block_means(

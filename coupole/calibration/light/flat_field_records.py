@@ -67,17 +67,12 @@ def flat_field_outcome(
     straight = {channel: linearise(response_record, channel, frames) for channel in channels}
     height, width = frames.lit[0].read().shape
     size_px = (width, height)
-    block_px = max(8, 2 * round(width / _BLOCKS / 2))
     views: dict[str, list[FlatView]] = {channel: [] for channel in channels}
     for number, ((view, light), found) in enumerate(by_view.items()):
-        mean, black = mean_of(found), dark(found[0])
-        saturated = _any_saturated(found, frames.white_dn)
-        for channel in channels:
-            mask = channel_mask((height, width), frames.pattern, channel)
-            signal = straight[channel](np.asarray(mean - black, np.float64))
-            pixels, values = block_means(signal, mask, block_px, saturated=saturated)
-            places = panel_places(pixels, frames.focal_px, size_px, found[0].base_from_camera, base_from_panel)
-            views[channel].append(FlatView(f"{view}/{light}", pixels, values, places))
+        for channel, reduced in _reduced(
+            f"{view}/{light}", found, frames, dark, straight, base_from_panel
+        ).items():
+            views[channel].append(reduced)
         progress(number + 1, len(by_view))
     fits = {
         channel: fit_flat_field(views[channel], channel=channel, focal_px=frames.focal_px, size_px=size_px)
@@ -112,6 +107,30 @@ def flat_field_outcome(
         remarks=remarks,
         more_inputs=(*record_input(dark_record), *record_input(response_record)),
     )
+
+
+def _reduced(
+    name: str,
+    found: Sequence[LightFrame],
+    frames: LightFrames,
+    dark: Callable[[LightFrame], NDArray[np.float32]],
+    straight: Mapping[str, Callable[[Floats], Floats]],
+    base_from_panel: Floats,
+) -> dict[str, FlatView]:
+    """One view's frames as means of blocks, by channel."""
+    mean, black = mean_of(found), dark(found[0])
+    height, width = mean.shape
+    block_px = max(8, 2 * round(width / _BLOCKS / 2))
+    saturated = _any_saturated(found, frames.white_dn)
+    views = {}
+    for channel, linear in straight.items():
+        mask = channel_mask((height, width), frames.pattern, channel)
+        signal = linear(np.asarray(mean - black, np.float64))
+        pixels, values = block_means(signal, mask, block_px, saturated=saturated)
+        pose = found[0].base_from_camera
+        places = panel_places(pixels, frames.focal_px, (width, height), pose, base_from_panel)
+        views[channel] = FlatView(name, pixels, values, places)
+    return views
 
 
 def _brightest(frames: LightFrames) -> dict[tuple[str, Light], list[LightFrame]]:

@@ -91,6 +91,12 @@ def prior_of(tile: Tile, places: int = 1) -> Floats:
     return np.array([*of_place * places, tile.u_reflectance / tile.reflectance, tile.u_minnaert])
 
 
+def _common_names(places: Sequence[int]) -> tuple[str, ...]:
+    """[c] of what LEDs share, in the order of `prior_of`."""
+    of_places = [f"place{p}.{what}" for p in places for what in ("tilt_x_deg", "tilt_y_deg", "height_mm")]
+    return (*of_places, "ln_reflectance", "minnaert")
+
+
 def calibrate_led_power(
     views: Sequence[TileView],
     positions: Positions,
@@ -109,31 +115,23 @@ def calibrate_led_power(
         raise InputError("LED power: expected views of the tile, found none")
     ids = np.unique(np.concatenate([view.leds for view in views]))
     places = sorted({view.place for view in views})
-    of_places = [f"place{p}.{what}" for p in places for what in ("tilt_x_deg", "tilt_y_deg", "height_mm")]
-    names = (*of_places, "ln_reflectance", "minnaert")
-    prior = prior_of(tile, len(places))
+    names = _common_names(places)
     remarks: list[str] = []
     rows: list[Row] = []
     lit_elsewhere: set[int] = set()
     for v, view in enumerate(views):
+        place = places.index(view.place)
         found, not_used = rows_of(
-            v,
-            view,
-            positions,
-            tile,
-            emission,
-            side_mm=side_mm,
-            place=places.index(view.place),
-            figures=len(names),
-            remarks=remarks,
-        )
+            v, view, positions, tile, emission,
+            side_mm=side_mm, place=place, figures=len(names), remarks=remarks,
+        )  # fmt: skip
         rows += found
         lit_elsewhere |= not_used
     if not rows:
         raise InputError("LED power: no LED could be used: " + ("; ".join(remarks[:5]) or "all stand too low"))
     rows, dead = without_dark(rows, views, ids, lit_elsewhere, remarks)
     y, w, led, view_of, design = arrays_of(rows, ids, flash_noise)
-    solved = _solve(y, w, led, design, len(ids), prior)
+    solved = _solve(y, w, led, design, len(ids), prior_of(tile, len(places)))
     redundancy = max(1.0, float(len(y) - len(np.unique(led))))
     chi2 = float(np.sum(w * solved.left**2))
     factor = max(1.0, chi2 / redundancy) if len(y) > len(np.unique(led)) else 1.0
@@ -143,13 +141,6 @@ def calibrate_led_power(
     power = np.where(used, np.exp(np.where(used, solved.log_power, 0.0)), np.nan)
     power[dead] = 0.0
     own = np.where(used, np.sqrt(factor / np.maximum(solved.weight, 1e-300)), np.nan)
-    residuals = []
-    for v, view in enumerate(views):
-        mine = np.full(len(view.leds), np.nan)
-        where = {int(i): n for n, i in enumerate(view.leds)}
-        for n in np.flatnonzero(view_of == v):
-            mine[where[int(ids[led[n]])]] = solved.left[n]
-        residuals.append(mine)
     missing = ids[~used & ~dead]
     if len(missing):
         remarks.append(f"{len(missing)} LEDs have no usable picture: {list_of(missing)}")
@@ -162,10 +153,24 @@ def calibrate_led_power(
         solved.covariance,
         solved.theta,
         float(np.sqrt(factor / np.median(w))),
-        tuple(residuals),
+        _by_view(views, view_of, ids[led], solved.left),
         tuple(remarks),
         redundancy,
     )
+
+
+def _by_view(
+    views: Sequence[TileView], view_of: NDArray[np.intp], led_of: NDArray[np.int64], left: Floats
+) -> tuple[Floats, ...]:
+    """Residuals of each view in the order of its LEDs [n]; NaN where an LED was not used."""
+    residuals = []
+    for v, view in enumerate(views):
+        mine = np.full(len(view.leds), np.nan)
+        where = {int(i): n for n, i in enumerate(view.leds)}
+        for n in np.flatnonzero(view_of == v):
+            mine[where[int(led_of[n])]] = left[n]
+        residuals.append(mine)
+    return tuple(residuals)
 
 
 @dataclass(frozen=True)

@@ -78,53 +78,67 @@ def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1
         )
     flicker = _flicker(ordered)
     _refuse_contradictions(ordered, signals, flicker)
-    known = np.isfinite(signals)
-    start = np.nanmedian(signals / exposures, axis=1)
-    scatter = max(flicker / np.sqrt(2.0), 1e-6)
-
-    def residuals(p: Floats) -> Floats:
-        c2, c3, t0, rates, light = (
-            p[0],
-            p[1],
-            p[2] * 1e3,
-            start * np.exp(p[3 : 3 + len(start)]),
-            p[-len(exposures) :],
-        )
-        x = signals / range_dn
-        made_linear = signals * (1.0 + x * (c2 + x * c3))
-        expected = rates[:, None] * (exposures + t0) * (1.0 + light)
-        left = (made_linear - expected) / u_signals
-        return np.concatenate([left[known], light / scatter])
-
-    fit = least_squares(residuals, np.zeros(3 + len(start) + len(exposures)), method="trf", x_scale="jac")
-    degrees = max(1, len(fit.fun) - len(fit.x))
-    factor = max(1.0, 2.0 * fit.cost / degrees)  # Birge: never better than the data agree
-    covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * factor
-    coefficients, c_covariance = fit.x[:2], covariance[:2, :2]
+    fit = _fit(signals, u_signals, exposures, range_dn, flicker)
+    coefficients, c_covariance = fit.coefficients, fit.covariance[:2, :2]
     x = np.linspace(0.05, 0.95, 91)
     curve = x * coefficients[0] + x * x * coefficients[1]
     deviation = _from_line(x, curve)
     basis = np.stack([_from_line(x, x), _from_line(x, x * x)])
     worst = int(np.argmax(np.abs(deviation)))
-    u_worst = float(np.sqrt(max(basis[:, worst] @ c_covariance @ basis[:, worst], 0.0)))
+    u_worst = float(np.sqrt(max(float(basis[:, worst] @ c_covariance @ basis[:, worst]), 0.0)))
     unlikely = float(chi2.sf(coefficients @ np.linalg.solve(c_covariance, coefficients), 2))
-    _refuse_other_scene(ordered, fit.fun[: known.sum()], known, signals, u_signals)
-    rates = start * np.exp(fit.x[3 : 3 + len(start)])
-    light = fit.x[-len(exposures) :]
-    deviations = signals / (rates[:, None] * (exposures + 1e3 * fit.x[2]) * (1.0 + light)) - 1.0
+    _refuse_other_scene(ordered, fit.left, np.isfinite(signals), signals, u_signals)
     return Linearity(
         coefficients if unlikely < significance else np.zeros(2),
         c_covariance,
-        1e3 * covariance[:2, 2],
+        1e3 * fit.covariance[:2, 2],
         range_dn,
-        Estimate(float(1e3 * fit.x[2]), float(1e3 * np.sqrt(covariance[2, 2]))),
+        Estimate(float(fit.time_offset_us), float(1e3 * np.sqrt(fit.covariance[2, 2]))),
         float(abs(deviation[worst])),
         u_worst,
         exposures,
-        deviations,
+        fit.deviations,
         signals,
         flicker,
     )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    coefficients: Floats
+    """c2, c3."""
+    time_offset_us: float
+    covariance: Floats
+    """[3, 3] of c2, c3 and the time offset in ms."""
+    left: Floats
+    """Residuals of the unsaturated signals over their uncertainties."""
+    deviations: Floats
+    """[groups, exposures] relative deviations of the uncorrected signals from a line."""
+
+
+def _fit(signals: Floats, u_signals: Floats, exposures: Floats, range_dn: float, flicker: float) -> _Fit:
+    """Curve, time offset (ms), logarithm of each group's rate over its start, relative light of each exposure."""
+    known = np.isfinite(signals)
+    start = np.nanmedian(signals / exposures, axis=1)
+    scatter = max(flicker / np.sqrt(2.0), 1e-6)
+
+    def expected(p: Floats) -> Floats:
+        rates, light = start * np.exp(p[3 : 3 + len(start)]), p[-len(exposures) :]
+        signal: Floats = rates[:, None] * (exposures + 1e3 * p[2]) * (1.0 + light)
+        return signal
+
+    def residuals(p: Floats) -> Floats:
+        x = signals / range_dn
+        made_linear = signals * (1.0 + x * (p[0] + x * p[1]))
+        left = (made_linear - expected(p)) / u_signals
+        return np.concatenate([left[known], p[-len(exposures) :] / scatter])
+
+    fit = least_squares(residuals, np.zeros(3 + len(start) + len(exposures)), method="trf", x_scale="jac")
+    degrees = max(1, len(fit.fun) - len(fit.x))
+    factor = max(1.0, 2.0 * fit.cost / degrees)  # Birge ratio: never smaller than the scatter of the data shows
+    covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * factor
+    deviations = signals / expected(fit.x) - 1.0
+    return _Fit(fit.x[:2], 1e3 * fit.x[2], covariance[:3, :3], fit.fun[: known.sum()], deviations)
 
 
 def _grouped(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:

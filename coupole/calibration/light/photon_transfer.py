@@ -64,35 +64,8 @@ def photon_transfer(pairs: Sequence[Pair]) -> PhotonTransfer:
     if not pairs:
         raise InputError("response: expected two frames of each exposure; set `repeats: 2` in the plan")
     refuse_all_clipped(pairs)
-    signal, squared = [], []
-    for pair in pairs:
-        keep = ~pair.saturated
-        if keep.sum() < _LEAST_PIXELS:
-            continue
-        mean = 0.5 * (pair.first[keep] + pair.second[keep])
-        difference = pair.first[keep] - pair.second[keep]
-        ratio = float(difference.sum() / max(mean.sum(), 1e-9))
-        difference = difference - ratio * mean  # flicker makes one frame of a pair brighter as a whole
-        signal.append(mean)
-        squared.append(difference**2 / 2.0)
-    if not signal:
-        raise InputError(f"response: {named(pairs)}: nearly all pixels are saturated; add shorter exposures")
-    levels, variances, counts = _levels(np.concatenate(signal), np.concatenate(squared))
-    used = np.ones(len(levels), np.bool_)
-    fit = _line(levels, variances, counts, used)
-    for _ in range(10):
-        predicted = fit.intercept + fit.slope * levels
-        # Near the end of the scale noise is cut off: levels above the first that falls short are left out.
-        short = (variances < _COLLAPSED * predicted) & (levels > np.median(levels))
-        beyond = levels >= levels[short].min() if short.any() else np.zeros(len(levels), np.bool_)
-        off = np.abs(variances - predicted) > _GROSS * predicted * np.sqrt(2.0 / counts)
-        # A level that is off by less than 3 % is no gross error: it counts in chi^2.
-        off &= np.abs(variances - predicted) > 0.03 * predicted
-        now = ~beyond & ~off
-        if now.sum() < 4 or (now == used).all():
-            break
-        used = now
-        fit = _line(levels, variances, counts, used)
+    levels, variances, counts = _levels(*_squared_differences(pairs))
+    fit, used = _line_of_sound_levels(levels, variances, counts)
     if fit.slope <= 0.0 or fit.slope < 3.0 * np.sqrt(fit.covariance[1, 1]):
         raise InputError(
             "response: the variance of pixels does not grow with their signal; is the camera's picture processed, "
@@ -132,6 +105,44 @@ class _Line:
     slope: float
     covariance: Floats
     chi2_per_degree: float
+
+
+def _squared_differences(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
+    """Mean of the two frames and their squared difference over 2, at each unsaturated pixel of all pairs."""
+    signal, squared = [], []
+    for pair in pairs:
+        keep = ~pair.saturated
+        if keep.sum() < _LEAST_PIXELS:
+            continue
+        mean = 0.5 * (pair.first[keep] + pair.second[keep])
+        difference = pair.first[keep] - pair.second[keep]
+        ratio = float(difference.sum() / max(mean.sum(), 1e-9))
+        difference = difference - ratio * mean  # flicker makes one frame of a pair brighter as a whole
+        signal.append(mean)
+        squared.append(difference**2 / 2.0)
+    if not signal:
+        raise InputError(f"response: {named(pairs)}: nearly all pixels are saturated; add shorter exposures")
+    return np.concatenate(signal), np.concatenate(squared)
+
+
+def _line_of_sound_levels(levels: Floats, variances: Floats, counts: Floats) -> tuple[_Line, NDArray[np.bool_]]:
+    """The line through the levels that are neither saturated nor gross errors, and which [levels] these are."""
+    used = np.ones(len(levels), np.bool_)
+    fit = _line(levels, variances, counts, used)
+    for _ in range(10):
+        predicted = fit.intercept + fit.slope * levels
+        # Near saturation noise is clipped: the first level with too little variance and all above are left out.
+        short = (variances < _COLLAPSED * predicted) & (levels > np.median(levels))
+        beyond = levels >= levels[short].min() if short.any() else np.zeros(len(levels), np.bool_)
+        off = np.abs(variances - predicted) > _GROSS * predicted * np.sqrt(2.0 / counts)
+        # A level that is off by less than 3 % is no gross error: it counts in chi^2.
+        off &= np.abs(variances - predicted) > 0.03 * predicted
+        now = ~beyond & ~off
+        if now.sum() < 4 or (now == used).all():
+            break
+        used = now
+        fit = _line(levels, variances, counts, used)
+    return fit, used
 
 
 def _levels(signal: Floats, squared: Floats) -> tuple[Floats, Floats, Floats]:

@@ -209,22 +209,10 @@ def response_outcome(
         raise InputError(
             f"response: expected two frames of each exposure, found one of {single[0]:.0f} us; set `repeats: 2`"
         )
-    dark = dark_signal(frames, dark_record)
-    channels = channels_of(frames.pattern)
-    pairs: dict[str, list[Pair]] = {channel: [] for channel in channels}
-    for number, (exposure_us, found) in enumerate(sorted(by_exposure.items())):
-        black = dark(found[0])
-        first, second = (frame.read() for frame in found[:2])
-        for channel in channels:
-            take = _sample(first.shape, frames.pattern, channel)
-            raw_a, raw_b, under = first[take], second[take], black[take]
-            full = np.maximum(raw_a, raw_b) >= frames.white_dn
-            a, b = (np.subtract(raw, under, dtype=np.float64) for raw in (raw_a, raw_b))
-            pairs[channel].append(Pair(str(found[0].shot), exposure_us, a, b, full))
-        progress(number + 1, len(by_exposure))
+    pairs = _pairs_by_channel(frames, by_exposure, dark_signal(frames, dark_record), progress)
     range_dn = float(frames.white_dn - frames.black_dn)
-    transfers = {channel: photon_transfer(pairs[channel]) for channel in channels}
-    lines = {channel: linearity(pairs[channel], range_dn) for channel in channels}
+    transfers = {channel: photon_transfer(found) for channel, found in pairs.items()}
+    lines = {channel: linearity(found, range_dn) for channel, found in pairs.items()}
     height, width = lit[0].read().shape
     parameters, covariance = _response_parameters(transfers, lines)
     worst = max(line.u_deviation for line in lines.values())
@@ -232,12 +220,6 @@ def response_outcome(
     remarks = [_linear_remark(channel, line) for channel, line in lines.items()]
     if not any(t.saturated_seen for t in transfers.values()):
         remarks.append("no frame was saturated: full well is at least what is stated")
-    fixed = {"range_dn": range_dn}
-    for channel, transfer in transfers.items():
-        fixed[f"saturation_dn.{channel}"] = transfer.saturation_dn
-        fixed[f"saturation_e.{channel}"] = transfer.saturation_e.value
-        if transfer.prnu is not None:
-            fixed[f"prnu.{channel}"] = transfer.prnu.value
     noise = [
         Noise(
             name=f"reading {channel}",
@@ -258,10 +240,42 @@ def response_outcome(
         partial(pictures.draw_response, transfers, lines),
         limits=judged(RESPONSE, request.limits, {"linearity": worst, "flicker": flicker}),
         noise=noise,
-        fixed=fixed,
+        fixed={"range_dn": range_dn, **_saturation_figures(transfers)},
         remarks=remarks,
         more_inputs=record_input(dark_record),
     )
+
+
+def _pairs_by_channel(
+    frames: LightFrames,
+    by_exposure: Mapping[float, Sequence[LightFrame]],
+    dark: Callable[[LightFrame], NDArray[np.float32]],
+    progress: Progress,
+) -> dict[str, list[Pair]]:
+    """The first two frames of each exposure, dark signal subtracted."""
+    channels = channels_of(frames.pattern)
+    pairs: dict[str, list[Pair]] = {channel: [] for channel in channels}
+    for number, (exposure_us, found) in enumerate(sorted(by_exposure.items())):
+        black = dark(found[0])
+        first, second = (frame.read() for frame in found[:2])
+        for channel in channels:
+            take = _sample(first.shape, frames.pattern, channel)
+            raw_a, raw_b, under = first[take], second[take], black[take]
+            full = np.maximum(raw_a, raw_b) >= frames.white_dn
+            a, b = (np.subtract(raw, under, dtype=np.float64) for raw in (raw_a, raw_b))
+            pairs[channel].append(Pair(str(found[0].shot), exposure_us, a, b, full))
+        progress(number + 1, len(by_exposure))
+    return pairs
+
+
+def _saturation_figures(transfers: Mapping[str, PhotonTransfer]) -> dict[str, float]:
+    figures = {}
+    for channel, transfer in transfers.items():
+        figures[f"saturation_dn.{channel}"] = transfer.saturation_dn
+        figures[f"saturation_e.{channel}"] = transfer.saturation_e.value
+        if transfer.prnu is not None:
+            figures[f"prnu.{channel}"] = transfer.prnu.value
+    return figures
 
 
 def _one_scene(frames: LightFrames) -> list[LightFrame]:

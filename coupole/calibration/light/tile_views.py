@@ -126,32 +126,10 @@ def rows_of(
     number `place`, ln reflectance, Minnaert's k. What cannot be used is added to `remarks`.
     """
     centres, normals = positions.of(view.leds)
-
-    def log_h(tilt_deg: Floats | None = None, height_mm: float = 0.0, minnaert: float | None = None) -> Floats:
-        h, _ = transfer(
-            view,
-            centres,
-            normals,
-            tile,
-            tilt_deg=tilt_deg,
-            height_mm=height_mm,
-            minnaert=minnaert,
-            emission=emission,
-            side_mm=side_mm,
-        )
-        mean: Floats = np.log(np.maximum(h.mean(axis=1), 1e-300))
-        return mean
-
     h, cos_in = transfer(view, centres, normals, tile, emission=emission, side_mm=side_mm)
     slopes = np.zeros((len(view.leds), figures))
-    for axis in range(2):
-        tilt = _STEP * np.eye(2)[axis]
-        slopes[:, OF_PLACE * place + axis] = (log_h(tilt) - log_h(-tilt)) / (2 * _STEP)
-    up, down = log_h(height_mm=_STEP_MM), log_h(height_mm=-_STEP_MM)
-    slopes[:, OF_PLACE * place + 2] = (up - down) / (2 * _STEP_MM)
-    slopes[:, -2] = 1.0
-    more, less = (log_h(minnaert=tile.minnaert + step) for step in (_STEP, -_STEP))
-    slopes[:, -1] = (more - less) / (2 * _STEP)
+    of_place = slice(OF_PLACE * place, OF_PLACE * (place + 1))
+    slopes[:, of_place], slopes[:, -2:] = _slopes(view, centres, normals, tile, emission, side_mm)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio, u_ratio = view.signal / h, view.u_signal / h
     usable = (cos_in.min(axis=1) > _LOWEST_COSINE) & (h > 0).all(axis=1) & np.isfinite(view.signal).all(axis=1)
@@ -172,6 +150,34 @@ def rows_of(
     if (full := view.leds[view.saturated & usable]).size:
         remarks.append(f"view {view.name}: the tile is saturated under {list_of(full)}; not used, expose less")
     return rows, {*shaded, *map(int, full)}
+
+
+def _slopes(
+    view: TileView, centres: Floats, normals: Floats, tile: Tile, emission: Emission, side_mm: float
+) -> tuple[Floats, Floats]:
+    """Derivatives of ln h by the tile's two tilts and its height [n, 3], and by ln reflectance and Minnaert's k
+    [n, 2]; central differences."""
+
+    def log_h(tilt_deg: Floats | None = None, height_mm: float = 0.0, minnaert: float | None = None) -> Floats:
+        h, _ = transfer(
+            view,
+            centres,
+            normals,
+            tile,
+            tilt_deg=tilt_deg,
+            height_mm=height_mm,
+            minnaert=minnaert,
+            emission=emission,
+            side_mm=side_mm,
+        )
+        mean: Floats = np.log(np.maximum(h.mean(axis=1), 1e-300))
+        return mean
+
+    tilts = [(log_h(tilt) - log_h(-tilt)) / (2 * _STEP) for tilt in _STEP * np.eye(2)]
+    height = (log_h(height_mm=_STEP_MM) - log_h(height_mm=-_STEP_MM)) / (2 * _STEP_MM)
+    more, less = (log_h(minnaert=tile.minnaert + step) for step in (_STEP, -_STEP))
+    by_minnaert = (more - less) / (2 * _STEP)
+    return np.column_stack([*tilts, height]), np.column_stack([np.ones(len(centres)), by_minnaert])
 
 
 def arrays_of(

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coupole.calibration import optics
 from coupole.calibration.adjustment import Adjusted, Block, Group, adjust
@@ -151,6 +152,107 @@ def _by_view(
     return tuple(found)
 
 
+@dataclass(frozen=True)
+class _Problem:
+    """The observations, and how they depend on the state.
+
+    The columns are the mesh's step [6], a step [6] for each view, an offset [3] for each target, and the figures
+    that all views share [f + 6 + k].
+    """
+
+    intrinsics: Intrinsics
+    stated: Stated
+    reported: Floats
+    """[v, 4, 4] base_from_camera."""
+    targets_mm: Floats
+    """[t, 3] the table's, of the recognised targets."""
+    observed_px: Floats
+    """[n, 2] stickers in pictures, by target."""
+    target_of: NDArray[np.intp]
+    """[n] target of each sticker."""
+    view_of: NDArray[np.intp]
+    """[n] and its view."""
+    lens: NDArray[np.intp]
+    """[f] rows of the free lens parameters in `optics.NAMES`."""
+    held: Floats
+    """W [f + 6 + k, f + 6 + k] with W'W the inverse covariance of what views share."""
+    by_shared: Floats
+    """[v, 6, f + 6 + k] step of each reported pose for what views share."""
+
+    @property
+    def first_target(self) -> int:
+        return 6 + 6 * len(self.reported)
+
+    @property
+    def first_shared(self) -> int:
+        return self.first_target + 3 * len(self.targets_mm)
+
+    def evaluate(self, state: _State) -> list[Block]:
+        return [*self._sticker_blocks(state), *self._target_blocks(state), *self._pose_blocks(state)]
+
+    def move(self, state: _State, step: Floats) -> _State:
+        return _State(
+            moved(state.base_from_mesh, step[:6]),
+            moved(state.base_from_camera, step[6 : self.first_target].reshape(-1, 6)),
+            state.targets_mm + step[self.first_target : self.first_shared].reshape(-1, 3),
+            state.shared_step + step[self.first_shared :],
+        )
+
+    def _sticker_blocks(self, state: _State) -> list[Block]:
+        turn, places = state.base_from_mesh[:3, :3], state.targets_mm[self.target_of]
+        camera_from_base = inverses(state.base_from_camera)[self.view_of]
+        in_base = places @ turn.T + state.base_from_mesh[:3, 3]
+        in_camera = np.einsum("nij,nj->ni", camera_from_base[:, :3, :3], in_base) + camera_from_base[:, :3, 3]
+        vector = self.intrinsics.vector()
+        vector[self.lens] += state.shared_step[: len(self.lens)]
+        projected = optics.project(in_camera, vector)
+        by_base = projected.by_point @ camera_from_base[:, :3, :3]
+        by_turn = by_base @ (-turn @ skew(places))
+        by_view = projected.by_point @ skew(in_camera)
+        by_all = [by_base, by_turn, by_base @ turn, -by_base, by_view, projected.by_intrinsics[:, :, self.lens]]
+        jacobian = np.concatenate(by_all, axis=2) / self.stated.sticker_px
+        residuals = (self.observed_px - projected.pixels) / self.stated.sticker_px
+        columns = self._sticker_columns()
+        return [Block(residuals[k], jacobian[k], columns[k], 0) for k in range(len(residuals))]
+
+    def _sticker_columns(self) -> NDArray[np.intp]:
+        """[n, 6 + 3 + 6 + f] of mesh, target, view and lens."""
+        own, count = np.arange(6), len(self.target_of)
+        return np.concatenate(
+            [
+                np.tile(own, (count, 1)),
+                self.first_target + 3 * self.target_of[:, None] + own[:3],
+                6 + 6 * self.view_of[:, None] + own,
+                np.tile(self.first_shared + np.arange(len(self.lens)), (count, 1)),
+            ],
+            axis=1,
+        )
+
+    def _target_blocks(self, state: _State) -> list[Block]:
+        """Each target lies where the table has it, within the scanner's accuracy."""
+        sigma_mm = self.stated.scanner_mm
+        blocks = []
+        for row, at_mm in enumerate(state.targets_mm):
+            columns = np.arange(self.first_target + 3 * row, self.first_target + 3 * row + 3)
+            blocks.append(Block((self.targets_mm[row] - at_mm) / sigma_mm, np.eye(3) / sigma_mm, columns, 1))
+        return blocks
+
+    def _pose_blocks(self, state: _State) -> list[Block]:
+        """Each view's pose is the reported one, moved by what views share, within the arm's noise. What views
+        share is zero within its record's covariance."""
+        pose_sigma = np.array([self.stated.robot_mm] * 3 + [np.radians(self.stated.robot_deg)] * 3)
+        shared = self.first_shared + np.arange(len(self.held))
+        off_by = between(state.base_from_camera, self.reported) + self.by_shared @ state.shared_step
+        blocks = []
+        for view in range(len(self.reported)):
+            for group, part in ((2, slice(0, 3)), (3, slice(3, 6))):
+                columns = np.concatenate([6 + 6 * view + np.arange(6)[part], shared])
+                by_both = np.concatenate([np.eye(3), -self.by_shared[view, part]], axis=1)
+                weighted = by_both / pose_sigma[part][:, None]
+                blocks.append(Block(off_by[view, part] / pose_sigma[part], weighted, columns, group))
+        return [*blocks, Block(-self.held @ state.shared_step, self.held, shared, 4)]
+
+
 def _adjust(
     views: Sequence[CameraView],
     intrinsics: Intrinsics,
@@ -160,10 +262,8 @@ def _adjust(
     stated: Stated,
     prior: CameraPrior | None,
 ) -> Adjusted[_State]:
-    """Unknowns: the mesh's step [6], one [6] for each view, an offset [3] for each target, what views share."""
+    """Adjust the mesh's pose from `start` together with the views, the targets and what views share."""
     reported = np.array([view.base_from_camera for view in views])
-    first_target = 6 + 6 * len(views)
-    pose_sigma = np.array([stated.robot_mm] * 3 + [np.radians(stated.robot_deg)] * 3)
     groups = (
         Group(STICKERS, estimated=True, rejects=2),
         Group(SCANNER, estimated=False),
@@ -171,7 +271,6 @@ def _adjust(
         Group(ORIENTATION, estimated=True),
         Group(HAND_EYE, estimated=False),
     )
-    first_shared = first_target + 3 * len(seen)
     lens = np.array([], np.intp)
     if prior is None:
         held, by_shared = np.eye(6), np.zeros((len(views), 6, 6))
@@ -179,63 +278,17 @@ def _adjust(
         lens = np.array([optics.NAMES.index(name) for name in prior.free], np.intp)
         held = np.asarray(np.linalg.inv(np.linalg.cholesky(prior.covariance)))
         by_shared = _by_shared(reported, prior)
-    shared = np.arange(len(held))
-
-    row_of = np.concatenate([np.full(len(point.views), row) for row, point in enumerate(seen)])
-    view_of = np.concatenate([point.views for point in seen])
-    observed = np.array(
+    observed_px = np.array(
         [views[v].pixels[p] for point in seen for v, p in zip(point.views, point.places, strict=True)]
     )
-    own = np.arange(6)
-    columns = np.concatenate(
-        [
-            np.tile(own, (len(row_of), 1)),
-            first_target + 3 * row_of[:, None] + own[:3],
-            6 + 6 * view_of[:, None] + own,
-            np.tile(first_shared + np.arange(len(lens)), (len(row_of), 1)),
-        ],
-        axis=1,
+    target_of = np.concatenate([np.full(len(point.views), row) for row, point in enumerate(seen)])
+    view_of = np.concatenate([point.views for point in seen])
+    problem = _Problem(
+        intrinsics, stated, reported, targets_mm, observed_px, target_of, view_of, lens, held, by_shared
     )
-
-    def evaluate(state: _State) -> list[Block]:
-        turn, places = state.base_from_mesh[:3, :3], state.targets_mm[row_of]
-        camera_from_base = inverses(state.base_from_camera)[view_of]
-        in_base = places @ turn.T + state.base_from_mesh[:3, 3]
-        in_camera = np.einsum("nij,nj->ni", camera_from_base[:, :3, :3], in_base) + camera_from_base[:, :3, 3]
-        vector = intrinsics.vector()
-        vector[lens] += state.shared_step[: len(lens)]
-        projected = optics.project(in_camera, vector)
-        by_base = projected.by_point @ camera_from_base[:, :3, :3]
-        by_turn = by_base @ (-turn @ skew(places))
-        by_view = projected.by_point @ skew(in_camera)
-        by_all = [by_base, by_turn, by_base @ turn, -by_base, by_view, projected.by_intrinsics[:, :, lens]]
-        jacobian = np.concatenate(by_all, axis=2) / stated.sticker_px
-        residuals = (observed - projected.pixels) / stated.sticker_px
-        blocks = [Block(residuals[k], jacobian[k], columns[k], 0) for k in range(len(row_of))]
-        for row in range(len(seen)):
-            off = (targets_mm[row] - state.targets_mm[row]) / stated.scanner_mm
-            columns_of = np.arange(first_target + 3 * row, first_target + 3 * row + 3)
-            blocks.append(Block(off, np.eye(3) / stated.scanner_mm, columns_of, 1))
-        off_by = between(state.base_from_camera, reported) + by_shared @ state.shared_step
-        for view in range(len(views)):
-            for group, part in ((2, slice(0, 3)), (3, slice(3, 6))):
-                columns_of = np.concatenate([6 + 6 * view + own[part], first_shared + shared])
-                by_both = np.concatenate([np.eye(3), -by_shared[view, part]], axis=1)
-                weighted = by_both / pose_sigma[part][:, None]
-                blocks.append(Block(off_by[view, part] / pose_sigma[part], weighted, columns_of, group))
-        blocks.append(Block(-held @ state.shared_step, held, first_shared + shared, 4))
-        return blocks
-
-    def move(state: _State, step: Floats) -> _State:
-        return _State(
-            moved(state.base_from_mesh, step[:6]),
-            moved(state.base_from_camera, step[6:first_target].reshape(-1, 6)),
-            state.targets_mm + step[first_target:first_shared].reshape(-1, 3),
-            state.shared_step + step[first_shared:],
-        )
-
     begin = _State(start, reported, targets_mm, np.zeros(len(held)))
-    return adjust(begin, evaluate, move, groups, first_shared + len(held), what="mesh to robot")
+    unknowns = problem.first_shared + len(held)
+    return adjust(begin, problem.evaluate, problem.move, groups, unknowns, what="mesh to robot")
 
 
 def _by_shared(base_from_camera: Floats, prior: CameraPrior) -> Floats:

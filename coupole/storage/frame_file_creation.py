@@ -1,0 +1,111 @@
+"""Lays out the file of one view's frames as NeXus HDF5, with all its space allocated."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.devices import FrameFormat
+from coupole.storage.disk_errors import disk_error
+from coupole.storage.frame_file import DATA, FRAME_DTYPE, MAX_POSES, PAGE, POSE_DTYPE
+
+Collections = Mapping[str, Mapping[str, NDArray[np.generic]]]
+"""Arrays by name, by name of the group in the entry that holds them (NXcollection)."""
+
+
+def create(
+    path: Path,
+    slots: int,
+    frame_format: FrameFormat,
+    metadata: dict[str, Any],
+    collections: Collections | None = None,
+    *,
+    packed: bool = False,
+) -> None:
+    """Lay out a view's file with `slots` slots, all free, and its space allocated; frames of up to 12 bits may be
+    `packed`.
+
+    `metadata`: `title`, `sample`, `simulated`, `pixel_pitch_um` and whatever else is to stand in the entry's
+    attributes. Raises DiskFull if there is no room for all of it.
+    """
+    partial = path.with_suffix(".part")
+    try:
+        with h5py.File(
+            partial, "w", alignment_threshold=PAGE, alignment_interval=PAGE, libver=("v108", "v110")
+        ) as file:
+            _describe(file, slots, frame_format, metadata, packed=packed)
+            for name, arrays in (collections or {}).items():
+                collection = _group(file["entry"], name, "NXcollection")
+                for key, values in arrays.items():
+                    collection[key] = values
+        with partial.open("r+b") as file_on_disk:
+            os.posix_fallocate(file_on_disk.fileno(), 0, partial.stat().st_size)
+            os.fsync(file_on_disk.fileno())
+        partial.rename(path)
+        folder = os.open(path.parent, os.O_RDONLY)
+        os.fsync(folder)
+        os.close(folder)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise disk_error(path, error) from error
+
+
+def _describe(
+    file: h5py.File, slots: int, frame_format: FrameFormat, metadata: dict[str, Any], *, packed: bool
+) -> None:
+    file.attrs["default"] = "entry"
+    entry = _group(file, "entry", "NXentry", default="data")
+    entry["title"] = metadata["title"]
+    for key, value in metadata.items():
+        entry.attrs[key] = value
+    instrument = _group(entry, "instrument", "NXinstrument")
+    instrument["name"] = "La Coupole"
+    detector = _group(instrument, "detector", "NXdetector")
+    columns, dtype = (frame_format.width_px * 3 // 2, "u1") if packed else (frame_format.width_px, "<u2")
+    shape = (slots, frame_format.height_px, columns)
+    data = _contiguous(detector, "data", shape, np.dtype(dtype), fill=False)
+    if packed:
+        data.attrs["packing"] = "three bytes hold two pixels a, b: a[7:0], b[3:0] a[11:8], b[11:4] (GenICam 12p)"
+    data.attrs["units"] = "DN"
+    data.attrs["long_name"] = "raw frames, one a slot; `frames` says what each slot holds"
+    _contiguous(detector, "frames", (slots,), FRAME_DTYPE, fill=True)
+    detector["bit_depth_readout"] = frame_format.bit_depth
+    detector["saturation_value"] = frame_format.white_dn
+    detector["black_level"] = frame_format.black_dn
+    detector["bayer_pattern"] = frame_format.bayer_pattern
+    for axis in ("x_pixel_size", "y_pixel_size"):
+        detector[axis] = float(metadata["pixel_pitch_um"])
+        detector[axis].attrs["units"] = "um"
+    robot = _group(instrument, "robot", "NXpositioner")
+    _contiguous(robot, "poses", (MAX_POSES,), POSE_DTYPE, fill=True)
+    sample = _group(entry, "sample", "NXsample")
+    sample["name"] = metadata["sample"]
+    shown = _group(entry, "data", "NXdata", signal="data")
+    shown["data"] = h5py.SoftLink(f"/{DATA}")
+
+
+def _group(parent: h5py.Group, name: str, nx_class: str, **attributes: str) -> h5py.Group:
+    group = parent.create_group(name)
+    group.attrs["NX_class"] = nx_class
+    for key, value in attributes.items():
+        group.attrs[key] = value
+    return group
+
+
+def _contiguous(
+    group: h5py.Group, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], *, fill: bool
+) -> h5py.Dataset:
+    """A contiguous dataset that is allocated at once, so that its offset in the file is known."""
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_layout(h5py.h5d.CONTIGUOUS)
+    properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    properties.set_fill_time(h5py.h5d.FILL_TIME_ALLOC if fill else h5py.h5d.FILL_TIME_NEVER)
+    space = h5py.h5s.create_simple(shape)
+    h5py.h5d.create(group.id, name.encode(), h5py.h5t.py_create(dtype, logical=True), space, dcpl=properties)
+    return group[name]

@@ -21,6 +21,7 @@ from coupole.plan.bursts import Burst
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
 from coupole.plan.schedule import build_schedule
+from coupole.plan.shot_id import ShotId
 
 FORMAT = FrameFormat(8, 8, 12, "MONO", 64, 4095)
 LEDS = [3, 0, 2, 1]
@@ -55,7 +56,7 @@ class Cell:
     counts: bool = True
     """The camera counts its exposures."""
     done: list[str] = field(default_factory=list)
-    proven: dict[str, Mapping[str, int]] = field(default_factory=dict)
+    proven: dict[ShotId, Mapping[str, int]] = field(default_factory=dict)
     freed: list[int] = field(default_factory=list)
     noted: list[Any] = field(default_factory=list)
     now_ns_: int = 0
@@ -143,13 +144,13 @@ class Cell:
 
 
 def leds_proven(cell: Cell) -> list[int]:
-    return [fields["led"] for shot, fields in cell.proven.items() if "led" in shot.split("/")[1]]
+    return [fields["led"] for shot, fields in cell.proven.items() if "led" in str(shot.light)]
 
 
 def test_all_frames_are_proven_where_all_is_well() -> None:
     cell, burst = Cell(), burst_of()
     assert cell.fire(burst).match.reason == ""
-    assert sorted(cell.proven) == sorted(burst.shot_ids)
+    assert set(cell.proven) == set(burst.shots)
     assert sorted(leds_proven(cell)) == sorted(LEDS)
     assert cell.freed == []
 
@@ -178,14 +179,14 @@ def test_a_step_takes_its_whole_period() -> None:
 def test_a_frame_that_may_not_be_the_lights_own_is_not_proven(what: str) -> None:
     cell, burst = Cell({2: what}), burst_of()
     cell.fire(burst)
-    assert set(burst.shot_ids) - set(cell.proven) == {burst.shot_ids[2]}
+    assert set(burst.shots) - set(cell.proven) == {burst.shots[2]}
 
 
 @pytest.mark.parametrize("what", ["dark", "twice", "none"])
 def test_the_same_with_a_camera_that_does_not_count(what: str) -> None:
     cell, burst = Cell({2: what}, counts=False), burst_of()
     cell.fire(burst)
-    assert set(burst.shot_ids) - set(cell.proven) == {burst.shot_ids[2]}
+    assert set(burst.shots) - set(cell.proven) == {burst.shots[2]}
 
 
 @pytest.mark.parametrize("mark", [0, 5])
@@ -203,14 +204,14 @@ def test_nothing_is_proven_unless_both_marks_were_seen_and_dark(mark: int, what:
 def test_a_light_that_is_bright_is_no_fault() -> None:
     cell, burst = Cell({2: "bright"}), burst_of()
     cell.fire(burst)
-    assert set(cell.proven) == set(burst.shot_ids)
+    assert set(cell.proven) == set(burst.shots)
 
 
 def test_of_a_box_with_a_log_each_frame_is_proven_when_it_has_come() -> None:
     cell, burst = Cell({2: "fails"}), burst_of(runs_tables=True)
     with pytest.raises(ZeroDivisionError):
         cell.fire(burst)
-    assert sorted(cell.proven) == sorted(burst.shot_ids[:2])
+    assert set(cell.proven) == set(burst.shots[:2])
 
 
 def test_a_failure_leaves_no_light_and_notes_what_was_given() -> None:

@@ -24,7 +24,7 @@ def job() -> Job:
 
 def refusal(view: ViewPose) -> str:
     rig = job().cell.rig
-    (only,) = plan_itinerary([view], rig, job().bodies, rig.motion.home_joints_deg).refusals
+    (only,) = plan_itinerary([view], rig, job().motion.bodies, rig.motion.home_joints_deg).refusals
     return only
 
 
@@ -33,8 +33,8 @@ def standing(*joints_deg: float) -> ViewPose:
 
 
 def test_the_demo_is_planned_and_every_motion_is_clear_at_every_place() -> None:
-    rig, bodies = job().cell.rig, job().bodies
-    found = job().itinerary(job().schedule.views, rig.motion.home_joints_deg)
+    rig, bodies = job().cell.rig, job().motion.bodies
+    found = job().motion.itinerary(job().schedule.views, rig.motion.home_joints_deg)
     assert found.refusals == ()
     here = np.array(rig.motion.home_joints_deg)
     for index in found.order:
@@ -76,7 +76,7 @@ def test_a_pose_beyond_its_reach_is_refused() -> None:
 
 def test_the_watch_over_the_way_counts_the_urs_own_reach() -> None:
     here = np.array(job().cell.rig.motion.home_joints_deg)
-    off_mm = path_deviation_mm([here], here + np.eye(6)[0], job().bodies.reach_mm)
+    off_mm = path_deviation_mm([here], here + np.eye(6)[0], job().motion.bodies.reach_mm)
     assert off_mm > np.radians(1.0) * 1300.0  # the arm's reach, by its data sheet
 
 

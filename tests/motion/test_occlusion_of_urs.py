@@ -26,9 +26,9 @@ def job() -> Job:
 @cache
 def view(number: int) -> tuple[np.ndarray, Occlusion]:
     """Posture and shadows of one of the demo's views on a UR10e."""
-    visit = job().itinerary(job().schedule.views, job().cell.rig.motion.home_joints_deg).visits[number]
+    visit = job().motion.itinerary(job().schedule.views, job().cell.rig.motion.home_joints_deg).visits[number]
     assert visit is not None
-    return visit.joints_deg, job().occlusions.at(visit.joints_deg)
+    return visit.joints_deg, job().motion.occlusions.at(visit.joints_deg)
 
 
 @pytest.mark.parametrize("number", range(3))
@@ -41,7 +41,7 @@ def test_the_arm_itself_hides_leds_and_not_its_tool_alone(number: int) -> None:
 @pytest.mark.parametrize("number", range(3))
 def test_shadows_of_the_arm_are_those_that_an_independent_checker_finds(number: int) -> None:
     joints_deg, shadow = view(number)
-    checker, patches = Checker("ur10e"), job().occlusions.patches
+    checker, patches = Checker("ur10e"), job().motion.occlusions.patches
     checker.place(joints_deg)
     tools = ("camera", "cables")
     solids = {
@@ -52,7 +52,7 @@ def test_shadows_of_the_arm_are_those_that_an_independent_checker_finds(number: 
     for code in (REACHED, BY_ARM, BY_TOOL):
         at, of = np.nonzero(shadow.codes == code)
         for k in random.choice(len(at), 100):
-            start, led = starts_mm[at[k]], job().occlusions.leds_mm[of[k]]
+            start, led = starts_mm[at[k]], job().motion.occlusions.leds_mm[of[k]]
             ray = fcl.CollisionObject(fcl.Cylinder(1e-4, float(np.linalg.norm(led - start))), standing(start, led))
             hit = {
                 by: any(fcl.collide(ray, s, fcl.CollisionRequest(), fcl.CollisionResult()) for s in of_it)
@@ -65,7 +65,7 @@ def test_shadows_of_the_arm_are_those_that_an_independent_checker_finds(number: 
 @pytest.mark.parametrize("number", range(3))
 def test_what_the_simulated_arm_hides_the_mask_hides_and_most_of_the_other_way_round(number: int) -> None:
     joints_deg, shadow = view(number)
-    rig, occlusions = job().cell.rig, job().occlusions
+    rig, occlusions = job().cell.rig, job().motion.occlusions
     base_from_support = rig.support.base_from_support.matrix()
     tool = [ToolBody(from_mm=t.from_mm, to_mm=t.to_mm, radius_mm=t.radius_mm) for t in rig.tool]
     arm = np.vstack(

@@ -177,7 +177,7 @@ def test_durations_follow_the_speeds_that_a_description_has(tmp_path: Path) -> N
     assert np.allclose(arm_of(cell.rig).velocity_deg_s, 0.3 * 20.0)
     demo = REPO / "configs/plans/demo.yaml"
     slow, fast = (
-        job.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg)
+        job.motion.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg)
         for job in (read_job(demo, tmp_path / "rig.yaml"), read_job(demo))
     )
     durations_s = [sum(visit.leg.duration_s for visit in found.visits if visit) for found in (slow, fast)]

@@ -302,18 +302,18 @@ def test_without_a_log_a_burst_has_a_dark_mark_at_each_end() -> None:
     assert not burst.table["sends_edge"].any()
     assert len(burst.table) == 1 + 2 + 1080 + 1
     assert np.flatnonzero(burst.table["led"] == NO_LED).tolist() == [0, 1, 2, 1083]
-    assert [burst.labels[i] for i in (0, 1, 2, -1)] == ["dark0/e0", "dark2/e0", "dark3/e0", "dark1/e0"]
+    assert [str(burst.labels[i]) for i in (0, 1, 2, -1)] == ["dark0/e0", "dark2/e0", "dark3/e0", "dark1/e0"]
     assert np.all(burst.table["period_us"] == burst.timing.period_us)
 
 
 def test_the_marks_of_a_panels_burst_have_names_of_their_own() -> None:
     burst = by_host(lights={"kind": "panels", "panels": [2]})
-    assert burst.labels == ("panel2-mark0/e0", "panel2/e0", "panel2-mark1/e0")
+    assert list(map(str, burst.labels)) == ["panel2-mark0/e0", "panel2/e0", "panel2-mark1/e0"]
 
 
 def test_a_burst_without_a_log_that_is_shot_again_has_its_marks_anew() -> None:
-    burst = by_host(darks_per_view=0).only({"led0007/e0"})
-    assert burst.labels == ("", "led0007/e0", "")
+    burst = by_host(darks_per_view=0).only(labels("led0007/e0"))
+    assert burst.labels == (None, ShotLabel(Led(7), 0), None)
     assert burst.table["led"].tolist() == [NO_LED, 7, NO_LED]
 
 

@@ -64,7 +64,7 @@ def test_boards_that_would_get_too_hot_set_the_pace_and_stay_below_their_limit(d
 
 
 def test_leds_that_must_rest_longer_set_the_pace(demo: Job) -> None:
-    plan = demo.plan.model_copy(update={"lights": type(demo.plan.light_selection)(kind="all"), "repeats": 2})
+    plan = demo.plan.model_copy(update={"lights": type(demo.plan.lights)(kind="all"), "repeats": 2})
     again = with_limits(at_pace(replace(demo, plan=plan), Pace(led_duty=0.999)), cooldown_ratio=2000.0)
     _, report = check_job(again, StorageFacts(ROOMY, 4e9), paths=False)
     assert [timing.bound for timing in report.timings] == ["heat"]

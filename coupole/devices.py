@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Protocol, cast, get_type_hints
 
 import numpy as np
@@ -81,11 +81,6 @@ STEP_DTYPE = _dtype_of(Step)
 """Tables are arrays [n] of this: the fields of `Step`, as int64 and bool."""
 STEP_RECORD_DTYPE = _dtype_of(StepRecord)
 """Logs are arrays [n] of this: the fields of `StepRecord`, as int64, bool and float64."""
-
-
-def record_array(record: StepRecord) -> NDArray[np.void]:
-    """One record as a log [1] of STEP_RECORD_DTYPE."""
-    return np.array([astuple(record)], STEP_RECORD_DTYPE)
 
 
 class Clock(Protocol):

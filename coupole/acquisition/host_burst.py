@@ -11,7 +11,7 @@ been seen to be dark no frame of the burst is proven.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ from coupole.devices import (
     Frame,
     FrameFormat,
     StepRecord,
-    record_array,
 )
 from coupole.plan.bursts import Burst
 from coupole.plan.shot_id import ShotId
@@ -89,7 +88,7 @@ class HostBurst:
                 self._arm.attend()
                 self._wait_while_paused()
                 taken = self._fire_one(burst, index)
-                logs.append(record_array(taken.record))
+                logs.append(np.array([astuple(taken.record)], STEP_RECORD_DTYPE))
                 if shot is not None and taken.record.invalid_exposure:
                     dead.append(shot)
                 arm_after = None

@@ -83,14 +83,18 @@ def budget(
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
+    _say(result, console, as_json=as_json)
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _say(result: _Result, console: Console, *, as_json: bool) -> None:
     if as_json:
         print(json.dumps(result.document))
         return
     _show(console, result.budget)
     _show_accuracies(console, result)
-
-
-# -- helpers --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -73,13 +73,9 @@ class StepRecord:
         return self.led != NO_LED and (self.led_open or self.over_temperature)
 
 
-def _dtype_of(described: type[Step | StepRecord]) -> np.dtype[np.void]:
-    return np.dtype([(name, np.dtype(kind)) for name, kind in get_type_hints(described).items()])
-
-
-STEP_DTYPE = _dtype_of(Step)
+STEP_DTYPE = np.dtype(list(get_type_hints(Step).items()))
 """Tables are arrays [n] of this: the fields of `Step`, as int64 and bool."""
-STEP_RECORD_DTYPE = _dtype_of(StepRecord)
+STEP_RECORD_DTYPE = np.dtype(list(get_type_hints(StepRecord).items()))
 """Logs are arrays [n] of this: the fields of `StepRecord`, as int64, bool and float64."""
 
 

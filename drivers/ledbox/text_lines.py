@@ -24,6 +24,10 @@ from drivers.ledbox.serial_link import SerialLink, open_serial
 _REPLY_MARGIN_S = 2.0
 """What a box may take to answer, the bytes' own time apart."""
 _SHORT_REPLY_BYTES, _LONGEST_REPLY_BYTES = 100, 1000
+_CONFIRMS_S = 0.5
+"""A box that takes longer to confirm a light gets less of it: its own bound must not come before ours."""
+_BOX_PATIENCE = 1.5
+"""The box's own bound on a light over the driver's, its clock being a cheap one."""
 _LOOK_S = 0.001
 """Machine time between two looks at the rig's clock while a light shines."""
 _ENDINGS = {"lf": "\n", "crlf": "\r\n", "cr": "\r"}
@@ -149,14 +153,17 @@ class TextLineBox:
             self._refuse(
                 f"an LED from 0 to {self.led_count - 1}", f"{led} was asked for", "Correct the LED table."
             )
-        on_ms = math.ceil(on_us * 1.5e-3) + 100  # for the box's own clock: only if the host is gone
+        silent_s = self._settings.obeys_ms * 1e-3 if self._settings.expected_reply is None else 0.0
+        longest_s = on_us * 1e-6 + _CONFIRMS_S + silent_s
+        on_ms = math.ceil(_BOX_PATIENCE * longest_s * 1e3)  # by then the driver has ended it, or the host is gone
         with self._lock:
             try:
                 self._end()
-                sent_ns = self._clock.now_ns()
+                from_sending, sent_ns = Deadline(self._clock, longest_s), self._clock.now_ns()
                 if led != NO_LED:
                     self._command(self._settings.on.format(led=led + self._settings.first_led, on_ms=on_ms))
-                self._flash = _Flash(led, sent_ns, Deadline(self._clock, on_us * 1e-6))
+                lasts_s = min(on_us * 1e-6, from_sending.remaining_s)
+                self._flash = _Flash(led, sent_ns, Deadline(self._clock, lasts_s))
                 threading.Thread(target=self._watch, args=(self._flash,), name="led box", daemon=True).start()
             except BaseException:
                 self._darken_somehow()

@@ -165,6 +165,13 @@ def test_past_its_time_a_light_is_not_believed_though_nothing_has_ended_it(plain
             assert not box.lit()
 
 
+def test_a_silent_box_that_ends_lights_itself_does_not_end_them_before_they_are_believed(tmp_path: Path) -> None:
+    settings = {"expected_reply": None, "identify": None, "obeys_ms": 4000, "on": "LED {led} ON {on_ms}"}
+    with text_world(tmp_path, settings, answers=False) as world, world.opener() as box:
+        box.flash(5, 100_000)
+        assert world.lights[0][2] - world.lights[0][1] > 4_100_000_000
+
+
 def test_a_light_that_could_not_be_ended_in_time_is_not_hidden(plain: LedBoxWorld) -> None:
     with plain.opener() as box:
         box.flash(5, FLASH_US)

@@ -112,7 +112,7 @@ def drift(calibrated: Path, later: Path, out: Path, x_mm: float, y_mm: float) ->
 def by_record(record: Record, frames: list[LightFrame], table: Path) -> tuple[NDArray[np.float64], ...]:
     """Factor of each frame by the formula of the record, its relative uncertainty, and the truth."""
     board_c = {int(row["id"]): float(row["board_c"]) for row in rows_of(table)}
-    leds = [int(frame.light[3:]) for frame in frames]
+    leds = [frame.led for frame in frames]
     hours = np.array([(frame.t_s - record.value("start_s")) / 3600 for frame in frames])
     warmer_k = np.array([frame.temperature_c - board_c[led] for frame, led in zip(frames, leds, strict=True)])
     design = np.stack([np.ones_like(hours), hours, warmer_k], axis=1)

@@ -1,4 +1,4 @@
-"""Commands about what is on disk: status, verify, archive, export, scan."""
+"""Commands on stored data: status, verify, archive, export, scan."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coupole.errors import CoupoleError, InputError
 
 
 def status(run: RunPath, as_json: JsonOption = False) -> None:
-    """How far a run is; works while it goes on."""
+    """Progress of a run, also while it is running."""
     from coupole.storage.run import Run
     from coupole.storage.run import status as status_of
     from coupole.viewing.terminal import make_console, show_status
@@ -48,7 +48,7 @@ def verify(run: RunPath, as_json: JsonOption = False) -> None:
         raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames are not as they were written")
     if found.missing:
         raise UnprovenError(f"{len(found.missing)} frames of the plan are missing; resume the run")
-    console.print(f"ok: {found.frames} frames, each of them once, all checksums right")
+    console.print(f"ok: {found.frames} frames, each exactly once, all checksums right")
 
 
 def archive(

@@ -1,7 +1,7 @@
-"""Points in space from what several cameras of known pose saw, without being told what belongs together.
+"""Points in space from detections of several cameras of known pose, without known correspondences.
 
-Rays of two views that pass each other closely make a candidate; it stands if enough other views saw something
-where it would appear. Each thing seen is used once, by the candidate that most views agree on.
+Two rays of different views that pass close to each other give a candidate, which is accepted if enough other views
+have a detection at its projection. Each detection is used once, by the candidate with the most views.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _REFINEMENTS = 4
 
 @dataclass(frozen=True)
 class CameraView:
-    """One picture: where the camera stood, and the pixels [n, 2] at which something was seen."""
+    """One picture: the camera's pose, and the pixels [n, 2] of the detections."""
 
     name: str
     base_from_camera: Floats
@@ -33,7 +33,7 @@ class CameraView:
 
 @dataclass(frozen=True)
 class SeenPoint:
-    """One point and where it was seen: numbers of views, and of pixels in them."""
+    """One point and its detections: numbers of views, and of pixels in them."""
 
     base_mm: Floats
     views: tuple[int, ...]
@@ -44,7 +44,7 @@ class SeenPoint:
 def unproject(pixels: Floats, intrinsics: Intrinsics) -> Floats:
     """Unit directions [n, 3] in the camera frame that project to pixels [n, 2] (Newton's method).
 
-    Raises InputError where the distortion cannot be undone.
+    Raises InputError where the distortion cannot be inverted.
     """
     vector = intrinsics.vector()
     rays = np.concatenate([(pixels - vector[2:4]) / vector[:2], np.ones((len(pixels), 1))], axis=1)
@@ -65,9 +65,10 @@ def seen_points(
     depth_mm: tuple[float, float],
     least_views: int = LEAST_VIEWS,
 ) -> list[SeenPoint]:
-    """Points [base frame] that at least `least_views` views agree on within a tolerance, best supported first.
+    """Points [base frame] that at least `least_views` views agree on within a tolerance, those with the most views
+    first.
 
-    `depth_mm`: nearest and farthest that things stand in front of a camera.
+    `depth_mm`: least and largest distance in front of a camera.
     """
     vector, focal_px = intrinsics.vector(), float(intrinsics.fx)
     camera_from_base = inverses(np.array([view.base_from_camera for view in views]))
@@ -97,7 +98,7 @@ def seen_points(
 def _crossings(
     a: CameraView, rays_a: Floats, b: CameraView, rays_b: Floats, depth_mm: tuple[float, float], spread: float
 ) -> Floats:
-    """Midpoints [n, 3] of all pairs of rays that pass each other as closely as pixels tell, at allowed depths."""
+    """Midpoints [n, 3] of all pairs of rays that intersect within the tolerance in pixels, at allowed depths."""
     apart = b.base_from_camera[:3, 3] - a.base_from_camera[:3, 3]
     cosine = rays_a @ rays_b.T
     along_a, along_b = (rays_a @ apart)[:, None], (rays_b @ apart)[None]
@@ -118,7 +119,7 @@ def _nearest(
     vector: Floats,
     depth_mm: tuple[float, float],
 ) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.intp]], Floats]:
-    """For each point and view the place nearest to where the point appears [n, views], and how far that is, px."""
+    """For each point and view the detection nearest to the point's projection [n, views], and its distance, px."""
     nearest = np.zeros((len(points), len(views)), np.intp)
     off_px = np.full((len(points), len(views)), np.inf)
     for number, view in enumerate(views):
@@ -142,7 +143,7 @@ def _refined(
     rays: Sequence[Floats],
     views: Sequence[CameraView],
 ) -> Floats:
-    """Points moved to where they are nearest to all the rays that agree (least squares of distances)."""
+    """Points nearest to all rays that agree (least squares of distances)."""
     normal, side = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     for number, view in enumerate(views):
         rows = np.flatnonzero(agreeing[:, number])
@@ -165,7 +166,7 @@ def _chosen(
     tolerance_px: float,
     least_views: int,
 ) -> list[SeenPoint]:
-    """Candidates by support, then by residual, each with places that none before it took."""
+    """Candidates by number of views, then by residual, each with detections that no earlier one uses."""
     agreeing = off_px <= tolerance_px
     rms_px = np.sqrt(np.where(agreeing, off_px, 0.0) ** 2).mean(axis=1)
     taken: set[tuple[int, int]] = set()

@@ -1,7 +1,7 @@
 """The camera of the processing: pinhole with Brown-Conrady distortion, and its derivatives.
 
 The camera frame has z forward, x to the right and y down; the centre of the first pixel is (0, 0) (OpenCV's
-convention). The simulator has optics of its own, so that the two check each other.
+convention). The simulator has its own implementation, so that the two check each other.
 """
 
 from __future__ import annotations

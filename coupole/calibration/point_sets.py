@@ -1,9 +1,9 @@
-"""Which of the points found are which of the points known, though some are missing and some are false.
+"""Assigns points found to points known, although some are missing and some are false.
 
-Three points that stand near each other form a triangle whose sides no rigid motion changes. Triangles of the found
-points are looked up among those of the known ones; each pair that fits gives a motion, and the motion that brings
-most found points onto known ones wins. If another motion does nearly as well, the layout is ambiguous and nothing
-is claimed.
+Three neighbouring points form a triangle whose sides a rigid motion does not change. Triangles of the found points
+are looked up among those of the known ones; each pair that fits gives a motion, and the motion that brings most
+found points onto known ones is the result. If another motion is nearly as good, the layout is ambiguous, which is
+an error.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from coupole.calibration.rotations import Floats, nearest_rotation
 from coupole.errors import InputError
 
 NEIGHBOURS = 7
-"""Triangles are made of each point and two of so many nearest ones: enough for a third of them to be missing."""
+"""Triangles are made of each point and two of this number of nearest ones: enough if a third of them is
+missing."""
 LEAST_MATCHED, LEAST_SHARE = 4, 0.4
-"""So many must agree, and such a share of the smaller set: fewer do by chance."""
+"""Least number of points that agree, and least share of the smaller set: fewer may agree by chance."""
 _TRIES = 20_000
 _AMBIGUOUS_SHARE = 0.8
 _THINNEST = 0.1
-"""Triangles thinner than this (height over longest side) say too little of the motion."""
+"""Triangles thinner than this (height over longest side) determine the motion too poorly."""
 
 
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
@@ -69,7 +70,7 @@ def match_points(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Mat
     least = max(LEAST_MATCHED, int(np.ceil(LEAST_SHARE * min(len(found_mm), len(known_mm)))))
     for rough in _motions(found_mm, known_mm, tolerance_mm):
         motion, pairs = rough, _pairs(tree, rough, known_mm, 2 * tolerance_mm)
-        for _ in range(3):  # with all pairs the motion is better known, and more may come in
+        for _ in range(3):  # with all pairs the motion is more accurate, and more points may agree
             if len(pairs[0]) >= least:
                 motion = rigid_motion(known_mm[pairs[1]], found_mm[pairs[0]])
                 pairs = _pairs(tree, motion, known_mm, tolerance_mm)
@@ -124,7 +125,7 @@ def _motions(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Iterato
 
 
 def _pairs(tree: cKDTree, motion: Floats, known_mm: Floats, tolerance_mm: float) -> Pairs:
-    """Each found point with the known one that comes nearest to it, one to one."""
+    """Each found point with the nearest known one, one to one."""
     off_mm, found = tree.query(known_mm @ motion[:3, :3].T + motion[:3, 3], distance_upper_bound=tolerance_mm)
     taken: dict[int, int] = {}
     for known in np.argsort(off_mm):

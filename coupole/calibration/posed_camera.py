@@ -1,4 +1,4 @@
-"""Camera and hand-eye by their records: what turns a pixel and a reported pose into a ray, and how well."""
+"""Camera and hand-eye by their records: the ray of a pixel at a reported pose, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from coupole.geometry import transform
 
 HAND_EYE = "flange_from_camera"
 MOST_APART = 5.0
-"""Two records of one lens differ by no more of their joint standard uncertainty."""
+"""Largest difference of two records of one lens, over its standard uncertainty."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class CameraPrior:
     covariance: Floats
     """[free + 6 + k, free + 6 + k]: lens, the hand-eye's step (mm, rad), then the zeros of k axes (deg)."""
     axis_sensitivity: Floats | None = None
-    """[views, 6, k] step of the flange in its own frame (mm, rad) for each degree of these axes, at the views that
-    the camera was carried to; None: k is 0."""
+    """[views, 6, k] step of the flange in its own frame (mm, rad) per degree of these axes, at each view; None: k
+    is 0."""
 
     @property
     def hand_eye_covariance(self) -> Floats:
@@ -41,7 +41,7 @@ class CameraPrior:
         return self.covariance[own, own]
 
     def by_axes(self, base_from_flange: Floats) -> Floats:
-        """[v, 6, k] step of each pose [v, 4, 4] as `rotations.moved` has it, for each degree of the axes."""
+        """[v, 6, k] step of each pose [v, 4, 4], as in `rotations.moved`, per degree of the axes."""
         if self.axis_sensitivity is None:
             return np.zeros((len(base_from_flange), 6, 0))
         shift = base_from_flange[:, :3, :3] @ self.axis_sensitivity[:, :3]
@@ -51,8 +51,9 @@ class CameraPrior:
 def read_posed_camera(hand_eye: Path, camera: Path | None, about: About, size_px: tuple[int, int]) -> CameraPrior:
     """Camera and hand-eye from a hand-eye record, whose lens is its own camera's.
 
-    `camera` may name that camera's record too, as a check. `about` and `size_px` say what took the images at hand.
-    Raises InputError: a record of another kind, camera, focus, aperture or size; two records of different lenses.
+    `camera` may name that camera's record too, as a check. `about` and `size_px` describe the camera of the
+    images. Raises InputError: a record of another kind, camera, focus, aperture or size; two records of different
+    lenses.
     """
     record = read_earlier(hand_eye, "hand-eye", about, size_px)
     prior = _prior(record)

@@ -1,4 +1,4 @@
-"""Robot poses as a file gives them, and the conventions that they may be meant in.
+"""Robot poses from a file, and the conventions that their numbers may follow.
 
 ::
 
@@ -31,7 +31,7 @@ _AXES = np.eye(3)
 
 
 class Convention(Model):
-    """What the numbers of a pose mean: x y z, then the rotation."""
+    """Convention of the numbers of a pose: x y z, then the rotation."""
 
     length_unit: Literal["mm", "m"] = "mm"
     angle_unit: Literal["deg", "rad"] = "deg"
@@ -58,7 +58,7 @@ class PoseFile(Convention):
 
 @dataclass(frozen=True)
 class ReportedPoses:
-    """Poses as numbers, and what they are said to mean."""
+    """Poses as numbers, and their stated convention."""
 
     numbers: Floats
     """[n, 6], or [n, 7] with quaternions."""

@@ -1,9 +1,9 @@
-"""The record of a calibration: what was found, how well, from what, and where it holds.
+"""The record of a calibration: result, uncertainty, inputs and validity.
 
-A YAML file that people read and programs trust: it carries a SHA-256 of its own content, so that a record which
-was edited by hand is refused. Values of a rigid transform are given as people write them (mm, KUKA's A B C); their
-uncertainty is that of a small step: `x_mm y_mm z_mm` along the axes of the frame on the left of the transform's
-name, `rx_deg ry_deg rz_deg` about those of the frame on the right.
+A YAML file with a SHA-256 of its own content, so that a record which was edited by hand is refused. Values of a
+rigid transform are given in mm and KUKA's A B C; their uncertainty is that of a small step: `x_mm y_mm z_mm` along
+the axes of the frame on the left of the transform's name, `rx_deg ry_deg rz_deg` about those of the frame on the
+right.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Kind = Literal[
     "camera", "chromatic", "hand-eye", "leds", "mesh", "flat-field", "dark", "response", "led-power", "drift"
 ]
 SEAL = "# A calibration of Coupole"
-"""How a record's file begins."""
+"""First words of a record's file."""
 _STEPS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
 _MOST_ASYMMETRY = 1e-9
 
@@ -47,17 +47,17 @@ class Parameter(Model):
     name: Annotated[str, Field(min_length=1)]
     """With its unit: `fx_px`, `flange_from_camera.x_mm`."""
     value: float | None
-    """None for small turns: the transform itself has the angles."""
+    """None for the rotations of a small step: the transform itself has the angles."""
     u: NotNegative
     """Standard uncertainty, in the name's unit."""
     degrees_of_freedom: Positive
-    """Behind that uncertainty; intervals follow Student's distribution."""
+    """Effective, of that uncertainty; intervals follow Student's distribution."""
     dominated_by: str
-    """What causes most of its variance."""
+    """The largest source of its variance."""
 
 
 class Noise(Model):
-    """What the residuals say of one kind of observation."""
+    """Stated and estimated noise of one kind of observation."""
 
     name: str
     unit: str
@@ -67,7 +67,7 @@ class Noise(Model):
 
 
 class ImageResidual(Model):
-    """How one image fits."""
+    """Residual of one image."""
 
     name: str
     corners: Count
@@ -76,16 +76,16 @@ class ImageResidual(Model):
 
 
 class Limit(Model):
-    """One acceptance limit and how the calibration stands against it."""
+    """One acceptance limit and the figure that it limits."""
 
     what: str
     found: float
     limit: float
     unit: str
     name: str | None = Field(default=None, exclude_if=_not_said)
-    """What `--limit` calls it; None where an operator cannot set it."""
+    """Name for `--limit`; None if an operator cannot set it."""
     usual: float | None = Field(default=None, exclude_if=_not_said)
-    """What the limit is unless an operator sets another; None if it is that."""
+    """Default of the limit if the operator set another; else None."""
 
     @property
     def passed(self) -> bool:
@@ -101,7 +101,7 @@ class Input(Model):
 
 
 class Validity(Model):
-    """Where a record may be used. What is None was not known and is not checked."""
+    """Conditions under which a record holds. What is None was not known and is not checked."""
 
     expires: AwareDatetime
     camera: str | None = None
@@ -142,7 +142,7 @@ class Record(Model):
     limits: tuple[Limit, ...]
     """Acceptance limits; all must be met."""
     remarks: tuple[str, ...]
-    """What a person should know: methods that disagree, corners that were left out."""
+    """For the operator: methods that disagree, corners that were left out."""
     inputs: Annotated[tuple[Input, ...], Field(min_length=1)]
     sha256: Sha256
 
@@ -161,20 +161,20 @@ class Record(Model):
 
 
 def sealed(**content: Any) -> Record:
-    """A record of this content, with its hash. Raises pydantic's ValidationError for content that is none."""
+    """A record of this content, with its hash. Raises pydantic's ValidationError for invalid content."""
     unsealed = Record.model_construct(**content, schema_version=1, sha256="")
     plain = json.loads(unsealed.model_dump_json(exclude={"sha256"}))
     return Record.model_validate_json(json.dumps({**plain, "sha256": content_sha256(plain)}))
 
 
 def content_sha256(plain: dict[str, Any]) -> str:
-    """Of a record's content as JSON has it, without its own hash: keys sorted, no spaces."""
+    """Of a record's content as JSON (keys sorted, no spaces), without its own hash."""
     rest = {key: value for key, value in plain.items() if key != "sha256"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def write_record(path: Path, record: Record) -> None:
-    """Write a record; a file that is there is whole. Raises StorageError."""
+    """Write a record atomically. Raises StorageError."""
     plain = json.loads(record.model_dump_json())
     text = f"{SEAL}. It carries its own checksum: do not edit it, calibrate anew.\n"
     partial = path.with_name(f".{path.name}.part")
@@ -191,8 +191,8 @@ def write_record(path: Path, record: Record) -> None:
 
 
 def read_record(path: Path) -> Record:
-    """Read a record back. Raises InputError with all problems: wrong keys, an edited record, a covariance that is
-    none."""
+    """Read a record back. Raises InputError with all problems: wrong keys, an edited record, an invalid
+    covariance."""
     document = yamlfile.read(path)
     record = document.validate(Record)
     plain = json.loads(record.model_dump_json())
@@ -207,7 +207,7 @@ def read_record(path: Path) -> Record:
 
 
 def rows_of(matrix: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
-    """A covariance as records keep it: symmetric to the last bit."""
+    """A covariance as records keep it: exactly symmetric."""
     symmetric = 0.5 * (matrix + matrix.T)
     return tuple(tuple(map(float, row)) for row in symmetric)
 
@@ -226,7 +226,7 @@ def step_names(transform: str) -> tuple[str, ...]:
 def _covariance_problems(record: Record) -> Iterator[str]:
     count = len(record.parameters)
     if [len(row) for row in record.covariance] != [count] * count:
-        yield f"expected {count} rows of {count} numbers, as there are parameters"
+        yield f"expected {count} rows of {count} numbers, one for each parameter"
         return
     covariance = record.covariance_matrix
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
@@ -262,7 +262,7 @@ def _lines(plain: dict[str, Any]) -> Iterator[str]:
 
 
 def intrinsics_of(record: Record) -> tuple[Intrinsics, tuple[str, ...]]:
-    """The lens of a record, and which of its parameters are estimated, in the covariance's order."""
+    """The lens of a record, and its estimated parameters in the covariance's order."""
     values = {p.name: p.value for p in record.parameters} | dict(record.fixed)
     named = {name.removesuffix("_px"): value for name, value in values.items()}
     lens = Intrinsics(**{name: float(named.get(name) or 0.0) for name in NAMES})

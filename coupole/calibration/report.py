@@ -30,7 +30,7 @@ BLUE, RED, GREY, DARK = "#2a6f97", "#c1121f", "#b8bec5", "#333333"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a calibration gives: its record, files that stand beside it, and how to draw it."""
+    """Result of a calibration: its record, the files beside it, and a function that draws it."""
 
     record: Record
     draw: Callable[[Figure], None]
@@ -148,7 +148,7 @@ def _parameter(parameter: Parameter) -> str:
 
 
 def _decimals(uncertainty: float) -> int:
-    """So many that two digits of the uncertainty can be seen in the value."""
+    """Number of decimals of a value that shows two digits of its uncertainty."""
     return int(np.clip(1 - np.floor(np.log10(max(uncertainty, 1e-12))), 0, 12))
 
 

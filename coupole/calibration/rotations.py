@@ -32,8 +32,8 @@ def rotation(vectors_rad: ArrayLike) -> Floats:
 def quaternion(rotations: ArrayLike) -> Floats:
     """Unit quaternions [..., 4] (w, x, y, z), w >= 0, of rotation matrices.
 
-    The column of largest norm of q q^T, which is linear in R (Bar-Itzhack, J. Guidance 23(6), 2000): no branch
-    loses digits.
+    The column of largest norm of q q^T, which is linear in R (Bar-Itzhack, J. Guidance 23(6), 2000), so that no
+    digits are lost near special angles.
     """
     r = np.asarray(rotations, dtype=np.float64)
     outer = np.empty((*r.shape[:-2], 4, 4))

@@ -1,8 +1,8 @@
-"""Where calibrations get their images: a run, or a folder of pictures with a file of poses.
+"""Images of calibrations: from a run, or from a folder of pictures with a file of poses.
 
-Of a run each view gives one image: the mean of its frames under panels or LEDs, at the longest exposure that clips
-little; dark frames are subtracted where there are some. Frames of one view are taken at one pose, so their mean
-has less noise and its corners no other place.
+Each view of a run gives one image: the mean of its frames under panels or LEDs, at the longest exposure with few
+clipped pixels, dark frames subtracted if there are any. Frames of one view are taken at one pose, so their mean
+has less noise and the same corners.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from coupole.storage.step_fields import temperature_range_c
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
 POSES_NAME, BOARD_NAME = "poses.yaml", "board.yaml"
 _MOST_FRAMES = 64
-"""Of one view: more make no corner better."""
+"""Of one view: more do not improve corners."""
 _CLIPPED = 0.02
 
 
 @dataclass(frozen=True)
 class About:
-    """What is known of the camera that took the images. None: not said."""
+    """The camera that took the images. What is None is not known."""
 
     simulated: bool
     camera: str | None = None
@@ -46,14 +46,14 @@ class About:
     focus_distance_mm: float | None = None
     f_number: float | None = None
     temperature_c: tuple[float, float] | None = None
-    """Lowest and highest temperature of the LED boards, the only ones that a run knows."""
+    """Lowest and highest temperature of the LED boards, the only ones that a run has."""
     begun: datetime | None = None
     """When the latest of the runs began."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """One image to look for the board in, read when it is asked for."""
+    """One image, read when it is used."""
 
     name: str
     read: Callable[[], Picture]
@@ -72,7 +72,7 @@ class Sources:
     """Name and SHA-256 of every file that was or will be read."""
 
     def with_file(self, path: Path | None) -> Sources:
-        """The same, made with one more file."""
+        """The same with one more input file."""
         return self if path is None else replace(self, inputs=(*self.inputs, (path.name, sha256(path))))
 
 
@@ -117,7 +117,7 @@ def _of_folder(folder: Path, poses: Path | None) -> Sources:
 
 
 def _picture(path: Path) -> Picture:
-    """In the bits and colours that the file has. Raises InputError if it is no picture."""
+    """The picture with the file's bit depth and colours. Raises InputError if it cannot be read."""
     import cv2
 
     image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
@@ -161,7 +161,7 @@ def _of_run(run: Run) -> Sources:
 
 
 def _at_one_pose(frames: Sequence[FrameProven], table: NDArray[np.void]) -> list[FrameProven]:
-    """The frames of the pose that most were taken at: an arm that was pushed aside has two in a view."""
+    """The frames of the pose with most frames: a view has two poses if the arm was moved during it."""
     taken = Counter(int(table[frame.index]["pose"]) for frame in frames)
     return [frame for frame in frames if int(table[frame.index]["pose"]) == taken.most_common(1)[0][0]]
 
@@ -169,7 +169,7 @@ def _at_one_pose(frames: Sequence[FrameProven], table: NDArray[np.void]) -> list
 def _mean_frame(
     name: str, path: Path, lit: Sequence[FrameProven], dark: Sequence[FrameProven], table: NDArray[np.void]
 ) -> Picture:
-    """Mean of the frames at the longest exposure that clips little, dark frames subtracted."""
+    """Mean of the frames at the longest exposure with few clipped pixels, dark frames subtracted."""
     layout, facts = frame_file.read_layout(path), frame_file.read_facts(path)
     exposures = {frame.shot: int(table[frame.index]["exposure_us"]) for frame in (*lit, *dark)}
     for exposure_us in sorted({exposures[frame.shot] for frame in lit}, reverse=True):
@@ -205,7 +205,7 @@ def _spread(frames: Sequence[FrameProven]) -> Iterator[FrameProven]:
 
 
 def frames_sha256(frames: Sequence[FrameProven]) -> str:
-    """Of the frames' proven checksums: the same however the file is packed or archived."""
+    """Of the frames' proven checksums, which packing and archiving do not change."""
     lines = sorted(f"{frame.shot} {frame.xxh3}" for frame in frames)
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
@@ -220,7 +220,7 @@ def poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
 
 
 def about_of(run: Run, attributes: dict[str, Any]) -> About:
-    """What a view's attributes say of camera and lens."""
+    """Camera and lens by a view's attributes."""
 
     def number(key: str) -> float | None:
         return float(attributes[key]) if key in attributes else None

@@ -1,1 +1,2 @@
-"""The commands by what they are about. Each reads its input, calls what does the work, and says how it went."""
+"""The commands of the command line, by subject. Each reads its input, calls the room that does the work, and
+prints the result."""

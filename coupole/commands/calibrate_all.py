@@ -1,4 +1,4 @@
-"""`coupole calibrate all`: every calibration of a cell, from nothing, in their order."""
+"""`coupole calibrate all`: all calibrations of a cell, in order."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def calibrate_all(
     """Dark frames, response, flat field, lens and hand-eye, LEDs and their power, an object's place: acquire and
     calibrate each.
 
-    What has a record in the folder already is left as it is, and a run that was cut off is gone on with: call it
-    again to finish. For a real cell it says what must stand on the support, and waits; a simulated one has its own
-    object and scanner.
+    A step with a record in the folder is skipped, and an interrupted run is resumed, so call it again to finish.
+    For a real cell it prints what must be on the support, and waits; a simulated one has its own object and
+    scanner.
     """
     from coupole.plan.cell import read_cell
     from coupole.plan.rig_devices import in_world
@@ -52,7 +52,7 @@ def calibrate_all(
         if MESH in (only or []):
             raise InputError(f"--only {MESH}: needs the object's scan, as `coupole scan` writes it: --scan FOLDER")
         known.remove(MESH)
-        console.print(f"{MESH}: left out, as no --scan is given")
+        console.print(f"{MESH}: skipped, as no --scan is given")
     stated = Repeatability(repeatability_mm, repeatability_deg)
     campaign = Campaign(
         rig, out, scan, stated, simulated=simulated, ask=not yes and not simulated, console=console
@@ -75,7 +75,7 @@ def calibrate_all(
 
 
 def _for_a_rig(rig: Path, records: dict[str, str]) -> str:
-    """The lines that name records of the cell, not of an object, in its rig."""
+    """The lines for the rig that name the cell's records, without those of an object."""
     folder = rig.resolve().parent
     paths = [os.path.relpath(path, folder) for kind, path in records.items() if kind != MESH]
     return "\n".join(["calibrations:", *(f"  - {path}" for path in paths)])

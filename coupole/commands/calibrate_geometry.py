@@ -45,7 +45,7 @@ def leds(
     repeatability_deg: RepeatabilityDeg = 0.003,
     tolerance_mm: Annotated[float, typer.Option(min=1e-4, help="Of LEDs on their boards, as stated.")] = 0.05,
 ) -> Work:
-    """Where all LEDs are and face, from views of the lit LEDs themselves, each seen six times or more."""
+    """Positions and normals of all LEDs, from views of the lit LEDs, each seen six times or more."""
     from coupole.calibration.leds.drawing import draw_leds
     from coupole.calibration.leds.equations import Stated
     from coupole.calibration.leds.sources import find_leds
@@ -91,7 +91,7 @@ def mesh(
     repeatability_mm: RepeatabilityMm = 0.03,
     repeatability_deg: RepeatabilityDeg = 0.003,
 ) -> Work:
-    """Where a scanned object lies in the base, by its stickers in six views or more."""
+    """Pose of a scanned object in the base, by its stickers in six views or more."""
     from coupole.calibration.calibrated_arm import has_axis_zeros
     from coupole.calibration.posed_camera import read_posed_camera
     from coupole.calibration.report import Outcome
@@ -140,8 +140,8 @@ def _base_from_support(cell: Cell) -> Transform:
 
 
 def _arm(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
-    """The rig's arm by a hand-eye record; None for a record without axis zeros. Raises InputError where the rig's
-    driver knows no model of the arm."""
+    """The rig's arm with the axis zeros of a hand-eye record; None for a record without. Raises InputError if the
+    rig's driver has no model of the arm."""
     from coupole.calibration.calibrated_arm import has_axis_zeros, read_arm
     from coupole.plan.rig_devices import planning_arm
 
@@ -157,7 +157,7 @@ def _arm(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
 
 
 def _cell(rig: Path | None, runs: list[Path]) -> Cell:
-    """The rig that is named, or that of the first run if it is still what it was."""
+    """The rig that is named, or that of the first run if its file is unchanged."""
     from coupole.plan.cell import read_cell
     from coupole.storage.run import Run, sha256
 

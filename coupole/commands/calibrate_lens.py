@@ -56,7 +56,7 @@ def chromatic(
     board: BoardOption = None,
     model: ModelOption = "brown5",
 ) -> Work:
-    """How far red and blue are seen beside green, from the images that give the lens."""
+    """Lateral shift of red and blue against green, from the images of a lens calibration."""
     from coupole.calibration.lens.chromatic_workflow import chromatic_from, draw_chromatic
     from coupole.calibration.report import Outcome
 
@@ -90,7 +90,7 @@ def hand_eye(
     absolute_deg: Annotated[float, typer.Option(min=1e-5, help="Of orientation, or of each axis' zero.")] = 0.02,
     model: ModelOption = "brown5",
 ) -> Work:
-    """Where the camera sits on the flange, from 10 to 60 images of a board that stands still."""
+    """Pose of the camera on the flange, from 10 to 60 images of a board that is not moved."""
     from coupole.calibration.lens.bundle import RobotNoise
     from coupole.calibration.lens.workflow import hand_eye_from
 
@@ -145,8 +145,8 @@ def _look(
 
 
 def _earlier_lens(path: Path | None, sources: Sources, found: Found) -> EarlierLens | None:
-    """The lens of a camera's record, with its covariance. Raises InputError for a record that does not hold for
-    these images."""
+    """The lens of a camera record, with its covariance. Raises InputError if the record does not hold for these
+    images."""
     from coupole.calibration.earlier import read_earlier, refuse_same_images
     from coupole.calibration.lens.equations import EarlierLens
     from coupole.calibration.record import intrinsics_of

@@ -59,7 +59,7 @@ def response(
     runs: Runs,
     dark_record: DarkOption = None,
 ) -> Work:
-    """Gain, read noise, full well and linearity from a bracket of a scene that stands still, each frame twice."""
+    """Gain, read noise, full well and linearity from a bracket of a constant scene, each frame twice."""
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.records import response_outcome
 
@@ -104,7 +104,7 @@ def led_power(
     flat: FlatOption = None,
     emission: EmissionOption = "lambertian",
 ) -> Work:
-    """Power of each LED from views of a white tile whose place is known."""
+    """Power of each LED from views of a white tile of known pose."""
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.led_power_records import led_power_outcome
 
@@ -133,9 +133,9 @@ def drift(
     flat: FlatOption = None,
     emission: EmissionOption = "lambertian",
 ) -> Work:
-    """How LED power drifted from its calibration to a run, by temperature and age, on a tile seen in some views.
+    """Drift of LED power from its calibration to a run, by temperature and age, from views of a tile.
 
-    Give the same records, and the same tile, as `led-power` had.
+    Give the same records and the same tile as for `led-power`.
     """
     from coupole.calibration.light.drift_records import drift_outcome
     from coupole.calibration.light.frames import open_light_frames
@@ -174,7 +174,7 @@ def _setting(
     flat: Path | None,
     emission: str,
 ) -> Setting:
-    """What pictures of a tile are read with. Raises InputError for files that are none."""
+    """Descriptions and calibrations that frames of a tile are read with. Raises InputError for invalid files."""
     from coupole.calibration.light.led_power_tile import Setting, calibrated_positions
     from coupole.calibration.light.spectralon import read_tile
     from coupole.calibration.light.tile_views import Positions

@@ -1,4 +1,4 @@
-"""What all `coupole calibrate` commands share: options, and how a record is written, said and refused."""
+"""What all `coupole calibrate` commands share: options; writing, printing and refusing a record."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from coupole.calibration.request import Request
 
     Work = Callable[[Console, Request], Outcome]
-    """Of a calibration, once its options are known."""
+    """The work of a calibration, its options bound."""
 else:
     Work = Callable
 
 _SUFFIXES = (".yaml", ".html", ".png", ".csv", ".h5")
-"""Of a record and what stands beside it."""
+"""Of a record and of the files beside it."""
 Paths = Annotated[
     list[Path],
     typer.Argument(help="Runs, or one folder of pictures.", show_default=False, metavar="RUN_OR_FOLDER..."),
@@ -55,7 +55,7 @@ def emission_of(name: str) -> Emission:
 def calibration(
     kind: str, *, limits: Sequence[Allowed] = (), valid_days: int = 180, lens: bool = True
 ) -> Callable[[Callable[..., Work]], Callable[..., None]]:
-    """Make a command of a function that takes its own options and returns the work to be done with them.
+    """Make a command from a function that takes the calibration's options and returns the work to do.
 
     All commands have `--out`, `--name`, `--valid-days` and `--json` besides; `--limit` where the calibration has
     `limits`, and `--lens` where records are of one lens.
@@ -106,9 +106,9 @@ def _calibrate(
     limit: Sequence[str] | None = None,
     limits: Sequence[Allowed],
 ) -> None:
-    """Do the work, write record, files and report, say what was found, refuse what misses its limits.
+    """Do the work, write record, files and report, print the result, refuse a record that exceeds its limits.
 
-    `limit` is what the operator said of the calibration's `limits`.
+    `limit` are the operator's settings of the calibration's `limits`.
     """
     from coupole.calibration.report import write_outcome
     from coupole.calibration.request import Request
@@ -150,7 +150,7 @@ def _calibrate(
 
 
 def _refuse_name(name: str | None) -> None:
-    """Raise InputError for a name that no record may have."""
+    """Raise InputError for a name that is not valid for a record."""
     from pydantic import TypeAdapter, ValidationError
 
     from coupole.plan.plan import Name
@@ -165,7 +165,7 @@ def _refuse_name(name: str | None) -> None:
 
 @contextmanager
 def bar(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar; yields how to move it: done, total."""
+    """A progress bar; yields the function that advances it: done, total."""
     from rich.progress import Progress
 
     with Progress(console=console, disable=not console.is_terminal) as bars:
@@ -174,7 +174,7 @@ def bar(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def _show(console: Console, record: Record) -> None:
-    """The figures, for people."""
+    """Print the figures as text."""
     from rich.table import Table
 
     for name, pose in record.transforms.items():
@@ -197,7 +197,7 @@ def _show(console: Console, record: Record) -> None:
 
 
 def _figures(record: Record) -> dict[str, Any]:
-    """The figures, for programs."""
+    """The figures, for JSON."""
     return {
         "kind": record.kind,
         "accepted": record.passed,

@@ -1,4 +1,4 @@
-"""A campaign of calibrations: its steps in their order, and the folder that holds what they need and find."""
+"""A campaign of calibrations: its steps in order, and the folder with their inputs and results."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ OBJECT: Mapping[str, Any] = {
     "abc_deg": [25.0, 0.0, 0.0],
     "stickers": {"count": 24},
 }
-"""What a simulated cell has on its support for the mesh, and its scanner scans."""
+"""The object on a simulated cell's support for the mesh, which the simulated scanner scans."""
 MESH = "mesh"
 
 
@@ -49,14 +49,14 @@ class Repeatability:
 
 @dataclass(frozen=True)
 class Step:
-    """One acquisition and the records that are made from it."""
+    """One acquisition and the records made from it."""
 
     name: str
     """Of the plan, and of its template."""
     stands: str
     """What must be on the support, for the operator."""
     things: tuple[Mapping[str, Any], ...]
-    """The same for a simulated cell, which sets it up itself (`world.settings.things`)."""
+    """The same for a simulated cell, which places it itself (`world.settings.things`)."""
     records: tuple[str, ...]
 
 
@@ -79,7 +79,7 @@ STEPS = (
 class Campaign:
     """The folder of a campaign: `plans/`, `rigs/`, `runs/`, and the records with their reports.
 
-    Plans and the descriptions of board and tile that stand there are kept: change them to yours.
+    Existing plans and descriptions of board and tile are kept, so that they can be edited.
     """
 
     def __init__(
@@ -104,12 +104,12 @@ class Campaign:
                 (self._out / name).write_text(text, encoding="utf-8")
 
     def found(self) -> dict[str, str]:
-        """Records that stand, by kind."""
+        """Existing records, by kind."""
         kinds = [kind for step in STEPS for kind in step.records]
         return {kind: str(self._record(kind)) for kind in kinds if self._record(kind).is_file()}
 
     def do(self, step: Step) -> None:
-        """Acquire what is missing of a step, and calibrate what has no record yet."""
+        """Acquire the missing frames of a step, and make its missing records."""
         self._refuse_missed(step)
         todo = [kind for kind in step.records if not self._record(kind).is_file()]
         if not todo:
@@ -121,7 +121,8 @@ class Campaign:
             self._calibrations()[kind](run)
 
     def _refuse_missed(self, step: Step) -> None:
-        """Raise CalibrationRefused if a record of an earlier call missed its limits: nothing is built on it."""
+        """Raise CalibrationRefused if a record of an earlier call exceeds its limits: later steps must not use
+        it."""
         from coupole.calibration.record import read_record
 
         for kind in step.records:
@@ -161,7 +162,7 @@ class Campaign:
         return Path(found["run"])
 
     def _plan(self, step: Step) -> Path:
-        """The step's plan; one that stands there, and may have been changed by hand, is kept."""
+        """The step's plan; an existing one is kept, as it may have been edited."""
         from coupole.calibration.leds.led_plan import led_plan
         from coupole.plan.cell import read_cell
         from coupole.plan.templates import LEDS, TEMPLATES
@@ -178,7 +179,8 @@ class Campaign:
         return path
 
     def _rig_of(self, step: Step) -> Path:
-        """The rig; of a simulated cell a copy with the step's things on the support, kept as it stands there."""
+        """The rig; for a simulated cell a copy with the step's things on the support, which is kept if it
+        exists."""
         path = self._out / "rigs" / f"{step.name}.yaml"
         if not self._simulated:
             return self._rig
@@ -198,7 +200,7 @@ class Campaign:
         return path
 
     def _scan(self) -> Path:
-        """The object's scan; a simulated cell's scanner makes one, which is taken in like any other."""
+        """The object's scan; a simulated cell's scanner makes one, which is imported like any other."""
         from coupole.plan.registry import SCANNER_EXPORT, load_class
         from coupole.viewing.scan_sheet import import_scan
 
@@ -208,7 +210,7 @@ class Campaign:
         if not folder.exists():
             export: Any = load_class(SCANNER_EXPORT)
             mesh, targets = export(OBJECT, self._out / "scanner")
-            with self._console.status("taking the scan in") as status:
+            with self._console.status("importing the scan") as status:
                 import_scan(
                     mesh,
                     targets,
@@ -224,7 +226,7 @@ class Campaign:
         return self._out / f"{kind}.yaml"
 
     def _calibrations(self) -> dict[str, Callable[[Path], None]]:
-        """How each record is made from a run, with the records before it."""
+        """For each kind, the function that makes its record from a run with the records before it."""
         record, out = self._record, self._out
         dark, response, flat = record("dark"), record("response"), record("flat-field")
         camera, hand_eye = record("camera"), record("hand-eye")

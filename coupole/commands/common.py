@@ -1,4 +1,4 @@
-"""What the commands share: arguments and options that many of them have, and errors in JSON."""
+"""What the commands share: common arguments and options, and errors in JSON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RunPath = Annotated[Path, typer.Argument(help="The run's folder.", show_default=
 
 
 def fail(error: CoupoleError, *, as_json: bool, found: dict[str, Any] | None = None) -> None:
-    """Put an error into the JSON document, if that was asked for; the caller raises it on."""
+    """Print an error as JSON if `as_json`; the caller raises it afterwards."""
     if as_json:
         document = {
             **(found or {}),

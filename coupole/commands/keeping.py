@@ -1,4 +1,4 @@
-"""Commands about what is on disk: status, verify, archive, export, scan."""
+"""Commands on stored data: status, verify, archive, export, scan."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coupole.errors import CoupoleError, InputError
 
 
 def status(run: RunPath, as_json: JsonOption = False) -> None:
-    """How far a run is; works while it goes on."""
+    """Progress of a run, also while it is running."""
     from coupole.storage.run import Run
     from coupole.storage.run import status as status_of
     from coupole.viewing.terminal import make_console, show_status

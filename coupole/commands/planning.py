@@ -1,4 +1,4 @@
-"""Commands about a plan, without any device: check, view, simulate, schema, plan new."""
+"""Commands on a plan, without devices: check, view, simulate, schema, plan new."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def check(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Say everything that can be known of a plan before a device is touched."""
+    """Check everything about a plan that can be checked without devices."""
     from coupole.preflight.checking import preflight_of
     from coupole.preflight.job import read_job, without_hidden
     from coupole.viewing.terminal import make_console, show_preflight, show_views
@@ -74,7 +74,7 @@ def view(
     show: Annotated[bool, typer.Option("--show", help="Open the page in a browser.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw a plan, refused or not: a picture (PNG) and a page to turn round (HTML)."""
+    """Draw a plan, refused or not: a picture (PNG) and an interactive page (HTML)."""
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
     from coupole.viewing.view import look_at_plan
@@ -100,7 +100,7 @@ def simulate(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Render some frames of a plan, without devices, for a look: a PNG each, and all on one sheet."""
+    """Render some frames of a plan, without devices, as a preview: a PNG each, and all on one sheet."""
     from rich.progress import Progress
 
     from coupole.preflight.job import read_job

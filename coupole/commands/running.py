@@ -23,10 +23,10 @@ def acquire(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell moves.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run a plan: check it, move, fire, prove, store.
+    """Run a plan: check it, move, trigger, prove the frames, store them.
 
     Ctrl-C stops safely (lights off, arm still) and the run can be resumed. SIGUSR1 pauses between bursts, and
-    goes on when sent again.
+    continues when sent again.
     """
     from coupole.acquisition.session import acquire_plan, rehearse
     from coupole.preflight.job import read_job
@@ -55,7 +55,7 @@ def devices(
     rig: Annotated[Path, typer.Option("--rig", help="The rig (YAML).")] = Path("configs/rigs/sim.yaml"),
     as_json: JsonOption = False,
 ) -> None:
-    """Open each device of a rig, let it say who it is and test itself, close it."""
+    """Open each device of a rig, read its identity, run its self-test, close it."""
     from rich.table import Table
 
     from coupole.acquisition.opened_cell import open_cell
@@ -97,7 +97,7 @@ def meter(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell moves.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Advise on a plan's exposure: a few pictures of each view, under a few lights, none of them kept."""
+    """Advise on a plan's exposure, by a few pictures of each view under a few lights, which are not stored."""
     from coupole.acquisition.looking import meter as meter_plan
     from coupole.preflight.exposure_advice import Request, write_plan
     from coupole.preflight.job import read_job
@@ -136,10 +136,10 @@ def live(
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page; 0: any.")] = 0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before real light is given.")] = False,
 ) -> None:
-    """Look through the camera, or at a run that goes on: figures here, pictures on a page for this machine.
+    """Live view of the camera, or of a run in progress: figures here, pictures on a page for this machine.
 
-    Of a run the folder alone is read, so it is never slowed. Of a rig or a plan (then its object's light is
-    entered in the ledger) the camera is taken; the arm is held where it stands.
+    For a run only its folder is read, so it is not slowed. For a rig or a plan (whose object's light is then
+    entered in the ledger) the camera is opened; the arm is not moved.
     """
     from coupole.acquisition.looking import watch_cell, watch_run
     from coupole.plan.cell import read_cell
@@ -162,7 +162,8 @@ def sim(
     plan: Annotated[Path | None, typer.Option("--plan", help="Put this plan's object on the support.")] = None,
     speed: Annotated[float | None, typer.Option("--speed", min=0.01, help="Pace of the world.")] = None,
 ) -> None:
-    """Serve a rig's stand-ins for other clients; prints one JSON line with their endpoints, until Ctrl-C."""
+    """Serve the simulated devices of a rig for other clients; prints one JSON line with their endpoints. Ctrl-C
+    ends it."""
     from coupole.plan.cell import read_cell
     from coupole.plan.registry import WORLD, load_class
     from coupole.preflight.job import read_job

@@ -1,4 +1,4 @@
-"""`coupole budget`: what a reflectance is uncertain by, from calibration records."""
+"""`coupole budget`: uncertainty of a reflectance, from calibration records."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def _write_report(out: Path, result: _Result) -> None:
 
 
 def _with_plan(given: tuple[InForce, ...], plan: Path | None) -> tuple[InForce, ...]:
-    """The records given, and those in force for a plan of the kinds that are not given."""
+    """The records given, and for kinds that are not given those in force for a plan."""
     from coupole.calibration.budget.records import of_use
     from coupole.preflight.job import read_job
 
@@ -167,12 +167,12 @@ def _with_plan(given: tuple[InForce, ...], plan: Path | None) -> tuple[InForce, 
 
 
 def _folder(records: tuple[InForce, ...]) -> str:
-    """What a column is called: the folder that its records stand in."""
+    """Heading of a column: the folder of its records."""
     return records[0].path.resolve().parent.name if records else "no records"
 
 
 def _spread(known: Known) -> Spread:
-    """Samples all over a dome: as many LEDs in each part of the sky above 20 degrees."""
+    """Samples over a dome: LEDs of equal density on the sphere above 20 degrees elevation."""
     from coupole.calibration.budget.budget import Geometry, spread_over
 
     steps = [(number + 0.5) / _SAMPLES for number in range(_SAMPLES)]
@@ -181,7 +181,7 @@ def _spread(known: Known) -> Spread:
 
 
 def _refuse_target(out: Path) -> None:
-    """Raise InputError where a picture's name is none, or something stands there."""
+    """Raise InputError if the name is not that of a PNG, or a file exists already."""
     if out.suffix != ".png":
         raise InputError(f"--out {out}: expected the name of a picture, as budget.png")
     for path in (out, out.with_suffix(".html"), out.with_suffix(".json")):

@@ -1,1 +1,1 @@
-"""Other programs' formats."""
+"""Export to formats of other programs."""

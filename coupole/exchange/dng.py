@@ -1,7 +1,7 @@
 """A frame as DNG (Adobe, Digital Negative Specification 1.4), for LibRaw, darktable, RawTherapee.
 
-The pixels are the camera's, bit for bit: uncompressed, 12 bits packed where they are no more, else 16. Without a
-colour calibration the colour matrix is the identity and the file says so: it shows the sensor's own colours.
+The pixels are the camera's, bit for bit: uncompressed, packed if they have 12 bits, else 16 bits each. There is no
+colour calibration, so the colour matrix is the identity, which the file states: colours are those of the sensor.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Tag:
 
 
 def encode(picture: Picture) -> bytes:
-    """The whole file: header, directory, values that have no room in it, one strip of pixels."""
+    """The whole file: header, directory, values that do not fit into it, one strip of pixels."""
     height, width = picture.pixels.shape
     twelve = width % 2 == 0 and max(picture.white_dn, int(picture.pixels.max())) < 4096
     strip = pack12(picture.pixels, "msb").tobytes() if twelve else picture.pixels.astype("<u2").tobytes()
@@ -56,7 +56,7 @@ def _image_tags(height: int, width: int, *, bits: int, strip_bytes: int) -> list
         _short(258, bits),
         _short(259, 1),  # Compression: none
         _STRIP_OFFSET,
-        _short(274, 1),  # Orientation: as it lies
+        _short(274, 1),  # Orientation: not rotated
         _short(277, 1),  # SamplesPerPixel
         _long(278, height),  # RowsPerStrip
         _long(279, strip_bytes),
@@ -103,7 +103,7 @@ def _colour_tags(pattern: str) -> list[Tag]:
 
 
 def _lay_out(tags: list[Tag]) -> tuple[bytes, bytes, int]:
-    """The directory, the values behind it, and where the strip goes (an even offset)."""
+    """The directory, the values after it, and the offset of the strip (even)."""
     values_offset = _HEADER_BYTES + 2 + _ENTRY_BYTES * len(tags) + 4
     values = bytearray()
     offsets = {}
@@ -144,4 +144,4 @@ def _rationals(number: int, values: list[Fraction], kind: int = _RATIONAL) -> Ta
 
 
 _STRIP_OFFSET = _long(273, 0)
-"""StripOffsets: known when all else is laid out."""
+"""StripOffsets: a placeholder until everything else is laid out."""

@@ -25,7 +25,7 @@ from coupole.storage.step_fields import STORED_NO_LED, board_temperature_c
 
 @dataclass(frozen=True)
 class Picture:
-    """One proven frame with what is known of it."""
+    """One proven frame with its metadata."""
 
     pixels: NDArray[np.uint16]
     """[H, W] DN, as the camera gave them."""
@@ -35,12 +35,12 @@ class Picture:
     white_dn: int
     exposure_us: int
     about: dict[str, Any]
-    """Goes into the file as JSON: shot, LED, exposure, pose, lens, `simulated`, run."""
+    """Stored in the file as JSON: shot, LED, exposure, pose, lens, `simulated`, run."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What `export_run` wrote."""
+    """Number and size of the files that `export_run` wrote."""
 
     files: int
     bytes: int
@@ -56,11 +56,11 @@ def export_run(
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Exported:
-    """Write the proven frames whose view and whose label (`led0417/e0`) match any of some patterns (`*` and `?`;
-    none: all) into `folder`, as `<view>_led0417_e0.<to>`.
+    """Write proven frames into `folder`, as `<view>_led0417_e0.<to>`. View and label (`led0417/e0`) must each
+    match one of the patterns (`*` and `?`); without patterns all do.
 
-    Raises InputError if nothing matches or a file stands there already (unless `overwrite`), before anything is
-    written; ChecksumMismatch if a frame is not what was proven, DiskFull or StorageError.
+    Raises InputError if nothing matches or a file exists already (unless `overwrite`), before anything is written;
+    ChecksumMismatch if a frame is not what was proven, DiskFull or StorageError.
     """
     encode = _encoder(to)
     frames = [
@@ -138,14 +138,14 @@ def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
 
 
 def _poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
-    """Measured poses of a view, and what its file says of object, lens and gain, as JSON takes it."""
+    """Measured poses of a view, and the attributes of its file (object, lens, gain) in JSON types."""
     with h5py.File(path, "r") as file:
         attributes = {k: v for k, v in file["entry"].attrs.items() if k not in ("NX_class", "default")}
         return file[frame_file.POSES][:], {key: np.asarray(value).tolist() for key, value in attributes.items()}
 
 
 def _write(path: Path, content: bytes) -> int:
-    """A file that is there is whole: it gets its name when its bytes are written."""
+    """Write atomically: the file gets its name when all its bytes are written."""
     partial = path.with_name(f".{path.name}.part")
     try:
         partial.write_bytes(content)

@@ -1,4 +1,4 @@
-"""A triangle mesh, and what every reader of one expects of its file."""
+"""A triangle mesh, and the checks that all readers share."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from coupole.errors import InputError
 from coupole.scan.mesh_text import OK, TOO_FEW
 
 CHUNK = 4_000_000
-"""Records that are converted at once."""
+"""Number of records that are converted at a time."""
 MOST_VERTICES = 2**31
-"""An edge is kept as one 64-bit number (`coupole.scan.mesh_defects`)."""
+"""An edge is stored as one 64-bit number (`coupole.scan.mesh_defects`)."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def expect_records(path: Path, what: str, count: int, read: int, wanted: int | N
 
 
 def expect_finite(path: Path, points: NDArray[np.float32], where: str) -> None:
-    """`where` names a point by its number."""
+    """Raise InputError if a coordinate is not finite; `where` is a format string for the number of the point."""
     bad = _first_not_finite(points.reshape(-1, 3))
     if bad >= 0:
         xyz = ", ".join(f"{value:g}" for value in points.reshape(-1, 3)[bad])

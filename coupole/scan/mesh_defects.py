@@ -1,4 +1,4 @@
-"""What a scanned mesh may have wrong though its file is whole: looked for, counted, and placed."""
+"""Defects of a scanned mesh whose file is valid: their numbers and places."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from numpy.typing import NDArray
 from coupole.scan.mesh import Mesh
 
 OUT_OF_PROPORTION = 200.0
-"""An edge so many times longer or shorter than the median is of another scale: mm and m differ by 1000."""
+"""An edge longer or shorter than the median by this factor has another scale: mm and m differ by 1000."""
 _ODD_SHARE = 1e-3
 _SAMPLE = 1_000_000
 
 
 @dataclass(frozen=True)
 class Defects:
-    """Counts, and where the first of each is: a triangle's number, or -1."""
+    """Counts, and the number of the first triangle with each defect, or -1."""
 
     non_manifold_edges: int
     first_non_manifold: int
     """Edges with three triangles or more."""
     flipped_edges: int
     first_flipped: int
-    """Edges whose two triangles go round in opposite senses: one shows its inside."""
+    """Edges whose two triangles have opposite orientations: one shows its inside."""
     open_edges: int
     """Edges with one triangle: rims of holes."""
     degenerate: int
     first_degenerate: int
     """Triangles without area."""
     odd_scale: int
-    """A triangle of another scale than the rest, where more than a few are so; -1 where not."""
+    """A triangle of another scale than the others if there are more than a few of these; else -1."""
 
 
 def find_defects(mesh: Mesh) -> Defects:
-    """Look at all edges and triangles. Needs 24 bytes a triangle beside the mesh."""
+    """Check all edges and triangles. Needs 24 bytes per triangle beside the mesh."""
     degenerate, first_degenerate = _degenerate(mesh.vertices, mesh.triangles)
     keys = np.empty(3 * len(mesh.triangles), np.uint64)
     _fill_edge_keys(mesh.triangles, keys)
@@ -55,7 +55,7 @@ def find_defects(mesh: Mesh) -> Defects:
 
 
 def longest_edges(mesh: Mesh, triangles: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """[n] of some of a mesh's triangles [n, 3], in the mesh's unit."""
+    """[n] longest edge of each of these triangles [n, 3], in the mesh's unit."""
     corners = mesh.vertices[triangles].astype(np.float64)
     edges: NDArray[np.float64] = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     return edges
@@ -88,7 +88,7 @@ def _degenerate(vertices, triangles):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _fill_edge_keys(triangles, keys):  # type: ignore[no-untyped-def]
-    """Lower vertex, higher vertex, and in the last bit which way round the triangle goes."""
+    """Keys of lower vertex, higher vertex and, in the last bit, the orientation of the triangle."""
     for t in range(len(triangles)):
         for k in range(3):
             a, b = np.uint64(triangles[t, k]), np.uint64(triangles[t, (k + 1) % 3])
@@ -100,7 +100,8 @@ def _fill_edge_keys(triangles, keys):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _judge_edges(keys):  # type: ignore[no-untyped-def]
-    """Number of open edges; number and first key of edges with too many triangles; the same of those turned."""
+    """Number of open edges; number and first key of edges with more than two triangles; the same for flipped
+    edges."""
     none = np.uint64(0)
     open_edges, crowded, turned, first_crowded, first_turned = 0, 0, 0, none, none
     at = 0

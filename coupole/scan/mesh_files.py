@@ -1,8 +1,8 @@
 """Triangle meshes of up to tens of millions of triangles: PLY, STL and OBJ, read at the speed of the disk.
 
-What cannot be right is refused, with its place: a file that ends too early, coordinates that are no finite
-numbers, corners that do not exist, faces that are no triangles, nothing at all. Memory stays within about three
-times what vertices and triangles take themselves.
+Invalid files are refused with the place of the error: a file that ends too early, coordinates that are not finite,
+corners that do not exist, faces that are not triangles, no faces. Memory stays within about three times that of
+vertices and triangles.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from coupole.scan.mesh_stl import read_stl
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read a mesh by its ending: .ply, .stl or .obj. Raises InputError with the place of what is wrong.
+    """Read a mesh, its format by the suffix: .ply, .stl or .obj. Raises InputError with the place of the error.
 
-    Vertices of an STL, which repeats them for each triangle, are those with the same coordinates, bit by bit.
+    An STL repeats vertices for each triangle; those with bitwise equal coordinates become one.
     """
     readers: dict[str, Callable[[Path], Mesh]] = {".ply": read_ply, ".stl": read_stl, ".obj": read_obj}
     if path.suffix.lower() not in readers:

@@ -1,4 +1,4 @@
-"""OBJ: vertices and faces; everything else is passed over."""
+"""OBJ: vertices and faces; everything else is ignored."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coupole.scan.mesh_text import BAD_CORNER, NOT_A_NUMBER, OK
 
 
 def read_obj(path: Path) -> Mesh:
-    """Raises InputError with the line of what is wrong."""
+    """Read an OBJ. Raises InputError with the line of the error."""
     data = mesh_text.mapped(path)
     count, triangles_count, bad_line = _count_obj(data)
     if bad_line:
@@ -30,7 +30,7 @@ def read_obj(path: Path) -> Mesh:
 
 @numba.njit(cache=True, nogil=True)
 def _obj_line(data, at, end):  # type: ignore[no-untyped-def]
-    """1 for a vertex, 2 for a face, 0 for anything else; and where its words begin."""
+    """1 for a vertex, 2 for a face, 0 for anything else; and the offset of its first value."""
     at = mesh_text.skip_blanks(data, at, end)
     if at + 1 < end and (data[at + 1] == 32 or data[at + 1] == 9):
         if data[at] == 118:
@@ -63,7 +63,8 @@ def _count_obj(data):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _fill_obj(data, vertices, triangles):  # type: ignore[no-untyped-def]
-    """Faces with more corners become fans; negative corners count back from the last vertex."""
+    """Faces with more than three corners become triangle fans; negative corners count back from the last
+    vertex."""
     at, line, v, t = 0, 1, 0, 0
     while at < len(data):
         end = mesh_text.line_end(data, at)

@@ -1,4 +1,4 @@
-"""PLY: text, or binary in either byte order, with whatever other properties."""
+"""PLY: text, or binary in either byte order; other properties are skipped."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class _Element:
 
 
 def read_ply(path: Path) -> Mesh:
-    """Raises InputError with the place of what is wrong."""
+    """Read a PLY. Raises InputError with the place of the error."""
     file_format, elements, at, line = _ply_header(path)
     if file_format == "ascii":
         return _read_ascii_ply(path, elements, at, line)
@@ -56,7 +56,7 @@ def read_ply(path: Path) -> Mesh:
 
 
 def _ply_header(path: Path) -> tuple[str, list[_Element], int, int]:
-    """Format, elements, and byte and line at which the data begin."""
+    """Format, elements, and the byte and line at which the data begin."""
     elements: list[_Element] = []
     file_format = ""
     with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""STL: binary, whatever its header says, or text. It repeats vertices for each triangle."""
+"""STL, binary or text. It repeats vertices for each triangle."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _STL_HEADER_BYTES = 80
 
 
 def read_stl(path: Path) -> Mesh:
-    """Binary, whatever its header says, if its size is what its count asks for; else text."""
+    """Read an STL: as binary if its size agrees with its count of triangles, whatever its header; else as text."""
     size = path.stat().st_size
     with path.open("rb") as file:
         header = file.read(_STL_HEADER_BYTES)
@@ -96,7 +96,7 @@ def _fill_ascii_stl(data, word, points):  # type: ignore[no-untyped-def]
 
 
 class _Welder:
-    """Gives corners with the same coordinates the same number, in order of first sight."""
+    """Gives corners with equal coordinates the same number, in order of first occurrence."""
 
     def __init__(self, triangles: int) -> None:
         slots = 1 << max(4, int(np.ceil(np.log2(max(1, triangles) * 1.5))))
@@ -110,7 +110,7 @@ class _Welder:
         out = self._triangles.reshape(-1)[3 * self._filled :]
         while done < len(points):
             done, self._known = _weld(points, done, self._slots, self._vertices, self._known, out)
-            if done < len(points):  # room runs out: more vertices than a closed surface has
+            if done < len(points):  # not enough room: more vertices than a closed surface has
                 self._vertices = np.concatenate([self._vertices, np.empty_like(self._vertices)])
                 self._slots = np.full(2 * len(self._slots), -1, np.int64)
                 _fill_slots(self._slots, self._vertices, self._known)
@@ -122,7 +122,7 @@ class _Welder:
 
 @numba.njit(cache=True, nogil=True)
 def _slot(slots, vertices, x, y, z):  # type: ignore[no-untyped-def]
-    """Where a point stands, or could: open addressing, from a mix of its coordinates' bits."""
+    """Slot of a point in the hash table (open addressing), or the free slot for it."""
     key = np.empty(3, np.float32)
     key[0], key[1], key[2] = x + np.float32(0.0), y + np.float32(0.0), z + np.float32(0.0)  # -0 becomes 0
     bits = key.view(np.uint32)

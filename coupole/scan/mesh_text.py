@@ -1,6 +1,6 @@
 """Numbers in text files of gigabytes: lines, tokens and decimal numbers of a byte array, in compiled code.
 
-A file is mapped, never loaded; it is gone through once to count and once to fill arrays of the right size.
+A file is mapped, not loaded; it is read once to count and once to fill arrays of the right size.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 OK, NOT_A_NUMBER, TOO_FEW, BAD_CORNER = 0, 1, 2, 3
 _NEWLINE, _SPACE, _TAB, _RETURN = 10, 32, 9, 13
 _DIGITS = 18
-"""More of them do not fit a 64-bit integer; what comes after them is below a float64's resolution."""
+"""More do not fit into a 64-bit integer; further digits are below the resolution of float64."""
 
 
 def mapped(path: Path) -> NDArray[np.uint8]:
-    """A file's bytes, read as they are used."""
+    """A file's bytes, mapped into memory."""
     if path.stat().st_size == 0:
         return np.zeros(0, np.uint8)
     with path.open("rb") as file:
@@ -28,7 +28,7 @@ def mapped(path: Path) -> NDArray[np.uint8]:
 
 @numba.njit(cache=True, nogil=True)
 def line_end(data, at):  # type: ignore[no-untyped-def]
-    """Place of the newline that ends the line at `at`, or the end of the data."""
+    """Offset of the newline that ends the line at `at`, or the end of the data."""
     while at < len(data) and data[at] != _NEWLINE:
         at += 1
     return at
@@ -50,7 +50,7 @@ def token_end(data, at, end):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def whole(data, at, end):  # type: ignore[no-untyped-def]
-    """The whole number at `at`, the place after it, and whether there was one."""
+    """The integer at `at`, the offset after it, and whether there was one."""
     negative = at < end and data[at] == 45
     if at < end and (data[at] == 45 or data[at] == 43):
         at += 1
@@ -63,7 +63,7 @@ def whole(data, at, end):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def decimal(data, at, end):  # type: ignore[no-untyped-def]
-    """The decimal number at `at` (also nan and inf, as NaN), the place after it, and whether there was one."""
+    """The decimal number at `at` (also nan and inf, as NaN), the offset after it, and whether there was one."""
     stop = token_end(data, at, end)
     negative = at < stop and data[at] == 45
     if at < stop and (data[at] == 45 or data[at] == 43):

@@ -1,4 +1,4 @@
-"""A scan as it is kept: in mm, in one folder with what was found; plans and calibrations name the mesh from there.
+"""A stored scan: in mm, in one folder with its facts; plans and calibrations refer to the mesh in this folder.
 
 The folder holds `mesh.ply` (binary, float32 mm), `targets.csv`, `scan.json`, and a picture, `scan.png`.
 """
@@ -31,7 +31,7 @@ _SAMPLE = 1_000_000
 
 @contextmanager
 def new_scan_folder(folder: Path) -> Iterator[Path]:
-    """A folder to write into, which becomes `folder` when all went well and is gone otherwise.
+    """A temporary folder to write into, which is renamed to `folder` on success and removed otherwise.
 
     Raises InputError if `folder` is there already, StorageError if nothing can be written.
     """
@@ -52,9 +52,9 @@ def new_scan_folder(folder: Path) -> Iterator[Path]:
 
 
 def write_scan(scan: Scan, sources: Sequence[Path], unit: str, folder: Path) -> dict[str, Any]:
-    """Write `mesh.ply`, `targets.csv` and `scan.json` into a folder; returns what `scan.json` says.
+    """Write `mesh.ply`, `targets.csv` and `scan.json` into a folder; returns the content of `scan.json`.
 
-    `sources` are the scanner's files, `unit` the mesh's there. Raises OSError.
+    `sources` are the scanner's files, `unit` is the mesh's unit in them. Raises OSError.
     """
     found = {
         "schema_version": 1,
@@ -110,7 +110,7 @@ def edges_mm(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def target_distances_mm(targets_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """From each target to the next [n], and between all pairs [n (n - 1) / 2]."""
+    """From each target to the nearest other one [n], and between all pairs [n (n - 1) / 2]."""
     from scipy.spatial.distance import pdist, squareform
 
     pairs_mm: NDArray[np.float64] = pdist(targets_mm)

@@ -1,7 +1,7 @@
-"""What a hand-held laser scanner exports (Creaform VXelements): the object's mesh and its positioning targets.
+"""Export of a hand-held laser scanner (Creaform VXelements): the object's mesh and its positioning targets.
 
-An STL of VXelements says so in its header and has attribute bytes that mean nothing here. All lengths are brought
-to mm; the frame is the scanner's own.
+An STL of VXelements is named so in its header and has attribute bytes, which are ignored. All lengths are
+converted to mm; the frame is the scanner's.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from coupole.scan.targets import Targets
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "in": 25.4}
 PLAUSIBLE_MM = (2.0, 3000.0)
-"""Size of an object, corner to corner of its box: the support is 1.48 m wide."""
+"""Diagonal of an object's bounding box: the support is 1.48 m wide."""
 _TARGETS_BEYOND = 3.0
-"""Targets stand on the object or round it, within so many sizes of it."""
+"""Targets are on the object or around it, within this many sizes of it."""
 
 Progress = Callable[[str], None]
 
@@ -49,17 +49,17 @@ def read_scan(
     accept_defects: bool = False,
     progress: Progress = lambda what: None,
 ) -> Scan:
-    """Read mesh and targets and look for what is wrong with them.
+    """Read mesh and targets and check them.
 
-    `unit` is the mesh's (mm, cm, m, um, in), `targets_unit` the table's: what it says itself, else the mesh's.
-    With `accept_defects` a mesh is taken though edges have more than two triangles or turn its inside out; these
-    are counted, not mended. Raises InputError.
+    `unit` is the mesh's (mm, cm, m, um, in), `targets_unit` the table's; without it, the unit in the table, else
+    the mesh's. With `accept_defects` a mesh is accepted although edges have more than two triangles or opposite
+    orientations; these are counted, not repaired. Raises InputError.
     """
     progress("reading the mesh")
     raw = mesh_files.read_mesh(mesh_path)
     mesh = Mesh((raw.vertices * np.float32(MM_PER_UNIT[unit])), raw.triangles)
     _expect_plausible(mesh_path, mesh, unit)
-    progress("looking at its edges")
+    progress("checking its edges")
     defects = mesh_defects.find_defects(mesh)
     _refuse(mesh_path, mesh, defects, accept_defects=accept_defects)
     if targets_path is None:

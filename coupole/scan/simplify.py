@@ -1,4 +1,4 @@
-"""Large meshes made small."""
+"""Simplification of large meshes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 def simplified(
     vertices_mm: NDArray[np.float64], faces: NDArray[np.int64], faces_at_most: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices [n, 3] and faces [m, 3] of about the same shape with fewer faces: the vertices in a cell of a grid
-    become one, in cells as large as it takes."""
+    """Vertices [n, 3] and faces [m, 3] of about the same shape with fewer faces: the vertices in each cell of a
+    grid are merged, with cells as large as needed."""
     size_mm = float(np.ptp(vertices_mm, axis=0).max(initial=0.0))
     cells, found = 512, (vertices_mm, faces)
     while len(found[1]) > faces_at_most:

@@ -1,8 +1,8 @@
-"""Tables of positioning targets (retro-reflective stickers) as text: what VXelements and spreadsheets write.
+"""Tables of positioning targets (retro-reflective stickers) as text, from VXelements or spreadsheets.
 
-No real file of the scanner could be examined, so more is understood than may be needed: remarks, tabs, commas,
-semicolons or blanks between columns, decimal commas, a line of headings, a name in front, normals behind.
-What could be read in two ways is refused with its line.
+No file of the real scanner was available, so many variants are read: comments; tabs, commas, semicolons or blanks
+between columns; decimal commas; a line of headings; a name in the first column; normals in the last ones. An
+ambiguous line is refused with its number.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Targets:
     centers: NDArray[np.float64]
     normals: NDArray[np.float64] | None
     unit: str
-    """What the file itself says; empty if it says nothing."""
+    """Unit in the file; empty if there is none."""
 
 
 def read_targets(path: Path) -> Targets:
-    """Read a table of targets. Raises InputError with the line of what is wrong or could be read in two ways."""
+    """Read a table of targets. Raises InputError with the number of an invalid or ambiguous line."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except FileNotFoundError:
@@ -67,7 +67,7 @@ def _unit(found: str) -> str:
 
 
 def _words(line: str, path: Path, number: int) -> list[str]:
-    """A line's columns. A comma is a decimal comma where other separators part the columns."""
+    """A line's columns. A comma is a decimal comma if another separator is between the columns."""
     text = line.strip()
     if ";" in text or "\t" in text:
         words = [word.strip().replace(",", ".") for word in re.split(r"[;\t]+", text.rstrip(";\t"))]

@@ -26,8 +26,8 @@ CURE = 3.0
 """A hypothesis that reduces the scatter by this factor is a likely cause."""
 _NO_WORSE = 0.7
 _WORTH_A_LOOK = 0.3
-"""Share of the expected scatter above which hypotheses are tried: a moved board may be hidden in the noise that is
-stated for a poor robot."""
+"""Scatter over the expected one, above which single faults are looked for: a moved board may be hidden in the
+noise that is stated for a poor robot."""
 _AS_GOOD = 1.5
 """Hypotheses whose scatter is within this factor of the best are ranked by how little they change."""
 _DEPTH_WORSE = 5.0

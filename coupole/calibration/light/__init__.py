@@ -1,10 +1,10 @@
-"""Sensor, lens and LEDs as radiometers.
+"""Radiometry of sensor, lens and LEDs.
 
 ::
 
-    frames.py       the frames of runs, as these calibrations read them
-    dark.py response.py flat_field*.py  the sensor's offset, gain and linearity; the lens's fall-off
-    led_power*.py   power of each LED on a white tile: spectralon.py, irradiance.py
-    drift*.py       how that changed until a run, on a tile that stands in it
-    records.py      frames to records; limits.py, drawing.py: what is accepted and shown
+    frames.py       the frames of runs, as these calibrations read them; pairs.py: pairs of equal exposure
+    dark.py photon_transfer.py linearity.py flat_field*.py  offset, gain and linearity of the sensor; fall-off
+    led_power*.py   power of each LED, by a white tile: tile_views.py, spectralon.py, irradiance.py
+    drift*.py       change of the power until a run, by a tile that is in the run's views
+    records.py      from frames to records; acceptance.py, drawing.py: acceptance limits and pictures
 """

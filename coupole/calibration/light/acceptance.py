@@ -1,4 +1,4 @@
-"""What radiometric calibrations must reach to be accepted; uncertainties are relative."""
+"""Acceptance limits of the radiometric calibrations; uncertainties are relative."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What a sensor gives without light: each pixel's offset and dark current, noise, hot pixels.
+"""A sensor without light: offset, dark current and noise of each pixel, hot pixels.
 
 A pixel's dark signal is offset + current * exposure * 2^((T - T0) / doubling): EMVA 1288 release 4.0, section 7,
-with the usual law of temperature, which counts as known. Frames are looked at one by one, so memory does not grow
-with their number: sums of y, y^2 and y t over the frames are all that a straight line through each pixel needs.
+with a doubling temperature that is taken as known. Frames are read one by one, so memory does not grow with their
+number: the straight line of each pixel needs only the sums of y, y^2 and y t over the frames.
 
 Read and row noise come from differences of two frames of one exposure, in which all fixed patterns cancel.
 """
@@ -19,13 +19,13 @@ from coupole.errors import InputError
 
 Maps = NDArray[np.float32]
 HOT_SIGMA = 8.0
-"""A pixel is hot if its dark current lies so many robust standard deviations above the median."""
+"""Robust standard deviations above the median, beyond which a pixel's dark current makes it hot."""
 _ROUNDING = 1.0 / 12.0
 """Variance of rounding to whole DN (EMVA 1288 release 4.0, section 2.4)."""
 _MAD = 1.4826
 _LEAST_FRAMES = 4
 _LIT = 10.0
-"""A frame whose mean lies so many times the others' scatter off the line was not dark."""
+"""A frame whose mean lies above the line by more than this, over the scatter of the others, was not dark."""
 _LIT_DN = 0.5
 
 
@@ -62,7 +62,7 @@ class Dark:
     hot: NDArray[np.int64]
     """[hot, 2] row and column of hot pixels, the hottest first."""
     reference_c: float | None
-    """None if no frame's temperature was known; then the maps hold for that of the frames."""
+    """None if not all frames have a temperature; the maps then hold for the temperature of the frames."""
     doubling_k: float
     levels: tuple[tuple[float, float, float], ...]
     """Exposure (s), temperature (C), mean DN of each frame."""
@@ -89,10 +89,11 @@ def calibrate_dark(
     doubling_k: float = 6.5,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Dark:
-    """A line through each pixel of frames without light.
+    """Fit a line to each pixel of frames without light.
 
-    `doubling_k` is the warming that doubles dark current: a figure of silicon (Janesick, Photon Transfer, 2007,
-    section 11.1.2), believed. Raises InputError: too few frames or exposures, frames with light, saturated ones.
+    `doubling_k` is the rise of temperature that doubles dark current: a figure of silicon (Janesick, Photon
+    Transfer, 2007, section 11.1.2), which is not estimated. Raises InputError: too few frames or exposures, frames
+    with light, saturated ones.
     """
     listed = sorted(frames, key=lambda frame: (frame.exposure_s, frame.temperature_c))
     exposures = {frame.exposure_s for frame in listed}
@@ -139,7 +140,7 @@ def calibrate_dark(
 
 
 def hot_pixels(current_dn_per_s: Maps, sigma: float = HOT_SIGMA) -> NDArray[np.int64]:
-    """[hot, 2] row and column of pixels whose dark current stands out, the hottest first."""
+    """[hot, 2] row and column of pixels with a high dark current, the hottest first."""
     median = np.median(current_dn_per_s)
     spread = _MAD * np.median(np.abs(current_dn_per_s - median))
     places = np.argwhere(current_dn_per_s > median + sigma * max(spread, 1e-9))
@@ -173,7 +174,7 @@ def _noises(pairs: list[tuple[float, float, float]], height: int, width: int) ->
 
 
 class _Sums:
-    """Sums over frames, four maps in all: y, y t, y^2, and y of the first frame that all are counted from."""
+    """Sums over frames, four maps in all: y, y t and y^2 relative to the first frame, and the first frame."""
 
     def __init__(self) -> None:
         self._t: list[float] = []
@@ -186,7 +187,7 @@ class _Sums:
             self._maps = [np.zeros(pixels.shape, np.float32) for _ in range(3)]
         if pixels.shape != self._first.shape:
             raise InputError(f"{name}: {pixels.shape} pixels, the frames before it {self._first.shape}")
-        # Counted from the first frame the numbers stay small, and single precision keeps a thousandth of a DN.
+        # Relative to the first frame numbers are small, so that single precision resolves a thousandth of a DN.
         y = np.subtract(pixels, self._first, dtype=np.float32)
         self._t.append(t_s)
         self._maps[0] += y
@@ -208,7 +209,7 @@ class _Sums:
 
 
 def _pair_variances(a: NDArray[np.uint16], b: NDArray[np.uint16]) -> tuple[float, float]:
-    """Variance of one pixel within its row, and of the rows, of one frame, from the difference of two.
+    """Variance of a pixel within its row and variance of the rows, of one frame, from the difference of two.
 
     Pixels with shot noise of their own (hot ones) are left out.
     """
@@ -229,7 +230,7 @@ def _refuse_saturated(frame: DarkFrame, pixels: NDArray[np.uint16], white_dn: in
         )
     if float(np.mean(pixels == 0)) > 0.01:
         raise InputError(
-            f"{frame.name}: more than 1 % of a dark frame is 0, noise is cut off; raise the camera's black level"
+            f"{frame.name}: more than 1 % of a dark frame is 0, noise is clipped; raise the camera's black level"
         )
 
 
@@ -247,7 +248,7 @@ def _refuse_lit(names: list[str], t_s: NDArray[np.float64], mean_dn: NDArray[np.
 
 
 def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Theil and Sen's: median of the slopes of all pairs."""
+    """Theil-Sen estimator: median of the slopes of all pairs."""
     i, j = np.triu_indices(len(x), 1)
     apart = np.abs(x[i] - x[j]) > 1e-9
     slope = float(np.median((y[i] - y[j])[apart] / (x[i] - x[j])[apart]))

@@ -1,4 +1,4 @@
-"""Pictures of the radiometric calibrations' reports: each asks of its result what could be wrong with it."""
+"""Pictures of the radiometric calibrations' reports: each shows what may be wrong with its result."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 CHANNEL_COLOURS = {"R": RED, "G": "#2d7d46", "B": BLUE}
 _MOST_SIDE = 800
-"""Pixels of a map that a picture shows."""
+"""Largest number of pixels along a side of a map in a picture."""
 
 
 def draw_dark(dark: Dark, record: Record, figure: Figure) -> None:
@@ -108,7 +108,7 @@ def draw_flat_field(
     record: Record,
     figure: Figure,
 ) -> None:
-    """Fall-off of green, its cuts per channel with their uncertainty, what is left of it, pixels' own response."""
+    """Fall-off of green, profiles of each channel with their uncertainty, residuals, response of single pixels."""
     axes = figure.subplots(2, 2)
     green = fits["G"]
     width, height = green.size_px
@@ -178,7 +178,8 @@ def draw_led_power(powers: Mapping[str, LedPower], positions: Positions, record:
 
 
 def _dome_map(positions: Positions, ids: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places of LEDs on a flat map, degrees: seen from where their axes cross, angles to the dome's axis kept."""
+    """Positions of LEDs on a plane map, degrees: seen from the point where their axes intersect, with true angles
+    to the dome's axis."""
     centres_mm, normals = positions.of(ids)
     across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
     middle_mm = np.linalg.lstsq(across.sum(axis=0), (across @ centres_mm[:, :, None]).sum(axis=0)[:, 0])[0]
@@ -196,7 +197,7 @@ def _dome_map(positions: Positions, ids: NDArray[np.int64]) -> tuple[NDArray[np.
 
 
 def _map(ax: Axes, values: NDArray[np.float32], title: str) -> None:
-    """A map [H, W], thinned, between its 0.5 and 99.5 % quantiles."""
+    """A map [H, W], subsampled, between its 0.5 and 99.5 % quantiles."""
     step = max(1, -(-max(values.shape) // _MOST_SIDE))
     thin = values[::step, ::step]
     low, high = np.nanquantile(thin, [0.005, 0.995])

@@ -1,11 +1,11 @@
-"""Drift of the LEDs between their calibration and a run, seen on a tile that is in every run.
+"""Drift of the LEDs between their calibration and a run, measured on a tile in the run's views.
 
-A reading is the tile's signal over what the calibrated power makes of it: 1 if nothing changed. In logarithms it
-is common level + rate * hours + coefficient * (T - T0) + noise, T0 being the board's temperature when the LED's
-power was calibrated. The coefficient has a prior (white power LEDs: about -0.3 % per kelvin), since within a run
-temperature and time go up together. So each frame gets a factor of its own, from its board's temperature and its
-time, with an uncertainty. What all readings share (the tile's tilt, now and when the powers were calibrated) is
-estimated along with it, within what is known of it.
+A reading is the tile's signal over that expected from the calibrated power: 1 if nothing changed. Its logarithm is
+common level + rate * hours + coefficient * (T - T0) + noise, T0 being the board's temperature when the LED's power
+was calibrated. The coefficient has a prior (white power LEDs: about -0.3 % per kelvin), because temperature and
+time are correlated within a run. So each frame gets its own factor, by its board's temperature and its time, with
+an uncertainty. Errors that all readings share (the tile's tilt, in the run and in the calibration of the powers)
+are estimated too, with their priors.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ NAMES = ("level", "rate_per_h", "per_k")
 LEAST_READINGS = 3
 _SUDDEN_SIGMA = 5.0
 _SUDDEN = 0.003
-"""Relative: a smaller step is no matter."""
+"""Relative: smaller steps are accepted."""
 _UNKNOWN = 10.0
 _NEIGHBOURS = 11
 _ODD_SIGMA, _ODD = 6.0, 0.01
-"""A reading so far from its neighbours' median says something of its LED, not of the drift."""
+"""A reading farther than this from its neighbours' median shows a fault of its LED, not drift."""
 _NO_FIGURES: Floats = np.zeros((0, 0))
 
 
@@ -38,9 +38,9 @@ class Reading:
     name: str
     t_s: float
     warmer_k: float
-    """Temperature of the LED's board over that at which its power was calibrated; NaN if either is not known."""
+    """Temperature of the LED's board minus that at which its power was calibrated; NaN if either is not known."""
     ratio: float
-    """Signal seen over signal expected from the LED's calibrated power."""
+    """Measured signal over that expected from the LED's calibrated power."""
     u_ratio: float
     """From noise, and from the LED's own calibration."""
     by_shared: tuple[float, ...] = ()
@@ -58,7 +58,7 @@ class Drift:
     start_s: float
     """Of the first reading, on the frames' clock."""
     noise: float
-    """Relative scatter of one reading, over its stated noise if that is greater."""
+    """Relative noise of one reading: the estimated one, but not less than the stated one."""
     used: tuple[Reading, ...]
     """In their order."""
     residuals: Floats
@@ -73,7 +73,7 @@ class Drift:
         return (self.used[-1].t_s - self.used[0].t_s) / 3600.0
 
     def factor(self, warmer_k: ArrayLike, t_s: ArrayLike) -> Floats:
-        """Power now over calibrated power, of frames whose boards are so much warmer, at times [...]."""
+        """Power over calibrated power [...], by boards' temperatures relative to the calibration (K) and times."""
         value: Floats = np.exp(self._design(warmer_k, t_s) @ self.parameters)
         return value
 
@@ -98,10 +98,10 @@ def fit_drift(
     rate_per_h: float = 0.0,
     u_rate_per_h: float = 0.005,
 ) -> Drift:
-    """The factor from a run's readings; `shared_covariance` [c, c] is what is known of the shared figures, whose
-    mean is 0.
+    """The factor from a run's readings; `shared_covariance` [c, c] is the prior of the shared figures, whose mean
+    is 0.
 
-    Raises InputError: too few readings, a dark tile, a sudden change, named by the frames it lies between.
+    Raises InputError: too few readings, a dark tile, a sudden change (with the frames before and after it).
     """
     ordered = sorted(readings, key=lambda reading: reading.t_s)
     _refuse_few(ordered)
@@ -143,12 +143,12 @@ class _Solved:
     noise: Floats
     """[readings] as stated, relative."""
     scale: float
-    """Of the noise as found over that as stated, 1 or more."""
+    """Estimated over stated noise, 1 or more."""
     freedom: float
 
 
 def _solve(readings: Sequence[Reading], prior: Floats, precision: Floats) -> _Solved:
-    """Least squares with a prior; the noise is scaled by what residuals say of it."""
+    """Least squares with a prior; the noise is scaled by the residuals."""
     ratio = np.array([reading.ratio for reading in readings])
     hours = np.array([(reading.t_s - readings[0].t_s) / 3600.0 for reading in readings])
     warm = np.nan_to_num(np.array([reading.warmer_k for reading in readings]))
@@ -175,14 +175,14 @@ def _refuse_few(readings: Sequence[Reading]) -> None:
 
 
 def _excess(left: Floats, noise: Floats) -> float:
-    """Noise as found over that as stated, by neighbours' differences: one step among many changes their median
-    little."""
+    """Estimated over stated noise, by the median of neighbours' differences, which a single step hardly
+    changes."""
     differences = np.abs(np.diff(left)) / np.hypot(noise[1:], noise[:-1])
     return max(1.0, float(np.median(differences) * 1.4826))
 
 
 def _odd(left: Floats, noise: Floats) -> NDArray[np.bool_]:
-    """Which readings [n] stand alone, far from their neighbours' median; a step that lasts is none."""
+    """Which single readings [n] are far from their neighbours' median; a lasting step does not count."""
     from scipy.ndimage import median_filter
 
     if len(left) < _NEIGHBOURS:
@@ -192,7 +192,8 @@ def _odd(left: Floats, noise: Floats) -> NDArray[np.bool_]:
 
 
 def _refuse_sudden(names: Sequence[str], left: Floats, noise: Floats) -> None:
-    """Raise InputError if the readings' level steps: the greatest step of means before and after, by its noise."""
+    """Raise InputError if the level of the readings has a step, by the largest difference of means before and
+    after, over its noise."""
     weight = (_excess(left, noise) * noise) ** -2.0
     before, sums = np.cumsum(weight)[:-1], np.cumsum(weight * left)[:-1]
     after, rest = weight.sum() - before, (weight * left).sum() - sums

@@ -1,4 +1,4 @@
-"""The picture of a drift: readings over time and temperature, the factor of the run's frames, what is left."""
+"""The picture of a drift: readings over time and temperature, the factor of the run's frames, residuals."""
 
 from __future__ import annotations
 

@@ -28,11 +28,11 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 CHANNEL = "G"
-"""What drifts is the light of an LED, not its colour: one channel tells it."""
+"""One channel is sufficient: the power of an LED drifts, its colour hardly."""
 _DARK = 0.1
-"""Of what is expected: less is a shadow, or a dead LED."""
+"""Of the expected signal: less is a shadow, or a dead LED."""
 _FLASH = 5e-4
-"""What flashes of an LED are believed to differ by (as `calibrate_led_power` has it)."""
+"""Relative scatter of an LED's flashes (as in `calibrate_led_power`)."""
 
 
 @dataclass(frozen=True)
@@ -40,18 +40,18 @@ class Powers:
     """The powers of a record, of one channel."""
 
     row: dict[int, int]
-    """Of each LED in the arrays."""
+    """Row of each LED in the arrays, by its id."""
     power: Floats
     u_own: Floats
     board_c: Floats
     """[n] temperature of its board when it was calibrated."""
     common: Floats
-    """[n, c] relative change of each power by what the LEDs shared then."""
+    """[n, c] relative change of each power by one unit of each figure that the LEDs shared."""
     names: tuple[str, ...]
     covariance: Floats
     """[c, c]."""
     found: dict[str, float]
-    """What the calibration found the shared figures to be off their description."""
+    """Departure of the shared figures from their description, by the calibration."""
 
 
 def read_powers(path: Path) -> Powers:
@@ -85,7 +85,7 @@ def read_powers(path: Path) -> Powers:
 def drift_outcome(
     frames: LightFrames, setting: Setting, led_power: Path, request: Request, progress: Progress
 ) -> Outcome:
-    """How the LEDs' power drifted from its calibration to a run, from views that show the reference tile.
+    """Drift of the LEDs' power from its calibration to a run, from views that show the reference tile.
 
     Raises InputError: no view shows the tile, or as `fit_drift` does.
     """
@@ -105,7 +105,7 @@ def drift_outcome(
         shared_covariance=_shared_covariance(setting, powers),
     )
     if drift.odd:
-        remarks.append(f"{len(drift.odd)} readings are off their neighbours, not used: {_list(drift.odd)}")
+        remarks.append(f"{len(drift.odd)} readings differ from their neighbours, not used: {_list(drift.odd)}")
     warmer_k = np.array([_warmer_k(frame, powers) for frame in lit])
     t_s = np.array([frame.t_s for frame in lit])
     u = drift.u_factor(warmer_k, t_s)
@@ -144,7 +144,7 @@ def _readings(
     remarks: list[str],
     progress: Progress,
 ) -> list[Reading]:
-    """The tile under each LED of known power, from the frames of the views that show it.
+    """Readings of the tile under each LED of known power, from the frames of the views that show it.
 
     Observations that cannot be used are added to `remarks`. Raises InputError if no view shows the tile.
     """
@@ -177,11 +177,11 @@ def _by_view(lit: Sequence[LightFrame]) -> list[list[LightFrame]]:
 
 
 def _reading(frame: LightFrame, value: float, u: float, design: Floats, powers: Powers) -> Reading:
-    """The tile under one LED against its calibrated power; `design` as `rows_of` has it."""
+    """The tile under one LED relative to the LED's calibrated power; `design` is that of `rows_of`."""
     assert frame.led is not None, "only frames under LEDs are read"
     row = powers.row[frame.led]
     ratio, u_own = value / powers.power[row], float(powers.u_own[row])
-    # The figures of the tile itself are those that the powers were calibrated with.
+    # Reflectance and Minnaert's k of the tile are those that the powers were calibrated with.
     ratio *= np.exp(-design[3] * powers.found["ln_reflectance"] - design[4] * powers.found["minnaert"])
     common = powers.common[row].copy()
     common[powers.names.index("ln_reflectance")] += design[3]
@@ -198,7 +198,7 @@ def _reading(frame: LightFrame, value: float, u: float, design: Floats, powers: 
 
 
 def _shared_covariance(setting: Setting, powers: Powers) -> Floats:
-    """Of the tile's tilt and height in this run, then of what the powers' calibration shared."""
+    """Of the tile's tilt and height in this run, then of the figures that the powers' calibration shared."""
     from scipy.linalg import block_diag
 
     place = np.diag(prior_of(setting.tile)[:OF_PLACE] ** 2)
@@ -222,9 +222,7 @@ def _parameters(drift: Drift) -> list[Parameter]:
 def _table(drift: Drift) -> str:
     """CSV of the readings."""
     text = io.StringIO()
-    text.write(
-        "# the reference tile: signal over what the calibrated power makes of it; residual against the fit\n"
-    )
+    text.write("# the reference tile: signal over that expected from the calibrated power; residual of the fit\n")
     text.write("shot,t_s,warmer_k,ratio,u_ratio,residual\n")
     for reading, left in zip(drift.used, drift.residuals, strict=True):
         text.write(

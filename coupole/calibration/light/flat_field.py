@@ -1,17 +1,18 @@
-"""Flat field: what share of the light of the field's best place reaches each pixel, per channel.
+"""Flat field: light at each pixel over that at the field's brightest point, per channel.
 
-Seed 003, section 4.2 (g in its Eq. 1). A luminous panel is photographed shifted and turned. Its signal is
-a_v * g(p) * s(q), with a_v the view's brightness, g the lens's fall-off, which stays with the pixel p, and s the
-panel's own unevenness, which stays with the place q on the panel: that tells them apart. In logarithms
+Seed 003, section 4.2 (g in its Eq. 1). A luminous panel is photographed shifted and turned. Its signal is a_v *
+g(p) * s(q), with a_v the view's brightness, g the lens's fall-off, which depends on the pixel p, and s the panel's
+unevenness, which depends on the place q on the panel. Views that differ in shift and rotation separate the two. In
+logarithms
 
     ln g = -2 ln(1 + r^2/f^2) + k1 (r/R)^2 + k2 (r/R)^4 + k3 (r/R)^6,   r = |p - centre|,   R half the diagonal,
     ln s = e1 x + e2 y + e3 x^2 + e4 x y + e5 y^2,                      (x, y) = q / `panel_scale_mm`.
 
-The first term is cos^4 with the focal length f; the polynomial is what a real lens departs from it. Images are
-reduced to means of blocks of pixels; dust and dead pixels do not reach the result, as each block's mean leaves out
-what stands out and each block's weight falls with its residual (Tukey's). A block's errors are alike in all views
-(its pixels' own responses): covariance is that of clusters of blocks ("sandwich", Liang and Zeger 1986), each
-with its residual as if it were left out (Bell and McCaffrey 2002).
+The first term is cos^4 with the focal length f; the polynomial is the departure of a real lens from it. Images are
+reduced to means of blocks of pixels. Dust and dead pixels do not affect the result, as a block's mean leaves out
+outliers and its weight decreases with its residual (Tukey). The error of a block is the same in all views (its
+pixels' responses), so the covariance is that of clusters of blocks ("sandwich", Liang and Zeger 1986), with
+leave-one-out residuals (Bell and McCaffrey 2002).
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class FlatField:
     covariance: Floats
     """[5, 5]."""
     focal_px: float
-    """f, held: the polynomial takes up what it is off by."""
+    """f, held: the polynomial absorbs its error."""
     size_px: tuple[int, int]
     """Width and height."""
     panel: Floats
@@ -81,7 +82,7 @@ class FlatField:
     def u_at(self, pixels: Floats) -> Floats:
         """Relative standard uncertainty [...] of g at pixels [..., 2] against the mean over the field.
 
-        A common factor of g is one of the LEDs' power as well and drops out of every reflectance.
+        A common factor of g is also in the LEDs' power and cancels in every reflectance.
         """
         grid = _grid(self.size_px)
         by = self._slopes(pixels) - self._slopes(grid).mean(axis=1).reshape(5, *[1] * (pixels.ndim - 1))
@@ -109,7 +110,7 @@ def fit_flat_field(
     size_px: tuple[int, int],
     panel_scale_mm: float = 100.0,
 ) -> FlatField:
-    """Fit one channel. Raises InputError if the views cannot tell panel and lens apart, or have too few blocks."""
+    """Fit one channel. Raises InputError if the views do not separate panel and lens, or have too few blocks."""
     used = [np.isfinite(view.signal) & (view.signal > 0) for view in views]
     if len(views) < 3 or min(int(u.sum()) for u in used) < _LEAST_BLOCKS:
         least = min((int(u.sum()) for u in used), default=0)
@@ -204,7 +205,7 @@ def _fit(blocks: _Blocks, views: int, focal_px: float, size_px: tuple[int, int])
                 "shifted both ways by a third of the field, and turned by 90 degrees or more about the view"
             )
         step = np.linalg.solve(normal, (design / scale).T @ (weight * left)) / scale
-        # The centre is looked for inside the field: far outside, fall-off is no longer radial about it.
+        # Steps of the centre are limited: far outside the field, fall-off is no longer radial about it.
         step[:2] = np.clip(step[:2], -0.1 * max(size_px), 0.1 * max(size_px))
         p, rest = p + step[:5], rest + step[5:]
         left = left - design @ step
@@ -246,13 +247,13 @@ class Spot:
     row_px: float
     pixels: int
     depth: float
-    """Relative loss where it is deepest."""
+    """Largest relative loss."""
 
 
 def dust_spots(ratio: NDArray[np.float32], *, smooth_px: int = 5, least_depth: float = 0.01) -> list[Spot]:
     """Spots in [H, W] mean over views of signal / fitted signal (NaN where unknown), the deepest first.
 
-    The ratio is smoothed over `smooth_px`, so that the single pixels' own responses are no dust.
+    The ratio is smoothed over `smooth_px`, so that single pixels with a low response do not count as dust.
     """
     from scipy import ndimage
 
@@ -275,7 +276,7 @@ def dust_spots(ratio: NDArray[np.float32], *, smooth_px: int = 5, least_depth: f
 def panel_places(
     pixels: Floats, focal_px: float, size_px: tuple[int, int], base_from_camera: Floats, base_from_panel: Floats
 ) -> Floats:
-    """[n, 2] mm on the panel's plane z = 0 that pixels [n, 2] of a pinhole see."""
+    """[n, 2] mm: the points of the panel's plane z = 0 that pixels [n, 2] of a pinhole camera see."""
     centre = (np.array(size_px) - 1) / 2.0
     rays = np.column_stack([(pixels - centre) / focal_px, np.ones(len(pixels))])
     panel_from_camera = np.linalg.inv(base_from_panel) @ base_from_camera
@@ -285,7 +286,7 @@ def panel_places(
 
 
 def _radial(pixels: Floats, centre: Floats, focal_px: float, size_px: tuple[int, int]) -> tuple[Floats, Floats]:
-    """[4, ...] ln cos^4 and the powers 2, 4, 6 of r/R; [2, 4, ...] their derivatives by the centre's x and y."""
+    """ln cos^4 and the powers 2, 4, 6 of r/R [4, ...]; their derivatives by the centre's x and y [2, 4, ...]."""
     reach = 0.5 * float(np.hypot(*size_px))
     away = np.moveaxis(np.asarray(pixels, float), -1, 0) - np.reshape(centre, (2, *[1] * (np.ndim(pixels) - 1)))
     square = (away**2).sum(axis=0)
@@ -298,7 +299,7 @@ def _radial(pixels: Floats, centre: Floats, focal_px: float, size_px: tuple[int,
 
 
 def _clustered(design: Floats, weight: Floats, left: Floats, pixels: Floats) -> Floats:
-    """Covariance of a weighted fit whose errors are alike within a block, in whatever view it is seen."""
+    """Covariance of a weighted fit in which the errors of a block are the same in all views."""
     scale = np.linalg.norm(design, axis=0)
     scaled = design / scale
     bread = np.linalg.inv(scaled.T @ (scaled * weight[:, None]))
@@ -309,11 +310,11 @@ def _clustered(design: Floats, weight: Floats, left: Floats, pixels: Floats) -> 
     for members in np.split(order, starts):
         mine, root = scaled[members], np.sqrt(weight[members])
         hat = (root[:, None] * mine) @ bread @ (mine * root[:, None]).T
-        # A block at the field's rim pulls the fit to itself; its residual is what it would be without that.
+        # A block at the field's rim has leverage on the fit; its residual is that of a fit without it.
         alone = np.linalg.solve(np.eye(len(members)) - hat, root * left[members])
         scores.append((mine * root[:, None]).T @ alone)
     middle = np.array(scores).T @ np.array(scores)
-    # How the weighted residuals answer to a step: Tukey's psi grows less steeply than its weight lets expect.
+    # Derivative of the weighted residuals by a step: that of Tukey's psi, which is less than its weight.
     u2 = 1.0 - np.sqrt(weight)
     answer = np.linalg.inv(scaled.T @ (scaled * (np.sqrt(weight) * (1.0 - 5.0 * u2))[:, None]))
     return np.asarray(answer @ middle @ answer / scale / scale[:, None])

@@ -42,7 +42,7 @@ from coupole.plan.shot_id import Light
 _BLOCKS = 64
 """Across the field."""
 _ROWS = 64
-"""That are looked at together where every pixel is: memory stays small."""
+"""Rows that are processed together where all pixels are used, which limits memory."""
 _MOST_SATURATED = 1e-3
 _MOST_FLAT_U = 0.005
 _MOST_DUST_DEPTH = 0.05
@@ -56,8 +56,8 @@ def flat_field_outcome(
     panel_mm: float,
     progress: Progress,
 ) -> Outcome:
-    """Views of a panel, shifted and turned: fall-off per channel, dust. The panel stands `panel_mm` in front of
-    the camera's mean place, square to its mean axis."""
+    """Views of a panel, shifted and turned: fall-off per channel, dust. The panel is `panel_mm` in front of the
+    camera's mean position, perpendicular to its mean axis."""
     if not frames.lit:
         raise InputError("flat field: no frame with light; acquire `coupole plan new flat-field`")
     by_view = _brightest(frames)
@@ -134,9 +134,9 @@ def _reduced(
 
 
 def _brightest(frames: LightFrames) -> dict[tuple[str, Light], list[LightFrame]]:
-    """Frames by view and light, of the longest exposure in which next to nothing is saturated.
+    """Frames by view and light, of the longest exposure with a share of saturated pixels below `_MOST_SATURATED`.
 
-    Raises InputError if that is so in fewer than three views.
+    Raises InputError if fewer than three views have such frames.
     """
     found: dict[tuple[str, Light], list[LightFrame]] = {}
     for frame in sorted(frames.lit, key=lambda frame: -frame.exposure_us):
@@ -196,7 +196,7 @@ def _ratio(
     frames: LightFrames,
     base_from_panel: Floats,
 ) -> NDArray[np.float32]:
-    """[H, W] mean over views of signal over fitted signal: each pixel's own response, and dust."""
+    """[H, W] mean over views of signal over fitted signal: response of single pixels, and dust."""
     size_px = next(iter(fits.values())).size_px
     width, height = size_px
     total = np.zeros((height, width), np.float32)
@@ -227,7 +227,7 @@ def _any_saturated(frames: Sequence[LightFrame], white_dn: int) -> NDArray[np.bo
 
 
 def _map_of_pattern(maps: Mapping[str, NDArray[np.float32]], pattern: str) -> NDArray[np.float32]:
-    """[H, W] of each channel's map its own pixels."""
+    """[H, W] with the pixels of each channel from that channel's map."""
     shape = next(iter(maps.values())).shape
     found = np.zeros(shape, np.float32)
     for channel, values in maps.items():

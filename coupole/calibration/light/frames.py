@@ -1,6 +1,6 @@
-"""Frames of runs as radiometric calibrations need them: one by one, with light, exposure, time and temperature.
+"""Frames of runs for radiometric calibrations, with light, exposure, time and temperature.
 
-A frame is read when it is asked for, so a calibration that looks at one after the other needs memory for few.
+A frame is read when it is used, so a calibration that processes frames in turn needs memory for few.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class LightFrame:
     t_s: float
     """Of its trigger, on the box's clock."""
     temperature_c: float
-    """Of the LED's board; NaN where the box said nothing."""
+    """Of the LED's board; NaN where the box gave none."""
     base_from_flange: Floats
     """[4, 4] measured, mm."""
     base_from_camera: Floats
@@ -48,13 +48,13 @@ class LightFrame:
 
     @property
     def led(self) -> int | None:
-        """Id of the LED that shone; None under a panel or in the dark."""
+        """Id of the LED that was lit; None under a panel or in the dark."""
         return self.shot.light.id if isinstance(self.shot.light, Led) else None
 
 
 @dataclass(frozen=True)
 class LightFrames:
-    """All frames that a calibration may look at, and what they have in common."""
+    """All frames that a calibration may use, and their common properties."""
 
     frames: tuple[LightFrame, ...]
     pattern: str
@@ -63,7 +63,7 @@ class LightFrames:
     white_dn: int
     about: About
     focal_px: float
-    """Focal length over pixel pitch at the focus, f (1 + m): what a tangent of 1 is long on the sensor."""
+    """Image distance over pixel pitch, f (1 + m): length on the sensor, px, of a tangent of 1."""
     inputs: tuple[tuple[str, str], ...]
     """Name and SHA-256 of every file that was or will be read."""
 
@@ -82,7 +82,7 @@ class LightFrames:
         return width_px, height_px
 
     def seen_through(self, flange_from_camera: Floats) -> LightFrames:
-        """The same frames, of a camera that sits on the flange as this [4, 4] says."""
+        """The same frames with another pose [4, 4] of the camera on the flange."""
         frames = (
             replace(frame, base_from_camera=frame.base_from_flange @ flange_from_camera) for frame in self.frames
         )
@@ -128,13 +128,14 @@ def channels_of(pattern: str) -> tuple[str, ...]:
 
 
 def temperatures_of(frames: Sequence[LightFrame]) -> tuple[float, float] | None:
-    """Lowest and highest, C; None if no frame knows one."""
+    """Lowest and highest, C; None if no frame has one."""
     known = [frame.temperature_c for frame in frames if np.isfinite(frame.temperature_c)]
     return (min(known), max(known)) if known else None
 
 
 def _by_view(run: Run) -> dict[Path, list[FrameProven]]:
-    """Proven frames by their view's file, marks left out: they are dark, but end when their light may glow."""
+    """Proven frames by their view's file, without marks: these are dark, but light may still glow when they
+    end."""
     found: dict[Path, list[FrameProven]] = {}
     for shot, frame in run.proven().items():
         if not isinstance(shot.light, PanelMark):

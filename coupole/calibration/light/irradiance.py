@@ -1,9 +1,9 @@
 """Irradiance by an LED: a finite square that radiates by Lambert's law.
 
-The processing's own formula, shared with no simulator. Lambert's for a polygon (Photometria, 1760; seed 003,
-Eq. 2 and supplement): with unit vectors v_i from the point to the corners,
-G = sum_i angle(v_i, v_i+1) * unit(v_i x v_i+1), and E = Phi / (2 A) * G.n / pi for a flux Phi that leaves the
-square of area A. The factor 1 / pi is that of a Lambertian emitter's radiance, Phi / (pi A).
+This formula of the processing is not shared with the simulator. Lambert's for a polygon (Photometria, 1760; seed
+003, Eq. 2 and supplement): with unit vectors v_i from the point to the corners, G = sum_i angle(v_i, v_i+1) *
+unit(v_i x v_i+1), and E = Phi / (2 A) * G.n / pi for a flux Phi that leaves the square of area A. The factor 1 /
+pi is that of a Lambertian emitter's radiance, Phi / (pi A).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LED_SIDE_MM = 7.0
 def led_corners_mm(centre_mm: ArrayLike, normal: ArrayLike, side_mm: float = LED_SIDE_MM) -> Floats:
     """[..., 4, 3] corners of squares about `centre_mm` [..., 3] that look along the unit `normal` [..., 3].
 
-    Which way a square's sides run is not measured: at 1 m it changes irradiance by less than 1e-6.
+    The direction of the sides is not measured: at 1 m it changes irradiance by less than 1e-6.
     """
     centre, axis = np.broadcast_arrays(np.asarray(centre_mm, float), np.asarray(normal, float))
     helper = np.where(np.abs(axis[..., :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
@@ -36,8 +36,8 @@ def led_corners_mm(centre_mm: ArrayLike, normal: ArrayLike, side_mm: float = LED
 
 
 def lambert_vector(points_mm: ArrayLike, corners_mm: ArrayLike) -> Floats:
-    """G [..., 3] of polygons [..., k, 3] at points [..., 3]; |G| is twice the projected solid angle's maximum, and
-    it points to the light. Points before the polygon see its corners turn clockwise about its normal."""
+    """G [..., 3] of polygons [..., k, 3] at points [..., 3]; it points to the light, and |G| is twice the largest
+    projected solid angle. From points in front of the polygon its corners run clockwise about its normal."""
     towards = np.asarray(corners_mm, float) - np.asarray(points_mm, float)[..., None, :]
     unit = towards / np.sqrt(np.einsum("...i,...i", towards, towards))[..., None]
     after = np.roll(unit, -1, axis=-2)
@@ -69,7 +69,8 @@ def irradiance_per_flux(
     """E / Phi in m^-2 at points [..., 3] with unit normals [..., 3]; all arguments broadcast.
 
     0 for a point behind the LED or an LED whose centre is below the point's horizon: at a metre the LED's size
-    matters for less than half a degree there. `paper` takes the emitter's cosine twice (seed 003, Eq. 2).
+    matters within less than half a degree of the horizon. `paper` has the emitter's cosine twice (seed 003, Eq.
+    2).
     """
     points, facing = np.asarray(points_mm, float), np.asarray(normals, float)
     centres, axes = np.asarray(led_centres_mm, float), np.asarray(led_normals, float)

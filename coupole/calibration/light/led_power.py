@@ -1,15 +1,15 @@
 """Power of each LED from pictures of a Spectralon tile: Phi_k of seed 003, Eq. 2 and section 4.2.
 
 A patch of the tile at x gives the signal S = f(i, o) * E/Phi(x) * Phi_k, S being DN per second over the flat
-field: so Phi_k is in those units times m^2 sr, and a reflectance made with it is free of the camera's constants.
-Taken as logarithms the problem is linear,
+field. So Phi_k is in those units times m^2 sr, and the camera's constants cancel in a reflectance. In logarithms
+the problem is linear,
 
     ln S_kv - ln h_kv = ln Phi_k + J_kv . theta + noise,
 
-theta being what all LEDs share: the tile's tilt about two axes and its height in each place that it lay, the
-logarithm of its reflectance, its departure from Lambert's law. They have priors from the tile's description; where
-the tile was photographed in several places the data add to them. So the covariance of all powers is a diagonal
-(each LED's own noise) and a few common directions, and 1080 LEDs need no matrix of 1080 by 1080.
+theta being the figures that all LEDs share: the tile's tilt about two axes and its height at each of its places,
+the logarithm of its reflectance, its departure from Lambert's law. They have priors from the tile's description;
+data from several places of the tile improve them. So the covariance of all powers is a diagonal (noise of each
+LED) plus a matrix of low rank (the shared figures), and 1080 LEDs need no matrix of 1080 by 1080.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ from coupole.errors import InputError
 
 _UNLIKELY = 1e-6
 LEAST_PRIOR = 1e-12
-"""A figure that is said to be exact."""
+"""Standard uncertainty of a figure that is stated as exact."""
 
 
 @dataclass(frozen=True)
 class LedPower:
-    """Power of one channel; what is relative is so to the LED's own power."""
+    """Power of one channel; relative figures refer to the LED's power."""
 
     ids: NDArray[np.int64]
     power: Floats
-    """[n] DN s^-1 m^2 sr; 0 for a dead LED, NaN for one that no view could use."""
+    """[n] DN s^-1 m^2 sr; 0 for a dead LED, NaN for one without a usable view."""
     u_own: Floats
-    """[n] relative standard uncertainty that an LED shares with no other."""
+    """[n] relative standard uncertainty by errors that are independent between LEDs."""
     common: Floats
     """[n, c] relative change of each power by one unit of each common figure."""
     common_names: tuple[str, ...]
@@ -66,13 +66,13 @@ class LedPower:
     degrees_of_freedom: float
 
     def u(self) -> Floats:
-        """[n] relative standard uncertainty, all together."""
+        """[n] relative standard uncertainty, all errors together."""
         together = np.einsum("ni,ij,nj->n", self.common, self.common_covariance, self.common)
         total: Floats = np.sqrt(self.u_own**2 + together)
         return total
 
     def u_against_mean(self) -> Floats:
-        """[n] relative standard uncertainty of an LED's power over the mean of all: the common scale drops out."""
+        """[n] relative standard uncertainty of an LED's power over the mean of all, without the common scale."""
         off = self.common - np.nanmean(self.common[self.power > 0], axis=0)
         together = np.einsum("ni,ij,nj->n", off, self.common_covariance, off)
         total: Floats = np.sqrt(self.u_own**2 + together)
@@ -86,13 +86,13 @@ class LedPower:
 
 
 def prior_of(tile: Tile, places: int = 1) -> Floats:
-    """[c] standard uncertainties of what LEDs share, by the tile's description."""
+    """[c] standard uncertainties of the shared figures, by the tile's description."""
     of_place = [tile.u_tilt_deg, tile.u_tilt_deg, tile.u_height_mm]
     return np.array([*of_place * places, tile.u_reflectance / tile.reflectance, tile.u_minnaert])
 
 
 def _common_names(places: Sequence[int]) -> tuple[str, ...]:
-    """[c] of what LEDs share, in the order of `prior_of`."""
+    """[c] names of the shared figures, in the order of `prior_of`."""
     of_places = [f"place{p}.{what}" for p in places for what in ("tilt_x_deg", "tilt_y_deg", "height_mm")]
     return (*of_places, "ln_reflectance", "minnaert")
 
@@ -108,8 +108,8 @@ def calibrate_led_power(
 ) -> LedPower:
     """Powers of one channel from the tile's views.
 
-    `flash_noise` is what flashes of an LED are believed to differ by where none was seen twice. Raises InputError:
-    no view shows the tile lit, all are saturated, or the tile did not lie still between views.
+    `flash_noise` is the stated relative scatter of an LED's flashes. Raises InputError: no view shows the tile
+    lit, all are saturated, or the tile was moved between views of one place.
     """
     if not views:
         raise InputError("LED power: expected views of the tile, found none")
@@ -128,7 +128,7 @@ def calibrate_led_power(
         rows += found
         lit_elsewhere |= not_used
     if not rows:
-        raise InputError("LED power: no LED could be used: " + ("; ".join(remarks[:5]) or "all stand too low"))
+        raise InputError("LED power: no LED could be used: " + ("; ".join(remarks[:5]) or "all are too low"))
     rows, dead = without_dark(rows, views, ids, lit_elsewhere, remarks)
     y, w, led, view_of, design = arrays_of(rows, ids, flash_noise)
     solved = _solve(y, w, led, design, len(ids), prior_of(tile, len(places)))
@@ -207,7 +207,7 @@ def _refuse_moved(
     design: Floats,
     redundancy: float,
 ) -> None:
-    """Raise InputError if one view fits far better with a tilt of its own, though it names the others' place."""
+    """Raise InputError if one view fits far better with its own tilt, although it has the same place as others."""
     for place in {view.place for view in views}:
         mine = [v for v, view in enumerate(views) if view.place == place]
         if len(mine) < 2:
@@ -221,7 +221,7 @@ def _refuse_moved(
             part = np.column_stack([design[at][:, columns], np.ones(int(at.sum()))])
             normal = part.T @ (part * w[at, None])
             step = np.linalg.solve(normal, part.T @ (w[at] * left[at]))
-            # Residuals are shared between the views, so a view's own tilt shows in them only in part.
+            # The fit absorbs a part of a view's own tilt, which the residuals therefore do not show.
             share = len(mine) / (len(mine) - 1.0)
             gain = float(step @ normal @ step) * share
             noise = max(1.0, (float(np.sum(w * left**2)) - gain) / redundancy)

@@ -70,7 +70,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
 
 
 def board_temperatures(lit: Sequence[LightFrame]) -> dict[int, float]:
-    """Mean temperature of each LED's board over its frames, C: where its power holds; NaN where none is known."""
+    """Mean temperature of each LED's board over its frames, C, for which its power holds; NaN if not known."""
     seen: dict[int, list[float]] = {}
     for frame in lit:
         assert frame.led is not None, "only frames under LEDs are read"
@@ -102,7 +102,7 @@ def power_table(powers: Mapping[str, LedPower], board_c: Mapping[int, float]) ->
 
 
 def _parameters(powers: Mapping[str, LedPower], covariance: Floats) -> list[Parameter]:
-    """The mean power and what all LEDs share, by channel; the LEDs' own powers stand in the table."""
+    """The mean power and the shared figures, by channel; the power of each LED is in the table."""
     found = []
     u = iter(np.sqrt(np.diag(covariance)))
     for channel, power in powers.items():
@@ -122,7 +122,7 @@ def _parameters(powers: Mapping[str, LedPower], covariance: Floats) -> list[Para
 
 
 def _mean_and_slopes(power: LedPower) -> tuple[float, Floats]:
-    """The mean power of all LEDs, and its change [c] by what they share."""
+    """The mean power of all LEDs, and its derivatives [c] by the shared figures."""
     good = np.isfinite(power.power) & (power.power > 0)
     return float(power.power[good].mean()), np.asarray((power.power[good, None] * power.common[good]).mean(axis=0))
 
@@ -130,8 +130,8 @@ def _mean_and_slopes(power: LedPower) -> tuple[float, Floats]:
 def covariance_of(powers: Mapping[str, LedPower], prior: Floats) -> Floats:
     """Of `_parameters`, [channels (1 + c)] squared.
 
-    All channels see one tile. With the prior S and posteriors C_a, C_b the errors of channels a and b have the
-    covariance C_a S^-1 C_b: what of the prior's error is left in both; noise is each one's own.
+    All channels see the same tile. With the prior S and posteriors C_a, C_b the errors of channels a and b have
+    the covariance C_a S^-1 C_b, the remaining part of the prior's error; their noise is independent.
     """
     size = 1 + len(prior)
     whole = np.zeros((size * len(powers), size * len(powers)))

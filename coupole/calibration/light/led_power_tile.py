@@ -1,4 +1,4 @@
-"""What frames show of a white tile: mean signals of its patches, with all that they are read with."""
+"""A white tile in frames: mean signals of its patches, and the calibrations that are needed to read them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _LEAST_PIXELS = 6
 
 @dataclass(frozen=True)
 class Setting:
-    """What the tile's pictures are read with."""
+    """Calibrations and descriptions that the tile's frames are read with."""
 
     tile: Tile
     base_from_support: Floats
@@ -38,7 +38,7 @@ class Setting:
     flat: Path | None = None
     emission: Emission = "lambertian"
     files: tuple[Path, ...] = ()
-    """What tile, support and LEDs were read from: inputs of the record."""
+    """Files of tile, support and LEDs: inputs of the record."""
 
     @property
     def base_from_tile(self) -> Floats:
@@ -46,15 +46,15 @@ class Setting:
 
     @property
     def inputs(self) -> tuple[tuple[str, str], ...]:
-        """Name and SHA-256 of all files that stand behind this."""
+        """Name and SHA-256 of all these files."""
         made_with = (*self.files, self.dark, self.response, self.flat)
         return tuple(pair for path in made_with for pair in record_input(path))
 
 
 def calibrated_positions(leds: Path) -> Positions:
-    """Where a record of the kind `leds` has the LEDs. Raises InputError for one of another kind.
+    """Positions of the LEDs by a record of the kind `leds`. Raises InputError for one of another kind.
 
-    Its uncertainties go no further: 0.05 mm at 1.5 m change an irradiance by a tenth of what flashes differ by.
+    Its uncertainties are neglected: 0.05 mm at 1.5 m change an irradiance by a tenth of the scatter of flashes.
     """
     record = read_accepted(leds, "leds")
     table = read_led_table(leds.parent / next(file.name for file in record.files if file.name.endswith(".csv")))
@@ -76,8 +76,7 @@ class TileReader:
         self._flat = None if setting.flat is None else map_beside(setting.flat, "flat-field", "g", frames)
 
     def view(self, found: Sequence[LightFrame], tell: Callable[[], None]) -> dict[str, TileView]:
-        """What the frames of one view, each under one LED, show of the tile, by channel; `tell` is called
-        after each.
+        """The tile in the frames of one view, each under one LED, by channel; `tell` is called after each.
 
         Raises InputError if the view does not show the whole tile.
         """
@@ -112,8 +111,8 @@ class TileReader:
         return min(map(len, self.patches(base_from_camera)[1])) > 0
 
     def patches(self, base_from_camera: Floats) -> tuple[Floats, list[NDArray[np.intp]]]:
-        """Middles [m, 3] of the patches in the base frame, and the pixels [k, 2] (row, column) that see each: none
-        of a patch that is not wholly in the picture."""
+        """Centres [m, 3] of the patches in the base frame, and the pixels [k, 2] (row, column) that see each; none
+        for a patch that is not completely in the picture."""
         tile = self._setting.tile
         base_from_tile = self._setting.base_from_tile
         half = tile.side_mm / 2.0 - tile.margin_mm

@@ -1,9 +1,9 @@
 """Linearity of a sensor, with uncertainty (EMVA 1288, release 4.0, section 8).
 
 Under constant light the signal of any pixel is its rate times the exposure time. Pixels of several brightnesses
-share one curve, y + c2 y^2/R + c3 y^3/R^2 = rate * (t + t0), so that an exposure time that is off and a curve that
-is bent are told apart; each exposure may have its own factor of light (flicker), which a bent curve could be taken
-for.
+share one curve, y + c2 y^2/R + c3 y^3/R^2 = rate * (t + t0), so that an error of the exposure time and a curvature
+of the response are separated. Each exposure has its own factor of light (flicker), which could otherwise be
+mistaken for curvature.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 _GROUPS = 12
-"""Of pixels of like brightness."""
+"""Groups of pixels of similar brightness."""
 _CLIPPED_SHARE = 1e-3
 _CHANGED = 0.01
-"""Relative: groups of pixels that keep their ratio less well than this were not looking at the same scene."""
+"""Relative: if ratios between groups of pixels change by more, the scene was changed."""
 _SCENE_SIGMA = 8.0
 
 
 @dataclass(frozen=True)
 class Linearity:
-    """How far the response is from a line, and the polynomial that makes it one."""
+    """Deviation of the response from a line, and the polynomial that corrects it."""
 
     coefficients: Floats
-    """c2, c3 of y + c2 y^2/R + c3 y^3/R^2; zeros where a line will do."""
+    """c2, c3 of y + c2 y^2/R + c3 y^3/R^2; zeros if a line is sufficient."""
     covariance: Floats
     """[2, 2]."""
     with_offset: Floats
@@ -53,17 +53,18 @@ class Linearity:
     """Relative scatter of the light from frame to frame."""
 
     def linear(self, signal_dn: Floats) -> Floats:
-        """Signal made linear; same shape, DN above dark."""
+        """Linearised signal; same shape, DN above dark."""
         x = signal_dn / self.range_dn
         corrected: Floats = signal_dn * (1.0 + x * (self.coefficients[0] + x * self.coefficients[1]))
         return corrected
 
 
 def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1e-3) -> Linearity:
-    """Deviation from a line; its correction if a straight one would look like this less often than `significance`.
+    """Deviation from a line, and its correction if the probability of this deviation for a straight line is below
+    `significance`.
 
-    Raises InputError with what is wrong: clipped, a scene that changed, flickering light, exposures that do not
-    make it brighter.
+    Raises InputError: clipped frames, a scene that changed, flickering light, a longer exposure that is not
+    brighter.
     """
     refuse_all_clipped(pairs)
     ordered = sorted(pairs, key=lambda pair: pair.exposure_us)
@@ -142,10 +143,10 @@ def _fit(signals: Floats, u_signals: Floats, exposures: Floats, range_dn: float,
 
 
 def _grouped(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
-    """[groups, exposures] mean signals of pixels of like brightness, and their standard uncertainties; NaN where
-    some pixel of the group is saturated."""
+    """[groups, exposures] mean signals of pixels of similar brightness, and their standard uncertainties; NaN
+    where more than `_CLIPPED_SHARE` of a group is saturated."""
     bright = max(pairs, key=lambda p: float(np.where(p.saturated.mean() < _CLIPPED_SHARE, p.first.mean(), -1.0)))
-    # Blocks of neighbours are sorted, not pixels: sorted by its noise a pixel would look brighter than it is.
+    # Blocks of neighbours are sorted, not pixels: sorting by noisy values would bias the groups' means.
     blocks = np.arange(len(bright.first) // BLOCK * BLOCK).reshape(-1, BLOCK)
     order = blocks[np.argsort((bright.first + bright.second)[blocks].mean(axis=1), kind="stable")]
     signals, u = np.full((_GROUPS, len(pairs)), np.nan), np.ones((_GROUPS, len(pairs)))
@@ -174,8 +175,8 @@ def _flicker(pairs: Sequence[Pair]) -> float:
 def _refuse_contradictions(pairs: Sequence[Pair], signals: Floats, flicker: float) -> None:
     if flicker > 0.01:
         raise InputError(
-            f"response: the light flickers by {flicker:.1%} from frame to frame; at most 1 % can be told from a "
-            "bent response. Let it warm up, or take panels"
+            f"response: the light flickers by {flicker:.1%} from frame to frame; at most 1 % can be separated "
+            "from a bent response. Let it warm up, or take panels"
         )
     usable = np.isfinite(signals).sum(axis=0) >= _GROUPS // 3
     exposures = np.array([pair.exposure_us for pair in pairs])
@@ -185,14 +186,14 @@ def _refuse_contradictions(pairs: Sequence[Pair], signals: Floats, flicker: floa
         names = [pair.name for pair, use in zip(pairs, usable, strict=True) if use]
         raise InputError(
             f"response: {names[place + 1]} is exposed longer than {names[place]} and yet not brighter; was the "
-            "light off, or is the exposure time not what is written?"
+            "light off, or is the recorded exposure time wrong?"
         )
 
 
 def _refuse_other_scene(
     pairs: Sequence[Pair], left: Floats, known: NDArray[np.bool_], signals: Floats, u_signals: Floats
 ) -> None:
-    """Raise InputError if one exposure's groups of pixels do not have the others' ratios."""
+    """Raise InputError if the ratios between groups of pixels differ in one exposure."""
     relative = np.full(known.shape, np.nan)
     relative[known] = left * u_signals[known] / signals[known]
     rms = np.sqrt(np.nanmean((relative - np.nanmean(relative, axis=0)) ** 2, axis=0))
@@ -200,11 +201,11 @@ def _refuse_other_scene(
     worst = int(np.nanargmax(rms - _SCENE_SIGMA * noise))
     if rms[worst] > _CHANGED + _SCENE_SIGMA * noise[worst]:
         raise InputError(
-            f"response: the scene is another one in {pairs[worst].name}; nothing may move while it is photographed"
+            f"response: the scene is another one in {pairs[worst].name}; nothing may move between exposures"
         )
 
 
 def _from_line(x: Floats, relative: Floats) -> Floats:
-    """What is left of relative deviations after the best proportional line, in the middle of its extremes."""
+    """Relative deviations from the proportional line that halves their range."""
     left: Floats = relative - 0.5 * (relative.max() + relative.min())
     return left

@@ -1,4 +1,4 @@
-"""Pairs of frames of one scene, light and exposure: what the response of a sensor is told from."""
+"""Pairs of frames of one scene, light and exposure, from which the response of a sensor is determined."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 BLOCK = 64
-"""Neighbouring pixels of the sample whose scene is a smooth curve."""
+"""Number of neighbouring pixels over which the scene is assumed to be a smooth curve."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Pair:
     first: Floats
     second: Floats
     saturated: NDArray[np.bool_]
-    """[pixels] True where either frame reached the end of the scale."""
+    """[pixels] True where either frame is saturated."""
 
 
 @dataclass(frozen=True)

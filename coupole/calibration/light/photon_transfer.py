@@ -1,8 +1,8 @@
 """Photon transfer: gain, read noise and full well of a sensor, with uncertainties (EMVA 1288, release 4.0, 6.5).
 
 The temporal variance of a pixel is read^2 + 1/12 + K * signal, with K in DN per electron; variance is half the
-mean square of the difference of two frames, in which fixed patterns cancel. Pixels of equal mean are looked at
-together, so the scene need not be even.
+mean square of the difference of two frames, in which fixed patterns cancel. Pixels of equal mean are evaluated
+together, so the scene need not be uniform.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from coupole.errors import InputError
 ROUNDING_VARIANCE = 1.0 / 12.0
 _LEVELS = 24
 _LEAST_PIXELS = 400
-"""Of one level: fewer say little of its variance."""
+"""Of one level: fewer do not determine its variance."""
 _COLLAPSED = 0.7
-"""Variance over what the line says, below which a level counts as saturated."""
+"""Variance over that of the line, below which a level counts as saturated."""
 _GROSS = 6.0
 
 
@@ -38,9 +38,9 @@ class PhotonTransfer:
     """Signal above dark at which variance has its maximum (EMVA 1288, 6.6)."""
     saturation_e: Estimate
     saturated_seen: bool
-    """False if no frame came so far: then `saturation_dn` is only the highest level."""
+    """False if no frame reached saturation: `saturation_dn` is then only the highest level."""
     prnu: Estimate | None
-    """Relative; None if the scene was not even enough."""
+    """Relative; None if the scene was not uniform enough."""
     covariance: Floats
     """[2, 2] of intercept (DN^2) and gain (DN)."""
     chi2_per_degree: float
@@ -126,7 +126,7 @@ def _squared_differences(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
 
 
 def _line_of_sound_levels(levels: Floats, variances: Floats, counts: Floats) -> tuple[_Line, NDArray[np.bool_]]:
-    """The line through the levels that are neither saturated nor gross errors, and which [levels] these are."""
+    """The line through the levels that are neither saturated nor gross errors, and a mask [levels] of these."""
     used = np.ones(len(levels), np.bool_)
     fit = _line(levels, variances, counts, used)
     for _ in range(10):
@@ -135,7 +135,7 @@ def _line_of_sound_levels(levels: Floats, variances: Floats, counts: Floats) -> 
         short = (variances < _COLLAPSED * predicted) & (levels > np.median(levels))
         beyond = levels >= levels[short].min() if short.any() else np.zeros(len(levels), np.bool_)
         off = np.abs(variances - predicted) > _GROSS * predicted * np.sqrt(2.0 / counts)
-        # A level that is off by less than 3 % is no gross error: it counts in chi^2.
+        # A level with a deviation below 3 % is not a gross error: it counts in chi^2.
         off &= np.abs(variances - predicted) > 0.03 * predicted
         now = ~beyond & ~off
         if now.sum() < 4 or (now == used).all():
@@ -146,9 +146,9 @@ def _line_of_sound_levels(levels: Floats, variances: Floats, counts: Floats) -> 
 
 
 def _levels(signal: Floats, squared: Floats) -> tuple[Floats, Floats, Floats]:
-    """Mean signal, mean squared difference over 2 and count, in levels of like signal."""
+    """Mean signal, mean squared difference over 2 and number of pixels, in levels of similar signal."""
     order = np.argsort(signal, kind="stable")
-    # Equal steps of signal, not of rank: a scene may have few bright pixels, and they say most of the gain.
+    # Equal steps of signal, not of rank: bright pixels may be few, and they determine most of the gain.
     edges = np.linspace(signal[order[len(order) // 500]], signal[order[-1 - len(order) // 2000]], _LEVELS + 1)
     bins = np.clip(np.searchsorted(edges, signal, side="right") - 1, 0, _LEVELS - 1)
     counts = np.bincount(bins, minlength=_LEVELS).astype(float)
@@ -163,7 +163,7 @@ def _levels(signal: Floats, squared: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _line(signal: Floats, variance: Floats, counts: Floats, used: NDArray[np.bool_]) -> _Line:
-    """Weighted line; weights from the line itself, as weights from single variances would pull it down."""
+    """Weighted line; weights by the line itself, as weights by single variances would bias it downwards."""
     x, y, n = signal[used], variance[used], counts[used]
     expected = np.maximum(y, 1e-6)
     design = np.column_stack([np.ones_like(x), x])
@@ -181,7 +181,7 @@ def _line(signal: Floats, variance: Floats, counts: Floats, used: NDArray[np.boo
 def _prnu(pairs: Sequence[Pair]) -> Estimate | None:
     """Relative scatter of the pixels' responses (EMVA 1288, 6.8), from the brightest even pair without saturation.
 
-    In each block of neighbours a parabola stands for the scene; None where that is too poor for it.
+    In each block of neighbours the scene is modelled by a parabola; None if that is not sufficient.
     """
     clean = [pair for pair in pairs if not pair.saturated.any()]
     if not clean:
@@ -195,7 +195,7 @@ def _prnu(pairs: Sequence[Pair]) -> Estimate | None:
     steps = np.linspace(-1.0, 1.0, BLOCK)
     trend = np.linalg.qr(np.vander(steps, 3))[0]
     a, b = (values - (values @ trend) @ trend.T for values in (a, b))
-    # The product of both frames' departures has no temporal noise in its mean.
+    # Temporal noise averages out in the product of both frames' deviations.
     relative = (a * b).sum(axis=1) / (BLOCK - 3) / level**2
     if np.mean(np.abs(relative) > 25 * np.median(np.abs(relative))) > 0.05:
         return None

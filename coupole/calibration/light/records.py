@@ -1,6 +1,6 @@
-"""From frames of runs to the records of dark frames and response, and what all radiometric records share.
+"""From frames of runs to the records of dark frames and response; functions that all radiometric records share.
 
-Each calibration ends in an `Outcome`: a sealed record, its maps or tables, its picture.
+Each calibration returns an `Outcome`: a sealed record, its maps or tables, its picture.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from coupole.plan.shot_id import Light
 
 Progress = Callable[[int, int], None]
 _MOST_PIXELS = 200_000
-"""Of a channel that response looks at."""
+"""Of a channel, used for the response."""
 
 
 def sealed_outcome(
@@ -143,7 +143,8 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
 
 
 def _of_means(dark: Dark, u: Floats) -> Floats:
-    """[4, 4] covariance of the noises, which are apart, and of mean offset and current, which one line gave."""
+    """[4, 4] covariance of the two noises, which are independent, and of mean offset and current, which the line
+    correlates."""
     covariance = np.diag(u**2)
     together = float(dark.cofactor[0, 1] / np.sqrt(dark.cofactor[0, 0] * dark.cofactor[1, 1]))
     covariance[2, 3] = covariance[3, 2] = together * u[2] * u[3]
@@ -151,14 +152,14 @@ def _of_means(dark: Dark, u: Floats) -> Floats:
 
 
 def dark_signal(frames: LightFrames, record_path: Path | None) -> Callable[[LightFrame], NDArray[np.float32]]:
-    """What a frame holds without light [H, W], DN: from a dark record, else from the view's own dark frames of
-    the same exposure, else from any of that exposure, else the camera's black level."""
+    """The signal of a frame without light [H, W], DN: from a dark record, else from the dark frames of the same
+    exposure, else the camera's black level."""
     if record_path is not None:
         offset = map_beside(record_path, "dark", "offset_dn", frames)
         current = map_beside(record_path, "dark", "current_dn_per_s", frames)
         record = read_accepted(record_path, "dark")
         warm, reference_c = temperatures_of(frames.frames), record.fixed.get("reference_c")
-        # LED boards are warmed by their own light, the camera is not: the coolest is nearest to the camera.
+        # LED boards are warmed by their own light: the coolest has nearly the temperature of the camera.
         warmth = 1.0 if warm is None else warmth_of(warm[0], reference_c, record.value("doubling_k"))
         return lambda frame: offset + current * np.float32(warmth * frame.exposure_us * 1e-6)
     kept: dict[float, NDArray[np.float32]] = {}
@@ -176,7 +177,7 @@ def dark_signal(frames: LightFrames, record_path: Path | None) -> Callable[[Ligh
 
 
 def map_beside(path: Path, kind: Kind, name: str, frames: LightFrames) -> NDArray[np.float32]:
-    """[H, W] a map that stands beside a record that holds for these frames. Raises InputError for another."""
+    """[H, W] a map beside a record that holds for these frames. Raises InputError for another record."""
     record = read_earlier(path, kind, frames.about, frames.size_px)
     with h5py.File(path.parent / record.files[0].name, "r") as file:
         values: NDArray[np.float32] = file[name][()]
@@ -186,7 +187,7 @@ def map_beside(path: Path, kind: Kind, name: str, frames: LightFrames) -> NDArra
 def _mean_and_u(
     values: NDArray[np.float32], u: NDArray[np.float32], hot: NDArray[np.int64]
 ) -> tuple[float, float]:
-    """Mean of a map without hot pixels, and its standard uncertainty: pixels' errors are independent."""
+    """Mean of a map without hot pixels, and its standard uncertainty; errors of pixels are independent."""
     cold = np.ones(values.shape, np.bool_)
     cold[hot[:, 0], hot[:, 1]] = False
     variance = np.mean(np.square(u[cold], dtype=np.float64))
@@ -199,7 +200,7 @@ def _mean_and_u(
 def response_outcome(
     frames: LightFrames, request: Request, dark_record: Path | None, progress: Progress
 ) -> Outcome:
-    """Bracketed exposures of a scene that stands still, each taken twice: gain, noise, linearity."""
+    """Bracketed exposures of a constant scene, each taken twice: gain, noise, linearity."""
     lit = _one_scene(frames)
     by_exposure: dict[float, list[LightFrame]] = {}
     for frame in lit:
@@ -279,7 +280,7 @@ def _saturation_figures(transfers: Mapping[str, PhotonTransfer]) -> dict[str, fl
 
 
 def _one_scene(frames: LightFrames) -> list[LightFrame]:
-    """The frames of one view under one light: of the light that most were taken with."""
+    """The frames of one view under one light: those with the most frames."""
     if not frames.lit:
         raise InputError("response: no frame with light; acquire `coupole plan new response`")
     counted: dict[tuple[str, Light], list[LightFrame]] = {}
@@ -289,7 +290,7 @@ def _one_scene(frames: LightFrames) -> list[LightFrame]:
 
 
 def _sample(shape: tuple[int, ...], pattern: str, channel: str) -> NDArray[np.bool_]:
-    """[H, W] pixels of a channel, of whole rows so that neighbours stay neighbours."""
+    """[H, W] mask of a sample of a channel's pixels, in whole rows so that neighbours stay neighbours."""
     mask = channel_mask((shape[0], shape[1]), pattern, channel)
     step = max(1, round(float(mask.sum()) / _MOST_PIXELS))
     rows = (np.arange(shape[0]) // 2) % step == 0
@@ -362,7 +363,7 @@ def mean_of(frames: Sequence[LightFrame]) -> NDArray[np.float32]:
 
 
 def counter(progress: Progress, total: int) -> Callable[[], None]:
-    """What moves a progress bar by one of `total`."""
+    """A function that advances a progress bar by one of `total`."""
     done = count(1)
     return lambda: progress(next(done), total)
 
@@ -378,17 +379,17 @@ def h5_of(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def block_diagonal(blocks: Sequence[Floats]) -> Floats:
-    """Covariance of groups of parameters that do not depend on each other."""
+    """Covariance of groups of parameters that are independent of each other."""
     from scipy.linalg import block_diag
 
     return np.asarray(block_diag(*blocks))
 
 
 def limit_of(what: str, found: float, limit: float, unit: str = "") -> Limit:
-    """An acceptance limit and how it is met."""
+    """A figure with its acceptance limit."""
     return Limit(what=what, found=found, limit=limit, unit=unit)
 
 
 def record_input(path: Path | None) -> tuple[tuple[str, str], ...]:
-    """A file that a calibration was made with, as an input: none or one."""
+    """Name and SHA-256 of a file that a calibration used; empty for None."""
     return () if path is None else ((path.name, hashlib.sha256(path.read_bytes()).hexdigest()),)

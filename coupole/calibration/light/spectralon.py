@@ -1,11 +1,11 @@
 """Reflectance of a Spectralon tile, as a function of directions, with an uncertainty.
 
-Minnaert's law (Astrophysical Journal 93, 1941): f = rho (k + 1) / (2 pi) (cos_i cos_o)^(k - 1). It is
-reciprocal, k = 1 is Lambert's law, and for light along the normal the hemispherical reflectance is rho. For real
-Spectralon k is above 1: a comprehensive model from goniometer data (IEEE TGRS 2024, doi
-10.1109/TGRS.2024.3361392) has a diffuse part that falls with the zenith angle z in radians by 0.091 z^1.85,
-which k = 1.15 follows within 1 % to 60 degrees; its lobes, forward and back, are what `u_minnaert` has to cover.
-Whoever has a goniometer's certificate for the tile puts its figures into the description.
+Minnaert's law (Astrophysical Journal 93, 1941): f = rho (k + 1) / (2 pi) (cos_i cos_o)^(k - 1). It is reciprocal,
+k = 1 is Lambert's law, and for light along the normal the hemispherical reflectance is rho. For real Spectralon k
+is above 1: a comprehensive model from goniometer data (IEEE TGRS 2024, doi 10.1109/TGRS.2024.3361392) has a
+diffuse part that falls with the zenith angle z in radians by 0.091 z^1.85, which k = 1.15 follows within 1 % to 60
+degrees; `u_minnaert` has to cover its lobes, forward and back. Figures of a goniometer's certificate for the tile
+belong into the description.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class Tile(Model):
     u_minnaert: Annotated[float, Field(ge=0)] = 0.05
     side_mm: Annotated[float, Field(gt=0)] = 50.0
     margin_mm: Annotated[float, Field(ge=0)] = 5.0
-    """Of the rim that is not looked at."""
+    """Width of the rim that is not used."""
     support_from_tile: Pose = Pose(translation_mm=(0.0, 0.0, 10.0))
     u_tilt_deg: Annotated[float, Field(gt=0)] = 0.1
-    """Of its normal, about each of two axes: what the pose above is not known better than."""
+    """Of its normal, about each of two axes: standard uncertainty of the pose above."""
     u_height_mm: Annotated[float, Field(gt=0)] = 0.5
-    """Of its white face along its normal; shifts within the face change nothing that is seen of it."""
+    """Of its white face along its normal; shifts within the face do not change the image."""
 
     def brdf(self, cos_in: Floats, cos_out: Floats, *, minnaert: float | None = None) -> Floats:
         """f in 1/sr, for cosines of incidence and observation above 0."""

@@ -16,10 +16,10 @@ _DEAD_SIGMA = 5.0
 _DEAD_SHARE = 0.01
 """Of the median LED's power."""
 _SHADED = 0.03
-"""Relative departure of a part of the tile that noise does not explain."""
+"""Relative departure of a part of the tile, beyond noise, that counts as shadow."""
 _SHADED_SIGMA = 6.0
 _LOWEST_COSINE = 0.05
-"""Of incidence on the tile: LEDs nearer to its horizon (3 degrees) tell nothing but its tilt."""
+"""Of incidence on the tile: the signal of LEDs within 3 degrees of its horizon depends mostly on its tilt."""
 _STEP, _STEP_MM = 1e-4, 0.05
 OF_PLACE = 3
 """Figures of each place of the tile: two tilts, its height."""
@@ -35,7 +35,7 @@ class TileView:
     base_from_tile: Floats
     """[4, 4] mm, as described."""
     points_mm: Floats
-    """[m, 3] middles of the tile's patches, in the base frame."""
+    """[m, 3] centres of the tile's patches, in the base frame."""
     camera_mm: Floats
     """[3] projection centre."""
     leds: NDArray[np.int64]
@@ -69,7 +69,7 @@ class Row:
     view: int
     led: int
     value: float
-    """S / h, before the logarithm: the power, if the tile lies as described."""
+    """S / h, before the logarithm: the power if the tile's pose is as described."""
     u: float
     """Of the value, from noise."""
     design: Floats
@@ -91,7 +91,7 @@ def transfer(
 ) -> tuple[Floats, Floats]:
     """h [n, m] = f E/Phi of each patch under each LED, and the cosine of incidence [n, m].
 
-    A patch is what some pixels see: of a tile that lies higher, another part of it, nearer to the camera.
+    A patch is defined by the pixels that see it: at another height of the tile they see another part of it.
     """
     x, y = np.radians(np.zeros(2) if tilt_deg is None else tilt_deg)
     normal = view.base_from_tile[:3, :3] @ np.array([np.sin(y), -np.sin(x) * np.cos(y), np.cos(x) * np.cos(y)])
@@ -120,7 +120,7 @@ def rows_of(
     figures: int = 5,
     remarks: list[str],
 ) -> tuple[list[Row], set[int]]:
-    """Observations of view `number`, and LEDs that are lit there though their picture cannot be used.
+    """Observations of view `number`, and the LEDs that are lit in it although their frames cannot be used.
 
     `figures` are shared by all LEDs: two tilts and the height for each place of the tile, of which the view's is
     number `place`, ln reflectance, Minnaert's k. What cannot be used is added to `remarks`.
@@ -137,7 +137,7 @@ def rows_of(
     shaded: list[int] = []
     for n in np.flatnonzero(usable & ~view.saturated):
         middle = float(np.median(ratio[n]))
-        # A shadow's edge across a part makes that part's own noise great: what the parts have in common counts.
+        # A shadow's edge across a part raises that part's noise, so the median noise of all parts is used.
         limit = _SHADED * abs(middle) + _SHADED_SIGMA * float(np.median(u_ratio[n]))
         if (np.abs(ratio[n] - middle) > limit).any():
             shaded.append(int(view.leds[n]))
@@ -201,7 +201,7 @@ def without_dark(
     lit_elsewhere: set[int],
     remarks: list[str],
 ) -> tuple[list[Row], NDArray[np.bool_]]:
-    """Rows in which the tile is lit, and which LEDs [n] are dead: dark in every view, so far as can be seen."""
+    """Rows in which the tile is lit, and a mask [n] of dead LEDs, which are dark in all their views."""
     bright = float(np.median([row.value for row in rows]))
 
     def lit(row: Row) -> bool:
@@ -220,6 +220,6 @@ def without_dark(
 
 
 def list_of(ids: Sequence[int] | NDArray[np.int64]) -> str:
-    """The first of them by number, for people."""
+    """The first of them by number, as text."""
     named = ", ".join(f"{int(led)}" for led in list(ids)[:8])
     return f"LED {named}" + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")

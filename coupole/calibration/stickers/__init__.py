@@ -1,9 +1,9 @@
-"""A scanned object in the robot's base, by the scanner's retro-reflective targets.
+"""Pose of a scanned object in the robot's base, by the scanner's retro-reflective targets.
 
 ::
 
     detection.py    ellipses in a frame; sources.py: in all frames, and the scan's table
-    points.py       their centres in space
-    mesh_to_robot.py  which target is which sticker, and where that puts the mesh
-    workflow.py     runs to record; limits.py, drawing.py: what is accepted and shown
+    points.py       which of its two possible disks each ellipse is
+    mesh_to_robot.py  assignment of targets to stickers, and the mesh's pose
+    workflow.py     from runs to record; acceptance.py, drawing.py: acceptance limits and picture
 """

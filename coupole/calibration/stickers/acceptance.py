@@ -1,4 +1,4 @@
-"""What the place of a mesh must reach to be accepted."""
+"""Acceptance limits of a mesh's pose."""
 
 from __future__ import annotations
 

@@ -1,10 +1,11 @@
-"""The scanner's stickers in an image: bright disks on black ones, and where their centres are seen.
+"""The scanner's stickers in an image: bright disks with black borders, and the images of their centres.
 
-Candidates are bright components of about the right size; each one's rim is then followed along rays from its
-middle to where the signal is halfway between disk and border, by that ray's own levels, so that uneven light moves
-nothing. Rim points are brought to directions before the ellipse is fitted: without the lens's distortion a disk is
-an exact ellipse. Its middle is not where the disk's centre is seen: that follows from the two disks in space that
-the ellipse may be (`circle_poses`); which of the two it is, several views together say (`sticker_points`).
+Candidates are bright components of about the right size; the rim of each is then located on rays from its middle,
+where the signal is halfway between the levels of disk and border on that ray, so that uneven light does not shift
+it. Rim points are converted to directions before the ellipse is fitted: without the lens's distortion the image of
+a disk is an exact ellipse. The image of the disk's centre is not the ellipse's middle. It follows from the two
+disks in space that have this ellipse as their image (`circle_poses`); several views together show which of the two
+it is (`calibration.stickers.points`).
 """
 
 from __future__ import annotations
@@ -21,16 +22,16 @@ from coupole.calibration.rotations import Floats
 
 LEAST_RADIUS_PX = 4.0
 LEAST_AXES_RATIO = 0.25
-"""Seen flatter than 75 degrees a disk's rim is its edge."""
+"""Seen at more than 75 degrees from its normal, a disk's printed rim is not distinguished from its edge."""
 LEAST_CONTRAST = 0.25
-"""Between disk and border, over the disk's own signal: a border is black."""
+"""Between disk and border, over the disk's signal: a border is black."""
 _RAYS = 96
 _INSIDE, _OUTSIDE = 0.65, 1.35
-"""Where along a ray disk and border are, in radii; the border ends at 1.67."""
+"""Radii at which disk and border are sampled, over the disk's radius; the border ends at 1.67."""
 _LEAST_RIM = 0.8
-"""Share of the rays that must find a rim where the ellipse has it."""
+"""Least share of the rays with a rim on the ellipse."""
 _FAR_SIGMA, _WORST_RIM = 3.5, 0.06
-"""A rim rougher than this share of the radius is none of a printed disk."""
+"""A rim with a roughness above this share of the radius is not that of a printed disk."""
 _LEAST_SIGMA_PX = 0.02
 
 
@@ -41,7 +42,7 @@ class Sticker:
     middle: Floats
     """[2] of the ellipse in the image, px."""
     centres: Floats
-    """[2, 2] where the disk's centre is seen, for each of the two disks that it may be."""
+    """[2, 2] image of the disk's centre, for each of the two possible disks."""
     normals: Floats
     """[2, 3] of these disks, camera frame, towards the camera."""
     covariance: Floats
@@ -72,14 +73,14 @@ def find_stickers(
     diameter_mm: float = 6.0,
     depth_mm: tuple[float, float] = (200.0, 900.0),
 ) -> list[Sticker]:
-    """Stickers in one colour's plane [H, W] (`board.plane`), dark subtracted, whose disks measure `diameter_mm`
-    and stand so near and far from the camera."""
+    """Stickers in one colour's plane [H, W] (`grey_image.plane`), dark subtracted, whose disks have `diameter_mm`
+    and lie within this range of depth."""
     import cv2
 
     largest = lens.fx * diameter_mm / depth_mm[0] / 2
     smallest = max(LEAST_RADIUS_PX, lens.fx * diameter_mm / depth_mm[1] / 2 * LEAST_AXES_RATIO)
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
-    # The window holds a disk with its border and about as much else, so that its mean lies between the two.
+    # The window holds a disk with its border and about as much else, so that its mean is between their levels.
     window = min(int(4 * largest) | 1, (min(image.shape) // 2) | 1)
     local = cv2.boxFilter(smooth, -1, (window, window), borderType=cv2.BORDER_REFLECT)
     contours, _ = cv2.findContours((smooth > local).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -100,7 +101,7 @@ def find_stickers(
 
 
 def circle_poses(ellipse: Ellipse, radius_mm: float) -> tuple[Floats, Floats]:
-    """Centres [2, 3] (mm) and normals [2, 3] of the two circles in space that are seen as an ellipse of normalised
+    """Centres [2, 3] (mm) and normals [2, 3] of the two circles in space whose image is an ellipse in normalised
     coordinates, in front of the camera and facing it.
 
     Chen, Wu, Wada, "Camera calibration with two arbitrary coplanar circles", ECCV 2004, eq. 5 to 10.
@@ -126,8 +127,8 @@ def circle_poses(ellipse: Ellipse, radius_mm: float) -> tuple[Floats, Floats]:
 
 
 def fit_ellipse(points: Floats, floor: float = 0.0) -> Ellipse | None:
-    """The ellipse nearest to points [n, 2] by Gauss-Newton on distances to first order, outliers left out; None if
-    the points are of none. `floor` is the least noise to reckon with."""
+    """The ellipse nearest to points [n, 2], by Gauss-Newton on distances to first order, outliers left out; None
+    if the points fit no ellipse. `floor` is a lower bound of the noise."""
     used = np.ones(len(points), np.bool_)
     centre = points.mean(axis=0)
     spread = np.cov((points - centre).T)
@@ -172,7 +173,7 @@ def fit_ellipse(points: Floats, floor: float = 0.0) -> Ellipse | None:
 def _sticker(
     image: Floats, middle: Floats, radii: Floats, turn: float, lens: Intrinsics, diameter_mm: float
 ) -> Sticker | None:
-    """Follow the rim of a candidate, fit, and refuse what is no black-bordered disk."""
+    """Locate the rim of a candidate and fit it; None unless it is a disk with a black border."""
     rim = _rim(image, middle, radii, turn)
     if rim is None:
         return None

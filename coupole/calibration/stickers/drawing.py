@@ -1,4 +1,4 @@
-"""The picture of a mesh's place: stickers and mesh laid onto a frame, what is known how well."""
+"""The picture of a mesh's pose: stickers and mesh drawn onto a frame, and uncertainties."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def draw_mesh(found: MeshFound, figure: Figure) -> None:
 
 
 def _draw_frame(ax: Axes, found: MeshFound) -> None:
-    """One frame, with the mesh's outline and the table's stickers where they should be."""
+    """One frame, with the projected outline of the mesh and the projected stickers of the table."""
     from matplotlib.collections import LineCollection
 
     image = found.images.picture
@@ -51,7 +51,7 @@ def _draw_frame(ax: Axes, found: MeshFound) -> None:
 
 
 def _draw_uncertainty(ax: Axes, found: MeshFound) -> None:
-    """How well each sticker's place in the base is known, from the side of the mesh."""
+    """Uncertainty of each sticker's position in the base, drawn in the mesh's frame."""
     place = found.scan.targets_mm
     dots = ax.scatter(place[:, 0], place[:, 1], c=1e3 * found.u_mm, s=40, cmap="viridis")
     lost = np.isin(found.scan.names, found.pose.missing)

@@ -1,14 +1,14 @@
-"""Where a scanned mesh lies in the robot's base, from its stickers in pictures of known pose.
+"""Pose of a scanned mesh in the robot's base, from its stickers in pictures of known pose.
 
-The scanner's table says where the stickers are in the mesh's frame, to its own accuracy; pictures say where they
-are in the base, to that of camera, hand-eye and robot. Points are found in space, matched with the table by the
-triangles they form, and then everything is adjusted at once:
+The scanner's table has the stickers' positions in the mesh's frame, with the scanner's accuracy; pictures give
+them in the base, with that of camera, hand-eye and robot. Points are found in space and matched with the table by
+the triangles that they form. Then everything is adjusted together:
 
     pixel = project((base_from_flange_i . E_i . flange_from_camera)^-1 . base_from_mesh . (q_j + d_j))
 
-with q_j the table's target, d_j what it is off, E_i what the arm is off in view i; lens, hand-eye and, where they
-are known, the zeros of the arm's axes are observed by a record whose error all views share. (Seed 003, section 4,
-"mesh to robot", which has no uncertainty of target or arm in it.)
+with q_j the table's target, d_j its error, E_i the arm's error in view i. Lens, hand-eye and, if known, the zeros
+of the arm's axes are observed by a record whose error all views share. (Seed 003, section 4, "mesh to robot",
+where target and arm have no uncertainty.)
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ STICKERS, SCANNER, POSITION, ORIENTATION, HAND_EYE = (
 
 @dataclass(frozen=True)
 class Stated:
-    """What is known of the noise beforehand, standard deviations of each coordinate."""
+    """Stated noise: standard deviations of each coordinate."""
 
     sticker_px: float = 0.1
     scanner_mm: float = 0.03
     """Accuracy of the scanner (seed 003: 30 um)."""
     robot_mm: float = 0.3
     robot_deg: float = 0.02
-    """What the arm is off from pose to pose."""
+    """Noise of the arm from pose to pose."""
 
 
 @dataclass(frozen=True)
@@ -58,23 +58,23 @@ class MeshPose:
     """Names of the targets that were recognised."""
     missing: tuple[str, ...]
     false_points: int
-    """Points found in space that are none of the table's."""
+    """Number of points found in space that are not in the table."""
     views_of: dict[str, int]
     residual_px: float
     residuals_of: tuple[tuple[int, int, float], ...]
     """By view: stickers used, left out as gross errors, and the rms distance of those used, px."""
     point_rms_mm: float
-    """Of the points found in space, before the adjustment, from the table's."""
+    """Root mean square distance of the points found in space from the table's, before the adjustment."""
     noise: dict[str, float]
-    """Seen over stated, by group."""
+    """Estimated over stated, by group."""
     redundancy: dict[str, float]
     degrees: Floats
-    """[6] degrees of freedom behind the covariance."""
+    """[6] effective degrees of freedom."""
     dominated_by: tuple[str, ...]
-    """[6] the group that most of each variance comes from."""
+    """[6] the group with the largest contribution to each variance."""
 
     def uncertainty_at(self, mesh_mm: Floats) -> float:
-        """Standard uncertainty of a mesh point's place in the base, mm: root of the sum of its variances."""
+        """Standard uncertainty of a mesh point's position in the base, mm: root of the sum of its variances."""
         turn = self.base_from_mesh[:3, :3]
         by_step = np.concatenate([np.eye(3), -turn @ skew(mesh_mm) * np.pi / 180], axis=1)
         return float(np.sqrt(np.trace(by_step @ self.covariance @ by_step.T)))
@@ -101,10 +101,10 @@ def mesh_to_robot(
     prior: CameraPrior | None = None,
     depth_mm: tuple[float, float] = (200.0, 900.0),
 ) -> MeshPose:
-    """Find a mesh by its targets [n, 3] (mesh frame) in views in which things like stickers were seen.
+    """Find a mesh by its targets [n, 3] (mesh frame) and views with detected stickers.
 
-    Without `prior` the views' poses have no error in common.
-    Raises InputError if too few stickers are seen in three views, or if their layout fits nowhere or twice.
+    Without `prior` the views' poses have no error in common. Raises InputError if too few stickers are seen in
+    three views, or if their layout has no match or two.
     """
     pose_px = intrinsics.fx * (stated.robot_mm / np.mean(depth_mm) + np.radians(stated.robot_deg))
     tolerance_px = 4.0 * float(np.hypot(stated.sticker_px, pose_px))
@@ -292,8 +292,8 @@ def _adjust(
 
 
 def _by_shared(base_from_camera: Floats, prior: CameraPrior) -> Floats:
-    """[v, 6, f + 6 + k] step of each camera's pose for figures of the lens: none; for a step of the hand-eye, its
-    shift turned with the flange; for steps of the axes, which move the flange with the camera on it."""
+    """[v, 6, f + 6 + k] derivative of each camera's pose: zero for the lens; for the hand-eye, its step rotated
+    with the flange; for the axes, the motion of the flange with the camera on it."""
     turn, shift = prior.flange_from_camera[:3, :3], prior.flange_from_camera[:3, 3]
     base_from_flange = base_from_camera @ inverses(prior.flange_from_camera)
     first = len(prior.free)

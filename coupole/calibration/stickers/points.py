@@ -1,7 +1,7 @@
-"""Which of two disks an ellipse is: the one whose normal all views of a sticker agree on.
+"""Decides which of its two possible disks an ellipse is: the one whose normal all views of a sticker agree on.
 
-Seen once, a disk may be tilted to one side or to the other; the centre of either is seen at another place, by up
-to a fifth of a pixel for 6 mm at 0.35 m. Seen from two sides only one normal is the same both times.
+In a single view a disk may be tilted to either side, and the images of the two centres differ by up to a fifth of
+a pixel for 6 mm at 0.35 m. In views from two sides only one normal agrees.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from coupole.calibration.stickers.detection import Sticker
 def views_of(
     names: Sequence[str], base_from_camera: Floats, stickers: Sequence[Sequence[Sticker]]
 ) -> list[CameraView]:
-    """Views [v] with the middles of ellipses, which belong together well enough to be found."""
+    """Views [v] with the middles of ellipses, which are accurate enough to match detections between views."""
     return [
         CameraView(name, pose, np.array([sticker.middle for sticker in seen]).reshape(-1, 2))
         for name, pose, seen in zip(names, base_from_camera, stickers, strict=True)
@@ -29,7 +29,7 @@ def views_of(
 def corrected(
     views: Sequence[CameraView], stickers: Sequence[Sequence[Sticker]], points: Sequence[SeenPoint]
 ) -> list[CameraView]:
-    """The views with the places of all points moved from the ellipses' middles to the disks' centres."""
+    """The views with all detections moved from the ellipses' middles to the images of the disks' centres."""
     pixels = [view.pixels.copy() for view in views]
     for point in points:
         normals = np.array(

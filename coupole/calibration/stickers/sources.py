@@ -1,4 +1,4 @@
-"""A scan as `coupole scan` left it, and the stickers in the images of a run."""
+"""A scan as written by `coupole scan`, and the stickers in the images of a run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _COORDINATES = ("x_mm", "y_mm", "z_mm")
 
 @dataclass(frozen=True)
 class Scan:
-    """What a scanner says of its stickers, in the mesh's frame."""
+    """The scanner's table of stickers, in the mesh's frame."""
 
     names: tuple[str, ...]
     targets_mm: Floats
@@ -40,7 +40,7 @@ class StickerImages:
     names: tuple[str, ...]
     size_px: tuple[int, int]
     shown: int
-    """Which image has most stickers."""
+    """Number of the image with most stickers."""
     picture: Floats
     """[H, W] that image."""
 
@@ -73,7 +73,7 @@ def find_all_stickers(
     depth_mm: tuple[float, float],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> StickerImages:
-    """Look for stickers in all images of runs. Raises InputError if they differ in size or show none."""
+    """Find stickers in all images of runs. Raises InputError if the images differ in size or show none."""
     found: list[tuple[Sticker, ...]] = []
     size_px: tuple[int, int] | None = None
     shown, picture = 0, np.zeros((1, 1))

@@ -1,4 +1,4 @@
-"""From the stickers of a run and of a scan to the record of where the mesh lies, and what the report shows."""
+"""From the stickers of a run and of a scan to the record of the mesh's pose and the report's data."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from coupole.scan.simplify import simplified
 
 _LEAST_SIGMA_PX = 0.02
 _MOST_FACES = 1_000_000
-"""Of the mesh that is laid onto a frame."""
+"""Of the mesh that is drawn onto a frame."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def mesh_from(
     base_from_support: Transform | None = None,
     arm: CalibratedArm | None = None,
 ) -> MeshFound:
-    """Find where a scanned mesh lies. Raises InputError if its stickers are not those in the images."""
+    """Calibrate the pose of a scanned mesh. Raises InputError if its stickers do not match those in the images."""
     if sources.poses is None:
         raise InputError("mesh: the images have no poses; give runs, or a folder with poses")
     base_from_flange = sources.poses.base_from_flange
@@ -125,7 +125,7 @@ def _sigma_px(images: StickerImages) -> float:
 
 def outline_px(found: MeshFound, mesh: Path) -> Floats:
     """Ends [n, 2, 2] (px) of the mesh's edges between triangles that face the shown image's camera and triangles
-    that do not: its outline, and that of what stands out of it."""
+    that do not: its contours."""
     import trimesh
 
     whole = trimesh.load_mesh(mesh, process=False)
@@ -142,7 +142,7 @@ def outline_px(found: MeshFound, mesh: Path) -> Floats:
 
 
 def reprojected(found: MeshFound, mesh_mm: Floats) -> Floats:
-    """Pixels [n, 2] of points [n, 3] of the mesh in the image that is shown; NaN for what is not before it."""
+    """Pixels [n, 2] of points [n, 3] of the mesh in the image that is shown; NaN for points behind the camera."""
     in_camera = mesh_mm @ found.camera_from_mesh[:3, :3].T + found.camera_from_mesh[:3, 3]
     pixels = np.full((len(mesh_mm), 2), np.nan)
     before = in_camera[:, 2] > 1.0
@@ -183,7 +183,7 @@ def _noise(pose: MeshPose, stated: Stated) -> tuple[Noise, ...]:
 
 
 def _figures(pose: MeshPose, scan: Scan, u_mm: Floats) -> dict[str, float]:
-    """What `sticker_limits.MESH` are held against."""
+    """The figures that `acceptance.MESH` limits."""
     return {
         "place_mm": float(u_mm.max()),
         "missing": 1 - len(pose.matched) / len(scan.names),
@@ -199,7 +199,7 @@ def _remarks(pose: MeshPose) -> tuple[str, ...]:
     if pose.missing:
         remarks.append(f"{len(pose.missing)} stickers of the table were not found: {', '.join(pose.missing[:20])}")
     if pose.false_points:
-        remarks.append(f"{pose.false_points} things like stickers are none of the table's")
+        remarks.append(f"{pose.false_points} detected points are not in the table")
     return tuple(remarks)
 
 

@@ -49,7 +49,7 @@ def verify(run: RunPath, as_json: JsonOption = False) -> None:
         raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames are not as they were written")
     if found.missing:
         raise UnprovenError(f"{len(found.missing)} frames of the plan are missing; resume the run")
-    console.print(f"ok: {found.frames} frames, each of them once, all checksums right; proof: {opened.proof}")
+    console.print(f"ok: {found.frames} frames, each exactly once, all checksums right; proof: {opened.proof}")
 
 
 def archive(

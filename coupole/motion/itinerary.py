@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,10 @@ from coupole.plan.led_table import LedTable
 from coupole.plan.rig import KeepOutBox, KeepOutSphere, Rig
 from coupole.plan.rig_devices import described_arm, planning_arm
 from coupole.plan.schedule import ViewPose
+
+Vector: TypeAlias = tuple[float, float, float]
+KeptOutSphere: TypeAlias = tuple[str, Vector, float]
+KeptOutBox: TypeAlias = tuple[str, Vector, Vector]
 
 POSTURE_COST_S = 0.3
 """So much time a posture may cost that is farther from limits and singularities."""
@@ -88,8 +92,7 @@ def bodies_of(
             float(radius_mm.min()),
             float(elevation_deg.max()),
             surface_points(object_corners_support_mm),
-            tuple((k.name, k.center_mm, k.radius_mm) for k in rig.keep_out if isinstance(k, KeepOutSphere)),
-            tuple((k.name, k.min_mm, k.max_mm) for k in rig.keep_out if isinstance(k, KeepOutBox)),
+            *_keep_outs(rig),
         ),
         [Capsule(body.name, 7, body.from_mm, body.to_mm, body.radius_mm) for body in rig.tool],
         Clearances(
@@ -97,6 +100,21 @@ def bodies_of(
         ),
         link_meshes,
     )
+
+
+def _keep_outs(rig: Rig) -> tuple[tuple[KeptOutSphere, ...], tuple[KeptOutBox, ...]]:
+    """The rig's keep-out volumes by shape: name, centre and radius; name, lowest and highest corner; mm."""
+    spheres: list[KeptOutSphere] = []
+    boxes: list[KeptOutBox] = []
+    for volume in rig.keep_out:
+        match volume:
+            case KeepOutSphere():
+                spheres.append((volume.name, volume.center_mm, volume.radius_mm))
+            case KeepOutBox():
+                boxes.append((volume.name, volume.min_mm, volume.max_mm))
+            case _:
+                assert_never(volume)
+    return tuple(spheres), tuple(boxes)
 
 
 def base_from_flange(view: ViewPose, rig: Rig) -> Transform:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from coupole.motion.itinerary import Itinerary, Visit, arm_of, base_from_flange
 from coupole.motion.occlusion import Occlusion, Occlusions, Sight, capsule_axes, sight_of
 from coupole.motion.path_planner import Joints
 from coupole.plan.light_selection import leds_of_plan
-from coupole.plan.rig import KeepOutBox, Rig
+from coupole.plan.rig import KeepOut, KeepOutBox, KeepOutSphere, Rig
 from coupole.plan.schedule import ViewPose
 from coupole.preflight.job import Job
 from coupole.viewing.view_sight import footprint
@@ -164,12 +165,7 @@ def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals
         tuple(refusals),
         measured,
         shadows.patches.of_triangles(len(corners_mm)),
-        tuple(
-            box(k.name, k.min_mm, k.max_mm)
-            if isinstance(k, KeepOutBox)
-            else sphere(k.name, k.center_mm, k.radius_mm)
-            for k in rig.keep_out
-        ),
+        tuple(map(_keep_out_solid, rig.keep_out)),
         shadows.leds_mm,
         job.cell.leds.ids,
         used,
@@ -302,3 +298,13 @@ def _clash_on_the_way(from_deg: Joints, to_deg: Joints, bodies: CellBodies) -> C
         return None
     first = places[int(np.argmax(touches))]
     return Clash(bodies.contacts(first)[0], first)
+
+
+def _keep_out_solid(volume: KeepOut) -> Solid:
+    match volume:
+        case KeepOutSphere():
+            return sphere(volume.name, volume.center_mm, volume.radius_mm)
+        case KeepOutBox():
+            return box(volume.name, volume.min_mm, volume.max_mm)
+        case _:
+            assert_never(volume)

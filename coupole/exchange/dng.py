@@ -14,7 +14,7 @@ from fractions import Fraction
 import numpy as np
 
 import coupole
-from coupole.exchange.export import Picture
+from coupole.exchange.exported_frame import Picture
 from coupole.storage.packing import pack12
 
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _SRATIONAL = 1, 2, 3, 4, 5, 10

@@ -17,25 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import ChecksumMismatch, DiskFull, InputError, StorageError
+from coupole.exchange import dng, tiff
+from coupole.exchange.exported_frame import Picture
 from coupole.storage import frame_file
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 from coupole.storage.step_fields import STORED_NO_LED, board_temperature_c
 
-
-@dataclass(frozen=True)
-class Picture:
-    """One proven frame with its metadata."""
-
-    pixels: NDArray[np.uint16]
-    """[H, W] DN, as the camera gave them."""
-    pattern: str
-    """2x2 Bayer pattern from the top left, or MONO."""
-    black_dn: int
-    white_dn: int
-    exposure_us: int
-    about: dict[str, Any]
-    """Stored in the file as JSON: shot, LED, exposure, pose, lens, `simulated`, run."""
+FORMATS: dict[str, Callable[[Picture], bytes]] = {"dng": dng.encode, "tiff": tiff.encode}
+"""What `--to` may name, and what makes the bytes of a file."""
 
 
 @dataclass(frozen=True)
@@ -91,12 +81,9 @@ def export_run(
 
 
 def _encoder(to: str) -> Callable[[Picture], bytes]:
-    from coupole.exchange import dng, tiff
-
-    formats = {"dng": dng.encode, "tiff": tiff.encode}
-    if to not in formats:
-        raise InputError(f"--to: expected one of {', '.join(formats)}; found {to}")
-    return formats[to]
+    if to not in FORMATS:
+        raise InputError(f"--to: expected one of {', '.join(FORMATS)}; found {to}")
+    return FORMATS[to]
 
 
 def _matches(name: str, patterns: list[str]) -> bool:

@@ -6,7 +6,7 @@ import io
 import json
 
 import coupole
-from coupole.exchange.export import Picture
+from coupole.exchange.exported_frame import Picture
 
 
 def encode(picture: Picture) -> bytes:

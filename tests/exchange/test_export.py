@@ -18,7 +18,8 @@ from places import SHARED_DATA
 from coupole.devices import FrameFormat
 from coupole.errors import ChecksumMismatch, InputError
 from coupole.exchange import dng, tiff
-from coupole.exchange.export import Picture, export_run
+from coupole.exchange.export import export_run
+from coupole.exchange.exported_frame import Picture
 from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file
 from coupole.storage.archive import archive_run

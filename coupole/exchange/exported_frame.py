@@ -1,0 +1,24 @@
+"""One frame as every format takes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One proven frame with its metadata."""
+
+    pixels: NDArray[np.uint16]
+    """[H, W] DN, as the camera gave them."""
+    pattern: str
+    """2x2 Bayer pattern from the top left, or MONO."""
+    black_dn: int
+    white_dn: int
+    exposure_us: int
+    about: dict[str, Any]
+    """Stored in the file as JSON: shot, LED, exposure, pose, lens, `simulated`, run."""

@@ -20,6 +20,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from coupole.errors import StorageError
+from coupole.plan.shot_id import MAX_CHARACTERS
 
 FREE, STORED, PROVEN = 0, 1, 2
 
@@ -28,7 +29,7 @@ FRAME_DTYPE = np.dtype(
         ("state", "<u2"),
         ("led", "<u2"),
         ("exposure_us", "<u4"),
-        ("shot", "S80"),
+        ("shot", f"S{MAX_CHARACTERS}"),
         ("burst", "<u4"),
         ("step", "<u4"),
         ("t_trigger_ns", "<u8"),

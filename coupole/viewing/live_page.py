@@ -23,7 +23,7 @@ _OURS = "X-Coupole-Live"
 
 @dataclass(frozen=True)
 class _Page:
-    """What all viewers share."""
+    """The page, with the state that all viewers share."""
 
     html: bytes
     studio: Studio

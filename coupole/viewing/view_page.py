@@ -1,4 +1,4 @@
-"""The page of a plan: the cell to turn round, view by view. One file that needs no network."""
+"""The interactive page of a plan: the cell in 3D, view by view. One file that needs no network."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MANY = 8
 """With more views than this the arm is shown in one view at a time only."""
 _SUPPORT_THICKNESS_MM = 15.0
 _OVERVIEW, _ALWAYS = 0, -1
-"""Steps of the slider beside the views' numbers: when a part of the drawing is shown."""
+"""Steps of the slider, beside the views' numbers, at which a part of the drawing is shown."""
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
@@ -114,7 +114,7 @@ def _title(scene: Scene, stop: Stop) -> str:
 
 
 def _words_on(scene: Scene, stop: Stop) -> str:
-    """What is told of a view where it is pointed at."""
+    """Text that is shown when the pointer is on a view."""
     words = [f"<b>{stop.number} {stop.name}</b>"]
     if stop.refusal:
         words.append(f"refused: {escape(stop.refusal)}")
@@ -143,7 +143,7 @@ def _cell(scene: Scene) -> list[Any]:
 
 
 def _arm(scene: Scene, stop: Stop, *, opacity: float) -> list[Any]:
-    """The arm at a view, and where it would touch something, that in red."""
+    """The arm at a view, and in red where it would collide."""
     traces = []
     if stop.joints_deg is not None:
         arm = scene.arm(stop.joints_deg, _ROUND)
@@ -192,7 +192,7 @@ def _camera(scene: Scene, stop: Stop) -> list[Any]:
 
 
 def _leds(scene: Scene, share: NDArray[np.float64], stop: Stop | None) -> Any:
-    """LEDs of the plan, coloured by the share that they reach; in a view one is told what hides the rest."""
+    """LEDs of the plan, coloured by the share that they reach; in a view with the causes of occlusion."""
     columns = [scene.led_ids, share]
     told = "LED %{customdata[0]:.0f}: reaches %{customdata[1]:.0%} of what is seen"
     if stop is not None and stop.shadow is not None:

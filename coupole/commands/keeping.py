@@ -45,7 +45,7 @@ def verify(run: RunPath, as_json: JsonOption = False) -> None:
     if as_json:
         print(json.dumps({"ok": found.ok, "frames": found.frames, "bad": found.bad, "missing": found.missing}))
     if found.bad:
-        raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames are not as they were written")
+        raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames differ from what was written")
     if found.missing:
         raise UnprovenError(f"{len(found.missing)} frames of the plan are missing; resume the run")
     console.print(f"ok: {found.frames} frames, each exactly once, all checksums right")
@@ -54,7 +54,7 @@ def verify(run: RunPath, as_json: JsonOption = False) -> None:
 def archive(
     run: RunPath,
     codec: Annotated[str, typer.Option("--codec", help="lz4 (fast) or zstd (a little smaller).")] = "lz4",
-    keep: Annotated[bool, typer.Option("--keep", help="Keep the files as they were, in RUN/unarchived.")] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep the original files, in RUN/unarchived.")] = False,
     partial: Annotated[
         bool, typer.Option("--partial", help="Of a run that is not complete, archive the complete views.")
     ] = False,
@@ -106,7 +106,7 @@ def export(
         list[str] | None, typer.Option("--shots", help="Labels, as `led04*/e0`; again for more.")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder; RUN/export if not given.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over files that stand there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite existing files.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write proven frames as files of another format, one for each, named after its shot."""
@@ -147,7 +147,7 @@ def scan(
         str | None, typer.Option("--targets-unit", help="The table's, if it is another.")
     ] = None,
     accept_defects: Annotated[
-        bool, typer.Option("--accept-defects", help="Take a mesh that is no clean surface.")
+        bool, typer.Option("--accept-defects", help="Accept a mesh that is not a clean surface.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -42,7 +42,7 @@ def read_targets(path: Path) -> Targets:
     except FileNotFoundError:
         raise InputError(f"{path}: expected a table of targets; there is no such file") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected text (UTF-8); byte {error.start} is none") from None
+        raise InputError(f"{path}: expected text (UTF-8); byte {error.start} is not") from None
     rows: list[tuple[int, list[str]]] = []
     units: dict[str, int] = {}
     for number, line in enumerate(lines, start=1):
@@ -77,7 +77,7 @@ def _words(line: str, path: Path, number: int) -> list[str]:
         if not decimals and len(words) in (6, 8, 12, 14) and all(re.fullmatch(r"[+-]?\d+", w) for w in words[-6:]):
             raise InputError(
                 f"{path}:{number}: `{text[:60]}` could be {len(words)} whole numbers or {len(words) // 2} with "
-                "decimal commas; part the columns with semicolons or tabs, or write decimal points"
+                "decimal commas; separate the columns by semicolons or tabs, or write decimal points"
             )
     else:
         words = [word.replace(",", ".") for word in text.split()]

@@ -205,7 +205,7 @@ def _new_folder(parent: Path, name: str) -> Path:
         except FileExistsError:
             continue
         return folder
-    raise StorageError(f"{parent}: a thousand runs named {name} stand here already")
+    raise StorageError(f"{parent}: a thousand runs named {name} exist already")
 
 
 def _settled_bytes(view_file: Path) -> int:
@@ -247,7 +247,7 @@ class Status:
 
 
 def status(run: Run) -> Status:
-    """Progress of a run, also while it is in progress."""
+    """Progress of a run, also of one that is running."""
     found = Status()
     expected = list(run.expected_shots())
     found.shots = sum(shot.is_shot for shot in expected)

@@ -127,7 +127,7 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
 
 
 def _pace(timing: BurstTiming) -> str:
-    bounds = {"LED": "the LED's time alight", "heat": "the LEDs' heat", "disk": "the disk", "camera": "the camera"}
+    bounds = {"LED": "the LED's on-time", "heat": "the LEDs' heat", "disk": "the disk", "camera": "the camera"}
     return (
         f"{timing.period_us / 1e3:g} ms, as {bounds[timing.bound]} asks ({timing.exposure_us / 1e3:g} ms exposed)"
     )
@@ -174,7 +174,7 @@ def show_dry_run(
     console.print(table)
     if outcome.reshot or outcome.over_triggers or outcome.lost_transfers:
         console.print(
-            f"{outcome.reshot} shots re-shot, {outcome.over_triggers} edges came too early for the camera, "
+            f"{outcome.reshot} shots re-shot, {outcome.over_triggers} edges came while the camera was busy, "
             f"{outcome.lost_transfers} frames lost in transfer"
         )
 

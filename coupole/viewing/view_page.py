@@ -44,14 +44,14 @@ p, ol {{ margin: .2em 0; }}
 def write_page(scene: Scene, path: Path) -> None:
     """Write the HTML page, plotly.js in it."""
     clear = sum(not stop.refusal for stop in scene.stops)
-    checked = "" if scene.paths_checked else " Ways were not checked for collisions."
+    checked = "" if scene.paths_checked else " Paths were not checked for collisions."
     why = "".join(f"<li>{escape(refusal)}</li>" for refusal in scene.refusals)
     page = _PAGE.format(
         title=escape(scene.plan),
         red=css(colours.RED),
         about=f"{len(scene.stops)} views on {escape(scene.rig.name)}, {clear} of them clear.{checked} "
-        "Drag to turn, scroll to come nearer, point at a thing to read what it is; the slider goes from view to "
-        "view. LEDs are the lighter the more they reach of what the camera sees.",
+        "Drag to rotate, scroll to zoom, point at a part for its name; the slider goes from view to "
+        "view. LEDs are lighter the more they reach of what the camera sees.",
         refusals=f'<p class="refused">The plan is refused:</p><ol class="refused">{why}</ol>' if why else "",
         figure=_figure(scene).to_html(
             full_html=False,
@@ -122,7 +122,7 @@ def _words_on(scene: Scene, stop: Stop) -> str:
         words.append("axes " + ", ".join(f"{angle:.1f}" for angle in stop.joints_deg) + " deg")
     if stop.leg_s is not None:
         via = f" over {len(stop.vias_mm)} via points" if len(stop.vias_mm) else ""
-        words.append(f"way of {duration_text(stop.leg_s)}{via}")
+        words.append(f"path of {duration_text(stop.leg_s)}{via}")
     words += scene.light_on(stop)
     return "<br>".join(words)
 
@@ -172,7 +172,7 @@ def _those(parts: Sequence[Solid], wanted: Callable[[str], bool]) -> Solid:
 
 def _ways(stop: Stop) -> list[Any]:
     colour = colours.RED if stop.refusal else colours.CAMERA_WAY
-    words = f"way of the camera to {stop.number} {stop.name}"
+    words = f"path of the camera to {stop.number} {stop.name}"
     traces = [_line([stop.camera_way_mm], colour, 4, words)]
     traces.append(_line([stop.flange_way_mm], colours.FLANGE_WAY, 2, words.replace("camera", "flange")))
     if len(stop.vias_mm):

@@ -231,7 +231,7 @@ def _header(pen: Any, scene: Scene) -> None:
         f"{int(scene.used.sum())} of {len(scene.used)} LEDs"
     )
     if not scene.paths_checked:
-        words += "; ways were not checked for collisions"
+        words += "; paths were not checked for collisions"
     pen.text((_MARGIN, 62), words, colours.css(colours.INK), _font(16), anchor="ls")
     if scene.refusals:
         many = "is refused" if len(scene.refusals) == 1 else f"is refused for {len(scene.refusals)} reasons"
@@ -265,9 +265,9 @@ def _legend(pen: Any, bottom_left: tuple[int, int]) -> None:
     pen.text((x + 130, y - 5), note, colours.css(colours.INK), _font(13), anchor="lm")
     for row, (colour, words) in enumerate(
         (
-            (colours.SIGHT, "field of view, and where it falls"),
-            (colours.CAMERA_WAY, "way of the camera; grey: of the flange"),
-            (colours.TOOL, "camera and what else the flange carries"),
+            (colours.SIGHT, "field of view, and its footprint"),
+            (colours.CAMERA_WAY, "path of the camera; grey: of the flange"),
+            (colours.TOOL, "camera and other parts on the flange"),
             (colours.ARM, "arm at the views"),
             (colours.HOME, "arm at home"),
         ),

@@ -281,7 +281,7 @@ def test_a_run_that_another_process_acquires_into_is_refused(made: MadeRun) -> N
 
 
 def test_nothing_more_is_written_into_an_archived_view(archived: MadeRun) -> None:
-    with pytest.raises(StorageError, match="is archived, so nothing is written"):
+    with pytest.raises(StorageError, match="is archived, so nothing can be written"):
         ViewWriter(archived.run.view_path("top"), {})
 
 

@@ -47,7 +47,7 @@ def read_records(paths: Sequence[Path]) -> tuple[InForce, ...]:
     for number, item in enumerate(found):
         if item.record.kind not in READERS:
             raise InputError(
-                f"{item.path}: a record of the kind `{item.record.kind}` says nothing to this budget; expected "
+                f"{item.path}: a record of the kind `{item.record.kind}` is not used by a budget; expected "
                 f"{', '.join(READERS)}"
             )
         if any(item.record.kind == other.record.kind for other in found[:number]):

@@ -51,7 +51,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
     typical = float(np.median(green.u_against_mean()[good]))
     unusable = float(np.mean(~np.isfinite(green.power)))
     others = np.setdiff1d(setting.positions.ids, green.ids)
-    remarks = [f"{len(others)} LEDs of the dome are in no picture: {list_of(others)}"] if len(others) else []
+    remarks = [f"{len(others)} LEDs of the dome have no frame: {list_of(others)}"] if len(others) else []
     remarks += list(dict.fromkeys(remark for power in powers.values() for remark in power.remarks))
     return sealed_outcome(
         "led-power",

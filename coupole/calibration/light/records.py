@@ -325,8 +325,9 @@ def _response_parameters(
 
 
 def _linear_remark(channel: str, line: Linearity) -> str:
-    how = "corrected by a polynomial" if line.coefficients.any() else "not told from a straight line"
-    return f"{channel}: off a straight line by {line.worst_deviation:.2%} ({line.u_deviation:.2%}), {how}"
+    how = "corrected by a polynomial" if line.coefficients.any() else "which is not significant"
+    off = f"{line.worst_deviation:.2%} ({line.u_deviation:.2%})"
+    return f"{channel}: deviates from a straight line by {off}, {how}"
 
 
 def linearise(record_path: Path | None, channel: str, frames: LightFrames) -> Callable[[Floats], Floats]:

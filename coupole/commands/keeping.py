@@ -140,7 +140,7 @@ def export(
 
 def scan(
     mesh: Annotated[Path, typer.Argument(help="The scanner's mesh: PLY, STL or OBJ.", show_default=False)],
-    out: Annotated[Path, typer.Option("--out", help="A new folder for what was read.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="A new folder for the scan.", show_default=False)],
     targets: Annotated[Path | None, typer.Option("--targets", help="Table of the scanner's targets.")] = None,
     unit: Annotated[str, typer.Option("--unit", help="The mesh's unit: mm, cm, m, um or in.")] = "mm",
     targets_unit: Annotated[
@@ -151,7 +151,7 @@ def scan(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Take a scanned mesh and its targets in: check them, bring them to mm, draw them."""
+    """Import a scanned mesh and its targets: check them, convert them to mm, draw them."""
     from coupole.scan.scan import UNITS
     from coupole.viewing.scan_sheet import import_scan
     from coupole.viewing.terminal import make_console

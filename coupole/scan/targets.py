@@ -104,7 +104,7 @@ def _targets(path: Path, rows: list[tuple[int, list[str]]], unit: str) -> Target
     if len(set(names)) < len(names):
         again = next(name for name in names if names.count(name) > 1)
         lines = [str(line) for (line, _), name in zip(rows, names, strict=True) if name == again]
-        raise InputError(f"{path}:{lines[1]}: target `{again}` stands in lines {' and '.join(lines)}")
+        raise InputError(f"{path}:{lines[1]}: target `{again}` is in lines {' and '.join(lines)}")
     normals = _normals(path, rows, numbers[:, 3:]) if numbers.shape[1] == 6 else None
     return Targets(tuple(names), numbers[:, :3].copy(), normals, unit)
 

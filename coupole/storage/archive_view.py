@@ -117,10 +117,10 @@ def _storage_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise DiskFull(
-                f"{path}: the disk is full. The view is as it was; free some space, then archive again."
+                f"{path}: the disk is full. The view is unchanged; free some space, then archive again."
             ) from error
         raise StorageError(
-            f"{path}: {error.strerror or error}. The view is as it was; check the disk, then archive again."
+            f"{path}: {error.strerror or error}. The view is unchanged; check the disk, then archive again."
         ) from error
 
 
@@ -305,7 +305,7 @@ def _read_back(path: Path, partial: Path, frames: list[FrameProven], progress: P
 
 def _not_the_same(path: Path, what: str) -> ChecksumMismatch:
     return ChecksumMismatch(
-        f"{path}: {what} does not read back from the archive as it was. The view is as it was; check disk and "
+        f"{path}: {what} differs when read back from the archive. The view is unchanged; check disk and "
         "memory of this machine, then archive again."
     )
 

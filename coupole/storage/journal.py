@@ -108,7 +108,7 @@ def _events(path: Path, lines: Iterable[bytes]) -> Iterator[Event]:
         except ValidationError as error:
             what = error.errors()[0]
             raise StorageError(
-                f"{path}: line {number} is no event of a journal that this version knows "
+                f"{path}: line {number} is not an event of a journal that this version knows "
                 f"({'.'.join(map(str, what['loc']))}: {what['msg']}). Was it changed, or is it of a later version?"
             ) from error
         if isinstance(event, JournalBegun) and event.version > JOURNAL_VERSION:

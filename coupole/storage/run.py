@@ -316,7 +316,7 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
             result.bad.append(str(error))
             continue
         claimed = Counter(record["shot"] for record in table if record["state"] == frame_file.PROVEN)
-        result.bad += [f"{name}: {shot.decode()} stands in {n} slots" for shot, n in claimed.items() if n > 1]
+        result.bad += [f"{name}: {shot.decode()} is in {n} slots" for shot, n in claimed.items() if n > 1]
         for frame in sorted(frames, key=lambda f: f.index):
             if problem := _frame_problem(path, layout, table, frame):
                 result.bad.append(problem)

@@ -194,11 +194,11 @@ def _camera(scene: Scene, stop: Stop) -> list[Any]:
 def _leds(scene: Scene, share: NDArray[np.float64], stop: Stop | None) -> Any:
     """LEDs of the plan, coloured by the share that they reach; in a view with the causes of occlusion."""
     columns = [scene.led_ids, share]
-    told = "LED %{customdata[0]:.0f}: reaches %{customdata[1]:.0%} of what is seen"
+    told = "LED %{customdata[0]:.0f}: reaches %{customdata[1]:.0%} of the visible surface"
     if stop is not None and stop.shadow is not None:
         columns += [stop.shadow.share(code) for code in (AWAY, BY_OBJECT, BY_ARM, BY_TOOL)]
         told += "<br>turned away from %{customdata[2]:.0%}; hidden by the object %{customdata[3]:.0%}, "
-        told += "by the arm %{customdata[4]:.0%}, by what it carries %{customdata[5]:.0%}"
+        told += "by the arm %{customdata[4]:.0%}, by the tool %{customdata[5]:.0%}"
     marker = {
         "size": 3.5,
         "color": share[scene.used].astype(np.float32),

@@ -116,7 +116,7 @@ class Scene:
             return []
         reached, occluded = stop.shadow.share()[self.used].mean(), stop.shadow.occluded_leds()[self.used].sum()
         return [
-            f"an LED reaches {reached:.0%} of what is seen",
+            f"an LED reaches {reached:.0%} of the visible surface",
             f"{occluded} of {self.used.sum()} LEDs reach nothing of it",
         ]
 

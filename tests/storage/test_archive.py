@@ -325,7 +325,7 @@ def test_an_archive_that_does_not_read_back_does_not_replace_the_file(made: Made
 def archive_is_refused_or_unreadable(made: MadeRun, spoil: Any) -> None:
     """Spoilt tiles decode to other pixels, or not at all: both end in an error, and every file is as it was."""
     before = views_bytes(made.run)
-    with pytest.raises(StorageError, match="The view is as it was"):
+    with pytest.raises(StorageError, match="The view is unchanged"):
         archive_run(made.run, LZ4, progress=spoil)
     assert views_bytes(made.run) == before
 

@@ -147,7 +147,7 @@ def _of_leds(record: Record, path: Path) -> Said:
 
 
 def _of_mesh(record: Record, path: Path) -> Said:
-    """The worst sticker's place stands for all points of the object."""
+    """The uncertainty of the worst sticker is used for all points of the object."""
     turn = step_names("base_from_mesh")[3:]
     u = {parameter.name: parameter.u for parameter in record.parameters}
     figures = {

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from coupole.calibration.acceptance import judged
+from coupole.calibration.acceptance import against_limits
 from coupole.calibration.light import drawing as pictures
 from coupole.calibration.light.acceptance import LED_POWER
 from coupole.calibration.light.frames import LightFrame, LightFrames, channels_of
@@ -61,7 +61,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
         parameters,
         covariance,
         partial(pictures.draw_led_power, powers, setting.positions),
-        limits=judged(LED_POWER, request.limits, {"power": typical, "unusable": unusable}),
+        limits=against_limits(LED_POWER, request.limits, {"power": typical, "unusable": unusable}),
         files={f"{request.name}.csv": power_table(powers, warm).encode()},
         fixed={"tile.reflectance": setting.tile.reflectance, "tile.minnaert": setting.tile.minnaert},
         remarks=(f"emission profile `{setting.emission}`", *remarks),

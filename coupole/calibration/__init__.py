@@ -3,8 +3,8 @@
 ::
 
     lens/           camera, its place on the robot, its colours, from images of a board
-    leds/           where the LEDs are and face, from views of the LEDs themselves
-    stickers/       where a scanned object lies, from its stickers
+    leds/           positions and normals of the LEDs, from views of the LEDs themselves
+    stickers/       pose of a scanned object, by its stickers
     light/          radiometry of sensor, lens and LEDs, and its drift
     budget/         uncertainty of a reflectance, from the records of all calibrations
 

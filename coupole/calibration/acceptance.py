@@ -1,7 +1,7 @@
 """Acceptance limits of a calibration, and how an operator sets one.
 
 A calibration lists its limits once, as `Allowed`. Its command uses the list for `--limit NAME=VALUE` and for its
-help, its workflow for the record (`judged`). The record keeps the default beside the limit that was asked for.
+help, its workflow for the record (`against_limits`). The record keeps the default beside the limit asked for.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def asked(words: Sequence[str], limits: Sequence[Allowed]) -> dict[str, float]:
     return found
 
 
-def judged(
+def against_limits(
     limits: Sequence[Allowed], wanted: Mapping[str, float], found: Mapping[str, float]
 ) -> tuple[Limit, ...]:
     """Figures compared with their limits, as the record keeps them. `wanted` are the limits that the operator set;

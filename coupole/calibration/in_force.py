@@ -78,7 +78,7 @@ def _record_refusals(record: Record, here: Situation) -> list[str]:
         reasons.append(f"expired on {holds.expires:%Y-%m-%d %H:%M} UTC. Calibrate anew")
     if here.now < record.created:
         reasons.append(
-            f"made on {record.created:%Y-%m-%d %H:%M} UTC, which is yet to come. Set this machine's clock"
+            f"made on {record.created:%Y-%m-%d %H:%M} UTC, which is in the future. Set this machine's clock"
         )
     if record.simulated and not here.simulated:
         reasons.append("made with a simulated camera; this cell is real")
@@ -114,6 +114,6 @@ def _record_refusals(record: Record, here: Situation) -> list[str]:
         if not low <= here.temperature_c <= high:
             reasons.append(
                 f"holds from {low:g} to {high:g} C; the cell's coolest LED board has {here.temperature_c:g} C. "
-                "Let it come back to that temperature, or calibrate at this one"
+                "Wait for that temperature, or calibrate at this one"
             )
     return reasons

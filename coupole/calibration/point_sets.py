@@ -63,7 +63,7 @@ def match_points(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Mat
     if len(found_mm) < LEAST_MATCHED or len(known_mm) < LEAST_MATCHED:
         raise InputError(
             f"targets: expected {LEAST_MATCHED} or more on each side; {len(found_mm)} were found in the images, "
-            f"{len(known_mm)} stand in the table"
+            f"{len(known_mm)} are in the table"
         )
     tree = cKDTree(found_mm)
     best: list[tuple[int, float, Floats]] = []
@@ -86,8 +86,8 @@ def match_points(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Mat
     rivals = max((n for n, _, other in best[1:] if _differ(motion, other, known_mm, tolerance_mm)), default=0)
     if rivals > _AMBIGUOUS_SHARE * count:
         raise InputError(
-            f"targets: two motions fit: one brings {count} targets together, another {rivals}. The stickers stand "
-            "too regularly, or too few were seen; add some, or take more views."
+            f"targets: two motions fit: one brings {count} targets together, another {rivals}. The stickers are "
+            "placed too regularly, or too few were seen; add some, or take more views."
         )
     pairs = _pairs(tree, motion, known_mm, tolerance_mm)
     return Matched(*pairs, motion, rms_mm, rivals)

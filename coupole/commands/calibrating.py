@@ -122,7 +122,7 @@ def _calibrate(
         record_path = out / f"{request.name}.yaml"
         for path in (out / f"{request.name}{suffix}" for suffix in _SUFFIXES):
             if path.exists():
-                raise InputError(f"{path}: stands here already. Choose another --name or --out.")
+                raise InputError(f"{path}: exists already. Choose another --name or --out.")
         outcome = work(console, request)
         page, picture = write_outcome(record_path, outcome)
     except CoupoleError as error:

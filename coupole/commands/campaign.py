@@ -113,7 +113,7 @@ class Campaign:
         self._refuse_missed(step)
         todo = [kind for kind in step.records if not self._record(kind).is_file()]
         if not todo:
-            self._console.print(f"{step.name}: its records stand already")
+            self._console.print(f"{step.name}: its records exist already")
             return
         run = self._acquire(step)
         for kind in todo:
@@ -132,8 +132,8 @@ class Campaign:
                 raise CalibrationRefused(
                     [
                         *(f"{path}: not accepted: {one.what} is {one.found:.3g} {one.unit}" for one in missed),
-                        f"Read {path.with_suffix('.html')}; mend the cause, or calibrate by hand with --limit; "
-                        f"take {path.stem}.* away, and call this again",
+                        f"Read {path.with_suffix('.html')}; remove the cause, or calibrate by hand with --limit; "
+                        f"remove {path.stem}.*, and call this again",
                     ]
                 )
 
@@ -147,15 +147,15 @@ class Campaign:
         begun = sorted((self._out / "runs").glob(f"*-{step.name}"))
         resumed = begun[-1] if begun and (begun[-1] / "run.json").is_file() else None
         if resumed is not None and Run(resumed).about["plan"]["sha256"] != sha256(plan):
-            self._console.print(f"{plan} was changed since {resumed.name}: acquired anew")
+            self._console.print(f"{plan} was changed since {resumed.name}: a new run is acquired")
             resumed = None
         if resumed is not None and not status(Run(resumed)).missing:
             return resumed
         self._console.rule(f"acquire {step.name}")
         if self._ask:
-            self._console.print(f"On the support must stand: [bold]{step.stands}[/].")
+            self._console.print(f"Place on the support: [bold]{step.stands}[/].")
             if not typer.confirm("Ready?", default=True):
-                raise Interrupted("stopped by the operator; call it again to go on")
+                raise Interrupted("stopped by the operator; call it again to continue")
         found: dict[str, Any] = {}
         job = read_job(plan)
         acquire_plan(job, self._console, parent=self._out / "runs", resume=resumed, confirm=self._ask, found=found)

@@ -46,7 +46,7 @@ def verify(run: RunPath, as_json: JsonOption = False) -> None:
         document = {"ok": found.ok, "proof": opened.proof, "frames": found.frames}
         print(json.dumps({**document, "bad": found.bad, "missing": found.missing}))
     if found.bad:
-        raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames are not as they were written")
+        raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames differ from what was written")
     if found.missing:
         raise UnprovenError(f"{len(found.missing)} frames of the plan are missing; resume the run")
     console.print(f"ok: {found.frames} frames, each exactly once, all checksums right; proof: {opened.proof}")
@@ -55,7 +55,7 @@ def verify(run: RunPath, as_json: JsonOption = False) -> None:
 def archive(
     run: RunPath,
     codec: Annotated[str, typer.Option("--codec", help="lz4 (fast) or zstd (a little smaller).")] = "lz4",
-    keep: Annotated[bool, typer.Option("--keep", help="Keep the files as they were, in RUN/unarchived.")] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep the original files, in RUN/unarchived.")] = False,
     partial: Annotated[
         bool, typer.Option("--partial", help="Of a run that is not complete, archive the complete views.")
     ] = False,
@@ -107,7 +107,7 @@ def export(
         list[str] | None, typer.Option("--shots", help="Labels, as `led04*/e0`; again for more.")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder; RUN/export if not given.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over files that stand there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite existing files.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write proven frames as files of another format, one for each, named after its shot."""
@@ -141,18 +141,18 @@ def export(
 
 def scan(
     mesh: Annotated[Path, typer.Argument(help="The scanner's mesh: PLY, STL or OBJ.", show_default=False)],
-    out: Annotated[Path, typer.Option("--out", help="A new folder for what was read.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="A new folder for the scan.", show_default=False)],
     targets: Annotated[Path | None, typer.Option("--targets", help="Table of the scanner's targets.")] = None,
     unit: Annotated[str, typer.Option("--unit", help="The mesh's unit: mm, cm, m, um or in.")] = "mm",
     targets_unit: Annotated[
         str | None, typer.Option("--targets-unit", help="The table's, if it is another.")
     ] = None,
     accept_defects: Annotated[
-        bool, typer.Option("--accept-defects", help="Take a mesh that is no clean surface.")
+        bool, typer.Option("--accept-defects", help="Accept a mesh that is not a clean surface.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Take a scanned mesh and its targets in: check them, bring them to mm, draw them."""
+    """Import a scanned mesh and its targets: check them, convert them to mm, draw them."""
     from coupole.scan.scan import UNITS
     from coupole.viewing.scan_sheet import import_scan
     from coupole.viewing.terminal import make_console

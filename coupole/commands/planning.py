@@ -160,7 +160,7 @@ def plan_new(
         raise typer.BadParameter(f"expected one of {', '.join(known)}; found {template}")
     path = Path(f"{name}.yaml")
     if path.exists():
-        raise InputError(f"{path}: stands here already; choose another name")
+        raise InputError(f"{path}: exists already; choose another name")
     if template == LEDS:
         from coupole.calibration.leds.led_plan import led_plan
         from coupole.plan.cell import read_cell

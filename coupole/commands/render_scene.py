@@ -79,9 +79,9 @@ def read_scene(path: Path) -> tuple[Document, Scene]:
 
 
 def render_scene(document: Document, scene: Scene, folder: Path, progress: Progress) -> dict[str, Any]:
-    """Render into `folder`, with a summary (JSON) beside the pictures.
+    """Render into `folder`, with a summary (JSON).
 
-    Raises InputError if the scene or this machine cannot do it, StorageError if nothing can be written.
+    Raises InputError if the scene cannot be rendered on this machine, StorageError if nothing can be written.
     """
     from coupole.appearance.render import studio
 

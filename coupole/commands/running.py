@@ -17,7 +17,7 @@ def acquire(
     plan: PlanPath,
     rig: RigOption = None,
     output: Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")] = None,
-    resume: Annotated[Path | None, typer.Option("--resume", help="Go on with this run.")] = None,
+    resume: Annotated[Path | None, typer.Option("--resume", help="Resume this run.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Rehearse on the rig's twin.")] = False,
     speed: Annotated[float, typer.Option("--speed", min=0.1, max=1000, help="Pace of a dry run.")] = 20.0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell moves.")] = False,
@@ -33,9 +33,9 @@ def acquire(
     from coupole.viewing.terminal import make_console
 
     if dry_run and (resume or output):
-        raise typer.BadParameter("a dry run keeps nothing: --resume and --output do not go with --dry-run")
+        raise typer.BadParameter("a dry run stores nothing: --dry-run excludes --resume and --output")
     if resume and output:
-        raise typer.BadParameter("a resumed run stays where it is: --output does not go with --resume")
+        raise typer.BadParameter("a resumed run keeps its folder: --resume excludes --output")
     console = make_console(quiet=as_json)
     found: dict[str, Any] = {}
     try:
@@ -128,13 +128,13 @@ def meter(
 
 def live(
     what: Annotated[Path, typer.Argument(help="A run's folder, a plan, or a rig.", show_default=False)],
-    led: Annotated[int | None, typer.Option("--led", help="The LED to begin with; none is dark.")] = None,
-    exposure_us: Annotated[int, typer.Option("--exposure-us", min=10, help="Exposure to begin with.")] = 8000,
+    led: Annotated[int | None, typer.Option("--led", help="Id of the first LED; dark if not given.")] = None,
+    exposure_us: Annotated[int, typer.Option("--exposure-us", min=10, help="First exposure.")] = 8000,
     frames_per_s: Annotated[
         float, typer.Option("--fps", min=0.1, max=20, help="Pictures a second, at most.")
     ] = 5.0,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page; 0: any.")] = 0,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before real light is given.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before real LEDs are lit.")] = False,
 ) -> None:
     """Live view of the camera, or of a run in progress: figures here, pictures on a page for this machine.
 

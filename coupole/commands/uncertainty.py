@@ -24,6 +24,12 @@ if TYPE_CHECKING:
     from coupole.calibration.in_force import InForce
 
 _SAMPLES = 24
+CoverageOption = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--coverage", help="Of an interval, again for more. 0.68 and 0.95 if not given.", min=0.01, max=0.99
+    ),
+]
 
 
 def budget(
@@ -31,12 +37,13 @@ def budget(
         list[Path] | None,
         typer.Argument(
             help="Records, or folders of them: camera, hand-eye, leds, mesh, flat-field, response, led-power, "
-            "drift. Seed 003's figures, or assumed ones, where there is none.",
+            "drift. Without a record, seed 003's or assumed figures.",
             metavar="RECORD_OR_FOLDER",
         ),
     ] = None,
     plan: Annotated[
-        Path | None, typer.Option("--plan", help="Take the records that this plan names, where none is given.")
+        Path | None,
+        typer.Option("--plan", help="Add the records that this plan names, of other kinds."),
     ] = None,
     beside: Annotated[
         list[Path] | None,
@@ -49,12 +56,7 @@ def budget(
     contrast: Annotated[
         float, typer.Option("--contrast", min=0.0, help="Relative change of albedo per mm of the object.")
     ] = 0.02,
-    coverage: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--coverage", help="Of an interval, again for more. 0.68 and 0.95 if not given.", min=0.01, max=0.99
-        ),
-    ] = None,
+    coverage: CoverageOption = None,
     emission: EmissionOption = "lambertian",
     out: Annotated[Path | None, typer.Option("--out", help="Write this PNG, and HTML and JSON beside it.")] = None,
     as_json: JsonOption = False,
@@ -183,10 +185,10 @@ def _spread(known: Known) -> Spread:
 def _refuse_target(out: Path) -> None:
     """Raise InputError if the name is not that of a PNG, or a file exists already."""
     if out.suffix != ".png":
-        raise InputError(f"--out {out}: expected the name of a picture, as budget.png")
+        raise InputError(f"--out {out}: expected the name of a PNG, as budget.png")
     for path in (out, out.with_suffix(".html"), out.with_suffix(".json")):
         if path.exists():
-            raise InputError(f"{path}: stands here already; choose another --out")
+            raise InputError(f"{path}: exists already; choose another --out")
 
 
 def _write(files: Mapping[Path, bytes]) -> None:

@@ -64,7 +64,7 @@ def export_run(
     standing = [path for path in paths.values() if path.exists()]
     if standing and not overwrite:
         raise InputError(
-            f"{standing[0]}: stands here already ({len(standing)} such files). Choose another --out, or say "
+            f"{standing[0]}: exists already ({len(standing)} such files). Choose another --out, or give "
             "--overwrite."
         )
     written = 0

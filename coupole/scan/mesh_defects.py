@@ -41,7 +41,7 @@ def find_defects(mesh: Mesh) -> Defects:
     keys = np.empty(3 * len(mesh.triangles), np.uint64)
     _fill_edge_keys(mesh.triangles, keys)
     keys.sort()
-    open_edges, (non_manifold, crowded), (flipped, turned) = _judge_edges(keys)
+    open_edges, (non_manifold, crowded), (flipped, turned) = _count_edges(keys)
     return Defects(
         non_manifold,
         _triangle_with(mesh.triangles, crowded) if non_manifold else -1,
@@ -99,7 +99,7 @@ def _fill_edge_keys(triangles, keys):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _judge_edges(keys):  # type: ignore[no-untyped-def]
+def _count_edges(keys):  # type: ignore[no-untyped-def]
     """Number of open edges; number and first key of edges with more than two triangles; the same for flipped
     edges."""
     none = np.uint64(0)

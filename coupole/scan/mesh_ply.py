@@ -63,7 +63,7 @@ def _ply_header(path: Path) -> tuple[str, list[_Element], int, int]:
         for number in range(1, 10_000):
             words = file.readline(4096).decode("ascii", "replace").split()
             if number == 1 and words != ["ply"]:
-                raise InputError(f"{path}:1: expected `ply`; this is no PLY file")
+                raise InputError(f"{path}:1: expected `ply`; this is not a PLY file")
             match words:
                 case ["format", kind, _] if kind in ("ascii", "binary_little_endian", "binary_big_endian"):
                     file_format = kind

@@ -32,7 +32,7 @@ def read_stl(path: Path) -> Mesh:
             raise InputError(f"{path}: expected a header of 84 bytes; the file has {size}")
         at = (size - _STL_HEADER_BYTES - 4) // _STL_RECORD.itemsize
         raise InputError(
-            f"{path}: the file ends in triangle {at} of {count}, or is no STL: {size} bytes, not {expected}"
+            f"{path}: the file ends in triangle {at} of {count}, or is not an STL: {size} bytes, not {expected}"
         )
     welder = _Welder(count)
     with path.open("rb") as file:

@@ -36,7 +36,7 @@ def new_scan_folder(folder: Path) -> Iterator[Path]:
     Raises InputError if `folder` is there already, StorageError if nothing can be written.
     """
     if folder.exists():
-        raise InputError(f"--out {folder}: stands here already; name a new folder")
+        raise InputError(f"--out {folder}: exists already; name a new folder")
     partial = folder.with_name(folder.name + ".part")
     try:
         shutil.rmtree(partial, ignore_errors=True)

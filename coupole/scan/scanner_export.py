@@ -77,7 +77,7 @@ def _expect_plausible(path: Path, mesh: Mesh, unit: str) -> None:
     if low_mm <= size_mm <= high_mm:
         return
     fitting = [u for u, mm in MM_PER_UNIT.items() if low_mm <= size_mm / MM_PER_UNIT[unit] * mm <= high_mm]
-    hint = f"; in {' or '.join(fitting)} it would fit: say so with --unit" if fitting else ""
+    hint = f"; in {' or '.join(fitting)} it would fit: give its unit with --unit" if fitting else ""
     raise InputError(
         f"{path}: the mesh is {size_mm:.4g} mm in size if it is in {unit}; expected {low_mm:g} to {high_mm:g} mm"
         f"{hint}"
@@ -100,18 +100,18 @@ def _refuse(path: Path, mesh: Mesh, defects: Defects, *, accept_defects: bool) -
     if defects.non_manifold_edges:
         raise InputError(
             f"{path}: not a surface: {defects.non_manifold_edges} edges have three triangles or more; "
-            f"{at(defects.first_non_manifold)}. Mend it in the scanner's software, or give --accept-defects"
+            f"{at(defects.first_non_manifold)}. Repair it in the scanner's software, or give --accept-defects"
         )
     if defects.flipped_edges:
         raise InputError(
-            f"{path}: {defects.flipped_edges} edges part a triangle that shows its inside from one that does not; "
-            f"{at(defects.first_flipped)}. Mend the normals, or take it with --accept-defects"
+            f"{path}: {defects.flipped_edges} edges are between triangles of opposite orientation; "
+            f"{at(defects.first_flipped)}. Repair the normals, or accept it with --accept-defects"
         )
 
 
 def _targets_unit(path: Path, table: Targets, stated: str | None, mesh_unit: str) -> str:
     if stated and table.unit and stated != table.unit:
-        raise InputError(f"{path}: the table says {table.unit}, --targets-unit says {stated}")
+        raise InputError(f"{path}: the unit in the table is {table.unit}, that of --targets-unit {stated}")
     return stated or table.unit or mesh_unit
 
 
@@ -123,7 +123,7 @@ def _expect_together(mesh_path: Path, mesh: Mesh, path: Path, centers_mm: NDArra
     if len(centers_mm) > 1 and spread_mm < size_mm / mesh_defects.OUT_OF_PROPORTION:
         raise InputError(
             f"{path}: mixed units? The targets lie within {spread_mm:.3g} mm, the mesh of {mesh_path.name} is "
-            f"{size_mm:.4g} mm in size; say the table's unit with --targets-unit"
+            f"{size_mm:.4g} mm in size; give the table's unit with --targets-unit"
         )
     far = int(np.argmax(beyond_mm))
     if beyond_mm[far] > _TARGETS_BEYOND * size_mm:

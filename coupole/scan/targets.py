@@ -42,7 +42,7 @@ def read_targets(path: Path) -> Targets:
     except FileNotFoundError:
         raise InputError(f"{path}: expected a table of targets; there is no such file") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected text (UTF-8); byte {error.start} is none") from None
+        raise InputError(f"{path}: expected text (UTF-8); byte {error.start} is not") from None
     rows: list[tuple[int, list[str]]] = []
     units: dict[str, int] = {}
     for number, line in enumerate(lines, start=1):
@@ -77,7 +77,7 @@ def _words(line: str, path: Path, number: int) -> list[str]:
         if not decimals and len(words) in (6, 8, 12, 14) and all(re.fullmatch(r"[+-]?\d+", w) for w in words[-6:]):
             raise InputError(
                 f"{path}:{number}: `{text[:60]}` could be {len(words)} whole numbers or {len(words) // 2} with "
-                "decimal commas; part the columns with semicolons or tabs, or write decimal points"
+                "decimal commas; separate the columns by semicolons or tabs, or write decimal points"
             )
     else:
         words = [word.replace(",", ".") for word in text.split()]
@@ -104,7 +104,7 @@ def _targets(path: Path, rows: list[tuple[int, list[str]]], unit: str) -> Target
     if len(set(names)) < len(names):
         again = next(name for name in names if names.count(name) > 1)
         lines = [str(line) for (line, _), name in zip(rows, names, strict=True) if name == again]
-        raise InputError(f"{path}:{lines[1]}: target `{again}` stands in lines {' and '.join(lines)}")
+        raise InputError(f"{path}:{lines[1]}: target `{again}` is in lines {' and '.join(lines)}")
     normals = _normals(path, rows, numbers[:, 3:]) if numbers.shape[1] == 6 else None
     return Targets(tuple(names), numbers[:, :3].copy(), normals, unit)
 

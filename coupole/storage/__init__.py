@@ -1,1 +1,1 @@
-"""What is on disk: run folder, journal, frame files, archive."""
+"""Stored data: run folder, journal, frame files, archive."""

@@ -1,8 +1,8 @@
-"""Archive a run: each view's file is replaced by a compressed one that holds the same frames.
+"""Archives a run: the file of each view is replaced by a compressed one with the same frames.
 
-Views are archived one after the other, so that each frees its space before the next needs some. How one view is
-archived without ever being at risk: `storage.archive_view`. That a view is archived stands in its file alone: the
-journal tells how frames were taken, and that is over.
+Views are archived one after the other, so that each frees its space before the next one needs some.
+`storage.archive_view` archives one view without risk of data loss. Only the view's file shows that it is archived;
+the journal records how frames were taken, and is not changed.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from coupole.storage.bitshuffle import Codec
 from coupole.storage.run import Run
 
 KEPT_FOLDER = "unarchived"
-"""Of the run's folder: where `keep` puts the files that were archived."""
+"""Subfolder of the run for the original files, with `keep`."""
 
 
 @dataclass
 class Archived:
-    """What `archive_run` did."""
+    """Result of `archive_run`."""
 
     views: list[ArchivedView] = field(default_factory=list)
     already: list[str] = field(default_factory=list)
     """Views that an earlier call archived."""
     incomplete: list[str] = field(default_factory=list)
-    """Views that were left as they are, because frames of them are missing."""
+    """Views that were not archived because frames are missing."""
 
     def figures(self) -> dict[str, Any]:
-        """What `--json` says: sizes in bytes, speeds in MB/s of uncompressed frames."""
+        """Content of `--json`: sizes in bytes, speeds in MB/s of uncompressed frames."""
         pixels, stored = sum(v.pixel_bytes for v in self.views), sum(v.stored_bytes for v in self.views)
         seconds = sum((v.compress_s + v.read_back_s for v in self.views), 0.0)
         return {
@@ -61,12 +61,12 @@ def archive_run(
 ) -> Archived:
     """Archive all views of a run.
 
-    With `keep` the files as they were stay in `RUN/unarchived`. With `partial` the complete views of a run that is
-    not complete are archived; views that are not complete never are, so that the run can still be resumed.
+    With `keep` the original files are kept in `RUN/unarchived`. With `partial` the complete views of an incomplete
+    run are archived; incomplete views never are, so that the run can be resumed.
 
-    Raises InputError while another process has the run, UnprovenError if frames are missing (without `partial`),
-    ChecksumMismatch if a frame is not what was proven, before or after, and DiskFull; the view at hand is then as
-    it was before.
+    Raises InputError if another process has locked the run, UnprovenError if frames are missing (without
+    `partial`), ChecksumMismatch if a frame is not what was proven, before or after, and DiskFull; the current view
+    is then unchanged.
     """
     held = run.lock()
     try:

@@ -1,10 +1,10 @@
-"""One view's file compressed bit-exact, read back, and only then put in the old one's place.
+"""Compresses the file of one view without loss, reads it back, and only then replaces the original.
 
 The frames of `NAME.h5` are compressed into `NAME.archive`, which is synced, read back from the disk through HDF5
-as any reader would, and compared with the frame table and the journal. Then it is renamed onto `NAME.h5`. So
-whenever the machine stops there is one whole file under the view's name, and archiving is simply begun again.
+as any reader would, and compared with the frame table and the journal. Then it is renamed to `NAME.h5`. So at
+every moment a complete file has the view's name, and after a crash archiving can be repeated.
 
-Only proven frames are kept. A slot without one is free in the archive and has no pixels: it reads as 65535.
+Only proven frames are kept. Any other slot is free in the archive and has no stored pixels; they read as 65535.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ from coupole.storage.journal_events import FrameProven
 from coupole.storage.line_file import utc_now
 
 _METADATA_BYTES = 2**20
-"""Room that HDF5 may need for its own beside the frames of one step."""
+"""Space that HDF5 may need for metadata beside the frames of one step."""
 
 Progress = Callable[[str, int, int], None]
-"""Told what is done (`top: compress`), how many frames of it, and of how many."""
+"""Takes the current work (`top: compress`), the number of frames done, and their total."""
 Tiles = list[tuple[tuple[int, int], bytes]]
 
 
 @dataclass(frozen=True)
 class ArchivedView:
-    """One view that was archived now."""
+    """Figures of a view that was archived."""
 
     view: str
     frames: int
     pixel_bytes: int
-    """Of its frames, as they were taken."""
+    """Of its frames, uncompressed."""
     stored_bytes: int
-    """Of its frames, as they lie in the archive."""
+    """Of its frames in the archive."""
     freed_bytes: int
-    """Of the disk; below 0 if the file as it was is kept as well."""
+    """On the disk; negative if the original is kept."""
     compress_s: float
     read_back_s: float
 
@@ -77,9 +77,9 @@ class ArchivedView:
 def archive_view(
     path: Path, proven: Iterable[FrameProven], codec: Codec, progress: Progress, *, keep_in: Path | None = None
 ) -> ArchivedView:
-    """Archive one view's file, keeping the frames `proven`; the file as it was goes into the folder `keep_in`.
+    """Archive one view's file with its frames `proven`; the original is kept in the folder `keep_in`, if given.
 
-    Raises ChecksumMismatch, DiskFull or StorageError; the file is then as it was before.
+    Raises ChecksumMismatch, DiskFull or StorageError; the file is then unchanged.
     """
     partial = path.with_suffix(".archive")
     frames = sorted(proven, key=lambda frame: frame.index)
@@ -117,15 +117,15 @@ def _storage_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise DiskFull(
-                f"{path}: the disk is full. The view is as it was; free some space, then archive again."
+                f"{path}: the disk is full. The view is unchanged; free some space, then archive again."
             ) from error
         raise StorageError(
-            f"{path}: {error.strerror or error}. The view is as it was; check the disk, then archive again."
+            f"{path}: {error.strerror or error}. The view is unchanged; check the disk, then archive again."
         ) from error
 
 
 def _check_records(path: Path, table: NDArray[np.void], frames: list[FrameProven]) -> None:
-    """The file's own table must agree with the journal about every frame."""
+    """Raise unless the file's table agrees with the journal about every frame."""
     for frame in frames:
         claims = (frame_file.PROVEN, str(frame.shot).encode(), int(frame.xxh3, 16))
         if frame.index >= len(table) or table[frame.index][["state", "shot", "xxh3"]].item() != claims:
@@ -139,11 +139,11 @@ def _check_records(path: Path, table: NDArray[np.void], frames: list[FrameProven
 
 
 def _write(path: Path, partial: Path, frames: list[FrameProven], codec: Codec, progress: Progress) -> int:
-    """Compress the frames of `path` into a new file `partial`, synced; returns the bytes that they take there."""
+    """Compress the frames of `path` into a new file `partial`, synced; returns the bytes that they need there."""
     layout, workers = (
         frame_file.read_layout(path),
         (os.cpu_count() or 1) + 1,
-    )  # one more: some always wait for the disk
+    )  # one more, as some always wait for the disk
     tile = bitshuffle.tile_shape(layout.height_px, layout.width_px)
     with (
         _Source(path, layout, workers) as source,
@@ -176,7 +176,7 @@ def _write(path: Path, partial: Path, frames: list[FrameProven], codec: Codec, p
 
 
 def _reserve(fd: int, file: h5py.File, more_bytes: int) -> None:
-    """Have the disk promise room behind the file's end: HDF5 itself cannot go on, nor close, on a full disk."""
+    """Allocate space beyond the file's end, because HDF5 can neither continue nor close a file on a full disk."""
     os.posix_fallocate(fd, file.id.get_filesize(), more_bytes + _METADATA_BYTES)
 
 
@@ -188,7 +188,7 @@ def _copy_all_but_frames(
     codec: Codec,
     kept: set[int],
 ) -> h5py.Dataset:
-    """Copy groups, tables, values, links and attributes as they are; returns the frames' dataset, still empty."""
+    """Copy groups, tables, values, links and attributes unchanged; returns the frames' dataset, still empty."""
     frames = before[frame_file.DATA]
     pending = [(before["/"], after["/"])]
     while pending:
@@ -224,7 +224,7 @@ def _copy_attributes(old: h5py.HLObject, new: h5py.HLObject) -> None:
 def _in_order(
     pool: ThreadPoolExecutor, work: Callable[[FrameProven], Tiles], frames: list[FrameProven], ahead: int
 ) -> Iterator[tuple[FrameProven, Tiles]]:
-    """Each frame with what `work` makes of it; the pool is at most `ahead` frames ahead, so memory is bounded."""
+    """Each frame with the result of `work`; the pool is at most `ahead` frames ahead, which bounds memory."""
     pending: deque[tuple[FrameProven, Future[Tiles]]] = deque()
     for frame in frames:
         pending.append((frame, pool.submit(work, frame)))
@@ -236,8 +236,8 @@ def _in_order(
 
 
 class _Source:
-    """Frames of a view's file as they lie there, read into memory of its own, past the page cache where possible
-    (which takes a tenth of the processor's time)."""
+    """Stored frames of a view's file, read into separate memory, without the page cache if possible (which takes a
+    tenth of the processor's time)."""
 
     def __init__(self, path: Path, layout: frame_file.Layout, threads: int) -> None:
         self._path, self._layout = path, layout
@@ -275,7 +275,7 @@ def _open_direct(path: Path) -> int:
     try:
         return os.open(path, os.O_RDONLY | os.O_DIRECT)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # this file system cannot: use the page cache
+        if error.errno != errno.EINVAL:  # not supported by this file system: use the page cache
             raise
         return os.open(path, os.O_RDONLY)
 
@@ -305,7 +305,7 @@ def _read_back(path: Path, partial: Path, frames: list[FrameProven], progress: P
 
 def _not_the_same(path: Path, what: str) -> ChecksumMismatch:
     return ChecksumMismatch(
-        f"{path}: {what} does not read back from the archive as it was. The view is as it was; check disk and "
+        f"{path}: {what} differs when read back from the archive. The view is unchanged; check disk and "
         "memory of this machine, then archive again."
     )
 
@@ -314,7 +314,7 @@ def _replace(path: Path, partial: Path, keep_in: Path | None) -> None:
     if keep_in is not None:
         keep_in.mkdir(exist_ok=True)
         kept = keep_in / path.name
-        linked = kept.exists() and kept.samefile(path)  # by a call that was cut short
+        linked = kept.exists() and kept.samefile(path)  # by an interrupted call
         if not linked:
             os.link(path, kept)
         _sync_folder(keep_in)

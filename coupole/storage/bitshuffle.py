@@ -1,7 +1,7 @@
-"""A frame cut into tiles and compressed, as HDF5's bitshuffle filter (32008) would do it, but on any thread.
+"""Compression of a frame in tiles, in the format of HDF5's bitshuffle filter (32008), but on any thread.
 
-HDF5 compresses one chunk at a time under one lock. So tiles are compressed here, by the functions of the very
-filter that hdf5plugin ships (ctypes lets other threads run meanwhile), and written into the file as they are.
+HDF5 compresses one chunk at a time under one lock. So tiles are compressed here, by the functions of the filter
+that hdf5plugin ships (ctypes releases the interpreter's lock), and written into the file directly.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError, StorageError
 
 FILL_DN = 65535
-"""What pixels read as that are not stored; no 12-bit frame holds it."""
+"""Value of pixels that are not stored; it does not occur in 12-bit frames."""
 BLOCK_PIXELS = 16384
 """Pixels that are shuffled together: at the filter's own 4096, zstd takes twice the time and saves nothing."""
 _PIXEL_BYTES = 2
@@ -28,7 +28,7 @@ _PIXEL_BYTES = 2
 
 @dataclass(frozen=True)
 class Codec:
-    """How tiles are compressed."""
+    """Method by which tiles are compressed."""
 
     name: Literal["lz4", "zstd"]
     level: int | None
@@ -47,14 +47,15 @@ CODECS = {"lz4": Codec("lz4", None), "zstd": Codec("zstd", 1)}
 
 
 def codec_of(name: str) -> Codec:
-    """Raises InputError for a name that is none."""
+    """The codec of this name. Raises InputError if there is none."""
     if name not in CODECS:
         raise InputError(f"--codec: expected one of {', '.join(CODECS)}; found {name}")
     return CODECS[name]
 
 
 def tile_shape(height_px: int, width_px: int) -> tuple[int, int]:
-    """Rows and columns of a tile: at most 256 x 512, all of one size, and as little as possible beyond the edges.
+    """Rows and columns of a tile: at most 256 x 512, all of one size, with the least excess beyond the frame's
+    edges.
 
     Measured on frames of 4096 x 3072, from the disk: a window of 256 x 256 through all frames is read four times
     faster than from tiles as wide as the frame (twice, if it lies across edges), a whole frame as fast.
@@ -69,7 +70,7 @@ def tile_shape(height_px: int, width_px: int) -> tuple[int, int]:
 def compressed_tiles(
     pixels: NDArray[np.uint16], tile: tuple[int, int], codec: Codec
 ) -> Iterator[tuple[tuple[int, int], bytes]]:
-    """Each tile of a frame [H, W]: row and column of its corner, and its bytes as they stand in the file."""
+    """Each tile of a frame [H, W]: row and column of its corner, and its bytes in the file."""
     rows, columns = tile
     block = np.full(tile, FILL_DN, np.dtype("<u2"))
     out = np.empty(12 + _bound(block.size, codec), np.uint8)
@@ -97,7 +98,7 @@ def _compress(block: NDArray[np.uint16], out: NDArray[np.uint8], codec: Codec) -
 
 
 def _bound(pixels: int, codec: Codec) -> int:
-    """Bytes that a tile can take at most."""
+    """Largest possible size of a compressed tile, bytes."""
     return int(getattr(_library(), f"bshuf_compress_{codec.name}_bound")(pixels, _PIXEL_BYTES, BLOCK_PIXELS))
 
 

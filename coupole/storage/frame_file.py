@@ -1,9 +1,9 @@
-"""The file of one view's frames: what lies where in it, and how it is read.
+"""The file of one view's frames: its layout, and how it is read.
 
 It is a NeXus HDF5 file: frames `[n, H, W]` uint16 and a table of fixed records, both contiguous, which
 `coupole.storage.frame_file_creation` allocates once. `coupole.storage.view_writer` then writes bytes straight to
-their offsets, so the file is valid HDF5 at every moment and a crash cannot break it. The record of a slot says
-what the slot holds: nothing, a frame not yet proven, or a proven shot with its checksum.
+their offsets, so the file is valid HDF5 at every moment and a crash cannot break it. The record of a slot is its
+state: free, a frame not yet proven, or a proven shot with its checksum.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ FRAME_DTYPE = np.dtype(
         ("pose", "<u2"),
     ]
 )
-"""Frame table: what each slot holds (state 0 free, 1 stored but not proven, 2 proven)."""
+"""Frame table: content of each slot (state 0 free, 1 stored but not proven, 2 proven)."""
 
 POSE_DTYPE = np.dtype(
     [
@@ -52,7 +52,7 @@ POSE_DTYPE = np.dtype(
         ("base_from_camera", "<f8", (4, 4)),
     ]
 )
-"""Measured poses; a frame's `pose` says which was in force."""
+"""Measured poses; a frame's `pose` is the number of its pose in this table."""
 
 PAGE = mmap.PAGESIZE
 MAX_POSES = 256
@@ -70,7 +70,7 @@ def checksum(pixels: NDArray[np.uint16]) -> int:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things lie in the file, bytes."""
+    """Shape of the frames and offsets of frames and tables in the file, bytes."""
 
     frames: int
     height_px: int
@@ -80,21 +80,21 @@ class Layout:
     table_offset: int
     poses_offset: int
     archived: bool
-    """True if the frames are compressed, as `coupole.storage.archive` leaves them; then the file is only read."""
+    """True if the frames are compressed by `coupole.storage.archive`; the file is then read-only."""
     packed: bool
-    """True if two pixels lie in three bytes (`coupole.storage.packing`, `lsb`)."""
+    """True if two pixels are packed in three bytes (`coupole.storage.packing`, `lsb`)."""
     inode: int
-    """Of the file: another one has come to its place if it was archived since."""
+    """Of the file; it changes when the file is archived."""
 
     @property
     def frame_bytes(self) -> int:
-        """Of a frame in the file."""
+        """Size of a frame in the file."""
         pixels = self.height_px * self.width_px
         return pixels * 3 // 2 if self.packed else pixels * 2
 
 
 def read_layout(path: Path) -> Layout:
-    """Where frames and tables lie in a view's file. Raises StorageError if it is not such a file."""
+    """Layout of a view's file. Raises StorageError if it is not such a file."""
     try:
         inode = path.stat().st_ino  # before the file is opened: if it is replaced now, `read_frame` sees it
         with h5py.File(path, "r") as file:
@@ -150,7 +150,8 @@ def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
 
 
 def pixels_of(stored: bytes | mmap.mmap, layout: Layout) -> NDArray[np.uint16]:
-    """Pixels [H, W] of a frame as it lies in a file that is not archived, DN; not copied unless it is packed."""
+    """Pixels [H, W] of a frame from its bytes in a file that is not archived, DN; not copied unless it is
+    packed."""
     if layout.packed:
         from coupole.storage.packing import unpack12
 

@@ -16,7 +16,7 @@ from coupole.storage.disk_errors import disk_error
 from coupole.storage.frame_file import DATA, FRAME_DTYPE, MAX_POSES, PAGE, POSE_DTYPE
 
 Collections = Mapping[str, Mapping[str, NDArray[np.generic]]]
-"""Arrays by name, by name of the group in the entry that holds them (NXcollection)."""
+"""Arrays by name, by name of their group in the entry (NXcollection)."""
 
 
 def create(
@@ -28,11 +28,11 @@ def create(
     *,
     packed: bool = False,
 ) -> None:
-    """Lay out a view's file with `slots` slots, all free, and its space allocated; frames of up to 12 bits may be
+    """Create a view's file with `slots` free slots, and allocate its space; frames of up to 12 bits may be
     `packed`.
 
-    `metadata`: `title`, `sample`, `simulated`, `pixel_pitch_um` and whatever else is to stand in the entry's
-    attributes. Raises DiskFull if there is no room for all of it.
+    `metadata`: `title`, `sample`, `simulated`, `pixel_pitch_um` and any further attributes of the entry. Raises
+    DiskFull if the disk has not enough space.
     """
     partial = path.with_suffix(".part")
     try:
@@ -101,7 +101,7 @@ def _group(parent: h5py.Group, name: str, nx_class: str, **attributes: str) -> h
 def _contiguous(
     group: h5py.Group, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], *, fill: bool
 ) -> h5py.Dataset:
-    """A contiguous dataset that is allocated at once, so that its offset in the file is known."""
+    """A contiguous dataset that is allocated immediately, so that its offset in the file is known."""
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_layout(h5py.h5d.CONTIGUOUS)
     properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)

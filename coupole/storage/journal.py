@@ -1,7 +1,7 @@
-"""The run's diary: one JSON object a line, appended, never changed. The only module that writes or reads it.
+"""The run's journal: one JSON object per line, appended, never changed. Only this module reads or writes it.
 
-A `frame` line stands for a proven shot whose bytes are on disk. So lines are kept back until `commit()`, which
-the caller calls after it has synced the frames; then lines are written and synced too.
+A `frame` line means that a shot is proven and its bytes are on disk. So lines are held back until `commit()`,
+which the caller calls after it has synced the frames; lines are then written and synced too.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _EVENT: TypeAdapter[Event] = TypeAdapter(Annotated[Event, Field(discriminator="e
 
 
 class Journal:
-    """Append events; `commit()` makes them last."""
+    """Appends events; `commit()` makes them durable."""
 
     def __init__(self, path: Path) -> None:
         self._file = LineFile(path)
@@ -29,20 +29,20 @@ class Journal:
         self._begun = not self._file.was_empty
 
     def write(self, event: Event) -> None:
-        """Note an event; it reaches the disk with the next `commit()`."""
+        """Add an event; the next `commit()` writes it to the disk."""
         self._lines.append(event_line(event))
 
     def take(self) -> list[str]:
-        """The lines noted since the last time; they are the caller's now, to be handed to `append`."""
+        """The lines added since the last call; the caller must pass them to `append`."""
         lines, self._lines = self._lines, []
         return lines
 
     def commit(self) -> None:
-        """Write and sync what was noted. Raises DiskFull or StorageError; then nothing of it counts."""
+        """Write and sync the added events. Raises DiskFull or StorageError; none of them is then valid."""
         self.append(self.take())
 
     def append(self, lines: list[str]) -> None:
-        """Write and sync lines that were taken; may run on another thread than `write` and `take`."""
+        """Write and sync lines from `take`; may run on another thread than `write` and `take`."""
         if not lines:
             return
         begin = [] if self._begun else [event_line(JournalBegun())]
@@ -54,17 +54,17 @@ class Journal:
 
 
 def event_line(event: Event) -> str:
-    """The line of an event: its tag, its time, and what else it says."""
+    """The line of an event: its tag, its time, and its other fields."""
     fields = event.model_dump(mode="json")
     first = {"event": fields.pop("event"), "t": fields.pop("t")}
     return json.dumps({**first, **fields}, separators=(",", ":")) + "\n"
 
 
 def read(path: Path) -> Iterator[Event]:
-    """Events of a journal, also of one that version 0.1 wrote; none if there is no journal yet.
+    """Events of a journal, also of one by version 0.1; none if there is no journal yet.
 
-    A line torn by a crash is passed over: what it said did not count yet. Raises StorageError for a line that is
-    whole and says something else than an event, and for a journal of a later version.
+    A line truncated by a crash is skipped: its event was not committed. Raises StorageError for a complete line
+    that is not an event, and for a journal of a later version.
     """
     try:
         with path.open("rb") as file:
@@ -76,7 +76,7 @@ def read(path: Path) -> Iterator[Event]:
 
 
 def tail(path: Path, most_bytes: int) -> list[Event]:
-    """The last events of a journal, as far as they lie in its last `most_bytes`; none if there is no journal."""
+    """The events in the last `most_bytes` of a journal; none if there is no journal."""
     try:
         with path.open("rb") as file:
             begun = max(0, path.stat().st_size - most_bytes)
@@ -90,7 +90,7 @@ def tail(path: Path, most_bytes: int) -> list[Event]:
 
 
 def version(path: Path) -> int:
-    """Of the journal as it was begun; that of today for one that is not begun yet."""
+    """Version of a journal; the current one if it does not exist yet."""
     first = next(read(path), None)
     if first is None:
         return JOURNAL_VERSION
@@ -108,7 +108,7 @@ def _events(path: Path, lines: Iterable[bytes]) -> Iterator[Event]:
         except ValidationError as error:
             what = error.errors()[0]
             raise StorageError(
-                f"{path}: line {number} is no event of a journal that this version knows "
+                f"{path}: line {number} is not an event of a journal that this version knows "
                 f"({'.'.join(map(str, what['loc']))}: {what['msg']}). Was it changed, or is it of a later version?"
             ) from error
         if isinstance(event, JournalBegun) and event.version > JOURNAL_VERSION:
@@ -120,7 +120,7 @@ def _events(path: Path, lines: Iterable[bytes]) -> Iterator[Event]:
 
 
 def _of_today(fields: Any) -> Any:
-    """What a line says in the words of today: in version 1 `resume` with `after` meant the end of a pause."""
+    """A line's fields in the current version: in version 1 `resume` with `after` meant the end of a pause."""
     if isinstance(fields, dict) and fields.get("event") == "resume" and fields.get("after") == "pause":
         return {"event": "continue", "t": fields.get("t", "")}
     return fields

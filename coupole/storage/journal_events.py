@@ -1,7 +1,7 @@
-"""What a run's journal can say: one frozen model for each event, told apart by its tag `event`.
+"""Events of a run's journal: one frozen model for each, distinguished by its tag `event`.
 
-To add an event: write its model here, add it to `Event`, and handle it where `assert_never` then complains.
-Angles are in degrees, transforms 4x4 in mm. What version 0.1 did not write yet has a default.
+To add an event: write its model here, add it to `Event`, and handle it where the type checker then reports
+`assert_never`. Angles are in degrees, transforms 4x4 in mm. Fields that version 0.1 did not write have a default.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ class JournalEvent(BaseModel):
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
     t: str = Field(default_factory=utc_now)
-    """When, UTC, ISO 8601."""
+    """Time, UTC, ISO 8601."""
 
 
 class JournalBegun(JournalEvent):
-    """The first line of a journal; those of 0.1 (version 1) lack it."""
+    """The first line of a journal; journals of 0.1 (version 1) do not have it."""
 
     event: Literal["journal"] = "journal"
     version: int = JOURNAL_VERSION
 
 
 class SessionStarted(JournalEvent):
-    """The run's first session has its devices open."""
+    """The run's first session has opened its devices."""
 
     event: Literal["start"] = "start"
     simulated: bool = False
     room_c: float | None = None
     """Temperature of the coolest LED board."""
     acknowledged: str = ""
-    """The fault of the arm that the operator has said is mended."""
+    """The fault of the arm that the operator confirmed to be repaired."""
 
 
 class SessionResumed(JournalEvent):
-    """A later session of the run has its devices open (`--resume`)."""
+    """A later session of the run has opened its devices (`--resume`)."""
 
     event: Literal["resume"] = "resume"
     simulated: bool = False
@@ -62,25 +62,25 @@ class SessionResumed(JournalEvent):
 
 
 class ViewBegun(JournalEvent):
-    """The arm is about to go to a view."""
+    """The arm is about to move to a view."""
 
     event: Literal["view"] = "view"
     view: str
     hidden_leds: tuple[int, ...] = ()
-    """LEDs that reach nothing of what this view sees."""
+    """LEDs that are occluded from everything that this view sees."""
 
 
 class MoveBegun(JournalEvent):
-    """The arm sets out."""
+    """A motion of the arm begins."""
 
     event: Literal["move"] = "move"
     view: str
     joints_deg: tuple[Joints, ...]
-    """Joint angles of each waypoint, the view's own last."""
+    """Joint angles of each waypoint, the view's last."""
 
 
 class ArmSettled(JournalEvent):
-    """The arm stands still; where, as measured."""
+    """The arm is at rest, at this measured pose."""
 
     event: Literal["settled"] = "settled"
     view: str
@@ -103,22 +103,22 @@ class FrameProven(JournalEvent):
 
 
 class BurstEnded(JournalEvent):
-    """A burst is over, as a whole or not; what light it gave."""
+    """A burst has ended, complete or not; the light that it gave."""
 
     event: Literal["burst"] = "burst"
     view: str
     steps: int
     on_s: float
-    """Light of all its LEDs, summed."""
+    """Sum of the on-times of its LEDs."""
     joints_before_deg: Joints | None = None
     joints_after_deg: Joints | None = None
-    """None where the arm did not stand still."""
+    """None if the arm was not at rest."""
     frames: int
     table_s: float | None = None
     clocks: dict[str, float] | None = None
-    """How the clocks of box and camera run against each other."""
+    """Fit of the camera's clock against the box's."""
     camera: dict[str, int] | None = None
-    """The camera's own counters."""
+    """The camera's counters."""
     hottest_board_c: float | None = None
 
 
@@ -156,19 +156,19 @@ class FaultNoted(JournalEvent):
 
 
 class Paused(JournalEvent):
-    """The operator asked to wait; lights are off."""
+    """The operator paused the session; lights are off."""
 
     event: Literal["pause"] = "pause"
 
 
 class Continued(JournalEvent):
-    """The operator let the session go on after a pause."""
+    """The operator continued the session after a pause."""
 
     event: Literal["continue"] = "continue"
 
 
 class ViewSealed(JournalEvent):
-    """A view is complete as far as it will be in this session."""
+    """The session has finished a view, complete or not."""
 
     event: Literal["seal"] = "seal"
     view: str

@@ -1,4 +1,4 @@
-"""A file of lines that is appended to and never changed: whole lines, on disk when `append` returns."""
+"""A file of lines to which complete lines are appended; they are on disk when `append` returns."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def utc_now() -> str:
 
 
 class LineFile:
-    """Opened for appending. Raises DiskFull or StorageError, then nothing of what was to be appended counts."""
+    """A file opened for appending. Raises DiskFull or StorageError; none of the lines is then appended."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -29,13 +29,13 @@ class LineFile:
             raise disk_error(path, error) from error
 
     def _end_torn_line(self) -> None:
-        """After a crash the last line may be half written: close it, so that the next one is whole."""
+        """After a crash the last line may be truncated: end it, so that the next one is separate."""
         size = os.fstat(self._fd).st_size
         if size and os.pread(self._fd, 1, size - 1) != b"\n":
             os.write(self._fd, b"\n")
 
     def append(self, lines: Sequence[str]) -> None:
-        """Write lines, each with its line feed, and sync them."""
+        """Write lines, each with its newline, and sync them."""
         if not lines:
             return
         data = "".join(lines).encode()

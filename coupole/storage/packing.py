@@ -1,4 +1,4 @@
-"""Two 12-bit pixels in three bytes, in both orders that are in use.
+"""Two 12-bit pixels in three bytes, in both common orders.
 
 =====  ========  ==================  =======
 order  byte 0    byte 1              byte 2
@@ -9,7 +9,7 @@ msb    a[11:4]   a[3:0] and b[11:8]  b[7:0]
 
 (The middle byte's high half is named first.) `lsb` is GenICam's `Mono12p` and `BayerGB12p` (PFNC: least
 significant bit first, no gaps), `msb` is TIFF's and DNG's (FillOrder 1). GigE Vision's older `Mono12Packed` is
-neither. Rows follow each other without a gap, which for an even width is also what TIFF asks for.
+neither. Rows follow each other without a gap, as TIFF requires for an even width.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def unpack12(packed: NDArray[np.uint8], order: Order = "lsb") -> NDArray[np.uint
 
 @numba.njit(cache=True, nogil=True)
 def _pack(pixels, packed, msb_first):  # type: ignore[no-untyped-def]
-    """Returns the bits that any pixel has."""
+    """Returns the bitwise or of all pixels."""
     seen = np.uint16(0)
     for pair in range(len(packed) // 3):
         a, b = pixels[2 * pair], pixels[2 * pair + 1]

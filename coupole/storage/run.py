@@ -3,10 +3,10 @@
 ::
 
     RUN/
-      run.json        what was asked, by whom, with which software, plan, rig and files (and their SHA-256)
+      run.json        the request, operator and software; plan, rig and other files with their SHA-256
       journal.jsonl   one line per event; a `frame` line for each proven shot
       views/NAME.h5   frames
-      report.html     what happened, in pictures
+      report.html     report with pictures
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def sha256(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Files that a run depends on; a run is resumed only with the same ones."""
+    """Files that a run depends on; a run can be resumed only with unchanged ones."""
 
     plan: Path
     rig: Path
@@ -78,7 +78,7 @@ class Inputs:
 
 
 class Run:
-    """One run folder, opened."""
+    """An open run folder."""
 
     def __init__(self, folder: Path) -> None:
         """Open an existing run. Raises InputError if there is none."""
@@ -128,11 +128,12 @@ class Run:
         return self.folder / "views" / f"{view}.h5"
 
     def allocated_bytes(self) -> int:
-        """What the run's views need no more of the disk: laid out whole before their first frame, or archived."""
+        """Disk space that views already occupy: files are allocated completely before their first frame, or
+        archived."""
         return sum(map(_settled_bytes, (self.folder / "views").glob("*.h5")))
 
     def expected_shots(self) -> Iterable[ShotId]:
-        """All shots and dark frames of the plan, those apart that were left out as hidden in their view."""
+        """All shots and dark frames of the plan, without those whose LEDs are occluded in their view."""
         labels: list[str] | dict[str, list[str]] = self.about["labels"]
         for view in self.about["views"]:
             hidden = set(map(Led, self.hidden_leds.get(view, ())))
@@ -142,7 +143,7 @@ class Run:
 
     @property
     def hidden_leds(self) -> dict[str, list[int]]:
-        """LEDs that were left out of views, by name of view: arm, camera or object hide them there."""
+        """LEDs that were left out of views, by name of view, because arm, camera or object occlude them."""
         found: dict[str, list[int]] = self.about.get("hidden_leds", {})
         return found
 
@@ -153,11 +154,11 @@ class Run:
         return found
 
     def proven(self) -> dict[ShotId, FrameProven]:
-        """Proven shots, as the journal says."""
+        """Proven shots, by the journal."""
         return {event.shot: event for event in journal.read(self.journal_path) if isinstance(event, FrameProven)}
 
     def robot_fault(self) -> str:
-        """The fault of the arm that ended the last session, empty if none did."""
+        """The fault of the arm that ended the last session; empty if there was none."""
         found = ""
         for event in journal.read(self.journal_path):
             if isinstance(event, SessionStarted | SessionResumed):
@@ -167,7 +168,7 @@ class Run:
         return found
 
     def lock(self) -> int:
-        """Hold the run for this process. Raises InputError if another process acquires into it."""
+        """Lock the run for this process. Raises InputError if another process acquires into it."""
         fd = os.open(self.folder / "run.json", os.O_RDONLY)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -177,12 +178,12 @@ class Run:
         return fd
 
     def refuse_old_journal(self) -> None:
-        """Raise InputError where the journal is of a version that is read but not written any more."""
+        """Raise InputError if the journal has an old version, which can be read but not continued."""
         if (found := journal.version(self.journal_path)) != JOURNAL_VERSION:
             raise InputError(
                 f"{self.folder}: begun by coupole {self.about['software']['version']}, whose journal (version "
-                f"{found}) is not written any more: it cannot be resumed. It can be verified, exported, archived "
-                "and calibrated from; acquire what it lacks as a run of its own."
+                f"{found}) cannot be continued: it cannot be resumed. It can be verified, exported, archived "
+                "and used for calibrations; acquire its missing frames in a new run."
             )
 
     def refuse_changes(self, inputs: Inputs) -> None:
@@ -210,7 +211,7 @@ def _new_folder(parent: Path, name: str) -> Path:
         except FileExistsError:
             continue
         return folder
-    raise StorageError(f"{parent}: a thousand runs named {name} stand here already")
+    raise StorageError(f"{parent}: a thousand runs named {name} exist already")
 
 
 def _settled_bytes(view_file: Path) -> int:
@@ -234,7 +235,7 @@ def _write_synced(path: Path, text: str) -> None:
 
 @dataclass
 class Status:
-    """How far a run is, by its journal alone."""
+    """Progress of a run, by its journal alone."""
 
     state: str = "created"
     proof: str = ""
@@ -254,7 +255,7 @@ class Status:
 
 
 def status(run: Run) -> Status:
-    """Progress of a run, also while it goes on."""
+    """Progress of a run, also of one that is running."""
     found = Status(proof=run.proof)
     expected = list(run.expected_shots())
     found.shots = sum(shot.is_shot for shot in expected)
@@ -292,11 +293,11 @@ def _note_event(found: Status, event: Event) -> None:
 
 @dataclass
 class Verification:
-    """What `verify` found."""
+    """Result of `verify`."""
 
     frames: int = 0
     bad: list[str] = field(default_factory=list)
-    """One line for each thing that is not as it must be."""
+    """One line for each error."""
     missing: list[str] = field(default_factory=list)
 
     @property
@@ -305,7 +306,7 @@ class Verification:
 
 
 def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Verification:
-    """Read every proven frame back: each shot of the plan once, each record and checksum right."""
+    """Read every proven frame back: each shot of the plan exactly once, each record and checksum right."""
     result = Verification()
     proven = run.proven()
     result.missing = [str(shot) for shot in run.expected_shots() if shot not in proven]
@@ -323,7 +324,7 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
             result.bad.append(str(error))
             continue
         claimed = Counter(record["shot"] for record in table if record["state"] == frame_file.PROVEN)
-        result.bad += [f"{name}: {shot.decode()} stands in {n} slots" for shot, n in claimed.items() if n > 1]
+        result.bad += [f"{name}: {shot.decode()} is in {n} slots" for shot, n in claimed.items() if n > 1]
         for frame in sorted(frames, key=lambda f: f.index):
             if problem := _frame_problem(path, layout, table, frame):
                 result.bad.append(problem)

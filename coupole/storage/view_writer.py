@@ -39,8 +39,8 @@ WRITERS = 3
 
 
 class ViewWriter:
-    """Writes one view's file. `put` may be called from several threads, everything else from one (`sync` from
-    another than the rest)."""
+    """Writes one view's file. `put` may be called from several threads; all other methods from one thread, `sync`
+    possibly from another one."""
 
     def __init__(self, path: Path, proven_slots: dict[str, int]) -> None:
         """Open a file that `create` made. `proven_slots` (shot id to slot) are kept; all other slots are free.
@@ -49,7 +49,7 @@ class ViewWriter:
         self._layout = read_layout(path)
         if self._layout.archived:
             raise StorageError(
-                f"{path}: is archived, so nothing is written into it any more. Only complete views are archived: "
+                f"{path}: is archived, so nothing can be written into it. Only complete views are archived: "
                 "see with `coupole verify` whether the journal lost lines."
             )
         self._table = read_frames(path)
@@ -57,7 +57,7 @@ class ViewWriter:
         taken = set(proven_slots.values())
         self._free = deque(slot for slot in range(self._layout.frames) if slot not in taken)
         self._packed: queue.SimpleQueue[mmap.mmap] = queue.SimpleQueue()
-        """Memory to pack frames in, page-aligned as direct writing asks."""
+        """Memory to pack frames in, page-aligned as direct writing requires."""
         if self._layout.packed:
             from coupole.storage.packing import pack12
 
@@ -84,7 +84,7 @@ class ViewWriter:
             self._fd = os.open(self.path, os.O_WRONLY | os.O_DIRECT)
             self.direct = True
         except OSError as error:
-            if error.errno != errno.EINVAL:  # this file system cannot: stay with the page cache
+            if error.errno != errno.EINVAL:  # not supported by this file system: use the page cache
                 raise
 
     def _read_poses(self) -> NDArray[np.void]:
@@ -96,7 +96,7 @@ class ViewWriter:
         return len(self._free)
 
     def add_pose(self, arm: ArmState, base_from_camera: Transform) -> int:
-        """Note a measured pose; returns the number that frames refer to it by."""
+        """Store a measured pose; returns its number, by which frames refer to it."""
         if self._poses == MAX_POSES:
             raise StorageError(f"{self.path}: more than {MAX_POSES} measured poses in one view")
         record = np.zeros(1, POSE_DTYPE)
@@ -107,7 +107,7 @@ class ViewWriter:
         return self._poses - 1
 
     def put(self, pixels: NDArray[np.uint16], *, frame_id: int, camera_ns: int, exposure_us: int) -> int:
-        """Write a frame into a free slot and say in its record that it is there, unproven; returns the slot."""
+        """Write a frame into a free slot and record it as stored but not proven; returns the slot."""
         try:
             with self._lock:
                 slot = self._free.popleft()
@@ -127,7 +127,7 @@ class ViewWriter:
 
     @contextlib.contextmanager
     def _as_stored(self, pixels: NDArray[np.uint16]) -> Iterator[memoryview]:
-        """A frame's bytes as they are to lie in the file, while the context lasts."""
+        """A frame's bytes in the file's format, valid within the context."""
         if not self._layout.packed:
             yield pixels.data.cast("B")
             return
@@ -149,7 +149,7 @@ class ViewWriter:
         return int(self._table[slot]["frame_id"])
 
     def prove(self, slot: int, shot: str, **fields: Any) -> int:
-        """Say that a slot holds a proven shot; returns the frame's checksum. It counts after `sync()`."""
+        """Record that a slot holds a proven shot; returns the frame's checksum. Durable after `sync()`."""
         record = self._table[slot].copy()
         record["shot"] = shot.encode()
         for name, value in fields.items():
@@ -159,15 +159,15 @@ class ViewWriter:
         return int(record["xxh3"])
 
     def free(self, slot: int, *, give_back: bool = True) -> None:
-        """A slot's frame is not wanted: it may be overwritten."""
+        """Mark a slot as free: its frame may be overwritten."""
         self._note(slot, np.zeros((), FRAME_DTYPE))
         if give_back:
             with self._lock:
                 self._free.append(slot)
 
     def _note(self, slot: int, record: NDArray[np.void] | np.void) -> None:
-        """Change a slot's record. It is written by the next `sync()`, with others: a small write beside each large
-        one would cost a tenth of the disk's speed (they wait for each other in the file system)."""
+        """Change a slot's record in memory. The next `sync()` writes it with others: a small write beside each
+        large one would cost a tenth of the disk's speed (they wait for each other in the file system)."""
         with self._lock:
             self._table[slot] = record
             self._changed.add(slot)
@@ -191,7 +191,7 @@ class ViewWriter:
             raise disk_error(self.path, error) from error
 
     def sync(self) -> None:
-        """All that was put, proven and freed is on disk when this returns."""
+        """Bring everything that was put, proven and freed to the disk before it returns."""
         self._write_table()
         try:
             os.fdatasync(self._plain_fd)
@@ -199,7 +199,7 @@ class ViewWriter:
             raise disk_error(self.path, error) from error
 
     def close(self) -> None:
-        """Give the file back; what was not synced is written, but need not last."""
+        """Close the file; records that were not synced are written, but not durable."""
         with contextlib.suppress(StorageError):
             self._write_table()
         if self._fd != self._plain_fd:

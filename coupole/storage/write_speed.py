@@ -1,4 +1,4 @@
-"""Measures how fast a disk takes frames."""
+"""Measures the speed at which a disk takes frames."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _LEAST_BLOCKS, _MOST_BLOCKS, _FRAMES = 8, 64, 20
 
 
 def measure_write_speed(folder: Path, *, frame_bytes: int = 0) -> float:
-    """Bytes per second that a folder's disk takes, written as frames are: O_DIRECT where possible, several at a
-    time, into space that was allocated before, synced. Large frames are measured longer, for they need it."""
+    """Write speed of a folder's disk, bytes per second, measured as frames are written: O_DIRECT if possible,
+    several at a time, into allocated space, synced. The measurement takes longer for large frames."""
     blocks = min(max(_LEAST_BLOCKS, _FRAMES * frame_bytes // _BLOCK_BYTES), _MOST_BLOCKS)
     total_bytes = blocks * _BLOCK_BYTES
     path = folder / f".speed-{os.getpid()}"

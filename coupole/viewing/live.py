@@ -1,7 +1,7 @@
-"""Live view: the newest frame of a cell or of a run that goes on, for people who focus, aim and watch.
+"""Live view: the newest frame of a cell or of a run in progress, to focus, to aim and to watch.
 
-A *source* makes frames, `Studio` holds the newest one for viewers. Viewers ask when they like and get what is
-there: nothing waits for them. A run is watched through its folder alone, so that no viewer can slow it.
+A *source* gives frames, and `Studio` holds the newest one for viewers. Viewers poll it at any time, and nothing
+waits for them. Of a run only its folder is read, so that viewers cannot slow it.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ _POLL_S = 0.2
 
 @dataclass(frozen=True)
 class Choice:
-    """What the viewer wants to see."""
+    """The viewer's choice of light and exposure."""
 
     led: int | None
-    """Id of the LED that lights the picture, None for none."""
+    """Id of the LED that is lit; None for none."""
     exposure_us: int
 
 
 @dataclass(frozen=True)
 class Shown:
-    """One frame and what is known of it."""
+    """One frame with its metadata and figures."""
 
     number: int
     title: str
@@ -51,13 +51,13 @@ class Shown:
 
 
 class Source(Protocol):
-    """Gives frames until it is told to stop."""
+    """Gives frames until it is closed."""
 
     leds: tuple[int, ...]
-    """LEDs to choose from; none where nothing can be chosen."""
+    """Ids that may be chosen; empty if there is no choice."""
 
     def frames(self, studio: Studio) -> None:
-        """Hand frames to `studio.show` until `studio.closing` is set. Raises what ends it."""
+        """Pass frames to `studio.show` until `studio.closing` is set. Raises the error that ends it."""
         ...
 
 
@@ -139,7 +139,7 @@ class RunSource:
 
 
 def choice_from(wanted: dict[str, Any], before: Choice, leds: tuple[int, ...], longest_us: int) -> Choice:
-    """A viewer's choice, checked. Raises InputError for what the cell does not have or must not do."""
+    """A viewer's choice, checked. Raises InputError for an LED or an exposure that the cell does not have."""
     led, exposure_us = wanted.get("led", before.led), wanted.get("exposure_us", before.exposure_us)
     if led is not None and led not in leds:
         raise InputError(f"led: expected one of the dome's, found {led!r}")
@@ -149,12 +149,12 @@ def choice_from(wanted: dict[str, Any], before: Choice, leds: tuple[int, ...], l
 
 
 def run_source(source: Source, studio: Studio, failed: Callable[[Exception], None]) -> threading.Thread:
-    """Have a thread of its own fill the studio; `failed` hears what ended it."""
+    """Start a thread that fills the studio; `failed` is called with the error that ends it."""
 
     def work() -> None:
         try:
             source.frames(studio)
-        except Exception as error:  # noqa: BLE001  handed to the thread that shows it
+        except Exception as error:  # noqa: BLE001  passed to the thread that reports it
             failed(error)
             studio.closing.set()
 

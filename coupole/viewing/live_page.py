@@ -23,7 +23,7 @@ _OURS = "X-Coupole-Live"
 
 @dataclass(frozen=True)
 class _Page:
-    """What all viewers share."""
+    """The page, with the state that all viewers share."""
 
     html: bytes
     studio: Studio
@@ -83,9 +83,9 @@ def serve(studio: Studio, leds: tuple[int, ...], longest_us: int, port: int) -> 
                 return
             try:
                 if self.headers.get(_OURS) != "1":
-                    raise InputError("only the page of this server may choose")
+                    raise InputError("only the page of this server may change light and exposure")
                 if not leds:
-                    raise InputError("a run is watched: its plan chooses")
+                    raise InputError("this is a run: light and exposure follow its plan")
                 size = min(int(self.headers.get("Content-Length") or 0), _MOST_POSTED)
                 figures = page.choose(self.rfile.read(size))
             except (InputError, ValueError) as error:

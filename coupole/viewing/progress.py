@@ -1,4 +1,4 @@
-"""Where a run is and what came of it, as values that screens and reports show."""
+"""Progress and outcome of a run, as values for terminal and reports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from coupole.plan.shot_id import ShotId
 
 @dataclass(frozen=True)
 class Progress:
-    """Where the run is."""
+    """Progress of the run."""
 
     view: str
     view_number: int
@@ -23,17 +23,17 @@ class Progress:
 
 @dataclass
 class Outcome:
-    """What came of a session."""
+    """Outcome of a session."""
 
     shots: int
     proven: int = 0
     reshot: int = 0
     bad: set[ShotId] = field(default_factory=set)
-    """Shots whose LED drew no current: proven dark, so not kept as shots."""
+    """Shots whose LED drew no current: proven to be dark, so not stored as shots."""
     missing: list[ShotId] = field(default_factory=list)
     duration_s: float = 0.0
     ideal_s: float = 0.0
-    """Motion and settling at the arm's limits plus the tables' own time, of what this session did."""
+    """Time of this session's motions and settling at the arm's limits, plus that of its burst tables."""
     dose_lux_h: float = 0.0
     over_triggers: int = 0
     lost_transfers: int = 0
@@ -41,7 +41,7 @@ class Outcome:
 
 @dataclass
 class ViewExposure:
-    """How well a view is exposed, on the frames of a sample of its lights."""
+    """Exposure of a view, by the frames of a sample of its lights."""
 
     pictures: int = 0
     saturated: float = 0.0

@@ -1,4 +1,4 @@
-"""Pictures and figures of RAW frames, to look at: none of this is kept or measured with."""
+"""Pictures and figures of RAW frames for preview; no data or measurement depends on them."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ _GAMMA = 1 / 2.2
 BINS = 128
 _SATURATED, _SHARP = (255, 0, 0), (0, 255, 60)
 _SHARP_GRADIENT = 0.25
-"""Of the local brightness, from one cell to the next: an edge in focus."""
+"""Relative change of brightness from one cell to the next, above which an edge is in focus."""
 _DARK = 0.02
 """Share of full scale below which an edge is noise."""
 
 
 @dataclass(frozen=True)
 class Coding:
-    """How a frame's numbers are to be read."""
+    """Pattern and levels of a frame."""
 
     pattern: str
     """2x2 Bayer pattern from the top left, or MONO."""
@@ -29,7 +29,7 @@ class Coding:
 
 @dataclass(frozen=True)
 class Figures:
-    """What a RAW frame is like."""
+    """Figures of a RAW frame."""
 
     histograms: dict[str, list[int]]
     """By channel (R, G1, G2, B; Y for MONO): pixels in `BINS` equal steps from 0 to full scale."""
@@ -38,12 +38,12 @@ class Figures:
     brightest: float
     """99.9 % quantile, share of the range above black."""
     sharpness: float
-    """Mean squared gradient of the green cells over their mean squared (Tenengrad, freed of the light's strength);
-    only figures of the same scene compare."""
+    """Mean squared gradient of the green cells over their squared mean (Tenengrad, normalised by brightness);
+    comparable only for the same scene."""
 
 
 def develop(raw: NDArray[np.uint16], *, pattern: str, black_dn: int, white_dn: int) -> NDArray[np.uint8]:
-    """A picture to look at [h/2, w/2, 3] from a RAW frame: one pixel for each Bayer cell, plain gamma 2.2."""
+    """A preview [h/2, w/2, 3] of a RAW frame: one pixel for each Bayer cell, gamma 2.2."""
     scaled = np.clip((raw.astype(np.float32) - black_dn) / (white_dn - black_dn), 0, 1)
     cell = [scaled[0::2, 0::2], scaled[0::2, 1::2], scaled[1::2, 0::2], scaled[1::2, 1::2]]
     letters = pattern if pattern != "MONO" else "GGGG"
@@ -60,7 +60,7 @@ def develop(raw: NDArray[np.uint16], *, pattern: str, black_dn: int, white_dn: i
 
 
 def png(picture: NDArray[np.uint8], width_px: int | None = None) -> bytes:
-    """A picture as PNG, made narrower if asked."""
+    """A picture as PNG, scaled down to `width_px` if given."""
     from PIL import Image
 
     image = Image.fromarray(picture)
@@ -102,7 +102,8 @@ def figures(raw: NDArray[np.uint16], coding: Coding) -> Figures:
 
 
 def look(raw: NDArray[np.uint16], coding: Coding, width_px: int, *, saturation: bool, focus: bool) -> bytes:
-    """A JPEG of a RAW frame, at most `width_px` wide; saturated cells red, edges in focus green, where asked."""
+    """A JPEG of a RAW frame, at most `width_px` wide; on request with saturated cells in red and edges in focus in
+    green."""
     from PIL import Image
 
     stride = max(1, -(-raw.shape[1] // 2 // width_px))

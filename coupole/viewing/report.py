@@ -1,4 +1,4 @@
-"""`report.html` of a run: what happened, in pictures."""
+"""`report.html` of a run: figures, faults and pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ img{display:block;background:#000}.bad{color:#b00}.ok{color:#070}svg{background:
 
 
 def write(run: Run) -> Path:
-    """Write the run's report beside its journal; whatever can be shown of the run is shown."""
+    """Write the run's report beside its journal, also for an incomplete run."""
     path = run.folder / "report.html"
     try:
         path.write_text(_page(run), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Takes a scanner's mesh and targets in, with a picture of what was found."""
+"""Imports a scanner's mesh and targets, with a picture of the result."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def import_scan(
     accept_defects: bool,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Read, check, write and draw a scan into a new folder; returns what `scan.json` says.
+    """Read and check a scan, write and draw it into a new folder; returns the content of `scan.json`.
 
-    Raises InputError for what is wrong with the files, StorageError if the folder cannot be written.
+    Raises InputError for invalid files, StorageError if the folder cannot be written.
     """
     with new_scan_folder(folder) as partial:
         scan = read_scan(
@@ -54,7 +54,7 @@ def import_scan(
 
 
 def picture(scan: Scan) -> Any:
-    """The mesh from three sides, its targets as red dots, and how far these are from each other; a PIL image."""
+    """The mesh from three sides, its targets as red dots, and the distances between these; a PIL image."""
     from PIL import Image, ImageDraw
 
     mesh = scan.mesh

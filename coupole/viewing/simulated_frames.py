@@ -1,6 +1,6 @@
-"""Some frames of a plan, rendered without any device: how it would look, in seconds instead of a session.
+"""Preview of a plan: some of its frames, rendered without devices.
 
-Each is developed to a PNG that says that it is simulated, and all stand on one sheet.
+Each is developed to a PNG that is marked as simulated, and all are on one sheet.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Still:
-    """One rendered shot: its id, its file, how well it is exposed."""
+    """One rendered shot: its id, its file, its exposure."""
 
     shot: str
     file: str
@@ -91,7 +91,7 @@ def simulate(job: Job, folder: Path, count: int, *, width_px: int | None, progre
 
 
 def flange_at(view: ViewPose, job: Job) -> Transform:
-    """Where the flange is at a view: as its camera pose or its joints say, no error of the arm in it."""
+    """Nominal pose of the flange at a view, by its camera pose or its joints, without errors of the arm."""
     if view.joints_deg is not None:
         return forward(arm_of(job.cell.rig), np.asarray(view.joints_deg, dtype=np.float64))
     return base_from_flange(view, job.cell.rig)

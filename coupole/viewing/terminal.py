@@ -1,4 +1,4 @@
-"""What the operator sees: progress bars on a terminal, plain lines elsewhere, tables of reports."""
+"""Output for the operator: progress bars on a terminal, plain lines elsewhere, tables."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _PLAIN_LINE_EVERY_S = 5.0
 
 
 def make_console(*, quiet: bool) -> Console:
-    """The console for people: standard error, so that standard output stays free for `--json`."""
+    """The console for text: standard error, so that standard output is free for `--json`."""
     return Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=not sys.stderr.isatty())
 
 
 def ask(question: str) -> bool:
-    """Put a yes-or-no question on standard error, even where all else is quiet; only a typed yes is one."""
+    """Ask a yes-or-no question on standard error, even with `--json`; any answer but yes counts as no."""
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     try:
         return sys.stdin.readline().strip().lower() in {"y", "yes"}
@@ -66,7 +66,7 @@ class RunObserver:
 
     @contextmanager
     def showing(self, frames: int, views: int) -> Iterator[None]:
-        """Bars for the time of the run, if this is a terminal."""
+        """Progress bars during the run, if this is a terminal."""
         if not self._console.is_terminal or self._console.quiet:
             yield
             return
@@ -111,7 +111,7 @@ class RunObserver:
 
 
 def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> None:
-    """Summary of what will happen."""
+    """Print the summary of a preflight."""
     table = Table(title=f"{name} on {rig}", title_justify="left", box=None, show_header=False)
     table.add_row("views, shots, frames", f"{len(report.views)}, {report.shots}, {report.frames}")
     table.add_row("on disk", f"{bytes_text(report.bytes)} at {bytes_text(report.asked_bytes_s)}/s" + _disk(report))
@@ -127,7 +127,7 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
 
 
 def _pace(timing: BurstTiming) -> str:
-    bounds = {"LED": "the LED's time alight", "heat": "the LEDs' heat", "disk": "the disk", "camera": "the camera"}
+    bounds = {"LED": "the LED's on-time", "heat": "the LEDs' heat", "disk": "the disk", "camera": "the camera"}
     return (
         f"{timing.period_us / 1e3:g} ms, as {bounds[timing.bound]} asks ({timing.exposure_us / 1e3:g} ms exposed)"
     )
@@ -164,7 +164,7 @@ def show_status(console: Console, status: Status) -> None:
 def show_dry_run(
     console: Console, exposures: Mapping[str, ViewExposure], outcome: Outcome, found: dict[str, Any]
 ) -> None:
-    """What a dry run learnt."""
+    """Print the result of a dry run."""
     console.print(
         f"dry run: {duration_text(found['duration_s'])} of the cell's time in {duration_text(found['machine_s'])} "
         f"({found['speed']:.1f} times faster); preflight said {duration_text(found['preflight_s'])}"
@@ -175,13 +175,13 @@ def show_dry_run(
     console.print(table)
     if outcome.reshot or outcome.over_triggers or outcome.lost_transfers:
         console.print(
-            f"{outcome.reshot} shots re-shot, {outcome.over_triggers} edges came too early for the camera, "
+            f"{outcome.reshot} shots re-shot, {outcome.over_triggers} edges came while the camera was busy, "
             f"{outcome.lost_transfers} frames lost in transfer"
         )
 
 
 def show_advice(console: Console, advice: Advice) -> None:
-    """What metering learnt."""
+    """Print the result of metering."""
     table = Table("view", "at least", "at most", "object", box=None)
     for seen in advice.views:
         table.add_row(
@@ -199,7 +199,7 @@ def show_advice(console: Console, advice: Advice) -> None:
 
 
 class LiveFigures:
-    """The live view's figures: drawn in place on a terminal, a line now and then elsewhere."""
+    """The live view's figures: updated in place on a terminal, a line from time to time elsewhere."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -217,7 +217,7 @@ class LiveFigures:
             self._live.stop()
 
     def show(self, shown: Shown | None) -> None:
-        """Draw what is newest, if it is new."""
+        """Print the figures of the newest frame, if they are new."""
         if shown is None or shown.number == self._number:
             return
         self._number = shown.number

@@ -22,8 +22,8 @@ from coupole.viewing.view_scene import Scene, scene_of
 def look_at_plan(job: Job, folder: Path, console: Console, *, paths: bool) -> tuple[Path, Path]:
     """Write `<plan>.png` and `<plan>.html` into a folder, and say where.
 
-    Raises InputError if they cannot be written there. Without `paths` ways are straight and nothing is
-    looked at for collisions.
+    Raises InputError if they cannot be written there. Without `paths` all motions are straight and collisions are
+    not checked.
     """
     scene = look(job, console, paths=paths)
     png, html = folder / f"{job.plan.name}.png", folder / f"{job.plan.name}.html"
@@ -41,9 +41,9 @@ def look_at_plan(job: Job, folder: Path, console: Console, *, paths: bool) -> tu
 
 
 def look(job: Job, console: Console, *, paths: bool) -> Scene:
-    """What there is to see, and the refusals that `check` would give, but for those that concern the disk."""
+    """The scene, and the refusals that `check` would give, except those that concern the disk."""
     rig, views = job.cell.rig, job.schedule.views
-    with _doing(console, f"planning the ways to {len(views)} views" if paths else "finding postures"):
+    with _doing(console, f"planning paths to {len(views)} views" if paths else "finding postures"):
         job = without_hidden(job) if paths else job
         job, report = check_job(job, StorageFacts(free_bytes=sys.maxsize), paths=paths)
         home_deg = rig.motion.home_joints_deg
@@ -57,7 +57,7 @@ def look(job: Job, console: Console, *, paths: bool) -> Scene:
 
 @contextmanager
 def _doing(console: Console, what: str) -> Iterator[None]:
-    """Say what takes its time: in a line that goes away again on a terminal, in a plain one elsewhere."""
+    """Report slow work: by a temporary line on a terminal, by a plain one elsewhere."""
     if console.is_terminal:
         with console.status(what):
             yield

@@ -1,6 +1,6 @@
 """A small renderer: triangles, lines and dots with a depth buffer, in numpy and numba, for still pictures.
 
-Pictures are drawn twice as large as they are wanted, then made smaller: that smooths all edges.
+Pictures are drawn at twice their size and then scaled down, which smooths edges.
 """
 
 from __future__ import annotations
@@ -20,21 +20,20 @@ from coupole.viewing.view_solids import Points, Solid
 
 OVERSAMPLING = 2
 _TO_LIGHT = np.array((-0.35, -0.55, -0.76))
-"""In the frame of who looks: from above, from the left, from behind."""
+"""Direction to the light in the viewer's frame: from above, from the left, from behind."""
 _AMBIENT = 0.45
 _OUTLINE = 0.55
-"""Where one body ends before another, pixels are darkened to this."""
+"""Pixels at the outline of a body in front of another one are darkened by this factor."""
 _LINE_BIAS, _LINE_BIAS_MM = 2e-3, 10.0
-"""Lines lie on surfaces: they are seen where they are hidden by less than this share of their depth (perspective)
-or by less than this."""
+"""Depth tolerance for lines on surfaces: as a share of the depth (perspective), or in mm."""
 _NEARNESS_PER_MM = 1e-5
 """Without perspective."""
 
 
 @dataclass(frozen=True)
 class Lookout:
-    """Where a picture is seen from, its x to the right, y down, z forward. `scale` is in perspective the focal
-    length in pixels, else pixels per mm."""
+    """Viewpoint of a picture, x to the right, y down, z forward. `scale` is the focal length in pixels with
+    perspective, else pixels per mm."""
 
     world_from_eye: Transform
     scale: float
@@ -43,8 +42,8 @@ class Lookout:
     perspective: bool
 
     def project(self, points_mm: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pixels [..., 2] and nearness [...] of points [..., 3]: nearer points have more of it, and it is linear
-        in the picture. Points behind the eye give NaN."""
+        """Pixels [..., 2] and nearness [...] of points [..., 3]: it is larger for nearer points, and linear in the
+        picture. NaN for points behind the viewpoint."""
         seen = apply(inverse(self.world_from_eye), points_mm)
         depth_mm = seen[..., 2]
         middle = np.array((self.width_px, self.height_px)) / 2
@@ -55,7 +54,7 @@ class Lookout:
 
 
 class Canvas:
-    """A picture in the making, seen from one place."""
+    """A picture that is being drawn, from one viewpoint."""
 
     def __init__(self, lookout: Lookout, background: Colour = (1.0, 1.0, 1.0)) -> None:
         self._lookout = lookout
@@ -67,7 +66,7 @@ class Canvas:
         self, solids: Sequence[Solid], colours: Sequence[ArrayLike], *, opacity: float = 1.0, outlined: bool = True
     ) -> None:
         """Draw solids, each in one colour [3] or one per face [faces, 3]. Transparent ones are drawn as one layer:
-        of them only the nearest is seen, and what is drawn later shines through."""
+        only the nearest of them is visible, and solids drawn later shine through."""
         if not solids:
             return
         corners_mm = np.concatenate([solid.corners_mm for solid in solids])
@@ -142,7 +141,7 @@ class Canvas:
         opacity: float,
         hidden: float,
     ) -> None:
-        """Draw overlapping discs [n, 2] as one, so that their opacity does not add up."""
+        """Draw overlapping discs [n, 2] as one shape, so that their opacity does not accumulate."""
         radius = radius_px * OVERSAMPLING
         steps = np.arange(-int(radius) - 1, int(radius) + 2)
         offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)

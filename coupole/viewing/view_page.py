@@ -1,4 +1,4 @@
-"""The page of a plan: the cell to turn round, view by view. One file that needs no network."""
+"""The interactive page of a plan: the cell in 3D, view by view. One file that needs no network."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MANY = 8
 """With more views than this the arm is shown in one view at a time only."""
 _SUPPORT_THICKNESS_MM = 15.0
 _OVERVIEW, _ALWAYS = 0, -1
-"""Steps of the slider beside the views' numbers: when a part of the drawing is shown."""
+"""Steps of the slider, beside the views' numbers, at which a part of the drawing is shown."""
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
@@ -44,14 +44,14 @@ p, ol {{ margin: .2em 0; }}
 def write_page(scene: Scene, path: Path) -> None:
     """Write the HTML page, plotly.js in it."""
     clear = sum(not stop.refusal for stop in scene.stops)
-    checked = "" if scene.paths_checked else " Ways were not checked for collisions."
+    checked = "" if scene.paths_checked else " Paths were not checked for collisions."
     why = "".join(f"<li>{escape(refusal)}</li>" for refusal in scene.refusals)
     page = _PAGE.format(
         title=escape(scene.plan),
         red=css(colours.RED),
         about=f"{len(scene.stops)} views on {escape(scene.rig.name)}, {clear} of them clear.{checked} "
-        "Drag to turn, scroll to come nearer, point at a thing to read what it is; the slider goes from view to "
-        "view. LEDs are the lighter the more they reach of what the camera sees.",
+        "Drag to rotate, scroll to zoom, point at a part for its name; the slider goes from view to "
+        "view. LEDs are lighter the more they reach of what the camera sees.",
         refusals=f'<p class="refused">The plan is refused:</p><ol class="refused">{why}</ol>' if why else "",
         figure=_figure(scene).to_html(
             full_html=False,
@@ -114,7 +114,7 @@ def _title(scene: Scene, stop: Stop) -> str:
 
 
 def _words_on(scene: Scene, stop: Stop) -> str:
-    """What is told of a view where it is pointed at."""
+    """Text that is shown when the pointer is on a view."""
     words = [f"<b>{stop.number} {stop.name}</b>"]
     if stop.refusal:
         words.append(f"refused: {escape(stop.refusal)}")
@@ -122,7 +122,7 @@ def _words_on(scene: Scene, stop: Stop) -> str:
         words.append("axes " + ", ".join(f"{angle:.1f}" for angle in stop.joints_deg) + " deg")
     if stop.leg_s is not None:
         via = f" over {len(stop.vias_mm)} via points" if len(stop.vias_mm) else ""
-        words.append(f"way of {duration_text(stop.leg_s)}{via}")
+        words.append(f"path of {duration_text(stop.leg_s)}{via}")
     words += scene.light_on(stop)
     return "<br>".join(words)
 
@@ -143,7 +143,7 @@ def _cell(scene: Scene) -> list[Any]:
 
 
 def _arm(scene: Scene, stop: Stop, *, opacity: float) -> list[Any]:
-    """The arm at a view, and where it would touch something, that in red."""
+    """The arm at a view, and in red where it would collide."""
     traces = []
     if stop.joints_deg is not None:
         arm = scene.arm(stop.joints_deg, _ROUND)
@@ -172,7 +172,7 @@ def _those(parts: Sequence[Solid], wanted: Callable[[str], bool]) -> Solid:
 
 def _ways(stop: Stop) -> list[Any]:
     colour = colours.RED if stop.refusal else colours.CAMERA_WAY
-    words = f"way of the camera to {stop.number} {stop.name}"
+    words = f"path of the camera to {stop.number} {stop.name}"
     traces = [_line([stop.camera_way_mm], colour, 4, words)]
     traces.append(_line([stop.flange_way_mm], colours.FLANGE_WAY, 2, words.replace("camera", "flange")))
     if len(stop.vias_mm):
@@ -192,13 +192,13 @@ def _camera(scene: Scene, stop: Stop) -> list[Any]:
 
 
 def _leds(scene: Scene, share: NDArray[np.float64], stop: Stop | None) -> Any:
-    """LEDs of the plan, coloured by the share that they reach; in a view one is told what hides the rest."""
+    """LEDs of the plan, coloured by the share that they reach; in a view with the causes of occlusion."""
     columns = [scene.led_ids, share]
-    told = "LED %{customdata[0]:.0f}: reaches %{customdata[1]:.0%} of what is seen"
+    told = "LED %{customdata[0]:.0f}: reaches %{customdata[1]:.0%} of the visible surface"
     if stop is not None and stop.shadow is not None:
         columns += [stop.shadow.share(code) for code in (AWAY, BY_OBJECT, BY_ARM, BY_TOOL)]
         told += "<br>turned away from %{customdata[2]:.0%}; hidden by the object %{customdata[3]:.0%}, "
-        told += "by the arm %{customdata[4]:.0%}, by what it carries %{customdata[5]:.0%}"
+        told += "by the arm %{customdata[4]:.0%}, by the tool %{customdata[5]:.0%}"
     marker = {
         "size": 3.5,
         "color": share[scene.used].astype(np.float32),

@@ -20,7 +20,8 @@ WIDTH_PX, HEIGHT_PX = 1800, 1300
 _MARGIN, _HEADER, _STRIP = 16, 76, 316
 _LEFT = 1120
 _CAMERAS, _CAMERA_WIDTH = 4, 306
-"""At most so many views are shown through the camera: those that are refused first, the others evenly."""
+"""Largest number of views that are shown through the camera, and their width: refused ones first, then others at
+even intervals."""
 _GHOST, _GHOST_TOOL, _MANY = 0.38, 0.8, 8
 """Opacity of arm and tool at a view; with more views than this only the tool is drawn."""
 _SUPPORT_THICKNESS_MM = 15.0
@@ -57,7 +58,7 @@ def write_picture(scene: Scene, path: Path) -> None:
 
 
 def _cell_lookout(scene: Scene, width: int, height: int) -> Lookout:
-    """From outside, with a long lens, so that the whole dome is in the picture."""
+    """From outside, with a long focal length, so that the whole dome is in the picture."""
     radius_mm = float(np.linalg.norm(scene.leds_mm, axis=1).max())
     distance_mm = 4.0 * radius_mm
     eye = look_at((0, 0, 0.45 * radius_mm), distance_mm, -60.0, 18.0)
@@ -66,7 +67,7 @@ def _cell_lookout(scene: Scene, width: int, height: int) -> Lookout:
 
 
 def _flat_lookout(scene: Scene, width: int, height: int, *, above: bool) -> Lookout:
-    """Without perspective, as large as support and arm allow."""
+    """Without perspective, scaled to support and arm."""
     standing = [stop.joints_deg for stop in scene.stops]
     standing += [stop.clash.joints_deg for stop in scene.stops if stop.clash is not None]
     arms = [scene.arm(joints, around=8) for joints in (scene.home_deg, *standing) if joints is not None]
@@ -111,7 +112,7 @@ def _cell_from(scene: Scene, lookout: Lookout) -> Any:
 
 
 def _standing(scene: Scene) -> tuple[list[Solid], list[Solid], list[Solid]]:
-    """Where the arm is to stand: its links but the base, the tool, and what would touch something."""
+    """The arm at the views: its links without the base, the tool, and bodies that would collide."""
     arms: list[Solid] = []
     tools: list[Solid] = []
     touching: list[Solid] = []
@@ -128,7 +129,7 @@ def _standing(scene: Scene) -> tuple[list[Solid], list[Solid], list[Solid]]:
 
 
 def _dots_of_leds(canvas: Canvas, scene: Scene, lookout: Lookout) -> None:
-    """LEDs, those on the near side of the dome faint, so that one can look in."""
+    """LEDs, those on the near side of the dome faint, so that the inside is visible."""
     towards_eye = -lookout.world_from_eye[:3, 2]
     near_side = scene.leds_mm @ towards_eye > 0
     colour = np.where(scene.used[:, None], colours.of_share(scene.led_share), colours.UNUSED)
@@ -137,7 +138,7 @@ def _dots_of_leds(canvas: Canvas, scene: Scene, lookout: Lookout) -> None:
 
 
 def _labels(image: Any, scene: Scene, lookout: Lookout) -> None:
-    """Numbers at the camera's places, and words at what would touch."""
+    """Numbers at the camera's positions, and labels at collisions."""
     from PIL import ImageDraw
 
     pen = ImageDraw.Draw(image)
@@ -169,7 +170,7 @@ def _haloed(pen: Any, at: Any, words: str, width: int) -> None:
 
 
 def _through_the_camera(sheet: Any, pen: Any, scene: Scene, stop: Stop, left: int, top: int) -> None:
-    """What the camera sees in a view, the object coloured by how many LEDs reach it there."""
+    """The camera's picture in a view, the object coloured by the share of LEDs that reach it."""
     assert stop.sight is not None
     width = min(_CAMERA_WIDTH, (_STRIP - 84) * stop.sight.width_px // stop.sight.height_px)
     height = width * stop.sight.height_px // stop.sight.width_px
@@ -181,7 +182,7 @@ def _through_the_camera(sheet: Any, pen: Any, scene: Scene, stop: Stop, left: in
 
 
 def _chosen(stops: list[Stop]) -> list[Stop]:
-    """Those that are refused first, the others evenly, in the order of visiting."""
+    """Refused views first, then others at even intervals, in the order of visiting."""
     refused = [stop for stop in stops if stop.refusal][:_CAMERAS]
     others = [stop for stop in stops if not stop.refusal]
     room = min(len(others), _CAMERAS - len(refused))
@@ -230,7 +231,7 @@ def _header(pen: Any, scene: Scene) -> None:
         f"{int(scene.used.sum())} of {len(scene.used)} LEDs"
     )
     if not scene.paths_checked:
-        words += "; ways were not checked for collisions"
+        words += "; paths were not checked for collisions"
     pen.text((_MARGIN, 62), words, colours.css(colours.INK), _font(16), anchor="ls")
     if scene.refusals:
         many = "is refused" if len(scene.refusals) == 1 else f"is refused for {len(scene.refusals)} reasons"
@@ -238,7 +239,7 @@ def _header(pen: Any, scene: Scene) -> None:
 
 
 def _column(pen: Any, scene: Scene, x: int, top: int) -> None:
-    """Beside the pictures: why the plan is refused; otherwise the views and the times of their legs."""
+    """Text beside the pictures: why the plan is refused, else the views and the durations of their legs."""
     rows = [
         line
         for refusal in scene.refusals
@@ -256,7 +257,7 @@ def _column(pen: Any, scene: Scene, x: int, top: int) -> None:
 
 
 def _legend(pen: Any, bottom_left: tuple[int, int]) -> None:
-    """What the colours mean, upwards from a corner."""
+    """Legend of the colours, upwards from a corner."""
     x, y = bottom_left
     for k in range(120):
         pen.line((x + k, y - 10, x + k, y), colours.css(colours.of_share(k / 119)))
@@ -264,9 +265,9 @@ def _legend(pen: Any, bottom_left: tuple[int, int]) -> None:
     pen.text((x + 130, y - 5), note, colours.css(colours.INK), _font(13), anchor="lm")
     for row, (colour, words) in enumerate(
         (
-            (colours.SIGHT, "field of view, and where it falls"),
-            (colours.CAMERA_WAY, "way of the camera; grey: of the flange"),
-            (colours.TOOL, "camera and what else the flange carries"),
+            (colours.SIGHT, "field of view, and its footprint"),
+            (colours.CAMERA_WAY, "path of the camera; grey: of the flange"),
+            (colours.TOOL, "camera and other parts on the flange"),
             (colours.ARM, "arm at the views"),
             (colours.HOME, "arm at home"),
         ),

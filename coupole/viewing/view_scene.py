@@ -1,6 +1,6 @@
-"""What there is to see of a plan: the cell, where the arm stands at each view, its ways, and what it would touch.
+"""Scene of a plan: the cell, the arm at each view, its paths, and its collisions.
 
-Everything is in the support frame, in mm, and says nothing of how it is drawn.
+Everything is in the support frame, in mm, and independent of how it is drawn.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ _CLASH_PLACES = 200
 
 @dataclass(frozen=True)
 class Clash:
-    """The arm where it would touch something."""
+    """The arm in a collision."""
 
     contact: Contact
     joints_deg: Joints
 
     @property
     def words(self) -> str:
-        """What touches what, and how far off it is."""
+        """Both bodies and their distance, as text."""
         apart_mm = self.contact.distance_mm
         how = f"{apart_mm:.0f} mm from" if apart_mm > 0 else f"{-apart_mm:.0f} mm inside"
         return f"{self.contact.body} {how} {self.contact.other}"
@@ -55,26 +55,26 @@ class Clash:
 
 @dataclass(frozen=True)
 class Stop:
-    """One view and the way to it."""
+    """One view and the path to it."""
 
     name: str
     number: int
     """In the order of visiting, from 1; refused views come last."""
     joints_deg: Joints | None
-    """[6] where the arm stands; None where it cannot be there."""
+    """[6] joint angles at the view; None if the arm cannot reach it."""
     leg_s: float | None
-    """Time of the leg; None where there is none."""
+    """Duration of the leg; None if there is none."""
     camera_way_mm: Points
-    """[n, 3] of the projection centre on the leg; where there is none, straight ahead into what is in the way."""
+    """[n, 3] path of the projection centre on the leg; without a leg, of the straight motion to the collision."""
     flange_way_mm: Points
     vias_mm: Points
-    """[k, 3] the projection centre at the leg's via points."""
+    """[k, 3] projection centre at the leg's via points."""
     sight: Sight | None
     footprint_mm: Points
-    """[n, 3] closed line round what the picture shows of object and support."""
+    """[n, 3] closed line around the part of object and support that the picture shows."""
     shadow: Occlusion | None
     refusal: str
-    """Why the plan must not be run, as far as this view is concerned; empty if nothing speaks against it."""
+    """Why this view makes the plan be refused; empty if it does not."""
     clash: Clash | None
 
 
@@ -110,17 +110,17 @@ class Scene:
 
     @property
     def led_share(self) -> NDArray[np.float64]:
-        """[leds] share of what the camera sees that each LED reaches, mean of the views that can be taken."""
+        """[leds] share of the visible surface that each LED reaches, mean of the views that can be taken."""
         shares = [stop.shadow.share() for stop in self.stops if stop.shadow is not None]
         return np.mean(shares, axis=0) if shares else np.zeros(len(self.leds_mm))
 
     def light_on(self, stop: Stop) -> list[str]:
-        """What is to be said of the plan's LEDs in a view, a line each."""
+        """Text on the plan's LEDs in a view, one string per line."""
         if stop.shadow is None or not self.used.any():
             return []
         reached, occluded = stop.shadow.share()[self.used].mean(), stop.shadow.occluded_leds()[self.used].sum()
         return [
-            f"an LED reaches {reached:.0%} of what is seen",
+            f"an LED reaches {reached:.0%} of the visible surface",
             f"{occluded} of {self.used.sum()} LEDs reach nothing of it",
         ]
 
@@ -138,7 +138,7 @@ class Scene:
 
 
 def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals: Sequence[str]) -> Scene:
-    """Everything that there is to see of a job; without `bodies` nothing is looked at for collisions."""
+    """The scene of a job; without `bodies` collisions are not checked."""
     rig, views = job.cell.rig, job.schedule.views
     shadows, corners_mm = job.motion.occlusions, job.shape.corners_mm
     refused = [index for index in range(len(views)) if index not in itinerary.order]
@@ -237,7 +237,7 @@ def _footprint(sight: Sight | None, rig: Rig, shadows: Occlusions) -> Points:
 
 
 def _ways_mm(way_deg: Sequence[Joints], rig: Rig) -> tuple[Points, Points, Points]:
-    """Ways [n, 3] of camera and flange, and the camera's via points [k, 3]."""
+    """Paths [n, 3] of camera and flange, and the camera's via points [k, 3]."""
     along, vias = (_frames(rig, np.array(places))[..., FLANGE, :, :] for places in (_along(way_deg), way_deg))
     camera_mm = rig.flange_from_camera.matrix()[:3, 3]
     return (
@@ -256,7 +256,7 @@ def _frames(rig: Rig, joints_deg: Joints) -> NDArray[np.float64]:
 
 
 def _along(way_deg: Sequence[Joints]) -> Joints:
-    """Places [n, 6] close together on straight motions."""
+    """Joint angles [n, 6] at small intervals on straight motions."""
     places = [way_deg[0][None]]
     for a, b in pairwise(way_deg):
         steps = max(1, int(np.ceil(np.abs(b - a).max() / _WAY_STEP_DEG)))
@@ -267,9 +267,9 @@ def _along(way_deg: Sequence[Joints]) -> Joints:
 def _clash(
     view: ViewPose, starts_deg: Sequence[Joints], rig: Rig, bodies: CellBodies
 ) -> tuple[Clash | None, Joints]:
-    """What a refused view, or else a straight way to it, would touch, and where that way starts.
+    """Collision of a refused view, or of the straight motion to it, and the start of that motion.
 
-    Of postures that all touch something, the one that lacks least counts.
+    If all postures of the view collide, the one with the least penetration is used.
     """
     arm = arm_of(rig)
     postures = (
@@ -291,7 +291,7 @@ def _clash(
 
 
 def _clash_on_the_way(from_deg: Joints, to_deg: Joints, bodies: CellBodies) -> Clash | None:
-    """Where the straight motion between two places first touches something."""
+    """First collision of the straight motion between two postures."""
     places = from_deg + np.linspace(0, 1, _CLASH_PLACES)[:, None] * (to_deg - from_deg)
     touches = bodies.tightest_mm(places) < 0
     if not touches.any():

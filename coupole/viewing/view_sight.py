@@ -1,4 +1,4 @@
-"""Where a camera looks: the edges of its field of view, and where its picture falls."""
+"""Field of view of a camera: its edges, and its footprint."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from coupole.motion.occlusion import Sight
 from coupole.viewing.view_solids import Points
 
 _BORDER_POINTS = 16
-"""Points on each side of the picture whose rays draw its footprint."""
+"""Points on each side of the picture whose rays make up its footprint."""
 _FAR_MM = 1e4
 
 
 def picture_border(sight: Sight) -> Points:
-    """Points [4 n, 3] in the camera's frame, 1 mm in front of it, round its picture; every n-th is a corner."""
+    """Points [4 n, 3] in the camera's frame, 1 mm in front of it, along the border of its picture; every n-th is a
+    corner."""
     half = np.array((sight.width_px, sight.height_px)) / 2 / sight.focal_px
     corners = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
     share = np.arange(_BORDER_POINTS)[:, None] / _BORDER_POINTS
@@ -26,7 +27,7 @@ def picture_border(sight: Sight) -> Points:
 
 
 def sight_lines(sight: Sight, length_mm: float = 120.0) -> list[Points]:
-    """The edges of a camera's field of view: four rays [2, 3], and the closed line [5, 3] round their ends."""
+    """The edges of a camera's field of view: four rays [2, 3], and the closed line [5, 3] through their ends."""
     corners = length_mm * picture_border(sight)[::_BORDER_POINTS]
     far_mm = apply(sight.support_from_camera, np.concatenate([corners, corners[:1]]))
     eye_mm = sight.support_from_camera[:3, 3]
@@ -34,8 +35,8 @@ def sight_lines(sight: Sight, length_mm: float = 120.0) -> list[Points]:
 
 
 def footprint(sight: Sight, mesh: Any, support_radius_mm: float) -> Points:
-    """Closed line [n, 3] where the border of a camera's picture falls on the object, else on the support; without
-    the places where it falls on neither."""
+    """Closed line [n, 3]: the border of a camera's picture projected onto the object, else onto the support;
+    without points that are on neither."""
     eye_mm = sight.support_from_camera[:3, 3]
     rays = picture_border(sight) @ sight.support_from_camera[:3, :3].T
     with np.errstate(divide="ignore"):

@@ -1,4 +1,4 @@
-"""Shapes to draw: closed meshes of capsules, disks, boxes and spheres, and meshes to draw."""
+"""Shapes to draw: closed meshes of capsules, disks, boxes and spheres."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def box(name: str, low_mm: ArrayLike, high_mm: ArrayLike) -> Solid:
 
 
 def disk(name: str, radius_mm: float, thickness_mm: float, around: int = 96) -> Solid:
-    """Round the origin, its top at z = 0."""
+    """About the origin, its top at z = 0."""
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
     rim = radius_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     low = np.array((0, 0, -thickness_mm))
@@ -83,14 +83,14 @@ def disk(name: str, radius_mm: float, thickness_mm: float, around: int = 96) -> 
 
 
 def with_fewer_faces(solid: Solid, faces_at_most: int) -> Solid:
-    """About the same shape, quicker to draw."""
+    """About the same shape with fewer faces, for drawing."""
     return Solid(solid.name, *simplified(solid.vertices_mm, solid.faces, faces_at_most))
 
 
 @lru_cache(maxsize=8)
 def _ball(around: int) -> tuple[Points, NDArray[np.int64], NDArray[np.bool_]]:
-    """Unit sphere with two equators, so that it can be drawn apart to a capsule: vertices, faces, and for each
-    vertex whether it belongs to the upper half."""
+    """Unit sphere with two equators, so that its halves can be moved apart to make a capsule: vertices, faces, and
+    for each vertex whether it belongs to the upper half."""
     rings = max(2, around // 4)
     below = np.linspace(-np.pi / 2, 0, rings + 1)
     latitude = np.concatenate([below, -below[::-1]])

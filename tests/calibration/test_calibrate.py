@@ -133,7 +133,7 @@ def test_a_name_that_no_record_may_have_is_refused_before_the_work(folder: Path,
 @pytest.mark.parametrize("suffix", [".csv", ".h5", ".png", ".html"])
 def test_nothing_that_stands_beside_is_written_over(folder: Path, tmp_path: Path, suffix: str) -> None:
     (tmp_path / f"dome{suffix}").write_text("precious")
-    assert "stands here already" in refused("camera", folder, "--out", tmp_path, "--name", "dome")
+    assert "exists already" in refused("camera", folder, "--out", tmp_path, "--name", "dome")
     assert (tmp_path / f"dome{suffix}").read_text() == "precious"
 
 
@@ -154,7 +154,7 @@ def test_positions_in_metres_said_to_be_millimetres_are_refused_with_the_cause(t
 
 def test_a_record_is_never_written_over(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "lens.yaml").write_text("mine\n")
-    assert "stands here already" in refused("camera", folder, "--out", tmp_path, "--name", "lens")
+    assert "exists already" in refused("camera", folder, "--out", tmp_path, "--name", "lens")
     assert (tmp_path / "lens.yaml").read_text() == "mine\n"
 
 

@@ -118,7 +118,7 @@ def test_light_in_a_dark_frame_is_named_by_its_frame() -> None:
 
 
 def test_a_black_level_that_cuts_noise_off_is_named() -> None:
-    with pytest.raises(InputError, match="noise is cut off"):
+    with pytest.raises(InputError, match="noise is clipped"):
         calibrate_dark(dark_frames(TrueSensor(SHAPE, black_dn=3.0)), white_dn=4095)
 
 

@@ -240,5 +240,5 @@ def test_a_tile_that_moved_between_views_is_named() -> None:
     positions, power, random = small_dome()
     first = views_of(positions, power, random)[:1]
     moved = views_of(positions, power, random, tilts_deg=((1.0, 0.3),))[1:]
-    with pytest.raises(InputError, match=r"did not lie still: view p0c[01] sees it tilted by"):
+    with pytest.raises(InputError, match=r"was moved: view p0c[01] sees it tilted by"):
         found_with([*first, *moved], positions)

@@ -9,7 +9,7 @@ import cells
 import pytest
 from photographed import write_folder
 
-from coupole.calibration.acceptance import Allowed, asked, judged, words_of
+from coupole.calibration.acceptance import Allowed, against_limits, asked, words_of
 from coupole.calibration.leds.acceptance import LEDS
 from coupole.calibration.lens.acceptance import CAMERA, CHROMATIC, HAND_EYE
 from coupole.calibration.record import read_record
@@ -39,7 +39,7 @@ def test_what_is_no_limit_is_refused(words: list[str], message: str) -> None:
 
 def test_a_limit_that_was_set_keeps_what_is_usual_beside_it() -> None:
     limits = (Allowed("a_px", "first", 1.0, "px"), Allowed("b_px", "second", 2.0, "px"))
-    first, second = judged(limits, {"a_px": 3.0}, {"a_px": 2.5, "b_px": 2.5})
+    first, second = against_limits(limits, {"a_px": 3.0}, {"a_px": 2.5, "b_px": 2.5})
     assert (first.passed, first.limit, first.usual, first.name) == (True, 3.0, 1.0, "a_px")
     assert (second.passed, second.limit, second.usual) == (False, 2.0, None)
 

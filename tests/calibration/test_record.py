@@ -135,7 +135,7 @@ def test_a_kind_that_is_missing_or_named_twice_is_refused() -> None:
     ("here", "reason"),
     [
         ({"now": NOW + timedelta(days=181)}, "expired on 2026-08-28"),
-        ({"now": NOW - timedelta(days=1)}, "yet to come"),
+        ({"now": NOW - timedelta(days=1)}, "in the future"),
         ({"focus_distance_mm": 420.0}, "holds for a focus of 335 mm"),
         ({"f_number": 11.0}, "holds for aperture 8; the rig has 11"),
         ({"focal_length_mm": 50.0}, "holds for focal length 35 mm"),

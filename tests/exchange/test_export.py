@@ -247,7 +247,7 @@ def test_nothing_is_written_over_unless_that_is_asked(made: MadeRun, out: Path) 
     out.mkdir()
     mine = out / "top_led0001_e0.dng"
     mine.write_bytes(b"mine")
-    with pytest.raises(InputError, match="stands here already"):
+    with pytest.raises(InputError, match="exists already"):
         export(made, "dng", out)
     assert [path.name for path in out.iterdir()] == [mine.name]
     assert mine.read_bytes() == b"mine"

@@ -58,14 +58,14 @@ def test_what_was_read_in_is_read_in_again(exported: Path) -> None:
 def test_nothing_is_written_of_a_file_that_is_refused(exported: Path) -> None:
     ended = cells.here("scan", exported / "object.stl", "--out", exported / "scan")
     assert ended.code == 2
-    assert "say so with --unit" in ended.err
+    assert "give its unit with --unit" in ended.err
     assert sorted(path.name for path in exported.iterdir()) == ["object.stl", "targets.txt"]
 
 
 def test_a_folder_that_exists_is_not_written_into(exported: Path) -> None:
     ended = cells.here("scan", exported / "object.stl", "--unit", "m", "--out", exported)
     assert ended.code == 2
-    assert "stands here already" in ended.err
+    assert "exists already" in ended.err
 
 
 def test_an_unknown_unit_is_refused(exported: Path) -> None:

@@ -85,7 +85,7 @@ def test_its_run_is_not_resumed_and_the_remedy_is_said(run: Path) -> None:
     ended = cells.here("acquire", WITNESS / "plan.yaml", "--resume", run, "--yes")
     assert ended.code == 2
     assert "begun by coupole 0.1.0" in ended.err
-    assert "acquire what it lacks as a run of its own" in ended.err
+    assert "acquire its missing frames in a new run" in ended.err
     assert (run / "journal.jsonl").read_bytes() == before
 
 

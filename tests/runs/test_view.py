@@ -154,7 +154,7 @@ def test_without_json_refusals_and_files_are_told(cell: CellFolder) -> None:
     ended = cells.here("view", cell.plan, "--out", cell.folder)
     assert ended.code == 0
     assert ended.out == ""
-    assert "planning the ways to 1 views" in ended.err
+    assert "planning paths to 1 views" in ended.err
     assert "refused: view close: camera" in ended.err
     assert str(cell.folder / "small.html") in ended.err
 

@@ -223,7 +223,7 @@ def partly_in_metres(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     ("spoil", "message"),
     [
         (with_a_fin, r"not a surface: 1 edges have three triangles or more; the first is at triangle [57], \("),
-        (turned, r"3 edges part a triangle that shows its inside.*the first is at triangle \d+, \("),
+        (turned, r"3 edges are between triangles of opposite orientation.*the first is at triangle \d+, \("),
         (partly_in_metres, r"mixed units\? Triangle \d+ has an edge of 0\.00"),
         (
             lambda mesh: mesh.copy().apply_scale(1e-3),

@@ -84,7 +84,7 @@ def test_the_unit_that_the_table_names_is_found(tmp_path: Path, heading: str, un
         ("1 2 3\n4 x 6\n", ":2: expected a number in column 2, found `x`"),
         ("1 2 3\n4 nan 6\n", ":2: expected a number in column 2, found `nan`"),
         ("1 2\n", ":1: expected columns 3 (x y z)"),
-        ("a 1 2 3\na 4 5 6\n", ":2: target `a` stands in lines 1 and 2"),
+        ("a 1 2 3\na 4 5 6\n", ":2: target `a` is in lines 1 and 2"),
         ("1 2 3 0 0 2\n", ":1: expected a normal of length 1"),
         ("1,5,2,25,3,75\n", ":1: `1,5,2,25,3,75` could be 6 whole numbers or 3 with decimal commas"),
         ("# x in mm\n# y in inches\n1 2 3\n", ":2: mixed units: in and mm"),

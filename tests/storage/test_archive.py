@@ -282,7 +282,7 @@ def test_a_run_that_another_process_acquires_into_is_refused(made: MadeRun) -> N
 
 
 def test_nothing_more_is_written_into_an_archived_view(archived: MadeRun) -> None:
-    with pytest.raises(StorageError, match="is archived, so nothing is written"):
+    with pytest.raises(StorageError, match="is archived, so nothing can be written"):
         ViewWriter(archived.run.view_path("top"), {})
 
 
@@ -326,7 +326,7 @@ def test_an_archive_that_does_not_read_back_does_not_replace_the_file(made: Made
 def archive_is_refused_or_unreadable(made: MadeRun, spoil: Any) -> None:
     """Spoilt tiles decode to other pixels, or not at all: both end in an error, and every file is as it was."""
     before = views_bytes(made.run)
-    with pytest.raises(StorageError, match="The view is as it was"):
+    with pytest.raises(StorageError, match="The view is unchanged"):
         archive_run(made.run, LZ4, progress=spoil)
     assert views_bytes(made.run) == before
 

@@ -121,7 +121,7 @@ def test_a_whole_line_that_is_no_event_is_refused_with_its_number(tmp_path: Path
     written(path, [SessionStarted()])
     with path.open("a") as file:
         file.write(line + "\n")
-    with pytest.raises(StorageError, match="line 3 is no event"):
+    with pytest.raises(StorageError, match="line 3 is not an event"):
         list(journal.read(path))
 
 

@@ -76,7 +76,7 @@ def test_verify_finds_a_shot_that_stands_in_two_slots(finished: Run) -> None:
     slot = writer.put(frame(9), frame_id=200, camera_ns=9, exposure_us=8000)
     writer.prove(slot, "top/led0001/e0")
     writer.close()
-    assert run.verify(finished).bad == ["views/top.h5: top/led0001/e0 stands in 2 slots"]
+    assert run.verify(finished).bad == ["views/top.h5: top/led0001/e0 is in 2 slots"]
 
 
 def test_verify_finds_a_shot_that_was_proven_twice(finished: Run) -> None:

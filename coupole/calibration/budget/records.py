@@ -47,7 +47,7 @@ def read_records(paths: Sequence[Path]) -> tuple[InForce, ...]:
     for number, item in enumerate(found):
         if item.record.kind not in READERS:
             raise InputError(
-                f"{item.path}: a record of the kind `{item.record.kind}` says nothing to this budget; expected "
+                f"{item.path}: a record of the kind `{item.record.kind}` is not used by a budget; expected "
                 f"{', '.join(READERS)}"
             )
         if any(item.record.kind == other.record.kind for other in found[:number]):
@@ -147,7 +147,7 @@ def _of_leds(record: Record, path: Path) -> Said:
 
 
 def _of_mesh(record: Record, path: Path) -> Said:
-    """The worst sticker's place stands for all points of the object."""
+    """The uncertainty of the worst sticker is used for all points of the object."""
     turn = step_names("base_from_mesh")[3:]
     u = {parameter.name: parameter.u for parameter in record.parameters}
     figures = {

@@ -75,7 +75,7 @@ class LedGeometry:
     residuals_px: Floats
     """[k, 2] observed minus computed."""
     kept: NDArray[np.bool_]
-    """[k] spots that are no gross errors."""
+    """[k] False for spots left out as gross errors."""
     prior_step: Floats
     """[free + 6 + k] change of lens, hand-eye and axes, over the standard uncertainties of their record."""
     steps: int

@@ -88,7 +88,7 @@ def led_plan(
             head = _HEAD.format(views=len(lines), images=chosen.images, enough=enough, name=name, rig=rig)
             return head + "\n".join(lines) + "\n" + _TAIL
         joints_deg = np.delete(joints_deg, cut_off, axis=0)
-    raise InputError(f"leds: no ways were found to all of the views, {_ROUNDS} times over. Try another --seed")
+    raise InputError(f"leds: no paths to all of the views were found in {_ROUNDS} rounds. Try another --seed")
 
 
 def _candidates(rig: Rig, boards: Boards, bodies: CellBodies, random: np.random.Generator, drawn: int) -> Floats:

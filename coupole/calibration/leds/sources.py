@@ -60,7 +60,7 @@ class _Collected:
 
     inputs: list[tuple[str, str]]
     camera: tuple[About, tuple[int, int]] | None = None
-    """What the run says of the camera, and the width and height of its frames, px."""
+    """Properties of the camera, and width and height of its frames, px."""
     views: list[str] = field(default_factory=list)
     poses: list[Floats] = field(default_factory=list)
     joints_deg: list[Floats] = field(default_factory=list)

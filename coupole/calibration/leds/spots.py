@@ -122,7 +122,7 @@ def _spot(signal: Floats) -> Spot | str:
     weight = np.clip((signal - LOW) / (HIGH - LOW), 0.0, 1.0)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats((weight > 0).astype(np.uint8), connectivity=8)
     if count < 2:
-        return "fades away at full resolution"
+        return "too faint at full resolution"
     label = 1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA]))
     left, top, across, down = (int(v) for v in boxes[label, :4])
     if left == 0 or top == 0 or left + across == weight.shape[1] or top + down == weight.shape[0]:
@@ -144,7 +144,7 @@ def _spot(signal: Floats) -> Spot | str:
     fill = area / (4 * np.pi * float(np.sqrt(widths[0] * widths[1])))
     coarse = _COARSE / np.sqrt(area)
     if not LEAST_FILL - coarse < fill < MOST_FILL + coarse:
-        return f"not like a square or disk (fill {fill:.2f}): spots that touch, or half hidden"
+        return f"not like a square or disk (fill {fill:.2f}): spots that touch, or partly occluded"
     covariance = _CROSSING * about[at_rim].T @ about[at_rim] / area**2
     return Spot(centre, covariance, area, fill)
 

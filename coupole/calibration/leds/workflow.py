@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.calibration.acceptance import judged
+from coupole.calibration.acceptance import against_limits
 from coupole.calibration.calibrated_arm import ZEROS, CalibratedArm, calibrated_poses
 from coupole.calibration.leds.acceptance import LEDS
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
@@ -81,7 +81,7 @@ def leds_from(
         f"{request.name}.csv": led_csv(new_table, request.name).encode("ascii"),
         f"{request.name}.h5": _h5(geometry, matching, boards, leds.place, place, len(table.ids)),
     }
-    limits = judged(LEDS, request.limits, _figures(geometry, leds.found, leds.u_mm, leds.u_deg))
+    limits = against_limits(LEDS, request.limits, _figures(geometry, leds.found, leds.u_mm, leds.u_deg))
     faults = (*matching.faults, *_moved_boards(boards, geometry, place))
     record = _record(
         images,

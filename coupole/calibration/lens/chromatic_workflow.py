@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coupole.calibration import optics
-from coupole.calibration.acceptance import judged
+from coupole.calibration.acceptance import against_limits
 from coupole.calibration.grey_image import CHANNELS, Channel
 from coupole.calibration.lens.acceptance import CHROMATIC
 from coupole.calibration.lens.board import Board, Sighting, in_channel
@@ -71,7 +71,7 @@ def chromatic_from(found: Found, sources: Sources, board: Board, model: str, req
             )
             for channel, sigma in lenses.sigma_px.items()
         ),
-        limits=judged(CHROMATIC, request.limits, {**image_figures(fit, found), "shift_px": u_px}),
+        limits=against_limits(CHROMATIC, request.limits, {**image_figures(fit, found), "shift_px": u_px}),
         remarks=(*(_remark(channel, *shift) for channel, shift in shifts.items()), *found.left_out),
         fixed={
             f"{channel}.{unit_name(name)}": getattr(lenses.intrinsics[channel], name)

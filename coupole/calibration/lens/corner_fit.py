@@ -58,7 +58,8 @@ def enough_pixels(known: NDArray[np.bool_], radius_px: float) -> bool:
 def fit_corners(image: NDArray[Any], known: NDArray[np.bool_], rough: Floats, radius_px: float) -> Corners:
     """Corners about `rough` [n, 2] from the pixels within `radius_px`, of which there must be `enough_pixels`.
 
-    `image` [H, W] are RAW values; `known` [h, w] says which pixels take part, repeated over the image.
+    `image` [H, W] are RAW values; `known` [h, w] is the mask of the pixels to use, a tile that repeats over the
+    image.
     """
     values = np.ascontiguousarray(image, dtype=np.float32)
     found = np.full((len(rough), _UNKNOWNS), np.nan)
@@ -86,8 +87,7 @@ def _fit_all(image, known, rough, radius, found):  # type: ignore[no-untyped-def
 
 @numba.njit(cache=True, nogil=True)
 def _start(image, known, radius, unknowns):  # type: ignore[no-untyped-def]
-    """Directions of both edges, level and contrast from the values all around; False where there are no four
-    sectors."""
+    """Directions of both edges, level and contrast by the values around the corner; False without four sectors."""
     sums, counts = np.zeros(_SECTORS), np.zeros(_SECTORS)
     x, y = unknowns[_X], unknowns[_Y]
     for row in range(max(0, math.ceil(y - radius)), min(image.shape[0], math.floor(y + radius) + 1)):

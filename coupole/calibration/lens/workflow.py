@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from coupole.calibration import optics
-from coupole.calibration.acceptance import judged
+from coupole.calibration.acceptance import against_limits
 from coupole.calibration.adjustment import Component
 from coupole.calibration.arm_errors import axis_sensitivity
 from coupole.calibration.lens.acceptance import CAMERA, HAND_EYE
@@ -83,7 +83,7 @@ def camera_from(found: Found, sources: Sources, model: str, request: Request) ->
         parameters=tuple(parameters),
         covariance=rows_of(fit.covariance),
         noise=(_noise("corners", "px", 0.0, fit.sigma_px, redundancy),),
-        limits=judged(CAMERA, request.limits, {**image_figures(fit, found), "ray_px": ray_u_px(fit)}),
+        limits=against_limits(CAMERA, request.limits, {**image_figures(fit, found), "ray_px": ray_u_px(fit)}),
         remarks=found.left_out,
         fixed=held(fit.intrinsics, fit.free),
         images=image_lines(kept, residuals, fit.sightings),
@@ -136,7 +136,9 @@ def hand_eye_from(
         parameters=_hand_eye_parameters(result),
         covariance=rows_of(result.covariance),
         noise=_hand_eye_noise(result),
-        limits=judged(HAND_EYE, request.limits, {**image_figures(fit, found), **_hand_eye_figures(result)}),
+        limits=against_limits(
+            HAND_EYE, request.limits, {**image_figures(fit, found), **_hand_eye_figures(result)}
+        ),
         remarks=tuple(filter(None, (*found.left_out, *diagnosis.sentences(), diagnosis.of_methods()))),
         fixed=held(result.intrinsics, lens.free if lens else optics.MODELS[model]),
         images=image_lines(kept, result.residuals_px, fit.sightings),

@@ -97,7 +97,7 @@ def draw_response(
     )  # fmt: skip
     axes[1, 1].axhline(0, color=DARK, lw=1)
     axes[1, 1].set(
-        title="Off a straight line; lines: what is corrected", xlabel="signal above dark (DN)", ylabel="%"
+        title="Deviation from a straight line; lines: correction", xlabel="signal above dark (DN)", ylabel="%"
     )
 
 

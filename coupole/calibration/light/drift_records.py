@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coupole.calibration.acceptance import judged
+from coupole.calibration.acceptance import against_limits
 from coupole.calibration.earlier import read_accepted
 from coupole.calibration.light.acceptance import DRIFT
 from coupole.calibration.light.drift import NAMES, Drift, Reading, fit_drift
@@ -120,7 +120,7 @@ def drift_outcome(
         _parameters(drift),
         drift.covariance,
         partial(draw_drift, drift, warmer_k, t_s),
-        limits=judged(DRIFT, request.limits, {"factor": float(u.max()), "left_out": left_out}),
+        limits=against_limits(DRIFT, request.limits, {"factor": float(u.max()), "left_out": left_out}),
         files={f"{request.name}.csv": _table(drift).encode()},
         fixed={"start_s": drift.start_s, "hours": drift.hours, "noise": drift.noise},
         remarks=(

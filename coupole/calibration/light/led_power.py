@@ -230,6 +230,7 @@ def _refuse_moved(
         gain, v, tilt_deg = best
         if gain > chi2_distribution.isf(_UNLIKELY, 3) and tilt_deg > 0.05:
             raise InputError(
-                f"LED power: the tile did not lie still: view {views[v].name} sees it tilted by {tilt_deg:.2g} "
-                "deg or shifted against the other views of this place. Acquire again, or describe its places apart"
+                f"LED power: the tile was moved: view {views[v].name} sees it tilted by {tilt_deg:.2g} "
+                "deg or shifted against the other views of this place. Acquire again, or describe "
+                "its places separately"
             )

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from coupole.calibration.acceptance import judged
+from coupole.calibration.acceptance import against_limits
 from coupole.calibration.light import drawing as pictures
 from coupole.calibration.light.acceptance import LED_POWER
 from coupole.calibration.light.frames import LightFrame, LightFrames, channels_of
@@ -51,7 +51,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
     typical = float(np.median(green.u_against_mean()[good]))
     unusable = float(np.mean(~np.isfinite(green.power)))
     others = np.setdiff1d(setting.positions.ids, green.ids)
-    remarks = [f"{len(others)} LEDs of the dome are in no picture: {list_of(others)}"] if len(others) else []
+    remarks = [f"{len(others)} LEDs of the dome have no frame: {list_of(others)}"] if len(others) else []
     remarks += list(dict.fromkeys(remark for power in powers.values() for remark in power.remarks))
     return sealed_outcome(
         "led-power",
@@ -61,7 +61,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
         parameters,
         covariance,
         partial(pictures.draw_led_power, powers, setting.positions),
-        limits=judged(LED_POWER, request.limits, {"power": typical, "unusable": unusable}),
+        limits=against_limits(LED_POWER, request.limits, {"power": typical, "unusable": unusable}),
         files={f"{request.name}.csv": power_table(powers, warm).encode()},
         fixed={"tile.reflectance": setting.tile.reflectance, "tile.minnaert": setting.tile.minnaert},
         remarks=(f"emission profile `{setting.emission}`", *remarks),

@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.calibration.acceptance import judged
+from coupole.calibration.acceptance import against_limits
 from coupole.calibration.earlier import read_accepted, read_earlier
 from coupole.calibration.light import drawing as pictures
 from coupole.calibration.light.acceptance import DARK, RESPONSE
@@ -135,7 +135,7 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
         parameters,
         _of_means(dark, np.array([p.u for p in parameters])),
         partial(pictures.draw_dark, dark),
-        limits=judged(DARK, request.limits, {"hot": len(dark.hot) / pixels}),
+        limits=against_limits(DARK, request.limits, {"hot": len(dark.hot) / pixels}),
         files={f"{request.name}.h5": content},
         fixed=fixed,
         remarks=(f"{len(dark.hot)} hot pixels of {pixels}; the list is in {request.name}.h5",),
@@ -220,7 +220,7 @@ def response_outcome(
     flicker = max(line.flicker for line in lines.values())
     remarks = [_linear_remark(channel, line) for channel, line in lines.items()]
     if not any(t.saturated_seen for t in transfers.values()):
-        remarks.append("no frame was saturated: full well is at least what is stated")
+        remarks.append("no frame was saturated: the full well is a lower bound")
     noise = [
         Noise(
             name=f"reading {channel}",
@@ -239,7 +239,7 @@ def response_outcome(
         parameters,
         covariance,
         partial(pictures.draw_response, transfers, lines),
-        limits=judged(RESPONSE, request.limits, {"linearity": worst, "flicker": flicker}),
+        limits=against_limits(RESPONSE, request.limits, {"linearity": worst, "flicker": flicker}),
         noise=noise,
         fixed={"range_dn": range_dn, **_saturation_figures(transfers)},
         remarks=remarks,
@@ -325,8 +325,9 @@ def _response_parameters(
 
 
 def _linear_remark(channel: str, line: Linearity) -> str:
-    how = "corrected by a polynomial" if line.coefficients.any() else "not told from a straight line"
-    return f"{channel}: off a straight line by {line.worst_deviation:.2%} ({line.u_deviation:.2%}), {how}"
+    how = "corrected by a polynomial" if line.coefficients.any() else "which is not significant"
+    off = f"{line.worst_deviation:.2%} ({line.u_deviation:.2%})"
+    return f"{channel}: deviates from a straight line by {off}, {how}"
 
 
 def linearise(record_path: Path | None, channel: str, frames: LightFrames) -> Callable[[Floats], Floats]:
@@ -338,7 +339,9 @@ def linearise(record_path: Path | None, channel: str, frames: LightFrames) -> Ca
         return lambda signal: signal
     record = read_earlier(record_path, "response", frames.about, frames.size_px)
     if f"c2.{channel}" not in {parameter.name for parameter in record.parameters}:
-        raise InputError(f"{record_path}: has no response of the channel {channel}; calibrate this camera's anew")
+        raise InputError(
+            f"{record_path}: has no response of the channel {channel}; make a record with this camera"
+        )
     c2, c3 = record.value(f"c2.{channel}"), record.value(f"c3.{channel}")
     range_dn = record.value("range_dn")
 

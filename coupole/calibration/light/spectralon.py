@@ -22,7 +22,7 @@ from coupole.plan.plan import Model, Pose
 
 
 class Tile(Model):
-    """A white tile and where it lies; its white face is z = 0 of its frame, the origin in its middle."""
+    """A white tile and its pose; its white face is z = 0 of its frame, with the origin in the centre."""
 
     schema_version: Literal[1] = 1
     name: str = "Spectralon SRS-99"

@@ -60,7 +60,7 @@ def read_scan(folder: Path) -> Scan:
         targets_mm = np.array([[float(row[axis]) for axis in _COORDINATES] for row in rows])
         names = tuple(row["name"] for row in rows)
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{table}: not as `coupole scan` wrote it: {error!r}. Import the scan anew") from error
+        raise InputError(f"{table}: not as `coupole scan` wrote it: {error!r}. Import the scan again") from error
     inputs = tuple((f"{folder.resolve().name}/{path.name}", sha256(path)) for path in (mesh, table))
     return Scan(names, targets_mm.reshape(-1, 3), mesh, inputs)
 

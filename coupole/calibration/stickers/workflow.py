@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from coupole.calibration import optics
-from coupole.calibration.acceptance import judged
+from coupole.calibration.acceptance import against_limits
 from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
 from coupole.calibration.multi_view import seen_points
 from coupole.calibration.posed_camera import CameraPrior
@@ -109,7 +109,7 @@ def mesh_from(
             ImageResidual(name=name, corners=used, rejected=rejected, rms_px=rms_px)
             for name, (used, rejected, rms_px) in zip(images.names, pose.residuals_of, strict=True)
         ),
-        limits=judged(MESH, request.limits, _figures(pose, scan, u_mm)),
+        limits=against_limits(MESH, request.limits, _figures(pose, scan, u_mm)),
         remarks=(*_remarks(pose), *(() if arm is None else (_of_the_arm(arm),))),
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in (*sources.inputs, *scan.inputs)),
     )

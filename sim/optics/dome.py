@@ -12,7 +12,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
-from scipy.spatial.transform import Rotation
 
 from coupole.appearance.render.led_squares import Leds
 
@@ -39,6 +38,10 @@ class DomeErrors:
 
 def as_built(table: Leds, errors: DomeErrors) -> Leds:
     """The LEDs where they are; ids and fluxes are the table's, but a swapped LED has the other's flux as well."""
+    if not (errors.board_shift_mm or errors.board_turn_deg or errors.led_shift_mm or errors.swapped):
+        return table
+    from scipy.spatial.transform import Rotation
+
     positions_mm, normals = table.positions_mm.copy(), table.normals.copy()
     for board in np.unique(table.boards):
         mine = table.boards == board

@@ -25,7 +25,7 @@ from sim.optics.sensor import electrons, expose, expose_electrons, mosaic
 from sim.render import arm_shadow
 from sim.render.camera_view import View, Viewer, tangents
 from sim.render.embree import Obstacles
-from sim.render.emitter import LED_SIDE_MM, Emitter, irradiance, square
+from sim.render.emitter import LED_SIDE_MM, Emitter, irradiance_of_each, square, squares
 from sim.render.lens import Lens, sight
 from sim.render.radiance import led_radiance, panel_radiance
 from sim.render.shadows import Shadows
@@ -302,16 +302,13 @@ def _remembered(look: Look, light: int, compute: Callable[[], Radiance]) -> Radi
 
 
 def _emitters(leds: Leds) -> list[Emitter]:
-    return [
-        square(position, normal, side_mm=LED_SIDE_MM, flux_lm=float(flux))
-        for position, normal, flux in zip(leds.positions_mm, leds.normals, leds.flux_lm, strict=True)
-    ]
+    return squares(leds.positions_mm, leds.normals, side_mm=LED_SIDE_MM, fluxes_lm=leds.flux_lm)
 
 
 def _reference_lux(emitters: list[Emitter], base_from_support: Transform) -> float:
     """Median over the LEDs of the irradiance on a horizontal white target at the support's centre."""
     centre, up = base_from_support[:3, 3], base_from_support[:3, 2]
-    return float(np.median([irradiance(emitter, centre, up)[0] for emitter in emitters]))
+    return float(np.median(irradiance_of_each(emitters, centre, up)))
 
 
 def _surface(mesh: MeshConfig, settings: Settings) -> Surface:

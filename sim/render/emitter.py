@@ -7,6 +7,7 @@ for E / Phi, which is per m^2.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
@@ -39,12 +40,20 @@ def square(centre_mm: ArrayLike, normal: ArrayLike, *, side_mm: float, flux_lm: 
 
     The LED table does not say how squares lie; at 1 m that is worth 1e-5 of the irradiance at most.
     """
-    n = np.asarray(normal, dtype=np.float64)
-    n = n / np.linalg.norm(n)
+    (one,) = squares(np.atleast_2d(centre_mm), np.atleast_2d(normal), side_mm=side_mm, fluxes_lm=[flux_lm])
+    return one
+
+
+def squares(centres_mm: ArrayLike, normals: ArrayLike, *, side_mm: float, fluxes_lm: ArrayLike) -> list[Emitter]:
+    """`square` for each of centres [n, 3], normals [n, 3] and fluxes [n]."""
+    n = np.asarray(normals, dtype=np.float64)
+    n = n / np.linalg.norm(n, axis=1, keepdims=True)
     u = np.cross([0.0, 0.0, 1.0], n)
-    u = u / np.linalg.norm(u) if np.linalg.norm(u) > 1e-9 else np.array([1.0, 0.0, 0.0])
-    half = 0.5 * side_mm
-    return Emitter(np.asarray(centre_mm, dtype=np.float64), n, half * u, half * np.cross(n, u), flux_lm)
+    length = np.linalg.norm(u, axis=1, keepdims=True)
+    u = np.where(length > 1e-9, u / np.where(length > 1e-9, length, 1.0), [1.0, 0.0, 0.0])
+    half_u, half_v = 0.5 * side_mm * u, 0.5 * side_mm * np.cross(n, u)
+    centres, fluxes = np.asarray(centres_mm, dtype=np.float64), np.asarray(fluxes_lm, dtype=np.float64)
+    return [Emitter(*one) for one in zip(centres, n, half_u, half_v, fluxes.tolist(), strict=True)]
 
 
 def irradiance(
@@ -63,6 +72,14 @@ def irradiance(
     return out
 
 
+def irradiance_of_each(emitters: Sequence[Emitter], point_mm: ArrayLike, normal: ArrayLike) -> NDArray[np.float64]:
+    """[emitters] lux that each gives at one point [3] with unit normal [3], Lambertian, nothing in between."""
+    out = np.empty(len(emitters))
+    leds = np.array([packed(emitter) for emitter in emitters]).reshape(-1, 13)
+    _irradiance_of_each(np.asarray(point_mm, np.float64), np.asarray(normal, np.float64), leds, out)
+    return out
+
+
 def packed(emitter: Emitter) -> NDArray[np.float64]:
     """[13] centre, normal, half_u, half_v in mm, and flux in lm, for compiled code."""
     return np.array([*emitter.centre_mm, *emitter.normal, *emitter.half_u_mm, *emitter.half_v_mm, emitter.flux_lm])
@@ -75,6 +92,14 @@ def _irradiance(points, normals, led, out):  # type: ignore[no-untyped-def]
     for i in range(len(points)):
         p, n = points[i], normals[i]
         out[i] = led[12] * per_lumen(p[0], p[1], p[2], n[0], n[1], n[2], led, shares, work)
+
+
+@numba.njit(cache=True, nogil=True)
+def _irradiance_of_each(p, n, leds, out):  # type: ignore[no-untyped-def]
+    shares = np.empty(4)
+    work = np.empty((2, 8, 3))
+    for i in range(len(leds)):
+        out[i] = leds[i, 12] * per_lumen(p[0], p[1], p[2], n[0], n[1], n[2], leds[i], shares, work)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -294,7 +294,7 @@ def write_plan(plan_path: Path, out: Path, exposure: FixedExposure | BracketExpo
         with out.open("x", encoding="utf-8") as file:
             yaml.dump(document, file)
     except FileExistsError as error:
-        raise InputError(f"{out}: stands here already; choose another name") from error
+        raise InputError(f"{out}: exists already; choose another name") from error
 
 
 def _rounded(exposure_us: float, *, up: bool) -> int:

@@ -1,1 +1,1 @@
-"""Drivers of real devices. They know `coupole.devices`, `coupole.errors`, `coupole.geometry`, nothing more."""
+"""Drivers of real devices. They import only `coupole.devices`, `.errors`, `.geometry` and `.kinematics`."""

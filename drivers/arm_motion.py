@@ -1,4 +1,4 @@
-"""What the drivers of arms have in common: which targets they refuse, how an arm comes to rest, when it was heard.
+"""What the arm drivers share: checks of targets, stopping times and angles, waiting, age of the last message.
 
 Angles are degrees of the arm's six axes; speeds, accelerations and jerks are of the same axes.
 """
@@ -19,19 +19,19 @@ _LIMIT_TOLERANCE_DEG = 1e-9
 
 
 def refused(expected: str, happened: str) -> DeviceRefused:
-    """The error of a motion that is not begun, or not waited for."""
+    """The error of a motion that is refused, or of a wait for it."""
     return DeviceRefused("robot", expected=expected, happened=happened, remedy="Ask for another pose")
 
 
 def overtaken() -> DeviceRefused:
-    """The error of a wait for a motion that another command put an end to."""
-    return refused("the arm to go on to its target", "another command ended the motion")
+    """The error of a wait for a motion that another command has ended."""
+    return refused("the arm to continue to its target", "another command ended the motion")
 
 
 def checked_target(
     joints_deg: ArrayLike, limits_deg: Sequence[tuple[float, float]]
 ) -> tuple[float, float, float, float, float, float]:
-    """Six finite angles within lowest and highest of each axis; raises DeviceRefused, which names the axes."""
+    """Six finite angles within the limits of each axis; raises DeviceRefused, which names the axes."""
     target = np.asarray(joints_deg, dtype=np.float64)
     if target.shape != (6,) or not np.all(np.isfinite(target)):
         raise refused("six finite joint angles in degrees", f"got {joints_deg!r}")
@@ -54,11 +54,11 @@ def longest_stop_s(velocity_deg_s: Sequence[float], acceleration_deg_s2: float, 
 def farthest_stop_deg(
     velocity_deg_s: Sequence[float], acceleration_deg_s2: float, jerk_deg_s3: float, delay_s: float
 ) -> NDArray[np.float64]:
-    """Farthest that each axis [6] turns after a stop: its highest speed times the time that it may still last.
+    """Largest angle that each axis [6] can turn after a stop command: highest speed times braking time.
 
-    Coming to rest from speed v takes v/a + a/j, at half the speed on average; an axis that still speeds up needs
-    a/j before that. All axes share the time of the one that takes longest. To this comes `delay_s`, from the
-    call until the arm obeys.
+    To brake from speed v takes v/a + a/j, at half the speed on average; an axis that is still accelerating needs
+    a/j before that. All axes take the time of the slowest one. `delay_s`, from the call until the arm begins to
+    brake, is added.
     """
     speeds_deg_s = np.asarray(velocity_deg_s, dtype=np.float64)
     rise_s = acceleration_deg_s2 / jerk_deg_s3
@@ -78,9 +78,10 @@ def wait_for(
     describe: Callable[[State], str],
     remedy: str,
 ) -> None:
-    """Read and `check` the arm's state, with a `pause` between, until it is `done`; lets pass what these raise.
+    """Read the arm's state until it is `done`, with a `pause` between reads; `check` is applied to every state.
 
-    Raises DeviceTimeout at the deadline, with the last state as `describe` puts it.
+    Errors of `read` and `check` are raised unchanged. Raises DeviceTimeout at the deadline, with the last state
+    in the words of `describe`.
     """
     while True:
         state = read()
@@ -99,7 +100,7 @@ def wait_for(
 
 
 class News:
-    """When the controller was last heard of: silence does not make it later."""
+    """Rig time of the controller's latest message; it stays as it is while no message comes."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -107,7 +108,7 @@ class News:
         self._since_ns = 0
 
     def since_ns(self, count: int) -> int:
-        """Rig time at which this many messages of the controller were first seen to have come."""
+        """Rig time at which the message count was first seen to be `count`."""
         if count != self._count:
             self._count, self._since_ns = count, self._clock.now_ns()
         return self._since_ns

@@ -1,4 +1,4 @@
-"""A lock that serves threads in the order in which they asked."""
+"""A lock that is granted to threads in the order in which they request it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from types import TracebackType
 
 
 class FairLock:
-    """A thread that waits goes before the thread that held the lock last and wants it again.
+    """A waiting thread gets the lock before the thread that has just released it can take it again.
 
-    With a plain lock a thread that polls a device without a pause could shut the others out. Not re-entrant.
+    With a plain lock, a thread that polls a device without pause could starve the others. Not re-entrant.
     """
 
     def __init__(self) -> None:

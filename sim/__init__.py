@@ -1,1 +1,1 @@
-"""The other end of the wire: stand-ins for box, robot and camera, in one simulated world."""
+"""Stand-ins for LED box, robot and camera at the other end of their wires, in one simulated world."""

@@ -1,7 +1,7 @@
-"""Page-aligned memory for the frames of cameras whose library hands images out one by one.
+"""Page-aligned memory for the frames of cameras whose library delivers images one by one.
 
-A slot is free until it is taken for a frame, and again when that frame is released. Frames of an acquisition that
-is over may be released late: that does no harm to the slots of the next one.
+A slot is free until it is taken for a frame, and again when that frame is released. A frame of an earlier
+acquisition may be released late without effect on the slots of the present one.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 
 class FramePool:
-    """`slots` pieces of memory of `slot_bytes` each. May be used from several threads."""
+    """`slots` pieces of memory of `slot_bytes` each. Thread-safe."""
 
     def __init__(self, slots: int, slot_bytes: int) -> None:
         self.slots, self.slot_bytes = slots, slot_bytes
         self._pitch = -(-slot_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
-        # Populated: a burst's first frames must not wait for pages.
+        # Populated, so that a burst's first frames do not wait for page faults.
         flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | mmap.MAP_POPULATE
         self._memory = np.frombuffer(mmap.mmap(-1, slots * self._pitch, flags), np.uint8)
         self._acquisition = 0
@@ -27,13 +27,13 @@ class FramePool:
         self._freed = threading.Condition()
 
     def begin(self) -> None:
-        """A new acquisition begins: all slots are free, whoever still looks at one."""
+        """Begin a new acquisition: all slots become free, also those not yet released."""
         with self._freed:
             self._acquisition += 1
             self._free = list(range(self.slots))
 
     def take(self, timeout_s: float) -> Slot | None:
-        """A free slot, or None if none was given back in time."""
+        """A free slot, or None if none was released in time."""
         with self._freed:
             if not self._freed.wait_for(lambda: self._free, timeout_s):
                 return None
@@ -42,7 +42,7 @@ class FramePool:
             return Slot(self, index, self._acquisition, self._memory[start : start + self.slot_bytes])
 
     def give_back(self, index: int, acquisition: int) -> None:
-        """What `Slot.release` calls."""
+        """Called by `Slot.release`."""
         with self._freed:
             if acquisition == self._acquisition and index not in self._free:
                 self._free.append(index)
@@ -50,13 +50,13 @@ class FramePool:
 
 
 class Slot:
-    """One piece of the pool, taken."""
+    """A slot of the pool that is in use."""
 
     def __init__(self, pool: FramePool, index: int, acquisition: int, memory: NDArray[np.uint8]) -> None:
         self._pool, self._index, self._acquisition = pool, index, acquisition
         self.memory = memory
-        """[slot_bytes], begins on a page."""
+        """[slot_bytes], page-aligned."""
 
     def release(self) -> None:
-        """Give it back; a second time does nothing."""
+        """Return it to the pool; a second call does nothing."""
         self._pool.give_back(self._index, self._acquisition)

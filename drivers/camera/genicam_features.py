@@ -1,4 +1,4 @@
-"""What the drivers of GenICam cameras ask of a camera's features, by whichever library they reach them."""
+"""Access to a camera's GenICam features, as the shared functions of the GenICam drivers need it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Protocol
 from drivers.camera.genicam_settings import Value
 
 _READBACK_TOLERANCE = 0.01
-"""Cameras round: an exposure to their line time, a gain to their converter's steps."""
+"""Relative. Cameras round values: an exposure to the line time, a gain to the converter's steps."""
 
 
 class Features(Protocol):
-    """Of an opened camera, by name; see the drivers' own for what they raise."""
+    """Features of an open camera, by name; each driver's own class documents its errors."""
 
     def has(self, name: str) -> bool: ...
 
@@ -31,7 +31,7 @@ class Features(Protocol):
 
 
 def alike(held: Value, wanted: Value) -> bool:
-    """True if a feature that was set holds what was wanted, numbers rounded as cameras do."""
+    """True if `held`, read back, is the value that was set, within the rounding of cameras."""
     if isinstance(held, float) and not isinstance(wanted, str):
         return math.isclose(held, wanted, rel_tol=_READBACK_TOLERANCE, abs_tol=1e-9)
     return held == wanted

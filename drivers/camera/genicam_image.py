@@ -1,6 +1,6 @@
-"""What a GenICam camera's features say of its images, and how they are set.
+"""Image format of a GenICam camera: sets and reads it through features.
 
-For all drivers that reach such features, by whichever library.
+Used by all GenICam drivers, whatever their library.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from drivers.camera.pixel_formats import FORMATS, PixelFormat, pixels_in_a_group
 
 
 def set_image(features: Features, settings: GenICamSettings) -> None:
-    """What the rig sets before all else: its features in their order, the region, the pixels' format."""
+    """Set the rig's features in their order, then the region and the pixel format."""
     features.write_all(settings.features)
     if settings.region is not None:
         _set_region(features, settings.region)
@@ -23,7 +23,7 @@ def set_image(features: Features, settings: GenICamSettings) -> None:
 
 
 def _set_region(features: Features, region: Region) -> None:
-    """Offsets go to zero first: they bound the size, and the size bounds them."""
+    """Offsets are set to zero first, because offset and size limit each other."""
     for name, value in (
         ("OffsetX", 0),
         ("OffsetY", 0),
@@ -37,7 +37,7 @@ def _set_region(features: Features, region: Region) -> None:
 
 
 def pixel_format(features: Features, device: str) -> PixelFormat:
-    """The format that the camera sends now. Raises DeviceRefused for one that the driver does not know."""
+    """The camera's present pixel format. Raises DeviceRefused for one that the driver does not support."""
     name = str(features.read("PixelFormat"))
     if name not in FORMATS:
         raise DeviceRefused(
@@ -50,7 +50,7 @@ def pixel_format(features: Features, device: str) -> PixelFormat:
 
 
 def frame_format(features: Features, device: str, black_dn: int | None) -> FrameFormat:
-    """Of the camera's frames; `black_dn` None stands for what `BlackLevel` holds. Raises DeviceRefused."""
+    """Format of the camera's frames; with `black_dn` None, black is `BlackLevel`. Raises DeviceRefused."""
     sent = pixel_format(features, device)
     width_px, height_px = int(features.number("Width")), int(features.number("Height"))
     if width_px * height_px % pixels_in_a_group(sent):
@@ -67,7 +67,7 @@ def frame_format(features: Features, device: str, black_dn: int | None) -> Frame
 
 
 def readout_us(features: Features, device: str, given_us: int | None) -> int:
-    """Least time between two frames, us: as given, as the camera says, or by its greatest frame rate."""
+    """Least time between two frames, us: `given_us`, else the camera's readout time or highest frame rate."""
     if given_us is not None:
         return given_us
     if features.has("SensorReadoutTime"):

@@ -1,4 +1,4 @@
-"""What a rig says of a GenICam camera, whichever library reaches it."""
+"""Settings that all GenICam drivers share."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Protocol
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, StrictStr
 
 Value = StrictBool | StrictInt | StrictFloat | StrictStr
-"""What a feature holds; an enumeration's is the name of its entry."""
+"""Value of a feature; of an enumeration, the name of its entry."""
 
 
 class Region(BaseModel):
@@ -22,7 +22,7 @@ class Region(BaseModel):
 
 
 class Counter(BaseModel):
-    """A counter of the camera: features to set first (selectors), and the one that holds the count."""
+    """A counter of the camera: features to set first (selectors), and the feature that holds the count."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -31,7 +31,7 @@ class Counter(BaseModel):
 
 
 class GenICamSettings(Protocol):
-    """Of a driver's own settings, what `genicam_image` and `genicam_trigger` use; they explain each."""
+    """Settings used by `genicam_image` and `genicam_trigger`; each driver's own class documents them."""
 
     @property
     def region(self) -> Region | None: ...

@@ -1,4 +1,4 @@
-"""How a GenICam camera is told its exposure and what triggers it, and how it is asked what it counted."""
+"""Sets exposure and trigger of a GenICam camera, and reads its counters and frame id range."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from drivers.camera.genicam_features import Features
 from drivers.camera.genicam_settings import Counter, GenICamSettings
 
 _LAST_WIDE_ID = 2**62
-"""Stands for the end of 64-bit ids, which is never reached."""
+"""End of 64-bit ids, which is never reached."""
 
 
 def set_exposure(features: Features, settings: GenICamSettings, exposure: Exposure) -> None:
-    """Each frame starts at an edge of the box, or at a software trigger; nothing is left to the camera."""
+    """Each frame starts at an edge of the box or at a software trigger; automatic exposure and gain are off."""
     for name, entry in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("TriggerSelector", "FrameStart")):
         if features.has(name):
             features.write(name, entry)
@@ -26,8 +26,8 @@ def set_exposure(features: Features, settings: GenICamSettings, exposure: Exposu
 
 
 def frame_id_range(features: Features, *, gige: bool) -> tuple[int, int]:
-    """First and last frame id of the transport: 16 bits on GigE Vision, unless the camera says that it uses the
-    extended ids of version 2; else 64."""
+    """First and last frame id of the transport: 16 bits on GigE Vision, unless the camera reports the extended ids
+    of version 2; else 64."""
     if not gige:
         return (0, _LAST_WIDE_ID)
     extended = "GevGVSPExtendedIDMode"
@@ -36,7 +36,7 @@ def frame_id_range(features: Features, *, gige: bool) -> tuple[int, int]:
 
 
 def counts(features: Features, settings: GenICamSettings) -> tuple[int, int]:
-    """Exposures and edges that came too early, by the camera's own counters; -1 where it has none."""
+    """Numbers of exposures and of edges that came too early, from the camera's counters; -1 without counter."""
     return (_count(features, settings.exposed_counter), _count(features, settings.over_trigger_counter))
 
 
@@ -48,5 +48,5 @@ def _count(features: Features, counter: Counter | None) -> int:
 
 
 def since(count: int, before: int) -> int:
-    """What a counter of 32 bits has counted since it stood at `before`; -1 where there is none."""
+    """Increase of a 32-bit counter since it was `before`; -1 without counter."""
     return count if count < 0 else (count - before) % 2**32

@@ -1,4 +1,4 @@
-"""The error of a camera whose methods are called in an order that its contract does not allow."""
+"""The error for methods of a camera called in an order that its contract does not allow."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from coupole.errors import DeviceRefused
 
 
 def misused(device: str, expected: str, happened: str) -> DeviceRefused:
-    """To be raised; `device` is the camera's name in the rig."""
+    """The error to raise; `device` is the camera's name in the rig."""
     return DeviceRefused(
         device,
         expected=expected,

@@ -1,7 +1,7 @@
-"""Pixel formats of GenICam cameras (PFNC), and how packed pixels become 16-bit numbers.
+"""Pixel formats of GenICam cameras (PFNC), and the unpacking of packed pixels to 16-bit numbers.
 
-Formats of 10 to 16 bits in two bytes are used as they come. Those of one byte, and the packed ones, are
-widened into 16-bit frames of their own.
+Formats of 10 to 16 bits in two bytes are used as received. Those of one byte, and packed ones, are widened to
+16-bit frames.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ Packing = Literal["two bytes", "one byte", "10p", "12p", "10Packed", "12Packed"]
 
 @dataclass(frozen=True)
 class PixelFormat:
-    """One format that the driver understands."""
+    """One supported format."""
 
     name: str
     code: int
-    """PFNC's number; bits 16 to 23 are the bits that a pixel takes on the wire."""
+    """PFNC value; bits 16 to 23 are the bits per pixel on the wire."""
     bit_depth: int
     bayer_pattern: str
-    """As `coupole.devices.FrameFormat` has it."""
+    """As in `coupole.devices.FrameFormat`."""
     packing: Packing
 
     @property
@@ -33,7 +33,7 @@ class PixelFormat:
         return self.code >> 16 & 0xFF
 
     def wire_bytes(self, pixels: int) -> int:
-        """Bytes that an image of so many pixels takes on the wire, without padding."""
+        """Bytes of an image of `pixels` pixels on the wire, without padding."""
         return -(-pixels * self.wire_bits // 8)
 
 
@@ -44,7 +44,7 @@ _CODES = {
     ("BayerGB", "GBRG"): (0x0108000A, 0x0110000E, 0x01100012, 0, 0x01100030, 0x54, 0x55, 0x28, 0x2C),
     ("BayerBG", "BGGR"): (0x0108000B, 0x0110000F, 0x01100013, 0, 0x01100031, 0x52, 0x53, 0x29, 0x2D),
 }
-"""PFNC values by family: 8, 10, 12, 14, 16, 10p, 12p, 10Packed, 12Packed; the last four without their size."""
+"""PFNC values by family: 8, 10, 12, 14, 16, 10p, 12p, 10Packed, 12Packed; the last four without bits 16 to 31."""
 _COLUMNS: tuple[tuple[str, int, int, Packing], ...] = (
     ("8", 8, 0, "one byte"),
     ("10", 10, 0, "two bytes"),
@@ -67,7 +67,7 @@ FORMATS = {
 
 @numba.njit(cache=True, nogil=True)
 def _widen_12p(out, data):  # type: ignore[no-untyped-def]
-    """Three bytes, two pixels: a stream of bits, the least first."""
+    """Two pixels in three bytes: a bit stream, least significant bit first."""
     for pair in range(len(out) // 2):
         first, middle, last = data[3 * pair], data[3 * pair + 1], data[3 * pair + 2]
         out[2 * pair] = np.uint16(first) | np.uint16(middle & 15) << np.uint16(8)
@@ -76,7 +76,7 @@ def _widen_12p(out, data):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _widen_12_packed(out, data):  # type: ignore[no-untyped-def]
-    """Three bytes, two pixels: the outer bytes hold the upper eight bits, the middle one the lower four."""
+    """Two pixels in three bytes: the outer bytes hold the upper eight bits, the middle one the lower four."""
     for pair in range(len(out) // 2):
         first, middle, last = data[3 * pair], data[3 * pair + 1], data[3 * pair + 2]
         out[2 * pair] = np.uint16(first) << np.uint16(4) | np.uint16(middle & 15)
@@ -85,7 +85,7 @@ def _widen_12_packed(out, data):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _widen_10p(out, data):  # type: ignore[no-untyped-def]
-    """Five bytes, four pixels: a stream of bits, the least first."""
+    """Four pixels in five bytes: a bit stream, least significant bit first."""
     for quad in range(len(out) // 4):
         a, b, c = np.uint16(data[5 * quad]), np.uint16(data[5 * quad + 1]), np.uint16(data[5 * quad + 2])
         d, e = np.uint16(data[5 * quad + 3]), np.uint16(data[5 * quad + 4])
@@ -97,7 +97,7 @@ def _widen_10p(out, data):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _widen_10_packed(out, data):  # type: ignore[no-untyped-def]
-    """Three bytes, two pixels: the middle byte holds the lower two bits, of the second pixel from bit 4 on."""
+    """Two pixels in three bytes: the middle byte holds the lower two bits, those of the second from bit 4 on."""
     for pair in range(len(out) // 2):
         first, middle, last = data[3 * pair], data[3 * pair + 1], data[3 * pair + 2]
         out[2 * pair] = np.uint16(first) << np.uint16(2) | np.uint16(middle & 3)
@@ -121,10 +121,10 @@ _GROUP = {"one byte": 1, "two bytes": 1, "10p": 4, "12p": 2, "10Packed": 2, "12P
 
 
 def pixels_in_a_group(pixel_format: PixelFormat) -> int:
-    """Pixels that share bytes; an image must hold a multiple of it."""
+    """Number of pixels that share bytes; the pixels of an image must be a multiple of it."""
     return _GROUP[pixel_format.packing]
 
 
 def widen(out: NDArray[np.uint16], data: NDArray[np.uint8], pixel_format: PixelFormat) -> None:
-    """Fill `out` [pixels] with the pixels that `data` [bytes] holds; not for formats of two bytes."""
+    """Fill `out` [pixels] with the pixels in `data` [bytes]; not for formats of two bytes."""
     _WIDEN[pixel_format.packing](out, data)

@@ -1,7 +1,7 @@
 """The LED control box, by SCPI over a serial line or USBTMC (docs/reference/ledbox-protocol.md).
 
-Every message ends in `SYSTem:ERRor?`, so no command goes unproven and each costs one round trip. The box's
-table banks are used in turn: while one runs, the next table is uploaded into the other.
+Every message ends in `SYSTem:ERRor?`, so every command is confirmed and costs one round trip. The box's two
+table banks are used alternately: while one runs, the next table is uploaded into the other.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from drivers.ledbox.usbtmc import UsbtmcLink
 from drivers.ledbox.wire import RECORD_BYTES, STEP_BYTES, pack, unpack_log
 
 _BLOCK_TIMEOUT_S = 2.2
-"""After this silence the box has forgotten a block that was cut off (its own limit is 2 s)."""
+"""After this silence the box has discarded an incomplete block (its own limit is 2 s)."""
 _POLL_S, _POLL_OVERHEAD_BYTES = 0.055, 130
-"""A poll's time on the line while a burst runs, and its bytes apart from records."""
+"""Duration of a poll during a burst, and its bytes on the line apart from records."""
 _MAX_RECORDS_PER_POLL = 512
 _UPLOAD_OVERHEAD_S, _BITS_PER_BYTE = 0.1, 10
 _SHORTEST_PERIOD_US = 100
 _FLASH_MARGIN_S = 5.0
-"""A light that lasts so much longer than was asked has not ended."""
+"""A flash that lasts this much longer than requested counts as not ended."""
 
 
 class Settings(BaseModel):
@@ -44,25 +44,25 @@ class Settings(BaseModel):
     `usbtmc:VID:PID[:SERIAL]`, VID and PID in hexadecimal."""
     baud: int = Field(default=115200, ge=1200)
     led_count: int = Field(default=1080, ge=1, le=65535)
-    """LEDs that the box must have."""
+    """Number of LEDs that the box must report."""
     watchdog_s: float = Field(default=2.0, ge=0, le=60)
-    """The box darkens itself when it hears nothing for so long; 0 for never."""
+    """The box switches all light off after this time without a command; 0: never."""
     edge_width_us: int = Field(default=50, ge=10, le=10_000)
     edge_polarity: Literal["normal", "inverted"] = "normal"
     wait_for_ready: bool = False
-    """Hold each step back until the camera's exposure-ready line is up; needs that cable."""
+    """Delay each step until the camera's exposure-ready line is high; needs that cable."""
     name: str = "led box"
 
     def upload_s(self, steps: int) -> float:
-        """Time to bring a table of so many steps into the box over a serial line."""
+        """Time to upload a table of `steps` steps over a serial line."""
         return STEP_BYTES * steps * _BITS_PER_BYTE / self.baud + _UPLOAD_OVERHEAD_S
 
 
 class LedBox:
     """The box: a `coupole.devices.TableLedBox`.
 
-    Opening it resets it. A latched fault of the box (watchdog, over-temperature) ends with opening it anew.
-    Each call may raise DeviceTimeout, DeviceLost, DeviceRefused (the box's error is quoted) or DeviceFault.
+    Opening resets it, which also clears a latched fault of the box (watchdog, over-temperature).
+    Each call may raise DeviceTimeout, DeviceLost, DeviceRefused (with the box's error) or DeviceFault.
     """
 
     runs_tables = True
@@ -87,10 +87,10 @@ class LedBox:
         return self._identity
 
     def self_test(self) -> Mapping[str, str]:
-        """State, hottest board and settings; raises DeviceFault in a latched fault."""
+        """State, hottest board and settings; raises DeviceFault if a fault is latched."""
         state, celsius, watchdog_s = self._scpi.ask("SEQ:STAT?;:MEAS:TEMP?;:SYST:WATC?", 3)
         if state == "FAULT":
-            self._raise_fault("the box says FAULT")
+            self._raise_fault("the box reports FAULT")
         return {
             "state": str(state),
             "LEDs": str(self.led_count),
@@ -108,10 +108,10 @@ class LedBox:
         self._upload(bank, payload)
 
     def start(self, table: NDArray[np.void]) -> None:
-        """Run a loaded table. A bank whose CRC-32 is not the table's is uploaded once more, then refused."""
+        """Run a loaded table. A bank with a wrong CRC-32 is uploaded once more; if still wrong, it is refused."""
         payload = self._payload(table)
         if payload not in self._banks:
-            self._refuse("a loaded table", "neither bank holds this one", "Call load() before.")
+            self._refuse("a loaded table", "neither bank holds this one", "Call load() first.")
         bank = self._banks.index(payload)
         if self._crc(bank) != zlib.crc32(payload):
             self._upload(bank, payload)
@@ -119,16 +119,16 @@ class LedBox:
                 self._banks[bank] = None
                 self._refuse(
                     f"CRC-32 {wanted} in bank {bank}",
-                    f"it is {found} though uploaded twice",
-                    "Check the cable for disturbance.",
+                    f"it is {found} after two uploads",
+                    "Check the cable for interference.",
                 )
         self._scpi.ask("INIT", 0)
         self._running_bank, self._next_record = bank, 0
         self._started = table.copy()
 
     def poll_log(self) -> NDArray[np.void]:
-        """New records, STEP_RECORD_DTYPE [k]: of every step that had finished when the last round trip of this
-        call began (at 115200 baud one of 60 ms keeps up with 100 steps a second)."""
+        """New records, STEP_RECORD_DTYPE [k]: all steps that had finished when the last round trip of this call
+        began. At 115200 baud one round trip takes 60 ms, which keeps up with 100 steps per second."""
         more, records = self._poll()
         parts = [records]
         while more:
@@ -145,7 +145,7 @@ class LedBox:
         return int(self._scpi.number(count))
 
     def flash(self, led: int, on_us: int) -> None:
-        """A table of one step without edge, which the box times by itself: it runs as long as the LED is lit."""
+        """Run a table of one step without edge: the box times the flash, and runs as long as the LED is lit."""
         step = Step(led, on_us, 0, max(on_us, _SHORTEST_PERIOD_US), sends_edge=False)
         table = np.array([astuple(step)], STEP_DTYPE)
         self.load(table)
@@ -155,7 +155,7 @@ class LedBox:
         return self.running()
 
     def end_flash(self) -> StepRecord:
-        """Wait until the box says that the step is over, and read its record."""
+        """Wait until the box reports that the step has ended, and read its record."""
         on_s = float(self._started["on_us"].sum()) * 1e-6
         deadline = Deadline(self._clock, on_s + _FLASH_MARGIN_S)
         while self.running():
@@ -163,7 +163,7 @@ class LedBox:
                 raise DeviceTimeout(
                     self._settings.name,
                     expected=f"a light of {on_s:.3f} s to end within {deadline.seconds:.1f} s",
-                    happened="the box says that it is running still",
+                    happened="the box still reports that it is running",
                     remedy="Check the box, then resume the run.",
                 )
             self._clock.sleep(on_s / 10)
@@ -173,8 +173,8 @@ class LedBox:
         return StepRecord(*records[0].tolist())
 
     def lights_off(self) -> None:
-        """Abort, and see the box confirm it; raises only after a second try, which a box that was waiting for
-        the rest of a cut-off upload understands. Takes some 5 s at most."""
+        """Abort, and wait for the confirmation. Raises only if a second try fails too: by then a box that waited
+        for the rest of an incomplete upload has discarded it. Takes about 5 s at most."""
         self._running_bank = None
         try:
             self._abort()
@@ -190,13 +190,13 @@ class LedBox:
         return self._scpi.number(celsius)
 
     def close(self) -> None:
-        """Lights off if the box still listens; never raises for a link that is dead."""
+        """Lights off if the box still answers; never raises for a lost link."""
         with contextlib.suppress(DeviceError):
             self.lights_off()
         self._scpi.close()
 
     def _abort(self) -> None:
-        with contextlib.suppress(DeviceFault, DeviceRefused):  # older errors in the queue: ABORt was obeyed
+        with contextlib.suppress(DeviceFault, DeviceRefused):  # older errors in the queue: ABORt was executed
             self._scpi.ask("ABOR", 0)
 
     # Opening.
@@ -212,7 +212,7 @@ class LedBox:
             raise no_port(settings.name, settings.port, error) from error
 
     def _greet(self) -> Identity:
-        """Bring both ends into step, whatever a former program left on the line, and ask who is there."""
+        """Clear what an earlier program left in box and line, and read the box's identity."""
         try:
             self._scpi.ask("*CLS", 0)
         except DeviceTimeout:
@@ -252,7 +252,7 @@ class LedBox:
         self._banks[bank], self._last_loaded = payload, bank
 
     def _payload(self, table: NDArray[np.void]) -> bytes:
-        """The bytes that travel."""
+        """The bytes to upload."""
         try:
             return pack(table)
         except ValueError as error:

@@ -1,6 +1,6 @@
-"""SCPI, the host's side: a message out, its response in, and the device's error queue asked for every time.
+"""SCPI, host side: each message is followed by a query of the device's error queue, in the same line.
 
-Responses follow IEEE 488.2, chapter 8: units between `;`, ended by LF; a unit is text or a block.
+Responses follow IEEE 488.2, chapter 8: units separated by `;`, ended by LF; a unit is text or a block.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from coupole.devices import Clock, Deadline
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 
 REPLY_MARGIN_S = 2.0
-"""What a device may take to answer, the bytes' own time apart."""
+"""Time that a device may take to answer, without the transmission of the bytes."""
 _SHORT_REPLY_BYTES = 200
 _ERROR = re.compile(r'([+-]?[0-9]+),"(.*)"')
 _MAX_TEXT_BYTES = 4096
 
 Unit = str | bytes
-"""Text as it came, or the content of a definite-length block."""
+"""Text as received, or the content of a definite-length block."""
 
 
 class Link(Protocol):
-    """What carries bytes. Raises TimeoutError when a deadline passes, ConnectionError when it is gone."""
+    """Transports bytes. Raises TimeoutError when a deadline passes, ConnectionError when the link is lost."""
 
     bytes_per_s: float
 
@@ -34,7 +34,7 @@ class Link(Protocol):
 
 
 class ScpiSession:
-    """Asks `name`, the device at `port`. What is on the line from a former session is thrown away first.
+    """Messages to `name`, the device at `port`. Input left on the line by an earlier session is discarded first.
 
     Positive error numbers are latched faults of the device: they raise DeviceFault.
     """
@@ -45,9 +45,9 @@ class ScpiSession:
         self._out_of_step = True
 
     def ask(self, command: str | bytes, replies: int, reply_bytes: int = 0) -> tuple[Unit, ...]:
-        """Send a message and return its `replies` response units, `reply_bytes` of blocks among them.
+        """Send a message and return its `replies` response units, which may contain `reply_bytes` of blocks.
 
-        Raises DeviceRefused or DeviceFault quoting the device, DeviceTimeout, DeviceLost.
+        Raises DeviceRefused or DeviceFault with the device's error, DeviceTimeout, DeviceLost.
         """
         message = (command if isinstance(command, bytes) else command.encode("ascii")) + b";:SYST:ERR?\n"
         shown = (command if isinstance(command, str) else command[:40].split(b"#")[0].decode("ascii")).strip()
@@ -66,13 +66,13 @@ class ScpiSession:
             self.unexpected("a number", f"{unit!r} came")
 
     def unexpected(self, expected: str, happened: str) -> NoReturn:
-        """Raise DeviceError for a reply that makes no sense; the next message starts on a cleared line."""
+        """Raise DeviceError for an invalid reply; before the next message the line is cleared."""
         self._out_of_step = True
         raise DeviceError(
             self._name,
             expected=expected,
             happened=happened,
-            remedy="Check the line for disturbance, and the firmware against the protocol's reference.",
+            remedy="Check the line for interference, and the firmware against the protocol's reference.",
         )
 
     def close(self) -> None:
@@ -93,7 +93,7 @@ class ScpiSession:
                 self._name,
                 expected=f"an answer to {shown} within {seconds:.2f} s",
                 happened=str(error),
-                remedy=f"See that the device at {self._port} has power and the rig's baud rate, then resume.",
+                remedy=f"Check that the device at {self._port} has power and the rig's baud rate, then resume.",
             ) from error
         except ConnectionError as error:
             raise DeviceLost(
@@ -107,7 +107,7 @@ class ScpiSession:
         return units
 
     def _raise_errors(self, unit: Unit, shown: str) -> None:
-        """Empty the device's error queue, whose first entry is `unit`, and raise what it holds."""
+        """Empty the device's error queue, whose first entry is `unit`, and raise if it holds errors."""
         errors = [self._error(unit, shown)]
         while errors[-1][0]:
             units = self._exchange(b"SYST:ERR?\n", "SYST:ERR?", REPLY_MARGIN_S)
@@ -117,10 +117,10 @@ class ScpiSession:
         kind = DeviceFault if any(code > 0 for code, _ in errors) else DeviceRefused
         raise kind(
             self._name,
-            expected=f"{shown} to be obeyed",
+            expected=f"{shown} to be executed",
             happened="; ".join(f"{code} {text}" for code, text in errors[:-1]),
             remedy="Find and correct what the device names"
-            + ("; opening it anew resets the fault." if kind is DeviceFault else "."),
+            + ("; reopening it resets the fault." if kind is DeviceFault else "."),
         )
 
     def _error(self, unit: Unit, shown: str) -> tuple[int, str]:
@@ -131,9 +131,9 @@ class ScpiSession:
 
 
 def _read_response(read: Callable[[], bytes]) -> list[Unit]:
-    """The units of one response line, from `read`, which gives the next bytes each time.
+    """The units of one response line; `read` returns the next bytes at each call.
 
-    Raises ValueError for what is no response; lets pass what `read` raises.
+    Raises ValueError for an invalid response; errors of `read` are raised unchanged.
     """
     data = bytearray()
 
@@ -167,19 +167,19 @@ def _read_response(read: Callable[[], bytes]) -> list[Unit]:
                 raise ValueError(f"bytes came after the response's end: {bytes(data[:40])!r}")
             return units
         if separator != ord(";"):
-            raise ValueError(f"byte {separator:#04x} stands after a response unit")
+            raise ValueError(f"byte {separator:#04x} follows a response unit")
 
 
 def _error_of(unit: Unit) -> tuple[int, str]:
-    """Number and text of an answer to `SYSTem:ERRor?`; raises ValueError if it is none."""
+    """Number and text of an answer to `SYSTem:ERRor?`; raises ValueError if it is not one."""
     match = _ERROR.fullmatch(unit) if isinstance(unit, str) else None
     if match is None:
-        raise ValueError(f'{unit!r} is no <number>,"<text>"')
+        raise ValueError(f'{unit!r} is not <number>,"<text>"')
     return int(match[1]), match[2]
 
 
 def _text_end(data: bytearray) -> int | None:
-    """Where the text unit at the start of `data` ends: at `;` or LF outside of quotes."""
+    """Index of the end of the text unit at the start of `data`: `;` or LF outside quotes; None if not there."""
     quoted = False
     for index, byte in enumerate(data):
         if byte == ord('"'):

@@ -1,7 +1,7 @@
-"""Bytes to and from a device on a serial line, by any URL that pyserial knows.
+"""Bytes to and from a device on a serial line, by any URL that pyserial accepts.
 
-Time-outs are counted on the rig's clock, so that they hold in a world that runs faster or slower; pyserial's
-own, which are of the machine's clock, only set how often that clock is looked at.
+Time-outs are counted on the rig's clock, so that they hold in a simulated world that runs faster or slower.
+pyserial's own time-outs, in machine time, only set how often the rig's clock is read.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from coupole.devices import Clock, Deadline
 from coupole.errors import DeviceLost
 
 _LOOK_S = 0.02
-"""Machine time between two looks at the rig's clock."""
+"""Machine time between two readings of the rig's clock."""
 _BITS_PER_BYTE = 10
 _QUIET_S, _DRAIN_S = 0.05, 2.0
 
@@ -27,10 +27,10 @@ class SerialLink:
         import serial
 
         self._lost: tuple[type[Exception], ...] = (serial.SerialException, OSError)
-        with contextlib.suppress(ImportError):  # not on Windows
+        with contextlib.suppress(ImportError):  # termios does not exist on Windows
             import termios
 
-            self._lost += (termios.error,)  # pyserial lets it pass when it flushes a hung-up terminal
+            self._lost += (termios.error,)  # pyserial does not convert it when it flushes a hung-up terminal
         self._clock = clock
         self.bytes_per_s = baud / _BITS_PER_BYTE
         own_port = {} if "://" in url else {"exclusive": True}
@@ -42,7 +42,7 @@ class SerialLink:
             self._fileno: int | None = self._port.fileno()
             self._port.write_timeout = 0
         except (AttributeError, io.UnsupportedOperation):
-            self._fileno = None  # rfc2217: its writes go to a socket, whole
+            self._fileno = None  # rfc2217: writes go to a socket, all at once
 
     def write(self, data: bytes, deadline: Deadline) -> None:
         """Send all of `data`."""
@@ -50,7 +50,7 @@ class SerialLink:
         rest = memoryview(data)
         while rest:
             try:
-                # pyserial 3.5 spins for ever in a non-blocking write to a full port: wait for room first
+                # A non-blocking write of pyserial 3.5 to a full port loops for ever: wait for room first
                 if self._fileno is None or select.select([], [self._fileno], [], _LOOK_S)[1]:
                     rest = rest[self._port.write(rest) :]
                     continue
@@ -60,10 +60,10 @@ class SerialLink:
                 raise TimeoutError(f"{len(rest)} of {len(data)} bytes could not be sent")
 
     def read(self, deadline: Deadline) -> bytes:
-        """At least one byte, and what else has come."""
+        """At least one byte, and all others that have arrived."""
         self._refuse_closed()
         while True:
-            late = deadline.expired  # looked at before reading: what has come in time is taken however late
+            late = deadline.expired  # read first: bytes that arrived in time are accepted even if read late
             try:
                 data: bytes = self._port.read(max(1, self._port.in_waiting))
             except self._lost as error:
@@ -74,7 +74,7 @@ class SerialLink:
                 raise TimeoutError("nothing came")
 
     def waiting(self) -> bytes:
-        """What has come already, without waiting; maybe nothing."""
+        """Bytes that have already arrived, possibly none; does not wait."""
         self._refuse_closed()
         try:
             data: bytes = self._port.read(count) if (count := self._port.in_waiting) else b""
@@ -83,14 +83,14 @@ class SerialLink:
         return data
 
     def clear(self) -> None:
-        """Forget what is on its way from the device: read until the line is quiet."""
+        """Discard input until the line is quiet."""
         deadline = Deadline(self._clock, _DRAIN_S)
         with contextlib.suppress(TimeoutError):
             while not deadline.expired:
                 self.read(Deadline(self._clock, _QUIET_S))
 
     def close(self) -> None:
-        """Give the port back; a second call does nothing."""
+        """Release the port; a second call does nothing."""
         if not self._port.is_open:
             return
         with contextlib.suppress(*self._lost):
@@ -99,7 +99,7 @@ class SerialLink:
         with contextlib.suppress(*self._lost):
             self._port.close()
         if socket is not None:
-            socket.close()  # pyserial 3.5 forgets to, where the other side of a socket:// hung up
+            socket.close()  # pyserial 3.5 does not, if the other side of a socket:// has hung up
 
     def _refuse_closed(self) -> None:
         if not self._port.is_open:
@@ -115,7 +115,7 @@ def open_serial(name: str, url: str, baud: int, clock: Clock) -> SerialLink:
 
 
 def no_port(name: str, url: str, error: Exception) -> DeviceLost:
-    """The error to raise where the device `name` cannot be opened."""
+    """The error to raise if the device `name` cannot be opened."""
     return DeviceLost(
         name,
         expected=f"a port {url}",

@@ -1,8 +1,8 @@
-"""An LED box that knows nothing but lines of text: a dome that somebody built round a microcontroller.
+"""An LED box controlled by lines of text only, such as a dome built with a microcontroller.
 
-Each command is a line made from a template of the rig, and the box answers each with one line, or with none. Such
-a box has no table, no log, no clock and no watchdog. So light is bounded here: a thread of the driver ends each
-flash in time, whatever its caller does, and everything is switched off at opening, at closing, after any failure.
+Each command is a line made from a template in the rig; the box answers each with one line, or never answers. Such
+a box has no table, log, clock or watchdog. Therefore this driver limits the light: a thread ends each flash in
+time, whatever the caller does, and all LEDs are switched off at opening, at closing and after any failure.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from coupole.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.ledbox.serial_link import SerialLink, open_serial
 
 _REPLY_MARGIN_S = 2.0
-"""What a box may take to answer, the bytes' own time apart."""
+"""Time that a box may take to answer, without the transmission of the bytes."""
 _SHORT_REPLY_BYTES, _LONGEST_REPLY_BYTES = 100, 1000
 _CONFIRMS_S = 0.5
 """A box that takes longer to confirm a light gets less of it: its own bound must not come before ours."""
 _BOX_PATIENCE = 1.5
 """The box's own bound on a light over the driver's, its clock being a cheap one."""
 _LOOK_S = 0.001
-"""Machine time between two looks at the rig's clock while a light shines."""
+"""Machine time between two readings of the rig's clock during a flash."""
 _ENDINGS = {"lf": "\n", "crlf": "\r\n", "cr": "\r"}
 _FIELDS: dict[str, tuple[frozenset[str], frozenset[str]]] = {
     "on": (frozenset({"led"}), frozenset({"led", "on_ms"})),
@@ -37,7 +37,7 @@ _FIELDS: dict[str, tuple[frozenset[str], frozenset[str]]] = {
     "all_off": (frozenset(), frozenset()),
     "identify": (frozenset(), frozenset()),
 }
-"""Of each template the fields that it must have, and those that it may have."""
+"""For each template: the fields that it must have, and those that it may have."""
 
 
 class Settings(BaseModel):
@@ -49,24 +49,24 @@ class Settings(BaseModel):
     """A pyserial URL: `/dev/ttyACM0`, `COM3`, `socket://host:port`, `rfc2217://host:port`."""
     baud: int = Field(default=115200, ge=300)
     led_count: int = Field(ge=1, le=65535)
-    """LEDs that the box has; Coupole numbers them from 0."""
+    """Number of LEDs of the box; Coupole numbers them from 0."""
     first_led: int = Field(default=0, ge=0)
-    """The box's own number of LED 0: 1 for a box that counts from 1."""
+    """The box's number for LED 0: 1 for a box that counts from 1."""
     on: str = "LED {led} ON"
-    """Lights one LED. `{on_ms}` may stand in it for a time after which the box ends the light by itself."""
+    """Switches one LED on. It may contain `{on_ms}`: a time after which the box itself switches the LED off."""
     off: str | None = "LED {led} OFF"
-    """Ends one LED's light; none for a box that knows `all_off` alone."""
+    """Switches one LED off; null for a box that has `all_off` only."""
     all_off: str = "ALL OFF"
     identify: str | None = None
-    """Makes the box say who it is, in one line; none for a box that does not know."""
+    """Asks the box for its identity, answered in one line; null for a box without such a command."""
     expected_reply: str | None = "OK"
-    """The whole line with which the box confirms that it has obeyed; none for a box that says nothing."""
+    """The whole line by which the box confirms a command; null for a box that never answers."""
     line_ending: Literal["lf", "crlf", "cr"] = "lf"
-    """Of commands. A reply ends in LF, or in CR where commands do."""
+    """Ending of commands. A reply ends in LF, or in CR if commands do."""
     settle_ms: float = Field(default=2000, ge=0, le=60_000)
-    """From opening the port until the box listens: many microcontrollers start anew when it is opened."""
+    """From opening the port until the box accepts commands: many microcontrollers reset when it is opened."""
     obeys_ms: float = Field(default=50, ge=0, le=10_000)
-    """Time in which a box that says nothing has obeyed a command that reached it."""
+    """Time after which a box that never answers is taken to have executed a command."""
     name: str = "led box"
 
     @model_validator(mode="after")
@@ -79,7 +79,7 @@ class Settings(BaseModel):
 
 
 def _check_template(name: str, template: str) -> None:
-    """Raise ValueError for a template that does not make one line of ASCII of the fields that it may have."""
+    """Raise ValueError for a template that does not give one line of ASCII with the fields allowed for it."""
     must, may = _FIELDS[name]
     try:
         found = {
@@ -99,24 +99,24 @@ def _check_template(name: str, template: str) -> None:
 
 @dataclass
 class _Flash:
-    """A light that was asked for."""
+    """A flash that was requested."""
 
     led: int
     sent_ns: int
-    """When its command was sent, on the rig's clock: it cannot have shone earlier."""
+    """Rig time at which its command was sent: it cannot have begun earlier."""
     deadline: Deadline
     ended: threading.Event = field(default_factory=threading.Event)
     """Set before the command that ends the light is sent."""
     off_ns: int | None = None
-    """When the box confirmed that; None until then."""
+    """Rig time at which the box confirmed that command; None until then."""
     failure: DeviceError | None = None
-    """Why the driver's own thread could not end it."""
+    """Why the driver's thread could not end it."""
 
 
 class TextLineBox:
     """The box: a `coupole.devices.LedBox`.
 
-    Each call may raise DeviceTimeout, DeviceLost, or DeviceRefused, which quotes the box.
+    Each call may raise DeviceTimeout, DeviceLost, or DeviceRefused with the box's reply.
     """
 
     runs_tables = False
@@ -128,7 +128,7 @@ class TextLineBox:
         self._lock = threading.RLock()
         self._flash: _Flash | None = None
         self._in_step = False
-        """What comes next from the box is the answer to what is sent next."""
+        """True if the next line from the box is the answer to the next command."""
         self._link: SerialLink = open_serial(settings.name, settings.port, settings.baud, clock)
         try:
             clock.sleep(settings.settle_ms * 1e-3)
@@ -142,13 +142,13 @@ class TextLineBox:
         return self._identity
 
     def self_test(self) -> Mapping[str, str]:
-        """What is known of it; raises if it does not obey."""
+        """Number of LEDs and kind of confirmation; raises if the box does not execute a command."""
         self.lights_off()
         reply = self._settings.expected_reply
         return {"LEDs": str(self.led_count), "confirms": "nothing" if reply is None else f"with `{reply}`"}
 
     def flash(self, led: int, on_us: int) -> None:
-        """Light an LED. Where the box says nothing, it is taken to have obeyed after `obeys_ms`."""
+        """Switch one LED on. A box that never answers is taken to have done so after `obeys_ms`."""
         if led != NO_LED and not 0 <= led < self.led_count:
             self._refuse(
                 f"an LED from 0 to {self.led_count - 1}", f"{led} was asked for", "Correct the LED table."
@@ -170,13 +170,13 @@ class TextLineBox:
                 raise
 
     def lit(self) -> bool:
-        """Past its time a light is not believed, though the thread that is to end it may be late: the box may have
-        ended it by itself."""
+        """False once the flash's time is over, even if the thread that ends it is late: the box may have ended
+        it by itself."""
         flash = self._flash
         return flash is not None and not flash.ended.is_set() and not flash.deadline.expired
 
     def end_flash(self) -> StepRecord:
-        """End the light now, if its time has not ended it. `on_us` runs from the command to the box's word."""
+        """End the flash now, if its time has not ended it. `on_us`: from the command to the box's confirmation."""
         flash = self._flash
         if flash is None:
             self._refuse("a flash to end", "none was begun", "This is a fault of the program that drives the box.")
@@ -202,8 +202,8 @@ class TextLineBox:
         )
 
     def lights_off(self) -> None:
-        """All off, confirmed by the box; raises only after a second try, which a box understands that had half a
-        line from before on its hands."""
+        """All LEDs off, confirmed by the box. Raises only if a second try fails too: the first may have been
+        appended to an incomplete line that the box had received before."""
         with self._lock:
             if self._flash is not None:
                 self._flash.ended.set()
@@ -221,20 +221,20 @@ class TextLineBox:
         return None
 
     def close(self) -> None:
-        """Lights off if the box still listens; never raises for a link that is dead."""
+        """Lights off if the box still answers; never raises for a lost link."""
         self._darken_somehow()
         self._link.close()
 
     # How a light ends.
 
     def _watch(self, flash: _Flash) -> None:
-        """End a flash when its time is over. Runs on a thread of its own."""
+        """End a flash when its time is over. Runs in its own thread."""
         while not flash.deadline.expired:
             if flash.ended.wait(_LOOK_S):
                 return
         with self._lock:
             if not flash.ended.is_set():
-                with contextlib.suppress(DeviceError):  # in flash.failure, for the caller
+                with contextlib.suppress(DeviceError):  # kept in flash.failure, for the caller
                     self._end()
 
     def _end(self) -> None:
@@ -254,14 +254,14 @@ class TextLineBox:
             raise
 
     def _darken_somehow(self) -> None:
-        """All off, if the box still listens."""
+        """All LEDs off, if the box still answers."""
         with contextlib.suppress(DeviceError):
             self.lights_off()
 
     # Lines.
 
     def _greet(self) -> Identity:
-        """What the box says of itself: `vendor,model,serial,firmware`, or other words, its model."""
+        """Identity from a reply `vendor,model,serial,firmware`; any other reply is taken as the model."""
         if self._settings.identify is None:
             return Identity("unknown", "box of text lines", "unknown", "unknown")
         text = self._exchange(self._settings.identify, answers=True)
@@ -270,15 +270,17 @@ class TextLineBox:
         return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
 
     def _command(self, line: str) -> None:
-        """Have a command obeyed. Raises DeviceRefused if the box says anything but that it was."""
+        """Have a command executed. Raises DeviceRefused for any reply but the expected one."""
         expected = self._settings.expected_reply
         reply = self._exchange(line, answers=expected is not None)
         if expected is not None and reply != expected:
             self._in_step = False
-            self._refuse(f"`{expected}` in answer to `{line}`", f"it said `{reply}`", "See to what the box says.")
+            self._refuse(
+                f"`{expected}` in answer to `{line}`", f"it said `{reply}`", "Check the box's reply and the rig."
+            )
 
     def _exchange(self, line: str, *, answers: bool) -> str:
-        """Send a line and return the box's answer without its ending, empty if it gives none."""
+        """Send a line and return the box's answer without its ending; empty if it never answers."""
         settings, link = self._settings, self._link
         data = (line + _ENDINGS[settings.line_ending]).encode("ascii")
         seconds = _REPLY_MARGIN_S + (len(data) + _SHORT_REPLY_BYTES) / link.bytes_per_s
@@ -290,7 +292,7 @@ class TextLineBox:
                 self._refuse(
                     f"silence before `{line}`",
                     f"the box said `{_shown(unasked)}` unasked",
-                    "See whether it started anew, and whether it answers each command with one line.",
+                    "Check whether it has restarted, and whether it answers each command with one line.",
                 )
             self._in_step = False
             deadline = Deadline(self._clock, seconds)
@@ -304,7 +306,7 @@ class TextLineBox:
                 settings.name,
                 expected=f"an answer to `{line}` within {seconds:.2f} s",
                 happened=str(error),
-                remedy=f"See that the box at {settings.port} has power and the rig's baud rate, then resume.",
+                remedy=f"Check that the box at {settings.port} has power and the rig's baud rate, then resume.",
             ) from error
         except ConnectionError as error:
             raise DeviceLost(
@@ -322,9 +324,10 @@ class TextLineBox:
 
 
 def read_reply(read: Callable[[], bytes], line_ending: str) -> str:
-    """One line of a box's reply, without its ending, from `read`, which gives the next bytes each time.
+    """One line of a box's reply, without its ending; `read` returns the next bytes at each call.
 
-    Raises ValueError for a line too long, and for bytes behind it; TimeoutError, with what came, as `read` does.
+    Raises ValueError for a line that is too long, or followed by more bytes; TimeoutError, with the bytes
+    received, if `read` raises it.
     """
     ending = b"\r" if line_ending == "cr" else b"\n"
     data = b""
@@ -342,5 +345,5 @@ def read_reply(read: Callable[[], bytes], line_ending: str) -> str:
 
 
 def _shown(data: bytes) -> str:
-    """The box's words, as far as they can be printed."""
+    """The box's reply with unprintable bytes escaped."""
     return data.decode("ascii", "backslashreplace").replace("\r", "\\r").replace("\n", "\\n")

@@ -1,7 +1,7 @@
 """Messages to and from a device of the USB Test and Measurement Class, over pyusb.
 
-Source: USB-IF, "USB Test and Measurement Class Specification (USBTMC)", revision 1.0, 2003; table numbers
-below are its. The subclass USB488 needs nothing more for program messages and their responses.
+Source: USB-IF, "USB Test and Measurement Class Specification (USBTMC)", revision 1.0, 2003; the table numbers
+below are from it. Program messages and responses need nothing of the subclass USB488.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _USBTMC_CLASS, _USBTMC_SUBCLASS = 0xFE, 3
 _MAX_OUT_BYTES = 4096
 """Payload of one Bulk-OUT transfer; longer messages are sent in several."""
 _MAX_IN_BYTES = 16384
-"""Payload asked of one Bulk-IN transfer; longer responses come in several."""
+"""Payload requested in one Bulk-IN transfer; longer responses come in several."""
 _LOOK_MS = 50
-"""Machine time between two looks at the rig's clock."""
+"""Machine time between two readings of the rig's clock."""
 _CLEAR_TRIES = 50
 
 
@@ -34,7 +34,7 @@ class UsbtmcLink:
     """An open USBTMC interface: a `drivers.ledbox.scpi.Link`."""
 
     bytes_per_s = 1e6
-    """What full-speed USB carries at least."""
+    """Least rate of full-speed USB."""
 
     def __init__(self, vendor: int, product: int, serial: str | None, clock: Clock) -> None:
         import usb.core
@@ -49,7 +49,7 @@ class UsbtmcLink:
             self._device: Any = _find(vendor, product, serial)
             interface = _claim(self._device)
         except (usb.core.USBError, usb.core.NoBackendError, ValueError) as error:
-            # ValueError: pyusb could not read a string descriptor, for want of permission
+            # ValueError: pyusb could not read a string descriptor, for lack of permission
             raise ConnectionError(str(error)) from error
         self._interface = interface.bInterfaceNumber
         bulk = [one for one in interface if usb.util.endpoint_type(one.bmAttributes) == 2]
@@ -97,7 +97,7 @@ class UsbtmcLink:
         return transfer[_HEADER.size : _HEADER.size + size]
 
     def clear(self) -> None:
-        """Forget messages on their way, in both directions (section 4.2.1.6)."""
+        """Discard pending messages in both directions (section 4.2.1.6)."""
         self._requested_tag = None
         try:
             if self._class_request(_INITIATE_CLEAR, 1) != (_STATUS_SUCCESS,):
@@ -158,7 +158,7 @@ def _claim(device: Any) -> Any:
     """The device's USBTMC interface, claimed."""
     import usb.util
 
-    with contextlib.suppress(NotImplementedError):  # only Linux has kernel drivers in the way
+    with contextlib.suppress(NotImplementedError):  # only Linux binds a kernel driver to the interface
         for interface in device[0]:
             if device.is_kernel_driver_active(interface.bInterfaceNumber):
                 device.detach_kernel_driver(interface.bInterfaceNumber)

@@ -1,6 +1,6 @@
-"""The SCPI box's records as they travel, 16 bytes a step of a table, 28 a step of a log.
+"""Binary records of the SCPI box: 16 bytes per step of a table, 28 bytes per step of a log.
 
-The layout is that of docs/reference/ledbox-protocol.md.
+The layout is defined in docs/reference/ledbox-protocol.md.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ _TIMES = ("on_us", "trigger_delay_us", "period_us")
 
 
 def pack(table: NDArray[np.void]) -> bytes:
-    """A table (STEP_DTYPE [n]) as it is uploaded.
+    """A table (STEP_DTYPE [n]) as uploaded.
 
-    Raises TypeError for an array of another kind, ValueError naming the first record that does not fit the wire.
+    Raises TypeError for another kind of array, ValueError naming the first record that does not fit the format.
     """
     if table.dtype != STEP_DTYPE or table.ndim != 1:
         raise TypeError(f"a table is one row of STEP_DTYPE records, not {table.dtype} {table.shape}")
@@ -57,12 +57,12 @@ def pack(table: NDArray[np.void]) -> bytes:
 
 
 def unpack_log(log: bytes, started: NDArray[np.void]) -> NDArray[np.void]:
-    """Records (STEP_RECORD_DTYPE [k]) of a log that came, of the burst whose table (STEP_DTYPE [n]) was started.
+    """Records (STEP_RECORD_DTYPE [k]) of a log received for the started table (STEP_DTYPE [n]).
 
-    Raises ValueError for bytes that are no whole records, and for records of steps that the table does not have.
+    Raises ValueError for incomplete records, and for records of steps that the table does not have.
     """
     if len(log) % RECORD_BYTES:
-        raise ValueError(f"{len(log)} bytes came, no multiple of {RECORD_BYTES}")
+        raise ValueError(f"{len(log)} bytes came, not a multiple of {RECORD_BYTES}")
     raw = np.frombuffer(log, _RECORD)
     if np.any(raw["step"] >= len(started)):
         raise ValueError(f"a record of step {raw['step'].max()} came, of a table of {len(started)}")

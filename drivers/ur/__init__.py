@@ -1,4 +1,4 @@
-"""Universal Robots arms by RTDE."""
+"""Universal Robots arms over RTDE."""
 
 from drivers.ur.driver import Settings, UrRobot
 

@@ -1,6 +1,6 @@
-"""UR's dashboard server: a line asked, a line answered (Universal Robots, "Dashboard Server e-Series").
+"""UR's dashboard server: one line per question, one per answer (Universal Robots, "Dashboard Server e-Series").
 
-What must be known before ur-rtde is let loose, and how a program is ended without it.
+Used to check the controller before ur-rtde connects to it, and to end a program without ur-rtde.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ _PORT = 29999
 _LINE_BYTES = 4096
 _TIMEOUT_S = 2.0
 _CONDITIONS = (
-    ("safetystatus", ("Safetystatus: NORMAL", "Safetystatus: REDUCED"), "See to the cell and acknowledge"),
+    ("safetystatus", ("Safetystatus: NORMAL", "Safetystatus: REDUCED"), "Check the cell and acknowledge"),
     ("robotmode", ("Robotmode: RUNNING",), "Power the arm and release its brakes"),
     ("is in remote control", ("true",), "Switch the pendant to remote control"),
 )
-"""Before our program may run: a question, its answers that will do, and the remedy for others."""
+"""Conditions for running the program: question, accepted answers, remedy for any other."""
 
 
 class CannotBegin(Exception):
@@ -34,7 +34,7 @@ class CannotBegin(Exception):
 
 
 class Dashboard:
-    """A connection for a few questions. Raises OSError where the link fails or is silent for 2 s."""
+    """A connection for a few questions. Raises OSError if the link fails or is silent for 2 s."""
 
     def __init__(self, host: str) -> None:
         self._link = socket.create_connection((host, _PORT), timeout=_TIMEOUT_S)
@@ -55,9 +55,9 @@ class Dashboard:
 
 
 def ready_controller(config: Config) -> tuple[str, str, str]:
-    """Model, serial number and firmware; raises CannotBegin unless it is fit and free to run our program.
+    """Model, serial number and firmware; raises CannotBegin unless the controller is ready to run a program.
 
-    ur-rtde's constructor hangs where a program runs, so that is asked before.
+    ur-rtde's constructor hangs while another program runs; therefore this is checked first.
     """
     wait_until_s = time.monotonic() + 2.0 * config.watchdog_s + 0.5
     try:
@@ -83,7 +83,7 @@ def ready_controller(config: Config) -> tuple[str, str, str]:
 
 
 def why_ended(host: str) -> str:
-    """The name of the fault that a program which ended unasked is."""
+    """Name of the fault for a program that ended without being stopped by the driver."""
     with contextlib.suppress(OSError), contextlib.closing(Dashboard(host)) as dashboard:
         if dashboard.ask("is in remote control") == "false":
             return "not in remote control: the program was stopped at the pendant"
@@ -91,6 +91,6 @@ def why_ended(host: str) -> str:
 
 
 def end_program(host: str) -> None:
-    """End the program that runs or is paused. A link that fails now is noticed by its silence."""
+    """End the program that runs or is paused. A failing link is ignored: the link's time-out detects it."""
     with contextlib.suppress(OSError), contextlib.closing(Dashboard(host)) as dashboard:
         dashboard.ask("stop")

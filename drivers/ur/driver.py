@@ -1,12 +1,12 @@
-"""A Universal Robots arm through ur-rtde: `coupole.devices.Robot`.
+"""A Universal Robots arm over ur-rtde: `coupole.devices.Robot`.
 
-A process of its own (`ur_link`) owns the library and speaks to the controller; this class asks it and judges
-its answers by the age of the controller's timestamp. Order of work in the cell: power the arm, release its
-brakes, switch to remote control, then open this driver. The controller shapes the motion (movej: a trapezoid
-of the leading joint's speed), so there is no jerk to set.
+A separate process (`drivers.ur.worker`) runs the library and talks to the controller; this class queries it and
+takes the age of its answers from the controller's timestamp. In the cell: power the arm, release its brakes,
+switch to remote control, then open this driver. The controller shapes the motion (movej: a trapezoidal speed
+profile of the leading joint), so no jerk can be set.
 
-Poses are the controller's own `actual_TCP_pose`, with the tool's offset, as read at opening, taken off: the
-controller knows the arm's factory calibration, which nominal DH parameters miss by millimetres.
+Poses are the controller's own `actual_TCP_pose`, with the tool offset read at opening removed: the controller
+knows the arm's factory calibration, from which nominal DH parameters differ by millimetres.
 """
 
 from __future__ import annotations
@@ -33,44 +33,45 @@ _POLL_S = 0.008
 
 
 class Settings(BaseModel):
-    """Settings of the driver in the rig file. Angles are of the joints; speeds are of the leading joint."""
+    """Settings of the driver in the rig file. Angles are joint angles; speeds are of the leading joint."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     host: str = Field(min_length=1)
-    """Address of the controller; the ports are UR's own (29999, 30003, 30004)."""
+    """Address of the controller; the ports are fixed by UR (29999, 30003, 30004)."""
     model: str = Field(default="ur10e", pattern=r"^ur\d+e?$")
-    """Which arm it is; the controller must say the same, without the e."""
+    """Model of the arm; the controller must report the same, with or without the e."""
     arm_model: Arm | None = None
-    """The arm as a rig describes it; plans are made with it, this driver does without."""
+    """The arm as described in the rig, used for planning; this driver does not use it to move."""
     limits_deg: tuple[tuple[float, float], ...] = Field(default=((-360.0, 360.0),) * 6, min_length=6, max_length=6)
-    """Lowest and highest angle of each joint; narrower than the arm's own where the cell asks for it."""
+    """Lowest and highest angle of each joint; narrower than the arm's own limits if the cell requires it."""
     joint_speed_deg_s: float = Field(default=120.0, gt=0, le=179.9)
-    """What every joint can do: 120 for the UR10e, 179.9 for the UR3e and UR5e."""
+    """Highest speed of every joint: 120 for the UR10e, 179.9 for the UR3e and UR5e."""
     speed_fraction: float = Field(default=0.5, gt=0, le=1)
     acceleration_deg_s2: float = Field(default=80.0, gt=0, le=2000)
     stop_deg_s2: float = Field(default=300.0, gt=0, le=2000)
     """Deceleration of `stop`."""
     frequency_hz: float = Field(default=125.0, ge=10, le=500)
-    """Samples that the controller sends."""
+    """Rate of the controller's samples."""
     watchdog_s: float = Field(default=0.5, ge=0.05)
-    """Silence of this computer after which the controller ends all motion by itself."""
+    """The controller ends all motion after this time without a message from the host."""
     link_timeout_s: float = Field(default=1.0, gt=0)
-    """Silence of the controller after which the link counts as lost."""
+    """The link counts as lost after this time without a sample from the controller."""
     connect_timeout_s: float = Field(default=20.0, gt=0)
-    """How long opening may take, in machine time."""
+    """Time-out for opening, in machine time."""
     settle_deg: float = Field(default=0.02, gt=0)
     settle_deg_s: float = Field(default=0.1, gt=0)
     settle_samples: int = Field(default=10, ge=1)
-    """Settled: within both tolerances for so many samples, and again after the dwell."""
+    """Settled: within both tolerances for this many samples, and again after the dwell."""
     dwell_s: float = Field(default=0.1, ge=0)
     follow_deg: float = Field(default=1.0, gt=0)
     follow_samples: int = Field(default=10, ge=1)
-    """The arm does not follow: farther than that from where its controller wants it for so many samples."""
+    """The arm does not follow: farther than `follow_deg` from the controller's target joints for this many
+    samples."""
 
     def arm(self) -> Arm | None:
-        """The arm with the limits and speeds that this driver moves it at; preflight computes durations with it.
-        Motions are trapezoids of the leading joint's speed: there is no limit to the jerk."""
+        """The arm with the limits and speeds that this driver uses; preflight computes durations with it.
+        Speed profiles are trapezoids of the leading joint: the jerk is unlimited."""
         if self.arm_model is None:
             return None
         limits_deg = zip(self.limits_deg, self.arm_model.limits_deg, strict=True)
@@ -93,10 +94,10 @@ class Settings(BaseModel):
 
 
 class UrRobot:
-    """See `coupole.devices.Robot`. After a fault it moves no more: close it and open another."""
+    """See `coupole.devices.Robot`. After a fault it refuses to move: close it and open it again."""
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
-        """Start the controller's program that obeys ur-rtde; nothing moves.
+        """Start ur-rtde's program on the controller; the arm does not move.
 
         Raises DeviceFault if the controller is in a fault or in local control, DeviceRefused if a program runs
         there, DeviceLost if it cannot be reached, DeviceTimeout if the library hangs.
@@ -116,13 +117,13 @@ class UrRobot:
             self.close()
             raise
 
-    def _check_model(self, told: str) -> None:
-        """Plans are reckoned for one arm: another must not run them. The dashboard calls a UR10e `UR10`."""
-        if told.lower().removesuffix("e") != self.settings.model.removesuffix("e"):
+    def _check_model(self, reported: str) -> None:
+        """Plans are computed for one arm model; no other must run them. The dashboard calls a UR10e `UR10`."""
+        if reported.lower().removesuffix("e") != self.settings.model.removesuffix("e"):
             raise DeviceRefused(
                 "robot",
                 expected=f"a {self.settings.model.upper().replace('E', 'e')}, as the rig has it",
-                happened=f"the controller says that it moves a {told}",
+                happened=f"the controller says that it moves a {reported}",
                 remedy="Correct `model` in the robot's settings, and `arm`, if the rig names one",
             )
 
@@ -148,16 +149,16 @@ class UrRobot:
         }
 
     def move_to(self, joints_deg: NDArray[np.float64]) -> None:
-        """Start movej; an arm in motion is first brought to rest. Raises DeviceRefused out of limits."""
+        """Start movej; a moving arm is first brought to rest. Raises DeviceRefused for a target out of limits."""
         target_deg = checked_target(joints_deg, self.settings.limits_deg)
         state = self._command("move", target_deg)
         raise_fault(state)
         if state.speed_fraction <= 0.0:
-            raise refused("a speed slider above 0 %", "it stands at 0 %: the arm will not move")
-        way_deg = float(np.max(np.abs(np.subtract(target_deg, state.joints_deg))))
-        # Asked in motion, the arm first brakes, and may have gone on away from the target meanwhile.
-        way_deg += self.settings.speed_deg_s * self.settings.stop_s
-        self._motion_s = _movej_s(self.settings, way_deg) / state.speed_fraction + self._rest_s()
+            raise refused("a speed slider above 0 %", "it is at 0 %: the arm will not move")
+        turn_deg = float(np.max(np.abs(np.subtract(target_deg, state.joints_deg))))
+        # A moving arm brakes first, and may turn away from the target while it does.
+        turn_deg += self.settings.speed_deg_s * self.settings.stop_s
+        self._motion_s = _movej_s(self.settings, turn_deg) / state.speed_fraction + self._rest_s()
 
     def wait_settled(self) -> ArmState:
         settings, number = self.settings, self._number
@@ -169,7 +170,7 @@ class UrRobot:
         return self.measured()
 
     def measured(self) -> ArmState:
-        """Raises DeviceLost rather than tell what is older than `link_timeout_s`."""
+        """Raises DeviceLost if the last sample is older than `link_timeout_s`."""
         state = self._state()
         return ArmState(
             joints_deg=state.joints_deg,
@@ -181,9 +182,9 @@ class UrRobot:
         )
 
     def stop(self) -> None:
-        """Brake and wait until the arm stands; raises DeviceTimeout if it does not come to rest.
+        """Brake and wait until the arm is at rest; raises DeviceTimeout if it does not come to rest.
 
-        With a lost link it commands nothing: the controller's watchdog has stopped the arm.
+        With a lost link it sends nothing: the controller's watchdog has then stopped the arm.
         """
         with contextlib.suppress(DeviceLost):
             self._command("stop")
@@ -191,16 +192,16 @@ class UrRobot:
             self._wait(self._is_still, deadline, "the arm at rest", faults=False)
 
     def stopping_deg(self) -> NDArray[np.float64]:
-        """Farthest that each joint [6] turns after a stop: the leading joint's speed, which no joint exceeds, for
-        the time until stopj begins, and half of the time that it takes. A call of the library that is under way
-        comes before, and its commands wait for an answer: three samples each.
+        """Largest angle that each joint [6] can turn after a stop command: the leading joint's speed, which no
+        joint exceeds, times the delay before stopj and half the braking time. The delay is six samples: three for
+        a library call in progress, three for the answer to stopj.
         """
         settings = self.settings
         delay_s = 6.0 / settings.frequency_hz
         return np.full(6, settings.speed_deg_s * (delay_s + 0.5 * settings.stop_s))
 
     def statistics(self) -> Mapping[str, float]:
-        """Figures of the process's last word."""
+        """Figures of the process's latest answer."""
         with contextlib.suppress(DeviceLost):
             self._last = self._state()
         state = self._last
@@ -212,7 +213,7 @@ class UrRobot:
         }
 
     def close(self) -> None:
-        """Bring the arm to rest and end the controller's program and our process. Safe to call again."""
+        """Bring the arm to rest, end the controller's program and the process. Safe to call again."""
         self._process.close()
 
     def _command(self, verb: Literal["move", "stop"], target_deg: Six | None = None) -> State:
@@ -248,16 +249,16 @@ class UrRobot:
         return state.still_samples >= self.settings.settle_samples
 
     def _rest_s(self) -> float:
-        """Time until an arm told to stop counts as standing."""
+        """Longest time from a stop command until the arm counts as at rest."""
         return self.settings.stop_s + self.settings.settle_samples / self.settings.frequency_hz
 
 
-def _movej_s(settings: Settings, way_deg: float) -> float:
-    """Duration of a trapezoid of speed: d/v + v/a, or 2 sqrt(d/a) where full speed is not reached."""
+def _movej_s(settings: Settings, turn_deg: float) -> float:
+    """Duration of a trapezoidal speed profile: d/v + v/a, or 2 sqrt(d/a) if full speed is not reached."""
     speed, acceleration = settings.speed_deg_s, settings.acceleration_deg_s2
-    if way_deg < speed**2 / acceleration:
-        return 2.0 * math.sqrt(way_deg / acceleration)
-    return way_deg / speed + speed / acceleration
+    if turn_deg < speed**2 / acceleration:
+        return 2.0 * math.sqrt(turn_deg / acceleration)
+    return turn_deg / speed + speed / acceleration
 
 
 def _transform(pose_m_rad: Six) -> geometry.Transform:

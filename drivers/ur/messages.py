@@ -1,7 +1,7 @@
-"""What the driver and the process that owns ur-rtde (`ur_link`) tell each other: one JSON object a datagram.
+"""Messages between the driver and the process that runs ur-rtde (`drivers.ur.worker`): one JSON object a datagram.
 
-The driver asks, the process answers every question with its `State`; the process's last word, before it ends
-by itself, is a `State` too, or a `Failure` where it could not begin.
+The driver sends an `Ask`, the process answers each with its `State`. Its last message before it ends by itself is
+a `State` too, or a `Failure` if it could not begin.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Six = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True)
 class Config:
-    """What the process needs to know; see the fields of the same names in `drivers.ur.driver.Settings`."""
+    """Settings of the process; see the fields of the same names in `drivers.ur.driver.Settings`."""
 
     host: str
     frequency_hz: float
@@ -36,7 +36,7 @@ class Config:
 
 @dataclass(frozen=True)
 class Ask:
-    """A question, or a command with its number."""
+    """A query, or a command with its number."""
 
     verb: Literal["state", "move", "stop", "leave"]
     number: int = 0
@@ -45,13 +45,13 @@ class Ask:
 
 @dataclass(frozen=True)
 class State:
-    """What the controller last told."""
+    """State of the controller in its latest sample."""
 
     command: int
-    """Number of the last command obeyed."""
+    """Number of the last command taken."""
     joints_deg: Six
     wanted_deg: Six
-    """Where the controller wants the joints to be now."""
+    """The controller's present set point of the joints."""
     tcp_pose_m_rad: Six
     """base from tool centre point: x, y, z and a rotation vector."""
     tcp_offset_m_rad: Six
@@ -59,11 +59,11 @@ class State:
     speed_fraction: float
     """The speed slider at the pendant, 0 to 1."""
     still_samples: int
-    """Samples in a row in which the arm stood still, at its target if it has one."""
+    """Samples in a row in which the arm was at rest, and at its target if it has one."""
     samples: int
     max_gap_s: float
     max_call_s: float
-    """Longest that a call of the library took."""
+    """Longest duration of a call of the library."""
     model: str
     serial: str
     firmware: str
@@ -88,7 +88,7 @@ def send(link: socket.socket, message: Ask | State | Failure) -> None:
 
 
 def receive(link: socket.socket) -> Ask | State | Failure | None:
-    """None when the other end is gone."""
+    """The next message; None if the other end is closed."""
     data = link.recv(DATAGRAM_BYTES)
     if not data:
         return None

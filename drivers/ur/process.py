@@ -1,4 +1,4 @@
-"""The driver's end of the process that owns ur-rtde (`ur_link`): start it, ask it, end it where it hangs."""
+"""The driver's side of the process that runs ur-rtde (`drivers.ur.worker`): starts, queries and ends it."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from drivers.ur.messages import Ask, Config, Failure, State
 _LEAVE_S = 4.0
 """Longer than the process takes to bring the arm to rest and end."""
 _WATCHDOG_MARGIN_S = 0.3
-"""How late the controller may be: it hears a sign of life after that was sent, and brakes at its own rate."""
+"""Delay of the controller's watchdog: a sign of life reaches it after it was sent."""
 _FAILURES: dict[str, type[DeviceError]] = {"refused": DeviceRefused, "fault": DeviceFault, "lost": DeviceLost}
 
 
 class UrProcess:
-    """Every wait has an end: a process that does not answer in time is killed, and the robot is lost."""
+    """Every wait is limited: a process that does not answer in time is killed, and the robot counts as lost."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self._lost = ""
-        """Why no answer will ever come again."""
+        """Why no answer can come any more; empty while it can."""
         self._began = self._rested = False
         self._errors_fd = os.memfd_create("coupole-ur")
         self._link, its_link = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -37,7 +37,7 @@ class UrProcess:
                 [sys.executable, "-m", "drivers.ur.worker", str(its_link.fileno()), json.dumps(asdict(config))],
                 pass_fds=(its_link.fileno(),),
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,  # the library's chatter
+                stdout=subprocess.DEVNULL,  # the library prints there
                 stderr=self._errors_fd,
                 start_new_session=True,
             )
@@ -47,7 +47,7 @@ class UrProcess:
         return self._process.pid
 
     def first_word(self, timeout_s: float) -> State:
-        """The state after opening; raises DeviceTimeout if it does not come, or why it cannot."""
+        """The state after opening; raises DeviceTimeout if it does not come, or the reason why it cannot."""
         self._link.settimeout(timeout_s)
         state = self._take(DeviceTimeout)
         self._began = True
@@ -55,10 +55,10 @@ class UrProcess:
         return state
 
     def ask(self, ask: Ask) -> State:
-        """The answer; raises DeviceLost if there is none, or if it says that the link is gone: the arm stands
-        by then."""
+        """The answer. Raises DeviceLost if there is none, or if it reports a lost link; the arm is then at
+        rest."""
         if not self._lost:
-            with contextlib.suppress(OSError):  # it ended: its last word may still be there to be read
+            with contextlib.suppress(OSError):  # the process has ended: its last message may still be readable
                 messages.send(self._link, ask)
         state = self._take(DeviceLost)
         if state.lost:
@@ -68,7 +68,7 @@ class UrProcess:
         return state
 
     def close(self) -> None:
-        """Ask the process to leave with the arm at rest; kill it if it does not. Safe to call again."""
+        """Tell the process to bring the arm to rest and end; kill it if it does not. Safe to call again."""
         if self._process.poll() is None:
             with contextlib.suppress(OSError):
                 messages.send(self._link, Ask("leave"))
@@ -81,7 +81,7 @@ class UrProcess:
             os.close(self._errors_fd)
 
     def _take(self, when_silent: type[DeviceError]) -> State:
-        """The process's next word."""
+        """The process's next message."""
         said = None
         if not self._lost:
             try:
@@ -107,12 +107,12 @@ class UrProcess:
     def _receive(self) -> Ask | State | Failure | None:
         try:
             return messages.receive(self._link)
-        except ConnectionResetError:  # it ended with an ask of ours unread; its last word stands behind that error
+        except ConnectionResetError:  # it ended before it read our Ask; its last message follows that error
             return messages.receive(self._link)
 
     def _end(self) -> None:
-        """End the process. One that did not bring the arm to rest leaves that to the controller's watchdog, and
-        this waits for it."""
+        """End the process. If it did not bring the arm to rest, the controller's watchdog does; this waits for
+        that."""
         self._process.kill()
         code = self._process.wait()
         if self._began and code != 0 and not self._rested:
@@ -133,7 +133,7 @@ def raise_fault(state: State) -> None:
     kind = DeviceLost if state.lost else DeviceFault
     raise kind(
         "robot",
-        expected="an arm under the control of our program",
+        expected="an arm under the control of the driver's program",
         happened=state.fault,
-        remedy="See to the cell, acknowledge at the pendant, then reopen the robot",
+        remedy="Check the cell, acknowledge at the pendant, then reopen the robot",
     )

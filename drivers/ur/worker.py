@@ -2,12 +2,12 @@
 
     python -m drivers.ur.worker SOCKET_FD CONFIG_JSON
 
-The library is not let into the acquisition itself, for four reasons seen with ur-rtde 1.6: it prints on
-standard output; its constructor and moveJ can hang for minutes; after a lost link its getters go on telling
-stale data; and by itself it connects again and starts its program anew. A process can be ended, and this one
-ends itself when the link is lost.
+The library runs in a separate process for four reasons, observed with ur-rtde 1.6: it prints on standard output;
+its constructor and moveJ can hang for minutes; after a lost link its getters keep returning stale data; and it
+reconnects and restarts its program by itself. A process can be ended, and this one ends itself when the link is
+lost.
 
-The controller watches this process (RTDE watchdog): silence ends the program and so all motion.
+The controller monitors this process (RTDE watchdog): silence ends the program and so all motion.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ _SAFETY_FAULTS = (
     (0x010, "safeguard stop"),
     (0x300, "safety fault"),
 )
-"""Bits of RTDE's safety_status_bits, in the order of their weight."""
+"""Bits of RTDE's safety_status_bits, most serious first."""
 _NAMING_SAMPLES = 10
-"""A program that ended is named as a fault only so many samples later: the bits that say why come after it."""
+"""Samples between the end of a program and its fault: the safety bits that give the cause come after the end."""
 _CANNOT_BEGIN, _LOST = 1, 2
 """Exit codes."""
 _LEAVE_S = 3
-"""Longest life after being told to leave, or after the driver's death."""
+"""Longest time for which the process continues after `leave`, or after the driver's death."""
 
 
 class Link:
-    """The library's two interfaces, and what this process makes of them."""
+    """The library's two interfaces, and the state derived from them."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -78,7 +78,7 @@ class Link:
             raise CannotBegin("fault", "a watched program", "it took no watchdog", "See the controller's log")
         self._goal_deg: Six | None = None
         self._pending_deg: Six | None = None
-        """A target that waits until the arm stands: what movej does to a moving arm is not documented."""
+        """A target that waits until the arm is at rest: the effect of movej on a moving arm is not documented."""
         self._quiet_samples = self._astray_samples = self._ended_samples = 0
         self._timestamp_s = -1.0
         self._changed_s = self._kicked_s = time.monotonic()
@@ -100,7 +100,7 @@ class Link:
         )
 
     def tick(self) -> None:
-        """Look at the controller, keep its watchdog quiet, start what waits."""
+        """Read the controller's state, kick its watchdog, start a pending motion."""
         self._look()
         if self.state.fault:
             return
@@ -112,7 +112,7 @@ class Link:
             self._start(self._pending_deg)
 
     def obey(self, ask: Ask) -> None:
-        """Begin what is asked, or, after a fault, nothing; the answer is `state`."""
+        """Begin a command; after a fault, nothing. The answer is `state`."""
         if ask.verb == "state" or self.state.fault:
             return
         stands = self._settled()
@@ -145,7 +145,7 @@ class Link:
         speed, acceleration = math.radians(config.speed_deg_s), math.radians(config.acceleration_deg_s2)
         if not self._call(lambda: self._control.moveJ(target, speed, acceleration, True)):
             time.sleep(_NAMING_SAMPLES / config.frequency_hz)
-            self._look()  # a safety stop is named as what it is
+            self._look()  # so that a safety stop is reported as such
             if not self.state.fault:
                 self._latch("program stopped: it did not take moveJ")
 
@@ -157,7 +157,7 @@ class Link:
         return result
 
     def _look(self) -> None:
-        """Take the controller's sample, if it is a new one, and judge it."""
+        """Read the controller's sample and, if it is new, evaluate it."""
         timestamp_s, now_s = self._receive.getTimestamp(), time.monotonic()
         age_s = now_s - self._changed_s
         if not (self._receive.isConnected() and self._control.isConnected()):
@@ -206,7 +206,7 @@ class Link:
             self._latch(why_ended(config.host))
 
     def _latch(self, fault: str, *, lost: bool = False) -> None:
-        """From now on nothing is commanded; the program is ended, so that no acknowledgement resumes a motion."""
+        """Latch a fault: no more commands; the program is ended, so that no acknowledgement resumes a motion."""
         self._goal_deg = self._pending_deg = None
         self.state = replace(self.state, fault=fault, lost=lost)
         if not lost:
@@ -227,7 +227,7 @@ def _apart(a_deg: Six, b_deg: Six) -> float:
 
 
 def serve(driver: socket.socket, link: Link) -> None:
-    """Answer the driver until it asks to leave, or is gone, or the link is."""
+    """Answer the driver until it sends `leave` or ends, or until the link is lost."""
     config = link.config
     period_s = 1.0 / config.frequency_hz
     opened, next_s = False, time.monotonic()
@@ -249,8 +249,8 @@ def serve(driver: socket.socket, link: Link) -> None:
 
 
 def main() -> None:
-    """Serve, then end at once, with `link` alive: the library's destructors hang on a lost link, and while they
-    do, the library connects again and starts its program anew."""
+    """Serve, then end by os._exit with `link` alive: on a lost link the library's destructors hang, and while
+    they do, the library reconnects and restarts its program."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     driver = socket.socket(fileno=int(sys.argv[1]))
     try:
@@ -258,7 +258,7 @@ def main() -> None:
     except CannotBegin as error:
         send(driver, error.failure)
         os._exit(_CANNOT_BEGIN)
-    with contextlib.suppress(ConnectionError):  # the driver is gone
+    with contextlib.suppress(ConnectionError):  # the driver has ended
         serve(driver, link)
     os._exit(_LOST if link.state.lost else 0)
 

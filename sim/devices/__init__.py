@@ -1,1 +1,1 @@
-"""The other end of every driver's wire."""
+"""The stand-ins: the simulated end of every driver's wire."""

@@ -1,7 +1,6 @@
-"""What of the arm and its tool stands in the light: capsules in the base frame.
+"""Parts of arm and tool that block light: capsules in the base frame.
 
-The stand-ins' own picture of their arms, coarser than the controller's and apart from it, on `kuka_kinematics` and
-`ur_arm`.
+A separate and coarser model than the controller's own, computed with `kuka_kinematics` and `ur_arm`.
 """
 
 from __future__ import annotations
@@ -24,17 +23,17 @@ _UR_RADII_MM = {
     "ur5e": {"column": 60.0, "shoulder": 65.0, "upper": 60.0, "forearm": 50.0, "wrist": 45.0},
     "ur10e": {"column": 78.0, "shoulder": 85.0, "upper": 75.0, "forearm": 60.0, "wrist": 48.0},
 }
-"""After the outlines in Universal Robots' data sheets; the widest parts of each link are its joints' housings."""
+"""From the outlines in Universal Robots' data sheets; each link is widest at its joints' housings."""
 _UR_ASIDE_MM = {"ur5e": (138.0, 7.0), "ur10e": (176.0, 39.0)}
-"""How far upper arm and forearm lie beside the plane of axis 1, along axis 2."""
+"""Distance of upper arm and forearm from the plane of axis 1, along axis 2."""
 
 Capsules = NDArray[np.float64]
-"""[n, 7] two ends in the base frame and the radius, mm."""
+"""[n, 7] both ends in the base frame and the radius, mm."""
 NONE: Capsules = np.empty((0, 7))
 
 
 class ToolBody(BaseModel):
-    """What the flange carries, in its frame."""
+    """A capsule of what the flange carries, in the flange frame."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -44,7 +43,7 @@ class ToolBody(BaseModel):
 
 
 def tool_capsules(base_from_flange: Transform, tool: Sequence[ToolBody]) -> Capsules:
-    """The tool alone."""
+    """Capsules of the tool alone."""
     ends = np.array([[body.from_mm, body.to_mm] for body in tool]).reshape(-1, 2, 3)
     placed = ends @ base_from_flange[:3, :3].T + base_from_flange[:3, 3]
     return np.column_stack([placed.reshape(-1, 6), [body.radius_mm for body in tool]])

@@ -1,8 +1,8 @@
-"""What every simulated camera has in common, whatever carries its frames: trigger input, sensor, clock, counters.
+"""Parts common to all simulated cameras: trigger input, sensor timing, clock, counters.
 
-An edge that comes while the sensor is ready begins an exposure; one that comes too early is counted and
-ignored. Each exposure has a number, a frame id and a time on the camera's own clock, is rendered on a worker
-thread, and goes to the camera's *wire* in order, not before its readout has ended.
+An edge that comes while the sensor is ready begins an exposure; one that comes too early is counted and ignored.
+Each exposure has a number, a frame id and a time on the camera's own clock. It is rendered on a worker thread and
+passed to the camera's *wire* in order, not before its readout has ended.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from sim.world.reactor import Reactor
 
 @dataclass(frozen=True)
 class Exposed:
-    """What one exposure saw, for the renderer."""
+    """Light, pose and timing of one exposure, for the renderer."""
 
     seconds_of_led: dict[int, float]
-    """At tabulated flux: an LED that gives a tenth more shines a tenth longer."""
+    """LED number to seconds at its tabulated flux: an LED with 10 % more flux counts 10 % longer."""
     panels: list[int]
     exposure_s: float
     gain: float
@@ -38,53 +38,53 @@ class Exposed:
     """Counts exposures from power-on."""
     base_from_flange: Transform
     arm_mm: Capsules = field(default_factory=lambda: NONE)
-    """What of arm and tool stands in the light, in the base frame."""
+    """Parts of arm and tool that block light, in the base frame."""
 
 
 _RENDER_PATIENCE_S = 30.0
 
 Render = Callable[[NDArray[np.uint16], Exposed], None]
-"""Fill a frame [h, w] with what an exposure saw."""
+"""Fills a frame [h, w] with the image of an exposure."""
 
 
 class Settings(BaseModel):
-    """Character of the simulated camera, apart from its wire."""
+    """Properties of the simulated camera, apart from its wire."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     render_every: Annotated[int, Field(ge=0)] = 1
-    """Every n-th frame holds a picture, the others none; 0 for none at all (dry runs)."""
+    """Every n-th frame is rendered, the others are left as they are; 0: none (dry runs)."""
     render_once: bool = False
-    """Each frame memory gets a picture when it is first used, and shows it ever after: for tests of speed."""
+    """Each slot is rendered when it is first used, and keeps that picture: for tests of speed."""
     samples_per_side: Annotated[int, Field(ge=1, le=8)] = 1
-    """Rays through each pixel, k x k: for targets whose corners are measured to a fraction of a pixel."""
+    """Rays through each pixel, k x k: for targets whose corners are located to a fraction of a pixel."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2, k3 of the true lens (Brown and Conrady, OpenCV's order), which calibration must find."""
+    """k1, k2, p1, p2, k3 of the true lens (Brown-Conrady, OpenCV's order), to be found by calibration."""
     blur: bool = False
-    """Defocus and diffraction blur pictures; seconds a frame at full size."""
+    """Apply defocus and diffraction; takes seconds per full-size frame."""
     rim_radius: Annotated[float, Field(gt=0)] = 3.0
     rim_shift: Annotated[float, Field(ge=0)] = 4.0
-    """Mechanical vignetting, as `sim.optics.objective.Objective` has it."""
+    """Mechanical vignetting, as in `sim.optics.objective.Objective`."""
     lateral_colour: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Relative change of magnification of red, green and blue; with `blur` alone."""
+    """Relative change of magnification in red, green and blue; only with `blur`."""
     sensor: SensorModel = SensorModel()
-    """What the sensor is; Bayer pattern, bits and black level are the rig's."""
+    """The sensor's properties; Bayer pattern, bit depth and black level come from the rig."""
     sensor_temperature_c: float = 25.0
     clock_offset_ns: int = 7_777_000_000
     clock_ppm: float = -23.0
     timestamp_jitter_us: float = 2.0
     first_frame_id: Annotated[int, Field(ge=1, le=65535)] = 1
     id_modulus: Annotated[int, Field(ge=0)] = 65535
-    """Last frame id; after it comes 1 (GigE Vision 1)."""
+    """Last frame id, followed by 1 (GigE Vision 1)."""
     seed: int = 11
 
 
 @dataclass
 class Shot:
-    """A frame on its way from the sensor to the wire."""
+    """A frame between sensor and wire."""
 
     slot: int
-    """The wire's frame memory that it lies in."""
+    """Index of its frame memory in the wire."""
     frame_id: int
     timestamp_ns: int
     deliver_ns: int
@@ -94,10 +94,10 @@ class Shot:
 
 
 class Wire(Protocol):
-    """What carries frames to the host. Both are called on the reactor's thread, and may let the world wait."""
+    """Transport of frames to the host. Both calls run on the reactor's thread, and may pause the world."""
 
     def claim(self) -> int | None:
-        """A free slot of frame memory, or None if the host leaves none."""
+        """A free slot of frame memory, or None if the host has released none."""
         ...
 
     def pixels(self, slot: int) -> NDArray[np.uint16]:
@@ -105,26 +105,26 @@ class Wire(Protocol):
         ...
 
     def send(self, shot: Shot) -> bool:
-        """Send a frame; False if it cannot go now, and `CameraBody.deliver` must be called later."""
+        """Send a frame; False if that is not possible yet: `CameraBody.deliver` must then be called later."""
         ...
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What the world makes of a camera: the speed of its sensor, and what is before it."""
+    """What the world provides to a camera: sensor timing, light, pose, scene."""
 
     readout_us: float
     exposure_gap_us: float
     lighting: Lighting
     pose: Callable[[], Transform]
-    """`base_from_flange` of the arm that carries it, now."""
+    """Present `base_from_flange` of the arm that carries the camera."""
     render: Render
     arm: Callable[[], Capsules] = lambda: NONE
-    """What of the arm is in the way of light, now."""
+    """Parts of the arm that block light at present."""
 
 
 class CameraBody:
-    """One camera without its wire; `edge(t_ns)` is the trigger cable."""
+    """One camera without its wire; `edge(t_ns)` is the trigger input."""
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class CameraBody:
         self._pending: deque[Shot] = deque()
         self.armed = False
         self.hardware = False
-        """Edges make exposures; otherwise only `expose` does."""
+        """True: edges start exposures; False: only `expose` does."""
         self.exposure_ns = 8_000_000
         self.gain = 1.0
         self._session = 0
@@ -151,13 +151,13 @@ class CameraBody:
         self._frame_id = settings.first_frame_id
         self._number = self._edge_number = 0
         self.counters = dict.fromkeys(("exposed", "delivered", "lost_transfers", "over_triggers", "overflows"), 0)
-        """Since power-on."""
+        """Counted from power-on."""
         self.lose_frames: set[int] = set()
-        """Numbers of frames (counted from power-on) whose transfer gets lost."""
+        """Numbers of frames (counted from power-on) whose transfer is lost."""
         self.ignore_edges: set[int] = set()
-        """Numbers of edges (counted from power-on) that the camera does not see."""
+        """Numbers of edges (counted from power-on) that the camera does not detect."""
         self.pictured: set[int] = set()
-        """Slots that hold a picture already; the wire empties it with its memory."""
+        """Slots that hold a picture; the wire clears the set when it replaces its memory."""
 
     # -- triggers -----------------------------------------------------------------------------------------
 
@@ -168,15 +168,15 @@ class CameraBody:
             self.expose(t_ns)
 
     def ready(self) -> bool:
-        """The exposure-ready line: an edge now would make a frame."""
+        """The exposure-ready line: an edge now would start an exposure."""
         return self.armed and self._reactor.now_ns >= self._next_start_ns()
 
     def _next_start_ns(self) -> int:
-        """The next exposure must not end before the last frame is read out (facts/genicam)."""
+        """The next exposure must not end before the last frame is read out."""
         return max(self._ready_ns, self._readout_until_ns - self.exposure_ns)
 
     def expose(self, t_ns: int) -> None:
-        """Begin an exposure, whatever triggered it, unless the sensor is not ready yet."""
+        """Begin an exposure, unless the sensor is not ready yet."""
         if t_ns < self._next_start_ns():
             self.counters["over_triggers"] += 1
             return
@@ -230,8 +230,8 @@ class CameraBody:
         self._reactor.at(shot.deliver_ns, lambda: self._wait_for(working, session))
 
     def _wait_for(self, working: Future[None], session: int) -> None:
-        """World time stands still until a picture that is due is there: how fast this machine renders is no fault
-        of the camera."""
+        """Pause world time until a picture that is due is rendered, so that this machine's speed has no effect on
+        the simulated camera."""
         if session == self._session:
             wait([working], _RENDER_PATIENCE_S)
             self.deliver()
@@ -242,7 +242,7 @@ class CameraBody:
         self._reactor.call_threadsafe(self.deliver)
 
     def deliver(self) -> None:
-        """Give finished frames to the wire, in order, not before their readout has ended."""
+        """Pass finished frames to the wire, in order, not before their readout has ended."""
         while self._pending and self._pending[0].ready:
             shot = self._pending[0]
             if shot.deliver_ns > self._reactor.now_ns:
@@ -257,13 +257,13 @@ class CameraBody:
     # -- sessions -----------------------------------------------------------------------------------------
 
     def arm(self) -> None:
-        """Begin a session: edges or `expose` make frames from now on."""
+        """Begin a session: from now on edges or `expose` start exposures."""
         self.disarm()
         self._ready_ns = self._readout_until_ns = 0
         self.armed = True
 
     def disarm(self) -> None:
-        """End the session: what is under way is forgotten, and nothing renders any more."""
+        """End the session: pending frames are discarded, rendering has ended on return."""
         self.armed = False
         self._session += 1
         self._workers.submit(lambda: None).result()

@@ -1,7 +1,7 @@
-"""The simulated camera without a network: its frames lie in a ring of page-aligned slots, shared with the host.
+"""A simulated camera without a network: its frames are in a ring of page-aligned slots, shared with the host.
 
-Clients are told of frames over a Unix socket and hand the slots back. `memory_camera` is the driver at the
-other end; what the camera does with its edges is in `sim.devices.camera_body`.
+Clients are notified of frames over a Unix socket and return the slots. `memory_camera` is the driver at the other
+end; the sensor is in `sim.devices.camera_body`.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ _HOST_PATIENCE_S, _HOST_NAP_S = 30.0, 0.005
 
 
 class Settings(camera_body.Settings):
-    """Character of the simulated camera."""
+    """Properties of the simulated camera."""
 
     kind: Literal["memory"] = "memory"
     slots: Annotated[int, Field(ge=8)] = 48
 
 
 def _received(client: socket.socket, size: int) -> bytes:
-    """The next message, empty if the client is gone: killed with messages unread, it resets the connection."""
+    """The next message; empty if the client is gone. (Killed with unread messages, it resets the connection.)"""
     try:
         return client.recv(size)
     except ConnectionResetError:
@@ -48,7 +48,7 @@ def _received(client: socket.socket, size: int) -> bytes:
 
 
 class CameraServer:
-    """One camera with a trigger line; `edge(t_ns)` is the cable."""
+    """One camera with a trigger input, `edge(t_ns)`."""
 
     def __init__(
         self,
@@ -84,8 +84,8 @@ class CameraServer:
     # -- the wire (see sim.devices.camera_body.Wire) --------------------------------------------------------------
 
     def claim(self) -> int | None:
-        """A slot; without one the world stands still until the host hands one back: its load is no fault of the
-        camera."""
+        """A slot. If none is free the world pauses until the host returns one, so that the host's load has no
+        effect on the simulated camera."""
         patience_end = time.monotonic() + _HOST_PATIENCE_S
         while not self._free and self._stream is not None and time.monotonic() < patience_end:
             self._body.deliver()
@@ -158,7 +158,7 @@ class CameraServer:
         return {"slots": len(self._frames), "session": self._session % 65536, "memory": self._generation}
 
     def _do_memory(self) -> dict[str, Any]:
-        """Sends the ring's file descriptor ahead of the reply."""
+        """Send the ring's file descriptor before the reply."""
         assert self._control is not None
         socket.send_fds(self._control, [b"memory"], [self._memory_fd])
         return {}
@@ -170,7 +170,7 @@ class CameraServer:
         return {}
 
     def _do_statistics(self) -> dict[str, Any]:
-        """Since the camera was armed."""
+        """Counts since the camera was armed."""
         return {name: count - self._counted_before[name] for name, count in self._body.counters.items()}
 
     def _do_disarm(self) -> dict[str, Any]:
@@ -220,7 +220,7 @@ class CameraServer:
             self._stream = None
 
     def _drop_control(self) -> None:
-        """The client is gone: a camera without a client disarms itself."""
+        """The client is gone: disarm."""
         self._end_session()
         self._drop_stream()
         if self._control is not None:
@@ -229,7 +229,7 @@ class CameraServer:
             self._control = None
 
     def unplug(self) -> None:
-        """The cable is pulled: no client any more, and none can come."""
+        """Unplug the cable: the client is dropped, and no other can connect."""
         self._drop_control()
         self._reactor.remove_reader(self._listener)
         self._listener.close()

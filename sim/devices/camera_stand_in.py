@@ -1,4 +1,4 @@
-"""The camera's stand-in, whichever it is: what the world asks of it, and how a rig's choice is built."""
+"""The interface of the camera stand-ins to the world, and the choice of one by the rig."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim.world.reactor import Reactor
 
 
 def _kind(settings: Any) -> str:
-    """Which stand-in these settings are for; shared memory where they do not say."""
+    """Kind of stand-in that these settings are for; shared memory by default."""
     return str(settings.get("kind", "memory") if isinstance(settings, dict) else settings.kind)
 
 
@@ -25,11 +25,11 @@ CameraSettings = Annotated[
 
 
 class CameraStandIn(Protocol):
-    """All methods are called on the reactor's thread. GigE Vision's has one more, `lose_control`: see
+    """All methods are called on the reactor's thread. The GigE Vision stand-in also has `lose_control`: see
     `impossible`."""
 
     lose_frames: set[int]
-    """Numbers of frames (counted from power-on) whose transfer gets lost."""
+    """Numbers of frames (counted from power-on) whose transfer is lost."""
 
     @property
     def armed(self) -> bool: ...
@@ -43,14 +43,14 @@ class CameraStandIn(Protocol):
         ...
 
     def unplug(self) -> None:
-        """The cable is pulled."""
+        """Unplug the cable."""
         ...
 
     def close(self) -> None: ...
 
 
 def impossible(fault: faults.Fault, settings: CameraSettings) -> str:
-    """Why this stand-in cannot have the fault; empty if it can."""
+    """Why this stand-in cannot simulate the fault; empty if it can."""
     if isinstance(fault, faults.CameraControlLoss) and settings.kind != "gige":
         return f"`camera_control_loss` cannot happen to a camera of kind `{settings.kind}`: it has no such channel"
     return ""
@@ -64,7 +64,7 @@ def build(
     frame_format: dict[str, Any],
     surroundings: Surroundings,
 ) -> tuple[CameraStandIn, dict[str, Any]]:
-    """The stand-in, and what a client needs to know to reach it: under the names of our drivers' settings.
+    """The stand-in, and the driver settings with which a client reaches it.
 
     `frame_format` has the fields of `coupole.devices.FrameFormat`.
     """

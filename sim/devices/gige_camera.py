@@ -1,9 +1,9 @@
-"""The simulated GigE Vision camera: Aravis's fake camera on loopback, with our description, sensor and frames.
+"""The simulated GigE Vision camera: Aravis's fake camera on loopback, with Coupole's registers and sensor.
 
-Control and stream are real GVCP and GVSP packets, sent by a thread of libaravis. The fake knows no exposure, no
-overlap and no trigger line: those are `camera_body`'s, and the fake is only told "send one frame now", one
-at a time, since it merges what comes meanwhile. While it is busy, or the link is, the world stands still. What
-clients write to registers is seen by looking: at every edge, and every few milliseconds of world time.
+Control and stream are real GVCP and GVSP packets, sent by a thread of libaravis. The fake camera has no exposure
+timing, overlap or trigger input: those are in `camera_body`. The fake is only told to send single frames, one at a
+time, since it would merge several requests. While it or the link is busy, the world pauses. Registers written by
+clients are polled: at every edge, and every few milliseconds of world time.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from sim.world.reactor import Reactor
 
 _SLOTS = 6
 _POLL_HZ = 200.0
-"""How often the fake looks whether it shall send; it spins for 1 ms of each period."""
+"""Rate at which the fake checks whether to send; it busy-waits for 1 ms of each period."""
 _LOOK_S, _LOOK_FOR_TRIGGERS_S = 0.01, 0.001
 _PATIENCE_S, _NAP_S = 30.0, 0.001
 _PIXEL_FORMAT = {("GBRG", 12): 0x01100012, ("MONO", 12): 0x01100005, ("MONO", 8): 0x01080001}
 
 
 class Settings(camera_body.Settings):
-    """Character of the simulated camera."""
+    """Properties of the simulated camera."""
 
     kind: Literal["gige"] = "gige"
     address: str = "127.0.0.1"
-    """GigE Vision fixes the port (3956), so there is one camera for each address. Others than 127.0.0.1 must be
-    given to the loopback interface first (`ip address add 127.0.0.2/8 dev lo`)."""
+    """GigE Vision fixes the port (3956), so each address has one camera. An address other than 127.0.0.1 must
+    first be added to the loopback interface (`ip address add 127.0.0.2/8 dev lo`)."""
     serial: Annotated[str, Field(pattern=r"^[\w-]{1,15}$")] = "SIM-1"
     first_frame_id: Annotated[int, Field(ge=1, le=65535)] = 65_401
-    """Near the end, so that every longer run sees the ids wrap."""
+    """Near the last id, so that frame ids wrap in every longer run."""
     lost_packets: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of stream packets that get lost on the wire."""
+    """Fraction of stream packets that are lost on the wire."""
     link_mb_per_s: Annotated[float, Field(gt=0)] = 1_000.0
-    """What the wire carries, in machine time; the world waits for it."""
+    """Rate of the wire in machine time; the world pauses for it."""
     temperature_c: float = 41.5
 
 
 class GigeCamera:
-    """One camera with a trigger line; `edge(t_ns)` is the cable."""
+    """One camera with a trigger input, `edge(t_ns)`."""
 
     def __init__(
         self,
@@ -68,11 +68,11 @@ class GigeCamera:
         self._frames = [np.zeros(shape, np.uint16) for _ in range(_SLOTS)]
         self._free = deque(range(_SLOTS))
         self._handed: Shot | None = None
-        """The frame that the fake has been told to send and has not begun to."""
+        """The frame that the fake camera was told to send and has not begun to send."""
         self._handing = threading.Lock()
         self._taken = threading.Event()
         self._link_free_s = 0.0
-        """Machine time at which the wire will have carried the last frame."""
+        """Machine time at which the wire has carried the last frame."""
         self._session = self._triggers = self._payload_bytes = 0
         self._library = reg.load_library()
         self._fill = reg.FILL(self._on_fill)  # libaravis keeps no reference
@@ -133,7 +133,7 @@ class GigeCamera:
             registers.set_real(address, real)
 
     def unplug(self) -> None:
-        """The cable is pulled: the camera answers nobody any more."""
+        """Unplug the cable: the camera no longer answers."""
         self._body.disarm()
         if self._camera is not None:
             camera, self._camera = self._camera, None
@@ -146,12 +146,12 @@ class GigeCamera:
     # -- faults -------------------------------------------------------------------------------------------
 
     def lose_packets(self, ratio: float) -> None:
-        """From now on this share of stream packets gets lost on the wire."""
+        """From now on this fraction of stream packets is lost on the wire."""
         if self._camera is not None:
             reg.set_double_property(self._library, self._camera, "gvsp-lost-ratio", ratio)
 
     def lose_control(self) -> None:
-        """The camera forgets who controls it, as after a brown-out: it stops, and its client is out."""
+        """The camera drops its controlling client, as after a brown-out, and stops."""
         if self._camera is not None:
             self._registers.set_integer(reg.ACQUISITION, 0)
             self._registers.set_integer(reg.CONTROL_PRIVILEGE, 0)
@@ -166,7 +166,7 @@ class GigeCamera:
         self._show_counters()
 
     def ready(self) -> bool:
-        """The exposure-ready line: an edge now would make a frame."""
+        """The exposure-ready line: an edge now would start an exposure."""
         self._look()
         return self._body.ready()
 
@@ -182,7 +182,7 @@ class GigeCamera:
         self._reactor.after(_LOOK_FOR_TRIGGERS_S if by_software else _LOOK_S, self._look_again)
 
     def _look(self) -> None:
-        """Follow the client's registers."""
+        """Read the registers written by the client and act on them."""
         if self._camera is None:
             return
         registers = self._registers
@@ -218,7 +218,7 @@ class GigeCamera:
                 self._run_free(session)
 
     def _run_free(self, session: int) -> None:
-        """Without a trigger mode the camera exposes at its frame rate."""
+        """With trigger mode off, the camera exposes at its frame rate."""
         if self._camera is None or session != self._session:
             return
         self._body.expose(self._reactor.now_ns)
@@ -233,7 +233,7 @@ class GigeCamera:
     # -- the wire (see sim.devices.camera_body.Wire) --------------------------------------------------------------
 
     def claim(self) -> int | None:
-        """A slot; without one the world stands still until the fake has begun to send."""
+        """A slot. If none is free the world pauses until the fake has begun to send."""
         patience_end_s = time.monotonic() + _PATIENCE_S
         while not self._free and self._body.armed and time.monotonic() < patience_end_s:
             self._body.deliver()
@@ -244,7 +244,7 @@ class GigeCamera:
         return self._frames[slot]
 
     def send(self, shot: Shot) -> bool:
-        """Tell the fake to send, once it has begun with the last frame and the wire has carried that."""
+        """Tell the fake to send, once it has begun to send the last frame and the wire has carried that."""
         patience_end_s = time.monotonic() + _PATIENCE_S
         while self._handed is not None or time.monotonic() < self._link_free_s:
             self._look()
@@ -268,12 +268,12 @@ class GigeCamera:
         self._taken.wait(_NAP_S)
 
     def _on_fill(self, buffer: int, _data: int, _exposure_us: int, _gain: int, pixel_format: int) -> None:
-        """The fake wants the frame that it sends next; on its own thread."""
+        """Called by the fake camera, on its own thread, for the frame to send next."""
         with self._handing:
             shot, self._handed = self._handed, None
             if shot is None:
                 return
-            # A client that changes the image while it is being sent gets the old one's bytes, and no overflow.
+            # If a client changes the format during a transfer, the old frame is not encoded: no buffer overflow.
             if self._payload_bytes == self._registers.payload_bytes() and pixel_format in LAYOUTS:
                 address = self._library.arv_buffer_get_data(buffer, None)
                 out = np.ctypeslib.as_array((ctypes.c_uint8 * self._payload_bytes).from_address(address))

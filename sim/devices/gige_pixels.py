@@ -1,4 +1,4 @@
-"""How the simulated GigE Vision camera puts its 12-bit pixels on the wire (PFNC names and layouts)."""
+"""Encodes 12-bit pixels in the formats of the simulated GigE Vision camera (PFNC names and layouts)."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Layout:
-    """Bits per pixel that mean something, and how they lie in bytes."""
+    """Significant bits per pixel, and their packing in bytes."""
 
     depth: int
     packing: Literal["bytes", "p", "packed"]
-    """Whole little-endian bytes; PFNC `p`: one stream of bits, least first; GigE Vision 1 `Packed`."""
+    """Whole little-endian bytes; PFNC `p`: a bit stream, least significant first; GigE Vision 1 `Packed`."""
 
 
 LAYOUTS = {

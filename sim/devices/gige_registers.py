@@ -1,7 +1,7 @@
-"""Registers of the simulated GigE Vision camera, and the part of libaravis that holds them.
+"""Registers of the simulated GigE Vision camera, and the functions of libaravis that access them.
 
-Clients read and write the registers over the wire, on the fake camera's own thread; the stand-in looks at them
-and writes those that only it may write. No register is written by both: there is no lock across that wire.
+Clients read and write registers over the wire, on the fake camera's own thread; the stand-in polls those and
+writes its own. No register is written from both sides, since no lock spans the wire.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ CONTROL_PRIVILEGE = 0xA00
 WIDTH, HEIGHT, OFFSET_X, OFFSET_Y = 0x100, 0x104, 0x130, 0x134
 SENSOR_HEIGHT, SENSOR_WIDTH, PIXEL_FORMAT = 0x118, 0x11C, 0x128
 ACQUISITION = 0x124
-"""Number of the session that the client started; 0 while none runs."""
+"""Number of the session that the client started; 0 while none is active."""
 FAKE_TRIGGER_MODE, FAKE_TRIGGER_SOURCE, FAKE_TRIGGER = 0x300, 0x304, 0x30C
-"""The fake sends one frame when the third is 1, if mode and source are 1."""
+"""The fake sends one frame when the third register is 1, if mode and source are 1."""
 
-# Ours; 64-bit floats, then 32-bit integers. They stand in gige.xml under the same addresses.
+# Coupole's own: 64-bit floats, then 32-bit integers; gige.xml has the same addresses.
 TEMPERATURE_C, FRAME_RATE_HZ, FRAME_RATE_MAX_HZ, EXPOSURE_US = 0x2000, 0x2008, 0x2010, 0x2018
 READOUT_US, GAIN_DB, BLACK_LEVEL_DN = 0x2020, 0x2028, 0x2030
 NEXT_SESSION, TRIGGER_MODE, TRIGGER_SOURCE, TRIGGERS = 0x2040, 0x2048, 0x204C, 0x2054
@@ -60,7 +60,7 @@ _G_TYPE_DOUBLE = 15 << 2
 
 
 def load_library() -> Any:
-    """libaravis-0.8 with GObject behind it. Raises DeviceError where it is not installed."""
+    """libaravis-0.8, with the GObject functions. Raises DeviceError if it is not installed."""
     names = [ctypes.util.find_library("aravis-0.8"), "libaravis-0.8.so.0"]
     wheel = importlib.util.find_spec("aravis")
     if wheel is not None and wheel.origin is not None:
@@ -76,7 +76,7 @@ def load_library() -> Any:
         return library
     raise DeviceError(
         "world",
-        expected="libaravis-0.8, whose GigE Vision camera the simulated one is",
+        expected="libaravis-0.8, whose fake GigE Vision camera the simulation uses",
         happened="it is not installed",
         remedy="Install it (Debian: apt install libaravis-0.8-0; else pip install aravis-python), or use the rig "
         "with the camera in shared memory.",
@@ -84,7 +84,7 @@ def load_library() -> Any:
 
 
 class Registers:
-    """Memory of one fake camera, big-endian as on the wire."""
+    """Register memory of one fake camera, big-endian as on the wire."""
 
     def __init__(self, library: Any, fake: int) -> None:
         self._library, self._fake = library, fake
@@ -106,7 +106,7 @@ class Registers:
         return number
 
     def payload_bytes(self) -> int:
-        """Size of an image as width, height and pixel format are now."""
+        """Size of an image with the present width, height and pixel format."""
         size: int = self._library.arv_fake_camera_get_payload(self._fake)
         return size
 
@@ -121,7 +121,7 @@ class Registers:
 
 
 def set_double_property(library: Any, instance: int, name: str, number: float) -> None:
-    """`g_object_set_property` for a double: a GValue is 24 bytes that begin as zeros."""
+    """`g_object_set_property` for a double. A GValue is 24 bytes, initially zero."""
     value = ctypes.create_string_buffer(24)
     library.g_value_init(value, _G_TYPE_DOUBLE)
     library.g_value_set_double(value, number)

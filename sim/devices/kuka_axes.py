@@ -1,8 +1,8 @@
-"""The stand-in's axes: what is commanded, what pushes them aside, how they swing after a stop, and their brakes.
+"""The axes of the KUKA stand-in: commanded angles, displacement, vibration after a stop, brakes.
 
-The commanded axes go wherever corrections lead, unless the controller would stop there: limits of the axes, of
-their speed, acceleration and jerk, and workspaces. What is measured is the commanded axes with what something
-pushed them aside by, and with the vibration after a stop.
+The commanded axes follow the corrections, unless the real controller would stop: limits of axis angle, speed,
+acceleration and jerk, and workspaces. The measured axes are the commanded ones plus the displacement by a push,
+plus the vibration after a stop.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from sim.devices.kuka_settings import Box, Settings, Sphere, Workspace
 
 _NOWHERE: tuple[float, ...] = (0.0,) * 6
 _TOLERANCE_DEG = 2e-6
-"""Corrections come with six decimals."""
+"""Corrections have six decimals."""
 _STILL_DEG = 1e-5
-"""Less is no vibration: packets tell four decimals."""
+"""Vibration below this counts as none: packets have four decimals."""
 
 Axes6 = tuple[float, ...]
 
 
 class Axes:
-    """See the module. One call of `follow`, `brake` or `stay` for each cycle; times are the world's."""
+    """See the module. Call `follow`, `brake` or `stay` once per cycle; times are world time."""
 
     def __init__(self, settings: Settings, now_ns: int) -> None:
         self.commanded_deg: Axes6 = settings.start_joints_deg
@@ -37,12 +37,12 @@ class Axes:
         self._settings = settings
         self._pushed_deg: Axes6 = _NOWHERE
         self._step_deg: Axes6 = _NOWHERE
-        """What the axes moved in the last cycle, and below it, what they changed that by."""
+        """Step of the axes in the last cycle; below, the change of that step."""
         self._change_deg: Axes6 = _NOWHERE
         self._stood_ns: int | None = now_ns
-        """Since when the commanded axes stand, or the last push; None while they move."""
+        """World time at which the commanded axes came to rest or were last pushed; None while they move."""
         self._swing_deg: Axes6 = _NOWHERE
-        """Amplitudes at `_stood_ns`."""
+        """Amplitudes of the vibration at `_stood_ns`."""
         swings = settings.vibration_deg > _STILL_DEG
         self._swings_s = (
             settings.vibration_decay_s * math.log(settings.vibration_deg / _STILL_DEG) if swings else 0.0
@@ -50,21 +50,21 @@ class Axes:
         self._speed_limit_deg = [v * settings.cycle_ms / 1e3 + _TOLERANCE_DEG for v in AXIS_SPEEDS_DEG_S]
 
     def measured_deg(self, now_ns: int) -> Axes6:
-        """The axes as the controller measures and reports them."""
+        """The axes as measured and reported by the controller."""
         if self._pushed_deg is _NOWHERE and not self._swinging(now_ns):
             return self.commanded_deg
         away_deg = map(float.__add__, self._pushed_deg, self._swung_deg(now_ns))
         return tuple(map(float.__add__, self.commanded_deg, away_deg))
 
     def settled_since_ns(self, now_ns: int) -> int | None:
-        """World time since when the arm stands still; None while it moves or swings."""
+        """World time since which the arm is still; None while it moves or vibrates."""
         if self._stood_ns is None or self._swinging(now_ns):
             return None
         swings_s = self._swings_s if any(self._swing_deg) else 0.0
         return self._stood_ns + round(swings_s * 1e9)
 
     def follow(self, target_deg: Axes6, now_ns: int) -> str:
-        """Go there in this cycle; where the controller would stop instead, nothing moves and the text says why."""
+        """Move to the target in this cycle. If the controller would stop, nothing moves: returns the reason."""
         wanted_deg = tuple(map(float.__sub__, target_deg, self.commanded_deg))
         step_deg, fault = self._within_dynamics(wanted_deg)
         if step_deg != wanted_deg:
@@ -80,7 +80,7 @@ class Axes:
         self._go(self.commanded_deg, _NOWHERE, now_ns)
 
     def brake(self, now_ns: int) -> bool:
-        """One cycle of the controller's own stop; True when the axes stand, and then the brakes are closed."""
+        """One cycle of the controller's own stop; True once the axes are at rest and the brakes closed."""
         change_deg = self._settings.brake_deg_s2 * (self._settings.cycle_ms / 1e3) ** 2
         step_deg = tuple(math.copysign(max(0.0, abs(s) - change_deg), s) for s in self._step_deg)
         self._go(tuple(map(float.__add__, self.commanded_deg, step_deg)), step_deg, now_ns)
@@ -88,13 +88,13 @@ class Axes:
         return self.brakes_closed
 
     def release(self) -> None:
-        """Open the brakes: the axes hold, and are commanded, where they stand, however they came there."""
+        """Open the brakes; the present axes, with any displacement, become the commanded ones."""
         self.commanded_deg = tuple(map(float.__add__, self.commanded_deg, self._pushed_deg))
         self._pushed_deg = self._step_deg = self._change_deg = _NOWHERE
         self.brakes_closed = False
 
     def push(self, by_deg: Sequence[float], now_ns: int) -> None:
-        """Push the arm aside, off the commanded axes."""
+        """Displace the arm from the commanded axes."""
         self._pushed_deg = tuple(a + b for a, b in zip(self._pushed_deg, by_deg, strict=True))
         if self._stood_ns is not None:
             self._stood_ns, self._swing_deg = now_ns, _NOWHERE
@@ -113,7 +113,7 @@ class Axes:
         self._step_deg = step_deg
 
     def _within_dynamics(self, step_deg: Axes6) -> tuple[Axes6, str]:
-        """The step as far as acceleration and jerk allow it, or a fault."""
+        """The step limited by acceleration and jerk, or a fault."""
         settings, cycle_s = self._settings, self._settings.cycle_ms / 1e3
         for name, limit, order in (
             ("acceleration", settings.acceleration_limit_deg_s2, 2),
@@ -121,7 +121,7 @@ class Axes:
         ):
             if limit is None:
                 continue
-            # What the axis does of itself, without any acceleration or jerk, and how far it may be from that.
+            # Step without acceleration (or without jerk), and the largest allowed deviation from it.
             before = self._step_deg
             if order == 3:
                 before = tuple(map(float.__add__, before, self._change_deg))

@@ -1,11 +1,12 @@
-"""The stand-in for a KUKA controller that runs an RSI program: UDP packets out, corrections in.
+"""The stand-in for a KUKA controller with an RSI program: sends UDP packets, receives corrections.
 
-Every cycle of world time it applies the client's last answer and sends where the axes are. It stops for what
-the real one stops for: limits of axes and corrections, too fast corrections, poses that cannot be followed,
-workspaces, late answers, a silent client, an emergency stop. Then the brakes close, and the arm stays where it
-is until the RSI program is started again.
-In lock-step the world waits for an outstanding answer, so a client on a busy machine is never late; lateness
-is then something that the world's script asks for (`late`).
+In every cycle of world time it applies the client's last answer and sends the axes. It stops as the real one does
+on: limits of axes and corrections, corrections that are too fast, poses without solution, workspaces, late
+answers, a silent client, an emergency stop. Then the brakes close, and the arm stays where it is until the RSI
+program is restarted.
+
+In lock-step the world waits for each answer, so a client on a busy machine is never late; late answers are then
+produced only by the fault script (`late`).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from sim.world.reactor import Reactor, Timer
 __all__ = ["ALIKE", "KukaController", "Settings"]
 
 ALIKE = ("cycle_ms", "corrects", "mode", "sen_type", "measured_tag", "correction_tag")
-"""Settings that must be the same at both ends of the wire; the driver's have these names, too."""
+"""Settings that must be equal at both ends of the wire; the driver's settings have the same names."""
 _FIRST_IPOC = 4208163634
 _SEND_AGAIN_S = 0.05
 """Lock-step: an unanswered packet is sent again after this machine time."""
@@ -61,7 +62,7 @@ class KukaController:
         self._springs_back: list[Timer] = []
         self._ipoc_step = settings.ipoc_step or settings.cycle_ms
         self._ipoc = self._ended_ipoc = _FIRST_IPOC
-        """IPOC of the last packet, and of the last packet of the RSI program's last run."""
+        """IPOC of the last packet, and of the last packet of the RSI program's previous run."""
         self._delay = self._late_cycles = 0
         self._changes_ns = 0
         self._after_braking = _Does.WAIT
@@ -70,18 +71,18 @@ class KukaController:
         """Machine time of the last packet."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         host, port = settings.sends_to.rsplit(":", 1)
-        self._socket.connect((host, int(port)))  # connected, so that a closed port there is told at once
+        self._socket.connect((host, int(port)))  # connected, so that a closed port is reported at once
         self._socket.setblocking(False)
         self._timer = reactor.after(0.0, self._cycle)
 
     @property
     def joints_deg(self) -> tuple[float, ...]:
-        """The axes now, as the controller measures and reports them."""
+        """The present axes, as measured and reported by the controller."""
         return self._axes.measured_deg(self._reactor.now_ns)
 
     @property
     def settled_since_ns(self) -> int | None:
-        """World time since when the arm stands still; None while it moves or vibrates."""
+        """World time since which the arm is still; None while it moves or vibrates."""
         return self._axes.settled_since_ns(self._reactor.now_ns)
 
     @property
@@ -90,7 +91,7 @@ class KukaController:
 
     @property
     def brakes_closed(self) -> bool:
-        """True from the end of a stop of the controller's own until its RSI program starts again."""
+        """True from the end of a stop by the controller until its RSI program is restarted."""
         return self._axes.brakes_closed
 
     @property
@@ -99,31 +100,30 @@ class KukaController:
         return self._delay
 
     def true_base_from_flange(self) -> Transform:
-        """Where the flange truly is: what the controller believes, with the arm's fixed error and the last
-        stop's own."""
+        """True pose of the flange: the controller's, with the arm's constant error and that of the last stop."""
         return self.errors.true_flange_pose(self.joints_deg, self._axes.stops)
 
     def estop(self) -> None:
-        """Emergency stop: the axes brake, packets go on for a while, then RSI ends until `reset`."""
+        """Emergency stop: the axes brake, packets continue for a while, then RSI ends until `reset`."""
         self._stop_axes("emergency stop", _Does.REST, self._settings.packets_after_estop_s)
 
     def reset(self) -> None:
-        """Acknowledge all faults and start the RSI program again, from the axes where they stand."""
+        """Acknowledge all faults and restart the RSI program, from the present axes."""
         self.fault = ""
         self._does, self._changes_ns, self._ended_ipoc = _Does.WAIT, 0, self._ipoc
         self._release_axes()
         self._delay = self._late_cycles = 0
 
     def late(self, cycles: int) -> None:
-        """Take the next answers, one a cycle, for late ones."""
+        """Treat the next answers, one per cycle, as late."""
         self._late_cycles += cycles
 
     def lose_link(self, seconds: float) -> None:
-        """No packet leaves for `seconds`; the axes brake, and then the RSI program starts again."""
+        """Send no packet for `seconds`; the axes brake, then the RSI program is restarted."""
         self._stop_axes("link lost", _Does.WAIT, seconds)
 
     def nudge(self, joints_deg: Sequence[float], seconds: float | None = None) -> None:
-        """Push the arm off the commanded axes by six angles; after `seconds` it springs back, if given."""
+        """Displace the arm by six angles; after `seconds`, if given, it springs back."""
         self._axes.push(joints_deg, self._reactor.now_ns)
         if seconds is not None:
             back_deg = [-angle for angle in joints_deg]
@@ -135,7 +135,7 @@ class KukaController:
         self._socket.close()
 
     def _cycle(self) -> None:
-        """What happens once per interpolation cycle."""
+        """One interpolation cycle."""
         self._ipoc += self._ipoc_step
         if self._does is _Does.FOLLOW:
             self._follow()
@@ -150,7 +150,7 @@ class KukaController:
         self._timer = self._reactor.at(self._reactor.now_ns + self._cycle_ns, self._cycle)
 
     def _sends(self) -> bool:
-        """Whether packets leave: after a lost link only from `_changes_ns` on, after an E-stop until then."""
+        """True if packets are sent: after a lost link only from `_changes_ns` on, after an E-stop until then."""
         ending = self._does is _Does.REST or (self._does is _Does.BRAKE and self._after_braking is _Does.REST)
         return ending == (self._reactor.now_ns < self._changes_ns)
 
@@ -173,7 +173,7 @@ class KukaController:
             self._stop_axes(fault, _Does.REST, 0.0)
 
     def _take_answer(self) -> tuple[float, ...] | None:
-        """The corrections that answer the last packet; None if they are late or the client left."""
+        """The corrections that answer the last packet; None if they are late or the client has left."""
         awaited = self._ipoc - self._ipoc_step
         while True:
             try:
@@ -183,7 +183,7 @@ class KukaController:
                 if self._reactor.hold_for(self._socket, min(patience_s, _SEND_AGAIN_S)):
                     continue
                 if patience_s > _SEND_AGAIN_S:
-                    self._send_packet()  # a client that left with the packet unread is found out by the next
+                    self._send_packet()  # if the client left with the packet unread, this send reports it
                     continue
                 if self._settings.lock_step:
                     self._stop_axes("link lost: no answer", _Does.WAIT, self._settings.restart_s)
@@ -196,17 +196,17 @@ class KukaController:
                 return answer.values
 
     def _patience_s(self) -> float:
-        """Machine time that an answer may still take. In real time that is one cycle from its packet on, also
-        where the world itself is late and works cycles off in a row."""
+        """Machine time left for an answer. In real time it is one cycle from its packet on, also when the world is
+        late and runs several cycles in a row."""
         settings = self._settings
         cycle_s = settings.cycle_ms / 1e3 / self._reactor.clock.speed
         allowed_s = settings.answer_limit_s if settings.lock_step else cycle_s
         return max(0.0, self._sent_s + allowed_s - time.monotonic())
 
     def _look_for_client(self) -> None:
-        """Any answer to a packet of this run of the RSI program begins a session."""
+        """Any answer to a packet of the present RSI program run begins a session."""
         if self._axes.brakes_closed:
-            self._release_axes()  # the program has been started again
+            self._release_axes()  # the program was restarted
         try:
             answer = self._read_answer(self._socket.recv(4096))
             while answer is not None and answer.ipoc <= self._ended_ipoc:
@@ -220,14 +220,14 @@ class KukaController:
             self._corrections.begin(self._axes.commanded_deg)
 
     def _release_axes(self) -> None:
-        """Brakes open, and the axes are commanded where they are, pushed or not."""
+        """Open the brakes; the present axes, displaced or not, become the commanded ones."""
         for spring in self._springs_back:
             spring.cancel()
         self._springs_back.clear()
         self._axes.release()
 
     def _stop_axes(self, fault: str, then: _Does, seconds: float) -> None:
-        """End the session: brake, and let packets end (REST) or begin again (WAIT) `seconds` from now."""
+        """End the session: brake, then stop sending (REST) or resume sending (WAIT) `seconds` from now."""
         self.fault = self.fault or fault
         self._does, self._after_braking = _Does.BRAKE, then
         self._changes_ns = self._reactor.now_ns + round(seconds * 1e9)
@@ -243,4 +243,4 @@ class KukaController:
         try:
             self._socket.send(self._packet)
         except (ConnectionRefusedError, BlockingIOError):
-            return  # nobody there: the missing answer tells
+            return  # no client: the missing answer is detected

@@ -1,8 +1,8 @@
-"""What the stand-in makes of corrections: axes to go to, as the objects of an RSI context would.
+"""Corrections in the KUKA stand-in: computes the target axes, as the objects of an RSI context do.
 
-A correction of the pose adds its translation in base coordinates and turns the flange about the base's axes:
+A correction of the pose adds its translation in base coordinates and rotates the flange about the base's axes:
 rotation = Rz(A) Ry(B) Rx(C) * rotation before (POSCORR with RefCorrSys = BASE). Absolute corrections count from
-where the session began, relative ones from the sum of those before.
+the start of the session, relative ones are summed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _NOTHING: Axes6 = (0.0,) * 6
 
 
 class Corrections:
-    """The sum of one session's corrections, and the axes that it leads to."""
+    """Sum of one session's corrections, and the resulting axes."""
 
     def __init__(self, settings: Settings) -> None:
         self._relative = settings.mode == "relative"
@@ -35,13 +35,13 @@ class Corrections:
         self._last = _NOTHING
 
     def begin(self, axes_deg: Axes6) -> None:
-        """RSI starts with the axes here."""
+        """RSI starts with the axes at `axes_deg`."""
         self._sum = self._makes_sum(axes_deg, self._limits)
         self._last = _NOTHING
 
     def take(self, values: Axes6 | None) -> tuple[Axes6, str]:
-        """The axes to go to after one cycle's correction, None where none came in time (HOLDON); and why RSI stops
-        instead, if it does."""
+        """Target axes after one cycle's correction, and the reason if RSI stops instead. `values` is None if none
+        came in time (HOLDON)."""
         if values is None:
             values = self._last if self._holds else _NOTHING
         self._last = values

@@ -1,8 +1,8 @@
-"""The stand-in for a KUKA controller that runs the EthernetKRL programs of `configs/kuka/eki`: XML over TCP.
+"""The stand-in for a KUKA controller with the EthernetKRL programs of `configs/kuka/eki`: XML over TCP.
 
-Like them it has two parts: one takes commands and sends statuses at a steady rate, also while the robot
-program stands in a fault; the other runs point-to-point motions, braking for whatever comes in between.
-Nothing is simulated in steps: where the axes are follows from world time, so any world speed will do.
+Like them it has two parts: one takes commands and sends statuses at a steady rate, also while the robot program is
+in a fault; the other runs point-to-point motions, and brakes when a new command comes. The axes are computed from
+world time, not in steps, so they are exact at any world speed.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _STOP, _MOVE, _ASK = range(3)
 _NO_FAULT, _EMERGENCY_STOP, _TARGET_REFUSED = 0, 1, 5
 _TRY_AGAIN_S = 0.1
 _UNSENT_BYTES = 4096
-"""Room for statuses that the client has no room for: the world waits rather than run ahead of its client."""
+"""Send buffer. When it is full, the world pauses, so that it does not run ahead of its client."""
 _HARD = 100.0
-"""An emergency stop does not care for jerk: this many times more of it."""
+"""Factor on the jerk in an emergency stop, which is practically not jerk-limited."""
 
 
 class Settings(BaseModel):
@@ -40,15 +40,15 @@ class Settings(BaseModel):
 
     kind: Literal["eki"] = "eki"
     address: str = Field(default="127.0.0.1:0", pattern=r"^[^:]+:\d+$")
-    """host:port to listen at, or to connect to; port 0 for one that is free, see `KukaEkiController.address`."""
+    """host:port to listen at, or to connect to; port 0: any free port, see `KukaEkiController.address`."""
     controller_is: Literal["server", "client"] = "server"
     status_ms: int = Field(default=20, ge=4)
     ping_s: float = Field(default=0.2, gt=0)
-    """World time after which the controller knows that its link is dead, and brakes."""
+    """World time after which the controller detects a dead link, and brakes."""
     write_limit_s: float = Field(default=2.0, gt=0)
-    """Machine time that the world waits for a client that does not read its statuses."""
+    """Longest pause of the world, in machine time, for a client that does not read its statuses."""
     full_acceleration_deg_s2: float = Field(default=600.0, gt=0)
-    """What 100 % gives."""
+    """Acceleration at 100 %."""
     jerk_deg_s3: float = Field(default=3000.0, gt=0)
     start_joints_deg: Six = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
     brake_deg_s2: float = Field(default=1000.0, gt=0)
@@ -57,10 +57,10 @@ class Settings(BaseModel):
     seed: int = 0
     repeatability_um: float = Field(default=10.0, ge=0)
     repeatability_deg: float = Field(default=0.001, ge=0)
-    """Standard deviation in each coordinate of what differs from stop to stop."""
+    """Standard deviation, per coordinate, of the error that varies from stop to stop."""
     absolute_mm: float = Field(default=0.0, ge=0)
     absolute_deg: float = Field(default=0.0, ge=0)
-    """Standard deviation, over arms, of what stays the same: see `PoseErrors`."""
+    """Standard deviation, over arms, of the constant error: see `PoseErrors`."""
 
 
 class KukaEkiController:
@@ -70,7 +70,7 @@ class KukaEkiController:
         self.fault = ""
         """Why the robot program does not run; empty while it does."""
         self.settled_since_ns: int | None = reactor.now_ns
-        """World time since when the axes stand; None while they move."""
+        """World time since which the axes are at rest; None while they move."""
         self.errors = PoseErrors(
             seed=settings.seed,
             repeatability_um=settings.repeatability_um,
@@ -88,11 +88,11 @@ class KukaEkiController:
         self._session = self._taken = self._done = self._order = 0
         self._refused = False
         self._target: tuple[tuple[float, ...], float] | None = None
-        """Axes and speed (share of the highest) of the motion to begin once the axes stand."""
+        """Axes and speed (fraction of the highest) of the motion to begin once the axes are at rest."""
         self._client: socket.socket | None = None
         self._parser = _new_parser()
         self._cut = False
-        """Nothing passes, by `lose_link`."""
+        """True while `lose_link` blocks all communication."""
         self._healing: Timer | None = None
         self._listener: socket.socket | None = None
         self.address = _with_free_port(settings.address)
@@ -106,7 +106,7 @@ class KukaEkiController:
 
     @property
     def joints_deg(self) -> tuple[float, ...]:
-        """The axes now, as the controller measures and reports them."""
+        """The present axes, as measured and reported by the controller."""
         path_deg = self._motion.joints_deg((self._reactor.now_ns - self._begun_ns) / 1e9)
         return tuple(map(float.__add__, path_deg, self._pushes.deg))
 
@@ -115,22 +115,21 @@ class KukaEkiController:
         return self.settled_since_ns is None
 
     def true_base_from_flange(self) -> Transform:
-        """Where the flange truly is: what the controller believes, with the arm's fixed error and the last
-        stop's own."""
+        """True pose of the flange: the controller's, with the arm's constant error and that of the last stop."""
         return self.errors.true_flange_pose(self.joints_deg, self._stops)
 
     def estop(self) -> None:
-        """Emergency stop: the axes brake hard, the robot program ends until `reset`; statuses go on."""
+        """Emergency stop: the axes brake hard, the robot program ends until `reset`; statuses continue."""
         self.fault = "emergency stop"
         self._target = None
         self._brake(self._settings.brake_deg_s2, _HARD * self._settings.jerk_deg_s3)
 
     def reset(self) -> None:
-        """Acknowledge all faults and start the robot program again, from the axes where they stand."""
+        """Acknowledge all faults and restart the robot program, from the present axes."""
         self.fault = ""
 
     def lose_link(self, seconds: float) -> None:
-        """Nothing passes for `seconds`; the axes brake, and then the controller is ready for a connection."""
+        """Block all communication for `seconds`; the axes brake, then the controller accepts a connection."""
         self._unlisten()
         self._reactor.after(self._settings.ping_s, self._abandon)
         if self._healing is not None:
@@ -138,7 +137,7 @@ class KukaEkiController:
         self._healing = self._reactor.after(seconds, self._heal)
 
     def nudge(self, joints_deg: Sequence[float], seconds: float | None = None) -> None:
-        """Push the arm off the commanded axes by six angles; after `seconds` it springs back, if given."""
+        """Displace the arm by six angles; after `seconds`, if given, it springs back."""
         self._pushes.push(joints_deg, seconds)
         self._stops += not self.moving
 
@@ -152,14 +151,14 @@ class KukaEkiController:
     # -- the submit interpreter: commands in, statuses out ------------------------------------------------
 
     def _open(self) -> None:
-        """Be ready for a connection, or go for one."""
+        """Listen for a connection, or try to connect."""
         if self._listener is not None:
             self._reactor.add_reader(self._listener, self._accept)
         else:
             self._reactor.after(_TRY_AGAIN_S, self._connect)
 
     def _unlisten(self) -> None:
-        """Hear nothing more, neither of the client nor of one that would be."""
+        """Read nothing more, neither from the client nor from new ones."""
         for port in (self._listener, self._client):
             if port is not None and not self._cut:
                 self._reactor.remove_reader(port)
@@ -169,7 +168,7 @@ class KukaEkiController:
         assert self._listener is not None
         client, _ = self._listener.accept()
         if self._client is not None:
-            self._receive()  # it may have left already
+            self._receive()  # detects a client that has already left
         if self._client is not None:
             client.close()  # EKI serves one client
         else:
@@ -212,7 +211,7 @@ class KukaEkiController:
             self._drop()
 
     def _drop(self) -> None:
-        """The client has left, or speaks another language."""
+        """The client has left, or sends something else than commands."""
         self._hang_up()
         self._abandon()
         if self._listener is None:
@@ -226,7 +225,7 @@ class KukaEkiController:
             self._client = None
 
     def _abandon(self) -> None:
-        """The program knows that nobody commands it any more."""
+        """The link is lost: cancel the target and brake."""
         self._target = None
         self._brake(self._acceleration_deg_s2, self._settings.jerk_deg_s3)
 
@@ -240,7 +239,7 @@ class KukaEkiController:
         session, number, verb = (int(values[f"Command/{name}"]) for name in ("Session", "Number", "Verb"))
         if session != self._session:
             self._session, self._done, self._refused = session, 0, False
-            if not self.moving:  # from now on the arm belongs where it stands
+            if not self.moving:  # the present axes become the target of the new session
                 self._motion = standing(self.joints_deg)
                 self._pushes.forget()
         self._taken = number
@@ -271,7 +270,7 @@ class KukaEkiController:
                     raise TimeoutError
                 status = status[self._client.send(status) :]
         except OSError:
-            return  # the client is gone: reading tells
+            return  # the client is gone; `_receive` detects it
 
     def _status(self) -> bytes:
         axes = " ".join(f'A{axis}="{angle:.4f}"' for axis, angle in enumerate(self.joints_deg, start=1))
@@ -290,7 +289,7 @@ class KukaEkiController:
     # -- the robot interpreter: motions -------------------------------------------------------------------
 
     def _brake(self, acceleration_deg_s2: float, jerk_deg_s3: float) -> None:
-        """Come to rest along the way; then what is asked next begins."""
+        """Brake along the path; then the pending motion begins."""
         t_s = (self._reactor.now_ns - self._begun_ns) / 1e9
         self._begin(braked(self._motion, t_s, acceleration_deg_s2, jerk_deg_s3))
 
@@ -305,7 +304,7 @@ class KukaEkiController:
             self._stand()
 
     def _stand(self) -> None:
-        """The axes are at rest."""
+        """The axes have come to rest."""
         self._end = None
         self._motion = standing(self._motion.joints_deg(self._motion.duration_s))
         if self.settled_since_ns is None:
@@ -336,7 +335,7 @@ def _within_limits(joints_deg: Sequence[float]) -> bool:
 
 
 def _with_free_port(address: str) -> str:
-    """The address, with a port that is free in place of port 0."""
+    """The address, with port 0 replaced by a free port."""
     host, port = address.rsplit(":", 1)
     if port != "0":
         return address

@@ -1,6 +1,6 @@
-"""The stand-in's own arm: a chain of joints, as in KUKA's drawing of the KR10 R1100 sixx.
+"""The stand-in's arm model: a joint chain from KUKA's drawing of the KR10 R1100 sixx.
 
-Written apart from `coupole.kinematics` on purpose, so that each checks the other. Millimetres and degrees.
+Written independently of `coupole.kinematics`, so that each checks the other. Millimetres and degrees.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _CHAIN = (
     ((515.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
     ((80.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
 )
-"""Of each joint: its origin in the frame of the link before it, and the axis it turns about."""
+"""For each joint: its origin in the frame of the previous link, and its axis of rotation."""
 AXIS_LIMITS_DEG = (
     (-170.0, 170.0),
     (-190.0, 45.0),
@@ -64,11 +64,11 @@ def joints_near(base_from_flange: Transform, joints_deg: Sequence[float]) -> tup
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """How far the true flange is from where the controller believes it; the same for one seed.
+    """Difference between the true flange pose and the controller's; reproducible by seed.
 
-    Standard deviations of each coordinate. An arm's absolute errors are drawn once: the flange's position in
-    the base's coordinates, and the zero of each axis, which makes an error that varies over the cell. Those
-    of repeatability are drawn for each stop: position, and a rotation vector in the flange's coordinates.
+    Standard deviations per coordinate. An arm's absolute errors are drawn once: the flange's position in base
+    coordinates, and the zero of each axis, which gives an error that varies over the cell. Those of
+    repeatability are drawn for each stop: position, and a rotation vector in the flange's coordinates.
     """
 
     seed: int
@@ -86,7 +86,7 @@ class PoseErrors:
         return np.random.default_rng((self.seed, 1)).normal(0.0, 1.0, 6) * self.absolute_deg
 
     def true_flange_pose(self, joints_deg: Sequence[float], stop: int) -> Transform:
-        """`base_from_flange` as it truly is at the reported angles, in the arm's stop number `stop`."""
+        """True `base_from_flange` at the reported angles, in the arm's stop number `stop`."""
         base_from_flange = flange_pose((np.array(joints_deg) + self.axis_zero_error_deg()).tolist())
         random = np.random.default_rng((self.seed, 2, stop))
         stop_error_mm = random.normal(0.0, 1.0, 3) * self.repeatability_um / 1e3

@@ -1,4 +1,4 @@
-"""RSI's packets as the stand-in writes them, and answers as it reads them; apart from the drivers' on purpose."""
+"""RSI packets and answers on the stand-in's side, written independently of the drivers."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _POSE_XML = b'<RIst X="%.4f" Y="%.4f" Z="%.4f" A="%.4f" B="%.4f" C="%.4f"/>'
 class Answer(NamedTuple):
     ipoc: int
     values: tuple[float, ...]
-    """Six corrections, degrees or millimetres; one that is missing is none."""
+    """Six corrections, degrees or millimetres; a missing one is 0."""
 
 
 def answer_reader(settings: Settings) -> Callable[[bytes], Answer | None]:
-    """A function that reads an answer; None for what is none, or is of another SENTYPE."""
+    """A parser of answers; it returns None for anything else, or for another SENTYPE."""
     tag = re.escape(settings.correction_tag or TAGS[settings.corrects]).encode()
     names = [name.encode() for name in VALUE_NAMES[settings.corrects]]
     begins = re.compile(rb'<Sen\b[^>]*\bType="%s"' % re.escape(settings.sen_type).encode())
@@ -49,7 +49,7 @@ def answer_reader(settings: Settings) -> Callable[[bytes], Answer | None]:
 
 
 class PacketWriter:
-    """Makes packets; the part that tells the axes is made anew only when they have moved."""
+    """Forms packets; the part with the axes is formatted again only when they have moved."""
 
     def __init__(self, settings: Settings) -> None:
         axes = " ".join(f'A{axis}="%.4f"' for axis in range(1, 7))

@@ -23,11 +23,11 @@ class Box(_Model):
     min_mm: Three
     max_mm: Three
     stops: Literal["inside", "outside"]
-    """Where the flange must not be."""
+    """The region that the flange must not enter."""
 
 
 class Sphere(_Model):
-    """A workspace that is round."""
+    """A spherical workspace."""
 
     kind: Literal["sphere"] = "sphere"
     centre_mm: Three
@@ -39,16 +39,16 @@ Workspace = Annotated[Box | Sphere, Field(discriminator="kind")]
 
 
 class Limits(_Model):
-    """Objects of the RSI context that bound corrections, counted from where RSI was started. AXISCORR and POSCORR
-    clamp without a word, the monitors stop RSI. The defaults are those of `configs/kuka/rsi/context.md`."""
+    """Objects of the RSI context that limit corrections, counted from where RSI was started. AXISCORR and POSCORR
+    clamp without a message, the monitors stop RSI. The defaults are those of `configs/kuka/rsi/context.md`."""
 
     axis_clamp_deg: Six = (341.0, 236.0, 277.0, 371.0, 241.0, 701.0)
     axis_monitor_deg: Six = (340.0, 235.0, 276.0, 370.0, 240.0, 700.0)
     pose_clamp_mm: float = Field(default=2301.0, gt=0)
-    """Of each coordinate."""
+    """For each coordinate."""
     pose_clamp_deg: float = Field(default=180.0, gt=0)
     pose_monitor_mm: float = Field(default=2300.0, gt=0)
-    """Of the distance."""
+    """For the distance."""
     pose_monitor_deg: float = Field(default=180.0, gt=0)
 
 
@@ -59,9 +59,9 @@ class Settings(_Model):
     sends_to: str = Field(default="127.0.0.1:49152", pattern=r"^[^:]+:\d+$")
     cycle_ms: Literal[4, 12] = 4
     ipoc_step: int = Field(default=0, ge=0)
-    """What the IPOC grows by; 0 for the cycle in ms, as on real controllers."""
+    """Increment of the IPOC; 0: the cycle in ms, as on real controllers."""
     sen_type: str = "ImFree"
-    """SENTYPE: answers of another type count as none."""
+    """SENTYPE: answers of another type are ignored."""
     measured_tag: str = Field(default="AIPos", pattern=_TAG)
     delay_tag: str = Field(default="Delay", pattern=_TAG + "|^$")
     """Empty: the counter of late answers is not sent."""
@@ -73,39 +73,40 @@ class Settings(_Model):
     corrects: Literal["axes", "pose"] = "axes"
     mode: Literal["absolute", "relative"] = "absolute"
     hold_on: bool | None = None
-    """HOLDON of the corrections: in a cycle without answer the last one stays at the output, else zero. None: as
-    it must be for the mode, on for absolute and off for relative."""
+    """HOLDON of the corrections: in a cycle without answer the last one is kept, else zero is applied. None: the
+    right one for the mode, on for absolute and off for relative."""
     limits: Limits = Limits()
 
     lock_step: bool = True
     answer_limit_s: float = Field(default=2.0, gt=0)
-    """Lock-step: machine time that the world waits for an answer before the client counts as gone."""
+    """Lock-step: longest pause of the world, in machine time, for an answer, before the client counts as gone."""
     delay_limit: int = Field(default=100, ge=1)
     """Late answers at which RSI stops with KSS29002."""
     delay_counts: Literal["cumulative", "consecutive"] = "cumulative"
-    """Which of the two real controllers do is not known."""
+    """Which of the two applies to real controllers is not known."""
     packets_after_estop_s: float = Field(default=0.5, ge=0)
     restart_s: float = Field(default=1.0, gt=0)
-    """World time from a lost link until the RSI program runs, and sends, again."""
+    """World time from a lost link until the RSI program runs and sends again."""
 
     start_joints_deg: Six = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
     brake_deg_s2: float = Field(default=1000.0, gt=0)
     """Deceleration of the axes when the controller itself stops them."""
     acceleration_limit_deg_s2: float | None = Field(default=None, gt=0)
     jerk_limit_deg_s3: float | None = Field(default=None, gt=0)
-    """Of what corrections may ask for; None: any. What real controllers bear is not published."""
+    """Limits to what corrections demand; None: none. The limits of real controllers are not published."""
     on_excess: Literal["fault", "clamp"] = "fault"
-    """Beyond those two limits RSI stops, or the axes do what they may and fall behind. Speed always stops it."""
+    """Beyond those two limits, either RSI stops or the axes are limited and lag behind. Too high a speed always
+    stops RSI."""
     workspaces: tuple[Workspace, ...] = ()
     vibration_deg: float = Field(default=0.0, ge=0)
-    """After a stop every axis that moved swings on: damped, with this first amplitude."""
+    """Initial amplitude of the damped vibration, after a stop, of every axis that moved."""
     vibration_hz: float = Field(default=12.0, gt=0)
     vibration_decay_s: float = Field(default=0.15, gt=0)
 
     seed: int = 0
     repeatability_um: float = Field(default=10.0, ge=0)
     repeatability_deg: float = Field(default=0.001, ge=0)
-    """Standard deviation in each coordinate of what differs from stop to stop."""
+    """Standard deviation, per coordinate, of the error that varies from stop to stop."""
     absolute_mm: float = Field(default=0.0, ge=0)
     absolute_deg: float = Field(default=0.0, ge=0)
-    """Standard deviation, over arms, of what stays the same: see `PoseErrors`."""
+    """Standard deviation, over arms, of the constant error: see `PoseErrors`."""

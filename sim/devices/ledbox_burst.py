@@ -1,8 +1,8 @@
-"""One run of a table: lights, edges and the log, at the times of the box's own quartz.
+"""One run of a table: light, edges and log, timed by the box's own quartz.
 
 Step k lights its LED at t_on(k), sends its edge at t_on(k) + trigger_delay, darkens the LED at t_on(k) + on,
-and t_on(k + 1) = t_on(k) + period. All of it is scheduled on world time ahead, so the machine's load does not
-show in it. The pure functions and the two small states (quartz, boards) that it needs stand below it.
+and t_on(k + 1) = t_on(k) + period. All of it is scheduled ahead in world time, so the load of the machine does not
+affect it. The pure functions and two small states used (quartz, boards) follow below.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from sim.world.reactor import Reactor, Timer
 _LOG_RECORD = struct.Struct("<IHHQQhH")
 STATUS_LED_OPEN, STATUS_OVER_TEMPERATURE, STATUS_NO_EDGE, STATUS_WAITED = 1, 2, 4, 8
 """Bits of a log record's status: the LED drew no current; its board was too hot, and the burst ends; no edge was
-sent; the step was held back until the camera was ready."""
+sent; the step was delayed until the camera was ready."""
 _START_LEAD_NS = 200_000
 """From INITiate to the first t_on."""
 _READY_SAMPLE_NS = 100_000
-"""How often the box looks at the ready line while a step is held back."""
+"""Period at which the box samples the ready line while a step is delayed."""
 
 
 @dataclass(frozen=True)
 class Wiring:
-    """What a burst acts on. `send_edge` gets no argument: it happens at the reactor's `now_ns`."""
+    """Connections of a burst. `send_edge` has no argument: it happens at the reactor's `now_ns`."""
 
     send_edge: Callable[[], None]
     on_light: Callable[[int, int, int], None]
     on_dark: Callable[[int], None]
     ready: Callable[[], bool] | None
-    """The camera's exposure-ready line; None when the box does not look at it."""
+    """The camera's exposure-ready line; None if the box does not use it."""
     on_end: Callable[[], None]
 
 
 class _Done(NamedTuple):
-    """What the log says of a step, temperature apart; times on the box's clock."""
+    """Log data of a step, except temperature; times on the box's clock."""
 
     step: int
     led: int
@@ -89,7 +89,7 @@ class Burst:
         return bytes(self.log[first * _LOG_RECORD.size : (first + count) * _LOG_RECORD.size])
 
     def abort(self) -> None:
-        """Darken the LED at once and run no further; the step that ran gets no record."""
+        """Darken the LED at once and end the burst; the present step gets no record."""
         if self.state == "RUN":
             self._end("ABORTED")
 
@@ -132,7 +132,7 @@ class Burst:
         self._wiring.send_edge()
 
     def _darken(self) -> None:
-        """The LED goes off: its heat, up to now, is in its board."""
+        """Switch the LED off and add the heat of its light to its board."""
         if self._lit is not None:
             led, on_ns, _ = self._lit
             now_ns = self._reactor.now_ns
@@ -166,7 +166,7 @@ class Burst:
 
 
 class Quartz:
-    """The box's clock against the world's: offset, rate error, and the seeded jitter of edges."""
+    """The box's clock relative to the world's: offset, rate error, and the seeded jitter of edges."""
 
     def __init__(self, offset_ns: int, ppm: float, edge_jitter_us: float, seed: int) -> None:
         self._offset_ns, self._rate = offset_ns, 1.0 + ppm * 1e-6
@@ -208,7 +208,7 @@ class Boards:
         self._excess_k = [warm_k] * count
         self._since_ns = [0] * count
         self.tripped = False
-        """True from the moment that a board without light is over the limit, until it has cooled."""
+        """True from the moment an unlit board exceeds the limit, until it has cooled."""
 
     def __len__(self) -> int:
         return len(self._excess_k)
@@ -230,7 +230,7 @@ class Boards:
         self._since_ns[board] = now_ns
 
     def set_temperature(self, board: int, celsius: float, now_ns: int) -> None:
-        """Something else than light heats a board."""
+        """A board is heated by something other than light."""
         self._excess_k[board] = celsius - self._ambient_c
         self._since_ns[board] = now_ns
         self.tripped = self.tripped or celsius > self.limit_c

@@ -1,7 +1,7 @@
-"""The LED control box's firmware, standing on the world's clock (docs/reference/ledbox-protocol.md).
+"""The LED control box's firmware, on the world's clock (docs/reference/ledbox-protocol.md).
 
-It answers on a pseudo-terminal; what it does to the world (light, trigger edges, panels) leaves by callbacks,
-all of them with world times in nanoseconds. It has its own quartz, which is not the world's.
+It answers on a pseudo-terminal; its effects on the world (light, trigger edges, panels) are callbacks with world
+times in nanoseconds. The box has its own quartz, which differs from the world's clock.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from sim.world.reactor import Reactor, Timer
 
 _PANELS = (1, 2, 3, 4)
 _OVER_LIMIT_K = 5.0
-"""How far over its limit the fault `over_temperature` brings a board."""
+"""Excess over its limit to which the fault `over_temperature` sets a board."""
 
 
 class Settings(BaseModel):
-    """What the box is like. Physical values are those of a typical 15 W LED on a small board."""
+    """Properties of the box. Physical values are those of a typical 15 W LED on a small board."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["scpi"] = "scpi"
     baud: int = Field(default=115200, ge=0)
-    """Pace of the serial line, world time; 0 for none."""
+    """Rate of the serial line in world time; 0: not limited."""
     led_count: int = Field(default=1080, ge=1, le=65535)
     leds_per_board: int = Field(default=6, ge=1)
     """Board of an LED: led // leds_per_board."""
     serial_number: str = "SIM-0001"
     clock_offset_ns: int = Field(default=5_000_000_000, ge=0)
-    """The box's clock at world time 0."""
+    """Reading of the box's clock at world time 0."""
     clock_ppm: float = Field(default=12.0, ge=-1000, le=1000)
     edge_jitter_us: float = Field(default=1.0, ge=0, le=3)
     """Rms lateness of trigger edges."""
@@ -59,14 +59,14 @@ class Settings(BaseModel):
     thermal_time_constant_s: float = Field(default=240.0, gt=0)
     ambient_c: float = 22.0
     warm_k: float = Field(default=0.0, ge=0)
-    """Boards' temperature over the ambient one when the box is switched on, as after a long run: they cool."""
+    """Excess of the boards' temperature over ambient at power-on, as after a long run: they cool."""
     board_limit_c: float = 75.0
     block_timeout_s: float = Field(default=2.0, gt=0)
-    """A block whose bytes stop coming for so long is forgotten."""
+    """An incomplete block is discarded after this time without further bytes."""
 
 
 class Link(Protocol):
-    """What carries bytes to and from the box: a `PtyPort`, or the far end of a USB cable."""
+    """Transport of bytes to and from the box: a `PtyPort`, or the far end of a USB cable."""
 
     port: str
 
@@ -77,12 +77,12 @@ class Link(Protocol):
 
 
 class LedBoxFirmware:
-    """The box. All methods are to be called on the reactor's thread.
+    """The box. All methods must be called on the reactor's thread.
 
-    `on_light(led, t_on_ns, t_off_ns)` comes at t_on; `on_dark(t_ns)` when that light ends before its t_off;
-    `on_edge(t_ns)` for each pulse on the trigger cable; `on_panel(panel, on, t_ns)`; `ready()` reads the
-    camera's exposure-ready line. `on_edge_counted`, if set, gets each edge's number since power-on (from 0),
-    after the edge: the place for faults at a given edge. Without `link`, the box opens a pseudo-terminal.
+    `on_light(led, t_on_ns, t_off_ns)` is called at t_on; `on_dark(t_ns)` if that light ends before its t_off;
+    `on_edge(t_ns)` for each pulse on the trigger cable; `on_panel(panel, on, t_ns)`; `ready()` reads the camera's
+    exposure-ready line. `on_edge_counted`, if set, gets each edge's number since power-on (from 0), after the
+    edge, for faults at a given edge. Without `link`, the box opens a pseudo-terminal.
     """
 
     def __init__(
@@ -127,15 +127,15 @@ class LedBoxFirmware:
         self.port = self._link.port
         self._link.listen(self._receive)
 
-    # Faults that a script may cause.
+    # Faults for the fault script.
 
     @property
     def edge_count(self) -> int:
-        """Edges since power-on: the number of the next one, as the first has number 0."""
+        """Number of edges since power-on, which is the number of the next one."""
         return self._edge_count
 
     def drop_edge(self, n: int) -> None:
-        """Edge number `n` since power-on is logged and counted, but never reaches the cable."""
+        """Edge number `n` since power-on is logged and counted, but not sent."""
         self._dropped_edges.add(n)
 
     def double_edge(self, n: int, delay_us: int) -> None:
@@ -143,15 +143,15 @@ class LedBoxFirmware:
         self._doubled_edges[n] = delay_us
 
     def mute(self) -> None:
-        """The box neither hears nor answers any more; what runs, runs on until its watchdog ends it."""
+        """The box neither receives nor answers any more; a burst continues until the watchdog ends it."""
         self._link.mute()
 
     def unplug(self) -> None:
-        """The cable to the host is pulled."""
+        """Unplug the cable to the host."""
         self._link.close()
 
     def close(self) -> None:
-        """Give the line back; a second call does nothing."""
+        """Release the line; a second call does nothing."""
         self._link.close()
 
     def kill_led(self, led: int) -> None:
@@ -159,11 +159,11 @@ class LedBoxFirmware:
         self._dead_leds.add(led)
 
     def temperature_of_led_c(self, led: int) -> float:
-        """Of the LED's board, now."""
+        """Present temperature of the LED's board."""
         return self._boards.temperature_of_led_c(led, self._reactor.now_ns)
 
     def over_temperature(self, board: int) -> None:
-        """The board is over its limit from now on, until it has cooled."""
+        """Set the board above its limit; it then cools."""
         self._boards.set_temperature(board, self._boards.limit_c + _OVER_LIMIT_K, self._reactor.now_ns)
 
     # Bytes in, bytes out.
@@ -177,7 +177,7 @@ class LedBoxFirmware:
             self._check_block()
 
     def _check_block(self) -> None:
-        """Runs while a block is unfinished: lazily, so that each byte costs nothing."""
+        """Check for the time-out of an incomplete block; one timer per time-out, not per byte."""
         self._block_timer = None
         due_ns = self._heard_ns + round(self._settings.block_timeout_s * 1e9)
         if not self._scpi.inside_block:
@@ -229,7 +229,7 @@ class LedBoxFirmware:
         self._width_us, self._polarity, self._ready_source = 50, "NORM", "NONE"
 
     def _abort(self) -> None:
-        """Everything dark, whatever was running."""
+        """Switch off all light and end the burst."""
         if self._burst is not None:
             self._burst.abort()
         for panel in _PANELS:
@@ -319,7 +319,7 @@ class LedBoxFirmware:
         self._watchdog_s = number(seconds, 0.0, 60.0)
         self._watch()
 
-    # What goes on by itself.
+    # Events without command.
 
     @property
     def _running(self) -> bool:
@@ -344,7 +344,7 @@ class LedBoxFirmware:
             self._on_panel(panel, on, self._reactor.now_ns)
 
     def _watch(self) -> None:
-        """Look after the watchdog: one timer, which comes back no sooner than the earliest possible trip."""
+        """Check the watchdog; its one timer is set to the earliest possible trip."""
         if self._watchdog_timer is not None:
             self._watchdog_timer.cancel()
             self._watchdog_timer = None

@@ -1,4 +1,4 @@
-"""The LED box's stand-in, whichever it is: what the world asks of it, and how a rig's choice is built."""
+"""The interface of the LED box stand-ins to the world, and the choice of one by the rig."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sim.world.reactor import Reactor
 
 
 def _kind(settings: Any) -> str:
-    """Which stand-in these settings are for; the box that speaks SCPI where they do not say."""
+    """Kind of stand-in that these settings are for; the SCPI box by default."""
     return str(settings.get("kind", "scpi") if isinstance(settings, dict) else settings.kind)
 
 
@@ -26,23 +26,23 @@ LedBoxSettings = Annotated[
 
 
 class LedBoxStandIn(Protocol):
-    """All methods are called on the reactor's thread. Each kind has more of its own: see `impossible`."""
+    """All methods are called on the reactor's thread. Each kind has further methods: see `impossible`."""
 
     port: str
-    """What a client opens."""
+    """The port that a client opens."""
 
     def temperature_of_led_c(self, led: int) -> float: ...
 
     def mute(self) -> None:
-        """It neither hears nor answers any more."""
+        """The box neither receives nor answers any more."""
         ...
 
     def unplug(self) -> None:
-        """Its cable to the host is pulled."""
+        """Unplug its cable to the host."""
         ...
 
     def kill_led(self, led: int) -> None:
-        """The LED gives no light any more."""
+        """From now on the LED gives no light."""
         ...
 
     def close(self) -> None: ...
@@ -52,7 +52,7 @@ _EDGE_FAULTS = (faults.DropTrigger, faults.DoubleTrigger, faults.OverTemperature
 
 
 def impossible(fault: faults.Fault, settings: LedBoxSettings) -> str:
-    """Why this stand-in cannot have the fault; empty if it can."""
+    """Why this stand-in cannot simulate the fault; empty if it can."""
     if settings.kind == "text":
         if isinstance(fault, _EDGE_FAULTS):
             return (
@@ -73,7 +73,7 @@ def build(
     lighting: Lighting,
     on_light: Callable[[int, int, int], None],
 ) -> LedBoxStandIn:
-    """The stand-in, wired to the trigger cable and to what it lights."""
+    """The stand-in, connected to the trigger cable and to the lighting."""
     match settings:
         case ledbox_firmware.Settings():
             return ledbox_firmware.LedBoxFirmware(

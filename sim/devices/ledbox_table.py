@@ -1,4 +1,4 @@
-"""The limits of the box's table, as the firmware checks them: a table is taken whole or refused whole."""
+"""The limits of the box's table, as checked by the firmware: a table is accepted or rejected as a whole."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_RECORDS = 4096
 MIN_ON_US, MAX_ON_US = 1_000, 2_000_000
 MIN_PERIOD_US = 100
 REST_PER_ON = 2
-"""An LED that was lit for t rests for REST_PER_ON * t at least before the table lights it again."""
+"""An LED that was lit for t must be off for at least REST_PER_ON * t before the table lights it again."""
 
 
 def read_table(payload: bytes, led_count: int, edge_width_us: int) -> NDArray[np.void]:
@@ -77,7 +77,7 @@ def check_table(table: NDArray[np.void], led_count: int, edge_width_us: int) -> 
 def _cooling_fault(
     led: NDArray[np.uint16], on_us: NDArray[np.int64], period_us: NDArray[np.int64]
 ) -> tuple[int, str] | None:
-    """The first record that lights an LED which has not rested long enough, and why."""
+    """The first record that lights an LED before its minimum off time is over, with the reason."""
     t_on_us = np.cumsum(period_us) - period_us
     order = np.argsort(led, kind="stable")
     before, after = order[:-1], order[1:]

@@ -1,6 +1,6 @@
-"""Driver of the simulated camera without a network: frames lie in memory shared with the world.
+"""Driver of the simulated camera without a network: frames are in memory shared with the world.
 
-For machines without libaravis, and for rates that loopback cannot carry. It speaks to `sim.devices.camera_server`.
+For machines without libaravis, and for rates above those of loopback. Other end: `sim.devices.camera_server`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _REPLY_TIMEOUT_S = 60.0
 
 
 class Settings(BaseModel):
-    """`address`: path of the world's camera socket; the world's endpoint fills it in."""
+    """`address`: path of the world's camera socket; filled in from the world's endpoint."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -70,7 +70,7 @@ class MemoryCamera:
                 self._name,
                 expected=f"the world's camera at {address}",
                 happened=str(error),
-                remedy="Is `coupole sim` still running?",
+                remedy="Check that `coupole sim` is still running.",
             ) from error
         if "error" in reply:
             link.close()

@@ -1,4 +1,4 @@
-"""Joint angles that bring a stand-in's flange to a pose, for any chain of six turning joints."""
+"""Joint angles that bring a stand-in's flange to a pose, for any chain of six revolute joints."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from coupole.geometry import Transform
 
 Chain = Callable[[Sequence[float]], tuple[Transform, NDArray[np.float64], NDArray[np.float64]]]
-"""Of six joint angles in degrees: `base_from_flange`, and in the base frame the joints' origins in mm and their
+"""From six joint angles in degrees: `base_from_flange`, and in the base frame the joints' origins in mm and their
 axes, each [6, 3]."""
 
 _STEPS = 30
 _REACH_MM = 1000.0
-"""Weighs millimetres against radians."""
+"""Scales millimetres against radians."""
 _REACHED = 1e-10
 """A tenth of a nanometre, or a few billionths of a degree."""
 _DAMPING = 1e-10
@@ -27,11 +27,11 @@ _TINY = 1e-12
 def joints_near(
     chain: Chain, base_from_flange: Transform, joints_deg: Sequence[float]
 ) -> tuple[float, ...] | None:
-    """The joint angles that reach the pose from those given on the shortest way, or None if there is no way.
+    """The joint angles that reach the pose from `joints_deg`, or None if the iteration does not converge.
 
     Damped Newton steps: Nakamura, Hanafusa, "Inverse Kinematic Solutions with Singularity Robustness" (1986).
-    Limits are not looked at. A controller follows a pose like this: from where the axes are, so near a
-    singularity they may turn fast, or find no way on.
+    Limits are not checked. A controller that follows a pose does likewise, from the present axes: near a
+    singularity they may turn fast, or have no solution.
     """
     angles = np.radians(np.asarray(joints_deg, dtype=np.float64))
     for _ in range(_STEPS):

@@ -1,4 +1,4 @@
-"""A serial port without a wire: a pseudo-terminal read by the world at the pace of a baud rate."""
+"""A serial port without a wire: a pseudo-terminal, read by the world at the rate of a serial line."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from collections.abc import Callable
 from sim.world.reactor import Reactor, Timer
 
 _PIECE_BYTES = 64
-"""Paced bytes travel in pieces of this size: 5.6 ms at 115200 baud."""
+"""Bytes are transferred in pieces of this size: 5.6 ms at 115200 baud."""
 _RETRY_S = 0.001
 _BITS_PER_BYTE = 10
 
 
 class PtyPort:
-    """The box's end of a serial line. `port` is what a client opens; `baud` 0 means no pacing.
+    """The box's end of a serial line. `port` is what a client opens; `baud` 0: the rate is not limited.
 
-    A client may come and go: the world keeps the client's side open too, so the line never hangs up.
+    The world keeps the client's side open too, so the line does not hang up when a client leaves.
     """
 
     def __init__(self, reactor: Reactor, baud: int) -> None:
@@ -33,7 +33,7 @@ class PtyPort:
         self._reading = self._sending = False
 
     def listen(self, received: Callable[[bytes], None]) -> None:
-        """Call `received` with bytes as they have come in whole."""
+        """Call `received` with bytes as they arrive."""
         self._received = received
         self._wait_for_bytes()
 
@@ -50,7 +50,7 @@ class PtyPort:
                 self._write()
 
     def mute(self) -> None:
-        """Neither read nor write any more; the line stays up."""
+        """Stop reading and writing; the line stays up."""
         self._received = None
         self._output.clear()
         for timer in self._timers.values():
@@ -58,7 +58,7 @@ class PtyPort:
         self._stop_waiting()
 
     def close(self) -> None:
-        """Take the line away: the client sees a hang-up. A second call does nothing."""
+        """Close the line: the client sees a hang-up. A second call does nothing."""
         self.mute()
         if self._master >= 0:
             os.close(self._master)
@@ -76,7 +76,7 @@ class PtyPort:
             self._reading = False
 
     def _read_piece(self) -> None:
-        """Take a piece off the terminal; it is received when its last bit would have come."""
+        """Read a piece from the terminal; it is passed on at the time at which its last bit would have arrived."""
         try:
             piece = os.read(self._master, _PIECE_BYTES if self._byte_s else 65536)
         except BlockingIOError:
@@ -99,7 +99,7 @@ class PtyPort:
         return callback
 
     def _write(self) -> None:
-        """Write a piece as far as the terminal takes it; come back when the next one's bits have passed."""
+        """Write what the terminal accepts of a piece; call again when the bits of the next one have passed."""
         try:
             written = os.write(self._master, self._output[:_PIECE_BYTES] if self._byte_s else self._output)
         except BlockingIOError:

@@ -1,4 +1,4 @@
-"""The robot's stand-in, whichever it is: what the world asks of it, and how a rig's choice is built."""
+"""The interface of the robot stand-ins to the world, and the choice of one by the rig."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sim.world.reactor import Reactor
 
 
 def _kind(settings: Any) -> str:
-    """Which stand-in these settings are for; RSI where they do not say."""
+    """Kind of stand-in that these settings are for; RSI by default."""
     return str(settings.get("kind", "rsi") if isinstance(settings, dict) else settings.kind)
 
 
@@ -28,18 +28,18 @@ RobotSettings = Annotated[
 
 
 class RobotStandIn(Protocol):
-    """All methods are called on the reactor's thread. RSI's has one more, `late`: see `impossible`."""
+    """All methods are called on the reactor's thread. The RSI stand-in also has `late`: see `impossible`."""
 
     @property
     def joints_deg(self) -> tuple[float, ...]:
-        """The axes now, as the controller measures and reports them."""
+        """The present axes, as measured and reported by the controller."""
         ...
 
     @property
     def moving(self) -> bool: ...
 
     def true_base_from_flange(self) -> Transform:
-        """Where the flange truly is."""
+        """True pose of the flange."""
         ...
 
     def estop(self) -> None: ...
@@ -51,21 +51,21 @@ class RobotStandIn(Protocol):
     def lose_link(self, seconds: float) -> None: ...
 
     def nudge(self, joints_deg: Sequence[float], seconds: float | None = None) -> None:
-        """Push the arm by six angles, for good, or until it springs back after `seconds`."""
+        """Displace the arm by six angles, permanently, or until it springs back after `seconds`."""
         ...
 
     def close(self) -> None: ...
 
 
 def impossible(fault: faults.Fault, settings: RobotSettings) -> str:
-    """Why this stand-in cannot have the fault; empty if it can."""
+    """Why this stand-in cannot simulate the fault; empty if it can."""
     if isinstance(fault, faults.LateRsi) and settings.kind != "rsi":
         return f"`late_rsi` cannot happen to a robot of kind `{settings.kind}`: it has no RSI answers"
     return ""
 
 
 def build(reactor: Reactor, settings: RobotSettings) -> tuple[RobotStandIn, dict[str, Any]]:
-    """The stand-in, and what a client needs to know to reach it: under the names of our drivers' settings."""
+    """The stand-in, and the driver settings with which a client reaches it."""
     match settings:
         case kuka_controller.Settings():
             alike = {name: getattr(settings, name) for name in kuka_controller.ALIKE}
@@ -85,7 +85,7 @@ def build(reactor: Reactor, settings: RobotSettings) -> tuple[RobotStandIn, dict
 
 
 def _with_free_port(address: str) -> str:
-    """The UDP address, with a port that is free in place of port 0."""
+    """The UDP address, with port 0 replaced by a free port."""
     host, port = address.rsplit(":", 1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         if port == "0":

@@ -1,7 +1,7 @@
-"""A hand-held laser scanner before a thing of the world: the files that it exports, in its own frame and noise.
+"""A hand-held laser scanner of a thing of the world: the files that it exports, in its own frame, with noise.
 
-Nothing else of the world leaves here. Where the scanner's frame lies, `scanner_from_thing` tells: the truth for
-whoever checks a calibration.
+The files contain nothing else of the world. `scanner_from_thing` gives the true position of the scanner's frame,
+for tests of a calibration.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from sim.scene.things import Sample, Thing
 
 MESH, TARGETS = "scan.stl", "targets.txt"
 ACCURACY_MM = 0.03
-"""Standard deviation of each coordinate (facts/instrument: HandyScan 700, 30 um)."""
+"""Standard deviation of each coordinate (HandyScan 700: 30 um)."""
 _STL_TRIANGLE = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _FAR_MM = 400.0
-"""The scanner's frame begins where it was switched on."""
+"""Range of the thing's position in the scanner's frame, whose origin is where the scanner was switched on."""
 
 
 def scanner_from_thing(seed: int) -> Transform:
-    """Where the thing lies in the scanner's frame: anywhere, any way round."""
+    """Pose of the thing in the scanner's frame: random position and orientation."""
     random = np.random.default_rng([seed, 1])
     pose = np.eye(4)
     pose[:3, :3] = Rotation.random(random_state=random).as_matrix()
@@ -41,7 +41,7 @@ def export_scan(
 ) -> tuple[Path, Path]:
     """Scan a thing of `world.settings.things` that carries stickers; writes mesh and table, returns their paths.
 
-    The mesh is a binary STL with attribute bytes, the table has name, centre and normal of each sticker that the
+    The mesh is a binary STL with attribute bytes; the table has name, centre and normal of each sticker that the
     thing carried when it was scanned. Raises InputError for a thing without stickers, StorageError.
     """
     try:
@@ -69,7 +69,7 @@ def export_scan(
 
 
 def _stl(corners_mm: Array) -> bytes:
-    """Binary STL; what stands in the attribute bytes means nothing to others, as with VXelements."""
+    """Binary STL; the attribute bytes carry no information for other programs, as with VXelements."""
     triangles = np.zeros(len(corners_mm), _STL_TRIANGLE)
     cross = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     length = np.linalg.norm(cross, axis=1, keepdims=True)

@@ -1,7 +1,7 @@
-"""SCPI as the box's firmware understands it: messages out of a byte stream, commands by name, an error queue.
+"""SCPI in the box's firmware: messages from a byte stream, commands by name, an error queue.
 
-Nothing that arrives can make this raise: what is wrong becomes an entry of the error queue
-(SCPI-1999 volume 2, chapter 21) and a bit of the event status register (IEEE 488.2, chapter 11).
+No input can make this raise: an error becomes an entry of the error queue (SCPI-1999 volume 2, chapter 21) and a
+bit of the event status register (IEEE 488.2, chapter 11).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 MAX_TEXT_BYTES = 1024
-"""Longest program message, its blocks apart."""
+"""Longest program message, without its blocks."""
 QUEUE_LENGTH = 32
 
 STANDARD_ERRORS = {
@@ -40,7 +40,7 @@ Argument = str | bytes
 
 
 class ScpiError(Exception):
-    """A command that cannot be obeyed: SCPI error number, and what exactly was wrong."""
+    """A command that cannot be executed: SCPI error number and details."""
 
     def __init__(self, code: int, detail: str = "") -> None:
         self.code, self.detail = code, detail
@@ -49,7 +49,7 @@ class ScpiError(Exception):
 
 @dataclass(frozen=True)
 class Command:
-    """What a header does. The handler gets the header's suffix first if the pattern has one (`#`), then the
+    """A command. The handler gets the header's numeric suffix first if the pattern has one (`#`), then the
     parameters; it returns the response of a query, or None."""
 
     handler: Callable[..., str | bytes | None]
@@ -58,7 +58,7 @@ class Command:
 
 
 class Interpreter:
-    """Executes a byte stream, however it is cut, and returns the response bytes.
+    """Executes a byte stream, in pieces of any size, and returns the response bytes.
 
     `commands` maps patterns to commands: capitals are the short form, `#` stands for a numeric suffix, as in
     `OUTPut:PANel#`. `SYSTem:ERRor?`, `*CLS`, `*ESR?` and `*OPC?` are the interpreter's own.
@@ -82,15 +82,15 @@ class Interpreter:
 
     @property
     def inside_block(self) -> bool:
-        """True while bytes of a block are still to come."""
+        """True while a block is incomplete."""
         return self._splitter.inside_block
 
     def receive(self, data: bytes) -> bytes:
-        """Execute the messages that `data` completes; the responses, one line for each message that asks."""
+        """Execute the messages completed by `data`; returns one response line for each message with a query."""
         return b"".join(self._execute(message) for message in self._splitter.feed(data))
 
     def drop_block(self) -> None:
-        """Forget an unfinished message: its block's bytes did not come in time."""
+        """Discard an incomplete message whose block's bytes did not come in time."""
         self._splitter.reset()
         self.report(ScpiError(-161, "bytes of a block did not come in time"))
 
@@ -124,7 +124,7 @@ class Interpreter:
         return b";".join(replies) + b"\n" if replies else b""
 
     def _resolve(self, header: str, path: str) -> tuple[str, Command, tuple[int, ...]]:
-        """Path for the next header, command, suffix. Headers continue the one before unless `:` leads."""
+        """Path for the next header, command, suffix. A header without leading `:` continues the one before."""
         if header.startswith("*"):
             full = header
         else:
@@ -176,7 +176,7 @@ def integer(argument: Argument, low: int, high: int) -> int:
 
 
 def keyword(argument: Argument, *patterns: str) -> str:
-    """The one of `patterns` (capitals are the short form) that the parameter spells."""
+    """The pattern among `patterns` (capitals are the short form) that the parameter matches."""
     for pattern in patterns:
         if argument in _spellings(pattern):
             return pattern
@@ -196,7 +196,7 @@ def _call(command: Command, suffix: tuple[int, ...], arguments: list[Argument]) 
 
 
 def _arguments(unit: str, blocks: list[bytes]) -> tuple[str, list[Argument]]:
-    """Header and parameters of one program message unit; `\\0` stands where a block was."""
+    """Header and parameters of one program message unit; `\\0` marks the place of a block."""
     header, _, rest = unit.strip().replace("\t", " ").replace("\r", " ").partition(" ")
     if not rest.strip():
         return header.upper(), []
@@ -228,7 +228,7 @@ def _quotable(text: str) -> str:
 
 @dataclass(frozen=True)
 class _Text:
-    """One program message without its LF; each block stands as one `\\0`."""
+    """One program message without its LF; each block is replaced by one `\\0`."""
 
     text: str
     blocks: tuple[bytes, ...]
@@ -240,7 +240,7 @@ _FORBIDDEN = re.compile(r"[^\x00\t\r -~]")
 
 
 class _Splitter:
-    """Cuts a byte stream into messages at LF, except where an LF belongs to a block."""
+    """Splits a byte stream into messages at LF, except for LF within a block."""
 
     def __init__(self, max_block_bytes: int) -> None:
         self._max_block_bytes = max_block_bytes
@@ -287,7 +287,7 @@ class _Splitter:
 
     def _take_text(self, count: int) -> None:
         if not self._overrun:
-            self._text += self._input[:count].replace(b"\0", b"\x7f")  # \0 is the mark of a block
+            self._text += self._input[:count].replace(b"\0", b"\x7f")  # \0 marks the place of a block
             self._overrun = len(self._text) > MAX_TEXT_BYTES
         del self._input[:count]
 
@@ -305,7 +305,7 @@ class _Splitter:
         self._text += b"\0"
 
     def _open_block(self) -> bool:
-        """Read a block's head at a `#`; False if more bytes are needed to tell."""
+        """Read a block's header at a `#`; False if more bytes are needed to decide."""
         if self._overrun or not re.search(rb"[ \t\r,]\Z", self._text):
             self._take_text(1)
             return True
@@ -313,7 +313,7 @@ class _Splitter:
         digits = int(head[1]) if head and head[1] else 0
         if head is None or not digits or len(head[2]) < digits:
             if head is not None and head.end() == len(self._input):
-                return False  # so far it may become a head
+                return False  # it may still become a header
             self._take_text(1)
             return True
         length = int(head[2][:digits])

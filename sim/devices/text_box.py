@@ -1,8 +1,8 @@
-"""The firmware of a home-built dome, standing on the world's clock: lines of text in, one line out for each.
+"""The firmware of a home-built dome, on the world's clock: one line of text in, one line out.
 
 It is the sketch of docs/how-to/home-built-dome.md: `LED <n> ON [<ms>]` (ended by the box after that time),
-`LED <n> OFF`, `ALL OFF`, `ID`; the answer is `OK`, the identity, or `ERR` and why. It knows no time, keeps no log,
-has no watchdog and may light several LEDs at once, as such boxes do.
+`LED <n> OFF`, `ALL OFF`, `ID`; the answer is `OK`, the identity, or `ERR` and the reason. Like such boxes it has
+no clock, log or watchdog, and may light several LEDs at once.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ _LONGEST_LINE = 64
 
 
 class Settings(BaseModel):
-    """What the box is like."""
+    """Properties of the box."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["text"] = "text"
     baud: int = Field(default=115200, ge=0)
-    """Pace of the serial line, world time; 0 for none."""
+    """Rate of the serial line in world time; 0: not limited."""
     led_count: int = Field(default=64, ge=1, le=65535)
     first_led: int = Field(default=0, ge=0)
-    """The box's own number of LED 0."""
+    """The box's number for LED 0."""
     answers: bool = True
-    """Without, it never says anything but who it is."""
+    """If false, it answers nothing but its identity."""
     serial_number: str = "SIM-0002"
     ambient_c: float = 22.0
-    """Of the LEDs, which are not heated."""
+    """Temperature of the LEDs, which are not heated."""
 
 
 class TextBox:
-    """The box. All methods are to be called on the reactor's thread.
+    """The box. All methods must be called on the reactor's thread.
 
-    `on_light(led, t_on_ns, t_off_ns)` comes at t_on, `on_dark(led, t_ns)` when that LED ends before its t_off.
+    `on_light(led, t_on_ns, t_off_ns)` is called at t_on, `on_dark(led, t_ns)` if that LED ends before its t_off.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class TextBox:
         self._reactor, self._settings = reactor, settings
         self._on_light, self._on_dark = on_light, on_dark
         self._lit: dict[int, Timer | None] = {}
-        """LEDs that shine, with the timer that will end them."""
+        """LEDs that are lit, with the timer that will end them."""
         self._dead_leds: set[int] = set()
         self._stuck_leds: set[int] = set()
         self._line = bytearray()
@@ -62,29 +62,29 @@ class TextBox:
         self.port = self._link.port
         self._link.listen(self._receive)
 
-    # Faults that a script may cause.
+    # Faults for the fault script.
 
     def mute(self) -> None:
-        """The box neither hears nor answers any more; what shines, shines on."""
+        """The box neither receives nor answers any more; lit LEDs stay lit."""
         self._link.mute()
 
     def unplug(self) -> None:
-        """The cable to the host is pulled; what shines, shines on."""
+        """Unplug the cable to the host; lit LEDs stay lit."""
         self._link.close()
 
     def kill_led(self, led: int) -> None:
-        """From its next lighting on, the LED gives no light."""
+        """From its next flash on, the LED gives no light."""
         self._dead_leds.add(led)
 
     def stick_led(self, led: int) -> None:
-        """From now on nothing ends the LED's light once it shines: its transistor is burnt through."""
+        """From now on the LED cannot be switched off once it is lit: its transistor has failed short."""
         self._stuck_leds.add(led)
 
     def temperature_of_led_c(self, led: int) -> float:
         return self._settings.ambient_c
 
     def close(self) -> None:
-        """Give the line back; a second call does nothing."""
+        """Release the line; a second call does nothing."""
         self._link.close()
 
     # Lines in, lines out.
@@ -102,7 +102,7 @@ class TextBox:
                 self._link.send(reply.encode("latin-1") + b"\r\n")
 
     def _obey(self, line: str) -> str:
-        """Do what a line says; the answer."""
+        """Execute a command line; returns the answer."""
         match line.split():
             case ["ID"]:
                 return f"Coupole,text box,{self._settings.serial_number},1.0"
@@ -124,7 +124,7 @@ class TextBox:
         return f"ERR what? {line}"
 
     def _led(self, number: str) -> int | None:
-        """Of the LED with the box's own number, ours; None if the box has no such LED."""
+        """LED number from the box's own; None if the box has no such LED."""
         led = int(number) - self._settings.first_led if number.isdecimal() else -1
         return led if 0 <= led < self._settings.led_count else None
 

@@ -1,4 +1,4 @@
-"""The stand-in's UR: where its flange is, which joints bring it there, and how it moves on lines of both."""
+"""The UR stand-in's arm: forward and inverse kinematics, and motions straight in joint space or for the tool."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _DH = {
         (0.0, 116.55, 0.0),
     ),
 }
-"""Of each joint a and d in mm and alpha in rad, after Denavit and Hartenberg. Source: Universal Robots, "DH
+"""For each joint a and d in mm and alpha in rad, by Denavit and Hartenberg. Source: Universal Robots, "DH
 Parameters for calculations of kinematics and dynamics"."""
 
 
 _LINE_STEP_MM, _LINE_STEP_RAD = 5.0, 0.02
-"""How far apart the places of a line are that joints are computed for; between them they go straight."""
+"""Distance of the points of a tool line at which joints are computed; between them, joints move linearly."""
 
 
 def flange_pose(model: UrModel, joints_deg: Sequence[float]) -> Transform:
@@ -66,7 +66,7 @@ def chain(
 
 
 def rotation_vector(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Axis times angle (rad) of a 3x3 rotation, as UR writes orientations."""
+    """Axis times angle (rad) of a 3x3 rotation, as in UR poses."""
     from_skew = np.array(
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
     )
@@ -84,24 +84,24 @@ def rotation_vector(rotation: NDArray[np.float64]) -> tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Motion:
-    """With constant accelerations along a polyline in joint space.
+    """Motion with piecewise constant acceleration along a polyline in joint space.
 
-    In each phase v = v0 + a t and s = s0 + v0 t + a t^2 / 2, s being the way: degrees of the leading axis, or
-    metres of the tool.
+    In each phase v = v0 + a t and s = s0 + v0 t + a t^2 / 2, where s is the path length: degrees of the leading
+    axis, or metres of the tool.
     """
 
     places_deg: tuple[Six, ...]
-    """Corners of the polyline, two at least, each as far along the way from the last."""
-    way: float
-    """From the first place to the last."""
+    """Corners of the polyline, at least two, at equal distances along the path."""
+    length: float
+    """Path length from the first corner to the last."""
     speed: float
-    """At the start, way per second."""
+    """Initial speed, path length per second."""
     phases: tuple[tuple[float, float], ...]
-    """Duration in s and acceleration in way/s^2, in order."""
+    """Duration in s and acceleration in path length/s^2, in order."""
     start_ns: int
 
     def at(self, t_ns: int) -> tuple[Six, Six, bool]:
-        """Joint angles, their speeds in deg/s, and whether the motion goes on."""
+        """Joint angles, their speeds in deg/s, and False once the motion has ended."""
         left_s = (t_ns - self.start_ns) / 1e9
         gone, speed = 0.0, self.speed
         for duration_s, acceleration in self.phases:
@@ -114,20 +114,20 @@ class Motion:
         return self.places_deg[-1], (0.0,) * 6, False
 
     def _place(self, gone: float, speed: float) -> tuple[Six, Six]:
-        """Joint angles and their speeds after so much of the way."""
+        """Joint angles and their speeds at path length `gone`."""
         pieces = len(self.places_deg) - 1
-        piece = min(int(gone / self.way * pieces), pieces - 1)
-        share = gone / self.way * pieces - piece
+        piece = min(int(gone / self.length * pieces), pieces - 1)
+        share = gone / self.length * pieces - piece
         here_deg, there_deg = self.places_deg[piece : piece + 2]
         steps_deg = [b - a for a, b in zip(here_deg, there_deg, strict=True)]
         joints_deg = tuple(a + share * step for a, step in zip(here_deg, steps_deg, strict=True))
-        return joints_deg, tuple(step * pieces / self.way * speed for step in steps_deg)
+        return joints_deg, tuple(step * pieces / self.length * speed for step in steps_deg)
 
 
 def movej(start_deg: Six, end_deg: Six, speed_deg_s: float, acceleration_deg_s2: float, t_ns: int) -> Motion:
-    """From rest to rest, all axes in step: a trapezoid of the leading axis's speed, as URScript's movej."""
-    way_deg = max(abs(b - a) for a, b in zip(start_deg, end_deg, strict=True))
-    return _trapezoid((start_deg, end_deg), way_deg, speed_deg_s, acceleration_deg_s2, t_ns)
+    """From rest to rest, axes synchronised: trapezoidal speed of the leading axis, as URScript's movej."""
+    turn_deg = max(abs(b - a) for a, b in zip(start_deg, end_deg, strict=True))
+    return _trapezoid((start_deg, end_deg), turn_deg, speed_deg_s, acceleration_deg_s2, t_ns)
 
 
 def movel(
@@ -139,8 +139,8 @@ def movel(
     acceleration_m_s2: float,
     t_ns: int,
 ) -> Motion | None:
-    """From rest to rest, the tool on a straight line and turning at a steady rate about one axis, as URScript's
-    movel; None where the arm cannot follow. A turn on the spot counts radians as metres."""
+    """From rest to rest, the tool on a straight line and turning at a constant rate about one axis, as URScript's
+    movel; None if the arm cannot follow. For a pure rotation, radians count as metres."""
     start = flange_pose(model, start_deg) @ flange_from_tool
     line_mm = base_from_tool[:3, 3] - start[:3, 3]
     turned_rad = np.array(rotation_vector(start[:3, :3].T @ base_from_tool[:3, :3]))
@@ -162,21 +162,21 @@ def movel(
 
 
 def brake(start_deg: Six, velocity_deg_s: Six, deceleration_deg_s2: float, t_ns: int) -> Motion:
-    """To rest, straight on in joint space, as URScript's stopj."""
+    """To rest along the present direction in joint space, as URScript's stopj."""
     speed_deg_s = max(map(abs, velocity_deg_s))
     if speed_deg_s == 0.0:
         return Motion((start_deg, start_deg), 0.0, 0.0, (), t_ns)
-    way_deg = speed_deg_s**2 / (2.0 * deceleration_deg_s2)
-    end_deg = tuple(q + v / speed_deg_s * way_deg for q, v in zip(start_deg, velocity_deg_s, strict=True))
+    turn_deg = speed_deg_s**2 / (2.0 * deceleration_deg_s2)
+    end_deg = tuple(q + v / speed_deg_s * turn_deg for q, v in zip(start_deg, velocity_deg_s, strict=True))
     phases = ((speed_deg_s / deceleration_deg_s2, -deceleration_deg_s2),)
-    return Motion((start_deg, end_deg), way_deg, speed_deg_s, phases, t_ns)
+    return Motion((start_deg, end_deg), turn_deg, speed_deg_s, phases, t_ns)
 
 
-def _trapezoid(places_deg: tuple[Six, ...], way: float, speed: float, acceleration: float, t_ns: int) -> Motion:
-    """From rest to rest along the places."""
-    if way == 0.0:
-        return Motion(places_deg, way, 0.0, (), t_ns)
-    top = min(speed, math.sqrt(acceleration * way))
+def _trapezoid(places_deg: tuple[Six, ...], length: float, speed: float, acceleration: float, t_ns: int) -> Motion:
+    """From rest to rest along the corners."""
+    if length == 0.0:
+        return Motion(places_deg, length, 0.0, (), t_ns)
+    top = min(speed, math.sqrt(acceleration * length))
     ramp_s = top / acceleration
-    phases = ((ramp_s, acceleration), (way / top - ramp_s, 0.0), (ramp_s, -acceleration))
-    return Motion(places_deg, way, 0.0, phases, t_ns)
+    phases = ((ramp_s, acceleration), (length / top - ramp_s, 0.0), (ramp_s, -acceleration))
+    return Motion(places_deg, length, 0.0, phases, t_ns)

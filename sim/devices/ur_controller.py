@@ -1,10 +1,9 @@
-"""The stand-in for a UR and its controller, at the other end of ur-rtde: RTDE, dashboard, script upload.
+"""The stand-in for a UR arm and its controller, at the other end of ur-rtde: RTDE, dashboard, script upload.
 
-It runs what ur-rtde's uploaded program does (`ur_script`), moves its arm on trapezoids of speed, and stops
-for what the real one stops for: emergency stop, protective stop, a silent watchdog. The ports are UR's own,
-30003, 30004 and 29999, since ur-rtde asks for no others; so each stand-in needs an address of its own, of
-which 127.0.0.0/8 has enough. ur-rtde lives in real time: in a world that runs at another speed than 1 this
-stand-in refuses to be built.
+It does what ur-rtde's uploaded program does (`ur_script`), moves its arm with trapezoidal speed profiles, and
+stops as the real one does on: emergency stop, protective stop, a silent watchdog. The ports are UR's own, 30003,
+30004 and 29999, since ur-rtde cannot use others; so each stand-in needs its own address in 127.0.0.0/8. ur-rtde
+works in real time only: with a world speed other than 1, this stand-in raises InputError.
 """
 
 from __future__ import annotations
@@ -58,14 +57,14 @@ class Settings(BaseModel):
     kind: Literal["ur"] = "ur"
     model: UrModel = "ur10e"
     address: str = Field(default=_ANY, pattern=r"^127\.\d+\.\d+\.\d+$")
-    """Loopback address to listen at; the default chooses one that is free, see `UrController.address`."""
+    """Loopback address to listen at; the default chooses a free one, see `UrController.address`."""
     start_joints_deg: tuple[float, float, float, float, float, float] = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
     tcp_offset_m_rad: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.5)
     """Flange to tool centre point: x, y, z in m and a rotation vector in rad."""
     brake_deg_s2: float = Field(default=600.0, gt=0)
     """Deceleration of the leading axis when the controller itself stops the arm."""
     start_program_s: float = Field(default=0.05, gt=0)
-    """From the upload of a program until it runs."""
+    """Time from the upload of a program until it runs."""
 
 
 class UrController:
@@ -75,14 +74,14 @@ class UrController:
         """Raises InputError in a world that does not run in real time."""
         if reactor.clock.speed != 1.0:
             raise InputError(
-                f"a UR stand-in lives in real time: the world's speed is {reactor.clock.speed:g}, not 1"
+                f"a UR stand-in works in real time only: the world's speed is {reactor.clock.speed:g}, not 1"
             )
         self.fault = ""
-        """Why the last program was ended by the controller; empty while all is well."""
+        """Why the controller ended the last program; empty if it did not."""
         self.settled_since_ns: int | None = reactor.now_ns
-        """World time since when the axes stand; None while they move."""
+        """World time since which the axes are at rest; None while they move."""
         self.remote_control = True
-        """False: an operator took control at the pendant, programs from the network are refused."""
+        """False: the pendant has control, programs from the network are refused."""
         self._reactor, self._settings = reactor, settings
         self._motion: Motion | None = None
         self._commanded_deg: Six = settings.start_joints_deg
@@ -106,7 +105,7 @@ class UrController:
 
     @property
     def joints_deg(self) -> Six:
-        """The axes now, as the controller measures and reports them."""
+        """The present axes, as measured and reported by the controller."""
         return tuple(map(float.__add__, self._commanded_deg, self._pushes.deg))
 
     @property
@@ -115,11 +114,11 @@ class UrController:
 
     @property
     def program_state(self) -> str:
-        """STOPPED, PLAYING or PAUSED, as the dashboard says it."""
+        """STOPPED, PLAYING or PAUSED, as reported by the dashboard."""
         return self._runtime.name
 
     def true_base_from_flange(self) -> Transform:
-        """Where the flange is."""
+        """True pose of the flange."""
         return flange_pose(self._settings.model, self.joints_deg)
 
     def estop(self) -> None:
@@ -128,12 +127,12 @@ class UrController:
         self._end_program("emergency stop", _Runtime.STOPPED)
 
     def protective_stop(self) -> None:
-        """Collision seen: the arm brakes, the program pauses, and does not end before somebody ends it."""
+        """Collision detected: the arm brakes, the program pauses until it is ended."""
         self._safety_bits = _SAFETY_PROTECTIVE
         self._end_program("protective stop", _Runtime.PAUSED if self._script else _Runtime.STOPPED)
 
     def safeguard_stop(self) -> None:
-        """Somebody opens the cell's door: the arm brakes, the program pauses."""
+        """The cell's door is opened: the arm brakes, the program pauses."""
         self._safety_bits = _SAFETY_SAFEGUARD
         self._end_program("safeguard stop", _Runtime.PAUSED if self._script else _Runtime.STOPPED)
 
@@ -154,7 +153,7 @@ class UrController:
         self._end_program("stopped at the pendant", _Runtime.STOPPED)
 
     def lose_link(self, seconds: float) -> None:
-        """The network is cut for `seconds`; who was connected before is never heard again."""
+        """Cut the network for `seconds`; existing connections do not recover."""
         for port in self._ports:
             port.mute()
         self._reactor.after(seconds, self._restore_link)
@@ -165,7 +164,7 @@ class UrController:
             port.drop()
 
     def nudge(self, joints_deg: Sequence[float], seconds: float | None = None) -> None:
-        """Push the arm off the commanded axes by six angles; after `seconds` it springs back, if given."""
+        """Displace the arm by six angles; after `seconds`, if given, it springs back."""
         self._pushes.push(joints_deg, seconds)
 
     def close(self) -> None:
@@ -174,7 +173,7 @@ class UrController:
             port.close()
 
     def start_movej(self, target_deg: Six, speed_deg_s: float, acceleration_deg_s2: float) -> None:
-        """For the program, as are the next two."""
+        """Called by the program, like the next two."""
         now_ns = self._reactor.now_ns
         self._start(movej(self._commanded_deg, target_deg, speed_deg_s, acceleration_deg_s2, now_ns))
 
@@ -189,16 +188,16 @@ class UrController:
             self._motion = brake(self._commanded_deg, self._velocity_deg_s, deceleration_deg_s2, now_ns)
 
     def _start(self, motion: Motion | None) -> None:
-        """In motion the program ends in a fault: what a real arm does then is not documented."""
+        """Start a motion. If the arm moves, the program ends in a fault: a real arm's reaction is undocumented."""
         if self.moving:
             self._end_program("another motion while the arm moved", _Runtime.STOPPED)
         elif motion is None:
-            self._end_program("no way along that line", _Runtime.STOPPED)
+            self._end_program("no path along that line", _Runtime.STOPPED)
         else:
             self._motion, self.settled_since_ns = motion, None
 
     def _cycle(self) -> None:
-        """What happens every 2 ms."""
+        """One controller cycle, every 2 ms."""
         now_ns = self._reactor.now_ns
         if self._motion is not None:
             self._commanded_deg, self._velocity_deg_s, goes_on = self._motion.at(now_ns)
@@ -248,7 +247,7 @@ class UrController:
         self._heard_ns = self._reactor.now_ns
 
     def _take_program(self, connection: Connection) -> None:
-        """A program is whole when its last line has come: an `end` that stands at the left."""
+        """A program is complete with its last line, an unindented `end`."""
         if _END_OF_PROGRAM.search(connection.inbox):
             connection.inbox.clear()
             if self._runtime is not _Runtime.STOPPED:
@@ -265,7 +264,7 @@ class UrController:
             connection.send(self._dashboard_answer(line.decode(errors="replace").strip()).encode() + b"\n")
 
     def _dashboard_answer(self, question: str) -> str:
-        """Words as in Universal Robots, "Dashboard Server e-Series"."""
+        """Answers as in Universal Robots, "Dashboard Server e-Series"."""
         if question == "stop":
             self._end_program("stopped over the dashboard", _Runtime.STOPPED)
             return "Stopped"
@@ -288,7 +287,7 @@ class UrController:
         return answers.get(question, f"could not understand: '{question}'")
 
     def _variables(self) -> dict[str, Value]:
-        """All that RTDE can tell, once per cycle."""
+        """All RTDE variables, computed once per cycle."""
         if self._values is None:
             pose = self.true_base_from_flange() @ _transform(self._settings.tcp_offset_m_rad)
             self._values = {
@@ -310,7 +309,7 @@ class UrController:
 
 
 def _free_address() -> str:
-    """A loopback address at which nobody listens at UR's ports."""
+    """A loopback address at which UR's ports are free."""
     while True:
         host = f"127.{random.randint(1, 254)}.{random.randint(0, 254)}.{random.randint(1, 254)}"
         try:

@@ -1,4 +1,4 @@
-"""One client of the stand-in's RTDE port: handshake, recipes, packets out at the frequency that it asked."""
+"""One client of the stand-in's RTDE port: handshake, recipes, data packets at the requested frequency."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _VERSION = (5, 15, 0, 126600)
 
 
 class Line(Protocol):
-    """The connection, as far as a session needs it."""
+    """The connection, as needed by a session."""
 
     inbox: bytearray
     gone: bool
@@ -23,7 +23,7 @@ class Line(Protocol):
 
 
 class RtdeSession:
-    """See the module. `on_inputs` takes registers as the client writes them."""
+    """See the module. `on_inputs` receives registers when the client writes them."""
 
     def __init__(self, line: Line, on_inputs: Callable[[dict[str, Value]], None]) -> None:
         self.line = line
@@ -35,7 +35,7 @@ class RtdeSession:
         self._started = False
 
     def take(self) -> None:
-        """Work off what has come. A client that breaks the protocol is cut off."""
+        """Process received packets. A client that violates the protocol is disconnected."""
         try:
             for kind, payload in wire.take_packets(self.line.inbox):
                 self._take_packet(kind, payload)
@@ -43,7 +43,7 @@ class RtdeSession:
             self.line.gone = True
 
     def cycle(self, values: Callable[[], Mapping[str, Value]]) -> None:
-        """Once per controller cycle: send `values()` if it is this client's turn."""
+        """Once per controller cycle: send `values()` if a packet is due for this client."""
         self._cycles += 1
         if self._started and self._cycles % self._every_cycles == 0:
             self.line.send(wire.packet(wire.DATA, b"\x01" + wire.pack(self._outputs, values())))
@@ -80,6 +80,6 @@ def _names(payload: bytes) -> list[str]:
 
 
 def _recipe(number: int, names: list[str]) -> bytes:
-    """Recipe id and types; id 0, of no use, where a variable does not exist."""
+    """Recipe id and types; id 0, which is invalid, if a variable does not exist."""
     types = [wire.variable_type(name) for name in names]
     return bytes([0 if wire.NOT_FOUND in types else number]) + ",".join(types).encode()

@@ -1,6 +1,6 @@
-"""The wire of UR's Real-Time Data Exchange (RTDE), protocol version 2: packets, and variables by name.
+"""The wire format of UR's Real-Time Data Exchange (RTDE), protocol version 2: packets, and variables by name.
 
-Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": a packet is its size (uint16, with the
+Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": a packet is its size (uint16, including the
 header), its type (uint8) and a payload, big-endian. Units on the wire are SI: metres, radians, seconds.
 """
 
@@ -61,7 +61,7 @@ class Packet(NamedTuple):
 
 
 def take_packets(inbox: bytearray) -> list[Packet]:
-    """The whole packets at the head of `inbox`, which loses them. Raises ValueError for an impossible size."""
+    """Remove and return the complete packets at the start of `inbox`. Raises ValueError for an impossible size."""
     packets = []
     while len(inbox) >= _HEADER.size:
         size, kind = _HEADER.unpack_from(inbox)
@@ -93,7 +93,7 @@ def pack(names: Sequence[str], values: Mapping[str, Value]) -> bytes:
 
 
 def unpack(names: Sequence[str], payload: bytes) -> dict[str, Value]:
-    """Raises ValueError where the payload is not as long as the recipe says."""
+    """Raises ValueError if the payload's length differs from the recipe's."""
     formats = [_FORMATS[variable_type(name)] for name in names]
     whole = struct.Struct(">" + "".join(formats))
     if whole.size != len(payload):

@@ -1,6 +1,6 @@
-"""What the program that ur-rtde uploads does with the registers, written after that program (ur-rtde 1.6).
+"""Reaction to registers of the program that ur-rtde uploads, modelled on that program (ur-rtde 1.6).
 
-The client writes a command number to input_int_register_0 and its numbers beside it; the program answers in
+The client writes a command number to input_int_register_0 and its arguments to others; the program answers in
 output_int_register_0: 1 ready, 2 done. Then the client writes 0, and the program is ready again.
 """
 
@@ -19,7 +19,7 @@ _ASYNC_RUNNING = 0x8000
 
 
 class Arm(Protocol):
-    """What the program does to the arm."""
+    """Motions of the arm that the program starts."""
 
     @property
     def moving(self) -> bool: ...
@@ -29,13 +29,13 @@ class Arm(Protocol):
 
 
 class ControlScript:
-    """One run of the program, one `cycle` after the other."""
+    """One run of the program; call `cycle` once per controller cycle."""
 
     def __init__(self, arm: Arm, tcp_offset_m_rad: Six) -> None:
         self.ended = ""
         """Why the program ended by itself; empty while it runs."""
         self.watchdog_s: float | None = None
-        """Silence of input_int_register_0 after which the controller ends the program, once that is asked."""
+        """The controller ends the program after this time without a write to input_int_register_0; None: never."""
         self.outputs: dict[str, Value] = {}
         self._arm, self._tcp_offset = arm, tcp_offset_m_rad
         self._executing = False
@@ -44,7 +44,7 @@ class ControlScript:
         self._signal_async(running=False)
 
     def cycle(self, inputs: Mapping[str, Value]) -> None:
-        """Work off the registers once; `inputs` holds all that were ever written."""
+        """Process the registers once; `inputs` holds all registers ever written."""
         if self._async_running and not self._arm.moving:
             self._signal_async(running=False)
         command = int(_number(inputs, "input_int_register_0"))
@@ -82,7 +82,7 @@ class ControlScript:
             self.ended = f"this stand-in does not know command {command}"
 
     def _signal_async(self, *, running: bool) -> None:
-        """Bits 24 to 30 count operations, bits 16 to 22 writes; bit 15 says that an operation runs."""
+        """Bits 24 to 30 count operations, bits 16 to 22 writes; bit 15 is set while an operation runs."""
         self._async_running = running
         self._async_count = (self._async_count + 1) % 128
         self._async_operation = (self._async_operation + running) % 128

@@ -1,4 +1,4 @@
-"""TCP ports of a stand-in, on the reactor: connections that can be muted as a cut network would."""
+"""TCP ports of a stand-in, on the reactor; connections can be muted to simulate a cut network."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from sim.world.reactor import Reactor
 
 
 class Connection:
-    """One client's connection: what it sent and was not yet taken, and a way to answer."""
+    """One client's connection: received bytes that are not yet processed, and a way to answer."""
 
     def __init__(self, link: socket.socket) -> None:
         self.inbox = bytearray()
         self.link = link
         self.gone = False
-        """The client left, or takes no more bytes."""
+        """The client has left, or accepts no more bytes."""
 
     def send(self, data: bytes) -> None:
         if self.gone:
             return
         try:
-            self.gone = self.link.send(data) < len(data)  # a client that does not read is cut off
+            self.gone = self.link.send(data) < len(data)  # a client that does not read is disconnected
         except OSError:
             self.gone = True
 
@@ -45,7 +45,7 @@ class TcpPort:
         reactor.add_reader(self._listener, self._accept)
 
     def mute(self) -> None:
-        """From now on nobody is answered; who is connected now never again, and does not learn it."""
+        """Answer no client from now on; present connections never recover, and are not told."""
         if self._listens:
             self._reactor.remove_reader(self._listener)
             self._listens = False
@@ -56,19 +56,19 @@ class TcpPort:
         self._connections = []
 
     def unmute(self) -> None:
-        """Clients that come, or came meanwhile, are answered again."""
+        """Answer new clients again, including those that connected meanwhile."""
         if not self._listens:
             self._reactor.add_reader(self._listener, self._accept)
             self._listens = True
 
     def drop(self) -> None:
-        """End all connections, as a controller does that restarts."""
+        """Close all connections, as a restarting controller does."""
         for connection in self._connections:
             self._end(connection)
         self._connections = []
 
     def close(self) -> None:
-        """The reactor has ended or ends: close all sockets."""
+        """Close all sockets; the reactor must not run any more."""
         for connection in (*self._connections, *self._muted):
             connection.link.close()
         self._listener.close()
@@ -84,7 +84,7 @@ class TcpPort:
 
     def _read(self, connection: Connection) -> None:
         if connection not in self._connections:
-            return  # muted or ended by a callback of the same round
+            return  # muted or closed by a callback of the same round
         try:
             data = connection.link.recv(65536)
         except OSError:

@@ -5,12 +5,12 @@ The same arguments give the same triangles.
 
 =============  ============================================================================
 `shapes`       plane, sphere, glossy sphere, sculpted relief
-`board`        ChArUco board, one rectangle for each cell of black or white
+`board`        ChArUco board, one rectangle for each black or white cell
 `targets`      Spectralon tile, grey card, chrome ball, stickers
 `wedges`       gilt step wedge, paint wedge over black and white
 `urushi`       makie tile, nashiji slab
 `fabric`       woven cloth
-`appearance`   what they are made of, per channel of the camera
+`appearance`   their materials, per channel of the camera
 `mesh`         pieces of surfaces
 =============  ============================================================================
 """

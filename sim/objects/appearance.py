@@ -1,4 +1,4 @@
-"""What virtual objects are made of: spectra of `appearance.matter` as the camera sees them under the dome's LEDs.
+"""Materials of virtual objects: spectra of `appearance.matter` as seen by the camera under the dome's LEDs.
 
 Each material is reduced to a diffuse reflectance, a reflectance at normal incidence and a roughness per channel
 (`sim.scene.surface.Material`). White is a perfect diffuser: Spectralon itself has 0.99.
@@ -24,14 +24,14 @@ GREY_CARD = Material("grey card", (0.18, 0.18, 0.18))
 """18 % by definition."""
 WHITE_PRINT = Material("white of a printed board", (0.85, 0.85, 0.85))
 BLACK_PRINT = Material("black of a printed board", (0.035, 0.035, 0.035))
-"""Matt print on aluminium composite; both are assumed, the ratio is that of offset print."""
+"""Matt print on aluminium composite; both values are assumed, the ratio is that of offset print."""
 CHROME = Material("chrome", (0.0, 0.0, 0.0), (0.55, 0.55, 0.55), 0.02)
 """Chromium has n = 3.1, k = 3.3 near 550 nm (Johnson and Christy, Phys. Rev. B 9, 5056, 1974): Fresnel gives 0.55,
 with little change over the visible. The roughness is a polished ball's (assumed)."""
 STONE = Material("stone", (0.62, 0.55, 0.42))
 """Warm limestone (assumed); the demonstration object's."""
 RETROREFLECTIVE = Material("retro-reflective film", (0.90, 0.90, 0.90))
-"""What is left of it for light that does not come from the camera: a white diffuser (assumed)."""
+"""Its appearance under light from other directions than the camera's: a white diffuser (assumed)."""
 
 
 def rgb(spectral: ArrayLike) -> Rgb:
@@ -46,7 +46,7 @@ def paint(
     """A pigment of `typical` in a glossy binder, as a layer over a ground of reflectance `ground` [81] inside it.
 
     Kubelka-Munk with Saunderson. `scattering_per_mm` is S, the same at all wavelengths: 30 hides a ground
-    with some 0.1 mm (assumed).
+    at about 0.1 mm (assumed).
     """
     opaque = typical.reflectance(name)
     inside = opaque
@@ -58,9 +58,9 @@ def paint(
 
 
 def gilt(thickness_nm: float, *, uncovered: float = 0.0, roughness: float = 0.12) -> Material:
-    """Gold leaf on bole (`appearance.matter.gilding`): its mirror part, and the bole that shines through.
+    """Gold leaf on bole (`appearance.matter.gilding`): its specular part, and the bole visible through it.
 
-    `uncovered` is the share that holes and cracks leave bare; a roughness of 0.12 is well burnished (assumed).
+    `uncovered` is the fraction bared by holes and cracks; a roughness of 0.12 is well burnished (assumed).
     """
     gilded = gilding.gilt(indices.gold(), thickness_nm, typical.bole(), uncovered=uncovered)
     specular, diffuse = gilding.reflectances(gilded)
@@ -73,19 +73,20 @@ def metal(name: str, index: Complex, roughness: float) -> Material:
 
 
 def metal_in_lacquer(name: str, index: Complex, depth_mm: float, roughness: float) -> Material:
-    """Metal at a depth in clear urushi: absorbed on the way in and out, along the normal."""
+    """Metal at a depth in clear urushi, with absorption along the normal on both passes."""
     absorption = lacquer.urushi_absorption()
-    way = lacquer.transmittance(depth_mm, 1.0, absorption) ** 2 * (1.0 - _dielectric(indices.URUSHI)) ** 2
-    return Material(name, (0.0, 0.0, 0.0), rgb(way * fresnel.reflectance(1.0, index, indices.URUSHI)), roughness)
+    passed = lacquer.transmittance(depth_mm, 1.0, absorption) ** 2 * (1.0 - _dielectric(indices.URUSHI)) ** 2
+    f0 = rgb(passed * fresnel.reflectance(1.0, index, indices.URUSHI))
+    return Material(name, (0.0, 0.0, 0.0), f0, roughness)
 
 
 def black_lacquer(roughness: float = 0.04) -> Material:
-    """Polished black urushi: a clear mirror over next to no light (body assumed 0.6 %)."""
+    """Polished black urushi: a clear specular surface over a body of 0.6 % (assumed)."""
     return Material("black urushi", (0.006, 0.006, 0.006), _normal(indices.URUSHI), roughness)
 
 
 def glossy(name: str, diffuse: Rgb, roughness: float) -> Material:
-    """A coloured body under a clear coat of index 1.5; what the coat reflects does not reach the body."""
+    """A coloured body under a clear coat of index 1.5; light reflected by the coat does not reach the body."""
     f0 = _normal(indices.BINDER)
     red, green, blue = (d * (1.0 - f) for d, f in zip(diffuse, f0, strict=True))
     return Material(name, (red, green, blue), f0, roughness)

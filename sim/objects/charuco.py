@@ -1,6 +1,6 @@
-"""ChArUco board: a chessboard whose white squares carry markers, as OpenCV's calibration wants it.
+"""ChArUco board: a chessboard whose white squares carry markers, as OpenCV's calibration requires.
 
-Every cell of black or white is a rectangle of its own: edges are exact at any magnification, which no texture is.
+Every black or white cell is a rectangle of triangles: unlike in a texture, edges are exact at any magnification.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sim.scene.surface import Surface
 
 @dataclass(frozen=True)
 class Charuco:
-    """A board's measures; defaults are assumed."""
+    """Dimensions of a board; defaults are assumed."""
 
     squares_x: int = 12
     squares_y: int = 9
@@ -30,14 +30,14 @@ class Charuco:
     """OpenCV's name of the markers' dictionary."""
     thickness_mm: float = 4.0
     margin_mm: float = 5.0
-    """White around the squares, which the detector needs; with 20 there is room for stickers."""
+    """White border around the squares, which the detector needs; 20 leaves room for stickers."""
 
 
 def charuco_board(board: Charuco) -> Surface:
-    """A plate that stands on z = 0 with the board on its top, z = `thickness_mm`.
+    """A plate standing on z = 0 with the board on its top, z = `thickness_mm`.
 
-    The origin lies below the board's middle; x runs along the rows of squares, and the first square is at the top
-    left where y points up.
+    The origin is below the board's middle; x runs along the rows of squares, and with y pointing up the first
+    square is at the top left.
     """
     xs_mm, ys_mm, black = cells(board)
     top = _rectangles(xs_mm, ys_mm, board.thickness_mm)
@@ -52,7 +52,7 @@ def charuco_board(board: Charuco) -> Surface:
 
 
 def inner_corners_mm(board: Charuco) -> Array:
-    """[(squares_x - 1)(squares_y - 1), 3] chessboard corners by OpenCV's ids, in the board's frame: the truth."""
+    """True chessboard corners [(squares_x - 1)(squares_y - 1), 3] by OpenCV's ids, in the board's frame."""
     column, row = np.meshgrid(np.arange(1, board.squares_x), np.arange(1, board.squares_y))
     x = (column - board.squares_x / 2) * board.square_mm
     y = (board.squares_y / 2 - row) * board.square_mm
@@ -83,7 +83,7 @@ def opencv_board(board: Charuco) -> Any:
 
 
 def cells(board: Charuco) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Lines x [columns + 1] rising and y [rows + 1] falling, mm, and which cells [rows, columns] are black.
+    """Lines x [columns + 1] increasing and y [rows + 1] decreasing, mm, and which cells [rows, columns] are black.
 
     The lines are those of squares, of markers and of the markers' bits.
     """
@@ -117,7 +117,7 @@ def cells(board: Charuco) -> tuple[Array, Array, NDArray[np.bool_]]:
 
 
 def _rectangles(xs_mm: Array, ys_mm: Array, z_mm: float) -> Array:
-    """Corners [2 cells, 3, 3] of the cells between lines, row by row, a cell's two triangles together."""
+    """Corners [2 cells, 3, 3] of the cells between lines, row by row, the two triangles of a cell together."""
     x, y = np.meshgrid(xs_mm, ys_mm)
     points = np.stack([x, y, np.full(x.shape, z_mm)], axis=-1)
     a, b, c, d = points[1:, :-1], points[1:, 1:], points[:-1, 1:], points[:-1, :-1]

@@ -13,7 +13,7 @@ LINEN = Material("linen", (0.55, 0.47, 0.34), (0.04, 0.04, 0.04), 0.5)
 _BULGE_DEG = 50.0
 """Slope at the edge of a thread."""
 _DIP_DEG = 25.0
-"""Greatest slope along a thread, where it goes under its neighbour."""
+"""Greatest slope along a thread, where it passes under its neighbour."""
 
 
 def fabric(
@@ -24,10 +24,10 @@ def fabric(
     thread_mm: float = 1.2,
     material: Material = LINEN,
 ) -> Surface:
-    """A flat sheet in z = 0 about the origin, in plain weave: threads show in normals and tint.
+    """A flat sheet in z = 0 about the origin, in plain weave: threads are visible in normals and tint.
 
-    Threads are `thread_mm` wide. A thread needs some six triangles across to be seen as one: 1.2 mm at 200,000
-    triangles on 60 mm have nine.
+    Threads are `thread_mm` wide. A thread is resolved by about six triangles across: 1.2 mm at 200,000 triangles
+    on 60 mm have nine.
     """
     columns, rows = cells_for(triangles, width_mm, depth_mm)
     corners = rectangle(width_mm, depth_mm, columns, rows)
@@ -40,8 +40,8 @@ def fabric(
 def weave(places_mm: Array, thread_mm: float) -> tuple[Array, Array]:
     """Normals [n, 3] and shade [n], 0 to 1, of plain weave at places [n, 2].
 
-    Where column and row of a thread add up to an even number the warp (along y) lies on top, else the weft (along
-    x). Across a thread the normal turns as on a flattened cylinder, along it as on a wave of two threads' length.
+    Where column and row of a thread add up to an even number the warp (along y) is on top, else the weft (along
+    x). Across a thread the normal varies as on a flattened cylinder, along it as on a wave of two threads' length.
     """
     cell = np.floor(places_mm / thread_mm)
     within = 2.0 * (places_mm / thread_mm - cell) - 1.0

@@ -1,4 +1,4 @@
-"""Shapes for analytic checks and for looks: plane, sphere, sculpted relief."""
+"""Shapes for analytic checks and for demonstrations: plane, sphere, sculpted relief."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def plane(
 
 
 def sphere(radius_mm: float, *, triangles: int = 20_000, material: Material = appearance.SPECTRALON) -> Surface:
-    """A closed sphere that stands on z = 0: its centre is (0, 0, `radius_mm`). All corners lie on the sphere.
+    """A closed sphere standing on z = 0: its centre is (0, 0, `radius_mm`). All corners lie on the sphere.
 
     An icosahedron whose faces are divided into n x n: 20 n^2 triangles, the number nearest to `triangles`.
     """

@@ -1,4 +1,4 @@
-"""What a measuring dome is calibrated with: white tile, grey card, chrome ball, stickers."""
+"""Calibration targets: white tile, grey card, chrome ball, stickers."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from sim.scene.surface import Material, Surface
 
 _SEGMENTS = 48
 _BORDER = 10.0 / 6.0
-"""Diameter of a sticker over that of its bright disk."""
+"""Ratio of a sticker's diameter to that of its bright disk."""
 _THICKNESS_MM = 0.05
 _CELL_MM = 2.0
 _TRIES = 20_000
 
 
 def spectralon_tile(side_mm: float = 50.0, *, thickness_mm: float = 10.0) -> Surface:
-    """A square tile of Spectralon that stands on z = 0; its white face is at z = `thickness_mm`."""
+    """A square tile of Spectralon standing on z = 0; its white face is at z = `thickness_mm`."""
     return _tile(side_mm, side_mm, thickness_mm, appearance.SPECTRALON)
 
 
 def grey_card(width_mm: float = 210.0, depth_mm: float = 148.0, *, thickness_mm: float = 2.0) -> Surface:
-    """A card of 18 % reflectance that stands on z = 0; its face is at z = `thickness_mm`."""
+    """A card of 18 % reflectance standing on z = 0; its face is at z = `thickness_mm`."""
     return _tile(width_mm, depth_mm, thickness_mm, appearance.GREY_CARD)
 
 
 def chrome_ball(diameter_mm: float = 30.0, *, triangles: int = 80_000) -> Surface:
-    """A mirror ball that stands on z = 0."""
+    """A mirror ball standing on z = 0."""
     return sphere(diameter_mm / 2, triangles=triangles, material=appearance.CHROME)
 
 
@@ -62,7 +62,7 @@ def with_stickers(
     gap_mm: float = 0.8,
     where: NDArray[np.bool_] | None = None,
 ) -> Surface:
-    """The surface with `count` flat stickers put onto it; `sticker_poses` says where, and is the truth."""
+    """The surface with `count` flat stickers attached; `sticker_poses` gives their true poses."""
     poses = sticker_poses(surface, count, seed, diameter_mm=diameter_mm, gap_mm=gap_mm, where=where)
     return stuck_on(surface, poses, diameter_mm=diameter_mm)
 
@@ -84,9 +84,10 @@ def sticker_poses(
 ) -> Array:
     """[count, 4, 4] object_from_sticker, mm: the origin is the sticker's centre, z points away from the surface.
 
-    Places are drawn evenly over the surface. Kept are those that face up or sideways, where all of the surface
-    under the border lies in a layer of `gap_mm` and reaches as far as it, half a border away from other stickers.
-    A sticker rests on the highest point under it. `where` [triangles] tells on which triangles centres may lie.
+    Places are drawn uniformly over the surface. Accepted are those that face up or sideways, where the surface
+    under the border is within a layer of `gap_mm` and extends to the border on all sides, and that are half a
+    border away from other stickers. A sticker rests on the highest point under it. `where` [triangles] selects the
+    triangles on which centres may lie.
 
     Raises:
         InputError: The surface has no room for so many.
@@ -96,13 +97,13 @@ def sticker_poses(
     radius_mm = 0.5 * _BORDER * diameter_mm
     random = np.random.default_rng(seed)
     area_mm2 = _areas_mm2(surface.corners_mm)
-    # Points all over the surface stand for it, some forty under each sticker.
+    # The surface is sampled by points, about forty under each sticker.
     size = int(np.clip(40.0 * area_mm2.sum() / radius_mm**2, 20_000, 2_000_000))
     triangle = random.choice(len(area_mm2), size, p=area_mm2 / area_mm2.sum())
     cloud_mm = _points_in(surface.corners_mm[triangle], random)
     normals = flat_normals(surface.corners_mm)[triangle]
     allowed = normals[:, 2] > -0.1 if where is None else (normals[:, 2] > -0.1) & where[triangle]
-    # Ridges lie between the points: the triangles' corners belong to the surface too.
+    # Ridges may lie between the points: the triangles' corners are added.
     places_mm = np.concatenate([cloud_mm, surface.corners_mm.reshape(-1, 3)])
     facing = np.concatenate([normals, np.repeat(flat_normals(surface.corners_mm), 3, axis=0)])
     tree = cKDTree(places_mm)
@@ -145,7 +146,7 @@ def _points_in(corners_mm: Array, random: np.random.Generator) -> Array:
 
 
 def _goes_on(around: Array, normal: Array, radius_mm: float) -> bool:
-    """Whether the surface reaches the border in all eight directions: no sticker hangs over an edge."""
+    """True if the surface extends to the border in all eight directions, so that no sticker overhangs an edge."""
     pose = _standing(np.zeros(3), normal)
     x, y = (around @ pose[:3, :2]).T
     outer = np.hypot(x, y) > 0.6 * radius_mm
@@ -164,7 +165,7 @@ def _standing(centre_mm: Array, normal: Array) -> Array:
 
 
 def _tile(width_mm: float, depth_mm: float, thickness_mm: float, material: Material) -> Surface:
-    """A slab whose face has cells of `_CELL_MM`: light that falls off over it is shaded triangle by triangle."""
+    """A slab whose face has cells of `_CELL_MM`, so that a falloff of light over it is resolved by triangles."""
     columns, rows = (max(1, round(length_mm / _CELL_MM)) for length_mm in (width_mm, depth_mm))
     face = rectangle(width_mm, depth_mm, columns, rows, z_mm=thickness_mm)
     return of_material(np.concatenate([face, skirt(face)]), material)

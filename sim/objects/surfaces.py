@@ -1,4 +1,4 @@
-"""Surfaces of one material, joined and moved: what the generators of this room build objects of.
+"""Surfaces of one material, joined and moved: building blocks of the objects' generators.
 
 Everything is in the object's own frame, mm, z up; triangles are counter-clockwise seen from outside.
 """
@@ -15,7 +15,7 @@ from sim.scene.surface import Material, Surface
 
 
 def joined(parts: Sequence[Surface]) -> Surface:
-    """One surface of several; each brings its materials along."""
+    """One surface from several, with all their materials."""
     first = np.cumsum([0, *(len(part.materials) for part in parts)])
     tinted = any(part.tint is not None for part in parts)
     detailed = any(part.normals is not None for part in parts)
@@ -34,17 +34,17 @@ def of_material(corners_mm: Array, material: Material) -> Surface:
 
 
 def tint_of(surface: Surface) -> NDArray[np.float32]:
-    """[triangles, 3], ones where there is none."""
+    """[triangles, 3]; ones if the surface has no tint."""
     return np.ones((len(surface.corners_mm), 3), np.float32) if surface.tint is None else surface.tint
 
 
 def normals_of(surface: Surface) -> Array:
-    """[triangles, 3] shading normals, the flat ones where there are none."""
+    """[triangles, 3] shading normals; the flat ones if the surface has no others."""
     return flat_normals(surface.corners_mm) if surface.normals is None else surface.normals
 
 
 def moved(surface: Surface, frame_from_surface: Array) -> Surface:
-    """The surface under a rigid 4x4 transform, mm."""
+    """The surface transformed by a rigid 4x4, mm."""
     rotation, origin = frame_from_surface[:3, :3], frame_from_surface[:3, 3]
     normals = None if surface.normals is None else surface.normals @ rotation.T
     return Surface(

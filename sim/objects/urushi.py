@@ -14,11 +14,11 @@ from sim.scene.surface import Surface
 
 _BODY_MM = 6.0
 _LEVELS = 6
-"""Depths of flakes that have a metal of their own: gold looks redder the deeper it lies."""
+"""Number of depth levels of the flakes, each with its own metal: gold looks redder the deeper it lies."""
 
 
 def makie_tile(side_mm: float = 60.0, *, triangles: int = 60_000, petals: int = 8, seed: int = 1) -> Surface:
-    """A tile of polished black urushi that stands on z = 0, with a flower of sprinkled gold on its face.
+    """A tile of polished black urushi standing on z = 0, with a flower of sprinkled gold on its face.
 
     The drawing: `appearance.shapes.samples.makie_tile`.
     """
@@ -35,11 +35,11 @@ def makie_tile(side_mm: float = 60.0, *, triangles: int = 60_000, petals: int = 
 
 
 def nashiji_slab(slab_of: nashiji.Slab | None = None) -> Surface:
-    """Gold flakes on a body of dark lacquer that stands on z = 0; x and y go from 0 to the slab's size.
+    """Gold flakes on a body of dark lacquer standing on z = 0; x and y run from 0 to the slab's size.
 
-    The clear lacquer above the flakes is no surface of its own: its absorption along the normal, and what its face
-    lets through, are in the flakes' reflectance by depth (`appearance.metal_in_lacquer`). Refraction, and the
-    gloss of that face, are left away: they need paths to be traced. Flakes at the rim reach over it.
+    The clear lacquer above the flakes is not a surface: its absorption along the normal, and the transmittance of
+    its face, are included in the flakes' reflectance by depth (`appearance.metal_in_lacquer`). Refraction, and the
+    gloss of that face, are omitted: they require path tracing. Flakes at the rim extend beyond it.
     """
     found = nashiji.flakes(slab_of or nashiji.Slab())
     size_x, size_y = found.slab.size_mm

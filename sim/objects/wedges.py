@@ -1,4 +1,4 @@
-"""Samples in steps: gold leaf of rising thickness, and a paint of rising thickness over black and white."""
+"""Step samples: gold leaf of increasing thickness, and a paint of increasing thickness over black and white."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def gilt_step_wedge(
     depth_mm: float = 30.0,
     roughness: float = 0.12,
 ) -> Surface:
-    """A panel that stands on z = 0: along x, gold leaf of these thicknesses on bole (seed 001, section 5)."""
+    """A panel standing on z = 0: along x, gold leaf of these thicknesses on bole (seed 001, section 5)."""
     fields = [[appearance.gilt(thickness, roughness=roughness) for thickness in thicknesses_nm]]
     return _panel(fields, step_mm, depth_mm)
 
@@ -30,9 +30,9 @@ def paint_wedge(
     row_mm: float = 20.0,
     scattering_per_mm: float = 8.0,
 ) -> Surface:
-    """A panel that stands on z = 0: along x, a paint of these thicknesses; towards +y over white, else over black.
+    """A panel standing on z = 0: along x, a paint of these thicknesses; towards +y over white, else over black.
 
-    The grounds reflect 90 % and 2 % inside the binder, as the halves of a drawdown card; coarse blue pigments
+    The grounds reflect 90 % and 2 % inside the binder, like the halves of a drawdown card; coarse blue pigments
     scatter little (all assumed).
     """
     fields = [

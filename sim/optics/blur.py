@@ -1,6 +1,6 @@
-"""An image as the lens blurs it, before the sensor samples it: an optional stage, for most runs left out.
+"""Blur of the image by the lens, before the sensor samples it: an optional stage, off in most runs.
 
-It takes seconds at full size, where a frame without it takes some hundredths.
+It takes seconds at full size, where a frame without it takes hundredths.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ Image = NDArray[np.float32]
 _STEP = 1.25
 """Ratio of the standard deviations of neighbouring layers."""
 _SHARP_PX = 0.2
-"""A blur below this changes nothing that a pixel can see."""
+"""Blur below this has no visible effect on a pixel."""
 
 
 def through(objective: Objective, image: Image, depth_mm: Image, *, pixel_pitch_um: float) -> Image:
     """`image` [h, w, 3] (mean electrons in all channels) with lateral colour, defocus and diffraction.
 
-    `depth_mm` [h, w] is along the optical axis, infinite where nothing is seen. A pixel is blurred by its own
-    depth's curve: right on surfaces, wrong at the rim of something out of focus before something sharp.
+    `depth_mm` [h, w] is along the optical axis, infinite where nothing is seen. Each pixel is blurred by the
+    curve of its own depth: right on surfaces, wrong at the edge of an unsharp object in front of a sharp one.
     """
     out = np.empty_like(image)
     for channel in range(3):
@@ -33,10 +33,10 @@ def through(objective: Objective, image: Image, depth_mm: Image, *, pixel_pitch_
 
 
 def blurred(image: Image, sigma_px: Image) -> Image:
-    """`image` [h, w] blurred at each pixel by a normal curve of its own standard deviation [h, w].
+    """`image` [h, w] blurred at each pixel by a normal distribution of its own standard deviation [h, w].
 
-    Layers blurred by a few standard deviations are mixed so that the variance is right. Beyond its rim the image
-    goes on as its mirror.
+    Layers blurred by a few standard deviations are mixed so that the variance is right. The image is continued
+    beyond its border by reflection.
     """
     low, high = float(sigma_px.min()), float(sigma_px.max())
     if high <= _SHARP_PX:
@@ -56,7 +56,7 @@ def blurred(image: Image, sigma_px: Image) -> Image:
 
 
 def _evenly(image: Image, sigma_px: float) -> Image:
-    """The image blurred by Lindeberg's discrete normal curve, exp(-t) I_n(t) with t = sigma^2.
+    """The image blurred by Lindeberg's discrete normal distribution, exp(-t) I_n(t) with t = sigma^2.
 
     IEEE PAMI 12, 234 (1990). Its variance is t exactly; samples of a continuous curve narrower than a pixel
     lose up to half of it.
@@ -79,7 +79,7 @@ def _layers(low: float, high: float) -> list[float]:
 
 
 def _magnified(image: Image, scale: float) -> Image:
-    """The image enlarged by `scale` about its middle."""
+    """The image magnified by `scale` about its middle."""
     if scale == 1.0:
         return image
     from scipy.ndimage import affine_transform

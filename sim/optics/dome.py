@@ -1,7 +1,6 @@
-"""The dome as it was built: its boards stand a little beside where their table says, and wires may be swapped.
+"""The dome as built: its boards deviate slightly from the LED table, and wires may be swapped.
 
-The controller knows the table; frames are lit by what is here. This is the truth that the LEDs' calibration must
-find.
+The controller has the table; frames are lit by the LEDs given here. This is the truth for the LED calibration.
 """
 
 from __future__ import annotations
@@ -16,28 +15,28 @@ from pydantic import ConfigDict
 from coupole.appearance.render.led_squares import Leds
 
 _SHIFT, _TURN, _PLACE = 1, 2, 3
-"""Purposes of the seed's streams."""
+"""Numbers of the seed's random streams, by use."""
 
 
 @dataclass(frozen=True)
 class DomeErrors:
-    """How far the dome is from its table; all normal."""
+    """Deviations of the dome from its table; all normally distributed."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     seed: int = 1
     board_shift_mm: float = 0.0
-    """Standard deviation of a board's place along each axis."""
+    """Standard deviation of a board's position along each axis."""
     board_turn_deg: float = 0.0
-    """Standard deviation of a board's turn about each axis through its middle."""
+    """Standard deviation of a board's rotation about each axis through its middle."""
     led_shift_mm: float = 0.0
-    """Standard deviation of an LED's place on its board along each axis."""
+    """Standard deviation of an LED's position on its board along each axis."""
     swapped: tuple[tuple[int, int], ...] = ()
-    """Pairs of LEDs whose wires are swapped: each lights where the other stands."""
+    """Pairs of LEDs whose wires are swapped: each lights at the position of the other."""
 
 
 def as_built(table: Leds, errors: DomeErrors) -> Leds:
-    """The LEDs where they are; ids and fluxes are the table's, but a swapped LED has the other's flux as well."""
+    """The LEDs at their true positions; ids and fluxes are the table's, but swapped LEDs exchange fluxes."""
     if not (errors.board_shift_mm or errors.board_turn_deg or errors.led_shift_mm or errors.swapped):
         return table
     from scipy.spatial.transform import Rotation

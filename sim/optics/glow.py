@@ -1,8 +1,8 @@
-"""Lamps in the picture: what the camera sees of a lit LED or panel itself.
+"""Lamps in the picture: the image of a lit LED or panel itself.
 
-Every lamp is a rectangle that radiates by the cosine law, so its luminance is the same from all sides in front of
-it. It stands behind all else: where anything is seen, it is hidden. What is out of focus is a rectangle spread by
-the disk of confusion of its own distance.
+Every lamp is a rectangle that radiates by the cosine law, so its luminance is the same in all directions in front
+of it. It is behind all else: where anything is seen, the lamp is hidden. Out of focus, its rectangle is convolved
+with the disk of confusion of its own distance.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LEAST_DISK_PX = 0.25
 
 @dataclass(frozen=True)
 class Glow:
-    """Part of a picture that a lamp covers."""
+    """The part of a picture that a lamp covers."""
 
     rows: slice
     columns: slice
@@ -41,9 +41,9 @@ def glow(
     blur: tuple[Objective, float] | None,
     unevenness: float = 0.0,
 ) -> Glow | None:
-    """A lamp as the camera sees it, or None.
+    """The image of a lamp, or None if the camera does not see it.
 
-    `empty` [h, w] is the share of each pixel that sees nothing else; `blur` is objective and pixel pitch in um,
+    `empty` [h, w] is the fraction of each pixel that sees nothing else; `blur` is objective and pixel pitch in um,
     None for a picture that is sharp at all distances; `unevenness` is that of `sim.optics.panels.Panel`.
     """
     towards = base_from_camera[:3, 3] - emitter.centre_mm
@@ -84,13 +84,13 @@ def glow(
 
 
 def _box(seen_mm: NDArray[np.float64], through: Sight, margin_px: float) -> tuple[slice, slice] | None:
-    """The pixels that a polygon in the camera's frame may cover; all of them if part of it is behind the eye."""
+    """Pixels that a polygon in the camera's frame may cover; all of them if part of it is behind the camera."""
     lens = through.lens
     height, width = lens.height_px, lens.width_px
     if (seen_mm[:, 2] < _NEAR_MM).any():
         return slice(0, height), slice(0, width)
     at = distorted(seen_mm[:, :2] / seen_mm[:, 2:], lens.distortion) * lens.focal_px + lens.centre_px
-    # Distortion bends the edges outwards by less than the corners are moved.
+    # Distortion bends the edges outwards by less than it moves the corners.
     straight = seen_mm[:, :2] / seen_mm[:, 2:] * lens.focal_px + lens.centre_px
     points = np.concatenate([at, straight])
     left, top = np.floor(points.min(axis=0) - margin_px).astype(int)
@@ -103,9 +103,9 @@ def _box(seen_mm: NDArray[np.float64], through: Sight, margin_px: float) -> tupl
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _cover(coverage, edges, top, left, focal, centre_x, centre_y, shift):  # type: ignore[no-untyped-def]
-    """Share of each pixel whose rays lie on the inner side of all planes through eye and edge.
+    """Fraction of each pixel whose rays are on the inner side of all planes through camera centre and edge.
 
-    Within a pixel rays depend linearly on the place, so the share is the area of a square cut by straight lines.
+    Within a pixel rays are linear in position, so the fraction is the area of a square cut by straight lines.
     """
     height, width = coverage.shape
     bent = shift.shape[1] > 1
@@ -135,7 +135,7 @@ def _cover(coverage, edges, top, left, focal, centre_x, centre_y, shift):  # typ
 
 @numba.njit(cache=True, nogil=True)
 def _bend(at, shift, row, col):  # type: ignore[no-untyped-def]
-    """Add the lens's shift and its slopes to a pixel's ray."""
+    """Add the lens's shift and its derivatives to a pixel's ray."""
     above, below = max(row - 1, 0), min(row + 1, shift.shape[1] - 1)
     before, after = max(col - 1, 0), min(col + 1, shift.shape[2] - 1)
     for k in range(2):
@@ -180,7 +180,7 @@ def _area_within(lines, square, cut):  # type: ignore[no-untyped-def]
 def _evenness(
     unevenness: float, seen_mm: NDArray[np.float64], rows: slice, columns: slice, through: Sight
 ) -> NDArray[np.float32]:
-    """Luminance over that of the panel's centre, where each pixel's ray meets its plane."""
+    """Luminance relative to the panel's centre, where each pixel's ray meets its plane."""
     x = (np.arange(columns.start, columns.stop)[None, :] - through.lens.centre_px[0]) / through.lens.focal_px
     y = (np.arange(rows.start, rows.stop)[:, None] - through.lens.centre_px[1]) / through.lens.focal_px
     if through.shift is not None:
@@ -198,13 +198,13 @@ def _evenness(
 
 
 def _spread(coverage: NDArray[np.float32], disk_px: float) -> NDArray[np.float32]:
-    """The image convolved with an even disk of that diameter, its rim softened over a pixel."""
+    """The image convolved with a uniform disk of diameter `disk_px`, its edge softened over a pixel."""
     from scipy.signal import fftconvolve
 
     reach = int(np.ceil(0.5 * disk_px + 1.0))
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     disk = np.clip(0.5 * disk_px + 0.5 - np.hypot(x, y), 0.0, 1.0)
     spread = fftconvolve(coverage, disk / disk.sum(), mode="same")
-    # The transform leaves rounding where there is no light, and a lamp is bright enough to make it seen.
+    # The FFT leaves rounding errors where there is no light, which a bright lamp would make visible.
     spread[spread < 1e-6] = 0.0
     return np.asarray(spread, np.float32)

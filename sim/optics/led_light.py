@@ -1,7 +1,7 @@
-"""The dome's LEDs as single things: their spectrum, and how much each gives compared with its table.
+"""The dome's LEDs as individuals: their spectra, and their fluxes relative to the table.
 
-Everything is a function of seed, LED and flash; the model's figures are the truth that calibrations are tested
-against.
+Everything is a function of seed, LED and flash; the model's values are the truth against which calibrations are
+tested.
 """
 
 from __future__ import annotations
@@ -18,37 +18,37 @@ from coupole.appearance.spectra.grid import Array
 from coupole.appearance.spectra.white_led import WHITE_LED, LedSpectrum, spectral_power
 
 _OWN_FLUX, _OWN_PUMP, _FLASH, _LOOSE = 1, 2, 3, 4
-"""Purposes of the seed's streams."""
+"""Numbers of the seed's random streams, by use."""
 
 
 @dataclass(frozen=True)
 class LedModel:
-    """How a dome's LEDs differ from their table; all figures are assumed, of the order of white power LEDs."""
+    """How a dome's LEDs differ from their table; all values are assumed, of the order of white power LEDs."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     seed: int = 1
     flux_spread: float = 0.04
-    """Standard deviation of the logarithm of an LED's flux over its tabulated one: bins are some 10 % wide."""
+    """Standard deviation of the logarithm of an LED's flux over its tabulated one: bins are about 10 % wide."""
     pump_spread_nm: float = 2.5
-    """Standard deviation of the chip's wavelength."""
+    """Standard deviation of the pump chip's peak wavelength."""
     flux_per_k: float = -0.003
     """Relative change of flux per kelvin of board temperature."""
     reference_c: float = 25.0
-    """Board temperature at which the table holds."""
+    """Board temperature at which the table is valid."""
     hours_to_70_percent: float = 50_000.0
-    """Time of light after which 70 % of the flux is left (L70), on an exponential."""
+    """Operating time after which 70 % of the flux remains (L70), with exponential decay."""
     hours_shone: float = 0.0
-    """How old the LEDs are."""
+    """Operating time of the LEDs so far."""
     flicker: float = 5e-4
-    """Relative standard deviation from flash to flash."""
+    """Relative standard deviation of flux from flash to flash."""
     dead: tuple[int, ...] = ()
     """LEDs that give no light."""
     spectrum: LedSpectrum = WHITE_LED
 
 
 STEADY = LedModel(flux_spread=0.0, pump_spread_nm=0.0, flux_per_k=0.0, flicker=0.0)
-"""LEDs that give what their table says, always."""
+"""LEDs that always give the flux of their table."""
 
 
 def own_flux_factor(model: LedModel, led: int) -> float:
@@ -61,7 +61,7 @@ def own_flux_factor(model: LedModel, led: int) -> float:
 def led_flux_factor(model: LedModel, led: int, flash: int, temperature_c: float, *, hours: float = 0.0) -> float:
     """Flux of one flash over the tabulated flux.
 
-    `flash` counts this world's flashes, `temperature_c` is the board's, and `hours` is how long the LED has shone.
+    `flash` numbers this world's flashes, `temperature_c` is the board's, `hours` the LED's operating time.
     """
     warmth = 1.0 + model.flux_per_k * (temperature_c - model.reference_c)
     age = 0.7 ** (hours / model.hours_to_70_percent)
@@ -70,13 +70,13 @@ def led_flux_factor(model: LedModel, led: int, flash: int, temperature_c: float,
 
 
 class Flashes:
-    """A world's flashes, one after the other."""
+    """Flux of a world's flashes, in sequence."""
 
     def __init__(self, model: LedModel) -> None:
         self._model = model
         self._count = 0
         self.unsteady: dict[int, float] = {}
-        """LEDs with a loose contact: relative standard deviation from flash to flash, beside the model's."""
+        """LEDs with a loose contact: relative standard deviation from flash to flash, added to the model's."""
 
     def flux(self, led: int, temperature_c: float) -> float:
         """Flux of the LED's next flash over its tabulated flux."""
@@ -87,7 +87,7 @@ class Flashes:
 
 
 def led_power(model: LedModel, led: int) -> Array:
-    """Relative spectral power [81] of one LED, whose chip has its own wavelength; its sum is 1."""
+    """Relative spectral power [81] of one LED with its own pump wavelength; the sum is 1."""
     own = model.spectrum
     shift_nm = model.pump_spread_nm * _normal(model.seed, _OWN_PUMP, led)
     return spectral_power(
@@ -98,7 +98,7 @@ def led_power(model: LedModel, led: int) -> Array:
 
 
 def channel_factors(model: LedModel, led: int, sensitivities: Array) -> Array:
-    """[channels] signal of white under this LED over that under the model's own spectrum, at equal radiant power.
+    """[channels] signal of white under this LED relative to the model's own spectrum, at equal radiant power.
 
     `sensitivities` [channels, 81], such as `coupole.appearance.spectra.light.camera()`.
     """
@@ -106,10 +106,10 @@ def channel_factors(model: LedModel, led: int, sensitivities: Array) -> Array:
 
 
 def camera_weights(model: LedModel, sensitivities: ArrayLike) -> Array:
-    """[channels, 81] for `channels.channel_values`: what spectra become under the model's LED."""
+    """[channels, 81] for `channels.channel_values`: weights of spectra under the model's LED."""
     return channels.channel_weights(spectral_power(model.spectrum), sensitivities)
 
 
 def _normal(*where: int) -> float:
-    """Standard normal number of a place in the seed's streams."""
+    """Standard normal number at an index of the seed's streams."""
     return float(np.random.default_rng(where).standard_normal())

@@ -1,8 +1,7 @@
-"""Random numbers that are a pure function of where they are asked for: Philox, normal and Poisson draws, for
-kernels.
+"""Random numbers as pure functions of their index: Philox, normal and Poisson draws for kernels.
 
-A draw is named by a key (which seed, which kind of noise) and a counter (which pixel, which frame): no state, so
-the same frame comes out whatever the number of threads, the order of frames, or what was drawn before.
+A draw is identified by a key (seed, kind of noise) and a counter (pixel, frame). There is no state, so a frame is
+the same whatever the number of threads, the order of frames, or earlier draws.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 POISSON_EXACT_BELOW = 16.0
-"""Means below this are drawn exactly; above it a whole-number Cornish-Fisher quantile takes over."""
+"""Means below this are drawn exactly; above it, an integer Cornish-Fisher quantile is used."""
 
 _MEANS_PER_ELECTRON, _COUNTS = 8, 72
 _PER_OCTAVE_BITS = 6
@@ -22,7 +21,7 @@ _MANTISSA_BITS = 23
 _SHIFT = _MANTISSA_BITS - _PER_OCTAVE_BITS
 _OCTAVES = 33
 _FIRST = (127 - _OCTAVES) << _PER_OCTAVE_BITS
-"""Index of 2^-33: below it lies no probability that 31 random bits can name."""
+"""Index of 2^-33, below which 31 random bits have no probability."""
 
 
 def key(seed: int, kind: int) -> np.uint32:
@@ -52,8 +51,8 @@ INVERSE_NORMAL = _inverse_normal()
 
 
 def _small_means() -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
-    """Probability of fewer than n counts [128, 72] for means every 1/8, in units of 2^-32; and the count from
-    which to search [128, 256], by a word's upper 8 bits."""
+    """Probability of fewer than n counts [128, 72] for means in steps of 1/8, in units of 2^-32; and the count
+    from which to search [128, 256], by a word's upper 8 bits."""
     means = np.arange(int(POISSON_EXACT_BELOW) * _MEANS_PER_ELECTRON)[:, None] / _MEANS_PER_ELECTRON
     factors = np.concatenate([np.exp(-means), means / np.arange(1, _COUNTS - 1)], axis=1)
     fewer = np.cumsum(np.cumprod(factors, axis=1), axis=1) * 2.0**32
@@ -68,7 +67,7 @@ SMALL_MEANS, SMALL_STARTS = _small_means()
 
 @numba.njit(inline="always")
 def philox(counter, frame, seed):  # type: ignore[no-untyped-def]
-    """Two random uint32 of a 64-bit counter (pixel, frame) and a 32-bit key: Philox 2x32 with 7 rounds.
+    """Two random uint32 from a 64-bit counter (pixel, frame) and a 32-bit key: Philox 2x32 with 7 rounds.
 
     Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011; 7 rounds are the fewest
     that pass BigCrush there.
@@ -84,7 +83,7 @@ def philox(counter, frame, seed):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def normal(word, table):  # type: ignore[no-untyped-def]
-    """Standard normal of 32 random bits, by inversion: tails to 6.2 standard deviations."""
+    """Standard normal from 32 random bits, by inversion: tails to 6.2 standard deviations."""
     p = (np.float32(word >> np.uint32(1)) + np.float32(0.5)) * np.float32(2.0**-32)
     at = (np.float32(p).view(np.int32) >> np.int32(_SHIFT)) - np.int32(_FIRST)
     at = min(at, np.int32(len(table) - 1))
@@ -94,10 +93,10 @@ def normal(word, table):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def poisson_quantile(mean, z):  # type: ignore[no-untyped-def]
-    """Whole number distributed as Poisson(mean), from a standard normal `z`, for means of 16 and more.
+    """Integer distributed as Poisson(mean), from a standard normal `z`, for means of 16 and more.
 
-    Cornish and Fisher (1937), third order; 1/12 less variance makes room for the rounding (Sheppard). At a mean of
-    16 the distance in total variation is 3e-4 and the variance right to 2e-5; both fall as the mean grows.
+    Cornish and Fisher (1937), third order; the variance is reduced by 1/12 for the rounding (Sheppard). At a mean
+    of 16 the distance in total variation is 3e-4 and the variance right to 2e-5; both decrease with the mean.
     """
     mean = np.float32(mean)
     root = np.sqrt(mean - np.float32(1.0 / 12.0))
@@ -108,11 +107,11 @@ def poisson_quantile(mean, z):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def poisson_exact(mean, word, cumulative, start):  # type: ignore[no-untyped-def]
-    """Poisson count of 32 random bits, for means below 16: the sum of two counts, each by inversion.
+    """Poisson count from 32 random bits, for means below 16: the sum of two counts, each by inversion.
 
-    The first has the next lower mean of the tables, `SMALL_MEANS` and `SMALL_STARTS`. Where the word lies between
-    two of its steps is a random number as well: it draws the second, of what is left of the mean, nearly always 0.
-    A loop from 0 with the mean itself is four times slower: nothing foresees where it ends.
+    The first has the next lower mean of the tables, `SMALL_MEANS` and `SMALL_STARTS`. The position of the word
+    between two of its steps is a random number too: it draws the second, for the remainder of the mean, which is
+    nearly always 0. A loop from 0 with the mean itself is four times slower, as its length is unpredictable.
     """
     row = np.int32(mean * np.float32(_MEANS_PER_ELECTRON))
     count = np.int32(start[row, word >> np.uint32(24)])

@@ -1,7 +1,7 @@
-"""What the simulated lens does to light, beside where it sends it (`sim.render.lens`): loss, vignetting, blur.
+"""Effects of the simulated lens apart from its geometry (`sim.render.lens`): loss, vignetting, blur.
 
-A thin lens of focal length f and f-number N, focused at s from its principal plane: the image stands at
-f s/(s - f), magnified by m = f/(s - f).
+A thin lens of focal length f and f-number N, focused at s from its principal plane: the image distance is
+f s/(s - f), the magnification m = f/(s - f).
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from coupole.errors import InputError
 Array = NDArray[np.float64]
 
 CHANNEL_UM = (0.60, 0.54, 0.46)
-"""Wavelengths that stand for red, green and blue."""
+"""Wavelengths that represent red, green and blue."""
 
 
 @dataclass(frozen=True)
 class Objective:
-    """The lens as glass. Defaults are the instrument's 35 mm at f/8; what is marked "assumed" has its order."""
+    """Optical properties. Defaults are the instrument's 35 mm at f/8; values marked "assumed" are typical."""
 
     focal_length_mm: float = 35.0
     focus_distance_mm: float = 334.0
-    """From the lens's principal plane to what is sharp."""
+    """From the lens's principal plane to the plane in focus."""
     f_number: float = 8.0
     transmission: float = 0.90
-    """Of the glass, the same for all channels (assumed)."""
+    """Transmittance of the glass, the same for all channels (assumed)."""
     rim_radius: float = 3.0
     """Radius of the front rim over that of the pupil: stopped down to f/8 the rim is far outside (assumed)."""
     rim_shift: float = 4.0
-    """By how many radii of the pupil the rim moves across it, for a tangent of 1 (assumed)."""
+    """Shift of the rim across the pupil, in radii of the pupil, for a tangent of 1 (assumed)."""
     lateral_colour: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Relative change of magnification of red, green and blue: 1e-4 is 0.2 pixel in a corner at full size."""
 
@@ -50,7 +50,7 @@ class Objective:
 
     @property
     def working_f_number(self) -> float:
-        """N (1 + m): the cone of light that reaches the sensor is the narrower the farther the lens stands off."""
+        """N (1 + m): the cone of light at the sensor narrows with the lens's distance from it."""
         return self.f_number * (1.0 + self.magnification)
 
 
@@ -61,7 +61,7 @@ def illuminance_per_radiance(objective: Objective) -> float:
 
 
 def vignetting(objective: Objective, tangent: ArrayLike) -> Array:
-    """Share of the centre's light at a tangent of the angle to the axis: cos^4 and what the rim leaves."""
+    """Illuminance relative to the centre at a tangent of the angle to the axis: cos^4 and the rim's vignetting."""
     t = np.asarray(tangent, dtype=float)
     return np.asarray((1.0 + t * t) ** -2.0 * _overlap(objective.rim_radius, objective.rim_shift * t))
 
@@ -75,7 +75,7 @@ def defocus_px(objective: Objective, depth_mm: ArrayLike, pixel_pitch_um: float)
 
 
 def diffraction_px(objective: Objective, wavelength_um: ArrayLike, pixel_pitch_um: float) -> Array:
-    """Standard deviation, pixels, of the normal curve nearest to Airy's disk: 0.42 lambda N_w.
+    """Standard deviation, pixels, of the normal distribution nearest to the Airy disk: 0.42 lambda N_w.
 
     Zhang, Zerubia, Olivo-Marin, Appl. Opt. 46, 1819 (2007): 0.21 lambda/NA, with NA = 1/(2 N_w).
     """
@@ -85,14 +85,14 @@ def diffraction_px(objective: Objective, wavelength_um: ArrayLike, pixel_pitch_u
 def blur_px(objective: Objective, depth_mm: ArrayLike, channel: int, pixel_pitch_um: float) -> Array:
     """Standard deviation of the blur per axis, pixels, of points at a depth in one channel (0 red to 2 blue).
 
-    A disk of diameter c has c/4; variances of defocus and diffraction add.
+    A disk of diameter c has c/4; the variances of defocus and diffraction add.
     """
     disk = 0.25 * defocus_px(objective, depth_mm, pixel_pitch_um)
     return np.hypot(disk, diffraction_px(objective, CHANNEL_UM[channel], pixel_pitch_um))
 
 
 def _overlap(rim: float, shift: Array) -> Array:
-    """Share of a unit disk that a disk of radius `rim` covers whose centre is `shift` away."""
+    """Fraction of a unit disk that is covered by a disk of radius `rim` with its centre `shift` away."""
     d = np.clip(shift, abs(1.0 - rim) + 1e-12, 1.0 + rim - 1e-12)
     in_unit = np.arccos(np.clip((d * d + 1.0 - rim * rim) / (2.0 * d), -1.0, 1.0))
     in_rim = np.arccos(np.clip((d * d + rim * rim - 1.0) / (2.0 * d * rim), -1.0, 1.0))

@@ -1,4 +1,4 @@
-"""The dome's flat white panels: they light what stands in the dome, and the camera may look at them."""
+"""The dome's flat white panels: they light the scene, and may be visible to the camera."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from coupole.geometry import Transform
 from sim.render.emitter import Emitter, irradiance
 
 PARTS = 4
-"""A panel lights in PARTS x PARTS pieces, each with a shadow of its own: together they are soft."""
+"""A panel is computed as PARTS x PARTS pieces, each with its own shadow, which gives soft shadows."""
 _Vector = tuple[float, float, float]
 _Length = Annotated[float, Field(gt=0)]
 
 
 class Panel(BaseModel):
-    """One square panel, in the support frame. Its upper edge is level."""
+    """One square panel, in the support frame. Its upper edge is horizontal."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     centre_mm: _Vector
     towards_mm: _Vector = (0.0, 0.0, 0.0)
-    """A point that it faces."""
+    """A point that the panel faces."""
     side_mm: _Length = 600.0
     unevenness: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """By how much the middle of its edges is darker than its centre, which falls off as a paraboloid."""
+    """Relative decrease of luminance (a paraboloid) from its centre to the middle of its edges."""
 
 
 def whole(panel: Panel, base_from_support: Transform, lux: float) -> Emitter:
-    """The panel in the base frame, as if it were even: the flux is its centre's luminance times pi times its area.
-    It gives `lux` on a level surface at the support's centre."""
+    """The panel in the base frame as if it were uniform: the flux is pi times area times luminance of its centre.
+    It gives `lux` on a horizontal surface at the support's centre."""
     one = _one_lumen(panel, base_from_support)
     given = sum(
         float(irradiance(piece, base_from_support[:3, 3], base_from_support[:3, 2])[0])
@@ -64,7 +64,7 @@ def _one_lumen(panel: Panel, base_from_support: Transform) -> Emitter:
     rotation = base_from_support[:3, :3]
     level = np.cross((0.0, 0.0, 1.0), normal)
     length = np.linalg.norm(level)
-    level = level / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])  # it faces straight up or down
+    level = level / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])  # the panel faces straight up or down
     half_mm = 0.5 * panel.side_mm
     return Emitter(
         rotation @ centre + base_from_support[:3, 3],

@@ -1,4 +1,4 @@
-"""The world's photographer: renders what the true camera pose sees under the lights that shone."""
+"""Renders the simulated camera's frames: the scene from the true camera pose, under the lights that were on."""
 
 from __future__ import annotations
 
@@ -43,36 +43,36 @@ _RADIANCE_BYTES = 256 << 20
 _WARM_UP_HEIGHT_MM = 1000.0
 
 _AHEAD = square((0.0, 0.0, 1000.0), (0.0, 0.0, -1.0), side_mm=LED_SIDE_MM, flux_lm=1.0)
-"""A lamp before the camera, to try it on."""
+"""A lamp in front of the camera, for the warm-up."""
 
 Radiance = NDArray[np.float32]
 
 
 @dataclass
 class Look:
-    """What one pose of camera and arm sees, and what was worked out for it so far."""
+    """What one pose of camera and arm sees, and the radiances computed for it so far."""
 
     base_from_camera: Transform
     arm_mm: Capsules
-    """Bodies of the arm, which cast shadows."""
+    """Capsules of the arm, which cast shadows."""
     view: View
     places: NDArray[np.int32]
-    """[seen] of the triangles seen, in the table of shadows."""
+    """[seen] places of the seen triangles in the table of shadows."""
     samples: int
     scene: Scene
     radiance: dict[int, Radiance] = field(default_factory=dict)
-    """Of the triangles seen, by LED, or by minus the number of a panel."""
+    """Radiance of the seen triangles, by LED, or by minus the number of a panel."""
     glows: dict[int, Glow | None] = field(default_factory=dict)
-    """By the same numbers."""
+    """Images of lamps, by the same numbers."""
 
     @cached_property
     def empty(self) -> NDArray[np.float32]:
-        """[h, w] share of each pixel that sees nothing."""
+        """[h, w] fraction of each pixel that sees nothing."""
         return self.view.empty(self.samples)
 
     @cached_property
     def prepared(self) -> Prepared:
-        """For light that goes from surface to surface."""
+        """Scene and sensors for interreflections."""
         from sim.render.interreflection import prepare
 
         return prepare(self.scene, self.view.sides >> 1, self.view.towards_camera)
@@ -93,7 +93,7 @@ class Photographer:
         self._emission = scene.emission
         table = read_leds(scene.leds)
         self.leds: Leds = as_built(table, settings.dome)
-        """Where they are; the controller has the table's."""
+        """The LEDs where they really are; the controller has the table."""
         self._led_model = settings.leds
         self._emitters = _emitters(self.leds)
         self._row_of_led = {int(led): row for row, led in enumerate(self.leds.ids)}
@@ -136,7 +136,7 @@ class Photographer:
         self._warm_up(base_from_support)
 
     def _warm_up(self, base_from_support: Transform) -> None:
-        """Compile by looking down at the support under one LED, before anybody waits for a frame."""
+        """Compile by rendering the support from above under one LED, before the first frame is due."""
         support_from_camera = np.diag([1.0, -1.0, -1.0, 1.0])
         support_from_camera[2, 3] = _WARM_UP_HEIGHT_MM
         look = self._look_from(base_from_support @ support_from_camera @ inverse(self.flange_from_camera))
@@ -178,7 +178,7 @@ class Photographer:
             )
 
     def _lit(self, look: Look, exposed: Exposed) -> tuple[Radiance, float]:
-        """Radiance of what is seen, and for how many seconds."""
+        """Radiance of the seen triangles, and its duration in seconds."""
         lights = [(self._led(look, led), lit_s) for led, lit_s in exposed.seconds_of_led.items()]
         lights += [(self._panel(look, panel), exposed.exposure_s) for panel in exposed.panels]
         if len(lights) == 1:
@@ -190,7 +190,7 @@ class Photographer:
         return radiance, 1.0
 
     def _look_from(self, base_from_flange: Transform, arm_mm: Capsules = NONE) -> Look:
-        """Rasterise from a flange pose, unless it is the last one still."""
+        """Rasterise from a flange pose, unless it is still the last one."""
         base_from_camera = base_from_flange @ self.flange_from_camera
         look = self._look
         if look is None or np.abs(base_from_camera - look.base_from_camera).max() > _POSE_TOLERANCE:
@@ -203,10 +203,10 @@ class Photographer:
             look.radiance.clear()
         return look
 
-    # -- what lights things -------------------------------------------------------------------------------
+    # -- light on the scene -------------------------------------------------------------------------------
 
     def _led(self, look: Look, led: int) -> Radiance:
-        """Radiance of the view's triangles under one LED at its tabulated flux."""
+        """Radiance of the seen triangles under one LED at its tabulated flux."""
         row = self._row_of_led[led]
         return _remembered(look, led, lambda: self._lit_by_led(look, row) * self._colour_of(led))
 
@@ -214,7 +214,7 @@ class Photographer:
         return self._shaded(look, self._emitters[row], row) + self._indirect(look, self._emitters[row])
 
     def _panel(self, look: Look, panel: int) -> Radiance:
-        """Radiance of the view's triangles under panel 1 to 4."""
+        """Radiance of the seen triangles under panel 1 to 4."""
         if not self._panels:
             return panel_radiance(look.view, self._scene.materials, self.reference_lux)
         if panel > len(self._panels):
@@ -243,7 +243,7 @@ class Photographer:
         return radiance
 
     def _indirect(self, look: Look, emitter: Emitter) -> Radiance:
-        """What reaches the view's triangles by way of others; zeros where that is not asked for."""
+        """Radiance by interreflection; zeros if that is switched off."""
         if self._interreflection is None or len(look.view.sides) == 0:
             return np.zeros((len(look.view.sides), 3), np.float32)
         from sim.render.interreflection import indirect_radiance
@@ -252,7 +252,7 @@ class Photographer:
         return indirect_radiance(look.prepared, emitter, bounces=asked.bounces, samples=asked.samples)
 
     def _colour_of(self, led: int) -> NDArray[np.float32]:
-        """[3] signal of white under this LED over that under the median one, at equal flux."""
+        """[3] signal of white under this LED relative to the median one, at equal flux."""
         if self._led_model.pump_spread_nm == 0.0:
             return np.ones(3, np.float32)
         if led not in self._colour:
@@ -262,7 +262,7 @@ class Photographer:
     # -- lamps in the picture -----------------------------------------------------------------------------
 
     def _glows(self, look: Look, exposed: Exposed) -> NDArray[np.float32] | None:
-        """[h, w] mean electrons of lamps that the camera looks at, or None if it sees none."""
+        """[h, w] mean electrons from lamps in the picture, or None if there are none."""
         seen: list[tuple[Glow, NDArray[np.float32]]] = []
         for led, lit_s in exposed.seconds_of_led.items():
             if spot := self._glow(look, led, self._emitters[self._row_of_led[led]], self._emission):
@@ -282,7 +282,7 @@ class Photographer:
         return mean_e * self._falloff * np.float32(self._electrons)
 
     def _glow(self, look: Look, light: int, lamp: Emitter, emission: str, unevenness: float = 0.0) -> Glow | None:
-        """What the camera sees of a lamp; computed once per pose."""
+        """The image of a lamp; computed once per pose."""
         if light not in look.glows:
             blur = (self._objective, self._camera.pixel_pitch_um) if self._camera.blur else None
             look.glows[light] = glow(
@@ -292,7 +292,7 @@ class Photographer:
 
 
 def _remembered(look: Look, light: int, compute: Callable[[], Radiance]) -> Radiance:
-    """What fits into memory is computed once per pose."""
+    """The radiance under a light, computed once per pose as long as memory suffices."""
     if light in look.radiance:
         return look.radiance[light]
     radiance = compute()

@@ -1,11 +1,11 @@
-"""From radiance to digital numbers: what a CMOS sensor makes of the light that reaches it.
+"""The CMOS sensor: from radiance to digital numbers.
 
-Electrons: light by the Bayer filter and each pixel's response (PRNU), ambient light, dark current with its hot
-pixels; shot noise (Poisson); full well. Then the readout: offset (DSNU), row noise, read noise; gain; black level;
-rounding and the ends of the ADC. The terms are those of EMVA 1288.
+Electrons: light after Bayer filter and each pixel's response (PRNU), ambient light, dark current with hot pixels;
+shot noise (Poisson); full well. Then the readout: offset (DSNU), row noise, read noise; gain; black level;
+rounding and clipping by the ADC. The terms are those of EMVA 1288.
 
-A frame is a function of the model, the light and its number: same seed, same frame, bit by bit, whatever the
-number of threads. `fixed_pattern` and the model's own figures are the truth that calibrations are tested against.
+A frame is a function of the model, the light and its number: the same seed gives the same frame, bit by bit,
+whatever the number of threads. `fixed_pattern` and the model's values are the truth for tests of calibrations.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from sim.optics import noise
 from sim.optics.sensor_model import SensorModel
 
 _RESPONSE, _DARK, _PIXELS, _ROWS = range(4)
-"""Kinds of noise that one seed feeds."""
+"""Kinds of noise derived from one seed."""
 
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """What one sensor's pixels have of their own, in every frame; arrays are [h, w] and read-only."""
+    """Properties of the individual pixels, the same in every frame; arrays are [h, w] and read-only."""
 
     response: NDArray[np.float32]
     """Relative to the mean pixel (PRNU)."""
@@ -71,11 +71,11 @@ def expose(
 ) -> None:
     """Fill `out` [h, w] with one frame, DN.
 
-    `triangle` [h k, w k] names what k x k parts of each pixel see, a row of `radiance` [seen, 3] or -1 for
-    nothing; the pixel takes their mean. Radiance times `falloff` [h, w] times `electrons_per_radiance` is the mean
-    number of electrons of a pixel with response 1. `exposure_s` and `temperature_c` set dark current and ambient
-    light, `gain` divides the electrons per DN. `more_e` [h, w] are mean electrons of other light, such as that of
-    lamps in the picture.
+    `triangle` [h k, w k] holds, for k x k samples of each pixel, a row of `radiance` [seen, 3], or -1 for nothing;
+    the pixel takes their mean. Radiance times `falloff` [h, w] times `electrons_per_radiance` is the mean number
+    of electrons of a pixel with response 1. `exposure_s` and `temperature_c` set dark current and ambient light,
+    `gain` divides the electrons per DN. `more_e` [h, w] are mean electrons of other light, such as that of lamps
+    in the picture.
 
     Raises:
         InputError: The shapes do not fit together.
@@ -101,9 +101,9 @@ def electrons(
     *,
     electrons_per_radiance: float,
 ) -> NDArray[np.float32]:
-    """[h, w, 3] mean electrons in all three channels at every pixel: what a stage before the Bayer filter, such as
-    the lens's blur, works on. Arguments as in `expose`."""
-    seen = np.vstack([radiance, np.zeros((1, 3), np.float32)])  # the last row is nothing, which index -1 means
+    """[h, w, 3] mean electrons in all three channels at every pixel, for stages before the Bayer filter, such as
+    the lens's blur. Arguments as in `expose`."""
+    seen = np.vstack([radiance, np.zeros((1, 3), np.float32)])  # index -1 (nothing) is the row of zeros
     k = len(triangle) // len(falloff)
     mean_e = np.zeros((*falloff.shape, 3), np.float32)
     for part in range(k * k):
@@ -113,7 +113,7 @@ def electrons(
 
 
 def mosaic(image: NDArray[np.float32], model: SensorModel) -> NDArray[np.float32]:
-    """[h, w] of an image [h, w, 3]: what the Bayer filter leaves of it, for `expose_electrons`."""
+    """[h, w] of an image [h, w, 3] after the Bayer filter, for `expose_electrons`."""
     height, width, _ = image.shape
     rows, columns = np.ogrid[:height, :width]
     return np.ascontiguousarray(image[rows, columns, model.channels()[rows & 1, columns & 1]])
@@ -129,8 +129,7 @@ def expose_electrons(
     gain: float = 1.0,
     temperature_c: float = 25.0,
 ) -> None:
-    """Fill `out` [h, w] with one frame, DN, from the mean electrons [h, w] that light makes in pixels of response
-    1.
+    """Fill `out` [h, w] with one frame, DN, from the mean electrons [h, w] of light in pixels of response 1.
 
     Raises:
         InputError: The shapes differ.
@@ -145,7 +144,7 @@ def expose_electrons(
 def _settings(
     model: SensorModel, shape: tuple[int, ...], frame: int, exposure_s: float, gain: float, temperature_c: float
 ) -> tuple[Any, ...]:
-    """What `_develop` takes beside the light: fixed pattern, ambient light, readout, frame, keys, tables."""
+    """Arguments of `_develop` other than the light: fixed pattern, ambient light, readout, frame, keys, tables."""
     pattern = fixed_pattern(model, *shape)
     ambient_e = np.asarray(model.ambient_e_per_s, np.float32)[model.channels()] * np.float32(exposure_s)
     dn_per_e = gain / model.electrons_per_dn
@@ -218,8 +217,8 @@ def _develop(  # type: ignore[no-untyped-def]
     small_means,
     small_starts,
 ):
-    """Shot noise, full well, readout and ADC. The loops over a row are apart, so that all but that of the dim
-    pixels run as vectors; in tuples the arrays would cost half of the speed."""
+    """Shot noise, full well, readout and ADC. The loops over a row are separate, so that all but that of the dim
+    pixels are vectorised; arrays passed in tuples would halve the speed."""
     height, width = out.shape
     dark_s, full_well, read_e, row_e, dn_per_e, black, white = readout
     for row in numba.prange(height):

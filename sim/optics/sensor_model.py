@@ -1,4 +1,4 @@
-"""The figures of a simulated sensor: what `sim.optics.sensor` makes its frames with."""
+"""The parameters of a simulated sensor, for `sim.optics.sensor`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ CHANNEL = {"R": 0, "G": 1, "B": 2}
 
 @dataclass(frozen=True)
 class SensorModel:
-    """The simulated sensor; full well and range are those of the CMV12000 (facts/instrument), the rest is
-    assumed."""
+    """The simulated sensor; full well and range are those of the CMV12000, the rest is assumed."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
@@ -27,10 +26,10 @@ class SensorModel:
     """Standard deviation of one pixel's readout."""
     seed: int = 1
     adc_share: float = 0.96
-    """Share of the full well that fills the ADC at gain 1. Below 1 the ADC clips first, as makers set it: at 1,
-    read noise would leave half of all saturated pixels under `white_dn`."""
+    """Fraction of the full well that fills the ADC at gain 1. Below 1 the ADC clips first, as makers set it: at 1,
+    read noise would leave half of all saturated pixels below `white_dn`."""
     row_noise_e: float = 1.0
-    """Standard deviation of what all pixels of a row share in one frame."""
+    """Standard deviation of the offset common to all pixels of a row in one frame."""
     prnu: float = 0.01
     """Relative standard deviation of the pixels' responses."""
     dsnu_e: float = 3.0
@@ -41,12 +40,12 @@ class SensorModel:
     """Standard deviation of the natural logarithm of the pixels' dark currents."""
     dark_reference_c: float = 25.0
     dark_doubling_k: float = 6.5
-    """Warming that doubles the dark current."""
+    """Temperature rise that doubles the dark current."""
     hot_share: float = 1e-4
-    """Share of pixels whose dark current is greater by the factor `hot_factor`."""
+    """Fraction of pixels whose dark current is greater by the factor `hot_factor`."""
     hot_factor: float = 100.0
     ambient_e_per_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Red, green, blue: light of the room, the same on every pixel."""
+    """Red, green, blue: ambient light of the room, the same on every pixel."""
 
     @property
     def white_dn(self) -> int:
@@ -54,12 +53,12 @@ class SensorModel:
 
     @property
     def full_scale_e(self) -> float:
-        """Electrons that fill the ADC at gain 1; a gain divides them."""
+        """Electrons that fill the ADC at gain 1; to be divided by the gain."""
         return self.full_well_e * self.adc_share
 
     @property
     def electrons_per_dn(self) -> float:
-        """At gain 1; a gain divides it."""
+        """At gain 1; to be divided by the gain."""
         return self.full_scale_e / (self.white_dn - self.black_dn)
 
     def dark_factor(self, temperature_c: float) -> float:
@@ -67,6 +66,6 @@ class SensorModel:
         return float(2.0 ** ((temperature_c - self.dark_reference_c) / self.dark_doubling_k))
 
     def channels(self) -> NDArray[np.int64]:
-        """[2, 2] channel (0 red, 1 green, 2 blue) of each place in the Bayer cell; MONO is all green."""
+        """[2, 2] channel (0 red, 1 green, 2 blue) of each pixel of the Bayer cell; MONO is all green."""
         letters = self.bayer_pattern if self.bayer_pattern != "MONO" else "GGGG"
         return np.array([CHANNEL[c] for c in letters]).reshape(2, 2)

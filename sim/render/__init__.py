@@ -1,6 +1,6 @@
-"""From a scene, a camera pose and the lights that shone to the radiance of every visible triangle.
+"""From scene, camera pose and lights to the radiance of every visible triangle.
 
-`lens` says where a pixel looks, `raster` which triangle it sees, `shadows` which LEDs reach that triangle,
-`emitter` how much light arrives, `radiance` how much of it goes on to the camera. None of this is shared with the
-processing of real frames: the two check each other.
+`lens` gives the ray of a pixel, `raster` the triangle that it sees, `shadows` the LEDs that reach that triangle,
+`emitter` the irradiance, `radiance` the light reflected to the camera. None of this code is shared with the
+processing of real frames, so that each checks the other.
 """

@@ -1,7 +1,7 @@
-"""Shadows of what moves: capsules between the lights and what the camera sees.
+"""Shadows of moving bodies: capsules between the lights and the visible triangles.
 
-They are tested exactly, one segment from each triangle's centroid to the light's centre: some few bodies are
-quicker so than by building a tree anew for each pose.
+Tested exactly, one segment from each triangle's centroid to the light's centre: for a few bodies this is faster
+than building a new tree for each pose.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ def cast(
 
 
 def warm_up() -> None:
-    """Compile, before anybody waits for a frame."""
+    """Compile, before the first frame is due."""
     capsules = np.array([[0.0, 0.0, 50.0, 0.0, 10.0, 50.0, 5.0]])
     cast(np.ones((1, 3), np.float32), np.zeros((1, 3), np.float32), capsules, np.array([0.0, 0.0, 100.0]))
 
 
 @numba.njit(cache=True, nogil=True)
 def distance_mm(a, b, c, d):  # type: ignore[no-untyped-def]
-    """Between the segments a b and c d (Ericson, Real-Time Collision Detection, 5.1.9)."""
+    """Distance of the segments a b and c d (Ericson, Real-Time Collision Detection, 5.1.9)."""
     along, across, between = b - a, d - c, a - c
     aa, cc, f = along @ along, across @ across, across @ between
     if aa < 1e-12:

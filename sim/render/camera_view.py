@@ -1,4 +1,4 @@
-"""What one camera pose sees: a triangle for each pixel, and of each triangle seen what shading it takes."""
+"""The view from one camera pose: a triangle for each pixel, and the shading data of each triangle seen."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class View:
 
     triangle: NDArray[np.int32]
     sides: NDArray[np.int64]
-    """[seen] 2 t where the front of the scene's triangle t is seen (counter-clockwise), 2 t + 1 for its back."""
+    """[seen] 2 t if the front of the scene's triangle t is seen (counter-clockwise), 2 t + 1 for its back."""
     centroids_mm: NDArray[np.float32]
     """[seen, 3] in the base frame, as all below."""
     normals: NDArray[np.float32]
     """[seen, 3] flat unit normals of the sides seen."""
     shading_normals: NDArray[np.float32]
-    """[seen, 3] the same where the scene has no others."""
+    """[seen, 3]; the flat ones if the scene has no others."""
     towards_camera: NDArray[np.float32]
     """[seen, 3] unit."""
     diffuse: NDArray[np.float32]
@@ -36,14 +36,14 @@ class View:
     """[seen] row of the scene's materials."""
 
     def depth_mm(self, base_from_camera: Transform) -> NDArray[np.float32]:
-        """[h k, w k] of what each pixel sees, along the optical axis; infinite where it sees nothing."""
+        """[h k, w k] depth of each pixel along the optical axis; infinite where it sees nothing."""
         axis, eye = base_from_camera[:3, 2], base_from_camera[:3, 3]
         depths = np.append(self.centroids_mm @ axis - eye @ axis, np.inf).astype(np.float32)
         of_pixel: NDArray[np.float32] = depths[self.triangle]
         return of_pixel
 
     def empty(self, samples: int) -> NDArray[np.float32]:
-        """[h, w] share of each pixel's `samples` x `samples` that sees nothing."""
+        """[h, w] fraction of each pixel's `samples` x `samples` that see nothing."""
         nothing = self.triangle < 0
         if samples > 1:
             height, width = nothing.shape
@@ -53,7 +53,7 @@ class View:
 
 
 class Viewer:
-    """Looks at one scene through one lens, from any pose; `samples` k divides pixels into k x k."""
+    """Views of one scene through one lens, from any pose; `samples` k divides pixels into k x k."""
 
     def __init__(self, scene: Scene, lens: Lens, samples: int = 1) -> None:
         self._scene = scene

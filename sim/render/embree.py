@@ -1,7 +1,7 @@
 """Embree's shadow rays, called from compiled code.
 
-embreex carries the Embree 4 library but traces rays one at a time in the direction of numpy arrays; its C
-functions, found through the extension module that is linked to it, take packets of 16 rays from numba threads.
+embreex contains the Embree 4 library, but its Python functions trace rays one at a time. Embree's C functions,
+found through the extension module that is linked to it, take packets of 16 rays from numba threads.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _CHUNK = 4096
 _COHERENT, _ALL_FEATURES = 1 << 16, 0xFFFFFFFF
 _ARGUMENTS = np.array([_ALL_FEATURES << 32 | _COHERENT, 0, 0, 0, 0, 0], np.uint64)
 """RTCOccludedArguments: flags, features; no context, filter or function. Rays from neighbouring triangles to one
-light go the same way through the tree."""
+light are coherent: they traverse the tree alike."""
 OFFSET_MM = 2e-3
-"""A shadow ray starts so far above its triangle, on the light's side: ten times the rounding of float32
+"""Height above its triangle, on the light's side, at which a shadow ray starts: ten times the rounding of float32
 coordinates of 2 m, and a hundredth of a scanned triangle."""
 
 
 class _Library:
-    """The C functions with their types, bound once."""
+    """The C functions with their types, loaded once."""
 
     def __init__(self) -> None:
         import embreex.rtcore_scene as linked_to_embree
@@ -73,12 +73,12 @@ class Obstacles:
     _scene: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Build the tree. `corners_mm` must have 4 bytes to spare behind its end (`sim.scene.scene.spacious`)."""
+        """Build the tree. At least 4 bytes must follow `corners_mm` in memory (`sim.scene.scene.build_scene`)."""
         call, count = self._library, len(self.corners_mm)
         self._indices = np.arange(3 * count, dtype=np.uint32)
         self._device = call.new_device(b"")
         self._scene = call.new_scene(self._device)
-        # Compact: a tenth slower, but 40 million triangles fit; robust: no ray slips through a common edge.
+        # Compact: 10 % slower, but 40 million triangles fit; robust: no ray passes through a common edge.
         call.set_scene_flags(self._scene, _COMPACT | _ROBUST)
         geometry = call.new_geometry(self._device, _TRIANGLES)
         call.set_buffer(geometry, _VERTEX, 0, _FLOAT3, self.corners_mm.ctypes.data, 0, 12, 3 * count)
@@ -96,10 +96,10 @@ class Obstacles:
     def trace(
         self, sides: NDArray[np.int64], light_mm: NDArray[np.float64], first: int, bits: NDArray[np.uint8]
     ) -> None:
-        """Set, from place `first` on, the bits of those sides of triangles that a light's centre [3] reaches.
+        """Set, from place `first` on, the bits of those sides of triangles that are reached from a light's centre.
 
-        A side is 2 t for the front of triangle t (seen counter-clockwise), 2 t + 1 for its back. `bits` holds a
-        zero for every place before; sides that face away from the light keep it.
+        A side is 2 t for the front of triangle t (seen counter-clockwise), 2 t + 1 for its back. `bits` must be
+        zero from that place on; the bits of sides that face away from the light stay zero.
         """
         address, scene = self._library.occluded, np.uint64(self._scene)
         _trace(address, scene, self.corners_mm, sides, light_mm, first, bits, _ARGUMENTS)
@@ -111,7 +111,7 @@ class Obstacles:
 
 
 def _occluded16(_context, _address, _valid, _scene, _rays, _arguments):  # type: ignore[no-untyped-def]
-    """`rtcOccluded16(valid, scene, rays, arguments)` at an address that is one too, so that code can be cached."""
+    """`rtcOccluded16(valid, scene, rays, arguments)` with its address as argument, so that code can be cached."""
 
     def generate(context, builder, _signature, values):  # type: ignore[no-untyped-def]
         word = ir.IntType(64)
@@ -128,7 +128,7 @@ _call_occluded16: Any = intrinsic(_occluded16)
 
 @numba.njit(cache=True, nogil=True)
 def centroid_and_normal(corners, t, centroid, normal):  # type: ignore[no-untyped-def]
-    """Fill a triangle's centroid [3] and flat unit normal [3]; no normal, all zeros, where it has no area."""
+    """Fill a triangle's centroid [3] and flat unit normal [3]; the normal is zero if the triangle has no area."""
     for k in range(3):
         a, b, c = np.float64(corners[t, 0, k]), np.float64(corners[t, 1, k]), np.float64(corners[t, 2, k])
         centroid[k] = (a + b + c) / 3.0

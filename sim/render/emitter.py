@@ -1,8 +1,8 @@
-"""Light of a square Lambertian emitter at a point.
+"""Irradiance from a square Lambertian emitter at a point.
 
 E = Phi / (2 pi A) sum over the edges of the part above the receiver's horizon of angle_i (edge_i's normal . n)
-(Lambert 1760; seed 003, Eq. 2, where `paper` multiplies by the emitter's cosine once more). Lengths are in mm but
-for E / Phi, which is per m^2.
+(Lambert 1760; seed 003, Eq. 2, where `paper` multiplies by the emitter's cosine once more). Lengths are in mm,
+except that E / Phi is per m^2.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 LED_SIDE_MM = 7.0
 FAR_SIDES = 30.0
-"""From so many sides on, 2 x 2 Gauss points differ from the polygon by less than 1e-6 where the emitter is wholly
+"""At this distance in sides, 2 x 2 Gauss points differ from the polygon by less than 1e-6 if the emitter is
 above the horizon by a tenth of its distance (measured in tests/unit/render/test_emitter.py)."""
 _GAUSS = 1.0 / np.sqrt(3.0)
 
@@ -36,9 +36,9 @@ class Emitter:
 
 
 def square(centre_mm: ArrayLike, normal: ArrayLike, *, side_mm: float, flux_lm: float) -> Emitter:
-    """Emitter with two sides horizontal (perpendicular to z; along x where it looks straight up or down).
+    """Emitter with two sides horizontal (perpendicular to z; along x if it faces straight up or down).
 
-    The LED table does not say how squares lie; at 1 m that is worth 1e-5 of the irradiance at most.
+    The LED table does not give the orientation of squares; at 1 m it changes the irradiance by at most 1e-5.
     """
     (one,) = squares(np.atleast_2d(centre_mm), np.atleast_2d(normal), side_mm=side_mm, fluxes_lm=[flux_lm])
     return one
@@ -59,7 +59,7 @@ def squares(centres_mm: ArrayLike, normals: ArrayLike, *, side_mm: float, fluxes
 def irradiance(
     emitter: Emitter, points_mm: ArrayLike, normals: ArrayLike, emission: str = "lambertian"
 ) -> NDArray[np.float64]:
-    """[n] lux at points [n, 3] with unit normals [n, 3], nothing in between."""
+    """[n] lux at points [n, 3] with unit normals [n, 3], unobstructed."""
     points, facing = (
         np.atleast_2d(np.asarray(points_mm, np.float64)),
         np.atleast_2d(np.asarray(normals, np.float64)),
@@ -104,7 +104,7 @@ def _irradiance_of_each(p, n, leds, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def per_lumen(px, py, pz, nx, ny, nz, led, shares, work):  # type: ignore[no-untyped-def]
-    """E / Phi in 1/m^2 at p with unit normal n; fills `shares` [4] with what the four Gauss points add to it.
+    """E / Phi in 1/m^2 at p with unit normal n; fills `shares` [4] with the four Gauss points' contributions.
 
     `work` [2, 8, 3] is memory for the polygon. Without light the shares are 0.
     """
@@ -134,7 +134,7 @@ def per_lumen(px, py, pz, nx, ny, nz, led, shares, work):  # type: ignore[no-unt
 
 @numba.njit(cache=True, nogil=True)
 def _polygon(tx, ty, tz, nx, ny, nz, led, work):  # type: ignore[no-untyped-def]
-    """Lambert's sum over the edges of the square, clipped at the horizon; (tx, ty, tz) leads to its centre."""
+    """Lambert's sum over the edges of the square, clipped at the horizon; (tx, ty, tz) points to its centre."""
     whole, above = work[0], work[1]
     for k in range(4):
         u = 1.0 if k in (0, 3) else -1.0

@@ -1,12 +1,13 @@
-"""Light that goes from surface to surface before the camera sees it, by Mitsuba: what `sim.render` leaves out.
+"""Interreflections, computed with Mitsuba: light that meets two or more surfaces, which `sim.render` omits.
 
     prepared = prepare(scene, view.sides >> 1, view.towards_camera)
     radiance += indirect_radiance(prepared, emitter)
 
-A meter looks at each seen triangle's centroid as the camera does. It counts paths of up to `bounces` surfaces,
-then those of one surface alone; the difference went over two surfaces at least. Far from a small emitter direct
-light has next to no noise, so that little of it is left in the difference (tested: below 1e-3 of it). Triangles
-are flat here (no `Scene.normals`), Schlick's Fresnel factor is that of a real index, and LEDs are Lambertian.
+A radiance meter looks at each seen triangle's centroid from the camera's direction. It computes paths of up to
+`bounces` surfaces, then those of one surface alone; the difference met at least two surfaces. Far from a small
+emitter direct light has almost no noise, so little of it remains in the difference (tested: below 1e-3 of it).
+Triangles are flat here (no `Scene.normals`), Schlick's Fresnel factor is replaced by that of a real index, and
+LEDs are Lambertian.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from sim.render.emitter import Emitter
 from sim.scene.scene import Scene
 
 _START_MM = 0.05
-"""From a meter to its triangle: a quarter of a scanned one."""
+"""Distance of a meter from its triangle: a quarter of a scanned triangle."""
 _MM2 = 1e-6
 _BATCH = 20_000
 _LEAST_ROUGHNESS = 0.01
@@ -33,19 +34,19 @@ _LEAST_ROUGHNESS = 0.01
 
 @dataclass(frozen=True)
 class Prepared:
-    """Shapes of a scene and meters on the triangles that are seen; good for all LEDs of a pose."""
+    """Shapes of a scene and meters on the seen triangles; valid for all LEDs of a pose."""
 
     shapes: dict[str, Any]
     meters: list[Any]
     """Each a batch of at most `_BATCH` triangles."""
     origin_mm: NDArray[np.float64]
-    """Of Mitsuba's frame: its single precision shall be spent on the object."""
+    """Origin of Mitsuba's frame, at the object, for the sake of its single precision."""
 
 
 def prepare(scene: Scene, triangles: NDArray[np.integer], towards_camera: ArrayLike) -> Prepared:
     """Shapes and meters for the scene's `triangles` [seen], seen from unit directions [seen, 3].
 
-    Some 50 us a triangle. Raises InputError without Mitsuba.
+    Takes about 50 us per triangle. Raises InputError without Mitsuba.
     """
     mi = variant.mitsuba("scalar_rgb")
     centroids = scene.corners_mm[triangles].mean(axis=1, dtype=np.float64)
@@ -82,8 +83,8 @@ def _meters(mi: Any, starts_mm: NDArray[np.float64], directions: NDArray[np.floa
     pixel = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
     film = {**pixel, "width": len(starts_mm), "component_format": "float32"}
     meters = {
-        f"meter{number:06d}": {"type": "radiancemeter", "origin": start, "direction": way, "film": pixel}
-        for number, (start, way) in enumerate(zip(starts_mm.tolist(), directions.tolist(), strict=True))
+        f"meter{number:06d}": {"type": "radiancemeter", "origin": start, "direction": direction, "film": pixel}
+        for number, (start, direction) in enumerate(zip(starts_mm.tolist(), directions.tolist(), strict=True))
     }
     return variant.loaded(mi, {"type": "batch", "film": film, **meters})
 
@@ -117,7 +118,7 @@ def _shapes(mi: Any, scene: Scene, origin_mm: NDArray[np.float64]) -> dict[str, 
 
 
 def _material(figures: NDArray[np.float64], *, tinted: bool) -> Description:
-    """Lambert and GGX of a row of `Scene.materials`, blended in halves of twice the strength."""
+    """Lambert and GGX for a row of `Scene.materials`, blended half and half, each at twice its strength."""
     plain = _figures(_lambert(figures))
     body = {
         "type": "diffuse",
@@ -139,7 +140,7 @@ def _material(figures: NDArray[np.float64], *, tinted: bool) -> Description:
 
 
 def _lambert(figures: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Diffuse reflectance [3], twice as strong where it is one half of a blend."""
+    """Diffuse reflectance [3], doubled if it is one half of a blend."""
     return np.asarray(figures[:3] * (2.0 if _glossy(figures) else 1.0))
 
 
@@ -148,12 +149,12 @@ def _glossy(figures: NDArray[np.float64]) -> bool:
 
 
 def _figures(values: NDArray[np.float64]) -> Description:
-    """Three numbers as they are: no colour."""
+    """Three numbers without colour conversion."""
     return {"type": "srgb", "color": values.tolist(), "unbounded": True}
 
 
 def _square(mi: Any, emitter: Emitter, origin_mm: NDArray[np.float64]) -> Description:
-    """The emitter: a rectangle whose sides go from -1 to 1 in its own frame."""
+    """The emitter as a rectangle whose sides run from -1 to 1 in its own frame."""
     place = np.eye(4)
     columns = (emitter.half_u_mm, emitter.half_v_mm, emitter.normal, emitter.centre_mm - origin_mm)
     for column, vector in enumerate(columns):

@@ -1,12 +1,12 @@
-"""Where the pixels of the simulated camera look: a pinhole behind a lens that distorts.
+"""Rays of the simulated camera's pixels: a pinhole with lens distortion.
 
-Distortion is Brown and Conrady's in OpenCV's order and sign (k1, k2, p1, p2, k3): x = X/Z and y = Y/Z go to
+Distortion is the Brown-Conrady model in OpenCV's order and sign (k1, k2, p1, p2, k3): x = X/Z and y = Y/Z go to
 
     x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-The renderer needs the inverse, once per lens and for every pixel: it then tests triangles where the pixel really
-looks, so that long triangles have bent edges in the picture, as they must.
+The renderer needs the inverse, once per lens and for every pixel: it tests triangles along the true ray of each
+pixel, so that edges of long triangles are curved in the picture, as they should be.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from coupole.errors import InputError
 Distortion = tuple[float, float, float, float, float]
 NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 LANES = 8
-"""Pixels of a row that the rasteriser tests at once; tables by column are so much longer than the image."""
+"""Pixels of a row that the rasteriser tests at once; tables by column are longer than the image by this number."""
 _PROBES = 65
 _MARGIN = 1.25
-"""The steepest slope found between probes is taken this much steeper."""
+"""Safety factor on the steepest slope found between probes."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Focal length in pixels, and distortion; the principal point is the image's centre, pixels' centres are
-    whole numbers."""
+    """Focal length in pixels, and distortion; the principal point is the image's centre, and pixels' centres have
+    integer coordinates."""
 
     width_px: int
     height_px: int
     focal_px: float
     distortion: Distortion = NO_DISTORTION
     samples: int = 1
-    """Pixels along the sides of a pixel of the sensor: 1 but for a lens that is `supersampled`."""
+    """Subdivision of a sensor pixel along each side: 1, except for a lens that is `supersampled`."""
 
     @staticmethod
     def focused(
@@ -50,7 +50,7 @@ class Lens:
         focus_distance_mm: float,
         distortion: Distortion = NO_DISTORTION,
     ) -> Lens:
-        """Focused at `focus_distance_mm` the image stands at 1/(1/f - 1/focus) behind the lens."""
+        """Focused at `focus_distance_mm`: the image distance is 1/(1/f - 1/focus)."""
         image_distance_mm = 1.0 / (1.0 / focal_length_mm - 1.0 / focus_distance_mm)
         return Lens(width_px, height_px, image_distance_mm * 1e3 / pixel_pitch_um, distortion)
 
@@ -59,7 +59,7 @@ class Lens:
         return 0.5 * self.width_px - 0.5, 0.5 * self.height_px - 0.5
 
     def supersampled(self, factor: int) -> Lens:
-        """The lens of a sensor whose pixels are divided into `factor` x `factor`; see `rook_shifts_px`."""
+        """The lens with sensor pixels divided into `factor` x `factor`; see `rook_shifts_px`."""
         return replace(
             self,
             width_px=self.width_px * factor,
@@ -70,31 +70,31 @@ class Lens:
 
 
 def rook_shifts_px(samples: int, count: int) -> NDArray[np.float64]:
-    """[count] how far the rays of a supersampled pixel are shifted: of row r by the r-th to the right, of column c
-    by the c-th upwards. So the grid of a pixel's rays is turned, none stands in another's row or column, and an
-    edge along the rows grows in `samples`^2 steps, not in `samples`. Zeros for one sample.
+    """[count] shifts of the rays of a supersampled pixel: those of row r move by the r-th value to the right,
+    those of column c by the c-th upwards. So the grid of a pixel's rays is rotated, no two share a row or column,
+    and an edge along the rows is resolved in `samples`^2 steps instead of `samples`. Zeros for one sample.
     """
     return (np.arange(count) % samples + 0.5) / samples - 0.5
 
 
 @dataclass(frozen=True)
 class Sight:
-    """A lens with its inverse, ready to rasterise through."""
+    """A lens with its inverse, as used by the rasteriser."""
 
     lens: Lens
     shift: NDArray[np.float32] | None
-    """[2, h, w + LANES] what to add to x and y of a pixel's place in the image to undo distortion, in units of the
-    focal length (beyond the image: any number); None where there is no distortion."""
+    """[2, h, w + LANES] correction of x and y of a pixel's position that undoes distortion, in units of the focal
+    length (beyond the image: any number); None without distortion."""
     shift_slope: float
-    """Bound of the change of distortion's part of `shift` from one pixel to the next one in its row."""
+    """Upper bound of the change of distortion's part of `shift` from one pixel to the next in its row."""
     reach: tuple[float, float]
-    """No pixel looks farther from the axis than this, in x and y, in units of the focal length."""
+    """Upper bound of a pixel's distance from the axis, in x and y, in units of the focal length."""
     bend_slope: float
-    """Bound of the change of distortion over a change of position, in any direction within the image."""
+    """Upper bound of the change of distortion over a change of position, in any direction within the image."""
 
 
 def sight(lens: Lens) -> Sight:
-    """The inverse of a lens. Raises InputError where distortion folds the image."""
+    """The inverse of a lens. Raises InputError if distortion folds the image."""
     half_x, half_y = ((centre + 1.5) / lens.focal_px for centre in lens.centre_px)
     if lens.distortion == NO_DISTORTION:
         return Sight(lens, None, 0.0, (half_x, half_y), 0.0)
@@ -104,7 +104,7 @@ def sight(lens: Lens) -> Sight:
     if not _undistort(lens.focal_px, *lens.centre_px, terms, rooks, shift):
         raise InputError(
             f"simulated lens: distortion {lens.distortion} folds the image of {lens.width_px} x {lens.height_px} "
-            f"pixels at a focal length of {lens.focal_px:.0f} pixels, so that a pixel would look two ways; "
+            f"pixels at a focal length of {lens.focal_px:.0f} pixels, so that a pixel would see two directions; "
             "expected coefficients (k1, k2, p1, p2, k3) of a calibrated lens"
         )
     most = float(np.abs(shift).max())
@@ -115,19 +115,19 @@ def sight(lens: Lens) -> Sight:
 
 
 def _bend_slope(lens: Lens, reach: tuple[float, float]) -> float:
-    """Bound of |d(a) - d(b)| / |a - b| of the displacement d by distortion, over all that the image sees."""
+    """Upper bound of |d(a) - d(b)| / |a - b| of the displacement d by distortion, over the visible field."""
     grid = np.stack(np.meshgrid(*(np.linspace(-far, far, _PROBES) for far in reach)), axis=-1)
     step = 1e-6
     columns = [
-        (distorted(grid + np.array(way) * step, lens.distortion) - distorted(grid, lens.distortion)) / step
-        for way in ((1, 0), (0, 1))
+        (distorted(grid + np.array(direction) * step, lens.distortion) - distorted(grid, lens.distortion)) / step
+        for direction in ((1, 0), (0, 1))
     ]
     jacobian = np.stack(columns, axis=-1) - np.eye(2)
     return float(np.linalg.norm(jacobian, ord=2, axis=(-2, -1)).max()) * _MARGIN
 
 
 def distorted(xy: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64]:
-    """Brown and Conrady's model on normalised image coordinates [..., 2]."""
+    """Brown-Conrady model on normalised image coordinates [..., 2]."""
     k1, k2, p1, p2, k3 = distortion
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -143,7 +143,7 @@ def distorted(xy: NDArray[np.float64], distortion: Distortion) -> NDArray[np.flo
 
 @numba.njit(cache=True, nogil=True)
 def bend(x, y, terms):  # type: ignore[no-untyped-def]
-    """What distortion adds to a normalised position (x, y)."""
+    """Displacement of a normalised position (x, y) by distortion."""
     r2 = x * x + y * y
     radial = r2 * (terms[0] + r2 * (terms[1] + r2 * terms[4]))
     return (
@@ -154,7 +154,7 @@ def bend(x, y, terms):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _undistort(focal, centre_x, centre_y, terms, rooks, shift):  # type: ignore[no-untyped-def]
-    """Fill `shift` by fixed-point iteration, to 1e-7 pixel; False where it does not settle."""
+    """Fill `shift` by fixed-point iteration, to 1e-7 pixel; False if it does not converge."""
     height, width = shift.shape[1], shift.shape[2] - LANES
     settled = np.ones(height, np.bool_)
     for row in numba.prange(height):

@@ -1,10 +1,10 @@
-"""Radiance that visible triangles send to the camera under one LED, or under a panel.
+"""Radiance of visible triangles towards the camera under one LED, or under a panel.
 
 L = f E with f = diffuse / pi + D G F / (4 n.l n.v): Lambert and GGX with Smith's separable G (Walter et al. 2007,
-Eqs. 33 and 34) and Schlick's F, as `surface.Material` says. E comes from the whole square emitter; f is taken
-towards its centre where the lobe is wide, towards four Gauss points of it, weighted by their light, where the
-roughness is below `FINE_ROUGHNESS`. Below 0.01 or so, where the lobe is as narrow as the emitter looks (0.4 deg
-at 1 m), four points are too few. A side whose plane has the emitter's centre behind it is dark.
+Eqs. 33 and 34) and Schlick's F, as in `surface.Material`. E is that of the whole square emitter; f is evaluated
+towards its centre if the lobe is wide, towards four Gauss points weighted by their light if the roughness is below
+`FINE_ROUGHNESS`. Below about 0.01, where the lobe is as narrow as the emitter's angular size (0.4 deg at 1 m),
+four points are too few. A side whose plane has the emitter's centre behind it is dark.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ def led_radiance(
     places: NDArray[np.int32],
     reached: NDArray[np.uint8],
 ) -> NDArray[np.float32]:
-    """[seen, 3] lm/(m^2 sr), red green blue. `reached` are `Shadows.reached`'s bits, `places` where to look there.
+    """[seen, 3] lm/(m^2 sr), red green blue. `reached` are the bits of `Shadows.reached`, `places` the indices.
 
-    `paper` takes the emitter's cosine, towards the triangle, twice (seed 003, Eq. 2; facts/instrument).
+    `paper` applies the emitter's cosine, towards the triangle, twice (seed 003, Eq. 2).
     """
     radiance = np.empty((len(view.sides), 3), np.float32)
     _shade(
@@ -52,7 +52,7 @@ def led_radiance(
 
 
 def panel_radiance(view: View, materials: NDArray[np.float64], panel_lux: float) -> NDArray[np.float32]:
-    """[seen, 3] under a panel: the same irradiance everywhere, from all around, as a flat white panel is meant."""
+    """[seen, 3] under an ideal flat white panel: the same irradiance everywhere, from all directions."""
     albedo = view.diffuse + materials[view.material, 3:6]
     radiance: NDArray[np.float32] = (panel_lux / np.pi * albedo).astype(np.float32)
     return radiance
@@ -139,7 +139,7 @@ def _lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha):  # type: ignore[no-untyped
     cos_h = (nx * hx + ny * hy + nz * hz) / length
     cos_hv = (vx * hx + vy * hy + vz * hz) / length
     alpha2 = alpha * alpha
-    # sin^2 from the cross product: 1 - cos^2 in rounded numbers would shape the peak of a smooth surface.
+    # sin^2 from the cross product: 1 - cos^2 would distort the peak of a smooth surface by rounding.
     cx, cy, cz = ny * hz - nz * hy, nz * hx - nx * hz, nx * hy - ny * hx
     spread = cos_h * cos_h * alpha2 + (cx * cx + cy * cy + cz * cz) / (length * length)
     d = alpha2 / (np.pi * spread * spread)

@@ -1,13 +1,13 @@
-"""Which triangle each pixel sees: a z-buffer over all triangles of the scene, once per camera pose.
+"""The triangle that each pixel sees: a z-buffer over all triangles of the scene, once per camera pose.
 
 A pixel's ray d = (x, y, 1) meets the triangle of camera coordinates v0 v1 v2 where d (v1 x v2), d (v2 x v0) and
 d (v0 x v1) have the sign of v0 (v1 x v2), and then 1/z is their sum over that volume (Olano and Greer 1997). So
-triangles that reach behind the camera need no clipping, and two triangles with a common edge leave no crack: the
+triangles that extend behind the camera need no clipping, and two triangles with a common edge leave no crack: the
 edge's products are the same numbers with opposite signs.
 
-The image is cut into bands of rows. Every band goes through the triangles that reach it in their order and keeps
-the nearest, the first of equals: the result is the same for any number of threads. Nearness and number of the
-triangle are one integer, so that the nearest is a maximum, and eight pixels of a row are tested at once by a loop
+The image is divided into bands of rows. Each band processes the triangles that reach it in order and keeps the
+nearest, the first of equals: the result does not depend on the number of threads. Nearness and triangle number are
+packed into one integer, so that the nearest is a maximum, and eight pixels of a row are tested at once by a loop
 without branches.
 """
 
@@ -21,16 +21,16 @@ from coupole.geometry import Transform, inverse
 from sim.render.lens import LANES, Sight, bend, rook_shifts_px
 
 NEAR_MM = 1.0
-"""What is nearer to the projection centre is not seen."""
+"""Points nearer to the projection centre than this are not seen."""
 _BAND_ROWS = 32
 _LAST = np.int64(0xFFFFFFFF)
 _CHUNK = 16384
 _WIDE = 32
-"""From so many columns on it pays to find out first where a row is between the edges."""
+"""For more columns than this it is faster to find first which part of a row is between the edges."""
 _SMALL = 8
-"""Where the lens bends, triangles of fewer columns and rows have their corners moved, others each pixel's ray."""
+"""With distortion, smaller triangles (columns and rows) have their corners moved, larger ones each pixel's ray."""
 _STRIDE = 8
-"""Bands are worked on in this stride, so that every thread's share is spread over the image."""
+"""Bands are processed in this stride, so that every thread's part is spread over the image."""
 
 
 def visible_triangles(
@@ -38,10 +38,10 @@ def visible_triangles(
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """What each pixel's centre sees [h, w], a row of the second array or -1; and the triangles seen [seen].
 
-    `corners_mm` [n, 3, 3] are in the base frame. The answer is exact in float64 through a straight lens, and for
-    large triangles through one that bends; edges of small ones are right to 3e-4 pixel. Both sides are seen. The
-    triangles seen stand in the order in which rows and columns meet them first: neighbours in the image then lie
-    together in every table of visible triangles, which makes gathers three times faster.
+    `corners_mm` [n, 3, 3] are in the base frame. The result is exact in float64 without distortion, and for large
+    triangles with distortion; edges of small ones are right to 3e-4 pixel. Both sides are visible. Triangles are
+    listed in the order of their first pixel by rows and columns: neighbours in the image are then close together
+    in every table of visible triangles, which makes gathers three times faster.
     """
     lens = sight.lens
     height, width = lens.height_px, lens.width_px
@@ -100,7 +100,7 @@ def _to_camera(corners, t, m, v):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _box(v, lens, width, height):  # type: ignore[no-untyped-def]
-    """First and last column and row, of the distorted image, that a triangle of camera coordinates may reach."""
+    """First and last column and row of the distorted image that a triangle of camera coordinates may reach."""
     x0, x1, y0, y1 = np.inf, -np.inf, np.inf, -np.inf
     for k in range(3):
         n = (k + 1) % 3
@@ -115,14 +115,14 @@ def _box(v, lens, width, height):  # type: ignore[no-untyped-def]
             x0, x1, y0, y1 = min(x0, x), max(x1, x), min(y0, y), max(y1, y)
     focal, centre_x, centre_y, slope = lens[0], lens[1], lens[2], lens[9]
     if slope > 0.0:
-        # Distortion moves all that the image sees of the box by what it moves the middle of that, give or take.
+        # Distortion moves the visible part of the box by the shift of its middle, within the bound `slope`.
         x0, x1, y0, y1 = max(x0, -lens[10]), min(x1, lens[10]), max(y0, -lens[11]), min(y1, lens[11])
         if x0 > x1 or y0 > y1:
             return 0, -1, 0, -1
         by_x, by_y = bend(0.5 * (x0 + x1), 0.5 * (y0 + y1), lens[3:8])
         spare = slope * 0.5 * (x1 - x0 + y1 - y0)
         x0, x1, y0, y1 = x0 + by_x - spare, x1 + by_x + spare, y0 + by_y - spare, y1 + by_y + spare
-    # A thousandth of a pixel for rounding: the test of a pixel decides, the box only must not lose it.
+    # A thousandth of a pixel for rounding: the box may be too large, but must not miss a pixel.
     spare = lens[13] + 1e-3
     first_col = np.ceil(max(x0 * focal + centre_x - spare, 0.0))
     last_col = np.floor(min(x1 * focal + centre_x + spare, width - 1.0))
@@ -135,8 +135,8 @@ def _box(v, lens, width, height):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _find_bands(corners, camera_from_base, lens, width, height, boxes, counts):  # type: ignore[no-untyped-def]
-    """Columns and rows that each triangle may reach (last before first for none), and how many of a chunk reach
-    each band."""
+    """Columns and rows that each triangle may reach (last before first for none), and the number of each chunk's
+    triangles in each band."""
     for chunk in numba.prange(len(counts)):
         v = np.empty((3, 3))
         for t in range(chunk * _CHUNK, min(len(corners), (chunk + 1) * _CHUNK)):
@@ -164,8 +164,8 @@ def _list_bands(boxes, starts, members):  # type: ignore[no-untyped-def]
 def _fill_bands(  # type: ignore[no-untyped-def]
     corners, boxes, camera_from_base, lens, shift, rooks, members, bounds, order, pixels, firsts, firsts_in_band
 ):
-    """Z-buffer every band. A pixel gets a number within its band: how many other triangles the band's pixels saw
-    before they saw its own. `firsts`, from the band's bound on, are the triangles of these numbers."""
+    """Z-buffer every band. Pixels get numbers of triangles within the band, in the order in which they are first
+    seen. `firsts`, from the band's bound on, are the triangles of these numbers."""
     height, width = pixels.shape
     for place in numba.prange(len(order)):
         band = order[place]
@@ -201,13 +201,13 @@ def _fill_bands(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _merge(firsts, bounds, firsts_in_band, number_of_triangle):  # type: ignore[no-untyped-def]
-    """All triangles seen, once each, in the order of bands; in `firsts` their numbers in that take their place."""
+    """All triangles seen, once each, in the order of bands; `firsts` gets their numbers in this list instead."""
     seen = np.empty(firsts_in_band.sum(), np.int32)
     count = 0
     for band in range(len(firsts_in_band)):
         for place in range(bounds[band], bounds[band] + firsts_in_band[band]):
             triangle = firsts[place]
-            if number_of_triangle[triangle] == 0:  # numbers count from 1 here: zeroed memory comes for nothing
+            if number_of_triangle[triangle] == 0:  # numbers start at 1 here, as zeroed memory is cheap
                 seen[count] = triangle
                 count += 1
                 number_of_triangle[triangle] = count
@@ -217,7 +217,7 @@ def _merge(firsts, bounds, firsts_in_band, number_of_triangle):  # type: ignore[
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _renumber(pixels, numbers, bounds):  # type: ignore[no-untyped-def]
-    """From numbers within bands to numbers in the image."""
+    """Replace numbers within bands by numbers within the image."""
     for row in numba.prange(len(pixels)):
         start = bounds[row // _BAND_ROWS]
         for col in range(pixels.shape[1]):
@@ -227,14 +227,14 @@ def _renumber(pixels, numbers, bounds):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _is_small(v, box):  # type: ignore[no-untyped-def]
-    """Whether the picture of a triangle's edges is straight to 3e-4 pixel in any lens that one would buy."""
+    """True if the image of a triangle's edges is straight to 3e-4 pixel in any usual lens."""
     near = v[0, 2] < NEAR_MM or v[1, 2] < NEAR_MM or v[2, 2] < NEAR_MM
     return box[1] - box[0] < _SMALL and box[3] - box[2] < _SMALL and not near
 
 
 @numba.njit(cache=True, nogil=True)
 def _move_corners(v, lens):  # type: ignore[no-untyped-def]
-    """Move the corners to where a lens that does not bend would give the same picture, at the same depth."""
+    """Move the corners, at the same depth, to where a lens without distortion would give the same image."""
     for k in range(3):
         inverse_z = 1.0 / v[k, 2]
         by_x, by_y = bend(v[k, 0] * inverse_z, v[k, 1] * inverse_z, lens[3:8])
@@ -244,9 +244,9 @@ def _move_corners(v, lens):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: ignore[no-untyped-def]
-    """Z-buffer one triangle of camera coordinates, which reaches no further than `box`, into a band of rows from
-    `top` on. A pixel's value is the nearness of what it sees, a positive float32 whose bits grow with it, before
-    the member's number, which counts down so that the first of equals is the greatest."""
+    """Z-buffer one triangle of camera coordinates, which lies within `box`, into a band of rows from `top` on. The
+    high bits of a pixel's value are its nearness, a positive float32 whose bits increase with it; the low bits are
+    the member's number, counted down so that the first of equals is the greatest."""
     first_col, last_col = np.int64(box[0]), np.int64(box[1])
     first_row, last_row = max(np.int64(box[2]), top), min(np.int64(box[3]), top + len(nearest) - 1)
     a0, b0, c0 = _cross(v, 1, 2)
@@ -263,7 +263,7 @@ def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: i
     edges = (a0, b0, c0, a1, b1, c1, a2, b2, c2)
     below, nothing, too_near = _LAST - member, np.float32(0.0), np.float32(1.0 / NEAR_MM)
     for row in range(first_row, last_row + 1):
-        # Unsigned: signed indices cost a test each for being negative.
+        # Unsigned, since signed indices cost a test for negative values each.
         line, image_row = np.uint64(row - top), np.uint64(row)
         middle_y = (row - centre_y) * scale
         rest0, rest1, rest2, rest_z = (
@@ -278,7 +278,7 @@ def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: i
         shift_x = 0.0
         if rooks is not None:
             shift_x = rooks[image_row]
-        # Whole groups of lanes, without a branch; a pixel beyond `stop` is tested in vain.
+        # Whole groups of lanes, without a branch; pixels beyond `stop` are tested without effect.
         first = np.uint64(start)
         for lane in range(np.uint64((stop - start + LANES - 1) & -LANES)):
             col = first + lane
@@ -298,12 +298,12 @@ def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: i
 
 @numba.njit(cache=True, nogil=True)
 def _span(row, start, stop, edges, lens, shift):  # type: ignore[no-untyped-def]
-    """Narrow a row's columns from `start` to before `stop` to those between a triangle's edges."""
+    """Reduce a row's columns, `start` to before `stop`, to those between a triangle's edges."""
     a0, b0, c0, a1, b1, c1, a2, b2, c2 = edges
     focal, centre_x, centre_y = lens[0], lens[1], lens[2]
     y, shift_x, spare = (row - centre_y) / focal, 0.0, lens[13] / focal
     if shift is not None:
-        # The shift in the middle of the row; towards its ends it changes by no more than `spare`.
+        # The shift in the middle of the row; towards the ends it changes by at most `spare`.
         middle = (start + stop) >> 1
         shift_x, y = np.float64(shift[0, row, middle]), y + shift[1, row, middle]
         spare = 0.5 * (stop - start + 2) * lens[8] + 2.0 * spare
@@ -319,7 +319,7 @@ def _span(row, start, stop, edges, lens, shift):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _between(a, rest, low, high):  # type: ignore[no-untyped-def]
-    """Narrow the range [low, high] of x to where a x + rest >= 0."""
+    """Reduce the range [low, high] of x to where a x + rest >= 0."""
     if a > 0.0:
         return max(low, -rest / a), high
     if a < 0.0:
@@ -329,7 +329,7 @@ def _between(a, rest, low, high):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _cross(v, a, b):  # type: ignore[no-untyped-def]
-    """Cross product of two corners; of the same two the other way round it is exactly the negative."""
+    """Cross product of two corners; with the corners exchanged it is exactly the negative."""
     return (
         v[a, 1] * v[b, 2] - v[a, 2] * v[b, 1],
         v[a, 2] * v[b, 0] - v[a, 0] * v[b, 2],

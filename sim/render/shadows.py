@@ -1,8 +1,8 @@
-"""Which LEDs reach which triangles, remembered whatever the camera looks at.
+"""Table of the LEDs that reach each triangle, kept from view to view.
 
-LEDs, support and object stand still in the base frame, so whether an LED reaches a side of a triangle holds for
-every view. One ray goes from the triangle's centroid, lifted off it by `embree.OFFSET_MM`, to the emitter's
-centre: shadows are hard and follow triangles' edges. What moves casts its own: `sim.render.arm_shadow`.
+LEDs, support and object are fixed in the base frame, so whether an LED reaches a side of a triangle holds for
+every view. One ray is traced from the triangle's centroid, raised by `embree.OFFSET_MM`, to the emitter's centre:
+shadows are hard and follow triangles' edges. Moving bodies: `sim.render.arm_shadow`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ _Bits = NDArray[np.uint8]
 
 
 class Shadows:
-    """Table of bits [LED, side of a triangle], filled as views and LEDs ask for it.
+    """Table of bits [LED, side of a triangle], filled as views and LEDs require.
 
-    Sides get their places in it when a view first shows them. What has no room within `memory_bytes` is not kept:
-    sides of former views first, then LEDs that come late.
+    Sides get their places in it when a view first shows them. What exceeds `memory_bytes` is not kept: first the
+    sides of earlier views, then LEDs that come late.
     """
 
     def __init__(self, obstacles: Obstacles, leds_mm: NDArray[np.float64], memory_bytes: int) -> None:
@@ -29,10 +29,10 @@ class Shadows:
         self._place_of_side = np.full(2 * len(obstacles.corners_mm), -1, np.int32)
         self._side_of_place = np.empty(0, np.int64)
         self._kept: dict[int, tuple[int, _Bits]] = {}
-        """For each LED how many places were traced, and the bits of these."""
+        """For each LED, the number of places traced, and their bits."""
 
     def places(self, sides: NDArray[np.int64]) -> NDArray[np.int32]:
-        """[n] places of the sides that a view shows (`Obstacles.trace` numbers them), all different."""
+        """[n] places of the sides that a view shows (numbered as in `Obstacles.trace`), all different."""
         new = self._place_of_side[sides] < 0
         places = len(self._side_of_place) + int(new.sum())
         if places > len(sides) and places // 8 * len(self._leds_mm) > self._memory_bytes:
@@ -46,7 +46,7 @@ class Shadows:
         return self._place_of_side[sides]
 
     def reached(self, led: int) -> _Bits:
-        """Bit p % 8 of byte p // 8 tells whether the LED in row `led` reaches the side in place p."""
+        """Bit p % 8 of byte p // 8 is 1 if the LED in row `led` reaches the side in place p."""
         places = len(self._side_of_place)
         known, bits = self._kept.get(led, (0, np.empty(0, np.uint8)))
         if known < places:

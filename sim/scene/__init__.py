@@ -1,1 +1,1 @@
-"""What stands in the simulated dome."""
+"""The simulated scene in the dome."""

@@ -1,4 +1,4 @@
-"""What stands in the simulated dome: the support disk and the objects on it, their materials, and the LEDs.
+"""The simulated scene: the support disk and the objects on it, and their materials.
 
 Everything is in the robot's base frame, in mm; fluxes in lm.
 """
@@ -18,19 +18,19 @@ from coupole.geometry import Transform
 from sim.scene.surface import Material, Surface
 
 STONE = Material("warm stone", (0.62, 0.55, 0.42))
-"""Of what an object is made that says nothing of itself (assumed)."""
+"""Material of an object for which neither file nor rig gives one (assumed)."""
 PAINTED = Material("as coloured in its file", (1.0, 1.0, 1.0))
 DIBOND = Material("black anodised Dibond", (0.04, 0.04, 0.045))
-"""The support (facts/instrument: 'more absorbing'; the value is assumed)."""
+"""The support (assumed)."""
 _UNIT_MM = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
 SUPPORT_CELL_MM = 5.0
-"""Edges of the support's triangles: shadows on it are so fine."""
+"""Edge length of the support's triangles, which is the resolution of shadows on it."""
 _CHUNK = 1 << 18
 
 
 @dataclass(frozen=True)
 class Scene:
-    """All triangles in the base frame, and of what they are; 40 bytes a triangle at least."""
+    """All triangles in the base frame, and their materials; at least 40 bytes per triangle."""
 
     corners_mm: NDArray[np.float32]
     """[triangles, 3, 3]; at least 4 bytes follow in memory, which Embree may read."""
@@ -41,14 +41,14 @@ class Scene:
     tint: NDArray[np.float32] | None
     """[triangles, 3] factor of the diffuse reflectance."""
     normals: NDArray[np.float32] | None
-    """[triangles, 3] unit normals for shading, where they are not the flat ones."""
+    """[triangles, 3] unit normals for shading; None for flat ones."""
 
 
 def load_surface(path: Path, unit: str, material: Material | None = None) -> Surface:
-    """Any mesh that trimesh reads (PLY, STL, OBJ, ...), in mm, as it is: no vertex is merged or dropped.
+    """Any mesh that trimesh reads (PLY, STL, OBJ, ...), in mm; no vertex is merged or dropped.
 
     Colours of vertices or faces, or a texture (at triangles' centroids), become the tint; they are sRGB. Without
-    `material` a coloured mesh reflects diffusely what its colours say, any other is of `STONE`. Raises InputError.
+    `material` a coloured mesh reflects diffusely by its colours, any other is of `STONE`. Raises InputError.
     """
     import trimesh
 
@@ -112,10 +112,10 @@ def support_disk(diameter_mm: float, cell_mm: float = SUPPORT_CELL_MM) -> Surfac
 
 
 def build_scene(things: Sequence[tuple[Surface, Transform]]) -> Scene:
-    """Scene of surfaces, each with its `base_from_surface`."""
+    """Scene from surfaces, each with its `base_from_surface`."""
     counts = [len(surface.corners_mm) for surface, _ in things]
     total = sum(counts)
-    # Embree reads vertices by 16 bytes: one float more than the last corner's three.
+    # Embree reads vertices in units of 16 bytes: one float more than the last corner's three.
     corners = np.zeros(9 * total + 1, np.float32)[:-1].reshape(total, 3, 3)
     material = np.empty(total, np.int32)
     tint = np.ones((total, 3), np.float32) if any(s.tint is not None for s, _ in things) else None
@@ -125,7 +125,7 @@ def build_scene(things: Sequence[tuple[Surface, Transform]]) -> Scene:
     first = 0
     for (surface, base_from_surface), count in zip(things, counts, strict=True):
         part = slice(first, first + count)
-        # In chunks: a scan of 40 million triangles must not stand in memory twice in float64.
+        # In chunks: a scan of 40 million triangles must not be in memory twice in float64.
         for start in range(0, count, _CHUNK):
             piece = surface.corners_mm[start : start + _CHUNK]
             placed = piece.reshape(-1, 3) @ base_from_surface[:3, :3].T + base_from_surface[:3, 3]

@@ -1,4 +1,4 @@
-"""What the simulated world's things are made of: triangles, and how each of them reflects."""
+"""Surfaces of the simulated scene: triangles, and the reflection of each."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ Rgb = tuple[float, float, float]
 class Material:
     """Lambert and GGX with Schlick's Fresnel, per channel of the camera after normalisation by Spectralon.
 
-    f = diffuse / pi + D G F / (4 n.l n.v), with F = f0 + (1 - f0)(1 - h.v)^5; a roughness of 0 leaves the
-    specular part away.
+    f = diffuse / pi + D G F / (4 n.l n.v), with F = f0 + (1 - f0)(1 - h.v)^5; without the specular part if the
+    roughness is 0.
     """
 
     name: str
@@ -29,7 +29,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Surface:
-    """One thing's triangles in its own frame, mm."""
+    """Triangles of one thing in its own frame, mm."""
 
     corners_mm: NDArray[np.float64]
     """[triangles, 3, 3]; counter-clockwise seen from outside."""
@@ -37,6 +37,6 @@ class Surface:
     material: NDArray[np.int32]
     """[triangles] index into `materials`."""
     tint: NDArray[np.float32] | None = None
-    """[triangles, 3] factor of the diffuse reflectance (a texture); none means 1."""
+    """[triangles, 3] factor of the diffuse reflectance (a texture); None: 1."""
     normals: NDArray[np.float64] | None = None
-    """[triangles, 3] unit normals used for shading in place of the flat ones (normal detail)."""
+    """[triangles, 3] unit normals for shading instead of the flat ones (normal detail)."""

@@ -1,7 +1,7 @@
-"""Things that a world puts into its scene beside the plan's object: targets of calibration, samples.
+"""Things in the simulated scene in addition to the plan's object: calibration targets, samples.
 
-Listed in the rig under `world: settings: things:`, each with its kind, its measures and where it stands on the
-support. The controller knows nothing of them: keep views clear of what is tall.
+Listed in the rig under `world: settings: things:`, each with its kind, dimensions and position on the support. The
+controller does not know of them: views must keep clear of tall ones.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class _Thing(BaseModel):
 
     translation_mm: _Vector = (0.0, 0.0, 0.0)
     abc_deg: _Vector = (0.0, 0.0, 0.0)
-    """Where it stands, in the support frame, as in a plan's poses."""
+    """Pose in the support frame, as in a plan's poses."""
 
     def support_from_thing(self) -> Transform:
         return transform(self.translation_mm, self.abc_deg)
@@ -68,20 +68,20 @@ class Sphere(_Thing):
 
 
 class Stickers(BaseModel):
-    """The scanner's retro-reflective targets, stuck where the surface is flat enough."""
+    """The scanner's retro-reflective targets, attached where the surface is flat enough."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     count: Annotated[int, Field(ge=1)]
-    """How many there are now."""
+    """Number of stickers at present."""
     seed: int = 1
     diameter_mm: _Length = 6.0
     gap_mm: _Length = 0.8
-    """As in `sim.objects.standards.sticker_poses`, which tells where they are."""
+    """As in `sim.objects.standards.sticker_poses`, which gives their poses."""
     new: Annotated[int, Field(ge=0)] = 0
-    """So many of them were put on after the scan: its table does not know them."""
+    """Number of those that were attached after the scan and are not in its table."""
     fallen: Annotated[int, Field(ge=0)] = 0
-    """So many more there were then, which have come off."""
+    """Number of stickers in the scan that have come off since."""
 
     @model_validator(mode="after")
     def _some_stayed(self) -> Stickers:
@@ -90,17 +90,17 @@ class Stickers(BaseModel):
         return self
 
     def on(self, surface: Surface) -> Surface:
-        """The surface with its stickers as it is now. Raises InputError if it has no room for so many."""
+        """The surface with its present stickers. Raises InputError if it has no room for them."""
         from sim.objects.standards import stuck_on
 
         return stuck_on(surface, self._poses(surface)[: self.count], diameter_mm=self.diameter_mm)
 
     def poses_when_scanned(self, surface: Surface) -> Poses:
-        """[n, 4, 4] of the stickers that the scanner saw, in the thing's frame."""
+        """[n, 4, 4] of the stickers that were scanned, in the thing's frame."""
         return self._poses(surface)[self.new :]
 
     def _poses(self, surface: Surface) -> Poses:
-        """Of all that ever were on it: first the new ones, last those that fell off."""
+        """Of all stickers ever attached: first the new ones, last those that have come off."""
         from sim.objects.standards import sticker_poses
 
         total = self.count + self.fallen
@@ -108,7 +108,7 @@ class Stickers(BaseModel):
 
 
 class Sample(_Thing):
-    """A sample of a material, at the measures of its generator."""
+    """A sample of a material, with the dimensions of its generator."""
 
     kind: Literal[
         "spectralon_tile",
@@ -154,5 +154,5 @@ Thing = Annotated[CharucoBoard | Sphere | Sample, Field(discriminator="kind")]
 
 
 def placed(things: tuple[Thing, ...], base_from_support: Transform) -> list[tuple[Surface, Transform]]:
-    """Surfaces and where they are in the base frame."""
+    """Surfaces and their `base_from_surface`."""
     return [(thing.surface(), np.asarray(base_from_support @ thing.support_from_thing())) for thing in things]

@@ -1,1 +1,1 @@
-"""The shared state of the simulated cell, its clock, its faults, and the process that runs it."""
+"""The simulated cell's shared state, clock and faults, and the process that runs it."""

@@ -1,4 +1,4 @@
-"""How a rig gets a world: start one as a child process, or join one that runs already."""
+"""Starts a simulated world as a child process, or joins one that is already running."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STOP_TIMEOUT_S = 5.0
 
 
 class World:
-    """A running world: its clock, its endpoints, and a control line."""
+    """A running world: its clock, its endpoints, and a control connection."""
 
     def __init__(self, endpoints: dict[str, Any], process: subprocess.Popen[str] | None = None) -> None:
         self.endpoints = endpoints
@@ -30,9 +30,9 @@ class World:
 
     @staticmethod
     def start(config: dict[str, Any]) -> World:
-        """Start a world of its own for this process; it ends when this process does.
+        """Start a world for this process; it ends when this process does.
 
-        `config` is the JSON form of `Config`. Raises DeviceError if the world does not come up.
+        `config` is the JSON form of `Config`. Raises DeviceError if the world does not start.
         """
         line = Config.model_validate(config).model_dump_json()
         process = subprocess.Popen(
@@ -68,7 +68,7 @@ class World:
             ) from error
 
     def ask(self, do: str, **arguments: Any) -> dict[str, Any]:
-        """Say something on the control line: `state`, `fault`, `reset_robot`, `stop`."""
+        """Send a command on the control connection: `state`, `fault`, `reset_robot`, `stop`."""
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
             link.settimeout(_START_TIMEOUT_S)
             try:
@@ -96,7 +96,7 @@ class World:
         self._process.stdout.close()
 
     def wait(self) -> int:
-        """Serve until the world ends; its exit code."""
+        """Wait until the world ends; returns its exit code."""
         assert self._process is not None
         return self._process.wait()
 
@@ -107,7 +107,7 @@ def _first_line(stream: IO[str]) -> dict[str, Any]:
             "world",
             expected=f"endpoints within {_START_TIMEOUT_S:g} s",
             happened="none came",
-            remedy="Run `coupole sim RIG` to see what it says.",
+            remedy="Run `coupole sim RIG` to see its messages.",
         )
     line = stream.readline()
     if not line:
@@ -115,7 +115,7 @@ def _first_line(stream: IO[str]) -> dict[str, Any]:
             "world",
             expected="endpoints",
             happened="the world ended at its start",
-            remedy="Its message stands above.",
+            remedy="See its message above.",
         )
     endpoints: dict[str, Any] = json.loads(line)
     return endpoints

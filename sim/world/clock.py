@@ -1,11 +1,11 @@
-"""The world's time, and how other processes read it.
+"""The world's time, and its distribution to other processes.
 
-World time runs `speed` times as fast as the machine's monotonic clock, never past the next event that the
-world has not worked off yet (the *horizon*): a slow or lock-stepped world stretches its time instead of
-letting events happen late. A few numbers in shared memory are all that a reader needs.
+World time runs `speed` times as fast as the machine's monotonic clock, but never past the next unprocessed event
+(the *horizon*): in a slow or lock-stepped world, time is stretched, and no event happens late. Readers need only a
+few numbers in shared memory.
 
-A world that is to *hurry only when told* runs in real time except until a moment that its client names: the
-client's own work then costs as much world time as it would cost in life, and only its waiting is cut short.
+With `hurry_only_when_told`, the world runs in real time except until a moment that its client sets: the client's
+own work then takes as much world time as in a real cell, and only its waiting is shortened.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 
 _BLOCK = struct.Struct("<QqqdqqQ")
 """Sequence (odd while being written), machine ns and world ns at the anchor, speed, hurry-until ns, horizon ns,
-1 while the world lives. The client's request, hurry-until ns, stands behind it."""
+1 while the world runs. The client's request, hurry-until ns, follows it."""
 _SEQUENCE, _WISH = struct.Struct("<Q"), struct.Struct("<q")
 BLOCK_BYTES = _BLOCK.size + _WISH.size
 _NAP_S = 0.02
@@ -45,7 +45,7 @@ class Pace:
 
 
 class ClockWriter:
-    """The world's side: it owns the block and moves anchor and horizon."""
+    """The world's side: it writes the block and moves anchor and horizon."""
 
     def __init__(self, path: Path, speed: float, *, hurry_only_when_told: bool = False) -> None:
         self.speed = speed
@@ -59,7 +59,7 @@ class ClockWriter:
         self.publish(horizon_ns=0)
 
     def paced_ns(self) -> int:
-        """World time that the pace alone would give now, events apart."""
+        """World time by the pace alone, without regard to events."""
         now_ns = time.monotonic_ns()
         world_ns = self._pace.world_at(now_ns)
         if self._told:
@@ -69,18 +69,18 @@ class ClockWriter:
         return world_ns
 
     def machine_s_until(self, world_ns: int) -> float:
-        """Shortest machine time until `world_ns`; the pace may turn out slower."""
+        """Shortest machine time until `world_ns`; the pace may be slower."""
         return (world_ns - self.paced_ns()) / 1e9 / self.speed
 
     def slip_to(self, world_ns: int) -> None:
-        """Let it be `world_ns` now: the world fell behind and does not rush to catch up."""
+        """Set world time to `world_ns`: a world that is behind its pace does not catch up."""
         self._pace = Pace(time.monotonic_ns(), world_ns, self.speed, self._pace.hurry_until_ns)
 
     def publish(self, horizon_ns: int, *, alive: bool = True) -> None:
         self._sequence += 2
         pace = self._pace
         fields = (pace.machine_ns, pace.world_ns, pace.speed, pace.hurry_until_ns, horizon_ns, int(alive))
-        # Whole slices, in this order: `pack_into` would zero the block first, and a reader would see that.
+        # Whole slices, in this order: `pack_into` would zero the block first, which a reader could see.
         block = _BLOCK.pack(self._sequence, *fields)
         self._memory[:8] = _SEQUENCE.pack(self._sequence - 1)
         self._memory[8 : _BLOCK.size] = block[8:]
@@ -110,7 +110,7 @@ class SharedClock:
         return self._read()[2]
 
     def now_ns(self) -> int:
-        """World time, never running backwards."""
+        """World time; it never runs backwards."""
         pace, horizon_ns, _ = self._read()
         self._last_ns = max(self._last_ns, min(pace.world_at(time.monotonic_ns()), horizon_ns))
         return self._last_ns
@@ -122,5 +122,5 @@ class SharedClock:
             time.sleep(min(_NAP_S, max(left_ns / 1e9 / speed, 2e-5)))
 
     def hurry(self, until_ns: int) -> None:
-        """Tell a world that hurries only when told that it may, until then."""
+        """Let a world with `hurry_only_when_told` run at its speed until then."""
         self._memory[_BLOCK.size :] = _WISH.pack(until_ns)

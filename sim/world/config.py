@@ -1,4 +1,4 @@
-"""What a world is told when it starts: the rig's `world.settings`, and the scene of rig and plan."""
+"""Configuration of a world: the rig's `world.settings`, and the scene from rig and plan."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sim.scene.things import Stickers, Thing
 from sim.world import faults as script
 
 WHITE_SHARE = 0.6
-"""A white target at the support's centre reaches this share of full scale at the plan's exposure (design)."""
+"""A white target at the support's centre reaches this fraction of full scale at the plan's exposure."""
 
 
 _OF_THE_TRUE_CAMERA = (
@@ -36,7 +36,7 @@ _OF_THE_TRUE_CAMERA = (
     "sensor",
     "sensor_temperature_c",
 )
-"""What the rig's `world.settings.camera` says of the picture that it takes."""
+"""Settings in the rig's `world.settings.camera` that concern the picture."""
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -53,13 +53,13 @@ class MaterialConfig(_Model):
 
 
 class MeshConfig(_Model):
-    """One object: its mesh and where it lies on the support (row-major 4x4)."""
+    """One object: its mesh and its pose on the support (row-major 4x4)."""
 
     path: Path
     unit: Literal["mm", "m", "um"]
     support_from_object: list[list[float]]
     material: MaterialConfig | None = None
-    """Times the mesh's own colours; without it these alone, or a warm stone where there are none."""
+    """Multiplied by the mesh's own colours; None: these alone, or warm stone for a mesh without colours."""
 
 
 class SceneConfig(_Model):
@@ -71,15 +71,15 @@ class SceneConfig(_Model):
     support_diameter_mm: float
     objects: list[MeshConfig]
     tool: list[ToolBody] = []
-    """What the flange carries, which stands in the light."""
+    """Bodies on the flange, which block light."""
 
 
 class InterreflectionConfig(_Model):
-    """Light that goes from surface to surface, by Mitsuba (the extra `mitsuba`): seconds for each LED and pose."""
+    """Interreflections, computed with Mitsuba (the extra `mitsuba`): seconds for each LED and pose."""
 
     bounces: Annotated[int, Field(ge=2, le=16)] = 4
     samples: Annotated[int, Field(ge=1, le=4096)] = 64
-    """Paths from each triangle that is seen."""
+    """Paths per seen triangle."""
 
 
 class CameraConfig(_Model):
@@ -96,23 +96,23 @@ class CameraConfig(_Model):
     focal_length_mm: float
     focus_distance_mm: float
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2, k3 of Brown and Conrady, as OpenCV orders and signs them."""
+    """k1, k2, p1, p2, k3 of the Brown-Conrady model, in OpenCV's order and sign."""
     f_number: Annotated[float, Field(gt=0)] = 8.0
     samples_per_side: Annotated[int, Field(ge=1, le=8)] = 1
-    """Rays through each pixel, k x k: for targets whose corners are measured to a fraction of a pixel."""
+    """Rays through each pixel, k x k: for targets whose corners are located to a fraction of a pixel."""
     blur: bool = False
     rim_radius: float = 3.0
     rim_shift: float = 4.0
     lateral_colour: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sensor: SensorModel = SensorModel()
     sensor_temperature_c: float = 25.0
-    """These as in `sim.devices.camera_body.Settings`."""
+    """The settings from `blur` on are as in `sim.devices.camera_body.Settings`."""
     flange_from_camera: list[list[float]]
     nominal_exposure_us: int
     """The exposure at which white reaches `WHITE_SHARE` of full scale."""
 
     def true_sensor(self, seed: int) -> SensorModel:
-        """The sensor with the rig's pattern, bits and black level; the world's seed makes it another one."""
+        """The sensor with the rig's pattern, bit depth and black level; its seed depends on the world's."""
         return dataclasses.replace(
             self.sensor,
             bayer_pattern=self.bayer_pattern,
@@ -123,32 +123,32 @@ class CameraConfig(_Model):
 
 
 class Settings(_Model):
-    """The rig's `world.settings`: the character of the stand-ins, and what goes wrong."""
+    """The rig's `world.settings`: properties of the stand-ins, and faults."""
 
     speed: Annotated[float, Field(gt=0, le=1000)] = 1.0
     hurry_only_when_told: bool = False
-    """Real time, but `speed` while the controller says that it merely waits (dry runs)."""
+    """Real time, except for `speed` while the controller announces that it only waits (dry runs)."""
     seed: int = 1
     ledbox: LedBoxSettings = ledbox_firmware.Settings()
     robot: RobotSettings = kuka_controller.Settings()
     camera: CameraSettings = camera_server.Settings()
     faults: tuple[script.Fault, ...] = ()
     things: tuple[Thing, ...] = ()
-    """What stands on the support beside the plan's object."""
+    """Things on the support in addition to the plan's object."""
     interreflection: InterreflectionConfig | None = None
-    """`{}` adds it; without it light meets one surface."""
+    """`{}` switches it on; without it light meets one surface only."""
     arm_shadows: bool = True
-    """Whether arm and tool stand in the light."""
+    """Whether arm and tool block light."""
     material: MaterialConfig | None = None
-    """Of the plan's object, times its mesh's own colours; without it these alone, or a warm stone."""
+    """Of the plan's object, multiplied by its mesh's own colours; None: these alone, or warm stone."""
     stickers: Stickers | None = None
     """On the plan's object."""
     leds: LedModel = STEADY
-    """`{}` is LEDs as they are made: each has its own flux and colour, warms up, flickers."""
+    """`{}`: realistic LEDs, each with its own flux and colour, temperature dependence and flicker."""
     dome: DomeErrors = DomeErrors()
-    """How the dome differs from its table."""
+    """Deviations of the dome from its table."""
     panels: tuple[Panel, ...] = ()
-    """The flat white panels 1 to 4, for the camera to see; without them a panel is light from all around."""
+    """The flat white panels 1 to 4, visible to the camera; without them a panel is uniform ambient light."""
 
     @model_validator(mode="after")
     def _possible(self) -> Settings:
@@ -160,12 +160,12 @@ class Settings(_Model):
             ):
                 raise ValueError(why)
         if self.robot.kind == "ur" and self.speed != 1.0:
-            raise ValueError("a world with a robot of kind `ur` has speed 1: ur-rtde lives in real time")
+            raise ValueError("a world with a robot of kind `ur` has speed 1: ur-rtde works in real time only")
         return self
 
 
 class Config(_Model):
-    """All that a world needs to know."""
+    """The complete configuration of a world."""
 
     settings: Settings
     scene: SceneConfig
@@ -173,6 +173,6 @@ class Config(_Model):
 
     @property
     def photographed(self) -> CameraConfig:
-        """The camera as the renderer needs it: with the true lens, and as many rays as are wanted."""
+        """The camera as the renderer needs it: with the true lens, and the rays per pixel set in the rig."""
         true = {name: getattr(self.settings.camera, name) for name in _OF_THE_TRUE_CAMERA}
         return self.camera.model_copy(update=true)

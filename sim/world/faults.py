@@ -1,7 +1,7 @@
-"""What can be made to go wrong in the world, and when: the rig's `faults:`.
+"""Faults that can be caused in the world, and their moments: the rig's `faults:`.
 
-A fault happens at once, `at_s` seconds of world time after power-on, or when the box sends edge number
-`at_edge` (counted from 0 at power-on; an edge that is dropped counts).
+A fault happens at power-on, `at_s` seconds of world time later, or when the box sends edge number `at_edge`
+(counted from 0 at power-on; a dropped edge counts).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class When(BaseModel):
-    """Moment of a fault; none of the two: from power-on."""
+    """Moment of a fault; with neither field: at power-on."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -56,31 +56,31 @@ class LostTransfer(_Model):
 
 
 class MuteBox(When):
-    """The box runs on but neither answers nor listens."""
+    """The box continues its burst but neither answers nor receives."""
 
     kind: Literal["mute_box"]
 
 
 class CutWire(When):
-    """The box's serial line is pulled."""
+    """The box's serial line is unplugged."""
 
     kind: Literal["cut_wire"]
 
 
 class UnplugCamera(When):
-    """The camera's link is pulled."""
+    """The camera's link is unplugged."""
 
     kind: Literal["unplug_camera"]
 
 
 class CameraControlLoss(When):
-    """The camera forgets who controls it, as after a brown-out, and stops."""
+    """The camera drops its controlling client, as after a brown-out, and stops."""
 
     kind: Literal["camera_control_loss"]
 
 
 class OverTemperature(When):
-    """An LED board reports more than its limit."""
+    """An LED board reports a temperature above its limit."""
 
     kind: Literal["over_temperature"]
     board: Count
@@ -94,7 +94,7 @@ class DeadLed(_Model):
 
 
 class StuckLed(When):
-    """An LED that does not go out any more, once it is lit."""
+    """An LED that cannot be switched off once it is lit."""
 
     kind: Literal["stuck_led"]
     led: Count
@@ -109,7 +109,7 @@ class FlickeringLed(_Model):
 
 
 class EmergencyStop(When):
-    """Somebody hits the robot's red button."""
+    """The robot's emergency stop is pressed."""
 
     kind: Literal["emergency_stop"]
 
@@ -122,14 +122,14 @@ class LateRsi(When):
 
 
 class RsiLinkLoss(When):
-    """The robot's controller sends no packets for `seconds`, then starts its program again."""
+    """The robot's controller sends no packets for `seconds`, then restarts its program."""
 
     kind: Literal["rsi_link_loss"]
     seconds: Annotated[float, Field(gt=0)] = 10.0
 
 
 class NudgeArm(When):
-    """Something pushes the arm by `deg` on every axis; after `seconds` it springs back (none: it stays there)."""
+    """A displacement of the arm by `deg` on every axis; after `seconds` it springs back (None: it stays)."""
 
     kind: Literal["nudge_arm"]
     deg: float = 0.05

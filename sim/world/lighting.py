@@ -1,4 +1,4 @@
-"""What is lit when: the world's record of LEDs and panels, from which exposures are integrated."""
+"""Record of lit LEDs and panels over time, from which exposures are integrated."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ _KEEP_NS = 10_000_000_000
 
 
 class Lighting:
-    """Intervals of world time in which LEDs and panels shone."""
+    """Intervals of world time in which LEDs and panels were lit."""
 
     def __init__(self) -> None:
         self._lit: deque[tuple[int, int, int, float]] = deque()
         self._panels_since_ns: dict[int, int] = {}
 
     def light(self, led: int, t_on_ns: int, t_off_ns: int, flux: float = 1.0) -> None:
-        """LED `led` is switched on at `t_on_ns` and will go off at `t_off_ns` unless `dark` comes first; it gives
-        `flux` times what its table says."""
+        """LED `led` is switched on at `t_on_ns` and off at `t_off_ns` unless `dark` comes first, with `flux` times
+        its tabulated flux."""
         while self._lit and self._lit[0][2] < t_on_ns - _KEEP_NS:
             self._lit.popleft()
         self._lit.append((led, t_on_ns, t_off_ns, flux))
 
     def dark(self, t_ns: int) -> None:
-        """All LEDs go off now."""
+        """All LEDs are switched off now."""
         self._lit = deque((led, on, min(off, t_ns), flux) for led, on, off, flux in self._lit if on < t_ns)
 
     def darken_one(self, led: int, t_ns: int) -> None:
-        """One LED goes off now, others stay as they are."""
+        """One LED is switched off now."""
         self._lit = deque(
             (one, on, min(off, t_ns) if one == led else off, flux) for one, on, off, flux in self._lit
         )
@@ -38,15 +38,15 @@ class Lighting:
             self._panels_since_ns.pop(panel, None)
 
     def shining(self, t_ns: int) -> list[int]:
-        """LEDs that shine at `t_ns`."""
+        """LEDs that are lit at `t_ns`."""
         return [led for led, on, off, _ in self._lit if on <= t_ns < off]
 
     def panels(self, t_ns: int) -> list[int]:
-        """Panels that shine at `t_ns`."""
+        """Panels that are lit at `t_ns`."""
         return [panel for panel, since in self._panels_since_ns.items() if since <= t_ns]
 
     def exposure_s(self, start_ns: int, end_ns: int) -> dict[int, float]:
-        """Seconds that each LED shone between two times, at its tabulated flux; LEDs that did not are left out."""
+        """Seconds for which each LED was lit between two times, at its tabulated flux; unlit LEDs are left out."""
         seconds: dict[int, float] = {}
         for led, on, off, flux in reversed(self._lit):
             overlap_ns = min(off, end_ns) - max(on, start_ns)

@@ -1,9 +1,9 @@
-"""The world's heart: one thread that works off timed events and input, in the order of world time.
+"""The world's event loop: one thread that processes timed events and input, in the order of world time.
 
-Stand-ins do not own threads. They ask for callbacks: at a world time (`at`, `after`), when a file descriptor
-can be read (`add_reader`), or from a worker thread (`call_threadsafe`). A timed callback sees its own world
-time as `now_ns`, exactly, however late the machine gets round to it; so what happens in the world does not
-depend on the machine's load, only how long it takes to watch.
+Stand-ins have no threads. They register callbacks: at a world time (`at`, `after`), when a file descriptor can be
+read (`add_reader`), or from a worker thread (`call_threadsafe`). A timed callback sees its exact world time as
+`now_ns`, however late the machine executes it; so events in the world do not depend on the machine's load, which
+only affects how long the simulation takes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Protocol
 from sim.world.clock import FOREVER_NS, ClockWriter
 
 _MAX_LAG_S = 0.02
-"""A world further behind its pace than this (machine time) slips instead of catching up."""
+"""A world further behind its pace than this (machine time) gives up catching up."""
 _TIMERS_PER_POLL = 16
 _IDLE_TICK_NS = 10_000_000
 
@@ -33,7 +33,7 @@ class Readable(Protocol):
 
 @dataclass(order=True)
 class Timer:
-    """One callback to come; `cancel()` makes it not happen."""
+    """One pending callback; `cancel()` prevents it."""
 
     t_ns: int
     order: int
@@ -60,7 +60,7 @@ class Reactor:
 
     @property
     def now_ns(self) -> int:
-        """World time of what is being worked off."""
+        """World time of the present event."""
         return self._now_ns
 
     def at(self, t_ns: int, callback: Callable[[], None]) -> Timer:
@@ -74,7 +74,7 @@ class Reactor:
         return self.at(self._now_ns + round(seconds * 1e9), callback)
 
     def add_reader(self, readable: Readable | int, callback: Callable[[], None]) -> None:
-        """Call back whenever `readable` has bytes, or has come to its end."""
+        """Call back whenever `readable` has bytes, or has reached its end."""
         self._selector.register(readable, selectors.EVENT_READ, callback)
 
     def remove_reader(self, readable: Readable | int) -> None:
@@ -87,9 +87,9 @@ class Reactor:
 
     @staticmethod
     def hold_for(readable: Readable, machine_s: float) -> bool:
-        """Let world time stand still until `readable` has bytes; False if it had none after `machine_s`.
+        """Pause world time until `readable` has bytes; False if it had none after `machine_s`.
 
-        This is how a stand-in walks in lock-step with a client: the world waits for the client's answer.
+        Used by a stand-in in lock-step with a client: the world waits for the client's answer.
         """
         return bool(select.select([readable], [], [], machine_s)[0])
 
@@ -99,7 +99,7 @@ class Reactor:
         os.write(self._wake_write, b"!")
 
     def run(self) -> None:
-        """Work until stopped."""
+        """Process events until stopped."""
         while not self._stopped.is_set():
             next_ns = self._next_ns()
             wait_s = self.clock.machine_s_until(next_ns)

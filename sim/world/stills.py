@@ -1,4 +1,4 @@
-"""Pictures of a simulated cell without a world round it: no clock, no wires, just what the camera would see."""
+"""Frames of a simulated cell without a running world: no clock, no wires, only the rendered image."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim.world.config import Config
 
 
 class Stills:
-    """A camera that stands wherever it is wanted; `config` is that of the world (`sim.world.config.Config`)."""
+    """A camera at any pose; `config` is that of the world (`sim.world.config.Config`)."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         checked = Config.model_validate(config)
@@ -34,7 +34,7 @@ class Stills:
         exposure_s: float,
         gain: float = 1.0,
     ) -> NDArray[np.uint16]:
-        """A RAW frame [h, w], DN; LEDs and panels shine throughout, and of the arm only the tool is there."""
+        """A RAW frame [h, w], DN; LEDs and panels are lit throughout, and of the arm only the tool is present."""
         pixels = np.empty(self._shape, np.uint16)
         shining = dict.fromkeys(leds, exposure_s)
         tool = tool_capsules(base_from_flange, self._tool) if self._arm_shadows else NONE

@@ -1,7 +1,7 @@
 """The simulated cell: one process, one reactor, and the stand-ins that share its state.
 
 `python -m sim.world.world` reads its configuration as one JSON line from standard input, prints its endpoints as
-one JSON line and serves until standard input closes (its parent is gone), a signal comes or it is told to stop.
+one JSON line and serves until standard input closes (its parent has ended), a signal comes or it is told to stop.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SCRATCH = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gette
 
 
 class World:
-    """Stand-ins and what joins them: the trigger cable, the light, the arm that carries the camera_stand_in."""
+    """The stand-ins and their connections: the trigger cable, the light, the arm that carries the camera."""
 
     def __init__(self, config: Config, folder: Path) -> None:
         settings = config.settings
@@ -102,7 +102,7 @@ class World:
         )
 
     def _warm_up(self, camera: CameraConfig) -> None:
-        """Compile the renderer, and lay out what it keeps, before anybody waits for a frame."""
+        """Compile the renderer and fill its caches, before the first frame is due."""
         led = int(self._photographer.leds.ids[0])
         lit = Exposed({led: 1e-3}, [1], 1e-3, 1.0, 0, self.robot.true_base_from_flange())
         self._photographer.render(np.zeros((camera.height_px, camera.width_px), np.uint16), lit)
@@ -110,7 +110,7 @@ class World:
     # -- the cables ---------------------------------------------------------------------------------------
 
     def _arm(self) -> Capsules:
-        """What of arm and tool is in the way of light."""
+        """Parts of arm and tool that block light."""
         if not self._arm_shadows:
             return NONE
         tool = tool_capsules(self.robot.true_base_from_flange(), self._tool)
@@ -124,12 +124,12 @@ class World:
                 assert_never(kind)
 
     def _light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
-        """The box drives an LED, which shines as bright as it can now."""
+        """The box switches an LED on; it is lit with its present flux."""
         flux = self._flashes.flux(led, self.box.temperature_of_led_c(led))
         self.lighting.light(led, t_on_ns, t_off_ns, flux)
 
     def _edge_counted(self, number: int) -> None:
-        """The box sent, or should have sent, edge `number`: faults that wait for it happen."""
+        """The box has sent, or dropped, edge `number`: faults scheduled for it happen."""
         for fault in self._faults_at_edge.pop(number, ()):
             self._happen(fault)
 
@@ -158,21 +158,21 @@ class World:
             case script.UnplugCamera():
                 self.camera.unplug()
             case script.CameraControlLoss():
-                assert isinstance(self.camera, gige_camera.GigeCamera)  # others are refused before
+                assert isinstance(self.camera, gige_camera.GigeCamera)  # `impossible` refuses the fault for others
                 self.camera.lose_control()
             case script.OverTemperature():
                 self._scpi_box.over_temperature(fault.board)
             case script.DeadLed():
                 self.box.kill_led(fault.led)
             case script.StuckLed():
-                assert isinstance(self.box, TextBox)  # others are refused before
+                assert isinstance(self.box, TextBox)  # `impossible` refuses the fault for others
                 self.box.stick_led(fault.led)
             case script.FlickeringLed():
                 self._flashes.unsteady[fault.led] = fault.rms
             case script.EmergencyStop():
                 self.robot.estop()
             case script.LateRsi():
-                assert isinstance(self.robot, kuka_controller.KukaController)  # others are refused before
+                assert isinstance(self.robot, kuka_controller.KukaController)  # `impossible` refuses others
                 self.robot.late(fault.cycles)
             case script.RsiLinkLoss():
                 self.robot.lose_link(fault.seconds)
@@ -183,7 +183,7 @@ class World:
 
     @property
     def _scpi_box(self) -> LedBoxFirmware:
-        """The box, for faults that only this kind can have: others are refused before."""
+        """The SCPI box, for faults that only it can have; `impossible` refuses them for others."""
         assert isinstance(self.box, LedBoxFirmware)
         return self.box
 
@@ -243,7 +243,7 @@ class World:
 
 
 class OneFault(BaseModel):
-    """A fault on its own, for the control line."""
+    """One fault, for the control connection."""
 
     fault: script.Fault
 

@@ -205,7 +205,7 @@ def test_a_bank_that_stays_wrong_is_refused(
     monkeypatch.setattr(ledbox_firmware, "zlib", broken_memory)
     steps = table(7)
     box.load(steps)
-    with pytest.raises(DeviceRefused, match=r"CRC-32 .* in bank 0.*though uploaded twice"):
+    with pytest.raises(DeviceRefused, match=r"CRC-32 .* in bank 0.*after two uploads"):
         box.start(steps)
 
 

@@ -259,7 +259,7 @@ class TestProof:
     def test_a_file_that_was_cut_off_ends_the_run(self, still: StillCamera, camera: RawFiles) -> None:
         path = still.picture(42)
         path.write_bytes(path.read_bytes()[:300])
-        with pytest.raises(DeviceRefused, match="raise `still_s`"):
+        with pytest.raises(DeviceRefused, match="increase `still_s`"):
             camera.next_frame(WAIT_S)
 
     def test_a_folder_that_goes_away_is_reported(self, still: StillCamera, camera: RawFiles) -> None:

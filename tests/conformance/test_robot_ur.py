@@ -310,7 +310,7 @@ def _tool_pose(joints_deg: Sequence[float] | NDArray[np.float64]) -> NDArray[np.
 
 def test_a_line_that_the_arm_cannot_follow_ends_the_program(cell: UrCell) -> None:
     cell.in_world(lambda: cell.controller.start_movel((5.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.5, 2.0))
-    assert cell.controller.fault == "no way along that line"
+    assert cell.controller.fault == "no path along that line"
     cell.assert_stands()
 
 

@@ -147,7 +147,7 @@ def test_a_world_with_a_ur_does_not_run_at_another_speed_than_life(cell: CellFol
     cell.write()
     ended = cell.acquire()
     assert ended.code == 2
-    assert "ur-rtde lives in real time" in ended.err
+    assert "ur-rtde works in real time" in ended.err
 
 
 @pytest.mark.parametrize(("model", "views"), [("ur5e", [TOP]), ("ur10e", [TOP, SIDE])])

@@ -1,4 +1,4 @@
-"""GigE Vision and USB3 Vision cameras through libaravis."""
+"""GigE Vision and USB3 Vision cameras over libaravis."""
 
 from drivers.camera.aravis.driver import AravisCamera
 from drivers.camera.aravis.settings import Settings

@@ -1,4 +1,4 @@
-"""Which GigE Vision and USB3 Vision cameras there are, and opening one with control of it."""
+"""Finds GigE Vision and USB3 Vision cameras, and opens one with control of it."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.camera.aravis.library import call, is_a, load
 
 _STALE_CONTROL_S = 4.0
-"""A camera forgets a client that died 3 s after its last heartbeat (facts/genicam)."""
+"""Time for which opening is retried: a camera drops a client 3 s after its last heartbeat."""
 _RETRY_S = 0.25
 _PRIMARY_APPLICATION_IP = 0xA14
-"""Bootstrap register of GigE Vision: who controls the camera."""
+"""Bootstrap register of GigE Vision: address of the client that controls the camera."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A camera that answered the search."""
+    """A camera that answered discovery."""
 
     id: str
     address: str
@@ -32,7 +32,7 @@ class Found:
 
 
 def discover() -> list[Found]:
-    """All cameras that answer within a second or so; none where libaravis is not installed."""
+    """All cameras that answer within about a second; none if libaravis is not installed."""
     library = load()
     if library is None:
         return []
@@ -45,8 +45,8 @@ def discover() -> list[Found]:
 
 
 def name_of(device: str, address: str) -> str:
-    """What libaravis opens a camera by: an IP address as it is; of anything else (serial number, Aravis id, or
-    nothing) the one that answers to it. Raises DeviceLost if none does, DeviceRefused if several do."""
+    """The name by which libaravis opens a camera: an IP address unchanged; for a serial number, an Aravis id or
+    nothing, the camera that matches it. Raises DeviceLost if none matches, DeviceRefused if several do."""
     with contextlib.suppress(ValueError):
         return str(ipaddress.IPv4Address(address))
     found = discover()
@@ -63,9 +63,9 @@ def name_of(device: str, address: str) -> str:
 
 
 def open_controlled(library: Any, device: str, name: str) -> int:
-    """A handle of the camera with control of it; waits for a client that died to be forgotten.
+    """A handle of the camera with control of it; waits until the camera has dropped a client that died.
 
-    Raises DeviceLost if no camera answers to `name`, DeviceRefused if another client has it.
+    Raises DeviceLost if no camera answers to `name`, DeviceRefused if another client controls it.
     """
     end_s = time.monotonic() + _STALE_CONTROL_S
     while True:

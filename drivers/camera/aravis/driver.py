@@ -1,8 +1,8 @@
-"""GigE Vision and USB3 Vision cameras through libaravis: `coupole.devices.Camera`.
+"""GigE Vision and USB3 Vision cameras over libaravis: `coupole.devices.Camera`.
 
 The camera is found by its address, serial number or Aravis id; the rig's `features` are checked, written and
-read back at opening, in their order. Frames are views of our own page-aligned buffers, not copied (packed and
-8-bit formats are widened once). What a camera cannot tell is -1, never guessed. The settings are listed in
+read back at opening, in their order. Frames are views of page-aligned buffers of the driver, not copied (packed
+and 8-bit formats are widened once). Counts that the camera does not provide are -1. The settings are listed in
 `docs/reference/camera-aravis.md`.
 """
 
@@ -69,7 +69,7 @@ class AravisCamera:
     # -- opening and closing ------------------------------------------------------------------------------
 
     def _set_up(self) -> None:
-        with contextlib.suppress(DeviceRefused):  # a client that died may have left it running
+        with contextlib.suppress(DeviceRefused):  # a client that died may have left an acquisition running
             self._features.execute("AcquisitionStop")
         set_image(self._features, self._settings)
         if self._is_gige:
@@ -126,7 +126,7 @@ class AravisCamera:
         return report
 
     def temperature_c(self) -> float:
-        """Of the sensor or body, as the camera has it. Raises DeviceRefused if it has no thermometer."""
+        """Temperature of sensor or body, as the camera provides. Raises DeviceRefused without thermometer."""
         return self._features.number("DeviceTemperature")
 
     # -- exposure -----------------------------------------------------------------------------------------
@@ -165,7 +165,7 @@ class AravisCamera:
         self._armed.set()
 
     def _allocate(self, slots: int) -> None:
-        """Memory for the device's payload, never for what the format should make of it (facts/genicam)."""
+        """Buffers of the camera's `PayloadSize`, which may be larger than the pixel format requires."""
         assert self._format is not None
         self._wire_format = pixel_format(self._features, self._name)
         payload_bytes = int(self._features.number("PayloadSize"))
@@ -188,7 +188,7 @@ class AravisCamera:
         while True:
             left_s = end_s - time.monotonic()
             if self._lost.is_set():
-                raise self._link_lost("the camera no longer obeys: its control channel is gone")
+                raise self._link_lost("its control channel is gone")
             stream = self._stream
             if stream is None:
                 self._armed.wait(max(0.0, left_s))
@@ -215,7 +215,7 @@ class AravisCamera:
                 self._name,
                 expected=f"{shape[1]} x {shape[0]} pixels of {self._wire_format.name}",
                 happened=f"frame {frame_id} has {got[1]} x {got[0]} of format 0x{got[2]:08x}",
-                remedy="Has another program changed the camera? Start again.",
+                remedy="Check that no other program changes the camera's settings, then start again.",
             )
         if self._wire_format.packing == "two bytes":
             pixels = raw[: 2 * shape[0] * shape[1]].view(np.uint16).reshape(shape)
@@ -264,7 +264,7 @@ class AravisCamera:
         )
 
     def stream_statistics(self) -> StreamStatistics:
-        """Figures of frames and packets since `arm`."""
+        """Counts of frames and packets since `arm`."""
         stream = self._stream
         return stream.statistics() if stream is not None else self._last[1]
 

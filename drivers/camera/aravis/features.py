@@ -1,4 +1,4 @@
-"""GenICam features of an opened camera by name, with their types and ranges checked before anything is written."""
+"""GenICam features of an open camera, by name; types and ranges are checked before anything is written."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Features:
 
     def __init__(self, library: Any, handle: int, device: str) -> None:
         self._library, self._handle, self._device = library, handle, device
-        self._lock = threading.RLock()  # libaravis evaluates formulas without one
+        self._lock = threading.RLock()  # libaravis evaluates feature formulas without a lock
 
     def has(self, name: str) -> bool:
         """True if the camera has the feature and it can be used now."""
@@ -36,7 +36,7 @@ class Features:
         return next((name for name in names if self.has(name)), None)
 
     def read(self, name: str) -> Value:
-        """Raises DeviceRefused if the camera has no such feature, or it holds no value."""
+        """Raises DeviceRefused if the camera has no such feature, or the feature holds no value."""
         with self._lock:
             match self._kind(name):
                 case "enumeration" | "string":
@@ -61,8 +61,8 @@ class Features:
     def write(self, name: str, value: Value) -> None:
         """Set a feature and read it back.
 
-        Raises DeviceRefused if there is no such feature, the value is of another type or out of range, or the
-        camera then holds another one.
+        Raises DeviceRefused if there is no such feature, the value has the wrong type or is out of range, or the
+        camera then holds another value.
         """
         with self._lock:
             kind = self._kind(name)
@@ -95,7 +95,7 @@ class Features:
         return least.value, most.value
 
     def entries(self, name: str) -> list[str]:
-        """Names that an enumeration takes now."""
+        """Names of the enumeration's entries that are available now."""
         count = ctypes.c_uint()
         with self._lock:
             names = self._call("dup_available_enumeration_feature_values_as_strings", name, ctypes.byref(count))

@@ -1,6 +1,6 @@
-"""libaravis-0.8 through ctypes: prototypes of what the driver calls, and its errors as ours.
+"""libaravis-0.8 over ctypes: prototypes of the functions used, and translation of its errors.
 
-Every function has its result and argument types: a pointer passed as a C int is cut to 32 bits. `call` is for
+All argument and result types are declared: a pointer passed as a C int would be cut to 32 bits. `call` is for
 functions whose last parameter is a `GError **`.
 """
 
@@ -96,7 +96,7 @@ _PROTOTYPES: dict[str, tuple[Any, list[Any]]] = {
     "arv_buffer_get_image_pixel_format": (ctypes.c_uint32, [POINTER]),
     "arv_buffer_get_image_width": (_INT, [POINTER]),
     "arv_buffer_get_image_height": (_INT, [POINTER]),
-    # GObject and GLib, which libaravis brings with it
+    # GObject and GLib, which libaravis links
     "g_object_ref": (POINTER, [POINTER]),
     "g_object_unref": (None, [POINTER]),
     "g_object_set_property": (None, [POINTER, TEXT, POINTER]),
@@ -116,9 +116,9 @@ _NOT_CONNECTED, _TRANSFER_ERROR, _TIMEOUT, _NOT_FOUND, _NOT_CONTROLLER = 2, 4, 5
 
 @functools.cache
 def load() -> Any:
-    """The library, with GObject's functions to be had through it; None where it is not installed.
+    """The library, which also exports GObject's functions; None if it is not installed.
 
-    Looked for among the system's libraries, then in the wheel `aravis-python`.
+    Searched for among the system's libraries, then in the wheel `aravis-python`.
     """
     names = [ctypes.util.find_library("aravis-0.8"), "libaravis-0.8.so.0"]
     wheel = importlib.util.find_spec("aravis")
@@ -137,12 +137,12 @@ def load() -> Any:
 
 
 def require(device: str) -> Any:
-    """The library. Raises DeviceError, in the name of `device`, where it is not installed."""
+    """The library. Raises DeviceError, for `device`, if it is not installed."""
     library = load()
     if library is None:
         raise DeviceError(
             device,
-            expected="libaravis-0.8, which speaks GigE Vision and USB3 Vision",
+            expected="libaravis-0.8, which implements GigE Vision and USB3 Vision",
             happened="it is not installed",
             remedy="Install it (Debian: apt install libaravis-0.8-0; else pip install aravis-python).",
         )
@@ -150,7 +150,7 @@ def require(device: str) -> Any:
 
 
 def call(device: str, doing: str, function: Any, *arguments: Any) -> Any:
-    """Call a function that may set a GError; `doing` says what it does for `device`.
+    """Call a function that may set a GError; `doing` describes the call in messages about `device`.
 
     Raises DeviceTimeout, DeviceLost or DeviceRefused.
     """
@@ -172,18 +172,18 @@ def _judge(code: int) -> tuple[type[DeviceError], str]:
     if code in {_NOT_CONNECTED, _TRANSFER_ERROR, _NOT_FOUND}:
         return DeviceLost, "Check the camera's cable, power and address, then start again."
     if code == _NOT_CONTROLLER:
-        return DeviceLost, "Another program took the camera over: end it, then resume the run."
+        return DeviceLost, "Another program has taken control of the camera: end it, then resume the run."
     return DeviceRefused, "Correct the camera's settings in the rig."
 
 
 def is_a(library: Any, instance: int, type_name: str) -> bool:
-    """True if a GObject is of the type whose `<type_name>_get_type` the library has."""
+    """True if a GObject instance is of the type that the library's `<type_name>_get_type` returns."""
     return bool(library.g_type_check_instance_is_a(instance, getattr(library, f"{type_name}_get_type")()))
 
 
 def set_property(library: Any, instance: int, name: str, kind: str, number: int) -> None:
-    """`g_object_set_property` for a number of the `kind` int, uint or enum: a GValue is 24 bytes that begin as
-    zeros."""
+    """`g_object_set_property` for a number of the `kind` int, uint or enum. A GValue is 24 bytes, initially
+    zero."""
     value = ctypes.create_string_buffer(24)
     type_of_kind = {"int": 6 << 2, "uint": 7 << 2, "enum": library.arv_gv_stream_socket_buffer_get_type()}
     library.g_value_init(value, type_of_kind[kind])

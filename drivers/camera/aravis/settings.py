@@ -15,22 +15,22 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     device: str = "camera"
-    """How messages call it."""
+    """The camera's name in messages."""
     address: str = ""
-    """IP address, serial number or Aravis id; empty: the only camera there is."""
+    """IP address, serial number or Aravis id; empty: the only camera connected."""
     pixel_format: str = "BayerGB12"
     region: Region | None = None
-    """None: as the camera has it."""
+    """None: as set in the camera."""
     features: dict[str, Value] = Field(default_factory=dict)
-    """GenICam features to set at opening, in this order, before all else."""
+    """GenICam features to set at opening, in this order, before all others."""
     black_dn: Annotated[int, Field(ge=0)] | None = None
-    """Digital number of black; None: what the feature `BlackLevel` holds, where that is in DN."""
+    """Black level, DN; None: the value of the feature `BlackLevel`, if that is in DN."""
     trigger_line: str = "Line0"
-    """Entry of `TriggerSource` that the box's cable is on."""
+    """Entry of `TriggerSource` to which the box's cable is connected."""
     trigger_activation: str = "RisingEdge"
     software_trigger: str = "Software"
     exposed_counter: Counter | None = None
-    """Counts exposures. Without one, the host cannot tell how many frames were lost at a burst's end."""
+    """Counts exposures. Without one, frames lost at the end of a burst cannot be counted."""
     over_trigger_counter: Counter | None = None
     """Counts edges that came too early."""
     readout_us: Annotated[int, Field(gt=0)] | None = None
@@ -40,10 +40,10 @@ class Settings(BaseModel):
     timestamp_jitter_us: Annotated[float, Field(gt=0)] = 20.0
     """Largest deviation of the camera's timestamps from the edges; from its data sheet, or measured."""
     packet_size: Annotated[int, Field(ge=576, le=65500)] | None = None
-    """Bytes of a GigE Vision packet; None: as large as the network lets through. Jumbo frames take 9000."""
+    """Bytes of a GigE Vision packet; None: the largest that the network transmits. Jumbo frames take 9000."""
     packet_socket: bool = True
-    """Take packets past the kernel's network stack where the process has the privilege (CAP_NET_RAW)."""
+    """Receive packets past the kernel's network stack, if the process has the privilege (CAP_NET_RAW)."""
     frame_retention_ms: Annotated[int, Field(ge=1)] = 200
-    """How long the last packets of a frame may take before it counts as incomplete."""
+    """Longest time for the last packets of a frame, before it counts as incomplete."""
     buffers: Annotated[int, Field(ge=2)] = 16
-    """At least so many are queued."""
+    """Least number of buffers queued."""

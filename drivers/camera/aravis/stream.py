@@ -1,8 +1,8 @@
-"""One acquisition's stream: buffers over our own memory, from arming to disarming.
+"""The stream of one acquisition: buffers in the driver's own memory, from arming to disarming.
 
-All buffers are queued before the camera starts, and taken oldest first. An image that lost packets is counted
-and goes back; its id stays missing, and that gap is what tells of it. Those that libaravis cleared or aborted
-at start or end were never images.
+All buffers are queued before the camera starts, and images are taken oldest first. An image that lost packets is
+counted and its buffer queued again; the gap in the frame ids shows the loss. Buffers that libaravis cleared or
+aborted at start or end never held an image.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from drivers.camera.aravis.library import call, is_a, set_property
 _SUCCESS, _CLEARED, _ABORTED = 0, 1, 7
 """ArvBufferStatus (arvbuffer.h)."""
 _FIXED_SOCKET_BUFFER, _SOCKET_BUFFER_BYTES = 0, 2**28
-"""ArvGvStreamSocketBuffer (arvgvstream.h), and more than the kernel grants (net.core.rmem_max): Aravis's own
-choice is the size of a frame, which does not hold one, since the kernel counts what packets take in memory."""
+"""ArvGvStreamSocketBuffer (arvgvstream.h), and a size above the kernel's limit (net.core.rmem_max). Aravis's
+default, the size of a frame, is too small for one, since the kernel counts the memory that packets occupy."""
 _RECEIVERS = ("arv_gv_stream", "arv_uv_stream")
 _PRIORITY = 10
 _STRAYS_S = 0.02
-"""Until its filter is set, a packet socket takes all that comes to the interface, and libaravis takes that for
-parts of images: it is let go by while no buffer is queued."""
+"""Until its filter is set, a packet socket receives all traffic of the interface, and libaravis takes it for
+parts of images. It is discarded by waiting this long before any buffer is queued."""
 _SLICE_S = 0.05
-"""A waiting thread looks this often whether the stream was closed or the camera lost."""
+"""Interval at which a waiting thread checks whether the stream was closed or the camera lost."""
 
 
 class Pool:
@@ -46,14 +46,14 @@ class Pool:
         with contextlib.suppress(OSError):
             memory.madvise(mmap.MADV_HUGEPAGE)
         self._memory = np.frombuffer(memory, np.uint8)
-        # A page's first touch would cost the receiver more than its bytes. Not through numpy, which would keep the
-        # robot's thread waiting meanwhile.
+        # The first access to a page would cost the receiving thread more time than its bytes. memset through
+        # ctypes releases the GIL; numpy would block the robot's thread.
         ctypes.memset(self._memory.ctypes.data, 0, len(self._memory))
         self.out = 0
-        """Slots in the hands of those who took frames."""
+        """Number of slots that hold frames not yet released."""
 
     def fits(self, slots: int, payload_bytes: int) -> bool:
-        """True if it has these slots, and nobody holds one any more."""
+        """True if it has these slots, and none is in use."""
         return self.out == 0 and self.slots >= slots and self.payload_bytes == payload_bytes
 
     def slot(self, index: int) -> NDArray[np.uint8]:
@@ -67,7 +67,7 @@ class Pool:
 
 @dataclass(frozen=True)
 class Taken:
-    """A whole image, in its slot of the pool until `Stream.give_back`."""
+    """A complete image, in its slot of the pool until `Stream.give_back`."""
 
     buffer: int
     slot: int
@@ -77,22 +77,22 @@ class Taken:
 
 @dataclass(frozen=True)
 class StreamStatistics:
-    """What became of the frames and packets of one acquisition, as far as the host can know."""
+    """Counts of frames and packets of one acquisition, as known to the host."""
 
     completed: int = 0
-    """Images that arrived whole."""
+    """Images that arrived complete."""
     failed: int = 0
     """Images that arrived with packets missing."""
     skipped: int = 0
-    """Frame ids that no image came for, those of `failed` included."""
+    """Frame ids without a complete image, including those of `failed`."""
     underruns: int = 0
-    """Times that libaravis found no buffer free; several for one frame."""
+    """Times that libaravis found no free buffer; several may concern one frame."""
     missing_packets: int = 0
     resent_packets: int = 0
 
 
 class Stream:
-    """From its making to `close()`. `give_back` and `close` may be called from any thread."""
+    """Runs from construction to `close()`. `give_back` and `close` may be called from any thread."""
 
     def __init__(
         self, library: Any, device_handle: int, device: str, pool: Pool, *, frame_retention_us: int
@@ -119,9 +119,9 @@ class Stream:
             library.arv_stream_push_buffer(self._handle, library.arv_buffer_new(pool.payload_bytes, address))
 
     def next(self, timeout_s: float, first_id: int, last_id: int) -> Taken | None:
-        """The oldest whole image; None if none came in time, or the stream was closed.
+        """The oldest complete image; None if none came in time, or the stream was closed.
 
-        `first_id` and `last_id` are the ends of the transport's frame ids. A slice of the time at most is waited.
+        `first_id` and `last_id` are the ends of the transport's frame ids. Waits for 0.05 s at most.
         """
         end_s = time.monotonic() + min(timeout_s, _SLICE_S)
         while True:
@@ -139,7 +139,7 @@ class Stream:
                 return taken
 
     def _judge(self, buffer: int, first_id: int, last_id: int) -> Taken | None:
-        """A whole image, or None after the buffer was queued again."""
+        """A complete image, or None after its buffer was queued again."""
         library = self._library
         status = library.arv_buffer_get_status(buffer)
         with self._lock:
@@ -164,7 +164,7 @@ class Stream:
         return Taken(buffer, self._pool.index_of(address), frame_id, library.arv_buffer_get_timestamp(buffer))
 
     def give_back(self, buffer: int) -> None:
-        """Queue a taken buffer again; after `close` it is only let go."""
+        """Queue a taken buffer again; after `close`, free it."""
         with self._lock:
             self._pool.out -= 1
             if self._handle is None:
@@ -173,7 +173,7 @@ class Stream:
                 self._library.arv_stream_push_buffer(self._handle, buffer)
 
     def statistics(self) -> StreamStatistics:
-        """Since the stream was made; those at its end once it is closed."""
+        """Counts since the stream was made; after `close`, those at its end."""
         with self._lock:
             return self._final or self._count()
 
@@ -192,7 +192,7 @@ class Stream:
         )
 
     def close(self) -> None:
-        """Let go of stream and buffers; memory that frames still show stays theirs."""
+        """Release stream and buffers; memory of frames in use stays valid."""
         with self._lock:
             if self._handle is None:
                 return
@@ -202,8 +202,8 @@ class Stream:
 
 
 def _prefer_receivers() -> None:
-    """Let libaravis's receiving threads run before all else, where this process may: the packet ring bridges
-    0.1 s, and on a busy machine a thread may wait longer for its turn."""
+    """Give libaravis's receiving threads real-time priority, if this process may: the packet ring holds 0.1 s,
+    and on a busy machine a thread may wait longer than that."""
     for task in Path("/proc/self/task").glob("*"):
         with contextlib.suppress(OSError):
             if (task / "comm").read_text().strip() in _RECEIVERS:

@@ -1,4 +1,4 @@
-"""Cameras through a GenTL producer."""
+"""Cameras over a GenTL producer."""
 
 from drivers.camera.gentl.driver import GenTLCamera
 from drivers.camera.gentl.settings import Settings

@@ -1,11 +1,11 @@
-"""Cameras behind a GenTL producer (.cti), through `harvesters` and `genicam`: `coupole.devices.Camera`.
+"""Cameras of a GenTL producer (.cti), over `harvesters` and `genicam`: `coupole.devices.Camera`.
 
-The extra `gentl` installs both. Any maker's producer gives access to its cameras; each pixel is copied once, from
-the producer's buffer into page-aligned memory of ours, 8-bit and packed ones widened on the way, and the producer
-gets its buffer back at once.
+The extra `gentl` installs both packages. The producer of any maker gives access to its cameras. Each pixel is
+copied once, from the producer's buffer to page-aligned memory of the driver; 8-bit and packed pixels are widened
+in the same step. The producer's buffer is queued again at once.
 
-The tests run it on a producer of their own (tests/conformance/gentl_producer), and on the one that the package
-genicam ships, which knows no trigger. **No real camera** has been seen behind it yet.
+Tested with a producer written for the tests (tests/conformance/gentl_producer), and with the one in the package
+genicam, which has no trigger. **Not yet tested with a real camera.**
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from drivers.camera.misuse import misused
 from drivers.fair_lock import FairLock
 
 _A_LOOK_S = 1e-4
-"""harvesters may not look at all in less: its clock steps by 0.2 us."""
+"""Shortest time-out that harvesters accepts: with less it may not poll at all, as its clock has 0.2 us steps."""
 _NAP_S = 1e-3
-"""Between two looks for a frame: genicam 1.6 would keep all of Python waiting while it waits."""
+"""Pause between polls for a frame: a blocking wait of genicam 1.6 would hold the GIL."""
 _SILENCE_S = 0.5
-"""Without frames for so long, the camera is asked whether it is there: not every producer tells when it goes."""
+"""After this time without frames the camera is queried: not every producer reports a lost camera."""
 _IN_HAND = 16
-"""Frames that are on their way to the disk at once."""
+"""Most frames in memory on their way to the disk."""
 
 
 class GenTLCamera:
@@ -111,7 +111,7 @@ class GenTLCamera:
                 self._name,
                 expected="a camera that can be triggered",
                 happened="it has no feature `TriggerMode`",
-                remedy="Use another camera, or set `free_running: true` to look through this one.",
+                remedy="Use another camera, or set `free_running: true` to view images of this one.",
             )
 
     def min_period_us(self, exposure: Exposure) -> int:
@@ -156,7 +156,7 @@ class GenTLCamera:
             time.sleep(_NAP_S)
 
     def _listen(self) -> None:
-        """Raises DeviceLost if the camera has been silent for long and does not answer."""
+        """Raises DeviceLost if no frame has come for long and the camera does not answer."""
         if time.monotonic() > self._heard_s + _SILENCE_S:
             with self._lock:
                 if self._armed.is_set():
@@ -164,7 +164,7 @@ class GenTLCamera:
             self._heard_s = time.monotonic()
 
     def _fetch(self, slot: Slot) -> Frame | None:
-        """The oldest whole image that has come, in `slot`; None, and the slot is free again, if there is none."""
+        """The oldest complete image, copied to `slot`; None, with the slot released, if there is none."""
         with self._lock, reporting(self._name, "an image"):
             buffer = self._acquirer.try_fetch(timeout=_A_LOOK_S, is_raw=True) if self._armed.is_set() else None
             if buffer is None:
@@ -190,7 +190,7 @@ class GenTLCamera:
             self._features.write("TriggerSoftware", True)
 
     def statistics(self) -> CameraStatistics:
-        """At rest: those of the last acquisition."""
+        """Counts of the present acquisition; while disarmed, of the last one."""
         if self._armed.is_set():
             with self._lock, reporting(self._name, "the camera's counters"):
                 self._last = self._statistics()

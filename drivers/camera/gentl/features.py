@@ -1,4 +1,4 @@
-"""GenICam features of a camera's node map by name, with types and ranges checked before anything is written."""
+"""GenICam features in a camera's node map, by name; types and ranges are checked before anything is written."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _TYPES: dict[str, tuple[type, ...]] = {
 class Features:
     """Reads and writes the features of one camera; `device` is its name in the rig.
 
-    Each method raises DeviceRefused where the camera has no such feature or says no, DeviceLost where it does not
-    answer.
+    Each method raises DeviceRefused if the camera lacks the feature or rejects the access, DeviceLost if it does
+    not answer.
     """
 
     def __init__(self, node_map: Any, device: str) -> None:
@@ -45,7 +45,7 @@ class Features:
             self._failed(f"to learn whether it has `{name}`", error)
 
     def expect_answer(self) -> None:
-        """Ask the camera itself, not what is remembered of it. Raises DeviceLost."""
+        """Query the camera itself, not the cache. Raises DeviceLost."""
         try:
             self._node("Width").get_value(ignore_cache=True)
         except self._errors as error:
@@ -132,7 +132,7 @@ class Features:
             self._refuse(f"{node.min} plus a multiple of {node.inc} for `{name}`", f"{value:.10g} was given")
 
     def _failed(self, expected: str, error: Exception) -> NoReturn:
-        """A camera that does not answer is gone, whatever it was asked."""
+        """Raise DeviceLost if the camera does not answer, DeviceRefused for any other error."""
         if isinstance(error, self._silence):
             self._gone(expected, error)
         self._refuse(expected, str(error))

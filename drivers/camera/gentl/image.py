@@ -1,4 +1,4 @@
-"""What a buffer of a GenTL producer brings: pixels and a time."""
+"""Pixels and timestamp of a GenTL buffer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def copy_pixels(
 ) -> NDArray[np.uint16]:
     """A buffer's image as 16-bit pixels [height_px, width_px] in `memory` [frame_bytes].
 
-    Raises DeviceRefused for an image that is not what `configure` promised.
+    Raises DeviceRefused for an image that differs from the format which `configure` returned.
     """
     wanted = {
         "payload_type": _PLAIN_IMAGE,
@@ -51,8 +51,8 @@ def copy_pixels(
 
 
 def timestamp_ns(buffer: Any, camera: Any, device: str) -> int:
-    """When the camera says that a buffer's exposure began; older producers count ticks, and `camera` says of how
-    long. Raises DeviceRefused where neither is told."""
+    """Start of the exposure by the camera's clock, ns. Older producers give ticks, whose frequency `camera` gives.
+    Raises DeviceRefused if the producer gives neither."""
     stamp_ns = told(buffer, "timestamp_ns")
     if stamp_ns is not None:
         return stamp_ns
@@ -62,6 +62,6 @@ def timestamp_ns(buffer: Any, camera: Any, device: str) -> int:
             device,
             expected="timestamps from the producer, in nanoseconds or with their frequency",
             happened="it gives none",
-            remedy="Set `timestamps: host` to look through this camera; shots cannot be proven with it.",
+            remedy="Set `timestamps: host` to view images of this camera; shots cannot be proven with it.",
         )
     return ticks * 10**9 // ticks_hz

@@ -1,4 +1,4 @@
-"""Between the driver and `harvesters`: one camera of a producer opened, errors in our words, gaps in ids."""
+"""Layer between the driver and `harvesters`: opens a camera, translates errors, counts gaps in frame ids."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.camera.gentl.settings import Settings
 
 _LOG = logging.getLogger("harvesters")
-"""In place of harvesters' own, which prints to the terminal what is raised here anyway."""
+"""Replaces harvesters' own logger, which prints errors that are raised here anyway."""
 _LOG.addHandler(logging.NullHandler())
 
 
 def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
-    """Harvester, acquirer and description of the one camera that the settings mean."""
+    """Harvester, acquirer and description of the one camera that matches the settings."""
     name = settings.device
     try:
         import genicam.gentl
@@ -64,9 +64,9 @@ def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
 
 
 def _open_in_vain(producer: str) -> None:
-    """Raises what the producer says if it does not open: harvesters keeps that to itself and finds no camera.
+    """Raise the producer's error if it cannot be opened: harvesters hides it and finds no camera.
 
-    A producer can be open but once in a process (GenTL standard, GCInitLib).
+    A producer can be open only once in a process (GenTL standard, GCInitLib).
     """
     import genicam.gentl
 
@@ -94,7 +94,7 @@ def _opening_failed(name: str, error: Exception) -> DeviceError:
 
 
 def _describe(device: Any) -> dict[str, str]:
-    """What a producer says of a camera before it is opened; empty where it says nothing."""
+    """Description of a camera before it is opened; empty strings where the producer gives none."""
     import genicam.gentl
 
     def text(attribute: str) -> str:
@@ -115,7 +115,7 @@ def _lost(
 
 @contextlib.contextmanager
 def reporting(name: str, expected: str) -> Iterator[None]:
-    """What the producer or GenApi raises becomes a DeviceLost with its own words."""
+    """Translate errors of the producer or of GenApi to DeviceLost, with their text."""
     import genicam.genapi
     import genicam.gentl
 
@@ -126,7 +126,7 @@ def reporting(name: str, expected: str) -> Iterator[None]:
 
 
 def told(module: Any, what: str) -> int | None:
-    """A figure that producers need not give."""
+    """Value of an optional property; None if the producer does not provide it."""
     import genicam.gentl
 
     try:
@@ -137,7 +137,7 @@ def told(module: Any, what: str) -> int | None:
 
 
 def when_incomplete(count: Any) -> Any:
-    """`count` as harvesters wants to be given it."""
+    """`count` as a callback of harvesters."""
     from harvesters.core import Callback
 
     class Counting(Callback):  # type: ignore[misc,unused-ignore]  # harvesters has no types
@@ -148,18 +148,18 @@ def when_incomplete(count: Any) -> Any:
 
 
 class Gaps:
-    """Frame ids as they come, and what is missing between them."""
+    """Counts complete images and gaps in their frame ids."""
 
     def __init__(self) -> None:
         self.begin((0, 0))
 
     def begin(self, id_modulus: tuple[int, int]) -> None:
-        """A new acquisition; `id_modulus` as `coupole.devices.Camera` has it."""
+        """Begin a new acquisition; `id_modulus` as in `coupole.devices.Camera`."""
         self._ids = id_modulus[1] - id_modulus[0] + 1
         self._last_id: int | None = None
         self._skipped = self._incomplete_since = 0
         self.delivered = 0
-        """Whole images."""
+        """Complete images."""
 
     def whole(self, frame_id: int) -> None:
         self.delivered += 1
@@ -170,10 +170,10 @@ class Gaps:
         self._last_id, self._incomplete_since = frame_id, 0
 
     def incomplete(self) -> None:
-        """An image came with parts missing; its id will be a gap."""
+        """An image arrived incomplete; its id will be a gap."""
         self._incomplete_since += 1
 
     @property
     def missing(self) -> int:
-        """Images that did not come whole, as far as ids tell: none before the first, none after the last."""
+        """Images that did not arrive complete, from gaps in ids: none known before the first or after the last."""
         return self._skipped + self._incomplete_since

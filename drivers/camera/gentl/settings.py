@@ -1,4 +1,4 @@
-"""What a rig says of a camera behind a GenTL producer."""
+"""Settings of a camera over a GenTL producer."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ class Settings(BaseModel):
     producer: Path
     """The camera maker's GenTL producer, a file that ends in .cti."""
     device: str = "camera"
-    """How messages call it."""
+    """The camera's name in messages."""
     serial: str = ""
     model: str = ""
-    """Which camera, of those that the producer finds; empty: any, but there must be only one."""
+    """Selects one of the producer's cameras; empty: any, if there is only one."""
     pixel_format: str = "BayerGB12"
     region: Region | None = None
-    """None: as the camera has it."""
+    """None: as set in the camera."""
     features: dict[str, Value] = Field(default_factory=dict)
-    """GenICam features to set at opening, in this order, before all else."""
+    """GenICam features to set at opening, in this order, before all others."""
     black_dn: Annotated[int, Field(ge=0)] | None = None
-    """Digital number of black; None: what the feature `BlackLevel` holds, where that is in DN."""
+    """Black level, DN; None: the value of the feature `BlackLevel`, if that is in DN."""
     free_running: bool = False
-    """A camera without trigger: frames come at its own pace and with its own exposure. To look through only; no
-    shot can be proven with it."""
+    """A camera without trigger: it exposes at its own rate and exposure time. For viewing only; no shot can be
+    proven with it."""
     trigger_line: str = "Line0"
-    """Entry of `TriggerSource` that the box's cable is on."""
+    """Entry of `TriggerSource` to which the box's cable is connected."""
     trigger_activation: str = "RisingEdge"
     software_trigger: str = "Software"
     exposed_counter: Counter | None = None
-    """Counts exposures. Without one, the host cannot tell how many frames were lost at a burst's end."""
+    """Counts exposures. Without one, frames lost at the end of a burst cannot be counted."""
     over_trigger_counter: Counter | None = None
     """Counts edges that came too early."""
     readout_us: Annotated[int, Field(gt=0)] | None = None
@@ -45,8 +45,8 @@ class Settings(BaseModel):
     exposure_gap_us: Annotated[int, Field(ge=0)] = 100
     """Least time from the end of one exposure to the start of the next."""
     timestamps: Literal["camera", "host"] = "camera"
-    """`host`: for producers that give none; a frame is then stamped when it is taken, far from its edge."""
+    """`host`: for producers without timestamps; a frame is then stamped when it is taken, long after its edge."""
     timestamp_jitter_us: Annotated[float, Field(gt=0)] = 20.0
     """Largest deviation of the timestamps from the edges; from the camera's data sheet, or measured."""
     buffers: Annotated[int, Field(ge=2)] = 16
-    """At least so many are queued."""
+    """Least number of buffers queued."""

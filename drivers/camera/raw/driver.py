@@ -1,15 +1,15 @@
-"""A still camera whose RAW files a tethering program puts into a folder: `coupole.devices.Camera`.
+"""A still camera whose RAW files a tethering program writes to a folder: `coupole.devices.Camera`.
 
 The box's edge (or a command) releases the shutter; the camera or its program writes CR2, NEF, ARW or DNG files;
-LibRaw (`rawpy`) decodes them. A file is taken as a frame when its size has stood still.
+LibRaw (`rawpy`) decodes them. A file is taken as a frame once its size no longer changes.
 
-*Order and count are proven, never assumed.* The frame id is the number in the file's name, which the camera counts
-on with every picture and wraps from 9999 to 1: a picture that never comes leaves a gap. The timestamp is Exif's
-capture time with its fraction of a second. A file that comes after a later one, a number that comes twice, a
-capture time that runs backwards, another camera, exposure or sensitivity: each ends the run with a message.
+*Order and count are proven.* The frame id is the number in the file's name, which the camera increases with every
+picture and which wraps from 9999 to 1: a picture that never arrives leaves a gap. The timestamp is the Exif
+capture time with its fraction of a second. A file that arrives after a later one, a repeated number, a capture
+time that runs backwards, another camera, exposure or sensitivity: each ends the run with a message.
 
-*Slow by nature.* Marks stand a sixteenth of a period apart (docs/decisions/0002), so the period must be 40 times
-the jitter of the timestamps: 0.4 s with hundredths of a second, 20 s with whole ones.
+*Slow.* Marks are shifted by a sixteenth of a period (docs/decisions/0002), so the period must be 40 times the
+jitter of the timestamps: 0.4 s with hundredths of a second, 20 s with whole seconds.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from drivers.camera.raw.order import Order, file_number
 from drivers.camera.raw.picture import RawPicture, read_picture
 
 _LOOK_S = 0.05
-"""Between two looks into the folder."""
+"""Interval between two looks into the folder."""
 _PERIOD_IN_JITTERS = 40
-"""A mark stands a sixteenth of a period off the grid; that must be more than twice the jitter, with some drift."""
+"""A mark is shifted by 1/16 of a period; that must exceed twice the jitter, with some allowance for drift."""
 _IN_HAND = 4
-"""Pictures in memory at once; the others wait as files."""
+"""Most pictures in memory; the others wait as files."""
 _NOMINAL_EXPOSURE = 0.1
-"""A camera that is set to 1/125 s exposes for 1/128 s: by so much the two may differ."""
+"""Allowed relative difference of nominal and true exposure: a camera set to 1/125 s exposes for 1/128 s."""
 _RELEASE_TIMEOUT_S = 30.0
 
 
@@ -50,26 +50,26 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     folder: Path
-    """Where the tethering program puts the files."""
+    """Folder to which the tethering program writes."""
     period_us: Annotated[int, Field(gt=0)]
-    """From picture to picture, for as long as a burst lasts: with the camera's own memory full."""
+    """Time from picture to picture that the camera sustains for a whole burst, with its own memory full."""
     device: str = "camera"
-    """How messages call it."""
+    """The camera's name in messages."""
     sample: Path | None = None
-    """A RAW file of this camera, which tells what frames look like; None: the newest in the folder."""
+    """A RAW file of this camera, from which the frame format is read; None: the newest in the folder."""
     suffixes: tuple[str, ...] = (".cr2", ".nef", ".arw", ".dng")
     last_number: Annotated[int, Field(ge=99)] = 9999
-    """After it the camera counts from 1 again."""
+    """The camera's highest file number; after it the camera counts from 1 again."""
     release_command: tuple[str, ...] = ()
     """Program and arguments that release the shutter, for `trigger: software`."""
     shutter_jitter_us: Annotated[float, Field(ge=0)] = 5_000.0
-    """By how much the time from edge to exposure varies."""
+    """Variation of the time from edge to exposure."""
     still_s: Annotated[float, Field(gt=0)] = 1.0
-    """A file whose size has not changed for so long is complete."""
+    """A file whose size has not changed for this long is complete."""
     patience_s: Annotated[float, Field(gt=0)] = 30.0
-    """How long a picture is waited for whose successor has come, before it counts as lost."""
+    """Longest wait for a picture after a later one has arrived, before it counts as lost."""
     black_dn: Annotated[int, Field(ge=0)] | None = None
-    """Digital number of black; None: what LibRaw finds in the file."""
+    """Black level, DN; None: the value that LibRaw finds in the file."""
 
 
 class RawFiles:
@@ -92,8 +92,8 @@ class RawFiles:
         self._sample = self._read(settings.sample or self._newest())
         self._last_taken: Exif | None = None
         self.id_modulus = (1, settings.last_number)
-        # a stamp is the middle of what it may stand for
         self.delivery_s = settings.patience_s
+        # A timestamp is placed at the middle of its resolution interval.
         self.timestamp_jitter_us = self._sample.exif.resolution_us / 2 + settings.shutter_jitter_us
 
     def _newest(self) -> Path:
@@ -115,7 +115,7 @@ class RawFiles:
                 self._name,
                 expected=f"a whole RAW file of a Bayer sensor in {path.name}",
                 happened=str(error),
-                remedy="Look at the file; if it is cut off, raise `still_s` in the rig.",
+                remedy="Check the file; if it is truncated, increase `still_s` in the rig.",
             ) from error
 
     # -- who it is ----------------------------------------------------------------------------------------
@@ -127,7 +127,7 @@ class RawFiles:
         return Identity(vendor, model, serial, firmware)
 
     def self_test(self) -> Mapping[str, str]:
-        """What the sample tells. Raises DeviceLost if the folder is gone."""
+        """Data of the sample. Raises DeviceLost if the folder is gone."""
         files = self._order.files()
         return {
             "files": str(len(files)),
@@ -139,7 +139,7 @@ class RawFiles:
     # -- exposure -----------------------------------------------------------------------------------------
 
     def configure(self, exposure: Exposure) -> FrameFormat:
-        """The exposure is set on the camera, by hand: each picture is checked for it."""
+        """The exposure is set on the camera by hand; each picture is checked for it."""
         if self._armed.is_set():
             raise misused(self._name, "a disarmed camera", "configure() was called while it is armed")
         if exposure.gain_db:
@@ -160,13 +160,13 @@ class RawFiles:
         return self._format
 
     def min_period_us(self, exposure: Exposure) -> int:
-        to_tell_marks_apart = int(_PERIOD_IN_JITTERS * self.timestamp_jitter_us)
-        return max(self._settings.period_us, exposure.exposure_us, to_tell_marks_apart)
+        to_distinguish_marks_us = int(_PERIOD_IN_JITTERS * self.timestamp_jitter_us)
+        return max(self._settings.period_us, exposure.exposure_us, to_distinguish_marks_us)
 
     # -- acquisition --------------------------------------------------------------------------------------
 
     def arm(self, buffers: int) -> None:
-        """Files that are there already are not of this burst. `buffers` is met by the disk."""
+        """Files already in the folder do not belong to this burst. `buffers` is not used: files wait on disk."""
         if self._format is None:
             raise misused(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
@@ -190,7 +190,7 @@ class RawFiles:
             time.sleep(min(_LOOK_S, left_s))
 
     def _frame(self, path: Path, timeout_s: float) -> Frame | None:
-        """None if no memory became free in time: the file stays the next one."""
+        """None if no memory became free in time: the file remains the next one."""
         slot = self._pool.take(timeout_s)
         if slot is None:
             return None
@@ -212,7 +212,7 @@ class RawFiles:
         )
 
     def _check(self, path: Path, picture: RawPicture) -> None:
-        """Raises DeviceFault for a picture that is not of this burst or was not taken as asked."""
+        """Raises DeviceFault for a picture that is not of this burst or was not taken as requested."""
         assert self._exposure is not None
         sample, exif, asked_us = self._sample, picture.exif, self._exposure.exposure_us
         body = (exif.make, exif.model, exif.serial)
@@ -258,7 +258,7 @@ class RawFiles:
             )
 
     def statistics(self) -> CameraStatistics:
-        """A picture is taken to be exposed once its own number or a later one has come."""
+        """A picture counts as exposed once its own number or a later one has arrived."""
         counted, taken = self._order.counted, self._order.taken
         return CameraStatistics(
             exposed=counted, delivered=taken, lost_transfers=counted - taken, over_triggers=-1, overflows=0
@@ -278,5 +278,5 @@ class RawFiles:
             self._name,
             expected=f"{expected} in {path.name}",
             happened=happened,
-            remedy="Set the camera to manual, let no other program write into the folder, then resume the run.",
+            remedy="Set the camera to manual, let no other program write to the folder, then resume the run.",
         )

@@ -1,4 +1,4 @@
-"""What a RAW file of a still camera says of when and how it was taken: the Exif tags of CR2, NEF, ARW and DNG.
+"""Exif tags of a RAW file of a still camera (CR2, NEF, ARW, DNG): camera, capture time, exposure, sensitivity.
 
 All four are TIFF files whose first directory points to an Exif directory (Exif 2.32, JEITA CP-3451). tifffile
 reads both. LibRaw gives the capture time in whole seconds only, hence this module.
@@ -18,24 +18,24 @@ import tifffile
 
 @dataclass(frozen=True)
 class Exif:
-    """Of one picture. Times are the camera's own clock, whatever zone it is set to, counted from 1970."""
+    """Tags of one picture. Times are on the camera's own clock, in its own time zone, counted from 1970."""
 
     make: str
     model: str
     serial: str
-    """Of the body; empty where the camera does not tell."""
+    """Of the body; empty if the camera does not record it."""
     firmware: str
     taken_ns: int
-    """Start of exposure, cut off to `resolution_us`."""
+    """Start of exposure, truncated to `resolution_us`."""
     resolution_us: int
-    """1,000,000 for a camera that tells whole seconds only."""
+    """1,000,000 for a camera that records whole seconds only."""
     exposure_us: float
     iso: int
-    """0 where the camera does not tell."""
+    """0 if the camera does not record it."""
 
 
 def read_exif(path: Path) -> Exif:
-    """Raises ValueError, saying what is missing, for a file that is no such RAW or has no capture time."""
+    """Raises ValueError, naming what is missing, for a file of another kind or without capture time."""
     main = _main_tags(path)
     if not isinstance(exif := main.get("ExifTag"), dict):
         raise ValueError("it has no Exif directory (tag 34665)")  # noqa: TRY004  # the file is wrong, not a call
@@ -54,7 +54,7 @@ def read_exif(path: Path) -> Exif:
 
 
 def _main_tags(path: Path) -> Mapping[str, Any]:
-    """Tags of the file's first directory by their names in tifffile; `ExifTag` is a mapping of the same kind."""
+    """Tags of the file's first directory by their tifffile names; `ExifTag` is a mapping of the same kind."""
     try:
         with tifffile.TiffFile(path) as file:
             return {tag.name: tag.value for tag in file.pages.first.tags}
@@ -82,7 +82,7 @@ def _exposure_us(exif: Mapping[str, Any]) -> float:
 
 
 def _iso(exif: Mapping[str, Any]) -> int:
-    """Cameras with more than one sensitivity list them; the first counts. Raises ValueError for no number."""
+    """ISO sensitivity; the first of several. Raises ValueError if it is not a number."""
     match exif.get("ISOSpeedRatings", exif.get("PhotographicSensitivity", 0)):
         case int(iso) | (int(iso), *_):
             return iso

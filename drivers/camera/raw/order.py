@@ -16,7 +16,7 @@ _NUMBER = re.compile(r"(\d+)$")
 
 
 def file_number(path: Path, device: str, last_number: int) -> int:
-    """The digits that a file's name ends in: 42 of `IMG_0042.CR2`. Raises DeviceFault if there are none."""
+    """The trailing digits of a file's name: 42 of `IMG_0042.CR2`. Raises DeviceFault if there are none."""
     found = _NUMBER.search(path.stem)
     number = int(found[1]) if found else 0
     if not 1 <= number <= last_number:
@@ -34,8 +34,8 @@ def proven_order(
 ) -> list[Path]:
     """The files of one burst in the order in which they were taken, one for each of `triggers`.
 
-    The proof is twofold: numbers follow each other without a gap (over the wrap, too), and capture times rise with
-    them, strictly where they have a fraction of a second. Raises DeviceFault for a file that is missing, surplus
+    Proven in two ways: numbers follow each other without a gap (also over the wrap), and capture times increase
+    with them, strictly if they have a fraction of a second. Raises DeviceFault for a file that is missing, surplus
     or out of order, and ValueError for one without capture time.
     """
 
@@ -64,17 +64,17 @@ def proven_order(
 
 @dataclass(frozen=True)
 class _Seen:
-    """A file that is not taken yet, as it was found."""
+    """A file that is not taken yet."""
 
     size: int
     first_s: float
-    """Since when it is there, machine time."""
+    """Machine time at which it was first seen."""
     still_s: float
-    """Since when its size has not changed."""
+    """Machine time of the last change of its size."""
 
 
 class Order:
-    """Which file comes next. `begin`, then `next` and `take` in turn."""
+    """Finds the next file. Call `begin`, then `next` and `take` in turn."""
 
     def __init__(self, folder: Path, suffixes: Sequence[str], last_number: int, device: str) -> None:
         self._folder, self._suffixes = folder, frozenset(suffix.lower() for suffix in suffixes)
@@ -84,7 +84,7 @@ class Order:
         self._waiting: dict[Path, _Seen] = {}
         self._last: int | None = None
         self.counted = self.taken = 0
-        """Numbers that have passed since `begin`, and files that were taken."""
+        """Numbers passed since `begin`, and files taken."""
 
     def files(self) -> list[Path]:
         """All RAW files of the folder. Raises DeviceLost if it cannot be read."""
@@ -99,7 +99,7 @@ class Order:
             ) from error
 
     def begin(self) -> None:
-        """What is there now is not of this burst; the newest of it tells the number that comes next."""
+        """Files already present are not of this burst; the newest of them gives the number that comes next."""
         files = self.files()
         self._old, self._taken, self._waiting = frozenset(files), set(), {}
         newest = max(files, key=lambda path: path.stat().st_mtime_ns, default=None)
@@ -110,7 +110,7 @@ class Order:
         return file_number(path, self._device, self._last_number)
 
     def _steps(self, path: Path) -> int:
-        """How many numbers after the last one this file stands, 1 for the next."""
+        """Distance of this file's number from the last one, 1 for the next."""
         last = self._before_first() if self._last is None else self._last
         steps = (self._number(path) - last) % self._last_number
         if not 1 <= steps <= self._last_number // 2:
@@ -118,26 +118,26 @@ class Order:
                 self._device,
                 expected=f"the files after number {last}, in their order",
                 happened=f"{path.name} came after it",
-                remedy="A picture came too late or twice: raise `patience_s` in the rig, then resume the run.",
+                remedy="A picture came too late or twice: increase `patience_s` in the rig, then resume the run.",
             )
         return steps
 
     def _before_first(self) -> int:
-        """Where no number was known when the burst began: the one before the first of the files that have come.
+        """If no number was known at the start of the burst: the number before the first file that has arrived.
 
-        Should an earlier one come after that was taken, it is refused.
+        A file that arrives later with an earlier number is refused.
         """
         numbers = [self._number(path) for path in self._waiting]
         half = self._last_number // 2
         earliest = (a for a in numbers if all((b - a) % self._last_number <= half for b in numbers))
-        first = next(earliest, numbers[0])  # numbers[0]: there is none, and the others will be refused
+        first = next(earliest, numbers[0])  # numbers[0]: there is no earliest, and the others will be refused
         return (first - 2) % self._last_number + 1
 
     def next(self, still_s: float, patience_s: float) -> Path | None:
-        """The file that comes next, once its size has stood still for `still_s`; None if there is none yet.
+        """The next file, once its size has not changed for `still_s`; None if there is none yet.
 
-        A number that does not come is passed over when a later file has waited for `patience_s`. Raises
-        DeviceFault for a file that comes after a later one, and for two files of one number.
+        A missing number is skipped once a later file has waited for `patience_s`. Raises DeviceFault for a file
+        that arrives after a later one, and for two files with one number.
         """
         self._look()
         waiting = sorted((self._steps(path), path) for path in self._waiting)
@@ -148,7 +148,7 @@ class Order:
                 self._device,
                 expected="one file for each number",
                 happened="these came: " + ", ".join(sorted(path.name for _, path in waiting)),
-                remedy="Let the camera write one RAW file for each picture, and one program fetch it.",
+                remedy="Let the camera write one RAW file per picture, and only one program fetch it.",
             )
         steps, path = waiting[0]
         seen, now_s = self._waiting[path], time.monotonic()
@@ -173,7 +173,7 @@ class Order:
         self._waiting = found
 
     def take(self, path: Path) -> None:
-        """`path`, which `next` has named, is a frame now."""
+        """Mark `path`, which `next` has returned, as taken."""
         self.counted += self._steps(path)
         self.taken += 1
         self._last = self._number(path)

@@ -1,4 +1,4 @@
-"""A RAW file decoded: pixels as the sensor gave them, with pattern and levels, through LibRaw (`rawpy`)."""
+"""Decodes a RAW file with LibRaw (`rawpy`): the sensor's pixels without processing, pattern and levels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drivers.camera.raw.exif import Exif, read_exif
 
 _PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 _EVEN_BLACK = 1e-3
-"""Black levels of the four cells may differ by this share of the white level, and count as one."""
+"""Black levels of the four Bayer cells count as equal within this fraction of the white level."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class RawPicture:
 
 
 def read_picture(path: Path, black_dn: int | None = None) -> RawPicture:
-    """Decode a file; `black_dn` in place of the black level that it tells.
+    """Decode a file; `black_dn` replaces the black level in the file.
 
-    Raises ValueError for a file that is cut off, has no capture time or is not of a Bayer sensor; OSError.
+    Raises ValueError for a file that is truncated, has no capture time or is not of a Bayer sensor; OSError.
     """
     exif = read_exif(path)
     pixels, frame_format = decode(path, black_dn)
@@ -37,7 +37,7 @@ def read_picture(path: Path, black_dn: int | None = None) -> RawPicture:
 
 
 def decode(path: Path, black_dn: int | None = None) -> tuple[NDArray[np.uint16], FrameFormat]:
-    """Pixels and format of a file, as `RawPicture` has them. Raises ValueError; OSError."""
+    """Pixels and format of a file, as in `RawPicture`. Raises ValueError; OSError."""
     import rawpy
 
     try:
@@ -68,7 +68,7 @@ def decode(path: Path, black_dn: int | None = None) -> tuple[NDArray[np.uint16],
 
 
 def _black_dn(levels: list[int], white_dn: int) -> int:
-    """One black level for the four cells. Raises ValueError where they differ too much for one."""
+    """One black level for the four cells. Raises ValueError if they differ too much."""
     if max(levels) - min(levels) > _EVEN_BLACK * white_dn:
         raise ValueError(f"its cells have different black levels, {levels}: give `black_dn` in the rig")
     return round(sum(levels) / len(levels))

@@ -1,4 +1,4 @@
-"""Ximea cameras through the maker's library."""
+"""Ximea cameras over the maker's library."""
 
 from drivers.camera.xiapi.driver import XiCamera
 from drivers.camera.xiapi.settings import Settings

@@ -1,7 +1,7 @@
-"""One open xiAPI camera: parameters by name, images into memory of ours.
+"""One open xiAPI camera: parameters by name, images into the driver's memory.
 
-Calls are made one at a time, in the order of asking, whatever thread they come from: the header does not say
-that a camera's handle may be used by two at once. A thread that waits for an image lets the others in between.
+Calls are serialised in the order of request, from any thread: the header does not say that a camera's handle may
+be used by two threads at once. A thread that waits for an image lets the others in between.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _TEXT_BYTES = 256
 
 
 class XiDevice:
-    """Each method may raise DeviceLost, or DeviceRefused with xiAPI's own word for what is wrong."""
+    """Each method may raise DeviceLost, or DeviceRefused with xiAPI's error name."""
 
     def __init__(self, library: str, serial: str, name: str) -> None:
         self._name = name
@@ -104,7 +104,7 @@ class XiDevice:
         return value.value.decode(errors="replace")
 
     def set(self, parameter: str, value: Value) -> None:
-        """Set, after a check of the range that the camera names. Nothing is clipped."""
+        """Set a parameter after checking the range that the camera reports. Nothing is clipped."""
         if not isinstance(value, str):
             self._check_range(parameter, value)
         name = parameter.encode()
@@ -124,7 +124,7 @@ class XiDevice:
             self.set(parameter, value)
 
     def bounds(self, parameter: str) -> tuple[float, float]:
-        """Smallest and largest value; infinite where the camera names none."""
+        """Smallest and largest value; infinite if the camera reports none."""
         ends = []
         for info, unknown in ((":min", -math.inf), (":max", math.inf)):
             value = ctypes.c_float()
@@ -136,7 +136,7 @@ class XiDevice:
 
     def _check_range(self, parameter: str, value: float) -> None:
         low, high = self.bounds(parameter)
-        # the camera's ends are 32-bit floats: a value on the end may lie a rounding beyond it
+        # the reported limits are 32-bit floats: a value at a limit may exceed it by rounding
         slack = 1e-6 * max(abs(low), abs(high)) if math.isfinite(low + high) else 0.0
         if not low - slack <= value <= high + slack:
             raise DeviceRefused(
@@ -154,14 +154,14 @@ class XiDevice:
             self.acquiring = True
 
     def stop(self) -> None:
-        """Does nothing where nothing runs."""
+        """Does nothing if no acquisition runs."""
         with self._lock:
             if self.acquiring:
                 self.acquiring = False
                 self._check(self._library.xiStopAcquisition(self._handle), "the acquisition to stop")
 
     def image(self, address: int, size: int, timeout_s: float) -> Image | None:
-        """The oldest image, its pixels at `address`; None if none came in time or nothing is being acquired."""
+        """The oldest image, its pixels at `address`; None if none came in time or no acquisition runs."""
         image = Image(size=ctypes.sizeof(Image), bp=address, bp_size=size)
         with self._lock:
             if not self.acquiring:

@@ -1,14 +1,14 @@
-"""XIMEA cameras (CB120 and other PCIe and USB models) through libm3api: `coupole.devices.Camera`.
+"""XIMEA cameras (CB120 and other PCIe and USB models) over libm3api: `coupole.devices.Camera`.
 
-**Never run on a camera**: the tests have a C stand-in for the library, written from its header.
-docs/how-to/cb120-camera.md says what must be seen on the real one.
+**Not yet run on a camera**: the tests use a C stand-in for the library, written from its header.
+docs/how-to/cb120-camera.md lists what must be checked on the real one.
 
-*Buffers.* The transport carries 12-bit packed pixels; xiAPI unpacks them, in its one pass over the image, into
-page-aligned memory of ours (XI_RAW16, XI_BP_SAFE, XI_IMG.bp). The driver copies nothing, and pixels are valid
-until `release()`. The policy without that pass, XI_BP_UNSAFE, hands out xiAPI's own ring, which "may be
-overwritten by device" (xiApi.h) whoever still reads it: it is not used.
+*Buffers.* The transport carries 12-bit packed pixels; xiAPI unpacks them, in one pass over the image, into
+page-aligned memory of the driver (XI_RAW16, XI_BP_SAFE, XI_IMG.bp). The driver copies nothing, and pixels are
+valid until `release()`. The policy XI_BP_UNSAFE avoids that pass, but gives access to xiAPI's own ring, which "may
+be overwritten by device" (xiApi.h) while it is read; it is not used.
 
-*Queue.* Images wait in xiAPI's queue, oldest first, until one of our buffers is free. When the queue is full,
+*Queue.* Images wait in xiAPI's queue, oldest first, until a buffer of the driver is free. When the queue is full,
 xiAPI drops images and counts them; each leaves a gap in `acq_nframe`, the frame id.
 """
 
@@ -52,15 +52,15 @@ from drivers.camera.xiapi.library import (
 from drivers.camera.xiapi.settings import Region, Settings
 
 _SLICE_S = 0.05
-"""Longest wait for an image in one call: other calls wait as long."""
+"""Longest wait for an image in one call, which is also the longest wait of other calls."""
 _LOOK_S = 1.0
-"""So often a waiting camera is asked whether it is still there."""
+"""Interval at which the presence of a camera that sends no image is checked."""
 _IN_HAND = 16
-"""Frames that are on their way to the disk at once."""
+"""Most frames in memory on their way to the disk."""
 _KIB = 1024
 _COUNTERS = range(6)
 _UNTOUCHED = {"aeag": 0, "auto_wb": 0, "bpc": 0, "ffc": 0, "hdr": 0, "LUTEnable": 0}
-"""What would change pixels or exposure behind our back is switched off where a model has it."""
+"""Processing that would change pixels or exposure is switched off, if a model has it."""
 
 
 class XiCamera:
@@ -111,7 +111,7 @@ class XiCamera:
             device.set(parameter, given)
 
     def _set_region(self, region: Region) -> None:
-        """Offsets first to zero: they bound the size, and the size bounds them."""
+        """Offsets are set to zero first, because offset and size limit each other."""
         for parameter, value in (
             ("offsetX", 0),
             ("offsetY", 0),
@@ -133,7 +133,7 @@ class XiCamera:
                 happened=f"the camera says {rate_hz:g}",
                 remedy="Give `readout_us` in the camera's settings of the rig, from its data sheet.",
             )
-        return math.ceil(1e6 / rate_hz - 1e-3)  # a rate of 32 bits is not exact
+        return math.ceil(1e6 / rate_hz - 1e-3)  # the rate is a 32-bit float
 
     def close(self) -> None:
         with contextlib.suppress(DeviceError):
@@ -183,8 +183,8 @@ class XiCamera:
         edge = TRIGGER_RISING if settings.trigger_edge == "rising" else TRIGGER_FALLING
         device.set("trigger_source", edge if exposure.hardware_trigger else TRIGGER_SOFTWARE)
         device.set("trigger_selector", TRIGGER_STARTS_FRAME)
-        # An edge that comes too early must be ignored: latched (XI_TRG_OVERLAP_PREV_FRAME), it would expose later,
-        # under another light than its own.
+        # An edge that comes too early must be ignored: if latched (XI_TRG_OVERLAP_PREV_FRAME), it would start the
+        # exposure late, under the light of another step.
         device.set_if_present("trigger_overlap", OVERLAP_READ_OUT)
         device.set("exposure", exposure.exposure_us)
         self._check_exposure(exposure.exposure_us)
@@ -252,12 +252,12 @@ class XiCamera:
         self._armed.set()
 
     def _queue(self, images: int, image_bytes: int) -> int:
-        """Let xiAPI queue so many images, or as many as it can; the number.
+        """Have xiAPI queue `images` images, or as many as it can; returns the number.
 
-        The size of its memory is asked for as if pixels were not packed, which is enough for either.
+        Memory is requested for unpacked pixels, which is enough for packed ones too.
         """
         device = self._device
-        if device.has("acq_buffer_size_unit"):  # in bytes, an int ends at 2 GiB
+        if device.has("acq_buffer_size_unit"):  # in bytes, an int parameter is limited to 2 GiB
             device.set("acq_buffer_size_unit", _KIB)
             device.set("acq_buffer_size", math.ceil(images * image_bytes / _KIB))
         else:
@@ -293,7 +293,7 @@ class XiCamera:
         return self._frame(image, slot)
 
     def _frame(self, image: Image, slot: Slot) -> Frame:
-        """Raises DeviceRefused for an image that is not what `configure` promised."""
+        """Raises DeviceRefused for an image that differs from the format which `configure` returned."""
         assert self._format is not None
         promised = self._format
         seen = (image.height, image.width, image.frm)
@@ -316,12 +316,12 @@ class XiCamera:
         return int(image.tsSec * 1_000_000_000 + image.tsUSec * 1_000)
 
     def trigger(self) -> None:
-        if self._by_edges:  # xiAPI itself would fire (python-microscope/vendor-issues, issue 3)
+        if self._by_edges:  # xiAPI would expose a frame all the same (python-microscope/vendor-issues, issue 3)
             raise misused(self._name, "hardware_trigger=False", "a software trigger while edges trigger")
         self._device.set("trigger_software", 1)
 
     def statistics(self) -> CameraStatistics:
-        """From xiAPI's counters, as xiApi.h explains them. At rest: those of the last acquisition."""
+        """From xiAPI's counters, as described in xiApi.h. While disarmed: those of the last acquisition."""
         if self._armed.is_set():
             self._last = self._statistics()
         return self._last
@@ -371,7 +371,7 @@ class XiCamera:
 
 
 def _pixels(memory: NDArray[np.uint8], frame_format: FrameFormat, padding_bytes: int) -> NDArray[np.uint16]:
-    """[height_px, width_px] in place; rows that are padded at their ends are moved together first."""
+    """[height_px, width_px] in place; padding at the ends of rows is removed first."""
     height, width_bytes = frame_format.height_px, 2 * frame_format.width_px
     if padding_bytes:
         rows = memory[: height * (width_bytes + padding_bytes)].reshape(height, width_bytes + padding_bytes)

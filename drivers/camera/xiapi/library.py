@@ -1,4 +1,4 @@
-"""XIMEA's C library libm3api: structures, numbers and functions, as far as the driver needs them.
+"""XIMEA's C library libm3api: the structures, constants and functions that the driver uses.
 
 Source: xiApi.h of XIMEA's software package as published with the `xiapi-sys` bindings, and `xidefs.py` of the
 package ximea-py 4.27.13; both lay XI_IMG out alike (288 bytes on 64-bit machines). DWORD has 32 bits.
@@ -23,16 +23,16 @@ BUFFERS_SAFE = 1  # XI_BP
 OPEN_BY_SERIAL = 1  # XI_OPEN_BY
 
 BAYER_PATTERNS = {0: "MONO", 1: "RGGB", 4: "BGGR", 5: "GRBG", 6: "GBRG"}
-"""XI_COLOR_FILTER_ARRAY, those that a dome can use."""
+"""XI_COLOR_FILTER_ARRAY; the supported ones."""
 
 TRANSPORT_SKIPPED, API_SKIPPED, TRANSFERRED, MISSED_OVERLAP, MISSED_BUFFER_FULL, BUFFER_OVERFLOWS = range(6)
 """XI_COUNTER_SELECTOR."""
 
 OK, TIMEOUT, LOCKED = 0, 10, 57
 ABSENT = frozenset({12, 26, 100, 106, 107, 119})
-"""Codes that say: this camera has no such parameter, or not now."""
+"""Error codes: the camera has no such parameter, or not at present."""
 GONE = frozenset({1, 2, 3, 45, 46, 49, 55, 56})
-"""Codes that say: the camera does not answer, was reset, or stopped by itself."""
+"""Error codes: the camera does not answer, was reset, or stopped by itself."""
 
 _CODES = """
 0 OK 1 INVALID_HANDLE 2 READREG 3 WRITEREG 4 FREE_RESOURCES 5 FREE_CHANNEL 6 FREE_BANDWIDTH 7 READBLK 8 WRITEBLK
@@ -125,11 +125,11 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "xiGetParamFloat": (_HANDLE, _TEXT, ctypes.POINTER(_F32)),
     "xiGetParamString": (_HANDLE, _TEXT, ctypes.c_void_p, _U32),
 }
-"""Arguments; each function returns an XI_RET. ctypes lets other threads run while one of them works."""
+"""Arguments; each function returns an XI_RET. ctypes releases the GIL during a call."""
 
 
 def load(name: str, device: str) -> Any:
-    """The library, its functions declared. Raises DeviceLost if it is not installed."""
+    """The library with its functions declared. Raises DeviceLost if it is not installed."""
     try:
         library = ctypes.CDLL(name)
         for function, arguments in _FUNCTIONS.items():

@@ -1,4 +1,4 @@
-"""What a rig says of a XIMEA camera."""
+"""Settings of a XIMEA camera."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     device: str = "camera"
-    """How messages call it."""
+    """The camera's name in messages."""
     serial: str = ""
-    """As printed on the camera; empty: the only one there is."""
+    """As printed on the camera; empty: the only one connected."""
     library: str = LIBRARY
     """Name or path of libm3api."""
     region: Region | None = None
-    """None: as the camera has it."""
+    """None: as set in the camera."""
     bit_depth: Literal[8, 10, 12] = 12
     packed: bool = True
-    """Pixels of 10 and 12 bits travel without gaps: 12 megapixels of 12 bits are 18.9 MB instead of 25.2 MB."""
+    """Pixels of 10 and 12 bits are packed: 12 megapixels of 12 bits are 18.9 MB instead of 25.2 MB."""
     trigger_input: Annotated[int, Field(ge=1, le=12)] = 1
-    """`gpi_selector` of the box's cable."""
+    """`gpi_selector` of the input for the box's cable."""
     trigger_edge: Literal["rising", "falling"] = "rising"
     ready_output: Annotated[int, Field(ge=1, le=12)] | None = None
-    """`gpo_selector` of the line that tells the box when the camera is ready for an edge."""
+    """`gpo_selector` of the output that signals to the box when the camera is ready for an edge."""
     ready_inverted: bool = False
     """The line is low while the camera is ready."""
     black_dn: Annotated[int, Field(ge=0)] | None = None
-    """Digital number of black; None: what the camera says in `image_black_level`."""
+    """Black level, DN; None: the camera's `image_black_level`."""
     readout_us: Annotated[int, Field(gt=0)] | None = None
     """Least time between frames; None: from the largest `framerate` at the shortest exposure."""
     exposure_gap_us: Annotated[int, Field(ge=0)] = 100
     """Least time from the end of one exposure to the start of the next."""
     timestamps: Literal["seconds", "4ns"] = "seconds"
-    """What images carry: seconds and microseconds, as xiApi.h says; or one count of 4 ns in both fields, as
-    XIMEA's Rust bindings say of the xiB series."""
+    """Timestamp fields of an image: seconds and microseconds, by xiApi.h; or one 64-bit count of 4 ns in both
+    fields, by XIMEA's Rust bindings for the xiB series."""
     timestamp_jitter_us: Annotated[float, Field(gt=0)] = 20.0
     """Largest deviation of the camera's timestamps from the edges; to be measured."""
     buffers: Annotated[int, Field(ge=2)] = 16
-    """At least so many images can wait."""
+    """Least number of images queued."""
     parameters: dict[str, int | float | str] = Field(default_factory=dict)
     """Further xiAPI parameters, set at opening in this order."""

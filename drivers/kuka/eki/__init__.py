@@ -1,4 +1,4 @@
-"""KUKA arms by EthernetKRL: the driver names targets, the controller moves."""
+"""KUKA arms over EthernetKRL: the driver sends targets, the controller plans and runs the motion."""
 
 from drivers.kuka.eki.driver import KukaEki, Settings
 

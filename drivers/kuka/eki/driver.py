@@ -1,8 +1,8 @@
-"""A KUKA arm through EthernetKRL (EKI): `coupole.devices.Robot`, the gentle way to move, stop and settle.
+"""A KUKA arm over EthernetKRL (EKI): `coupole.devices.Robot` without real-time demands on the host.
 
-The controller plans and runs every motion itself (PTP); this driver names targets and watches the statuses
-that come at a steady rate. Nothing must be answered within a cycle. The programs for the controller are in
-`configs/kuka/`; order of work in the cell: start them, then open this driver.
+The controller plans and runs every motion itself (PTP); this driver sends targets and reads the status messages
+that arrive at a steady rate. No message has to be answered within a cycle. The programs for the controller are
+in `configs/kuka/eki/`; in the cell, start them before this driver is opened.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from drivers.kuka.eki.watch import Tolerances, Watch
 from drivers.kuka.eki.wire import Command, Six, Status
 
 _SAME_POSE_MM, _SAME_ROTATION = 1.0, 0.005
-"""How far the controller's pose may be from this driver's, for the axes that it tells."""
+"""Largest allowed difference between the controller's flange pose and that computed from its axes."""
 _T1_SLOWER = 10.0
-"""Motions last up to so much longer in T1, for the time-outs."""
+"""In T1, motions take up to this factor longer (for time-outs)."""
 
 
 class Settings(BaseModel):
@@ -37,39 +37,40 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     arm_model: Arm
-    """The arm that the controller moves; a rig fills in what it describes."""
+    """The arm that the controller moves; filled in from the rig."""
     address: str = Field(default="172.31.1.147:54600", pattern=r"^[^:]+:\d+$")
     """host:port of the controller, or of this machine where the controller is the client."""
     controller_is: Literal["server", "client"] = "server"
-    """Who waits for the connection; the other way round in EKI's configuration (EXTERNAL/TYPE)."""
+    """Which side listens for the connection; EKI's own configuration (EXTERNAL/TYPE) names the opposite side."""
     status_ms: int = Field(default=20, ge=4)
-    """How often the controller's program sends a status, in its own time."""
+    """Period of the controller's status messages, in controller time."""
     link_timeout_s: float = Field(default=2.0, gt=0)
-    """Silence after which the link counts as lost, in machine time; longer than any pause of the world."""
+    """The link counts as lost after this silence (machine time); longer than any pause of the simulated world."""
     connect_timeout_s: float = Field(default=10.0, gt=0)
-    """How long to wait for the connection and its first answer, in machine time."""
+    """Time-out for the connection and for its first answer, in machine time."""
     speed_fraction: float = Field(default=0.5, gt=0, le=1)
-    """Of the axes' highest speeds; the controller takes whole percents, rounded down."""
+    """Fraction of the axes' highest speeds; the controller takes whole percents, rounded down."""
     acceleration_deg_s2: float = Field(default=300.0, gt=0)
     full_acceleration_deg_s2: float = Field(default=600.0, gt=0)
-    """What $ACC_AXIS = 100 % gives. KUKA publishes no figure: measure it; as before, whole percents of it."""
+    """Acceleration at $ACC_AXIS = 100 %. KUKA publishes no figure: measure it. Whole percents, rounded down."""
     jerk_deg_s3: float = Field(default=3000.0, gt=0)
-    """What the controller's profile is taken to have, for durations; EKI cannot set it."""
+    """Jerk assumed for the controller's profile, to compute durations; EKI cannot set it."""
     settle_deg: float = Field(default=0.003, gt=0)
     settle_deg_s: float = Field(default=0.1, gt=0)
     settle_cycles: int = Field(default=3, ge=1)
-    """Settled: within both tolerances for so many statuses, and again after the dwell."""
+    """Settled: within both tolerances for this many statuses, and again after the dwell."""
     dwell_s: float = Field(default=0.1, ge=0)
     follow_deg: float = Field(default=1.0, gt=0)
     follow_cycles: int = Field(default=3, ge=1)
-    """The arm does not follow: done, but farther than `follow_deg` from the target for so many statuses."""
+    """The arm does not follow: motion done, but farther than `follow_deg` from the target for this many
+    statuses."""
 
     @model_validator(mode="after")
     def _percents_exist(self) -> Self:
         if not (self.velocity_percent() >= 1 and 1 <= self.acceleration_percent() <= 100):
             raise ValueError(
                 f"speed is {self.velocity_percent()} % and acceleration {self.acceleration_percent()} % "
-                f"of the controller's own: both must be from 1 to 100 %"
+                f"of the controller's own highest values: both must be from 1 to 100 %"
             )
         return self
 
@@ -80,7 +81,7 @@ class Settings(BaseModel):
         return int(round(100.0 * self.acceleration_deg_s2 / self.full_acceleration_deg_s2, 6))
 
     def arm(self) -> Arm:
-        """The arm with the speeds that this driver moves it at; preflight computes durations with it."""
+        """The arm with the speeds that this driver uses; preflight computes durations with it."""
         return slowed(
             self.arm_model,
             speed_fraction=self.velocity_percent() / 100.0,
@@ -90,13 +91,13 @@ class Settings(BaseModel):
 
 
 class KukaEki:
-    """See `coupole.devices.Robot`. After a fault it moves no more: close it and open another."""
+    """See `coupole.devices.Robot`. After a fault it refuses to move: close it and open it again."""
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
-        """Connect and have the controller begin a session, in which the arm stands where it stands.
+        """Connect and have the controller begin a session; the arm does not move.
 
-        Raises DeviceLost without connection, DeviceTimeout without answer, DeviceFault where the controller
-        tells a fault.
+        Raises DeviceLost without connection, DeviceTimeout without answer, DeviceFault if the controller
+        reports a fault.
         """
         self.settings = settings
         self.arm = settings.arm()
@@ -114,8 +115,8 @@ class KukaEki:
             raise DeviceLost(
                 "robot",
                 expected=f"an EthernetKRL connection at {settings.address}",
-                happened=str(error) or "nobody connected",
-                remedy="Start the controller's programs (configs/kuka), and check its IP and PORT",
+                happened=str(error) or "no connection came",
+                remedy="Start the controller's programs (configs/kuka/eki), and check its IP and PORT",
             ) from error
         self._link = Link(link, self._watch, settings.link_timeout_s)
         try:
@@ -130,7 +131,7 @@ class KukaEki:
             vendor="KUKA",
             model=self.arm.name,
             serial=str(status.serial),
-            firmware=f"EthernetKRL, controller tells {status.model!r}",
+            firmware=f"EthernetKRL, controller reports {status.model!r}",
             simulated="simulated" in status.model,
         )
 
@@ -150,8 +151,8 @@ class KukaEki:
         self._raise_fault()
         status = self._status()
         if status.override_percent <= 0:
-            raise refused("an override above 0 %", "the controller's program override stands at 0 %")
-        # Retargeted in motion, the arm first has to brake: as long as from the farthest point, twice.
+            raise refused("an override above 0 %", "the controller's program override is at 0 %")
+        # If the arm is moving it brakes first, which lengthens the motion by up to twice the braking time.
         move_s = move_duration_s(self.arm, status.joints_deg, target_deg) + self._stop_s()
         self._motion_s = move_s * _slower(status)
         self._order(wire.MOVE, target_deg)
@@ -159,7 +160,7 @@ class KukaEki:
     def wait_settled(self) -> ArmState:
         settings, watch = self.settings, self._watch
         order = watch.order
-        with self._link.changed:  # what the controller says from now on counts, not what is on its way
+        with self._link.changed:  # only statuses sent after the controller has taken ASK count
             watch.asked(self._number + 1)
         self._send(wire.ASK)
         self._wait_taken()
@@ -179,7 +180,7 @@ class KukaEki:
         return self.measured()
 
     def measured(self) -> ArmState:
-        """As of the last status. Raises DeviceLost where none comes any more."""
+        """State in the last status. Raises DeviceLost if the link is lost."""
         with self._link.changed:
             if self._watch.link_lost:
                 self._raise_fault()
@@ -193,9 +194,9 @@ class KukaEki:
             )
 
     def stop(self) -> None:
-        """Brake and wait until the arm stands; raises DeviceTimeout if it does not come to rest.
+        """Brake and wait until the arm is at rest; raises DeviceTimeout if it does not come to rest.
 
-        With a lost link it returns at once: the controller has stopped the arm itself.
+        With a lost link it returns at once: the controller has then stopped the arm itself.
         """
         watch = self._watch
         if watch.link_lost:
@@ -205,8 +206,8 @@ class KukaEki:
         self._wait(lambda: not watch.moving, 2.0 * self._stop_s() + 1.0, "the arm at rest", faults=False)
 
     def stopping_deg(self) -> NDArray[np.float64]:
-        """See `farthest_stop_deg`. The controller's program looks for commands at least as often as it sends
-        statuses; another such time is for the network, and for the robot program to be interrupted."""
+        """See `farthest_stop_deg`. The controller's program reads commands at least once per status period; a
+        second period allows for the network and for the interruption of the robot program."""
         settings, arm = self.settings, self.arm
         delay_s = 2.0 * settings.status_ms / 1e3
         return farthest_stop_deg(arm.velocity_deg_s, arm.acceleration_deg_s2[0], settings.jerk_deg_s3, delay_s)
@@ -226,12 +227,12 @@ class KukaEki:
             if self._watch.status is not None:
                 self.stop()
         except DeviceError:
-            pass  # its program stops the arm where it loses the connection
+            pass  # the controller's program stops the arm when it loses the connection
         finally:
             self._link.close()
 
     def _begin_session(self) -> None:
-        """A first STOP: the answers to it are this session's, whatever came before."""
+        """Send a first STOP; its answers carry this session's number, so older statuses are recognised."""
         self._order(wire.STOP, None)
         watch = self._watch
         self._link.wait_for(
@@ -244,7 +245,7 @@ class KukaEki:
                 expected=f"an answer from the program at {self.settings.address}",
                 happened=f"{watch.statuses} statuses answered, {watch.foreign} belonged to another session, "
                 f"{self._link.reader.malformed} were malformed",
-                remedy="Start the controller's programs anew, and check that they are those of configs/kuka",
+                remedy="Restart the controller's programs, and check that they are those of configs/kuka/eki",
             )
 
     def _order(self, verb: int, target_deg: Six | None) -> None:
@@ -274,19 +275,19 @@ class KukaEki:
         return status
 
     def _wait_taken(self) -> None:
-        watch, patience_s = self._watch, 2.0 * self.settings.link_timeout_s  # silence would be told before
+        watch, patience_s = self._watch, 2.0 * self.settings.link_timeout_s  # a lost link is noticed before that
         self._link.wait_for(lambda: watch.link_lost or watch.taken_ms is not None, patience_s)
         if watch.taken_ms is None and not watch.link_lost:
             raise DeviceTimeout(
                 "robot",
                 expected=f"command {self._number} to be taken within {patience_s:.1f} s",
-                happened="statuses come, but none acknowledges it",
+                happened="statuses arrive, but none acknowledges it",
                 remedy="See the controller's messages: its submit interpreter must run",
             )
 
     def _wait(self, done: Callable[[], bool], limit_s: float, expected: str, *, faults: bool = True) -> None:
-        """Wait until `done`. Raises a fault, once the arm stands, or DeviceTimeout `limit_s` of the
-        controller's time after the last command was taken."""
+        """Wait until `done`. Raises a fault once the arm is at rest, or DeviceTimeout when more than `limit_s` of
+        the controller's time have passed since it took the last command."""
         watch = self._watch
 
         def outcome() -> str:
@@ -308,17 +309,17 @@ class KukaEki:
             )
 
     def _compare_pose(self, status: Status) -> str:
-        """Phrase for the self-test; raises DeviceError where the controller has another arm or tool in mind."""
+        """Text for the self-test; raises DeviceError if the controller has another arm model or tool set."""
         if status.pose is None:
-            return "the controller tells none"
+            return "the controller reports none"
         x, y, z, *abc_deg = status.pose
         told = transform((x, y, z), (abc_deg[0], abc_deg[1], abc_deg[2]))
         apart = np.abs(told - forward(self.arm, status.joints_deg))
         if apart[:3, 3].max() > _SAME_POSE_MM or apart[:3, :3].max() > _SAME_ROTATION:
             raise DeviceError(
                 "robot",
-                expected=f"the flange of a {self.arm.name} where its axes put it",
-                happened=f"the controller tells {np.round(status.pose, 3).tolist()} (mm, deg)",
+                expected=f"the flange of a {self.arm.name} at the pose computed from its axes",
+                happened=f"the controller reports {np.round(status.pose, 3).tolist()} (mm, deg)",
                 remedy="Check that the program sets $TOOL and $BASE to $NULLFRAME, and the arm's model",
             )
         return f"flange at {x:.2f}, {y:.2f}, {z:.2f} mm, as computed from the axes"
@@ -335,10 +336,10 @@ class KukaEki:
             "robot",
             expected="an arm that moves as its program says",
             happened=fault.text,
-            remedy="See to the cell, acknowledge at the controller, restart its program, reopen the robot",
+            remedy="Check the cell, acknowledge at the controller, restart its program, reopen the robot",
         )
 
 
 def _slower(status: Status) -> float:
-    """By how much motions are slowed down at the controller."""
+    """Factor by which the controller slows motions down (override, T1)."""
     return 100.0 / status.override_percent * (_T1_SLOWER if status.t1 else 1.0)

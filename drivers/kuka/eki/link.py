@@ -1,4 +1,4 @@
-"""The TCP connection to EthernetKRL, and the thread that reads it so that statuses never pile up."""
+"""The TCP connection to EthernetKRL, and the thread that reads it at once, so that statuses do not queue up."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from drivers.kuka.eki.wire import Command, StatusReader, command_xml
 Outcome = TypeVar("Outcome")
 
 _LOOK_S = 0.05
-"""How often silence is looked at, and connecting is tried again."""
+"""Interval at which silence is checked, and at which connecting is retried."""
 _UNREAD_BYTES = 16384
-"""Room for statuses that wait to be read, half a second of them or less: what is read must not be old. A
-controller that is faster than its reader, as in a simulated world that hurries, is held back."""
+"""Receive buffer: at most half a second of unread statuses, so that none is read late. A controller that sends
+faster than it is read (a simulated world that runs faster than real time) is slowed down by TCP flow control."""
 
 
 def connect(address: str, controller_is: Literal["server", "client"], timeout_s: float) -> socket.socket:
-    """An open connection, tried for `timeout_s` of machine time. Raises OSError."""
+    """An open connection; retries for `timeout_s` of machine time. Raises OSError."""
     host, port = address.rsplit(":", 1)
     give_up = time.monotonic() + timeout_s
     if controller_is == "client":
         with socket.create_server((host, int(port)), backlog=1) as listener:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNREAD_BYTES)  # handed on to the link
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNREAD_BYTES)  # inherited by the link
             listener.settimeout(timeout_s)
             link, _ = listener.accept()
     else:
@@ -50,30 +50,31 @@ def connect(address: str, controller_is: Literal["server", "client"], timeout_s:
 
 
 class Link:
-    """Sends commands, and has `watch` judge every status that comes."""
+    """Sends commands, and passes every status received to `watch`."""
 
     def __init__(self, link: socket.socket, watch: Watch, timeout_s: float) -> None:
         self.reader = StatusReader()
         self._link, self._watch, self._timeout_s = link, watch, timeout_s
         self._link.settimeout(timeout_s)
         self.changed = threading.Condition()
-        """Hold this while the watch is read or changed."""
+        """To be held while the watch is read or changed."""
         self._closing = False
         self._thread = threading.Thread(target=self._read, name="kuka-eki", daemon=True)
         self._thread.start()
 
     def send(self, command: Command) -> None:
-        """Send a command whole, or latch that the link is lost."""
+        """Send a complete command; if that fails, latch that the link is lost."""
         try:
             self._link.sendall(command_xml(command))
         except OSError as error:
             self._lose(f"link lost: a command could not be sent ({error})")
 
     def wait_for(self, outcome: Callable[[], Outcome], patience_s: float | None = None) -> Outcome:
-        """Wait until there is an outcome (anything true), asked after every status, and give it.
+        """Wait until `outcome` returns anything true, called after every status, and return that.
 
-        After `patience_s` of machine time it gives what there is then. Without patience a silent controller
-        ends the wait, because that latches a fault: so `outcome` must look at the watch's fault.
+        After `patience_s` of machine time it returns whatever `outcome` gives then. Without `patience_s` only a
+        lost link ends the wait for a silent controller, by latching a fault: `outcome` must check the watch's
+        fault.
         """
         with self.changed:
             return self.changed.wait_for(outcome, patience_s)

@@ -1,7 +1,7 @@
-"""What a controller's statuses say over time: whether the arm is settled, astray, or the session in a fault.
+"""Evaluates a controller's statuses over time: is the arm settled, off its target, or the session in a fault.
 
-Time is the controller's own, as the statuses tell it: they come in order, so nothing is judged late because
-the machine was slow to read them. Touches neither socket nor thread.
+All times are the controller's own, taken from the statuses; so a host that reads them late does not change the
+result. Uses neither socket nor thread.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from drivers.kuka.eki.wire import Six, Status
 
 @dataclass(frozen=True)
 class Fault:
-    """Why the session is over; the first one stays."""
+    """Why the session has ended; only the first fault is kept."""
 
     kind: type[DeviceError]
     text: str
@@ -39,37 +39,37 @@ class Watch:
         self.status: Status | None = None
         """The last one of this session."""
         self.statuses = self.foreign = self.max_gap_ms = 0
-        """Statuses of this session and of others, and the longest time between two (controller time)."""
+        """Statuses of this session and of others; longest time between two of this session (controller time)."""
         self.fault: Fault | None = None
         self.link_lost = False
-        """Nothing comes any more, whatever the first fault was."""
+        """No further status will come, whatever the first fault was."""
         self.order = 0
         """Number of the last STOP or MOVE."""
         self.taken_ms: int | None = None
-        """Controller time at which the last command of any kind was known to be taken."""
+        """Controller time of the first status that acknowledges the last command of any kind."""
         self.settled_cycles = 0
         self.speed_deg_s = 0.0
         self._tolerances = tolerances
         self._rest_deg: Six | None = None
-        """Where the arm must stand when the order is done; None: wherever it comes to rest."""
+        """Where the arm must be when the order is done; None: wherever it comes to rest."""
         self._asked = self._astray_cycles = 0
 
     @property
     def moving(self) -> bool:
-        """True while an order is on its way or the axes turn; after a fault only the axes count."""
+        """True while an order is pending or the axes turn; after a fault only the axes count."""
         if self.status is None:
             return False
         waiting = self.fault is None and self.status.done != self.order
         return waiting or self.status.moving or self.speed_deg_s > self._tolerances.settle_deg_s
 
     def ordered(self, number: int, target_deg: Six | None) -> None:
-        """A STOP (without target) or a MOVE is on its way."""
+        """A STOP (without target) or a MOVE is about to be sent."""
         self.order = number
         self._rest_deg = target_deg
         self.asked(number)
 
     def asked(self, number: int) -> None:
-        """A command of any kind is on its way: only what is said after it was taken counts."""
+        """A command of any kind is about to be sent: only statuses from after it was taken count."""
         self._asked, self.taken_ms = number, None
         self.settled_cycles = self._astray_cycles = 0
 
@@ -78,7 +78,7 @@ class Watch:
         self.link_lost |= kind is DeviceLost
 
     def take(self, status: Status) -> None:
-        """Judge the next status."""
+        """Evaluate the next status."""
         if status.session != self.session:
             self.foreign += 1
             return
@@ -94,7 +94,7 @@ class Watch:
             self.settled_cycles = self._astray_cycles = 0
         if status.fault != wire.NO_FAULT:
             kind = DeviceRefused if status.fault == wire.TARGET_REFUSED else DeviceFault
-            self.fail(kind, wire.FAULTS.get(status.fault, f"the controller tells fault {status.fault}"))
+            self.fail(kind, wire.FAULTS.get(status.fault, f"the controller reports fault {status.fault}"))
         self._judge_rest(status, known_speed=elapsed_ms > 0)
 
     def _judge_rest(self, status: Status, *, known_speed: bool) -> None:
@@ -110,12 +110,12 @@ class Watch:
         if self._astray_cycles >= self._tolerances.follow_cycles:
             self.fail(
                 DeviceFault,
-                f"the arm does not follow: it stands {error_deg:.2f} deg from where it was sent "
+                f"the arm does not follow: it is {error_deg:.2f} deg from where it was sent "
                 f"(brakes, collision, or moved by hand)",
             )
 
     def overdue(self, limit_s: float) -> bool:
-        """True if the last command was taken longer ago than that, on the controller's clock."""
+        """True if the last command was taken more than `limit_s` ago, on the controller's clock."""
         if self.status is None or self.taken_ms is None:
             return False
         return self.status.time_ms - self.taken_ms > 1e3 * limit_s

@@ -1,8 +1,8 @@
-"""The XML that `KukaEki` and the controller exchange over EthernetKRL (EKI), and how to read it.
+"""The XML messages that `KukaEki` and the controller exchange over EthernetKRL (EKI), and their parser.
 
-Every element has a path, as EKI's configuration names it; `tools/make_kuka_files.py` writes the controller's
-files from the same tables. Each message carries all of its elements: EKI keeps a queue for every one of them,
-and a message without one would leave the queues out of step. Angles are degrees, lengths millimetres.
+Every element has a path, as in EKI's configuration; `tools/make_kuka_files.py` writes the controller's files
+from the same tables. Each message carries all of its elements: EKI keeps one queue per element, and a message
+that lacked one would leave the queues out of step. Angles are degrees, lengths millimetres.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Six = tuple[float, float, float, float, float, float]
 
 ROOT = "Coupole"
 STOP, MOVE, ASK = range(3)
-"""What a command asks: come to rest, move to the axes point to point, nothing but that it was taken."""
+"""Verbs of a command: brake to rest; move the axes point to point; only acknowledge."""
 
 _AXES = tuple((f"Axes/@A{axis}", "REAL") for axis in range(1, 7))
 COMMAND_ELEMENTS: tuple[tuple[str, str], ...] = (
@@ -27,7 +27,7 @@ COMMAND_ELEMENTS: tuple[tuple[str, str], ...] = (
     ("Command/@Acceleration", "INT"),
     *_AXES,
 )
-"""From the PC: path below the root and type. Velocity and acceleration are percent of $VEL_AXIS, $ACC_AXIS."""
+"""From the host: path below the root, and type. Velocity and acceleration are percent of $VEL_AXIS, $ACC_AXIS."""
 STATUS_ELEMENTS: tuple[tuple[str, str], ...] = (
     ("Status/@Session", "INT"),
     ("Status/@Taken", "INT"),
@@ -49,11 +49,11 @@ NO_FAULT, EMERGENCY_STOP, DRIVES_OFF, STOP_MESSAGE, PROGRAM_ENDED, TARGET_REFUSE
 FAULTS = {
     EMERGENCY_STOP: "emergency stop: the arm does not follow its program",
     DRIVES_OFF: "the drives are off: enabling switch, safety gate or operating mode",
-    STOP_MESSAGE: "the controller stands at a stop message",
+    STOP_MESSAGE: "the controller is halted by a stop message",
     PROGRAM_ENDED: "the robot program is not running",
     TARGET_REFUSED: "target refused: out of the controller's own software limits",
 }
-"""What the controller's fault numbers mean."""
+"""Text of the controller's fault numbers."""
 
 _OPEN, _CLOSE = f"<{ROOT}".encode(), f"</{ROOT}>".encode()
 _LONGEST_BYTES = 16384
@@ -61,7 +61,7 @@ _LONGEST_BYTES = 16384
 
 
 class Command(NamedTuple):
-    """One order. `number` rises with every command of a session, so that its answers can be told apart."""
+    """One command. `number` increases with every command of a session, so that answers can be matched to it."""
 
     session: int
     number: int
@@ -73,10 +73,10 @@ class Command(NamedTuple):
 
 @dataclass(frozen=True)
 class Status:
-    """How the controller stood when it sent this."""
+    """State of the controller when it sent this message."""
 
     session: int
-    """Of the last command taken: an echo, so that another session's answers are known."""
+    """Session of the last command taken, echoed, so that answers to another session are recognised."""
     taken: int
     """Number of the last command taken."""
     done: int
@@ -107,22 +107,22 @@ def command_xml(command: Command) -> bytes:
 
 
 class StatusReader:
-    """Finds statuses in a stream of bytes that may come in any pieces."""
+    """Finds statuses in a stream of bytes that arrives in pieces of any size."""
 
     def __init__(self) -> None:
         self.malformed = 0
-        """Messages that were no status; they are left out."""
+        """Messages that could not be read as a status; they are skipped."""
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Status]:
-        """The statuses that these bytes complete, in order."""
+        """The statuses completed by these bytes, in order."""
         *messages, self._rest = (self._rest + data).split(_CLOSE)
         if len(self._rest) > _LONGEST_BYTES:
             self.malformed += 1
             self._rest = b""
         statuses = []
         for message in messages:
-            start = message.rfind(_OPEN)  # what stands before was cut off in its midst
+            start = message.rfind(_OPEN)  # anything before it is the remainder of a truncated message
             status = _read_status(message[start:] + _CLOSE) if start >= 0 else None
             if status is None:
                 self.malformed += 1
@@ -132,7 +132,7 @@ class StatusReader:
 
 
 def _read_status(message: bytes) -> Status | None:
-    """None where the message is no XML, lacks an element or has one that is no number."""
+    """None if the message is not XML, lacks an element, or an element is not a number."""
     try:
         values = {
             f"{child.tag}/@{name}": value

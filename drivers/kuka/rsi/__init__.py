@@ -1,4 +1,4 @@
-"""KUKA arms by RobotSensorInterface: the driver corrects the path in every cycle."""
+"""KUKA arms over RobotSensorInterface: the driver corrects the axes or the pose in every cycle."""
 
 from drivers.kuka.rsi.driver import KukaRsi, Settings
 

@@ -1,8 +1,8 @@
-"""What an answer says: the corrections that bring the controller from where it stands to the commanded axes.
+"""The corrections in an answer: from where the controller is to the commanded axes.
 
-Absolute corrections count from where the session began. Relative ones add up on the controller, so what counts
-as told is what it has applied, rounded as it was sent: an increment that came too late is part of the next one,
-and the roundings of many do not add up.
+Absolute corrections count from the start of the session. Relative ones are summed by the controller, so the
+reference is the sum of those that it has applied, as rounded on the wire: an increment that arrived too late is
+included in the next one, and rounding errors do not accumulate.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from drivers.kuka.rsi.pose import Geometry, corrected, correction, flange_pose
 Six = tuple[float, ...]
 
 DECIMALS = 6
-"""Of a correction on the wire."""
+"""Decimals of a correction on the wire."""
 NAMES = {"axes": ("A1", "A2", "A3", "A4", "A5", "A6"), "pose": ("X", "Y", "Z", "A", "B", "C")}
-"""Attributes of a correction, by what is corrected."""
+"""Attributes of a correction, for axes and for the pose."""
 TAGS = {"axes": "AKorr", "pose": "RKorr"}
-"""The element that carries it, unless the controller's configuration calls it otherwise."""
+"""The element that carries the correction, unless the rig names another (`correction_tag`)."""
 _NOTHING: Six = (0.0,) * 6
 
 
 class Corrections:
-    """See the module. A `place` is where the arm is: its axes, or the flange's pose."""
+    """See the module. A `place` is the arm's position: its axes, or the flange's pose."""
 
     def __init__(self, corrects: str, mode: str, geometry: Geometry) -> None:
         self._relative = mode == "relative"
@@ -35,12 +35,12 @@ class Corrections:
         if corrects == "pose":
             self._place, self._between, self._moved = partial(flange_pose, geometry), correction, corrected
         self._from: Any = None
-        """The place that the next correction counts from."""
+        """The place from which the next correction counts."""
         self._last = self._applied = _NOTHING
-        """The last correction said, and the last that the controller is known to have applied."""
+        """The last correction sent, and the last that the controller is known to have applied."""
 
     def begin(self, start_deg: Six) -> None:
-        """A session begins with the axes here."""
+        """Begin a session with the axes at `start_deg`."""
         self._from = self._place(start_deg)
         self._last = self._applied = _NOTHING
 
@@ -52,13 +52,13 @@ class Corrections:
             self._last = _NOTHING
 
     def to(self, commanded_deg: Six) -> Six:
-        """The correction that leads to these axes."""
+        """The correction that leads to `commanded_deg`."""
         values = self._between(self._from, self._place(commanded_deg))
         self._last = tuple(round(value, DECIMALS) for value in values)
         return self._last
 
     def hold(self) -> Six:
-        """The correction that moves nothing."""
+        """The correction that causes no further motion."""
         self._last = _NOTHING if self._relative else self._applied
         return self._last
 

@@ -1,8 +1,8 @@
-"""A KUKA arm through RobotSensorInterface (RSI): `coupole.devices.Robot`.
+"""A KUKA arm over RobotSensorInterface (RSI): `coupole.devices.Robot`.
 
-The controller sends a packet every 4 or 12 ms and must be answered within that cycle, so a process of its
-own (`kuka_rsi_loop`) answers; this class writes commands to shared memory and reads the arm's state there.
-Order of work in the cell: open this driver, then start the controller's RSI program.
+The controller sends a packet every 4 or 12 ms and must be answered within that cycle. A separate process
+(`drivers.kuka.rsi.loop`) answers; this class writes commands to shared memory and reads the arm's state there.
+In the cell: open this driver first, then start the controller's RSI program.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from drivers.kuka.rsi.settings import Settings
 __all__ = ["KukaRsi", "Settings"]
 
 _SESSION_ANSWERS = 10
-"""Answers after which a session counts as established."""
+"""Number of answers after which a session counts as established."""
 _POLL_S = 0.004
 
 
 class KukaRsi:
-    """See `coupole.devices.Robot`. After a fault it moves no more: close it and open another."""
+    """See `coupole.devices.Robot`. After a fault it refuses to move: close it and open it again."""
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
-        """Wait for the controller's packets and answer them, with no correction until `move_to`.
+        """Wait for the controller's packets; they are answered with zero correction until `move_to`.
 
         Raises DeviceLost if the port cannot be bound, DeviceTimeout if no session begins in time.
         """
@@ -52,7 +52,7 @@ class KukaRsi:
         self._command = shared_state.Command()
         self._motion_s = 0.0
         self._target_deg: shared_state.Six = (0.0,) * 6
-        """Of the last motion."""
+        """Target of the last motion."""
         self._news = News(clock)
         self._process, self._block = _spawn(settings, self.arm)
         try:
@@ -85,14 +85,14 @@ class KukaRsi:
         target_deg = checked_target(joints_deg, self.arm.limits_deg)
         state = self._state()
         self._raise_fault(state)
-        # Retargeted in motion, the arm sets out from anywhere on the rest of its line.
+        # A new target during a motion: the arm may start from anywhere on the rest of the present line.
         on_the_way_deg = [state.commanded_deg] if self._stands(state) else [state.commanded_deg, self._target_deg]
         if violations := correction_violations(
             self.settings, self.arm, state.start_deg, on_the_way_deg, target_deg
         ):
-            raise refused("a motion that corrections can bring about", violations)
+            raise refused("a motion within the limits of corrections", violations)
         self._target_deg = target_deg
-        # It may first have to brake: as long as from the farthest point, twice.
+        # If the arm is moving it brakes first, which lengthens the motion by up to twice the braking time.
         self._motion_s = move_duration_s(self.arm, state.measured_deg, target_deg) + self._stop_s()
         self._send(shared_state.MOVE, self._target_deg)
 
@@ -118,9 +118,9 @@ class KukaRsi:
         )
 
     def stop(self) -> None:
-        """Brake and wait until the arm stands; raises DeviceTimeout if it does not come to rest.
+        """Brake and wait until the arm is at rest; raises DeviceTimeout if it does not come to rest.
 
-        With a lost link it returns at once: the controller has stopped the arm itself.
+        With a lost link it returns at once: the controller has then stopped the arm itself.
         """
         if self._process.poll() is not None:
             return
@@ -152,7 +152,7 @@ class KukaRsi:
         }
 
     def close(self) -> None:
-        """Bring the arm to rest, then end the process that answers. Safe to call again."""
+        """Bring the arm to rest, then end the answering process. Safe to call again."""
         if self._process.poll() is None:
             with contextlib.suppress(DeviceError):
                 self.stop()
@@ -170,7 +170,7 @@ class KukaRsi:
                     "robot",
                     expected=f"RSI packets at {self.settings.listen}",
                     happened=_why_no_session(state),
-                    remedy="Start the RSI program on the controller anew, and check its IP_NUMBER and PORT",
+                    remedy="Restart the RSI program on the controller, and check its IP_NUMBER and PORT",
                 )
             time.sleep(_POLL_S)
         self._raise_fault(state)
@@ -180,7 +180,7 @@ class KukaRsi:
         self._block.write_command(self._command)
 
     def _state(self) -> shared_state.State:
-        """The loop's last word; raises DeviceLost if the loop is gone."""
+        """The loop's latest state; raises DeviceLost if the loop has ended."""
         try:
             if self._process.poll() is None:
                 return self._block.read_state()
@@ -208,7 +208,7 @@ class KukaRsi:
                 f"axes measured at {np.round(state.measured_deg, 3).tolist()} deg, "
                 f"commanded to {np.round(state.commanded_deg, 3).tolist()} deg"
             ),
-            remedy="See the controller's messages; its override must stand at 100 %",
+            remedy="See the controller's messages; its override must be at 100 %",
         )
 
     def _settled(self, state: shared_state.State, command: shared_state.Command) -> bool:
@@ -236,7 +236,7 @@ class KukaRsi:
             "robot",
             expected="an arm that follows its RSI corrections",
             happened=state.fault_text.decode(errors="replace"),
-            remedy="See to the cell, acknowledge at the controller, restart its program, reopen the robot",
+            remedy="Check the cell, acknowledge at the controller, restart its program, reopen the robot",
         )
 
 
@@ -252,7 +252,7 @@ def _why_no_session(state: shared_state.State) -> str:
 
 
 def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], shared_state.Block]:
-    """Bind the port and start the loop; raises DeviceLost if the port is not to be had."""
+    """Bind the port and start the loop; raises DeviceLost if the port cannot be bound."""
     host, port = settings.listen.rsplit(":", 1)
     derived: dict[str, Any] = {
         "cycle_s": settings.cycle_ms / 1e3,

@@ -1,4 +1,4 @@
-"""What corrections cannot bring about, known before anything moves: the controller would stop RSI on the way."""
+"""Limits of corrections, checked before a motion begins: beyond them the controller would stop RSI on the path."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from coupole.kinematics import Arm, forward
 from drivers.kuka.rsi.settings import Settings
 
 _STEP_DEG = 2.0
-"""No axis turns farther between two checked places; between them a line bulges by about a millimetre."""
+"""Largest axis step between two checked points of a path; between them a line bulges by about a millimetre."""
 _STARTS = 9
-"""Places on the way to the last target that a new motion may set out from."""
+"""Checked starting points between the commanded axes and the last target, for a target given in motion."""
 
 
 def correction_violations(
     settings: Settings, arm: Arm, start_deg: ArrayLike, on_the_way_deg: ArrayLike, target_deg: ArrayLike
 ) -> str:
-    """Why a straight motion of the axes to `target_deg` [6] cannot be made, as a phrase for messages; empty if it
-    can. `start_deg` [6] is where RSI was started, `on_the_way_deg` [1 or 2, 6] where the motion sets out from: one
-    place, or any between two."""
+    """Why a motion, straight in joint space, to `target_deg` [6] is not possible, as text for messages; else "".
+
+    `start_deg` [6]: axes where RSI was started. `on_the_way_deg` [1 or 2, 6]: where the motion starts: one point,
+    or any point between two.
+    """
     start, target = np.asarray(start_deg, dtype=np.float64), np.asarray(target_deg, dtype=np.float64)
     if settings.corrects == "axes":
         return "; ".join(
@@ -27,8 +29,9 @@ def correction_violations(
             for axis, (away, limit) in enumerate(zip(target - start, settings.most_correction_deg, strict=True), 1)
             if abs(away) > limit
         )
-    ways = np.concatenate([_way(place, target) for place in _places(np.asarray(on_the_way_deg, dtype=np.float64))])
-    return _too_far(settings, arm, start, ways) or _singular(settings, ways)
+    starts_deg = _places(np.asarray(on_the_way_deg, dtype=np.float64))
+    paths_deg = np.concatenate([_path(place, target) for place in starts_deg])
+    return _too_far(settings, arm, start, paths_deg) or _singular(settings, paths_deg)
 
 
 def _places(on_the_way_deg: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -39,14 +42,14 @@ def _places(on_the_way_deg: NDArray[np.float64]) -> NDArray[np.float64]:
     return places
 
 
-def _way(from_deg: NDArray[np.float64], to_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+def _path(from_deg: NDArray[np.float64], to_deg: NDArray[np.float64]) -> NDArray[np.float64]:
     """Axes [n, 6] along the line."""
     count = int(np.ceil(np.abs(to_deg - from_deg).max() / _STEP_DEG)) + 1
     return np.linspace(from_deg, to_deg, max(2, count))
 
 
-def _too_far(settings: Settings, arm: Arm, start_deg: NDArray[np.float64], ways_deg: NDArray[np.float64]) -> str:
-    start, poses = forward(arm, start_deg), forward(arm, ways_deg)
+def _too_far(settings: Settings, arm: Arm, start_deg: NDArray[np.float64], paths_deg: NDArray[np.float64]) -> str:
+    start, poses = forward(arm, start_deg), forward(arm, paths_deg)
     away_mm = float(np.linalg.norm(poses[:, :3, 3] - start[:3, 3], axis=1).max())
     if away_mm > settings.pose_correction_mm:
         return (
@@ -63,11 +66,11 @@ def _too_far(settings: Settings, arm: Arm, start_deg: NDArray[np.float64], ways_
     return ""
 
 
-def _singular(settings: Settings, ways_deg: NDArray[np.float64]) -> str:
-    """Near a singularity the pose leaves axes open, or asks for any speed of them, and beyond it the controller's
-    axes are not those that were planned."""
+def _singular(settings: Settings, paths_deg: NDArray[np.float64]) -> str:
+    """Near a singularity a pose does not determine the axes, or needs unlimited axis speeds; beyond it the
+    controller may choose other axes than those planned."""
     arm, margin_deg = settings.wrist, settings.singularity_margin_deg
-    theta = arm.theta(ways_deg)
+    theta = arm.theta(paths_deg)
     upper, fore = theta[:, 1], theta[:, 1] + theta[:, 2]
     elbow = theta[:, 2] + np.arctan2(arm.a2_mm, arm.c3_mm)
     out_mm = arm.c2_mm * np.sin(upper) + arm.c3_mm * np.sin(fore) + arm.a2_mm * np.cos(fore) + arm.a1_mm

@@ -2,7 +2,7 @@
 
     python -m drivers.kuka.rsi.loop SOCKET_FD BLOCK_FD PARENT_PID CONFIG_JSON
 
-It imports little and does nothing else, because it must answer within the cycle; see `kuka_rsi_responder`.
+It imports little and has no other task, because it must answer within the cycle; see `rsi_session`.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from drivers.kuka.rsi.pose import Geometry
 from drivers.kuka.rsi.rsi_session import Config, RsiSession
 
 _TICK_S = 0.05
-"""How often the loop looks at its parent and at the link while no packet comes."""
+"""Interval at which the loop checks its parent process, and the link while no packet comes."""
 _ORPHAN_S = 0.8
-"""Longest life after the parent's death: the time to brake."""
+"""Longest time for which the loop continues after its parent's death: the time to brake."""
 _REALTIME_PRIORITY = 20
 
 
 def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, config: Config) -> None:
-    """Answer packets until told to leave or the parent is gone, and leave with the arm at rest."""
-    # The kernel's own receive time-out costs nothing per packet; Python's is a poll before each call.
+    """Answer packets until the command LEAVE or the parent's death; before returning, bring the arm to rest."""
+    # SO_RCVTIMEO costs nothing per packet; a Python socket time-out costs a poll() before every call.
     link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@qq", 0, int(_TICK_S * 1e6)))
     realtime = _become_realtime()
     session = RsiSession(config, time.monotonic_ns())
@@ -51,17 +51,17 @@ def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, conf
             leaving |= command.verb == shared_state.LEAVE
         late, answer = session.late, None
         if not idle and controller not in (None, address):
-            session.foreign += 1  # somebody else's axes must not be taken for this arm's
+            session.foreign += 1  # another controller's axes must not be taken for this arm's
         elif not idle:
             answer = session.answer(data, now_ns)
         if answer is None:
             session.check_link(now_ns)
         else:
             controller = address
-            with contextlib.suppress(OSError):  # a controller that is gone is noticed by its silence
+            with contextlib.suppress(OSError):  # a controller that has gone is detected by its silence
                 link.sendto(answer, address)
         if session.late > late:
-            _drop_backlog(link)  # answers to packets that wait here would be late too
+            _drop_backlog(link)  # answers to packets that are queued here would be late too
         shared.write_state(session.state(realtime))
         if now_ns > look_ns:
             look_ns = now_ns + int(_TICK_S * 1e9)
@@ -73,7 +73,7 @@ def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, conf
 
 
 def _become_realtime() -> int:
-    """1 if the process may run under SCHED_FIFO; 0, and it runs as any other, if not."""
+    """1 if the process may run under SCHED_FIFO; 0 if not, and it then runs with normal priority."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_REALTIME_PRIORITY))
     except OSError:
@@ -82,14 +82,14 @@ def _become_realtime() -> int:
 
 
 def _drop_backlog(link: socket.socket) -> None:
-    """Forget packets that have waited; the controller has long gone on."""
+    """Discard queued packets; their cycles are over."""
     with contextlib.suppress(BlockingIOError):
         while True:
             link.recv(4096, socket.MSG_DONTWAIT)
 
 
 if __name__ == "__main__":
-    # Ctrl-C is the operator's word to the program, which then stops us.
+    # Ctrl-C is for the parent program, which then stops this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.disable()
     socket_fd, block_fd, parent_pid = map(int, sys.argv[1:4])

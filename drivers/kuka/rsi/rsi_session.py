@@ -1,10 +1,10 @@
-"""What the RSI loop thinks: the commanded axes, and an answer to every packet.
+"""State of one RSI session: the commanded axes, and the answer to every packet.
 
-Each packet moves the commanded axes on by one cycle of a jerk-limited trajectory and is answered with their
-corrections, so the arm keeps pace with a real controller as well as with a world that waits or runs fast.
+Each packet advances the commanded axes by one cycle of a jerk-limited trajectory and is answered with their
+corrections. So the motion follows the controller's cycles, also in a simulated world that pauses or runs fast.
 
-Corrections count from where RSI was started (`kuka_rsi_corrections`). So only a program that saw the session
-begin may answer: to a session in progress a first answer of zero would be a jump back to its start.
+Corrections count from where RSI was started (`drivers.kuka.rsi.corrections`). Therefore only a program that saw
+the session begin may answer: in a session in progress, a first answer of zero would be a jump back to its start.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from drivers.kuka.rsi.trajectory import Motion
 from drivers.kuka.rsi.wire import Packet, answer_template, controller_type, packet_parser
 
 _GAP_STEPS = 25
-"""A jump of the IPOC by more than so many of its steps is a new session, or an outage long enough for one."""
+"""A jump of the IPOC by more than this many steps is a new session, or an outage long enough for one."""
 _LAST_WORDS = 5
-"""Packets that are still answered when the commanded axes stand after a fault."""
+"""Packets that are still answered once the commanded axes are at rest after a fault."""
 _HALTED_PACKETS = 5
-"""After so many late answers in a row the arm has come to a halt at the last correction that was in time."""
+"""After this many late answers in a row the arm has halted at the last correction that was in time."""
 _QUIET_NS = 500_000_000
-"""Where packets carry no delay counter, one after so long a silence is taken for the first of a session."""
+"""Without delay counter, a packet after a silence this long counts as the first of a session."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """What the driver tells the loop; the fields are explained at `drivers.kuka.rsi.driver.Settings`."""
+    """What the driver passes to the loop; the fields are described in `drivers.kuka.rsi.settings.Settings`."""
 
     cycle_s: float
     sen_type: str
@@ -52,7 +52,7 @@ class Config:
 
 
 class RsiSession:
-    """Makes an answer of every packet, and the state for the driver; touches neither socket nor memory."""
+    """Computes the answer to every packet, and the state for the driver; uses neither socket nor memory."""
 
     def __init__(self, config: Config, opened_ns: int = 0) -> None:
         self.fault, self.fault_text = shared_state.NO_FAULT, b""
@@ -67,18 +67,18 @@ class RsiSession:
         self._corrections = Corrections(config.corrects, config.mode, config.geometry)
         self._controller = b""
         self._start_deg: tuple[float, ...] | None = None
-        """The measured axes at the start of the session, which corrections refer to; None before it."""
+        """The measured axes at the start of the session, to which corrections refer; None before it."""
         self._measured_deg: tuple[float, ...] = (0.0,) * 6
         self._velocity_deg_s: tuple[float, ...] = (0.0,) * 6
         self._ipoc = self._ipoc_step = 0
         self._packet_ns = opened_ns
-        """When the last packet came, that of another program's session included."""
+        """Time of the last packet, including those of a session that another program began."""
         self._session_over = False
         self._last_words = _LAST_WORDS
         self._last_answer: bytes | None = None
 
     def obey(self, command: shared_state.Command) -> None:
-        """Take a command. After a fault only stopping is obeyed."""
+        """Take a command. After a fault, motion commands are ignored."""
         self.command = command.number
         self.settled_cycles = 0
         if command.verb == shared_state.MOVE and self.fault == shared_state.NO_FAULT:
@@ -87,7 +87,7 @@ class RsiSession:
             self.motion.stop()
 
     def answer(self, data: bytes, now_ns: int) -> bytes | None:
-        """What to send back, or None if this packet must not be answered."""
+        """The answer to a packet, or None if it must not be answered."""
         packet = self._parse(data)
         if packet is None or (packet.delay is None and self._config.mode == "relative"):
             self.malformed += 1
@@ -107,13 +107,13 @@ class RsiSession:
         self._ipoc, self._packet_ns, self.delay = int(packet.ipoc), now_ns, packet.delay or 0
         self.packets += 1
         self.late += rose
-        # Packets lost on the way here count as late, too, but say nothing of the answer before them.
+        # Packets lost on the network also raise the delay counter, but do not concern the answer before them.
         applied = rose == 0 or rose < advance // self._ipoc_step
         if applied:
             self._corrections.taken()
         self._watch(packet)
         self._late_in_row = self._late_in_row + 1 if rose else 0
-        if not applied:  # say the last answer again instead of running ahead of the arm
+        if not applied:  # repeat the last answer instead of advancing ahead of the arm
             if self._late_in_row >= _HALTED_PACKETS:
                 self.motion.halted()
         elif not self.motion.step():
@@ -123,20 +123,20 @@ class RsiSession:
         return self._last_answer
 
     def _values(self) -> shared_state.Six:
-        """The six corrections. When the arm has come to rest after a fault they move it no more."""
+        """The six corrections. Once the arm is at rest after a fault they cause no further motion."""
         if self.fault != shared_state.NO_FAULT and self.motion.phase == shared_state.STANDING:
             return self._corrections.hold()
         return self._corrections.to(self.motion.commanded_deg)
 
     def _silent(self) -> bool:
-        """After a fault the session is ended by silence, so that no old correction can meet a new session: at
-        once where a new one may have begun, else when the commanded axes, and the arm with them, stand."""
+        """After a fault the driver ends the session by not answering, so that no old correction reaches a new
+        session: at once if a new one may have begun, else when the commanded axes, and so the arm, are at rest."""
         if self.fault != shared_state.NO_FAULT and self.motion.phase == shared_state.STANDING:
             self._last_words -= 1
         return self._session_over or self._last_words < 0
 
     def check_link(self, now_ns: int) -> None:
-        """Latch a fault if packets stayed away for longer than the link's time-out."""
+        """Latch a fault if no packet has come for longer than the link's time-out."""
         silent_s = (now_ns - self._packet_ns) / 1e9
         if self._start_deg is not None and silent_s > self._config.link_timeout_s:
             self.fail(
@@ -144,8 +144,8 @@ class RsiSession:
             )
 
     def fail(self, fault: int, text: str) -> None:
-        """Latch the first fault and bring the commanded axes to rest: along their path if the arm is with them
-        and listens, else where they are, so that nothing pushes on."""
+        """Latch the first fault and bring the commanded axes to rest: along their path while the arm follows
+        them, else at once where they are, so that the arm is not pushed further."""
         if self.fault == shared_state.NO_FAULT:
             self.fault, self.fault_text = fault, text.encode()
         self._session_over |= fault == shared_state.LINK_LOST
@@ -178,7 +178,7 @@ class RsiSession:
         )
 
     def _may_begin(self, packet: Packet, now_ns: int) -> bool:
-        """Whether no other program can have begun this packet's session."""
+        """False if another program may have begun this packet's session."""
         quiet_ns, self._packet_ns = now_ns - self._packet_ns, now_ns
         return packet.delay == 0 if packet.delay is not None else quiet_ns > _QUIET_NS
 
@@ -189,15 +189,15 @@ class RsiSession:
         self.motion.stand_at(packet.joints_deg)
 
     def _in_sequence(self, packet: Packet, advance: int) -> bool:
-        """False for a packet that came twice or out of order. Notices sessions that begin anew."""
+        """False for a packet that came twice or out of order. Detects restarted sessions."""
         step = self._ipoc_step or 1
         if advance > 0 and not 0 < self._ipoc_step <= advance:
-            self._ipoc_step = advance  # the smallest so far: a packet may have been lost on the way
+            self._ipoc_step = advance  # the smallest so far: a packet may have been lost on the network
         elif advance > _GAP_STEPS * step:
             self.fail(shared_state.LINK_LOST, f"{advance // step - 1} packets are missing")
         elif advance < -_GAP_STEPS * step:
             if self.motion.phase != shared_state.STANDING:
-                self.fail(shared_state.RESTARTED, "RSI was started anew while the arm was moving")
+                self.fail(shared_state.RESTARTED, "RSI was restarted while the arm was moving")
             self._begin_session(packet)
         return advance > 0 or advance < -_GAP_STEPS * step
 

@@ -1,4 +1,4 @@
-"""Settings of the RSI driver: what the rig says of the controller's configuration, and how the arm moves."""
+"""Settings of the RSI driver: those that must match the controller's configuration, and those of the motion."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     arm_model: Arm
-    """The arm that the controller moves; a rig fills in what it describes."""
+    """The arm that the controller moves; filled in from the rig."""
     listen: str = Field(default="0.0.0.0:49152", pattern=r"^[^:]+:\d+$")
     """host:port to bind; the controller's RSI configuration names it (IP_NUMBER, PORT)."""
     cycle_ms: Literal[4, 12] = 4
@@ -33,63 +33,63 @@ class Settings(BaseModel):
     correction_tag: str = Field(default="", pattern=_TAG + "|^$")
     """Empty: AKorr for axes, RKorr for the pose."""
     corrects: Literal["axes", "pose"] = "axes"
-    """What the controller is corrected by: its axes (AXISCORR) or its flange's pose (POSCORR). Motions are
-    straight lines of the axes either way; where a pose does not tell the axes, they are refused."""
+    """What the controller corrects: axes (AXISCORR) or the flange's pose (POSCORR). In both cases motions are
+    straight in joint space; those on which the pose does not determine the axes are refused."""
     mode: Literal["absolute", "relative"] = "absolute"
-    """As in RSI_ON: corrections count from where RSI was started, or add up from cycle to cycle."""
+    """As in RSI_ON: corrections count from where RSI was started, or are summed from cycle to cycle."""
     axis_correction_deg: tuple[PositiveFloat, ...] | None = Field(default=None, min_length=6, max_length=6)
     """How far each axis may be from where RSI was started: MaxA1 to MaxA6 of the context's AXISCORRMON. The
     controller stops RSI beyond it, so a target there is refused. Without it, each axis' whole range."""
     pose_correction_mm: float = Field(default=2300.0, gt=0)
     pose_correction_deg: float = Field(default=180.0, gt=0, le=180)
-    """The same for corrections of the pose: MaxTrans and MaxRotAngle of POSCORRMON. The defaults forbid nothing:
-    the arm's whole reach, and any rotation."""
+    """The same for corrections of the pose: MaxTrans and MaxRotAngle of POSCORRMON. The defaults allow the arm's
+    whole reach, and any rotation."""
     singularity_margin_deg: float = Field(default=5.0, gt=0, lt=45)
-    """Corrections of the pose: how far A5, elbow and shoulder stay from where the pose leaves the axes open."""
+    """For corrections of the pose: least angle of wrist, elbow and shoulder from their singularities."""
     link_timeout_s: float = Field(default=2.0, gt=0)
-    """Silence after which the link counts as lost, in machine time; longer than any pause of the world."""
+    """The link counts as lost after this silence (machine time); longer than any pause of the simulated world."""
     connect_timeout_s: float = Field(default=10.0, gt=0)
-    """How long to wait for the first packets, in machine time."""
+    """Time-out for the first packets, in machine time."""
     delay_limit: int = Field(default=50, ge=1)
     """Delay counter at which motion ends in a fault; below the controller's own limit (100 as shipped)."""
     speed_fraction: float = Field(default=0.5, gt=0, le=1)
-    """Of the axes' highest speeds."""
+    """Fraction of the axes' highest speeds."""
     acceleration_deg_s2: float = Field(default=300.0, gt=0)
     jerk_deg_s3: float = Field(default=3000.0, gt=0)
     settle_deg: float = Field(default=0.003, gt=0)
     settle_deg_s: float = Field(default=0.1, gt=0)
     settle_cycles: int = Field(default=10, ge=1)
-    """Settled: within both tolerances for so many cycles, and again after the dwell."""
+    """Settled: within both tolerances for this many cycles, and again after the dwell."""
     dwell_s: float = Field(default=0.1, ge=0)
     follow_deg: float = Field(default=1.0, gt=0)
     follow_lag_s: float = Field(default=0.06, ge=0)
     follow_cycles: int = Field(default=10, ge=1)
     """The arm does not follow: farther than `follow_deg` plus `follow_lag_s` times the commanded speed from
-    the commanded axes for so many cycles."""
+    the commanded axes for this many cycles."""
 
     @model_validator(mode="after")
     def _pose_is_known(self) -> Self:
-        """The process that answers reckons poses with the formula of a spherical wrist and KUKA's flange."""
+        """The answering process computes poses with the formula of a spherical wrist and KUKA's flange."""
         standard = np.allclose(self.wrist.opw_from_flange, np.eye(4), rtol=0.0, atol=1e-9)
         if self.corrects == "pose" and not standard:
             raise ValueError(
                 f"corrections of the pose need KUKA's flange, its z axis along axis 6, not that of "
-                f"{self.arm_model.name}; correct the axes"
+                f"{self.arm_model.name}; set `corrects: axes`"
             )
         return self
 
     @property
     def wrist(self) -> SphericalWrist:
-        """The arm's lengths. Raises ValueError for an arm without spherical wrist."""
+        """The arm's lengths. Raises ValueError for an arm without a spherical wrist."""
         found = structure_of(self.arm_model)
         if not isinstance(found, SphericalWrist):
-            raise ValueError(  # noqa: TRY004  for pydantic, which tells where
+            raise ValueError(  # noqa: TRY004  pydantic adds the field's name to a ValueError only
                 f"expected an arm with a spherical wrist, as KUKA's have; {self.arm_model.name} has none"
             )
         return found
 
     def arm(self) -> Arm:
-        """The arm with the speeds that this driver moves it at; preflight computes durations with it."""
+        """The arm with the speeds that this driver uses; preflight computes durations with it."""
         return slowed(
             self.arm_model,
             speed_fraction=self.speed_fraction,
@@ -108,7 +108,7 @@ class Settings(BaseModel):
         return self.correction_tag or TAGS[self.corrects]
 
     def stopping_deg(self) -> NDArray[np.float64]:
-        """See `farthest_stop_deg`. Until the arm obeys, two cycles pass before the command is taken, one before
-        its answer is applied, and the arm lags behind its command."""
+        """See `farthest_stop_deg`. The delay: two cycles until the command is taken, one until its answer is
+        applied, and the lag of the arm behind its command."""
         delay_s = 3.0 * self.cycle_ms / 1e3 + self.follow_lag_s
         return farthest_stop_deg(self.arm().velocity_deg_s, self.acceleration_deg_s2, self.jerk_deg_s3, delay_s)

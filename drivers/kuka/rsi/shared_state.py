@@ -1,4 +1,4 @@
-"""The memory that `KukaRsi` and the process that answers the controller share.
+"""The memory shared by `KukaRsi` and the process that answers the controller.
 
 Two records, each with one writer: `Command` from the driver, `State` from the loop. A sequence number before
 the record is odd while it is being written (a seqlock), so neither side ever waits for the other.
@@ -20,9 +20,9 @@ _STATE = struct.Struct("=13Q24d32s200s")
 _TORN_S = 1.0
 
 HOLD, MOVE, STOP, LEAVE = range(4)
-"""What a command asks: nothing yet, move to the target, come to rest, come to rest and end the process."""
+"""Verbs of a command: nothing yet, move to the target, come to rest, come to rest and end the process."""
 STANDING, MOVING, STOPPING = range(3)
-"""What the commanded axes do."""
+"""Phase of the commanded axes."""
 NO_FAULT, LINK_LOST, LATE, NOT_FOLLOWING, RESTARTED, NO_TRAJECTORY = range(6)
 """Faults, latched."""
 
@@ -32,23 +32,23 @@ _ZEROS: Six = (0.0,) * 6
 
 class Command(NamedTuple):
     number: int = 0
-    """Counts commands; a new number is a new command."""
+    """Increases by one with every command."""
     verb: int = HOLD
     target_deg: Six = _ZEROS
 
 
 class State(NamedTuple):
     packets: int = 0
-    """Of the session, each counted once."""
+    """Packets of the session, each counted once."""
     answers: int = 0
     malformed: int = 0
-    """Packets that could not be read, and so were not answered."""
+    """Packets that could not be read, and were not answered."""
     refused: int = 0
     """Packets left unanswered because they belong to an RSI session that another program began."""
     foreign: int = 0
-    """Packets of other senders than the session's, which are not listened to."""
+    """Packets from other senders than the session's; they are ignored."""
     late: int = 0
-    """How far the controller's delay counter rose in all: answers that came too late or not at all."""
+    """Total rise of the controller's delay counter: answers that came too late or not at all."""
     delay: int = 0
     """The controller's delay counter in the last packet."""
     max_gap_ns: int = 0
@@ -59,16 +59,16 @@ class State(NamedTuple):
     """Number of the last command taken."""
     phase: int = STANDING
     settled_cycles: int = 0
-    """Packets in a row in which the measured axes stood at the commanded ones, within tolerance."""
+    """Packets in a row in which the measured axes were at the commanded ones, within tolerance."""
     fault: int = NO_FAULT
     measured_deg: Six = _ZEROS
     velocity_deg_s: Six = _ZEROS
     """Of the measured axes, over the last cycle."""
     commanded_deg: Six = _ZEROS
     start_deg: Six = _ZEROS
-    """Where the session began: the axes that correction limits count from."""
+    """Axes at the start of the session, from which the correction limits count."""
     controller: bytes = b""
-    """The Type that the controller's packets carry."""
+    """The `Type` attribute of the controller's packets."""
     fault_text: bytes = b""
 
 
@@ -86,7 +86,7 @@ class Block:
         return Command(number, verb, tuple(target))
 
     def command_number(self) -> int:
-        """The number alone, for a cheap look: 8 aligned bytes, so never torn."""
+        """The number alone, which is quick: 8 aligned bytes, so never torn."""
         number: int = _SEQUENCE.unpack_from(self._memory, _COMMAND_AT + _SEQUENCE.size)[0]
         return number
 
@@ -129,4 +129,4 @@ class Block:
             if before == after and before % 2 == 0:
                 return fields
             time.sleep(0)
-        raise TimeoutError("the shared record stays half written: its writer died")
+        raise TimeoutError("the shared record stays half written: its writer has died")

@@ -1,4 +1,4 @@
-"""The commanded axes: a jerk-limited run from rest to rest, one cycle at a time."""
+"""The commanded axes: a jerk-limited motion from rest to rest, one cycle at a time."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from drivers.kuka.rsi.shared_state import Six
 
 
 class Motion:
-    """The commanded axes: standing, moving to a target or coming to rest, always within the limits.
+    """The commanded axes: at rest, moving to a target or braking, always within the limits.
 
-    Motions are straight in joint space: one jerk-limited run along the line, as fast as the axis that limits it
-    allows. (Six axes synchronised by ruckig leave the line by up to 5 degrees in one move of six.) Coming to rest
-    happens on the line, too; a new target given on the way is set out for from there.
+    Motions are straight in joint space: one jerk-limited profile along the line, as fast as the axis that limits
+    it allows. (Six axes synchronised by ruckig leave the line by up to 5 degrees in one move of six.) Braking
+    also stays on the line; a target given during a motion is approached after the arm has come to rest.
     """
 
     def __init__(self, cycle_s: float, limits: tuple[Six, Six, Six]) -> None:
@@ -28,17 +28,17 @@ class Motion:
         self._input: Any = ruckig.InputParameter(1)
         self._output: Any = ruckig.OutputParameter(1)
         self._start_deg: Six = (0.0,) * 6
-        self._way_deg: Six = (0.0,) * 6
-        """From start to target; the run goes from 0 to 1 of it."""
+        self._line_deg: Six = (0.0,) * 6
+        """From start to target; the profile's position goes from 0 to 1 of it."""
         self._next_target_deg: Six | None = None
 
     def stand_at(self, joints_deg: Six) -> None:
-        """Take the axes as they are, at rest."""
+        """Set the commanded axes to `joints_deg`, at rest."""
         self.phase, self.commanded_deg, self.velocity_deg_s = shared_state.STANDING, joints_deg, (0.0,) * 6
         self._next_target_deg = None
 
     def halted(self) -> None:
-        """The arm stood still though the axes were commanded to go on: go on from rest."""
+        """The arm has halted although its axes were commanded to move: continue from rest."""
         self.velocity_deg_s = (0.0,) * 6
         self._input.current_velocity = self._input.current_acceleration = [0.0]
 
@@ -47,12 +47,12 @@ class Motion:
             self.stop()
             self._next_target_deg = target_deg
             return
-        way_deg = tuple(map(float.__sub__, target_deg, self.commanded_deg))
-        if not any(way_deg):
+        line_deg = tuple(map(float.__sub__, target_deg, self.commanded_deg))
+        if not any(line_deg):
             return
-        self._start_deg, self._way_deg = self.commanded_deg, way_deg
+        self._start_deg, self._line_deg = self.commanded_deg, line_deg
         highest = [
-            min(limit / abs(way) for limit, way in zip(limits, way_deg, strict=True) if way)
+            min(limit / abs(turn) for limit, turn in zip(limits, line_deg, strict=True) if turn)
             for limits in self._limits
         ]
         self._input.max_velocity, self._input.max_acceleration, self._input.max_jerk = ([h] for h in highest)
@@ -71,7 +71,7 @@ class Motion:
         self.phase = phase
 
     def step(self) -> bool:
-        """One cycle on; False if the trajectory could not be computed, and then the axes stand."""
+        """Advance one cycle; False if the trajectory could not be computed: the axes are then at rest."""
         if self.phase == shared_state.STANDING:
             return True
         result = self._run.update(self._input, self._output)
@@ -81,9 +81,9 @@ class Motion:
         self._output.pass_to_input(self._input)
         share, rate = self._output.new_position[0], self._output.new_velocity[0]
         self.commanded_deg = tuple(
-            start + share * way for start, way in zip(self._start_deg, self._way_deg, strict=True)
+            start + share * turn for start, turn in zip(self._start_deg, self._line_deg, strict=True)
         )
-        self.velocity_deg_s = tuple(rate * way for way in self._way_deg)
+        self.velocity_deg_s = tuple(rate * turn for turn in self._line_deg)
         if result == ruckig.Result.Finished:
             following = self._next_target_deg
             self.stand_at(self.commanded_deg)

@@ -1,6 +1,6 @@
-"""KUKA RSI's packets: read what the controller sends, write what it wants to hear.
+"""KUKA RSI's packets: reads those of the controller, and forms the answers.
 
-Names of elements are set by the controller's own RSI configuration, so they are parameters here.
+The names of elements are set in the controller's RSI configuration, so they are parameters here.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 class Packet(NamedTuple):
     ipoc: bytes
-    """As it came, to be sent back unchanged."""
+    """As received, to be sent back unchanged."""
     joints_deg: tuple[float, ...]
     delay: int | None
     """The counter of late answers; None where the controller does not send it."""
@@ -24,9 +24,9 @@ _TYPE = re.compile(rb"""<Rob\b[^>]*?\bTYPE\s*=\s*["']([^"']*)["']""", re.IGNOREC
 
 
 def packet_parser(measured_tag: str, delay_tag: str) -> Callable[[bytes], Packet | None]:
-    """A function that reads a controller's packet: any order of elements and attributes, others ignored.
+    """A parser of the controller's packets: elements and attributes in any order, unknown ones ignored.
 
-    It returns None where IPOC or an axis is missing or no number.
+    It returns None if IPOC or an axis is missing or not a number.
     """
     measured, delay = re.escape(measured_tag).encode(), re.escape(delay_tag).encode()
     usual_axes = re.compile(

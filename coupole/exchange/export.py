@@ -1,12 +1,10 @@
-"""Frames of a run for other programs: one file for each frame, named after its shot.
-
-A format is a module with `encode(picture)`, which gives the file's bytes.
-"""
+"""Frames of a run for other programs: one file for each frame, named after its shot."""
 
 from __future__ import annotations
 
 import errno
 import fnmatch
+import importlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import ChecksumMismatch, DiskFull, InputError, StorageError
+from coupole.exchange import FORMATS
 from coupole.storage import frame_file
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
@@ -91,12 +90,10 @@ def export_run(
 
 
 def _encoder(to: str) -> Callable[[Picture], bytes]:
-    from coupole.exchange import dng, tiff
-
-    formats = {"dng": dng.encode, "tiff": tiff.encode}
-    if to not in formats:
-        raise InputError(f"--to: expected one of {', '.join(formats)}; found {to}")
-    return formats[to]
+    if to not in FORMATS:
+        raise InputError(f"--to: expected one of {', '.join(FORMATS)}; found {to}")
+    encode: Callable[[Picture], bytes] = importlib.import_module(f"coupole.exchange.{to}").encode
+    return encode
 
 
 def _matches(name: str, patterns: list[str]) -> bool:

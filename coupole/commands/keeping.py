@@ -10,6 +10,7 @@ import typer
 
 from coupole.commands.common import JsonOption, RunPath, fail
 from coupole.errors import CoupoleError, InputError
+from coupole.exchange import FORMATS
 
 
 def status(run: RunPath, as_json: JsonOption = False) -> None:
@@ -99,7 +100,7 @@ def archive(
 
 def export(
     run: RunPath,
-    to: Annotated[str, typer.Option("--to", help="dng or tiff.", show_default=False)],
+    to: Annotated[str, typer.Option("--to", help=f"{' or '.join(FORMATS)}.", show_default=False)],
     views: Annotated[
         list[str] | None, typer.Option("--views", help="Names, with * and ?; again for more.")
     ] = None,

@@ -1,12 +1,10 @@
-"""Frames of a run for other programs: one file for each frame, named after its shot.
-
-A format is a module with `encode(picture)`, which gives the file's bytes.
-"""
+"""Frames of a run for other programs: one file for each frame, named after its shot."""
 
 from __future__ import annotations
 
 import errno
 import fnmatch
+import importlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,15 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import ChecksumMismatch, DiskFull, InputError, StorageError
-from coupole.exchange import dng, tiff
+from coupole.exchange import FORMATS
 from coupole.exchange.exported_frame import Picture
 from coupole.storage import frame_file
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 from coupole.storage.step_fields import STORED_NO_LED, board_temperature_c
-
-FORMATS: dict[str, Callable[[Picture], bytes]] = {"dng": dng.encode, "tiff": tiff.encode}
-"""What `--to` may name, and what makes the bytes of a file."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +78,8 @@ def export_run(
 def _encoder(to: str) -> Callable[[Picture], bytes]:
     if to not in FORMATS:
         raise InputError(f"--to: expected one of {', '.join(FORMATS)}; found {to}")
-    return FORMATS[to]
+    encode: Callable[[Picture], bytes] = importlib.import_module(f"coupole.exchange.{to}").encode
+    return encode
 
 
 def _matches(name: str, patterns: list[str]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import assert_never
 
 import numpy as np
@@ -20,6 +21,7 @@ from coupole.plan.plan import (
     Panels,
     Plan,
 )
+from coupole.plan.shot_id import Led, Panel
 
 
 def leds_of_plan(plan: Plan, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
@@ -55,17 +57,34 @@ def select_leds(lights: Lights, leds: LedTable, base_from_support: Transform) ->
             assert_never(lights)
 
 
-def missing_lights(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
-    """Key path and message for each light of the plan that the dome does not have."""
+def lit_in_bursts(lights: Lights, leds: LedTable, base_from_support: Transform) -> list[Sequence[Led] | Panel]:
+    """What each burst of one exposure lights: one burst for all LEDs, neighbours in time on different boards, or
+    one for each panel. Raises KeyError as `select_leds`."""
+    match lights:
+        case AllLights() | LightIds() | LightBoards() | EveryLight() | LightCone() | NoLights():
+            rows = select_leds(lights, leds, base_from_support)
+            return [[Led(int(led)) for led in leds.ids[rows[interleave(leds.boards[rows])]]]]
+        case Panels(panels=panels):
+            return [Panel(number) for number in panels]
+        case _:
+            assert_never(lights)
+
+
+def missing_lights(
+    plan: Plan, leds: LedTable, base_from_support: Transform
+) -> list[tuple[tuple[str | int, ...], str]]:
+    """Key path and message for each light of the plan that the dome does not have, and for a cone without any."""
     own = [(("views", i, "lights"), view.lights) for i, view in enumerate(plan.views) if view.lights is not None]
     return [
         (where + key, message)
         for where, lights in [(("lights",), plan.lights), *own]
-        for key, message in _missing(lights, leds)
+        for key, message in _missing(lights, leds, base_from_support)
     ]
 
 
-def _missing(lights: Lights, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
+def _missing(
+    lights: Lights, leds: LedTable, base_from_support: Transform
+) -> list[tuple[tuple[str | int, ...], str]]:
     match lights:
         case LightIds(ids=ids):
             have, key, what = set(leds.ids.tolist()), "ids", "LED"
@@ -74,6 +93,8 @@ def _missing(lights: Lights, leds: LedTable) -> list[tuple[tuple[str | int, ...]
             have, key, what, asked = set(leds.boards.tolist()), "boards", "board", boards
         case EveryLight(offset=offset) if offset >= len(leds.ids):
             return [(("offset",), f"expected less than the dome's {len(leds.ids)} LEDs, found {offset}")]
+        case LightCone() if not len(select_leds(lights, leds, base_from_support)):
+            return [((), "expected lights, none of the dome's LEDs lies in that cone")]
         case AllLights() | EveryLight() | LightCone() | Panels() | NoLights():
             return []
         case _:

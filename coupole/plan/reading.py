@@ -48,7 +48,8 @@ def read_plan(plan_path: Path, rig_path: Path | None = None) -> PlanFiles:
             f"expected the arm that `{cell.rig.robot.driver}` moves, as its file: what it touches must be known"
         )
         problems.append(cell.document.problem(("arm",), message))
-    wrong = missing_lights(plan, cell.leds) + names_too_long(plan, cell.leds)
+    wrong = missing_lights(plan, cell.leds, cell.rig.support.base_from_support.matrix())
+    wrong += names_too_long(plan, cell.leds)
     problems += [document.problem(key, message) for key, message in wrong]
     mesh_path = document.resolve(plan.object.mesh) if plan.object and plan.object.mesh else None
     if mesh_path is not None and not mesh_path.is_file():

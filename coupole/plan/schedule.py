@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import assert_never
 
 from coupole.geometry import Transform, look_at
 from coupole.plan.bursts import FASTEST, Burst, Pace, burst_timing, bursts_of_exposure
 from coupole.plan.led_table import LedTable
-from coupole.plan.light_selection import interleave, select_leds
+from coupole.plan.light_selection import lit_in_bursts
 from coupole.plan.marks import MARKS, Marks
-from coupole.plan.plan import Grid, Joints, Lights, LookAt, Panels, Plan, View
-from coupole.plan.shot_id import MAX_CHARACTERS, Led, Panel, PanelMark, ShotLabel
+from coupole.plan.plan import Grid, Joints, Lights, LookAt, Plan, View
+from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotLabel
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def build_schedule(
     for view in plan.views:
         lights = view.lights or plan.lights
         if lights not in bursts_of:
-            lit = _lit(lights, leds, base_from_support)
+            lit = lit_in_bursts(lights, leds, base_from_support)
             bursts_of[lights] = [
                 burst
                 for repeat in range(plan.repeats)
@@ -128,15 +128,6 @@ def build_schedule(
             bursts.append([replace(burst, view=pose.name) for burst in bursts_of[lights]])
     labels = tuple(tuple(label for burst in own for label in burst.labels if label) for own in bursts)
     return Schedule(tuple(views), tuple(map(tuple, bursts)), labels)
-
-
-def _lit(lights: Lights, leds: LedTable, base_from_support: Transform) -> list[Sequence[Led] | Panel]:
-    """What each burst of one exposure lights: one burst for all LEDs, neighbours in time on different boards, or
-    one for each panel."""
-    if isinstance(lights, Panels):
-        return [Panel(number) for number in lights.panels]
-    rows = select_leds(lights, leds, base_from_support)
-    return [[Led(int(led)) for led in leds.ids[rows[interleave(leds.boards[rows])]]]]
 
 
 def names_too_long(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Protocol, assert_never
 
 from pydantic import Discriminator, Tag
 
@@ -53,15 +53,18 @@ _EDGE_FAULTS = (faults.DropTrigger, faults.DoubleTrigger, faults.OverTemperature
 
 def impossible(fault: faults.Fault, settings: LedBoxSettings) -> str:
     """Why this stand-in cannot simulate the fault; empty if it can."""
-    if settings.kind == "text":
-        if isinstance(fault, _EDGE_FAULTS):
-            return (
-                f"`{fault.kind}` cannot happen to an LED box of kind `text`: it sends no edges and feels no heat"
-            )
-        if isinstance(fault, faults.When) and fault.at_edge is not None:
-            return "`at_edge`: an LED box of kind `text` sends no edges. Use `at_s`"
-    elif isinstance(fault, faults.StuckLed):
-        return f"`{fault.kind}` cannot happen to an LED box of kind `{settings.kind}`: it switches all current off"
+    match settings:
+        case ledbox_firmware.Settings():
+            if isinstance(fault, faults.StuckLed):
+                return f"`{fault.kind}` cannot happen to an LED box of kind `scpi`: it switches all current off"
+        case text_box.Settings():
+            if isinstance(fault, _EDGE_FAULTS):
+                why = "it sends no edges and feels no heat"
+                return f"`{fault.kind}` cannot happen to an LED box of kind `text`: {why}"
+            if isinstance(fault, faults.When) and fault.at_edge is not None:
+                return "`at_edge`: an LED box of kind `text` sends no edges. Use `at_s`"
+        case _:
+            assert_never(settings)
     return ""
 
 
@@ -72,11 +75,13 @@ def build(
     camera: CameraStandIn,
     lighting: Lighting,
     on_light: Callable[[int, int, int], None],
+    on_edge_counted: Callable[[int], None],
 ) -> LedBoxStandIn:
-    """The stand-in, connected to the trigger cable and to the lighting."""
+    """The stand-in, connected to the trigger cable and to the lighting; faults that wait for an edge are told the
+    number of each by `on_edge_counted(number)`."""
     match settings:
         case ledbox_firmware.Settings():
-            return ledbox_firmware.LedBoxFirmware(
+            box = ledbox_firmware.LedBoxFirmware(
                 reactor,
                 settings,
                 on_edge=camera.edge,
@@ -85,5 +90,9 @@ def build(
                 on_panel=lighting.panel,
                 ready=camera.ready,
             )
+            box.on_edge_counted = on_edge_counted
+            return box
         case text_box.Settings():
             return text_box.TextBox(reactor, settings, on_light=on_light, on_dark=lighting.darken_one)
+        case _:
+            assert_never(settings)

@@ -55,14 +55,17 @@ class World:
         self.robot, robot_endpoint = robot.build(self.reactor, settings.robot)
         self.camera, camera_endpoint = self._build_camera(config.camera, folder)
         self.box = ledbox_stand_in.build(
-            self.reactor, settings.ledbox, camera=self.camera, lighting=self.lighting, on_light=self._light
+            self.reactor,
+            settings.ledbox,
+            camera=self.camera,
+            lighting=self.lighting,
+            on_light=self._light,
+            on_edge_counted=self._edge_counted,
         )
         self._control = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.bind(str(folder / "control"))
         self._control.listen(4)
         self.reactor.add_reader(self._control, self._accept)
-        if isinstance(self.box, LedBoxFirmware):
-            self.box.on_edge_counted = self._edge_counted
         self._faults_at_edge: dict[int, list[script.Fault]] = {}
         for fault in settings.faults:
             self._schedule(fault)

@@ -17,7 +17,7 @@ from places import SHARED_DATA
 
 from coupole.devices import FrameFormat
 from coupole.errors import ChecksumMismatch, InputError
-from coupole.exchange import dng, tiff
+from coupole.exchange import FORMATS, dng, tiff
 from coupole.exchange.export import export_run
 from coupole.exchange.exported_frame import Picture
 from coupole.plan.shot_id import ShotId
@@ -190,7 +190,7 @@ def test_a_tiff_says_what_it_shows() -> None:
 # -- a run ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("to", ["dng", "tiff"])
+@pytest.mark.parametrize("to", FORMATS)
 def test_each_frame_becomes_a_file_named_after_its_shot(made: MadeRun, out: Path, to: str) -> None:
     names = export(made, to, out)
     assert names == sorted(f"{shot.replace('/', '_')}.{to}" for shot in made.frames)
@@ -239,7 +239,7 @@ def test_a_choice_without_a_frame_is_refused(made: MadeRun, out: Path) -> None:
 
 
 def test_a_format_that_is_not_known_is_refused_by_name(made: MadeRun, out: Path) -> None:
-    with pytest.raises(InputError, match="expected one of dng, tiff; found jpeg"):
+    with pytest.raises(InputError, match=f"expected one of {', '.join(FORMATS)}; found jpeg"):
         export(made, "jpeg", out)
 
 

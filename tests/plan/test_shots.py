@@ -220,13 +220,19 @@ def test_no_lights_is_marks_and_darks() -> None:
 
 
 def test_a_light_that_the_dome_does_not_have_is_named() -> None:
-    problems = missing_lights(plan_of({"kind": "ids", "ids": [3, 1080]}), DOME)
+    problems = missing_lights(plan_of({"kind": "ids", "ids": [3, 1080]}), DOME, BASE_FROM_SUPPORT)
     assert problems == [(("lights", "ids", 1), "the dome has no LED 1080; it has 0 to 1079")]
 
 
 def test_a_board_that_the_dome_does_not_have_is_named() -> None:
-    problems = missing_lights(plan_of({"kind": "boards", "boards": [180]}), DOME)
+    problems = missing_lights(plan_of({"kind": "boards", "boards": [180]}), DOME, BASE_FROM_SUPPORT)
     assert problems == [(("lights", "boards", 0), "the dome has no board 180; it has 0 to 179")]
+
+
+def test_a_cone_in_which_no_led_lies_is_named() -> None:
+    below = {"kind": "cone", "azimuth_deg": 0, "elevation_deg": -80, "half_angle_deg": 5}
+    (problem,) = missing_lights(plan_of(below), DOME, BASE_FROM_SUPPORT)
+    assert problem == (("lights",), "expected lights, none of the dome's LEDs lies in that cone")
 
 
 def test_a_view_may_have_lights_of_its_own() -> None:
@@ -242,7 +248,7 @@ def test_a_view_may_have_lights_of_its_own() -> None:
 
 def test_a_light_of_a_view_that_the_dome_does_not_have_is_named_at_the_view() -> None:
     own = {**TOP, "elevation_deg": 60, "lights": {"kind": "ids", "ids": [1080]}}
-    (problem,) = missing_lights(plan_of(ALL, views=[own]), DOME)
+    (problem,) = missing_lights(plan_of(ALL, views=[own]), DOME, BASE_FROM_SUPPORT)
     assert problem == (("views", 0, "lights", "ids", 0), "the dome has no LED 1080; it has 0 to 1079")
 
 

@@ -1,8 +1,8 @@
-"""What the sequencer asks of a device, and nothing more: one Protocol for each kind.
+"""The device contracts, limited to what the sequencer needs: one Protocol for each kind of device.
 
 Units are in the names. Times are nanoseconds of the clock that is named: the box's, the camera's or the rig's.
-Every blocking call has a time-out; a call that cannot do what it says raises a `coupole.errors.DeviceError`.
-After `close()`, and after any exception, a device is safe: lights off, camera disarmed, robot standing still.
+Every blocking call has a time-out; a call that fails raises a `coupole.errors.DeviceError`. After `close()`, and
+after any exception, a device is safe: lights off, camera disarmed, robot at rest.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from coupole.geometry import Transform
 NO_LED = -1
 """The `led` of a step or a flash without light."""
 UNKNOWN_NS = -1
-"""A time that a box cannot tell: it has no clock, or nothing happened at that time."""
+"""A time that is not available: the box has no clock, or the event did not happen."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Step:
     led: int
     """The LED that it lights, NO_LED for none."""
     on_us: int
-    """How long the LED is lit; of a dark step, how long it would be."""
+    """On-time of the LED; for a dark step the nominal time."""
     trigger_delay_us: int
     """From LED on to the trigger edge."""
     period_us: int
@@ -42,30 +42,31 @@ class Step:
 
 @dataclass(frozen=True)
 class StepRecord:
-    """What a step of a table, or a flash, really did: as the box's log says, or its driver saw."""
+    """The actual execution of a step of a table, or of a flash, from the box's log or its driver."""
 
     step: int
-    """Place in the table, from 0; 0 of a flash."""
+    """Index in the table, from 0; 0 for a flash."""
     led: int
     """As in `Step`."""
     edge_sent: bool
     """A trigger edge was sent."""
     led_open: bool
-    """The LED drew no current though it was switched on (dead LED, broken wire); False if the box cannot tell."""
+    """The LED drew no current though it was switched on (dead LED, broken wire); False if the box does not measure
+    it."""
     over_temperature: bool
-    """The board was over its limit; a burst ends with this step. False if the box cannot tell."""
+    """The board was over its limit; a burst ends with this step. False if the box does not measure it."""
     waited: bool
-    """The step was held back until the camera's exposure-ready line rose."""
+    """The step was delayed until the camera's exposure-ready line rose."""
     on_us: float
-    """How long the LED was lit, at the longest; 0 without light."""
+    """Upper bound of the time that the LED was lit; 0 without light."""
     t_on_ns: int
-    """When the LED was switched on, on the box's clock; UNKNOWN_NS of a box without one."""
+    """When the LED was switched on, on the box's clock; UNKNOWN_NS if the box has none."""
     t_trigger_ns: int
-    """When the edge was sent, on the box's clock; UNKNOWN_NS if none was, or of a box without clock."""
+    """When the edge was sent, on the box's clock; UNKNOWN_NS if none was, or if the box has no clock."""
     board_temperature_c: float
-    """Of the LED's board, C; NaN if the box cannot tell."""
+    """Of the LED's board, C; NaN if the box does not measure it."""
     led_current_ma: float
-    """Through the LED, mA; NaN if the box cannot tell."""
+    """Through the LED, mA; NaN if the box does not measure it."""
 
     @property
     def invalid_exposure(self) -> bool:
@@ -89,7 +90,7 @@ class Clock(Protocol):
         ...
 
     def hurry(self, until_ns: int) -> None:
-        """Until then the caller only waits: a simulated clock may run fast. A real one cannot."""
+        """Until then the caller only waits, so a simulated clock may run fast; a real clock ignores this."""
         ...
 
 
@@ -103,14 +104,14 @@ class SystemClock:
         time.sleep(seconds)
 
     def hurry(self, until_ns: int) -> None:
-        """Real time does not hurry."""
+        """No effect on a real clock."""
 
 
 class Deadline:
-    """Expires `seconds` from now on the rig's clock, or when that clock itself seems dead.
+    """Expires `seconds` from now on the rig's clock, or when that clock seems to have stopped.
 
-    The guard on the machine's own clock (`10 * seconds + 20 s`) matters only where the rig's clock can stand
-    still: a simulated world that died or hangs.
+    The guard on the machine's own clock (`10 * seconds + 20 s`) matters only if the rig's clock can stop: a
+    simulated world that ended or hangs.
     """
 
     def __init__(self, clock: Clock, seconds: float) -> None:
@@ -133,7 +134,7 @@ class Deadline:
 
 @dataclass(frozen=True)
 class Identity:
-    """Who a device says it is."""
+    """Identity reported by a device."""
 
     vendor: str
     model: str
@@ -143,58 +144,59 @@ class Identity:
 
 
 class LedBox(Protocol):
-    """The LED control box, as far as every one can go: it lights one LED at a time when it is told to.
+    """An LED control box with the functions that every box has: it lights one LED at a time on command.
 
-    Each call may raise a DeviceError; whatever was lit is dark then, as far as the box still obeys.
+    Each call may raise a DeviceError; all lights are then off, provided that the box still accepts commands.
     """
 
     runs_tables: bool
-    """True of a `TableLedBox`. Declared by the driver's class, so that a rig is judged before a box is opened."""
+    """True of a `TableLedBox`. Declared by the driver's class, so that a rig can be checked before a box is
+    opened."""
     led_count: int
-    """LEDs are numbered from 0 to one less."""
+    """Number of LEDs; they are numbered from 0."""
     panel_count: int
-    """Flat white panels that it switches, numbered from 1; 0 for none."""
+    """Number of flat white panels, numbered from 1; 0 if there are none."""
 
     def identify(self) -> Identity: ...
 
     def self_test(self) -> Mapping[str, str]:
-        """What the box reports of itself, for `coupole devices`; raises where it is not fit for use."""
+        """Self-test report of the box, for `coupole devices`; raises if the box is not usable."""
         ...
 
     def flash(self, led: int, on_us: int) -> None:
-        """Light one LED (NO_LED: none) for `on_us`; returns as soon as the box has confirmed that it shines.
+        """Light one LED (NO_LED: none) for `on_us`; returns as soon as the box has confirmed that it is lit.
 
-        Box or driver end the light at that time by themselves, whatever the caller does meanwhile. Nothing is
+        Box or driver switch the light off after that time, independently of the caller. The camera is not
         triggered. Raises DeviceRefused for an LED that the box does not have.
         """
         ...
 
     def lit(self) -> bool:
-        """True only if the light of the last `flash` has shone without a break since that call returned. Without
-        light: as it would be with it."""
+        """True only if the light of the last `flash` has been on without interruption since that call returned.
+        For a flash without light: while it would be on."""
         ...
 
     def end_flash(self) -> StepRecord:
-        """See the last `flash` end: it may be cut short. Returns what it did; its `led` is dark.
+        """End the last `flash`, possibly before its time. Returns its record; its LED is then off.
 
-        Raises DeviceTimeout if the box does not say in time that it has ended.
+        Raises DeviceTimeout if the box does not confirm the end in time.
         """
         ...
 
     def lights_off(self) -> None:
-        """Abort what runs, all LEDs and panels dark. Safe to call at any time."""
+        """Abort a running burst, switch all LEDs and panels off. Safe to call at any time."""
         ...
 
     def panel(self, panel: int, on: bool) -> None:
-        """Switch a flat white panel (1 to `panel_count`); raises DeviceRefused for another."""
+        """Switch a flat white panel (1 to `panel_count`); raises DeviceRefused for any other number."""
         ...
 
     def board_temperature_c(self, board: int) -> float | None:
-        """Of an LED board, C; None if the box cannot tell."""
+        """Of an LED board, C; None if the box does not measure it."""
         ...
 
     def close(self) -> None:
-        """Lights off if the box still listens; never raises for a link that is dead."""
+        """Lights off if the box still accepts commands; never raises because of a lost link."""
         ...
 
 
@@ -202,7 +204,7 @@ class TableLedBox(LedBox, Protocol):
     """A box that runs a table of steps by itself, sends trigger edges and keeps a log: bursts at full speed."""
 
     def load(self, table: NDArray[np.void]) -> None:
-        """Bring a table (STEP_DTYPE [n]) into the bank that is not running; a no-op if it is there already.
+        """Upload a table (STEP_DTYPE [n]) to the bank that is not running; no effect if it is already there.
 
         May be called while the other bank runs. Raises DeviceRefused, naming the record, for a table out of the
         box's limits.
@@ -210,7 +212,7 @@ class TableLedBox(LedBox, Protocol):
         ...
 
     def start(self, table: NDArray[np.void]) -> None:
-        """Run a loaded table, after making sure that the box still has it as it was loaded. Returns at once."""
+        """Run a loaded table, after checking that the box still has it unchanged. Returns at once."""
         ...
 
     def poll_log(self) -> NDArray[np.void]:
@@ -235,7 +237,7 @@ def table_box(box: LedBox) -> TableLedBox:
         raise DeviceRefused(
             "led box",
             expected="a box that runs tables and triggers the camera, for `trigger: hardware`",
-            happened="this one only lights one LED when it is told to",
+            happened="this one only switches single LEDs on command",
             remedy="Set `trigger: software` in the plan: then the host triggers the camera.",
         )
     return cast(TableLedBox, box)
@@ -243,7 +245,7 @@ def table_box(box: LedBox) -> TableLedBox:
 
 @dataclass(frozen=True)
 class FrameFormat:
-    """What every frame of an armed camera looks like."""
+    """Format of all frames of an armed camera."""
 
     height_px: int
     width_px: int
@@ -279,7 +281,7 @@ class Frame:
     pixels: NDArray[np.uint16] = field(repr=False)
     """[height_px, width_px], DN; page-aligned memory of the driver, not copied."""
     release: Any = field(default=lambda: None, repr=False)
-    """Call once, when the bytes are needed no more: the buffer goes back to the camera."""
+    """Return the buffer to the camera. Call once, when the bytes are no longer needed."""
     rendered: bool = True
     """False for a frame without picture, which the simulated camera may deliver in a dry run."""
 
@@ -291,7 +293,7 @@ class CameraStatistics:
     exposed: int
     """Frames that the sensor exposed."""
     delivered: int
-    """Frames that reached the host whole."""
+    """Frames that reached the host completely."""
     lost_transfers: int
     over_triggers: int
     """Edges that came too early and were ignored."""
@@ -305,7 +307,7 @@ class Camera(Protocol):
     id_modulus: tuple[int, int]
     """First and last frame id of the transport: (1, 65535) on GigE Vision 1; after last comes first."""
     timestamp_jitter_us: float
-    """Largest deviation of a timestamp from its edge, clock drift apart."""
+    """Largest deviation of a timestamp from its edge, without clock drift."""
     delivery_s: float
     """Longest time from the end of a readout until the frame has reached the host."""
 
@@ -314,7 +316,7 @@ class Camera(Protocol):
     def self_test(self) -> Mapping[str, str]: ...
 
     def configure(self, exposure: Exposure) -> FrameFormat:
-        """Set exposure, gain and trigger; returns what frames will look like. The camera must be disarmed."""
+        """Set exposure, gain and trigger; returns the format of the frames. The camera must be disarmed."""
         ...
 
     def min_period_us(self, exposure: Exposure) -> int:
@@ -322,11 +324,11 @@ class Camera(Protocol):
         ...
 
     def arm(self, buffers: int) -> None:
-        """Queue `buffers` buffers at least and start acquisition: edges make frames from now on."""
+        """Queue at least `buffers` buffers and start acquisition: from now on edges trigger frames."""
         ...
 
     def next_frame(self, timeout_s: float) -> Frame | None:
-        """The oldest frame not yet taken, or None if none came in time."""
+        """The oldest frame not yet taken, or None if none arrived in time."""
         ...
 
     def trigger(self) -> None:
@@ -344,12 +346,13 @@ class Camera(Protocol):
 
 @dataclass(frozen=True)
 class ArmState:
-    """Where the arm is, as measured by its controller."""
+    """The arm's state, as measured by its controller."""
 
     joints_deg: tuple[float, float, float, float, float, float]
     base_from_flange: Transform
     t_ns: int
-    """When this was first seen, on the rig's clock: a later time means that the controller was heard since."""
+    """When this state was received, on the rig's clock: a later time means that the controller has reported
+    since."""
     moving: bool
     fault: str = ""
     """Name and reason of a latched fault; empty when there is none."""
@@ -367,7 +370,7 @@ class Robot(Protocol):
         ...
 
     def wait_settled(self) -> ArmState:
-        """Wait until the arm stands at the target and still; the time-out is derived from the motion asked.
+        """Wait until the arm is at rest at the target; the time-out is derived from the commanded motion.
 
         Raises DeviceFault on a latched fault, DeviceLost if the link is gone, DeviceTimeout.
         """
@@ -376,15 +379,15 @@ class Robot(Protocol):
     def measured(self) -> ArmState: ...
 
     def stop(self) -> None:
-        """Bring the arm to rest along its path, as fast as its limits allow. Safe to call at any time.
+        """Stop the arm along its path, as fast as its limits allow. Safe to call at any time.
 
-        From any motion that `move_to` began, each axis turns by at most `stopping_deg` more.
+        In any motion started by `move_to`, each axis turns by at most `stopping_deg` more.
         """
         ...
 
     def stopping_deg(self) -> NDArray[np.float64]:
-        """Farthest that each axis [6] still turns after `stop` is called: what this driver's speeds,
-        accelerations and delays make of it."""
+        """Largest further turn of each axis [6] after `stop` is called, from this driver's speeds, accelerations
+        and delays."""
         ...
 
     def statistics(self) -> Mapping[str, float]:

@@ -1,21 +1,15 @@
-"""Every error that Coupole raises on purpose, and the exit code that it ends with.
+"""All errors that Coupole raises deliberately, with their exit codes.
 
 ::
 
-    CoupoleError
-    ├── InputError            2    plan, rig or arguments are wrong
-    ├── PreflightRefused      3    the plan is well formed but must not be run
-    ├── CalibrationRefused    3    the calibration misses its limits: written, but not to be used
-    ├── DeviceError           4    a device failed
-    │   ├── DeviceTimeout     4    ... did not answer in time
-    │   ├── DeviceLost        4    ... its link is gone
-    │   ├── DeviceRefused     4    ... said no to a command
-    │   └── DeviceFault       4    ... is in a latched fault; only the operator's word resumes it
-    ├── UnprovenError         5    frames are missing or unproven after re-shooting
-    ├── StorageError          6    the disk
-    │   ├── DiskFull          6    ... has no room left
-    │   └── ChecksumMismatch  6    ... does not give back what was written
-    └── Interrupted         130    the operator said stop
+    CoupoleError ├── InputError            2    plan, rig or arguments are wrong ├── PreflightRefused      3    the
+    plan is well formed but must not be run ├── CalibrationRefused    3    the calibration misses its limits:
+    written, but not to be used ├── DeviceError           4    a device failed │   ├── DeviceTimeout     4    ...
+    did not answer in time │   ├── DeviceLost        4    ... its link is gone │   ├── DeviceRefused     4    ...
+    refused a command │   └── DeviceFault       4    ... is in a latched fault; only an operator may clear it ├──
+    UnprovenError         5    frames are missing or unproven after re-shooting ├── StorageError          6 the
+    disk │   ├── DiskFull          6    ... has no space left │   └── ChecksumMismatch  6    ... does not give back
+    what was written └── Interrupted         130    the operator stopped the run
 
 A message names what was expected, what happened and what to do next.
 """
@@ -27,14 +21,14 @@ from dataclasses import dataclass
 
 
 class CoupoleError(Exception):
-    """Base of the tree; never raised itself."""
+    """Base class; never raised itself."""
 
     exit_code = 1
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing wrong in an input, where it stands and what would be right.
+    """One mistake in an input: its position, and what was expected.
 
     `line` and `column` count from 1; 0 means that the problem concerns the file as a whole.
     """
@@ -94,7 +88,7 @@ class DeviceError(CoupoleError):
 
 
 class DeviceTimeout(DeviceError):
-    """The device did not answer in the time that the work asked for allows."""
+    """The device did not answer within the time allowed for the operation."""
 
 
 class DeviceLost(DeviceError):
@@ -102,7 +96,7 @@ class DeviceLost(DeviceError):
 
 
 class DeviceRefused(DeviceError):
-    """The device answered, and said no."""
+    """The device refused a command."""
 
 
 class DeviceFault(DeviceError):
@@ -116,17 +110,17 @@ class UnprovenError(CoupoleError):
 
 
 class StorageError(CoupoleError):
-    """The run's folder cannot be written or read as it must."""
+    """The run's folder cannot be written or read."""
 
     exit_code = 6
 
 
 class DiskFull(StorageError):
-    """No room is left where the run is written."""
+    """The disk with the run has no space left."""
 
 
 class ChecksumMismatch(StorageError):
-    """Bytes on disk are not those that were written."""
+    """Bytes on disk differ from those that were written."""
 
 
 class Interrupted(CoupoleError):

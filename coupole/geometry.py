@@ -75,9 +75,9 @@ def look_at(
 ) -> Transform:
     """`support_from_camera` of a camera whose projection centre is `distance_mm` from the target.
 
-    The camera stands in direction (azimuth, elevation) as seen from the target and looks at it. The image is
-    upright: the support's z axis points up in it (straight from above, the direction away from the camera's
-    azimuth does). `roll_deg` turns the camera about its optical axis, clockwise as seen from behind it.
+    The camera is in direction (azimuth, elevation) from the target and looks at it. The image is upright: the
+    support's z axis points up in it (straight from above, the direction away from the camera's azimuth does).
+    `roll_deg` turns the camera about its optical axis, clockwise as seen from behind it.
     """
     towards_camera = direction(azimuth_deg, elevation_deg)
     forward = -towards_camera

@@ -1,9 +1,9 @@
-"""A chain of six turning joints: where its links are, and in closed form which angles bring its flange to a pose.
+"""A chain of six revolute joints: frames of its links, and inverse kinematics in closed form.
 
-A chain is data: of each joint its origin in the frame of the link before it and the coordinate axis that it turns
-about. A link's frame lies in its joint and, with all angles 0, is parallel to the base's. Two structures are
-solved, which nearly all arms with six joints have; `structure_of` finds out which one a chain has, and proves it
-by going forward from what it found.
+A chain is data: for each joint its origin in the frame of the previous link and the coordinate axis of rotation. A
+link's frame has its origin in the joint and, with all angles 0, is parallel to the base frame. Two structures are
+solved, which nearly all arms with six joints have; `structure_of` identifies a chain's structure and verifies it
+with the forward kinematics.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class JointChain:
     """Joints 1 to 6 and the flange."""
 
     origins_mm: tuple[Vector, ...]
-    """Of each joint, in the frame of the link before it."""
+    """Origin of each joint in the frame of the previous link."""
     axes: tuple[Axis, ...]
-    """What each joint turns about, right-handed, in its link's frame."""
+    """Axis of rotation of each joint, right-handed, in its link's frame."""
     link_6_from_flange: tuple[tuple[float, ...], ...]
     """4x4, row by row, mm."""
 
@@ -46,7 +46,7 @@ class JointChain:
 
     @property
     def senses(self) -> tuple[float, ...]:
-        """1 for each joint that turns about an axis of its frame, -1 for those that turn against it."""
+        """1 for each joint whose axis is a positive coordinate axis of its frame, -1 for a negative one."""
         return tuple(-1.0 if axis[0] == "-" else 1.0 for axis in self.axes)
 
 
@@ -68,7 +68,7 @@ class SphericalWrist:
     c4_mm: float
     offsets_deg: tuple[float, ...]
     flip_axes: tuple[bool, ...]
-    """True where the axis turns against OPW's sense."""
+    """True where the axis turns opposite to OPW's sense."""
     opw_from_flange: tuple[tuple[float, ...], ...]
     """4x4: from the flange of the paper, its z axis along axis 6, to the chain's."""
 
@@ -85,7 +85,7 @@ class ParallelAxes:
     arms.
 
     Lengths and angles are Denavit and Hartenberg's in their standard form, with alpha 90, 0, 0, 90, -90 and 0
-    degrees, of a base in the crossing of axes 1 and 2 and of a last frame in the crossing of axes 5 and 6, so that
+    degrees, with the base at the intersection of axes 1 and 2 and the last frame at that of axes 5 and 6, so that
     d1 and d6 are 0 (Hawkins, "Analytic Inverse Kinematics for the Universal Robots UR-5/UR-10 Arms", 2013, has the
     same chain).
     """
@@ -129,7 +129,7 @@ def link_frames(chain: JointChain, joints_deg: ArrayLike) -> Floats:
 
 
 def shoulder_mm(chain: JointChain) -> Floats:
-    """[3] the place on axis 1 that is nearest to joint 2, in the base frame."""
+    """[3] the point of axis 1 nearest to joint 2, in the base frame."""
     first, direction = np.array(chain.origins_mm[0]), _directions(chain)[0]
     along: Floats = first + (np.array(chain.origins_mm[1]) @ direction) * direction
     return along
@@ -137,7 +137,7 @@ def shoulder_mm(chain: JointChain) -> Floats:
 
 @lru_cache(maxsize=32)
 def structure_of(chain: JointChain) -> Structure | None:
-    """The structure by which the chain is solved; None where it has neither."""
+    """The chain's solvable structure; None if it has neither."""
     for found in (_spherical_wrist(chain), _parallel_axes(chain)):
         if found is not None and all(_solves(found, chain, joints_deg) for joints_deg in _PROOF_DEG):
             return found
@@ -145,7 +145,7 @@ def structure_of(chain: JointChain) -> Structure | None:
 
 
 def branches(chain: JointChain, base_from_flange: Transform) -> list[Floats]:
-    """Joint angles [6] in degrees that reach the pose, at most eight, wrapped to +-180; limits are not looked at.
+    """Joint angles [6] in degrees that reach the pose, at most eight, wrapped to +-180, regardless of limits.
 
     Raises ValueError for a chain that `structure_of` does not know.
     """
@@ -164,8 +164,8 @@ def _branches(structure: Structure, base_from_flange: Transform) -> list[Floats]
 
 
 def _solves(structure: Structure, chain: JointChain, joints_deg: tuple[float, ...]) -> bool:
-    """True if all that is found for a pose leads there, and the joint angles that the pose was made of are
-    found."""
+    """True if all solutions for a pose reproduce it and include the joint angles from which the pose was
+    computed."""
     pose = link_frames(chain, joints_deg)[FLANGE]
     found = np.array(_branches(structure, pose)).reshape(-1, 6)
     off_deg = np.abs((found - joints_deg + 180.0) % 360.0 - 180.0).max(axis=1, initial=0.0)
@@ -174,7 +174,7 @@ def _solves(structure: Structure, chain: JointChain, joints_deg: tuple[float, ..
 
 
 def _directions(chain: JointChain) -> Floats:
-    """[6, 3] what the joints turn about, with all angles 0."""
+    """[6, 3] axes of rotation with all angles 0."""
     return np.array(chain.senses)[:, None] * np.eye(3)[list(chain.axis_numbers)]
 
 
@@ -235,7 +235,7 @@ def _solver(wrist: SphericalWrist) -> Any:
 
 
 def _raw_branches(wrist: SphericalWrist, base_from_opw: Transform) -> Floats:
-    """[8, 6] in degrees, wrapped to +-180, limits not looked at; NaN where a branch does not exist."""
+    """[8, 6] in degrees, wrapped to +-180, regardless of limits; NaN where a branch does not exist."""
     from py_opw_kinematics import RigidTransform
 
     found: Floats = _solver(wrist)[0].reach(RigidTransform.from_matrix(base_from_opw)).joints[0]
@@ -243,7 +243,7 @@ def _raw_branches(wrist: SphericalWrist, base_from_opw: Transform) -> Floats:
 
 
 def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transform) -> list[Floats]:
-    """The branches [6] that exist, with those added that py-opw-kinematics loses where the wrist is stretched."""
+    """The existing branches [6], plus those that py-opw-kinematics misses when the wrist is stretched."""
     base_from_opw = base_from_flange @ _solver(wrist)[1]
     raw = _raw_branches(wrist, base_from_opw)
     found = [branch for branch in raw if not np.isnan(branch).any()]
@@ -337,7 +337,8 @@ def _branches_of_parallel_axes(arm: ParallelAxes, base_from_flange: Transform) -
         seen = turned.T @ across
         sine = float(np.hypot(seen[0], seen[1]))
         for t5 in (np.arctan2(sine, seen[2]), -np.arctan2(sine, seen[2])):
-            # With the wrist stretched axes 2 to 4 and 6 are parallel: of that family the one with t6 = 0 is given.
+            # With the wrist stretched axes 2 to 4 and 6 are parallel: of the family of solutions the one with t6 =
+            # 0 is given.
             t6 = np.arctan2(-seen[1] * np.sign(t5), seen[0] * np.sign(t5)) if sine > _ROUNDING else 0.0
             fifth = turned @ np.array((-np.sin(t6), -np.cos(t6), 0.0))
             elbow_mm = place_mm - arm.d5_mm * fifth - arm.d4_mm * across

@@ -1,7 +1,7 @@
-"""The arm: where its flange is, which joint angles bring it to a pose, and how long a motion takes.
+"""Kinematics of the arm: forward, inverse, and durations of motions.
 
-Joint angles are A1 to A6 in degrees, poses are `base_from_flange` (4x4, mm; a KUKA's base is $ROBROOT). Which arm
-it is, is data: `Arm` holds what a description says (`coupole.plan.arm_description` reads it).
+Joint angles are A1 to A6 in degrees, poses are `base_from_flange` (4x4, mm; a KUKA's base is $ROBROOT). The arm is
+data: `Arm` holds a description's values (`coupole.plan.arm_description` reads them).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _LIMIT_TOLERANCE_DEG = 1e-9
 
 @dataclass(frozen=True)
 class Arm:
-    """An arm with six turning joints, and how far and fast they turn."""
+    """An arm with six revolute joints, with their limits and speeds."""
 
     name: str
     chain: JointChain
@@ -54,7 +54,7 @@ class Arm:
 
 
 def slowed(arm: Arm, *, speed_fraction: float, acceleration_deg_s2: float, jerk_deg_s3: float) -> Arm:
-    """The same arm, moved at a fraction of its speeds and with one acceleration and jerk for all axes."""
+    """The same arm with a fraction of its speeds and one acceleration and jerk for all axes."""
     return replace(
         arm,
         velocity_deg_s=tuple(v * speed_fraction for v in arm.velocity_deg_s),
@@ -72,23 +72,23 @@ def forward(arm: Arm, joints_deg: ArrayLike) -> Transform:
 def link_frames(arm: Arm, joints_deg: ArrayLike) -> NDArray[np.float64]:
     """`base_from_link` [..., 8, 4, 4] of joint angles [..., 6]: base, the six links, the flange.
 
-    A link's frame lies in its joint and, with all angles 0, is parallel to the base's; the flange's is that of
-    `forward`.
+    A link's frame has its origin in its joint and, with all angles 0, is parallel to the base frame; the flange's
+    is that of `forward`.
     """
     return joint_chain.link_frames(arm.chain, joints_deg)
 
 
 def structure_of(arm: Arm) -> SphericalWrist | ParallelAxes | None:
-    """The structure by which `inverse` solves the arm; None if it cannot."""
+    """The arm's structure for `inverse`; None if `inverse` cannot solve it."""
     return joint_chain.structure_of(arm.chain)
 
 
 def inverse(arm: Arm, base_from_flange: Transform) -> NDArray[np.float64]:
     """All joint angles [k, 6] within the limits that reach the pose; k is 0 where there are none.
 
-    Every turn of an axis that its limits allow counts as a solution of its own. With the wrist stretched two axes
-    turn about parallel lines: of that family one member is given, with A4 = 0 of a spherical wrist, with A6 = 0 of
-    an arm with three parallel axes. Raises ValueError for an arm without `structure_of`.
+    Full turns of an axis within its limits count as separate solutions. With the wrist stretched two axes are
+    parallel: of the family of solutions one is given, with A4 = 0 of a spherical wrist, with A6 = 0 of an arm with
+    three parallel axes. Raises ValueError for an arm without `structure_of`.
     """
     solutions = [
         turned
@@ -99,10 +99,10 @@ def inverse(arm: Arm, base_from_flange: Transform) -> NDArray[np.float64]:
 
 
 def nearest(arm: Arm, solutions_deg: ArrayLike, from_joints_deg: ArrayLike) -> NDArray[np.float64]:
-    """The solution [6] that is reached first at the joint speed limits; of equals (1 ms), the one that stays
+    """The solution [6] that is reached first at the joint speed limits; of equally fast ones (1 ms), the one
     farthest from its limits.
 
-    Raises ValueError where there is none to choose from: ask `unreachable_reason` before.
+        Raises ValueError if there is no solution: check with `unreachable_reason` first.
     """
     solutions = np.asarray(solutions_deg, dtype=np.float64).reshape(-1, 6)
     if len(solutions) == 0:
@@ -141,7 +141,7 @@ def limit_violations(arm: Arm, joints_deg: ArrayLike) -> str:
 def unreachable_reason(arm: Arm, base_from_flange: Transform) -> str:
     """Why `inverse` finds nothing, as a phrase for messages; empty if it finds something.
 
-    Of the ways to reach the pose with axes out of their limits, the one that needs least more is told.
+    Among solutions with axes out of their limits, the one with the least excess is reported.
     """
     branches = joint_chain.branches(arm.chain, base_from_flange)
     if not branches:
@@ -166,7 +166,7 @@ def move_duration_s(arm: Arm, from_joints_deg: ArrayLike, to_joints_deg: ArrayLi
 
 def move_durations_s(arm: Arm, from_joints_deg: ArrayLike, to_joints_deg: ArrayLike) -> NDArray[np.float64]:
     """Durations [...] of jerk-limited motions from rest to rest on straight lines in joint space [..., 6], as fast
-    as the axes that limit them allow: the profile that the driver runs.
+    as the axes that limit them allow: the profile that the driver uses.
 
     The profile is symmetric: speed is gained for `ramp_s`, kept, and lost as it was gained. A distance d at the
     highest speed v then takes d / v + ramp_s(v), with ramp_s(v) = v / a + a / j where the acceleration a is

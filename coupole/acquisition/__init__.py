@@ -1,1 +1,1 @@
-"""Runs a schedule: arm to a view, a burst in the box, frames proved while it runs, recorded."""
+"""Runs a schedule: moves the arm to each view, runs bursts, proves frames while a burst runs, and records them."""

@@ -1,6 +1,6 @@
-"""Brings the arm to views and watches it: on its way within the tube that was found clear, then at rest.
+"""Moves the arm to views and monitors it: its path deviation in motion, its posture at rest.
 
-Only an arm that is heard of and stands where it was measured lets frames be proven.
+Frames are proven only while the arm reports that it is at the posture measured after the motion.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ _NEWS_S = 1.0
 
 
 class ArmMovedError(Exception):
-    """The arm moved while lights flashed."""
+    """The arm moved during a burst."""
 
 
 @dataclass(frozen=True)
 class SettledPose:
-    """Where the arm was measured to settled, still."""
+    """The arm's measured state after settling."""
 
     arm: ArmState
     base_from_camera: Transform
 
 
 class ArmSupervisor:
-    """One session's moves. Every method that waits gives way to the operator's stop and to the arm's faults."""
+    """One session's motions. Every method that waits can be ended by the operator's stop or a fault of the arm."""
 
     def __init__(self, job: Job, cell: OpenedCell, control: Control) -> None:
         self._job, self._robot, self._clock, self._control = job, cell.robot, cell.clock, control
@@ -48,10 +48,10 @@ class ArmSupervisor:
         self._arm = arm_of(job.cell.rig)
         self._settled: SettledPose | None = None
         self._from_deg = np.zeros(6)
-        """Where the next leg begins."""
+        """Joint angles at which the next leg begins."""
 
     def itinerary(self, views: Sequence[ViewPose]) -> Itinerary:
-        """Ways to views from where the arm really stands. Raises PreflightRefused where there is none."""
+        """Paths to views from the arm's actual posture. Raises PreflightRefused if there is none."""
         self._from_deg = np.array(self._robot.measured().joints_deg)
         found = self._job.motion.itinerary(views, self._from_deg.tolist())
         if found.refusals:
@@ -59,29 +59,29 @@ class ArmSupervisor:
         return found
 
     def attend(self) -> None:
-        """Raise Interrupted if the operator said stop, DeviceFault if the arm is in a fault."""
+        """Raise Interrupted after the operator's stop, DeviceFault if the arm is in a fault."""
         self._watched()
 
     def go(self, visit: Visit, meanwhile: Callable[[], None]) -> SettledPose:
-        """Follow the leg of a visit, doing something `meanwhile`; where the arm stands then, measured."""
+        """Follow the leg of a visit, call `meanwhile` during its first motion; returns the measured pose."""
         self._settled = None
-        way = (self._from_deg, *visit.leg.waypoints)
-        self._keep_to(way, self._watched(), "before it set out")
-        for here_deg, there_deg in pairwise(way):
+        path = (self._from_deg, *visit.leg.waypoints)
+        self._keep_to(path, self._watched(), "before it started")
+        for here_deg, there_deg in pairwise(path):
             self._robot.move_to(there_deg)
             if here_deg is self._from_deg:
                 meanwhile()
             self.hurry(move_duration_s(self._arm, here_deg, there_deg) + self._motion.settle_dwell_s)
             while (arm := self._watched()).moving:
-                self._keep_to(way, arm, "on its way")
+                self._keep_to(path, arm, "on its path")
                 self._clock.sleep(_POLL_S)
-        self._from_deg = way[-1]
+        self._from_deg = path[-1]
         return self._settle()
 
     def return_to_view(self) -> SettledPose:
-        """Bring an arm that was moved back to where it stood; where it stands now, measured anew.
+        """Move a displaced arm back to its posture; returns the newly measured pose.
 
-        Raises DeviceRefused where something is in the way.
+        Raises DeviceRefused if the straight path back is blocked.
         """
         assert self._settled is not None
         here_deg = np.array(self._robot.measured().joints_deg)
@@ -90,16 +90,16 @@ class ArmSupervisor:
         if contact is not None:
             raise DeviceRefused(
                 "robot",
-                expected="a clear way back to the view that the arm was pushed from",
+                expected="a clear path back to the view from which the arm was pushed",
                 happened=str(contact),
-                remedy="Bring the arm away from it by hand, then resume the run.",
+                remedy="Move the arm away from it by hand, then resume the run.",
             )
         self._robot.move_to(there_deg)
         return self._settle()
 
     def heard_at_rest(self) -> int:
-        """When the arm was last heard of, on the rig's clock; raises ArmMovedError if it does not stand where
-        it was measured."""
+        """Time of the arm's last reading, on the rig's clock; raises ArmMovedError if the arm is not at its
+        measured posture."""
         assert self._settled is not None
         arm = self._watched()
         off_deg = float(np.abs(np.subtract(arm.joints_deg, self._settled.arm.joints_deg)).max())
@@ -108,22 +108,22 @@ class ArmSupervisor:
         return arm.t_ns
 
     def await_news(self) -> ArmState:
-        """Hear once more of the arm at rest, lest it fell silent, or worse, while the last frames were taken."""
+        """Wait for one more reading of the arm at rest, so that it covers the burst's last frames."""
         since_ns = self._robot.measured().t_ns
         deadline = Deadline(self._clock, _NEWS_S)
         while self.heard_at_rest() <= since_ns:
             if deadline.expired:
                 raise DeviceLost(
                     "robot",
-                    expected=f"news of the arm within {_NEWS_S:g} s of the burst's end",
-                    happened="its controller is silent",
+                    expected=f"a reading of the arm within {_NEWS_S:g} s of the burst's end",
+                    happened="its controller sent none",
                     remedy="Check the controller and its network, then resume the run.",
                 )
             self._clock.sleep(_POLL_S)
         return self._robot.measured()
 
     def hurry(self, seconds: float) -> None:
-        """For so long there is nothing to do but to watch: a rehearsal's clock may run fast."""
+        """The caller only waits for these seconds: the clock of a dry run may run fast."""
         self._clock.hurry(self._clock.now_ns() + int(max(0.0, seconds) * 1e9))
 
     def _watched(self) -> ArmState:
@@ -139,17 +139,17 @@ class ArmSupervisor:
             )
         return arm
 
-    def _keep_to(self, way: Sequence[Joints], arm: ArmState, when: str) -> None:
-        """Stop an arm that is not where its leg was found clear."""
-        off_mm = path_deviation_mm(way, np.array(arm.joints_deg), self._job.motion.bodies.reach_mm)
+    def _keep_to(self, path: Sequence[Joints], arm: ArmState, when: str) -> None:
+        """Stop the arm if it deviates from its path by more than the tolerance."""
+        off_mm = path_deviation_mm(path, np.array(arm.joints_deg), self._job.motion.bodies.reach_mm)
         if off_mm <= PATH_TOLERANCE_MM:
             return
         self._robot.stop()
         raise DeviceFault(
             "robot",
-            expected=f"all of the arm within {PATH_TOLERANCE_MM:g} mm of the way that was found clear",
-            happened=f"{when} it was up to {off_mm:.1f} mm beside it and has been stopped",
-            remedy="See to the cell; the controller may move by other rules than straight lines of its axes.",
+            expected=f"all of the arm within {PATH_TOLERANCE_MM:g} mm of the path that was checked",
+            happened=f"{when} it deviated by up to {off_mm:.1f} mm and was stopped",
+            remedy="Check the cell; perhaps the controller does not move on straight lines in joint space.",
         )
 
     def _settle(self) -> SettledPose:

@@ -1,4 +1,4 @@
-"""One burst: run it, take its frames, prove them; here while the box runs it, in `host_burst` light by light."""
+"""Runs one burst in the box, takes its frames and proves them (`host_burst`: bursts that the host fires)."""
 
 from __future__ import annotations
 
@@ -37,29 +37,29 @@ from coupole.viewing.progress import Outcome
 
 _POLL_S = 0.05
 _STALL_S = 5.0
-"""A box that logs no step for so much longer than a step takes has stopped."""
+"""A box that logs no step for a step's duration plus this has stopped."""
 _LAST_STRETCH_S = 0.3
-"""Of a burst: time enough for a host that fell behind in a hurry to catch up before the end."""
+"""The last part of a burst runs in real time, so that a host that fell behind in a dry run catches up."""
 _BOX_JITTER_US = 20.0
 
 
 @dataclass
 class _RunningBurst:
-    """A burst that runs: what box and camera have said of it so far."""
+    """A running burst: data from box and camera so far."""
 
     burst: Burst
     grabber: FrameGrabber
     arm_before: ArmState
     arm_after: ArmState | None = None
-    """Measured after the last frame; None while it runs, and where the arm did not stand still."""
+    """Measured after the last frame; None while the burst runs, and if the arm was not still."""
     log: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, STEP_RECORD_DTYPE))
     judged: Match | None = None
     proven: set[int] = field(default_factory=set)
-    """Frames that the recorder has been told of."""
+    """Frames already passed to the recorder."""
 
 
 class BurstRunner:
-    """Fires bursts at an arm that stands. `tell(burst, step)` is called as it goes."""
+    """Fires bursts while the arm is at rest. `tell(burst, step)` is called during a burst."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class BurstRunner:
         self._by_host = HostBurst(cell, recorder, arm, tell, wait_while_paused, self._note)
         self._buffer_memory_bytes = memory_for_buffers()
         self._buffers = 0
-        """Never fewer than the burst before had: a ring that changes its size is memory to be touched anew."""
+        """Buffers of the previous burst; never reduced, because a new size means newly allocated memory."""
         self.times_s: list[float] = []
         """From start to last proof of each burst, on the rig's clock."""
 
@@ -89,14 +89,14 @@ class BurstRunner:
         return Exposure(burst.timing.exposure_us, self._gain_db, burst.hardware)
 
     def prepare(self, burst: Burst) -> None:
-        """Bring into the box what can be brought while the arm is on its way."""
+        """Upload the burst's table while the arm is moving."""
         if burst.hardware:
             table_box(self._cell.ledbox).load(burst.table)
 
     def fire(self, burst: Burst, following: Burst | None) -> Verdict:
-        """Run one burst and prove its frames; whatever happens, note what light was given and what was seen.
+        """Run one burst and prove its frames; dose and figures are recorded even if this raises.
 
-        The table of the burst that is `following` is brought into the box meanwhile. Raises ArmMovedError.
+        The table of the `following` burst is uploaded meanwhile. Raises ArmMovedError.
         """
         frame_format = self._cell.camera.configure(self.exposure(burst))
         if not burst.hardware:
@@ -148,7 +148,7 @@ class BurstRunner:
         return Verdict(running.judged, [shot for i in np.flatnonzero(dark) if (shot := burst.shots[i])])
 
     def _follow(self, running: _RunningBurst) -> None:
-        """Read log and frames until the burst is over, proving as it goes."""
+        """Read log and frames until the burst is over, and prove frames meanwhile."""
         box, clock, burst, grabber = table_box(self._cell.ledbox), self._cell.clock, running.burst, running.grabber
         readout_s = 1.0 / self._max_frames_per_s + burst.timing.exposure_us * 1e-6
         step_s = burst.timing.period_us * 1e-6
@@ -159,7 +159,8 @@ class BurstRunner:
         taken, confirmed, heard_ns = 0, 0, 0
         while True:
             if (news_ns := self._arm.heard_at_rest()) > heard_ns:
-                heard_ns, confirmed = news_ns, taken  # what had come by the last round was taken at rest
+                # frames that had arrived in the last round were taken at rest
+                heard_ns, confirmed = news_ns, taken
             taken = len(grabber)  # before the log is read: the proof needs frames that are older than the log
             steps = box.poll_log()
             if len(steps):
@@ -170,7 +171,7 @@ class BurstRunner:
                 edges = box.edges()
             complete = last_frames is not None and (taken >= edges or last_frames.expired)
             if complete:
-                clock.sleep(readout_s)  # a surplus frame may be on its way still
+                clock.sleep(readout_s)  # a surplus frame may still be in transfer
                 taken = confirmed = len(grabber)
                 running.arm_after = self._arm.await_news()
             if complete or (confirmed, len(running.log)) != judged_at:
@@ -203,7 +204,7 @@ class BurstRunner:
         )
 
     def _prove(self, running: _RunningBurst, confirmed: int, *, complete: bool) -> None:
-        """Hand newly proven frames to the recorder, of the first `confirmed`, once their bytes are written."""
+        """Pass newly proven frames among the first `confirmed` to the recorder, once their bytes are written."""
         judged, grabber, log = running.judged, running.grabber, running.log
         assert judged is not None
         for frame in np.flatnonzero(judged.step_of_frame != UNLABELLED).tolist():
@@ -217,7 +218,7 @@ class BurstRunner:
                 running.proven.add(frame)
 
     def _end(self, running: _RunningBurst, camera: CameraStatistics | None) -> None:
-        """Note light and figures, give back what is not wanted, make the rest last."""
+        """Record dose and figures, release unproven frames, commit the proven ones."""
         log, grabber = running.log, running.grabber
         grabber.stop()
         for frame in range(grabber.count):
@@ -262,7 +263,7 @@ class BurstRunner:
 
 
 def _hottest_c(log: NDArray[np.void]) -> float | None:
-    """The highest temperature that a log tells; None if it tells none."""
+    """The highest temperature in a log; None if it has none."""
     known = log["board_temperature_c"][np.isfinite(log["board_temperature_c"])]
     return float(known.max()) if len(known) else None
 

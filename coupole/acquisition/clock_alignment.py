@@ -1,6 +1,6 @@
 """Alignments of the camera's clock with the light box's clock: which step each frame falls on under each of them.
 
-The compiled kernels of `coupole.acquisition.frame_matching`, whose text has the fault model, the vocabulary and
+The compiled kernels of `coupole.acquisition.frame_matching`, whose docstring has the fault model, the terms and
 the proof. Times are int64 nanoseconds, frames counted from the first frame and steps from the first step that sent
 an edge; `view` and `steps_out` are int64 [frames]: the row of a step, or one of the codes below.
 """
@@ -17,7 +17,7 @@ PENDING = -2
 UNDECIDABLE = -3
 """Two steps lie within the tolerance of one frame."""
 DOUBTFUL = -4
-"""The frame has to be left out, or may have to be, for the others to fit one line."""
+"""Leaving out the frame is necessary, or possible, to make the others fit one line."""
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""The light dose that a run really gives, reckoned from the box's log."""
+"""The light dose of a run, computed from the box's log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from coupole.preflight.job import Job
 
 
 class DoseMeter:
-    """Adds up lux hours at the job's points on the object; the worst of them counts."""
+    """Sums lux hours at the job's points on the object; the highest is the run's dose."""
 
     def __init__(self, job: Job) -> None:
         rig = job.cell.rig
@@ -24,11 +24,11 @@ class DoseMeter:
 
     @property
     def lux_h(self) -> float:
-        """At the point that got most."""
+        """At the point with the highest dose."""
         return float(self._given_lux_h.max())
 
     def add(self, burst: Burst, log: NDArray[np.void]) -> float:
-        """Add what a burst gave, of which `log` (STEP_RECORD_DTYPE [n]) tells; returns seconds of LED light."""
+        """Add the dose of a burst from its `log` (STEP_RECORD_DTYPE [n]); returns seconds of LED light."""
         lit = log[log["led"] != NO_LED]
         rows = [self._row_of_led[int(led)] for led in lit["led"]]
         self._given_lux_h += self._lux[:, rows] @ lit["on_us"] / 3.6e9

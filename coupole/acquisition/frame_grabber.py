@@ -1,4 +1,4 @@
-"""Takes frames from the armed camera and keeps them, on threads of its own, while the burst runs."""
+"""Takes frames from the armed camera and stores them, in separate threads, while the burst runs."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from coupole.storage.view_writer import WRITERS
 
 _TAKE_TIMEOUT_S = 0.05
 _STALL_S = 2.0
-"""A pause of disk or host that the camera's buffers bridge, where memory allows."""
+"""A stall of disk or host that the camera's buffers must cover, if memory allows."""
 _FEWEST_BUFFERS = 16
 _MEMORY_SHARE = 0.25
-"""Of the memory that is free when a run begins, for buffers."""
+"""Share of the free memory that may be used for buffers."""
 
 
 def memory_for_buffers() -> int:
-    """Bytes that a camera's buffers may take on this machine, as it is now."""
+    """Bytes that a camera's buffers may take, from the memory that is free now."""
     return int(_MEMORY_SHARE * os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
 
 
 def buffers_for(frames: int, frame_bytes: int, period_s: float, memory_bytes: int) -> int:
-    """How many buffers to arm a camera with, for a burst of so many frames: enough for a stall, within memory."""
+    """Number of camera buffers for a burst of so many frames: enough for a stall, within the memory limit."""
     return max(_FEWEST_BUFFERS, min(frames, math.ceil(_STALL_S / period_s), memory_bytes // frame_bytes))
 
 
 class FrameGrabber:
-    """From `start()` to `stop()`: every frame that the camera gives is put away and its buffer handed back.
+    """From `start()` to `stop()`: stores every frame of the camera and returns its buffer.
 
     `keep(frame)` runs on `writers` threads and returns the slot. Frames are listed in order of arrival.
     """
@@ -59,7 +59,7 @@ class FrameGrabber:
                     self._slots.append(self._pool.submit(self._put, frame))
                     self._timestamps_ns.append(frame.timestamp_ns)
                     self._frame_ids.append(frame.frame_id)
-        except BaseException as error:  # noqa: BLE001  handed to the thread that asks for frames
+        except BaseException as error:  # noqa: BLE001  raised again in the thread that asks for frames
             self._error = error
 
     def _put(self, frame: Frame) -> int:
@@ -98,7 +98,7 @@ class FrameGrabber:
         return self._slots[frame].result()
 
     def stop(self) -> None:
-        """Take no more; what was taken gets written. Never raises."""
+        """Take no more frames; those taken are still written. Never raises."""
         self._stopping.set()
         if self._thread.ident is not None:
             self._thread.join()

@@ -1,9 +1,9 @@
 """Which step fired which frame: proofs from the box's trigger times and the camera's timestamps.
 
-The box logs when each step sent its edge, on its own clock; the camera stamps each frame that reaches the host,
-on another clock. A *hypothesis* is one alignment of the two clocks: frame `a` was fired by step `i`. It assigns
-a step to every other frame, or none (*surplus*). Alignments that differ by whole periods assign the LED steps
-equally well and are distinguished by the coded dark marks (`coupole.plan.marks`).
+The box logs when each step sent its edge, on its own clock; the camera stamps each frame that reaches the host, on
+another clock. A *hypothesis* is one alignment of the two clocks: frame `a` was fired by step `i`. It assigns a
+step to every other frame, or none (*surplus*). Alignments that differ by whole periods fit the LED steps equally
+well and are distinguished by the coded dark marks (`coupole.plan.marks`).
 
 **Fault model.** Any number of frames may be missing (lost in transfer, trigger missed, at the start, at the
 end, anywhere). At most `max_surplus` frames of a burst were fired by something other than a step (a bounce, an
@@ -41,7 +41,7 @@ UNLABELLED = -1
 
 @dataclass(frozen=True)
 class FaultModel:
-    """What may go wrong in a burst without a label ever being wrong (see the module's text)."""
+    """The faults that may occur in a burst without a wrong label (see the module's docstring)."""
 
     jitter_us: float = 100.0
     drift_ppm: float = 100.0
@@ -111,7 +111,7 @@ def match(
     id_modulus : first and last frame id; after the last comes the first.
     complete : the burst is over and no frame is still in transfer.
 
-    A label is never wrong within the fault model of the module's text; where it could be, none is given and
+    Within the fault model of the module's docstring a label is never wrong; if it could be, none is given and
     `ambiguous` is set.
     """
     model = model or FaultModel()

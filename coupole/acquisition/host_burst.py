@@ -1,11 +1,11 @@
 """A burst that the host fires, light by light, with any box and any camera that takes a software trigger.
 
-**Proof.** A frame is a light's if it is the only one that was exposed, and it was taken wholly while that light
-shone. The camera is armed in the dark, the light is switched on, and when the box has confirmed it the camera is
-triggered; the light must shine still, without a break, when the frame has come. Of a box that keeps no log
-(`Burst.marks` is `plain`) that is known by the host's clock and the box's word alone, and an LED that does not go
-out would shine into every frame after its own. So dark frames stand as marks at both ends, and until both have
-been seen to be dark no frame of the burst is proven.
+**Proof.** A frame belongs to a light if it is the only frame that was exposed, and it was exposed entirely while
+that light was on. The camera is armed in the dark, the light is switched on, and after the box has confirmed it
+the camera is triggered; the light must still be on, without interruption, when the frame has arrived. For a box
+without a log (`Burst.marks` is `plain`) the only evidence is the host's clock and the box's confirmation, and an
+LED that cannot be switched off would light all later frames. So a burst begins and ends with dark frames as marks,
+and no frame of the burst is proven until both marks have been found dark.
 """
 
 from __future__ import annotations
@@ -33,27 +33,28 @@ from coupole.storage.step_fields import step_fields
 
 _ONE_SHOT_BUFFERS = 8
 _UNCOUNTED = -1
-"""A camera that does not count its exposures: no other frame came while the light shone, which must do."""
+"""A camera without an exposure counter: the proof rests on no other frame having arrived while the light was
+on."""
 DARK_QUANTILE, DARK_SHARE = 0.99, 0.02
-"""A mark is dark if this share of its pixels is less than this share of the camera's range above black. Noise
-stays far below it; of an LED that lights a hundredth of the picture, whatever reaches it shows in that light."""
+"""A mark is dark if this share of its pixels is less than this share of the camera's range above black. Noise is
+far below this; an LED that lights a hundredth of the picture is detected."""
 
 
 @dataclass(frozen=True)
 class _Taken:
-    """One light and what the camera made of it."""
+    """One light and the camera's frames under it."""
 
     frame: Frame | None
     record: StepRecord
     alone: bool
-    """The frame is the only one, and came while the light shone without a break."""
+    """The frame is the only one, and arrived while the light was on without interruption."""
     t_trigger_ns: int
-    """When the camera was triggered, on the box's clock, or on the host's where the box has none."""
+    """Time of the trigger, on the box's clock, or on the host's if the box has none."""
 
 
 @dataclass(frozen=True)
 class _Kept:
-    """A frame that stands in its slot until the burst's marks have been seen."""
+    """A stored frame that waits for the burst's marks."""
 
     slot: int
     shot: ShotId
@@ -61,7 +62,8 @@ class _Kept:
 
 
 class HostBurst:
-    """Fires bursts without `hardware`. `tell(burst, step)` is called as it goes, `note` writes a burst's line."""
+    """Fires bursts with software trigger. `tell(burst, step)` is called during a burst, `note` writes its journal
+    line."""
 
     def __init__(
         self,
@@ -76,7 +78,7 @@ class HostBurst:
         self._tell, self._wait_while_paused, self._note = tell, wait_while_paused, note
 
     def fire(self, burst: Burst, frame_format: FrameFormat) -> Verdict:
-        """Light after light; whatever happens, note what light was given. Raises ArmMovedError."""
+        """Fire one light after the other; the dose is recorded even if this raises. Raises ArmMovedError."""
         logs: list[NDArray[np.void]] = []
         dead: list[ShotId] = []
         kept: list[_Kept] = []
@@ -113,7 +115,7 @@ class HostBurst:
         return Verdict(replace(NOTHING_TO_MATCH, reason=reason), dead)
 
     def _keep(self, taken: _Taken, frame: Frame, burst: Burst, shot: ShotId | None) -> list[_Kept]:
-        """The frame, stored but not proven yet; nothing if it can prove nothing."""
+        """The frame, stored but not proven yet; None if it cannot be proven."""
         if shot is None or not taken.alone or taken.record.invalid_exposure:
             frame.release()
             return []
@@ -127,7 +129,7 @@ class HostBurst:
             self._recorder.prove(one.slot, one.shot, one.fields)
 
     def _fire_one(self, burst: Burst, index: int) -> _Taken:
-        """Light one step, trigger the camera, see the light end, and keep the burst's pace."""
+        """Light one step, trigger the camera, wait for the light's end, and keep the burst's period."""
         box, camera, clock = self._cell.ledbox, self._cell.camera, self._cell.clock
         step, timing = burst.table[index], burst.timing
         camera.arm(_ONE_SHOT_BUFFERS)
@@ -151,7 +153,7 @@ class HostBurst:
         return _Taken(frame, record, alone, t_trigger_ns)
 
     def _alone(self) -> bool:
-        """No exposure but one since the camera was armed."""
+        """True if the camera made exactly one exposure since it was armed."""
         exposed = self._cell.camera.statistics().exposed
         if exposed != _UNCOUNTED:
             return exposed == 1
@@ -162,7 +164,7 @@ class HostBurst:
 
 
 def too_bright(frame: Frame, frame_format: FrameFormat) -> str:
-    """Why a mark's frame is not dark; empty if it is, or if it holds no picture (in a rehearsal)."""
+    """Why a mark's frame is not dark; empty if it is dark, or has no picture (in a dry run)."""
     if not frame.rendered:
         return ""
     black_dn, white_dn = frame_format.black_dn, frame_format.white_dn
@@ -170,4 +172,4 @@ def too_bright(frame: Frame, frame_format: FrameFormat) -> str:
     bright_dn = float(np.quantile(frame.pixels, DARK_QUANTILE))
     if bright_dn < limit_dn:
         return ""
-    return f"a dark mark shows light ({bright_dn:.0f} DN, {limit_dn:.0f} at most): a lamp shines that should not"
+    return f"a dark mark shows light ({bright_dn:.0f} DN, {limit_dn:.0f} at most): a lamp is on that should be off"

@@ -1,4 +1,4 @@
-"""The live view of a cell: its camera under one light at a time, the arm held where it stands."""
+"""The live view of a cell: its camera under one light at a time; the arm does not move."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from coupole.viewing.live import Choice, FrameRate, Shown, Studio
 from coupole.viewing.raw_preview import Coding, figures
 
 _FRAME_S = 2.0
-"""How long after its exposure a frame may take to reach the host."""
+"""Longest time from the end of an exposure until the frame reaches the host."""
 _BUFFERS = 8
 
 
 class CellSource:
-    """A cell's camera, one light at a time; the arm is held where it stands."""
+    """A cell's camera under one light at a time; the arm does not move."""
 
     def __init__(
         self, cell: OpenedCell, rig: Rig, leds: LedTable, lux: Callable[[int], float], *, frames_per_s: float
@@ -83,7 +83,7 @@ class CellSource:
         return self._frame(timing, "Check the trigger cable.")
 
     def _by_host(self, led: int, timing: BurstTiming, period_us: int) -> Frame:
-        """The box lights the LED when it is told to, and the host triggers the camera."""
+        """The box switches the LED on command, and the host triggers the camera."""
         self._cell.ledbox.flash(led, timing.on_us)
         self._cell.clock.sleep(timing.trigger_delay_us * 1e-6)
         self._cell.camera.trigger()
@@ -112,7 +112,7 @@ class CellSource:
                 raise DeviceTimeout(
                     "led box",
                     expected=f"a step of {period_s:.3f} s to end within {deadline.seconds:.1f} s",
-                    happened="the box says that it is running still",
+                    happened="the box reports that it is still running",
                     remedy="Check the box.",
                 )
             self._cell.clock.sleep(0.01)

@@ -1,4 +1,4 @@
-"""Looks through the camera that keep nothing: exposure advice, and the live view."""
+"""Uses of the camera that store no frames: exposure advice and the live view."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def meter(
 ) -> exposure_advice.Advice:
     """Take a few pictures of each view under lights spread over the dome, keep none, and advise on exposure.
 
-    The light that this gives the object is entered in its ledger. Raises PreflightRefused, DeviceError,
-    Interrupted, and UnprovenError where pictures stay missing.
+    The light on the object is entered in its dose ledger. Raises PreflightRefused, DeviceError, Interrupted, and
+    UnprovenError if pictures remain missing.
     """
     cell_leds, base_from_support = job.cell.leds, job.cell.rig.support.base_from_support.matrix()
     few = exposure_advice.metering_plan(job.plan, cell_leds, leds_of_plan(job.plan, cell_leds, base_from_support))
@@ -66,7 +66,7 @@ def meter(
 def watch_cell(
     job_or_cell: Job | Cell, console: Console, choice: Choice, *, frames_per_s: float, port: int, confirm: bool
 ) -> None:
-    """Show a cell's camera until the operator says stop; the arm is held where it stands."""
+    """Show a cell's camera until the operator stops it; the arm does not move."""
     job = job_or_cell if isinstance(job_or_cell, Job) else None
     rig_cell = job_or_cell.cell if isinstance(job_or_cell, Job) else job_or_cell
     rig, leds = rig_cell.rig, rig_cell.leds
@@ -88,7 +88,7 @@ def watch_cell(
 
 
 def watch_run(folder: Path, console: Console, *, port: int) -> None:
-    """Show the newest proven frame of a run until the operator says stop."""
+    """Show the newest proven frame of a run until the operator stops it."""
     _show_live(RunSource(folder), Studio(Choice(None, 0)), console, port, longest_us=0)
 
 

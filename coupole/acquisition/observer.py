@@ -1,4 +1,4 @@
-"""How a run is watched and steered from outside."""
+"""Observation and control of a run from outside."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from coupole.viewing.progress import Progress
 
 
 class Observer(Protocol):
-    """Watches a run. Called on the sequencer's thread, so be brief."""
+    """Observes a run. Called in the sequencer's thread, so methods must return quickly."""
 
     def progress(self, progress: Progress) -> None:
-        """Something was proven, or time went by."""
+        """Frames were proven, or some time passed."""
         ...
 
     def note(self, message: str) -> None:
-        """Something that the operator should know."""
+        """A message for the operator."""
         ...
 
 
 class Unwatched:
-    """An `Observer` that says nothing."""
+    """An `Observer` that does nothing."""
 
     def progress(self, progress: Progress) -> None:
         """Nobody asks."""
@@ -33,7 +33,7 @@ class Unwatched:
 
 @dataclass
 class Control:
-    """How the operator reaches into a run: set from signal handlers and other threads."""
+    """The operator's stop and pause: set from signal handlers and other threads."""
 
     stop: threading.Event = field(default_factory=threading.Event)
     pause: threading.Event = field(default_factory=threading.Event)

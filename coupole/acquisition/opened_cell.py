@@ -1,4 +1,4 @@
-"""Opened devices of a rig, real or in a world, that are made safe on every way out."""
+"""Opened devices of a rig, real or simulated, that are made safe on every exit."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ _LONGEST_WATCHDOG_S = 60.0
 
 @dataclass
 class OpenedCell:
-    """Devices in use. `make_safe` and `close` never raise; what goes wrong there is in `trouble`."""
+    """Devices in use. `make_safe` and `close` never raise; their errors are in `trouble`."""
 
     clock: Clock
     ledbox: LedBox
     camera: Camera
     robot: Robot
     sensor: Sensor
-    """What frames look like: the rig's sensor, or its coarse twin in a dry run."""
+    """The frame format: the rig's sensor, or its reduced twin in a dry run."""
     simulated: bool
     world_endpoints: Mapping[str, Any] | None
     identities: dict[str, Identity]
     trouble: list[str] = field(default_factory=list)
 
     def make_safe(self) -> None:
-        """Lights off, arm still, camera disarmed; each is tried whatever happens to the others."""
+        """Lights off, arm stopped, camera disarmed; each is tried even if another fails."""
         for what, act in (
             ("lights off", self.ledbox.lights_off),
             ("arm stopped", self.robot.stop),
@@ -95,7 +95,7 @@ def _open_device(
 ) -> Any:
     driver, settings = device_for(rig, kind, dry_run=dry_run)
     if speed > 1.0 and "watchdog_s" in settings_class(driver).model_fields:
-        # The world's seconds pass faster than the host's: its watchdog must not bite a host that is on time.
+        # World time may run faster than the host's: the box's watchdog must not trip because of that.
         settings["watchdog_s"] = min(_LONGEST_WATCHDOG_S, settings.get("watchdog_s", 2.0) * speed)
     if endpoints is not None:
         known = settings_class(driver).model_fields

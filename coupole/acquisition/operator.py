@@ -1,4 +1,4 @@
-"""What all sessions at a cell share: the operator's signals and word, devices named as they open, the ledger."""
+"""Common parts of all sessions at a cell: signals, confirmation, identities of devices, the dose ledger."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from coupole.preflight.preflight import Report
 from coupole.viewing.terminal import ask
 
 UNLIMITED_BYTES = 2**62
-"""A rehearsal keeps nothing: the disk does not matter."""
+"""A dry run stores nothing, so the disk does not matter."""
 
 
 def refuse(found: Report) -> None:
@@ -34,7 +34,7 @@ def refuse(found: Report) -> None:
 
 @contextmanager
 def operator_at(control: Control) -> Iterator[None]:
-    """Ctrl-C and SIGTERM stop, SIGUSR1 pauses and goes on; as before when this ends."""
+    """Ctrl-C and SIGTERM stop, SIGUSR1 pauses or continues; the former handlers are restored at the end."""
 
     def stop(*_: Any) -> None:
         control.stop.set()
@@ -55,19 +55,19 @@ def operator_at(control: Control) -> Iterator[None]:
 
 
 def ask_to_begin(cell: Cell, *, confirm: bool) -> None:
-    """Nothing real moves or shines unasked."""
+    """Ask the operator before a real cell moves the arm or switches lights."""
     real = not in_world(cell.rig, dry_run=False)
     if real and confirm and not ask("Move the arm and light the object?"):
         raise Interrupted("not started: answer the question, or say `--yes`")
 
 
 def longest_exposure_us(rig: Rig) -> int:
-    """What the LEDs' longest on-time leaves for the exposure."""
+    """Longest exposure that the LEDs' longest on-time allows."""
     return rig.led_limits.on_us[1] - rig.led_limits.rise_us - EXPOSURE_MARGIN_US
 
 
 def enter_dose(job: Job, cell: OpenedCell, dose_lux_h: float, what_for: str) -> None:
-    """Light that a real cell gave an object goes into the object's ledger."""
+    """Enter the light of a real cell in the object's dose ledger."""
     if job.plan.object and not cell.simulated:
         ledger.add(job.cell.storage_folder, job.plan.object.id, run=what_for, dose_lux_h=dose_lux_h)
 

@@ -1,4 +1,4 @@
-"""Where a run's frames and events go: into a run folder, or nowhere but into figures (dry run)."""
+"""Recorders for a run's frames and events: into a run folder, or for a dry run into statistics only."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from coupole.viewing.progress import ViewExposure
 
 COMMIT_EVERY_S = 0.5
 SPARE_SLOTS = 32
-"""Slots beyond the planned ones: surplus frames stand there until their burst is judged."""
+"""Additional slots for surplus frames, until their burst has been evaluated."""
 
 
 class Recorder(Protocol):
-    """What the sequencer needs of it. `put` may come from several threads, all else from one."""
+    """The recorder that the sequencer needs. `put` may be called from several threads, all else from one."""
 
     def proven(self) -> set[ShotId]:
         """Shots proven so far, also in an earlier session of the run."""
@@ -42,14 +42,14 @@ class Recorder(Protocol):
         base_from_camera: Transform,
         collections: Collections,
     ) -> None:
-        """Frames of this view come next; may be called again when the pose was measured anew.
+        """The next frames are of this view; may be called again after a new measurement of the pose.
 
-        `collections` are arrays by name that stand beside the frames, by name of their group.
+        `collections` are arrays to be stored with the frames: by group name, then by array name.
         """
         ...
 
     def put(self, frame: Frame, exposure_us: int) -> int:
-        """Keep a frame that is not proven yet; returns its slot."""
+        """Store an unproven frame; returns its slot."""
         ...
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None: ...
@@ -61,7 +61,7 @@ class Recorder(Protocol):
         ...
 
     def commit(self, *, now: bool) -> None:
-        """Make what was proven and noted last; with `now=False` only if the last time was a while ago."""
+        """Write proven frames and events to disk; with `now=False` only if the last commit was some time ago."""
         ...
 
     def end_view(self) -> None: ...
@@ -100,7 +100,7 @@ class RunRecorder:
             own = {str(shot): slot for shot, slot in self._proven.items() if shot.view == view}
             if not path.exists():
                 if own:
-                    raise StorageError(f"{path}: the journal knows proven frames of it, but it is gone")
+                    raise StorageError(f"{path}: the journal lists proven frames of it, but the file is missing")
                 metadata = {**self._metadata, "title": view}
                 create(path, frames + SPARE_SLOTS, frame_format, metadata, collections, packed=self._packed)
             self._writer = ViewWriter(path, own)
@@ -123,7 +123,7 @@ class RunRecorder:
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         if shot in self._proven:
-            raise StorageError(f"{self._file}: {shot} is proven already in slot {self._proven[shot]}")
+            raise StorageError(f"{self._file}: {shot} is already proven in slot {self._proven[shot]}")
         frame_id = self._view.frame_id(slot)
         digest = self._view.prove(slot, str(shot), pose=self._pose, **fields)
         self._proven[shot] = slot
@@ -138,8 +138,8 @@ class RunRecorder:
         self._journal.write(event)
 
     def commit(self, *, now: bool) -> None:
-        """A disk may take seconds to sync, so this happens on another thread unless it must be `now`: while a
-        burst runs, nobody waits for the disk. What went wrong there is raised by the next call."""
+        """A disk may take seconds to sync, so this is done in another thread unless it must be `now`, and a
+        running burst does not wait for the disk. Errors of that thread are raised by the next call."""
         if self._committing is not None and (now or self._committing.done()):
             committing, self._committing = self._committing, None
             committing.result()
@@ -150,7 +150,7 @@ class RunRecorder:
             self._committing = self._committer.submit(self._commit, self._writer, self._journal.take())
 
     def _commit(self, writer: ViewWriter | None, lines: list[str]) -> None:
-        """Frames first, then the lines that speak of them."""
+        """Frames first, then the journal lines that refer to them."""
         if writer is not None:
             writer.sync()
         self._journal.append(lines)
@@ -164,12 +164,12 @@ class RunRecorder:
                 self._writer = None
 
     def close_quietly(self) -> None:
-        """Commit the last events if the disk still lets us; the error that ended the run matters more."""
+        """Commit the last events if possible; a failure here must not hide the error that ended the run."""
         with contextlib.suppress(StorageError):
             self.commit(now=True)
 
     def close(self) -> None:
-        """Give everything back; what was not committed is not lost, it is unproven."""
+        """Release everything; frames that were not committed remain unproven."""
         self._committer.shutdown(wait=True)
         if self._writer is not None:
             self._writer.close()
@@ -178,7 +178,7 @@ class RunRecorder:
 
 
 class DryRecorder:
-    """Into figures: counts what is proven, judges the exposure of frames that hold a picture."""
+    """For a dry run: counts proven frames, evaluates the exposure of frames with a picture."""
 
     def __init__(self) -> None:
         self._proven: set[ShotId] = set()
@@ -230,7 +230,7 @@ class DryRecorder:
         self.events.append(event)
 
     def commit(self, *, now: bool) -> None:
-        """Nothing lasts in a dry run."""
+        """A dry run writes nothing."""
 
     def end_view(self) -> None:
         self._slots.clear()

@@ -1,7 +1,7 @@
-"""Runs a schedule: moves the arm, fires bursts, shoots again what is missing.
+"""Runs a schedule: moves the arm, fires bursts, takes unproven shots again.
 
-Only this module and its two hands, `arm` and `firing`, command devices. They keep to one order at all times:
-arm at rest and measured, camera armed, then lights; and backwards. On the way out, whatever the reason,
+Only this module, the arm supervisor and the burst runner command devices, always in the same order: arm at rest
+and measured, camera armed, lights; and the reverse order at the end. On every exit
 `coupole.acquisition.opened_cell` makes the devices safe.
 """
 
@@ -82,7 +82,8 @@ class Sequencer:
     # -- the run ------------------------------------------------------------------------------------------
 
     def acquire(self) -> Outcome:
-        """Do all that is not proven yet. Raises UnprovenError if shots stay missing, or a CoupoleError."""
+        """Take all shots that are not proven yet. Raises UnprovenError if shots remain missing, or a
+        CoupoleError."""
         schedule = self._job.schedule
         left = {n: found for n, bursts in enumerate(schedule.bursts) if (found := self._left_of(bursts))}
         numbers = list(left)
@@ -107,7 +108,7 @@ class Sequencer:
         return self.outcome
 
     def _left_of(self, bursts: Sequence[Burst]) -> list[Burst]:
-        """Bursts of which something is not proven yet, cut down to that."""
+        """Bursts with unproven shots, reduced to these."""
         done = self._recorder.proven()
         left = []
         for burst in bursts:
@@ -163,9 +164,9 @@ class Sequencer:
             )
 
     def _acquire_burst(self, burst: Burst, following: Burst | None, begin: Callable[[SettledPose], None]) -> None:
-        """Fire a burst, and what it left unproven again, up to the plan's limit.
+        """Fire a burst and then its unproven shots again, up to the plan's limit.
 
-        An arm that was pushed is brought back, and frames taken from there on `begin` anew.
+        An arm that was pushed is moved back, and `begin` is called again for the frames after that.
         """
         todo = burst
         for attempt in range(self._job.plan.reshoot_limit + 1):

@@ -1,4 +1,4 @@
-"""One `coupole acquire` from reading the plan to the last journal line, for real or as a rehearsal."""
+"""One `coupole acquire` from reading the plan to the last journal line, or one dry run."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from coupole.viewing.progress import Outcome
 from coupole.viewing.terminal import RunObserver, ask, show_dry_run, show_preflight
 
 _ASKED_BOARDS = 12
-"""So many boards, all over the dome, are asked for their temperature."""
+"""Number of boards, spread over the dome, whose temperature is read."""
 
 
 # -- the run ----------------------------------------------------------------------------------------------
@@ -105,7 +105,9 @@ def _acquire_into(
             recorder.note(begun(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledged))
             _acquire(job, cell, run, recorder, console, found=found)
         except CoupoleError:
-            with contextlib.suppress(StorageError):  # what ended the run matters more than its report
+            with contextlib.suppress(
+                StorageError
+            ):  # An error in the report must not hide the error that ended the run.
                 report.write(run)
             raise
         else:
@@ -115,9 +117,9 @@ def _acquire_into(
 
 
 def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float | None:
-    """What only devices can tell of the records in force: whose camera they are of, and how warm it may be.
+    """Check the records in force against the devices: the camera's identity and the cell's temperature.
 
-    Returns the temperature of the coolest LED board, which is nearest to the room's; None if the box knows none.
+    Returns the temperature of the coolest LED board, which is nearest to the room's; None if the box reports none.
     """
     boards = np.unique(job.cell.leds.boards)
     some = boards[np.unique(np.linspace(0, len(boards) - 1, _ASKED_BOARDS).astype(int))]
@@ -129,14 +131,14 @@ def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float | None:
 
 
 def _camera_name(cell: OpenedCell) -> str:
-    """As records of its calibration call it."""
+    """The camera's name in calibration records."""
     return " ".join((cell.identities["camera"].model, cell.identities["camera"].serial))
 
 
 def _ask_whether_clear(fault: str) -> str:
-    """After a fault of the arm a person must say that it may move again; `--yes` does not say it.
+    """After a fault of the arm a person must confirm that it may move again; `--yes` is no confirmation.
 
-    Returns the fault that was acknowledged, empty if there was none. Raises DeviceFault without that word.
+    Returns the acknowledged fault, empty if there was none. Raises DeviceFault without confirmation.
     """
     if not fault:
         return ""
@@ -146,14 +148,14 @@ def _ask_whether_clear(fault: str) -> str:
         raise DeviceFault(
             "robot",
             expected="the word of a person who has been to the cell",
-            happened="nobody said that the arm may move again",
-            remedy="See to the cell, then resume from a terminal and answer the question (`--yes` does not).",
+            happened="there was no confirmation that the arm may move again",
+            remedy="Check the cell, then resume from a terminal and answer the question (`--yes` does not).",
         )
     return fault
 
 
 def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
-    """What stands in run.json beside the inputs."""
+    """The contents of run.json in addition to the inputs."""
     return {
         "simulated": cell.simulated,
         "proof": _proof(job),
@@ -169,7 +171,7 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
 
 
 def _labels(schedule: Schedule) -> list[str] | dict[str, list[str]]:
-    """One list where all views have the same frames; else one for each view, by its name."""
+    """One list if all views have the same frames; otherwise one for each view, by its name."""
     if len(set(schedule.labels)) == 1:
         return list(map(str, schedule.labels[0]))
     return {
@@ -178,7 +180,7 @@ def _labels(schedule: Schedule) -> list[str] | dict[str, list[str]]:
 
 
 def _proof(job: Job) -> str:
-    """What the identity of the run's frames rests on."""
+    """The kind of proof of the run's frames."""
     return PROOF_BY[job.schedule.bursts[0][0].marks]
 
 
@@ -267,7 +269,7 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> No
 
 
 def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any]) -> None:
-    """Run a whole plan on the rig's twin, faster than life, and say what preflight could not know."""
+    """Run a whole plan on the rig's twin, faster than real time, and report what preflight cannot compute."""
     job = without_hidden(job)
     job, preflight = check_job(job, StorageFacts(UNLIMITED_BYTES))
     show_preflight(console, preflight, name=job.plan.name, rig=f"the twin of {job.cell.rig.name}")

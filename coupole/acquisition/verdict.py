@@ -1,4 +1,4 @@
-"""What is said of one burst after its end, and what that rests on."""
+"""The result of one burst after its end, and its kind of proof."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ PROOF_BY: dict[Marks, str] = {
     "none": "one light, one exposure, one frame; box log",
     "plain": "one light, one exposure, one frame; host's clock",
 }
-"""What a run says of its proof, by the marks of its bursts; from the strongest to the weakest
+"""The kind of proof that a run states, by the marks of its bursts; from the strongest to the weakest
 (docs/reference/run-folder.md)."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Of one burst, after its end."""
+    """The result of one burst after its end."""
 
     match: Match
     dead: list[ShotId]

@@ -1,6 +1,6 @@
 """An LED box controlled by lines of text only, such as a dome built with a microcontroller.
 
-Each command is a line made from a template in the rig; the box answers each with one line, or never answers. Such
+Each command is a line made from a template in the rig; the box answers each with one line. Such
 a box has no table, log, clock or watchdog. Therefore this driver limits the light: a thread ends each flash in
 time, whatever the caller does, and all LEDs are switched off at opening, at closing and after any failure.
 """
@@ -59,14 +59,13 @@ class Settings(BaseModel):
     all_off: str = "ALL OFF"
     identify: str | None = None
     """Asks the box for its identity, answered in one line; null for a box without such a command."""
-    expected_reply: str | None = "OK"
-    """The whole line by which the box confirms a command; null for a box that never answers."""
+    expected_reply: str = Field(default="OK", min_length=1)
+    """The whole line by which the box confirms a command. A box that never answers is not supported: nothing would
+    prove which LED shone during an exposure."""
     line_ending: Literal["lf", "crlf", "cr"] = "lf"
     """Ending of commands. A reply ends in LF, or in CR if commands do."""
     settle_ms: float = Field(default=2000, ge=0, le=60_000)
     """From opening the port until the box accepts commands: many microcontrollers reset when it is opened."""
-    obeys_ms: float = Field(default=50, ge=0, le=10_000)
-    """Time after which a box that never answers is taken to have executed a command."""
     name: str = "led box"
 
     @model_validator(mode="after")
@@ -144,17 +143,15 @@ class TextLineBox:
     def self_test(self) -> Mapping[str, str]:
         """Number of LEDs and kind of confirmation; raises if the box does not execute a command."""
         self.lights_off()
-        reply = self._settings.expected_reply
-        return {"LEDs": str(self.led_count), "confirms": "nothing" if reply is None else f"with `{reply}`"}
+        return {"LEDs": str(self.led_count), "confirms": f"with `{self._settings.expected_reply}`"}
 
     def flash(self, led: int, on_us: int) -> None:
-        """Switch one LED on. A box that never answers is taken to have done so after `obeys_ms`."""
+        """Switch one LED on; returns when the box has confirmed it."""
         if led != NO_LED and not 0 <= led < self.led_count:
             self._refuse(
                 f"an LED from 0 to {self.led_count - 1}", f"{led} was asked for", "Correct the LED table."
             )
-        silent_s = self._settings.obeys_ms * 1e-3 if self._settings.expected_reply is None else 0.0
-        longest_s = on_us * 1e-6 + _CONFIRMS_S + silent_s
+        longest_s = on_us * 1e-6 + _CONFIRMS_S
         on_ms = math.ceil(_BOX_PATIENCE * longest_s * 1e3)  # by then the driver has ended it, or the host is gone
         with self._lock:
             try:
@@ -264,7 +261,7 @@ class TextLineBox:
         """Identity from a reply `vendor,model,serial,firmware`; any other reply is taken as the model."""
         if self._settings.identify is None:
             return Identity("unknown", "box of text lines", "unknown", "unknown")
-        text = self._exchange(self._settings.identify, answers=True)
+        text = self._exchange(self._settings.identify)
         fields = [one.strip() for one in text.split(",")]
         vendor, model, serial, firmware = fields if len(fields) == 4 else ("unknown", text, "unknown", "unknown")
         return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
@@ -272,22 +269,22 @@ class TextLineBox:
     def _command(self, line: str) -> None:
         """Have a command executed. Raises DeviceRefused for any reply but the expected one."""
         expected = self._settings.expected_reply
-        reply = self._exchange(line, answers=expected is not None)
-        if expected is not None and reply != expected:
+        reply = self._exchange(line)
+        if reply != expected:
             self._in_step = False
             self._refuse(
                 f"`{expected}` in answer to `{line}`", f"it said `{reply}`", "Check the box's reply and the rig."
             )
 
-    def _exchange(self, line: str, *, answers: bool) -> str:
-        """Send a line and return the box's answer without its ending; empty if it never answers."""
+    def _exchange(self, line: str) -> str:
+        """Send a line and return the box's answer without its ending."""
         settings, link = self._settings, self._link
         data = (line + _ENDINGS[settings.line_ending]).encode("ascii")
         seconds = _REPLY_MARGIN_S + (len(data) + _SHORT_REPLY_BYTES) / link.bytes_per_s
         try:
             if not self._in_step:
                 link.clear()
-            elif (unasked := link.waiting().strip()) and settings.expected_reply is not None:
+            elif unasked := link.waiting().strip():
                 self._in_step = False
                 self._refuse(
                     f"silence before `{line}`",
@@ -297,9 +294,7 @@ class TextLineBox:
             self._in_step = False
             deadline = Deadline(self._clock, seconds)
             link.write(data, deadline)
-            if not answers:
-                self._clock.sleep(len(data) / link.bytes_per_s + settings.obeys_ms * 1e-3)
-            reply = read_reply(lambda: link.read(deadline), settings.line_ending) if answers else ""
+            reply = read_reply(lambda: link.read(deadline), settings.line_ending)
             self._in_step = True
         except TimeoutError as error:
             raise DeviceTimeout(

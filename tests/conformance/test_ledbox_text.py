@@ -165,13 +165,6 @@ def test_past_its_time_a_light_is_not_believed_though_nothing_has_ended_it(plain
             assert not box.lit()
 
 
-def test_a_silent_box_that_ends_lights_itself_does_not_end_them_before_they_are_believed(tmp_path: Path) -> None:
-    settings = {"expected_reply": None, "identify": None, "obeys_ms": 4000, "on": "LED {led} ON {on_ms}"}
-    with text_world(tmp_path, settings, answers=False) as world, world.opener() as box:
-        box.flash(5, 100_000)
-        assert world.lights[0][2] - world.lights[0][1] > 4_100_000_000
-
-
 def test_a_light_that_could_not_be_ended_in_time_is_not_hidden(plain: LedBoxWorld) -> None:
     with plain.opener() as box:
         box.flash(5, FLASH_US)
@@ -225,16 +218,6 @@ def test_a_stuck_led_shines_on_though_the_box_confirms_that_it_is_off(plain: Led
         box.flash(5, FLASH_US)
         box.end_flash()
         assert plain.shining() == [5]
-
-
-def test_a_box_that_says_nothing_is_given_time_to_obey(tmp_path: Path) -> None:
-    settings = {"expected_reply": None, "identify": None, "obeys_ms": 1000}
-    with text_world(tmp_path, settings, answers=False) as world, world.opener() as box:
-        box.flash(5, LONG_US)
-        assert world.shining() == [5]
-        box.end_flash()
-        assert world.shining() == []
-        assert box.identify().model == "box of text lines"
 
 
 def test_a_port_that_does_not_exist_is_a_device_lost(plain: LedBoxWorld) -> None:

@@ -164,5 +164,5 @@ def test_an_arm_that_leaves_its_way_is_stopped(joining: CellFolder) -> None:
             ended = joining.acquire()
         cells.wait_until(lambda: cells.safe(world), "a safe cell")
     assert_told(joining, ended, "robot")
-    assert "way that was found clear" in ended.document["error"]
+    assert "path that was checked" in ended.document["error"]
     assert cells.events(joining.run_folder, "burst") == []

@@ -82,7 +82,7 @@ def test_a_view_by_the_joints_of_a_ur_is_rendered_from_where_its_flange_is(tmp_p
         cell.moved_by_ur("ur10e")
         cell.write(views=[TOP])
         job = read_job(cell.plan)
-        (visit,) = job.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg).visits
+        (visit,) = job.motion.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg).visits
         assert visit is not None
         if by_joints:
             cell.write(views=[{"kind": "joints", "name": "top", "joints_deg": visit.joints_deg.tolist()}])

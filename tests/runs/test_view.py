@@ -131,7 +131,7 @@ def test_a_ur_is_drawn_with_its_own_links(cell: CellFolder) -> None:
     cell.world_settings["speed"] = 1.0
     cell.write(views=[TOP])
     job = read_job(cell.plan)
-    itinerary = job.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg)
+    itinerary = job.motion.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg)
     scene = scene_of(job, itinerary, job.motion.bodies, [])
     stop = scene.stops[0]
     assert stop.joints_deg is not None

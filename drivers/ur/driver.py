@@ -110,7 +110,7 @@ class UrRobot:
         config = {field.name: getattr(settings, field.name) for field in fields(Config)}
         self._process = UrProcess(Config(**config))
         try:
-            self._last = self._process.first_word(settings.connect_timeout_s)
+            self._last = self._process.first_state(settings.connect_timeout_s)
             raise_fault(self._last)
             self._check_model(self._last.model)
         except BaseException:

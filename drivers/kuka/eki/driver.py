@@ -313,8 +313,8 @@ class KukaEki:
         if status.pose is None:
             return "the controller reports none"
         x, y, z, *abc_deg = status.pose
-        told = transform((x, y, z), (abc_deg[0], abc_deg[1], abc_deg[2]))
-        apart = np.abs(told - forward(self.arm, status.joints_deg))
+        reported = transform((x, y, z), (abc_deg[0], abc_deg[1], abc_deg[2]))
+        apart = np.abs(reported - forward(self.arm, status.joints_deg))
         if apart[:3, 3].max() > _SAME_POSE_MM or apart[:3, :3].max() > _SAME_ROTATION:
             raise DeviceError(
                 "robot",

@@ -169,7 +169,7 @@ class KukaRsi:
                 raise DeviceTimeout(
                     "robot",
                     expected=f"RSI packets at {self.settings.listen}",
-                    happened=_why_no_session(state),
+                    happened=_no_session_reason(state),
                     remedy="Restart the RSI program on the controller, and check its IP_NUMBER and PORT",
                 )
             time.sleep(_POLL_S)
@@ -240,7 +240,7 @@ class KukaRsi:
         )
 
 
-def _why_no_session(state: shared_state.State) -> str:
+def _no_session_reason(state: shared_state.State) -> str:
     if state.refused:
         return f"{state.refused} packets belong to a running RSI session that another program may have begun"
     if state.malformed:

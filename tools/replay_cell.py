@@ -1,8 +1,8 @@
 """The cell in python-fcl: an independent check of motions that Coupole's own checker has accepted.
 
 Nothing of `coupole.kinematics`, `motion.collisions` or `motion.path_planner` is used, except the sizes of the
-arm's capsules if its meshes are not available: joint chains are from the data sheets, profiles from ruckig, bodies are
-triangle meshes and fcl's own shapes.
+arm's capsules if its meshes are not available: joint chains are from the data sheets, profiles from ruckig,
+bodies are triangle meshes and fcl's own shapes.
 """
 
 from __future__ import annotations

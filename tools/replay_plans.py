@@ -4,8 +4,8 @@
 
 `--meshes` is a folder with the links' meshes (base_link.stl, link_1.stl to link_6.stl); without it the replay uses
 meshes of the arm's capsules. With `--check-meshes` preflight uses those meshes too. Prints one JSON line: number
-of accepted plans, reasons for the refusal of the others, number of replayed postures, and collisions. Exits with 1 if
-there were any.
+of accepted plans, reasons for the refusal of the others, number of replayed postures, and collisions. Exits with
+1 if there were any.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from coupole.devices import ArmState, Clock, Identity
 from coupole.errors import DeviceError, DeviceLost, DeviceTimeout
 from coupole.geometry import transform
 from coupole.kinematics import Arm, forward, move_duration_s, slowed
-from drivers.arm_motion import News, checked_target, farthest_stop_deg, longest_stop_s, overtaken, refused
+from drivers.arm_motion import MessageTime, checked_target, farthest_stop_deg, longest_stop_s, overtaken, refused
 from drivers.kuka.eki import wire
 from drivers.kuka.eki.link import Link, connect
 from drivers.kuka.eki.watch import Tolerances, Watch
@@ -102,7 +102,7 @@ class KukaEki:
         self.settings = settings
         self.arm = settings.arm()
         self._clock = clock
-        self._news = News(clock)
+        self._message_time = MessageTime(clock)
         self._number = 0
         self._motion_s = 0.0
         self._watch = Watch(
@@ -188,7 +188,7 @@ class KukaEki:
             return ArmState(
                 joints_deg=status.joints_deg,
                 base_from_flange=forward(self.arm, status.joints_deg),
-                t_ns=self._news.since_ns(self._watch.statuses),
+                t_ns=self._message_time.since_ns(self._watch.statuses),
                 moving=self._watch.moving,
                 fault=fault.text if fault else "",
             )

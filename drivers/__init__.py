@@ -1,1 +1,1 @@
-"""Drivers of real devices. They import only `coupole.devices`, `.errors`, `.geometry` and `.kinematics`."""
+"""Drivers of real devices. Of `coupole` they import the contracts only: devices, errors, geometry, kinematics."""

@@ -99,7 +99,7 @@ def wait_for(
         pause()
 
 
-class News:
+class MessageTime:
     """Rig time of the controller's latest message; it stays as it is while no message comes."""
 
     def __init__(self, clock: Clock) -> None:

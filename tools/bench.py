@@ -1,8 +1,8 @@
-"""Figures with their peers, one JSON line each: `python tools/bench.py [check|sequencing|store|matching|rsi ...]`.
+"""Benchmarks against peers, one JSON line each: `python tools/bench.py [check|sequencing|store|matching|rsi ...]`.
 
-Each line has `name`, `value`, `unit`, `peer` (what ran beside it in the same run, or the limit it is held
-against) and `ratio` (ours over the peer's; above 1 is better). Medians of interleaved runs: these figures are
-ratios because machines are noisy.
+Each line has `name`, `value`, `unit`, `peer` (a program measured in the same run, or the limit) and `ratio`
+(Coupole's figure over the peer's; above 1 is better). Values are medians of interleaved rounds; ratios are given
+because absolute times vary from machine to machine and from run to run.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def cpu_s() -> float:
 
 
 def bench_check(rounds: int) -> None:
-    """`coupole check --no-paths` of 30 views x 1080 LEDs x 3 exposures, against the 3 s it may take and against
-    a Python that only imports numpy, pydantic and h5py."""
+    """`coupole check --no-paths` of 30 views x 1080 LEDs x 3 exposures, against the limit of 3 s and against a
+    Python process that only imports numpy, pydantic and h5py."""
     command = [
         sys.executable,
         "-m",
@@ -66,7 +66,7 @@ def bench_check(rounds: int) -> None:
 
 def bench_sequencing(rounds: int) -> None:
     """A burst of 1080 LEDs at 100 frames/s, from INITiate to the last proven frame, against the table's own
-    time; on the world's clock and on the machine's."""
+    duration; on the world's clock and on the machine's."""
     from coupole.acquisition.opened_cell import open_cell
     from coupole.acquisition.recorder import RunRecorder
     from coupole.acquisition.sequencer import Sequencer
@@ -106,7 +106,7 @@ def bench_sequencing(rounds: int) -> None:
 
 
 def bench_store(rounds: int) -> None:
-    """Full-size frames to disk: the view writer and others, and the whole stream of a run."""
+    """Full-size frames to disk: the view writer and others, and the whole data path of a run."""
     from bench_store import figures
 
     for figure in figures(ROOT, rounds):
@@ -118,7 +118,7 @@ def bench_store(rounds: int) -> None:
 
 def bench_matching(rounds: int) -> None:
     """Proof of a whole burst of 1092 frames, 2 % of them lost, against numpy's nearest-neighbour pairing, which
-    is told the clocks' offset and proves nothing; and against the 10 ms that a frame takes at 100 frames/s."""
+    is given the clocks' offset and proves nothing; and against the 10 ms per frame at 100 frames/s."""
     from coupole.acquisition.frame_matching import compile_now, match
     from coupole.devices import STEP_RECORD_DTYPE
     from coupole.preflight.job import read_job
@@ -152,7 +152,7 @@ def bench_matching(rounds: int) -> None:
     line("matching_per_frame", value, "us", "numpy_nearest_pairing", peer / value, peer_value=round(peer, 4))
 
 
-# -- robot and collisions: in files of their own beside this one ---------------------------------------------
+# -- robot and collisions: in separate files ------------------------------------------------------------------
 
 
 def bench_rsi(rounds: int) -> None:
@@ -172,7 +172,7 @@ def bench_collisions(rounds: int) -> None:
 
 
 def bench_archive(rounds: int) -> None:
-    """Ratio and speed of archiving a view, reading from it, against plain h5py and the file before."""
+    """Compression ratio and speed of archiving a view, and reading from it, against h5py and the file before."""
     from bench_archive import figures
 
     for figure in figures(ROOT, rounds):
@@ -180,7 +180,7 @@ def bench_archive(rounds: int) -> None:
 
 
 def bench_codecs(rounds: int) -> None:
-    """Packing, compression and Exif beside libraries that offer the same: same output, and how fast."""
+    """Packing, compression and Exif against libraries with the same functions: equality of output, and speed."""
     from bench_codecs import figures
 
     for figure in figures(ROOT, rounds):
@@ -230,7 +230,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"which of {', '.join(BENCHES)}; all if none")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", action="store_true", help="the lines are JSON anyway")
+    parser.add_argument("--json", action="store_true", help="accepted for uniformity: the lines are always JSON")
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(BENCHES):
         parser.error(f"expected some of {', '.join(BENCHES)}; found {', '.join(sorted(unknown))}")

@@ -1,8 +1,8 @@
-"""What archiving a view costs and brings: ratio, speed, and reading from the archive against the file before.
+"""Archiving a view: compression ratio, speed, and reading from the archive against the file before.
 
-Full-size frames of a dim object on a dark ground, with the shot and read noise of the simulated sensor, drawn anew
-for each of eight frames that then repeat. Speed is taken of a view of 40 frames, reading of one with as many of
-1080 as the disk has room for, cold: the page cache is emptied of the file before.
+Full-size frames of a dim object on a dark ground, with the shot and read noise of the simulated sensor; eight
+different frames, repeated. Speed is measured on a view of 40 frames, reading on one with up to 1080 frames, as the
+disk has room, with the page cache emptied of the file.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ FRAME_BYTES = HEIGHT_PX * WIDTH_PX * 2
 FRAMES, FEW_FRAMES, DISTINCT = 1080, 40, 8
 _DATA = "entry/instrument/detector/data"
 TILE = np.s_[1100:1356, 1900:2156]
-"""A window of 256 x 256 that is in line with no tile's edge."""
+"""A window of 256 x 256 that is not aligned with any tile."""
 
 
 def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
-    """For each codec ratio, speed, and two readings; peers: plain h5py, and the file before."""
+    """For each codec: ratio, speed, and two readings; peers: plain h5py, and the file before."""
     import hdf5plugin  # noqa: F401  # registers the filter
 
     from coupole.storage.bitshuffle import CODECS
@@ -55,7 +55,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
 def _speeds(
     path: Path, pictures: NDArray[np.uint16], name: str, codec: Any, rounds: int
 ) -> Iterator[dict[str, Any]]:
-    """Ratio and speed of a small view, time and again, with plain h5py in between."""
+    """Ratio and speed for a small view, repeated, interleaved with plain h5py."""
     proven, kept = _write_view(path, pictures, FEW_FRAMES), path.parent / "kept_small"
     compress, read_back, plain, cpu_ms = [], [], [], []
     for _ in range(rounds):
@@ -95,7 +95,7 @@ def _cpu_s() -> float:
 
 
 def pictures(count: int) -> NDArray[np.uint16]:
-    """Frames [count, H, W] in page-aligned memory: photons and 13 electrons of read noise at 3.35 electrons a
+    """Frames [count, H, W] in page-aligned memory: photons and 13 electrons of read noise at 3.35 electrons per
     DN, 64 DN black; the light comes from another side in each."""
     memory = mmap.mmap(-1, count * FRAME_BYTES)
     drawn = np.frombuffer(memory, np.uint16).reshape(count, HEIGHT_PX, WIDTH_PX)
@@ -115,7 +115,7 @@ def pictures(count: int) -> NDArray[np.uint16]:
 
 
 def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[Any]:
-    """A view whose frames are all proven; returns what its journal would say of them."""
+    """Write a view whose frames are all proven; returns the corresponding entries of its journal."""
     from coupole.devices import FrameFormat
     from coupole.storage.frame_file_creation import create
     from coupole.storage.journal_events import FrameProven
@@ -134,8 +134,8 @@ def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[A
 
 
 def _plain_h5py_mb_s(path: Path, before: Path, codec: Any) -> float:
-    """Speed of plain h5py: one frame after the other read and assigned to a dataset of the same chunks and filter,
-    then synced. Nothing is compared."""
+    """Speed of plain h5py: frame by frame read and assigned to a dataset of the same chunks and filter, then
+    synced, without comparison."""
     from coupole.storage.bitshuffle import tile_shape
 
     chunks = (1, *tile_shape(HEIGHT_PX, WIDTH_PX))
@@ -152,7 +152,7 @@ def _plain_h5py_mb_s(path: Path, before: Path, codec: Any) -> float:
 
 
 def _forget(path: Path) -> None:
-    """Empty the page cache of a file."""
+    """Remove a file from the page cache."""
     with path.open("rb") as file:
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
@@ -160,7 +160,7 @@ def _forget(path: Path) -> None:
 def _interleaved(
     rounds: int, read: Callable[[h5py.Dataset], None], ours: Path, before: Path
 ) -> tuple[float, float]:
-    """Median seconds of a reading from either file."""
+    """Median seconds for reading from either file."""
     times: dict[Path, list[float]] = {ours: [], before: []}
     for _ in range(rounds):
         for path, found in times.items():

@@ -1,7 +1,7 @@
-"""How fast boards are found and adjustments done: against OpenCV's plain use, and scipy's sparse least squares.
+"""Speed of board detection and of adjustments, against plain use of OpenCV and scipy's sparse least squares.
 
-The peers solve the same problem from the same start: `least_squares` with the sparsity of its Jacobian told,
-derivatives by differences; no estimate of the noise and no covariance, which ours has in its time.
+The peers solve the same problem from the same start: `least_squares` with the sparsity of its Jacobian and
+numerical derivatives; without noise estimate and covariance, which are included in Coupole's time.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def _detection(rounds: int) -> dict[str, Any]:
-    """One 12-megapixel image of a ChArUco board, to corners refined in 12 bits."""
+    """One 12-megapixel image of a ChArUco board, including refinement of the corners in 12 bits."""
     import cv2
 
     from coupole.calibration.grey_image import Picture
@@ -79,7 +79,7 @@ class _Scene:
     """[v, 4, 4] as reported."""
     flange_from_camera: np.ndarray
     point: np.ndarray
-    """[k] of each observation."""
+    """[k] index of the point of each observation."""
     view: np.ndarray
     pixels: np.ndarray
 
@@ -87,7 +87,7 @@ class _Scene:
 def _scene(
     places_mm: Any, body_of: Any, base_from_body: Any, base_from_camera: Any, seed: int, off_mm: float = 0.0
 ) -> _Scene:
-    """What is seen of points on bodies, with noise of pixels, arm and places."""
+    """Observations of points on bodies, with noise of pixels, arm and positions."""
     random = np.random.default_rng(seed)
     flange_from_camera = _pose(np.array([31.0, -42.0, 118.0]), np.array([0.07, -0.05, 1.0]))
     poses = base_from_body[body_of]
@@ -186,7 +186,7 @@ def _leds(rounds: int) -> dict[str, Any]:
 
 
 def _dome() -> _Scene:
-    """Boards of six on a sphere of 1.5 m; views from near its middle, until six see each LED."""
+    """Boards of six on a sphere of 1.5 m; views from near its middle, until each LED has been seen six times."""
     random = np.random.default_rng(3)
     heights = 0.1 + 0.85 * (np.arange(180) + 0.5) / 180
     around, ring = np.arange(180) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - heights**2)
@@ -234,7 +234,7 @@ def _dome() -> _Scene:
 
 
 def _plain(scene: _Scene, offsets: bool) -> Any:
-    """The same unknowns in scipy: bodies, views, hand-eye, eight of the lens; offsets of points if wanted."""
+    """The same unknowns in scipy: bodies, views, hand-eye, eight of the lens; offsets of points if requested."""
     bodies, views, points = len(scene.base_from_body), len(scene.base_from_flange), len(scene.places_mm)
     at_view = 6 * bodies
     at_camera = at_view + 6 * views
@@ -281,7 +281,7 @@ def _plain(scene: _Scene, offsets: bool) -> Any:
 
 
 def _see(points: Any, lens: Any) -> Any:
-    """Brown's model, plainly."""
+    """Brown-Conrady model."""
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = lens
     x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
     r2 = x * x + y * y
@@ -303,7 +303,7 @@ def _pose(translation_mm: Any, turn_rad: Any) -> Any:
 
 
 def _towards(random: np.random.Generator, target_mm: Any, distance_mm: float) -> Any:
-    """A camera that looks down on a board, tilted up to 40 degrees."""
+    """Pose of a camera that looks down on a board, tilted by up to 40 degrees."""
     turn = Rotation.from_euler(
         "ZYZ", [random.uniform(0, 360), random.uniform(8, 40), random.uniform(0, 360)], degrees=True
     )

@@ -1,4 +1,4 @@
-"""Codecs of our own beside what libraries offer: is their output the same, and how fast are they.
+"""Coupole's codecs against libraries: equality of output, and speed.
 
 One full-size 12-bit frame on one core and, for the compression, on two threads at once; the small DNG of the
 conformance tests for the Exif reader. The libraries are those of the dependency group `bench`.
@@ -24,7 +24,7 @@ FEWEST_ROUNDS = 9
 
 
 def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
-    """`same_output` tells whether the peer's bytes or pixels are ours."""
+    """`same_output` is true if the peer's bytes or pixels equal Coupole's."""
     rounds = max(rounds, FEWEST_ROUNDS)
     from bench_archive import pictures
 
@@ -54,7 +54,7 @@ def _packing(frame: NDArray[np.uint16], rounds: int) -> Iterator[dict[str, Any]]
 
 
 def _bitshuffle(frame: NDArray[np.uint16], rounds: int) -> Iterator[dict[str, Any]]:
-    """All tiles of a frame compressed, by one thread and by two that have a frame each."""
+    """Compression of all tiles of a frame, by one thread and by two with a frame each."""
     from coupole.storage.bitshuffle import CODECS, compressed_tiles, tile_shape
 
     tile = tile_shape(*frame.shape)
@@ -80,7 +80,7 @@ def _tiles(frame: NDArray[np.uint16], tile: tuple[int, int]) -> Iterator[NDArray
 
 
 def _imagecodecs_tile(part: NDArray[np.uint16], codec: Any) -> bytes:
-    """HDF5's filter 32008 put together from imagecodecs' functions, which know the shuffle but not the format."""
+    """HDF5's filter 32008 composed from imagecodecs' functions, which provide the shuffle but not the format."""
     import imagecodecs
 
     from coupole.storage.bitshuffle import BLOCK_PIXELS
@@ -133,7 +133,7 @@ def _at_once(work: Callable[[], object], threads: int) -> None:
 
 
 def _medians_s(rounds: int, ours: Callable[[], object], theirs: Callable[[], object]) -> tuple[float, float]:
-    """Of interleaved rounds, after one of each that is not counted: numba compiles, memory comes."""
+    """Medians of interleaved rounds, without the first of each: numba compiles, memory is allocated."""
     times: tuple[list[float], list[float]] = ([], [])
     for counted in range(-1, rounds):
         for work, found in zip((ours, theirs), times, strict=True):

@@ -1,7 +1,7 @@
-"""How long it takes to know what comes too close in one pose of the arm, against python-fcl through trimesh.
+"""Time of the collision check of one pose of the arm, against python-fcl through trimesh.
 
-Ours gives the distance of every pair of bodies: arm, camera, object, support, dome, keep-out volumes, the arm
-itself. The peer only says whether any of the arm's capsules, as meshes, touches the object's mesh or the support.
+Coupole computes the distance of every pair of bodies: arm, camera, object, support, dome, keep-out volumes. The
+peer only tests whether any of the arm's capsules, as meshes, touches the object's mesh or the support.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _POSES = 100
 
 
 def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
-    """Microseconds a pose, of random ones in the demo's cell."""
+    """Microseconds per pose, for random poses in the demo's cell."""
     from coupole.preflight.job import read_job
 
     job = read_job(root / "configs/plans/demo.yaml")
@@ -49,9 +49,9 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | None:
-    """The peer's work on all poses; None where python-fcl is not installed."""
+    """The peer's work on all poses; None if python-fcl is not installed."""
     try:
-        import fcl  # noqa: F401  what trimesh's manager works with
+        import fcl  # noqa: F401  required by trimesh's collision manager
     except ImportError:
         return None
     import trimesh

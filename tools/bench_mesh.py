@@ -1,4 +1,4 @@
-"""How fast a scanner's mesh is read, and in how much memory; a wavy sheet of many triangles stands for a scan."""
+"""Time and memory for reading a scanner's mesh; the scan is replaced by a wavy sheet of many triangles."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _figure(name: str, ours_s: float, peer: str, peer_s: float) -> dict[str, Any
 
 
 def _sheet(triangles: int) -> tuple[int, Any, Any]:
-    """Vertices in a row; functions of the first and last row that give vertices, and triangles of a strip."""
+    """Vertices per row, and functions of first and last row that give vertices and triangles of a strip."""
     side = int(np.sqrt(triangles / 2)) + 1
 
     def rows(first: int, last: int) -> Any:
@@ -137,7 +137,7 @@ def _trimesh(path: Path) -> Any:
 
 
 def _in_a_process(path: Path) -> tuple[float, float]:
-    """Seconds and peak memory (GB) of reading and checking a scan in a process of its own."""
+    """Seconds and peak memory (GB) for reading and checking a scan, in a separate process."""
     code = (
         "import json, resource, sys, time; from pathlib import Path; "
         "from coupole.scan.scanner_export import read_scan; "

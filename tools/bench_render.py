@@ -1,6 +1,6 @@
-"""How fast the simulated dome makes pictures, and in how much memory, beside Open3D, Embree and Mitsuba.
+"""Speed and memory of the simulated dome's renderer, against Open3D, Embree and Mitsuba.
 
-Scenes are reliefs that fill the frame, under the demo's dome. Peers that are not installed are left out:
+Scenes are reliefs that fill the frame, in the demo's dome. Peers that are not installed are left out:
 `pip install open3d mitsuba`.
 """
 
@@ -34,7 +34,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def relief(triangles: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Vertices and faces of a bumpy rectangle, z up, in mm: 3:4, of a scan's 0.2 mm cells from 1.4 million
+    """Vertices and faces of a bumpy rectangle, z up, in mm: 3:4, with the 0.2 mm cells of a scan from 1.4 million
     triangles on, and never smaller than the field of view."""
     down = round((triangles / 2 * 3 / 4) ** 0.5)
     across, half_y = down * 4 // 3, max(75.0, 0.1 * down)
@@ -55,21 +55,21 @@ def corners_of_relief(triangles: int) -> NDArray[np.float32]:
 
 
 def write_relief(path: Path, triangles: int) -> None:
-    """As binary PLY."""
+    """Write a relief as binary PLY."""
     import trimesh
 
     trimesh.Trimesh(*relief(triangles), process=False).export(path)
 
 
 def camera_pose() -> NDArray[np.float64]:
-    """Looking straight down from the working distance."""
+    """A camera that looks straight down from the working distance."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = WORKING_DISTANCE_MM
     return pose
 
 
 def times_s(works: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median times of interleaved works; the first round, which compiles, does not count."""
+    """Median times of interleaved functions, without the first round, which compiles."""
     times: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(1 + rounds):
         for name, work in works.items():
@@ -79,11 +79,11 @@ def times_s(works: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float
     return {name: statistics.median(each[1:]) for name, each in times.items()}
 
 
-# -- which triangle each pixel sees -----------------------------------------------------------------------
+# -- triangle of each pixel -------------------------------------------------------------------------------
 
 
 def gbuffer_figures(rounds: int) -> Iterator[dict[str, Any]]:
-    """Seconds for the triangles of 12.6 Mpixel, with and without a distorting lens, against ray tracers."""
+    """Seconds for the triangles of 12.6 Mpixel, with and without lens distortion, against ray tracers."""
     from sim.render.lens import Lens, sight
     from sim.render.raster import visible_triangles
 
@@ -114,7 +114,7 @@ def gbuffer_figures(rounds: int) -> Iterator[dict[str, Any]]:
 def ray_tracers(
     corners: NDArray[np.float32], lens: Any, pose: NDArray[np.float64]
 ) -> dict[str, Callable[[], Any]]:
-    """Primary rays of an undistorted camera through other programs; trees and rays are made before."""
+    """Primary rays of an undistorted camera with other programs; trees and rays are prepared before."""
     columns, rows = np.meshgrid(np.arange(lens.width_px), np.arange(lens.height_px))
     x, y = (columns - lens.centre_px[0]) / lens.focal_px, (rows - lens.centre_px[1]) / lens.focal_px
     ways = (np.stack([x, y, np.ones_like(x)], axis=-1) @ pose[:3, :3].T).astype(np.float32).reshape(-1, 3)
@@ -171,8 +171,8 @@ def render_leds(by: Any, pose: NDArray[np.float64], out: NDArray[np.uint16], led
 
 
 def frame_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
-    """Frames per second: each LED's first frame, with its shadow rays; again, shadows kept, in another view of the
-    same triangles; again from the same pose, radiance kept where it has room."""
+    """Frames per second: each LED's first frame, with its shadow rays; again with cached shadows, in another view
+    of the same triangles; again from the same pose, with cached radiance as far as memory allows."""
     for size, millions in ((FULL, 1.4), (SMALL, 0.1)):
         label = f"{size[0]}x{size[1]}_{millions:g}_M_triangles"
         with tempfile.TemporaryDirectory() as folder:
@@ -193,7 +193,7 @@ def frame_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
                 peers.append(time.perf_counter() - start_s)
             leds = range(1 + turn * _LEDS_OF_A_ROUND, 1 + (turn + 1) * _LEDS_OF_A_ROUND)
             for times, place in ((first, pose), (kept, nudged), (again, nudged)):
-                render_leds(by, place, out, range(1))  # a new pose is rasterised here, apart
+                render_leds(by, place, out, range(1))  # rasterises the new pose, which is not timed here
                 start_s = time.perf_counter()
                 render_leds(by, place, out, leds)
                 times.append((time.perf_counter() - start_s) / len(leds))
@@ -212,7 +212,7 @@ def frame_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def mitsuba_frame(mesh: Path, by: Any) -> Callable[[int], None] | None:
-    """Moves Mitsuba's LED and renders a frame; None where Mitsuba is not installed."""
+    """A function that moves Mitsuba's LED and renders a frame; None if Mitsuba is not installed."""
     try:
         import mitsuba
     except ImportError:
@@ -267,8 +267,8 @@ print(json.dumps([int(peak.split()[1]) / 2**20, read_s]))
 
 
 def memory_figure(root: Path) -> dict[str, Any]:
-    """Peak of a process that reads a binary PLY of 10 million triangles and renders one LED at full size, against
-    the 16 GiB of a laboratory's computer."""
+    """Peak memory of a process that reads a binary PLY of 10 million triangles and renders one LED at full size,
+    against the 16 GiB of a laboratory's computer."""
     with tempfile.TemporaryDirectory() as folder:
         mesh = Path(folder) / "mesh.ply"
         write_relief(mesh, 10_000_000)

@@ -1,8 +1,8 @@
-"""How fast our RSI process answers, at 4 ms, idle and beside two busy processes; against a minimal program in C.
+"""Latency of the RSI process at 4 ms, idle and beside two busy processes, against a minimal program in C.
 
-This process plays the controller: it sends a packet every 4 ms and takes the time until its answer is here. An
-answer that takes longer than the cycle is late. Both responders, and this process above them, run under
-SCHED_FIFO where permitted; each figure says whether.
+This process acts as the controller: it sends a packet every 4 ms and measures the time until the answer. An answer
+that takes longer than the cycle is late. Both responders, and this process with higher priority, run under
+SCHED_FIFO if permitted; each figure states it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 
 CYCLE_S = 0.004
 _BLOCK_CYCLES, _BLOCKS = 250, 8
-"""The two take turns by the second; so many seconds a round."""
+"""The responders alternate every second; number of seconds per round."""
 _PRIORITY = 30
 _SOURCE = Path(__file__).with_name("bench_rsi_responder.c")
 _IPOC = re.compile(rb"<IPOC>(\d+)</IPOC>")
@@ -35,7 +35,7 @@ _AXES = b'<AIPos A1="0.0000" A2="-90.0000" A3="90.0000" A4="0.0000" A5="90.0000"
 
 
 class Controller:
-    """The other end of one responder's wire."""
+    """The controller's end of one responder's wire."""
 
     def __init__(self, port: int) -> None:
         self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -47,7 +47,7 @@ class Controller:
         self.latencies_us: list[float] = []
 
     def ask(self, cycles: int) -> None:
-        """Send packets, one a cycle, and note how long each answer takes; infinity for a late one."""
+        """Send packets, one per cycle, and record the latency of each answer; infinity for a late one."""
         next_s = time.perf_counter()
         for _ in range(cycles):
             next_s += CYCLE_S
@@ -87,7 +87,7 @@ def free_port() -> int:
 
 @contextmanager
 def our_responder() -> Iterator[tuple[Controller, bool]]:
-    """The driver's process with a session, and whether it runs under SCHED_FIFO."""
+    """The driver's process with a session, and True if it runs under SCHED_FIFO."""
     from coupole.devices import SystemClock
     from coupole.plan.arm_description import shipped_arm
     from drivers.kuka.rsi.driver import KukaRsi, Settings
@@ -112,7 +112,7 @@ def our_responder() -> Iterator[tuple[Controller, bool]]:
 
 @contextmanager
 def c_responder(folder: Path) -> Iterator[tuple[Controller, bool] | None]:
-    """The program in C, compiled on the spot; None where there is no compiler."""
+    """The program in C, compiled here; None without compiler."""
     compiler, port = shutil.which("cc"), free_port()
     if compiler is None:
         yield None
@@ -131,7 +131,7 @@ def c_responder(folder: Path) -> Iterator[tuple[Controller, bool] | None]:
 
 @contextmanager
 def neighbours(count: int) -> Iterator[None]:
-    """Processes that do nothing but keep a core busy."""
+    """Processes that keep a core busy."""
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
     try:
         yield
@@ -142,10 +142,10 @@ def neighbours(count: int) -> Iterator[None]:
 
 
 def figures(rounds: int) -> Iterator[dict[str, Any]]:
-    """Latencies in us and shares of late answers, each with its peer."""
+    """Latencies in us and fractions of late answers, each with its peer."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        try:  # for this process alone: the busy neighbours are ordinary ones
+        try:  # for this process only; the busy neighbours have normal priority
             realtime = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             os.sched_setscheduler(0, realtime, os.sched_param(_PRIORITY))
         except PermissionError:
@@ -164,7 +164,7 @@ def figures(rounds: int) -> Iterator[dict[str, Any]]:
 def compared(
     load: str, ours: tuple[Controller, bool], theirs: tuple[Controller, bool] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Figures of one load. Without a peer they are held against the cycle."""
+    """Figures for one load. Without a peer they are compared with the cycle."""
     peer = "c_responder" if theirs else "cycle"
     more: dict[str, Any] = {"answers": len(ours[0].latencies_us), "sched_fifo": ours[1]}
     if theirs:
@@ -194,7 +194,7 @@ def compared(
 
 
 def quantile_us(controller: Controller, share: float) -> float:
-    """Late answers count as one cycle."""
+    """A quantile of the latency; late answers count as one cycle."""
     return float(np.quantile(np.minimum(controller.latencies_us, CYCLE_S * 1e6), share))
 
 

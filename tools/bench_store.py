@@ -1,8 +1,8 @@
-"""How fast full-size frames reach the disk: the view writer beside other writers, and the whole stream of a run.
+"""Speed of full-size frames to disk: the view writer against other writers, and the whole data path of a run.
 
-All write the same frames, drawn with the noise of a dim picture, to the same disk, and end with them on it. The
-stream is a run as an operator would start it: world, camera, LED box, proof, journal; its camera shows pictures
-that were rendered before, and is asked for twice the frames/s that the real one can give.
+All write the same frames, with the noise of a dim picture, to the same disk, and sync them. The whole data path is
+a run as an operator would start it: world, camera, LED box, proof, journal; its camera sends pictures rendered
+beforehand, at twice the frame rate of the real one.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ HEIGHT_PX, WIDTH_PX = 3072, 4096
 FRAME_BYTES = HEIGHT_PX * WIDTH_PX * 2
 FRAMES, DISTINCT = 48, 8
 STREAM_FRAMES = 520
-"""Of one burst; the view has two of them, and its disk space is used again in the next round."""
+"""Frames of one burst; the view has two bursts, and its disk space is reused in the next round."""
 STREAM_FRAMES_PER_S = 200
 Writer = Callable[[Path, NDArray[np.uint16], int], None]
-"""Write n frames (the given ones in turn) into a folder, and have them on disk."""
+"""Writes n frames (the given ones in turn) into a folder, and syncs them."""
 
 
 def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
@@ -41,7 +41,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def writers(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
-    """Frames per second and CPU time a frame of each writer, in turn."""
+    """Frames per second and CPU time per frame of each writer, in turn."""
     known: dict[str, Writer] = {
         "coupole": _coupole,
         "coupole_packed12": partial(_coupole, packed=True),
@@ -244,7 +244,7 @@ def stream(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def _burst(root: Path, folder: Path) -> dict[str, float]:
-    """Figures of the second burst of a run, the first having filled the camera's memory with pictures."""
+    """Figures of the second burst of a run; in the first one the camera's memory is filled with pictures."""
     from ruamel.yaml import YAML
 
     from coupole.acquisition.observer import Observer, Progress
@@ -265,7 +265,7 @@ def _burst(root: Path, folder: Path) -> dict[str, float]:
     rig["dome"]["leds"] = str(root / "configs/domes/coupole.csv")
     rig["led_limits"] |= {"cooldown_ratio": 0.0}
     rig["world"]["settings"] |= {"camera": {"render_once": True}}
-    # The box's own clock decides how fast it goes, so an arm that is late by a frame's rendering is no fault.
+    # The box's own clock sets the rate, so that a delay of the arm by a frame's rendering has no effect.
     rig["robot"]["settings"] = {"link_timeout_s": 30.0}
     (folder / "rig.yaml").write_text(json.dumps(rig))
     plan = {

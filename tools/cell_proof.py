@@ -1,7 +1,7 @@
-"""A random cell calibrated from rendered frames to records, and held against the truth.
+"""Calibrates a random cell from rendered frames to records, and compares the records with the truth.
 
-Frames are rendered by `sim`, found and adjusted by `coupole.calibration`, which share no code; what is judged is
-what stands in the records: camera, hand-eye, LEDs, and where a scanned mesh lies.
+Frames are rendered by `sim` and evaluated by `coupole.calibration`, which share no code. Compared are the results
+in the records: camera, hand-eye, LEDs, and the pose of a scanned mesh.
 """
 
 from __future__ import annotations
@@ -70,15 +70,15 @@ class Judged:
 
 @dataclass(frozen=True)
 class Proof:
-    """What one cell's records are worth."""
+    """Comparison of one cell's records with the truth."""
 
     judged: list[Judged]
     accuracy: dict[str, float]
-    """Distances from the truth in mm and deg, by name; `_in_true_base`: with what the arm is off as a whole."""
+    """Distances from the truth in mm and deg, by name; `_in_true_base`: including the arm's common error."""
 
 
 def prove_cell(seed: int, *, at: Postures, width_px: int, samples: int, absolute: bool) -> Proof:
-    """Render, find, adjust, and compare what the records say with the truth."""
+    """Render, detect, adjust, and compare the records with the truth."""
     cell = RandomCell(seed, width_px, samples, absolute)
     request = Request(f"cell{seed}", datetime.now(UTC))
     model: Arm | None = planning_arm(cell.cell.rig) if absolute else None
@@ -96,7 +96,7 @@ def prove_cell(seed: int, *, at: Postures, width_px: int, samples: int, absolute
 
 
 def _far(proof: Proof, name: str, cell: RandomCell, found_mm: Floats, true_mm: Floats) -> None:
-    """Median and largest distance of points [n, 3] in the base from where they are."""
+    """Median and largest distance of points [n, 3] in the base from their true positions."""
     own = cell.own_base(np.eye(4))
     own_mm = true_mm @ own[:3, :3].T + own[:3, 3]
     for suffix, there_mm in (("", own_mm), ("_in_true_base", true_mm)):
@@ -108,7 +108,7 @@ def _far(proof: Proof, name: str, cell: RandomCell, found_mm: Floats, true_mm: F
 def _camera_centres_mm(
     cell: RandomCell, at: Postures, prior: CameraPrior, arm: CalibratedArm | None
 ) -> tuple[Floats, Floats]:
-    """Where the camera is at the board's postures, by the records and truly, but for the arm's repeatability."""
+    """Camera positions at the board's postures, by the records and true, without the arm's repeatability."""
     poses = np.stack([flange_pose(joints) for joints in at.board])
     steady = replace(cell.arm_errors, repeatability_um=0.0, repeatability_deg=0.0)
     true = np.stack([steady.true_flange_pose(joints, 0) for joints in at.board]) @ cell.flange_from_camera

@@ -1,4 +1,4 @@
-"""Sizes that a reader can take in, and names of modules that tell rooms apart; `tools/check` runs this.
+"""Limits on sizes of functions and packages, and unique names of modules; run by `tools/check`.
 
 `python tools/check_sizes.py [ROOT]` prints each violation with its place and exits with 1 if there is one.
 """
@@ -14,15 +14,15 @@ from pathlib import Path
 FOLDERS = ("coupole", "drivers", "sim", "tools")
 MOST_MODULE_LINES = 400
 MOST_FUNCTION_LINES = 60
-"""From the first decorator or `def` to the last line, docstring and all."""
+"""From the first decorator or `def` to the last line, including the docstring."""
 MOST_ROOMS, MOST_TOP_FILES = 14, 6
-"""Of coupole/."""
+"""Packages and top-level files in coupole/."""
 SHARED_NAMES = {"__init__", "records", "report", "settings"}
-"""What modules of several rooms may be called."""
+"""Names that modules of several packages may have."""
 
 
 def violations(root: Path) -> Iterator[str]:
-    """What is too large or named twice under `root`, one line each."""
+    """Functions that are too large, or modules named twice, under `root`, one line each."""
     for folder in FOLDERS:
         for path in sorted((root / folder).rglob("*.py")):
             yield from _large(path, path.relative_to(root))

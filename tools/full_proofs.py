@@ -1,8 +1,8 @@
-"""The long proofs, one after the other, and one table of how they ended: what `tools/test --full` runs.
+"""Runs the long proofs one after the other and prints a table of results: `tools/test --full`.
 
     python tools/full_proofs.py [--only NAME ...] [--list]
 
-Each proof is a command that anyone can run by itself. Ends with 1 if one of them failed; its output is in
+Each proof is a command that can be run by itself. Exits with 1 if one of them failed; its output is in
 `runs/proofs/<name>.log`.
 """
 
@@ -26,7 +26,7 @@ _PYTEST = "-m pytest --full -q -n 2 --dist loadscope --timeout 3600"
 
 @dataclass(frozen=True)
 class Proof:
-    """A command and what it shows."""
+    """A command and what it proves."""
 
     name: str
     shows: str
@@ -52,7 +52,7 @@ PROOFS = (
 
 @dataclass(frozen=True)
 class Ended:
-    """How a proof ended."""
+    """The result of a proof."""
 
     proof: Proof
     minutes: float
@@ -61,7 +61,7 @@ class Ended:
 
 
 def run(proof: Proof) -> Ended:
-    """Run one proof, its output into a file."""
+    """Run one proof with its output in a file."""
     LOGS.mkdir(parents=True, exist_ok=True)
     log = LOGS / f"{proof.name}.log"
     started = time.monotonic()
@@ -74,8 +74,8 @@ def run(proof: Proof) -> Ended:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("--only", nargs="+", choices=[proof.name for proof in PROOFS], help="these proofs alone")
-    parser.add_argument("--list", action="store_true", help="name the proofs and their commands, run nothing")
+    parser.add_argument("--only", nargs="+", choices=[proof.name for proof in PROOFS], help="only these proofs")
+    parser.add_argument("--list", action="store_true", help="list the proofs and their commands, run nothing")
     options = parser.parse_args()
     console = Console(soft_wrap=True)
     if options.list:

@@ -1,4 +1,4 @@
-"""A contract for import-linter: a package, and all that it may import. What is not listed is forbidden."""
+"""A contract for import-linter: a package, and all that it may import. Other imports are forbidden."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from importlinter import Contract, ContractCheck, fields, output
 
 
 class AllowListContract(Contract):
-    """`package` and everything below it may import itself, `allowed_modules` and what lies below those; and the
-    package that it stands in, for its version.
+    """`package` and its modules may import themselves, `allowed_modules` with their submodules, and the package's
+    parent, for its version.
 
-    Only the project's own packages count; other libraries are free.
+    Only the project's own packages are checked; other libraries are always allowed.
     """
 
     package = fields.StringField()

@@ -1,9 +1,9 @@
-"""Draws the rooms of the project and which uses which, from the imports as they are: docs/pictures/rooms.svg.
+"""Draws the project's packages and their dependencies, from the present imports: docs/pictures/rooms.svg.
 
     python tools/make_architecture.py [--output docs/pictures/rooms.svg]
 
-Rooms stand on a staircase in the order of import-linter's layers (pyproject.toml). A line leaves a room to the
-right and comes down on a room that it uses; its width grows with the number of imports. Nothing may lead upwards.
+Packages are arranged as a staircase in the order of import-linter's layers (pyproject.toml). A line leaves a
+package to the right and ends on one that it uses; its width grows with the number of imports. None leads upwards.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _STEP_X, _STEP_Y, _BOX_W, _BOX_H, _MARGIN = 74, 46, 132, 34, 16
 
 
 def rooms_in_order() -> list[str]:
-    """From the top floor down, the four contracts as one, drivers and simulation between plan and appearance."""
+    """From the top layer down, the four contracts merged, drivers and simulation between plan and appearance."""
     config = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = config["tool"]["importlinter"]["contracts"]
     layers = [name for name in contracts[0]["layers"] if name not in CONTRACTS]
@@ -33,7 +33,7 @@ def rooms_in_order() -> list[str]:
 
 
 def room_of(module: str) -> str:
-    """The room that a module stands in."""
+    """The package of a module."""
     parts = module.split(".")
     if parts[0] in BESIDE or len(parts) == 1:
         return parts[0]
@@ -43,7 +43,7 @@ def room_of(module: str) -> str:
 
 
 def arrows() -> Counter[tuple[str, str]]:
-    """How many imports lead from one room into another."""
+    """Number of imports from one package into another."""
     graph = grimp.build_graph("coupole", *BESIDE, cache_dir=None)
     found: Counter[tuple[str, str]] = Counter()
     for module in graph.modules:
@@ -55,7 +55,7 @@ def arrows() -> Counter[tuple[str, str]]:
 
 
 def purpose(room: str) -> str:
-    """The first sentence of the room's own docstring."""
+    """The first sentence of the package's docstring."""
     if room == "contracts":
         return "What all rooms agree on: devices, errors, frames of reference, a described arm."
     folder = ROOT / (room if room in BESIDE else f"coupole/{room}")
@@ -73,7 +73,7 @@ def size(room: str) -> int:
 
 
 def drawing() -> str:
-    """The SVG; its `desc` lists the arrows, one a line, for a test to compare."""
+    """The SVG; its `desc` lists the arrows, one per line, for comparison by a test."""
     rooms, found = rooms_in_order(), arrows()
     width = _MARGIN * 2 + _STEP_X * (len(rooms) - 1) + _BOX_W
     height = _MARGIN * 2 + _STEP_Y * (len(rooms) - 1) + _BOX_H

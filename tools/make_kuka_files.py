@@ -1,11 +1,11 @@
-"""Writes what a KUKA controller needs for both of Coupole's drivers: RSI and EthernetKRL.
+"""Writes the files that a KUKA controller needs for Coupole's two drivers: RSI and EthernetKRL.
 
     python tools/make_kuka_files.py [--output configs/kuka] [--pc-address 192.168.1.10]
                                     [--rsi JSON] [--eki JSON] [--load 1]
 
-Ports, tags, cycle and rates come from the drivers' own settings: their defaults, or those given as JSON as in
-a rig's `robot: settings:`. KRL is made of the templates in `tools/kuka`. The same options give the same bytes.
-How to install them: docs/how-to/kuka-controller.md.
+Ports, tags, cycle and rates come from the drivers' own settings: their defaults, or those given as JSON, as in
+a rig's `robot: settings:`. KRL is made from the templates in `tools/kuka`. The same options give the same bytes.
+Installation: docs/how-to/kuka-controller.md.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ TEMPLATES = ROOT / "tools" / "kuka"
 
 EKI_NAME, RSI_CONTEXT, RSI_CONFIG = "CoupoleEki", "coupole_rsi", "coupole_rsi_ethernet.xml"
 ALIVE_FLAG, RECEIVED_FLAG, ORDER_FLAG = 501, 502, 503
-"""Elements of $FLAG: connection alive, something received, an order for the robot program."""
+"""Elements of $FLAG: connection alive, message received, order for the robot program."""
 PING_S = 1
-"""EKI's shortest interval for finding out that the PC is gone."""
+"""EKI's shortest interval for detecting that the PC is gone."""
 
 KRL_COMMAND = {
     "Command/@Session": "CP_IN_SESSION",
@@ -38,7 +38,7 @@ KRL_COMMAND = {
     "Command/@Velocity": "CP_IN_VELOCITY",
     "Command/@Acceleration": "CP_IN_ACCELERATION",
 } | {f"Axes/@A{axis}": f"CP_IN_AXES.A{axis}" for axis in range(1, 7)}
-"""Variable of coupole_link.dat that takes each element."""
+"""Variable of coupole_link.dat for each element."""
 KRL_STATUS = (
     {
         "Status/@Session": "CP_SESSION",
@@ -56,23 +56,23 @@ KRL_STATUS = (
     | {f"Axes/@A{axis}": f"$AXIS_ACT_MEAS.A{axis}" for axis in range(1, 7)}
     | {f"Pose/@{name}": f"CP_POSE.{name}" for name in "XYZABC"}
 )
-"""What the controller sends in each element."""
+"""Value that the controller sends in each element."""
 WIRE_NUMBERS = (
     *("MOVE", "ASK", "NO_FAULT", "EMERGENCY_STOP", "DRIVES_OFF"),
     *("STOP_MESSAGE", "PROGRAM_ENDED", "TARGET_REFUSED"),
 )
-"""Numbers of the wire that the programs use."""
+"""Numbers of the wire protocol used in the programs."""
 _KRL_TYPE = {"INT": "Int", "REAL": "Real", "STRING": "String"}
 
 
 def rsi_xml(settings: kuka_rsi.Settings, pc_address: str) -> str:
-    """Configuration of the ETHERNET object: what is sent, what is received, to whom."""
+    """Configuration of the ETHERNET object: elements sent, elements received, address."""
     host, port = settings.listen.rsplit(":", 1)
     sent = "\n".join(
         f'      <ELEMENT TAG="DEF_{tag}" TYPE="{kind}" INDX="INTERNAL"/>'
         for tag, kind in (("RIst", "DOUBLE"), (settings.measured_tag, "DOUBLE"), (settings.delay_tag, "LONG"))
     )
-    # Held, an absolute correction keeps the arm where it is; a relative one would go on moving it.
+    # With HOLDON an absolute correction keeps the arm in place; a relative one would keep moving it.
     hold_on = {"absolute": 1, "relative": 0}[settings.mode]
     received = "\n".join(
         f'      <ELEMENT TAG="{settings.tag}.{name}" TYPE="DOUBLE" INDX="{index}" HOLDON="{hold_on}"/>'
@@ -102,7 +102,7 @@ def rsi_xml(settings: kuka_rsi.Settings, pc_address: str) -> str:
 
 
 def eki_xml(settings: kuka_eki.Settings) -> str:
-    """Configuration of the EthernetKRL connection. The flag is set when a whole message has come."""
+    """Configuration of the EthernetKRL connection. The flag is set when a complete message has arrived."""
     host, port = settings.address.rsplit(":", 1)
     here = f"<IP>{host}</IP>\n      <PORT>{port}</PORT>"
     if settings.controller_is == "server":
@@ -158,8 +158,8 @@ def krl_set() -> str:
 
 
 def correction_rows(settings: kuka_rsi.Settings) -> str:
-    """Rows of the table of objects: the correction and its monitor. The monitor stops RSI before the correction
-    is clamped: its limits are the tighter ones, by a degree or a millimetre."""
+    """Rows of the table of objects: the correction and its monitor. The monitor stops RSI before the correction is
+    clamped: its limits are tighter by a degree or a millimetre."""
     clamp, monitor, inputs = {
         "axes": ("AXISCORR1", "AXISCORRMON1", "CorrA1 to CorrA6"),
         "pose": ("POSCORR1", "POSCORRMON1", "CorrX, CorrY, CorrZ, CorrA, CorrB, CorrC"),

@@ -2,9 +2,9 @@
 
     python tools/make_relief.py [--output configs/objects/relief.ply]
 
-Object frame: z up, bottom at z = 0, origin below the middle. Seen from above with x to the right, an F stands
-on the left, three round bosses of three sizes lie on the right, and stairs climb along the lower edge towards
-+x: no rotation and no mirror image looks the same. The mesh is closed. The same code gives the same bytes.
+Object frame: z up, bottom at z = 0, origin below the middle. Seen from above with x to the right, an F is on the
+left, three round bosses of three sizes are on the right, and stairs rise along the lower edge towards +x: no
+rotation or mirror image looks the same. The mesh is closed. The same code gives the same bytes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ F_BARS_MM = ((-56.0, 8.0, 8.0, 42.0), (-34.0, 42.0, 30.0, 8.0), (-40.0, 10.0, 24
 BOSSES_MM = ((22.0, 38.0, 12.0), (56.0, 30.0, 18.0), (38.0, -4.0, 14.0))
 """Bosses: centre x, centre y, radius of the hemisphere."""
 PEDESTAL_MM = 30.0
-"""What lifts the tallest boss, on its shaft, to the full height of 60 mm."""
+"""Height of the shaft that raises the tallest boss to the full height of 60 mm."""
 STAIRS = 4
 STAIR_X_MM, STAIR_Y_MM, STAIR_LENGTH_MM, STAIR_RISE_MM = -40.0, -48.0, 24.0, 7.0
 STAIR_HALF_DEPTH_MM, STAIR_FLANK_MM = 9.0, 3.0

@@ -1,6 +1,6 @@
 """Renders the shipped scenes for docs/pictures/renderings: uv run python tools/make_renderings.py [NAME ...]
 
-Fewer samples and coarser bands than the scene files ask for: minutes instead of an hour.
+With fewer samples and coarser bands than in the scene files: minutes instead of an hour.
 """
 
 from __future__ import annotations

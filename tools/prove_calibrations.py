@@ -1,15 +1,15 @@
-"""Are the intervals of calibrations true? Many random simulated cells, rendered, calibrated, held against truth.
+"""Checks the stated intervals of calibrations on many random simulated cells, rendered and calibrated.
 
     python tools/prove_calibrations.py --cells 100 [--width 1024] [--images 20] [--absolute] [--keep FILE] [--json]
 
-Each cell (`random_cells`) has a lens, a hand-eye, an arm, a dome and an object of its own. One line for each
-parameter: how many of the stated 95 % intervals hold the truth, and the root mean square of error over standard
-uncertainty, about 1. Then how far camera, LEDs and mesh are from the truth, in the cells' median and 95th percent.
-What `--keep` names gets a line for each cell; called again, only missing cells are done.
+Each cell (`random_cells`) has its own lens, hand-eye, arm, dome and object. Printed is one line per parameter: the
+fraction of the stated 95 % intervals that contain the truth, and the root mean square of error over standard
+uncertainty, about 1. Then the distances of camera, LEDs and mesh from the truth, as median and 95th percentile
+over the cells. The file `--keep` gets a line for each cell; in a later call only missing cells are computed.
 
-The exit code is 1 if a cell could not be calibrated, or a parameter's intervals are not what they should be: 90 to
-99 % hold the truth, and rms(error/u) lies between 0.8 and 1.25, but for what chance does to so many cells once in
-1000.
+The exit code is 1 if a cell could not be calibrated, or if a parameter's intervals are wrong: 90 to 99 % must
+contain the truth, and rms(error/u) must be between 0.8 and 1.25; both limits are widened to what chance exceeds
+once in 1000 for the given number of cells.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from coupole.errors import CoupoleError
 from random_cells import postures
 
 SETTINGS = ("width", "images", "samples", "led_boards", "absolute")
-"""Options that make cells what they are."""
+"""Options that determine the cells."""
 _CHANCE = 1e-3
 
 
@@ -52,12 +52,12 @@ class Verdict:
     covered: float
     rms_over_u: float
     median_error: float
-    """Of its size, in the name's unit."""
+    """Of its magnitude, in the name's unit."""
     median_u: float
 
     @property
     def faults(self) -> list[str]:
-        """How the intervals are not what they should be. Values of one cell are alike: cells count, not values."""
+        """Violated limits. Values of one cell are correlated: the number of cells counts, not of values."""
         found = []
         if binom.cdf(round(self.covered * self.cells), self.cells, 0.90) < _CHANCE:
             found.append(f"{self.name}: {self.covered:.1%} of the intervals hold the truth")
@@ -75,11 +75,11 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--width", type=int, default=1024, help="of frames, px; 4096 is the real camera")
     parser.add_argument("--images", type=int, default=20, help="of the board")
-    parser.add_argument("--led-boards", type=int, help="so many boards instead of the whole dome: quick to plan")
-    parser.add_argument("--samples", type=int, default=8, help="rays a pixel and direction")
+    parser.add_argument("--led-boards", type=int, help="number of boards instead of the whole dome: quick to plan")
+    parser.add_argument("--samples", type=int, default=8, help="rays per pixel and direction")
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--absolute", action="store_true", help="the arm is off by 0.3 mm and 0.02 deg as well")
-    parser.add_argument("--keep", type=Path, help="file of cells that are done, one line of JSON each")
+    parser.add_argument("--absolute", action="store_true", help="add absolute errors of the arm: 0.3 mm, 0.02 deg")
+    parser.add_argument("--keep", type=Path, help="file of finished cells, one line of JSON each")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     settings = {name: getattr(arguments, name) for name in SETTINGS}
@@ -144,14 +144,14 @@ def keep(path: Path | None, settings: dict[str, Any], seed: int, proof: Proof) -
 
 
 def accuracies(proofs: Sequence[Proof]) -> dict[str, tuple[float, float]]:
-    """Median and 95th percent over the cells of each figure."""
+    """Median and 95th percentile over the cells of each figure."""
     names = proofs[0].accuracy if proofs else ()
     figures = {name: [proof.accuracy[name] for proof in proofs] for name in names}
     return {name: (float(np.median(one)), float(np.quantile(one, 0.95))) for name, one in figures.items()}
 
 
 def verdicts(proofs: Sequence[Proof]) -> list[Verdict]:
-    """What the intervals are worth."""
+    """Evaluation of the intervals."""
     found = []
     cells = [proof.judged for proof in proofs]
     for name in dict.fromkeys(one.name for cell in cells for one in cell):

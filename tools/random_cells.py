@@ -1,4 +1,4 @@
-"""A simulated cell drawn at random: what is true of it, and its rendered frames as a run would give them."""
+"""A random simulated cell: its true parameters, and its rendered frames in the form of a run's."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RIG = ROOT / "configs/rigs/sim-imperfect.yaml"
 EXPOSURE_S = 0.001
 LAMPS, LAMPS_ELEVATION_DEG = 6, 62.0
-"""LEDs that light board and object, all round it: a few, as each is shaded by itself."""
+"""Number of LEDs around board and object that light them; few, as each is shaded separately."""
 SQUARES, SQUARE_MM, MARKER_MM, THICKNESS_MM = (12, 9), 16.0, 9.6, 4.0
 STICKERS, STICKER_MM = 16, 6.0
 LED_BOARDS, MESH_IMAGES = 8, 10
@@ -59,8 +59,8 @@ class Postures:
 
 
 def postures(images: int, *, led_boards: int | None = None) -> Postures:
-    """As `coupole plan new` wants them; so many images of the calibration board, and LEDs of so many boards that
-    stand together in the dome, instead of all."""
+    """Postures as planned by `coupole plan new`, for `images` images of the calibration board and for the LEDs of
+    `led_boards` neighbouring boards of the dome, or of all."""
     cell = read_cell(RIG)
     middles_mm = cell.leds.positions_mm.reshape(-1, 6, 3).mean(axis=1)
     nearest = np.argsort(np.linalg.norm(middles_mm - middles_mm[_MIDDLE_BOARD], axis=1))[:led_boards]
@@ -79,7 +79,7 @@ def postures(images: int, *, led_boards: int | None = None) -> Postures:
 
 
 def some_leds(table: LedTable, boards: Sequence[int] | NDArray[np.int64]) -> LedTable:
-    """The part of a dome's table that is on these boards."""
+    """The part of a dome's table with these boards."""
     rows = np.isin(table.boards, boards)
     return LedTable(
         table.ids[rows], table.boards[rows], table.positions_mm[rows], table.normals[rows], table.flux_lm[rows]
@@ -87,7 +87,7 @@ def some_leds(table: LedTable, boards: Sequence[int] | NDArray[np.int64]) -> Led
 
 
 def lamps(table: LedTable, base_from_support: Floats) -> list[int]:
-    """LEDs nearest to so many directions about the support."""
+    """LEDs nearest to `LAMPS` directions around the support."""
     azimuths = np.radians(np.arange(LAMPS) * 360.0 / LAMPS)
     elevation = np.radians(LAMPS_ELEVATION_DEG)
     wanted = np.stack(
@@ -124,9 +124,9 @@ class RandomCell:
     seed: int
     width_px: int
     samples: int
-    """Rays a pixel and direction."""
+    """Rays per pixel and direction."""
     absolute: bool
-    """The arm is off by 0.3 mm and 0.02 deg besides its repeatability."""
+    """The arm has absolute errors of 0.3 mm and 0.02 deg in addition to its repeatability."""
 
     @cached_property
     def cell(self) -> Cell:
@@ -155,7 +155,7 @@ class RandomCell:
         return dict(zip(("focus_mm", "k1", "p1", "p2"), map(float, figures), strict=True))
 
     def place(self, purpose: int) -> dict[str, Any]:
-        """Of a thing on the support, in the support's frame."""
+        """Pose of a thing on the support, in the support's frame."""
         random = np.random.default_rng((self.seed, 3, purpose))
         return {
             "translation_mm": [*random.uniform(-8.0, 8.0, 2), 0.0],
@@ -168,14 +168,14 @@ class RandomCell:
 
     @property
     def true_lens(self) -> dict[str, float]:
-        """As records name its parameters."""
+        """By the parameter names of records."""
         focal_px = 1e3 / self.pitch_um / (1.0 / self.cell.rig.lens.focal_length_mm - 1.0 / self.lens["focus_mm"])
         bent = {name: self.lens[name] for name in ("k1", "p1", "p2")}
         middle = {"cx_px": 0.5 * (self.size_px[0] - 1), "cy_px": 0.5 * (self.size_px[1] - 1)}
         return {"fx_px": focal_px, "fy_px": focal_px, **middle, **bent, "k2": 0.0}
 
     def config(self, *things: dict[str, Any]) -> dict[str, Any]:
-        """Of its world, with things on the support."""
+        """Configuration of the cell's world, with things on the support."""
         width_px, height_px = self.size_px
         sensor = self.cell.rig.sensor.model_copy(
             update={"width_px": width_px, "height_px": height_px, "pixel_pitch_um": self.pitch_um}
@@ -196,12 +196,12 @@ class RandomCell:
         return config
 
     def shifted_base(self, in_base: Floats) -> Floats:
-        """Poses [..., 4, 4] of the base in one that is shifted by what the arm is off in all poses alike, which no
-        image tells, and no record claims."""
+        """Poses [..., 4, 4] of the base in a base shifted by the arm's error common to all poses, which no image
+        shows, and no record claims."""
         return inverse(transform(tuple(self.arm_errors.base_error_mm()), (0.0, 0.0, 0.0))) @ in_base
 
     def own_base(self, in_base: Floats) -> Floats:
-        """The same in the base that the arm itself has: turned by its first axis' zero besides."""
+        """The same in the arm's own base, which is also rotated by the zero error of its first axis."""
         zero_deg = float(self.arm_errors.axis_zero_error_deg()[0])
         first = flange_pose((zero_deg, 0, 0, 0, 0, 0)) @ inverse(flange_pose((0, 0, 0, 0, 0, 0)))
         return inverse(first) @ self.shifted_base(in_base)
@@ -215,7 +215,7 @@ class RandomCell:
 
 
 class Photographs:
-    """Frames of one acquisition, and the poses that the robot reports; each is rendered when it is asked for."""
+    """Frames of one acquisition, and the poses reported by the robot; each is rendered on request."""
 
     def __init__(self, cell: RandomCell, joints_deg: Floats, first_stop: int, *things: dict[str, Any]) -> None:
         config = cell.config(*things)
@@ -233,7 +233,7 @@ class Photographs:
         return self._stills.take(self._true[number], leds=leds, panels=[], exposure_s=EXPOSURE_S)
 
     def sources(self) -> Sources:
-        """As a run of the things on the support would give them."""
+        """Sources in the form of a run of the things on the support."""
         white = self.white_dn - self.camera["black_dn"]
 
         def read(number: int) -> Picture:
@@ -247,7 +247,7 @@ class Photographs:
         return Sources(images, reported(self.reported), About(simulated=True), (("rendered", "0" * 64),))
 
     def leds(self, table: LedTable, lit: Sequence[tuple[int, int]]) -> LedImages:
-        """Spots of LEDs: `lit` has view and row of the table of each frame."""
+        """Spots of LEDs: `lit` gives view and row of the table for each frame."""
         spots = []
         for view, row in lit:
             frame = self.frame(view, [int(table.ids[row])])

@@ -1,7 +1,7 @@
-"""The cell as python-fcl sees it: an independent check of motions that Coupole's own checker has called clear.
+"""The cell in python-fcl: an independent check of motions that Coupole's own checker has accepted.
 
-Nothing of `coupole.kinematics`, `motion.collisions` or `motion.path_planner` is used (but the sizes of the arm's
-capsules, where its meshes are not at hand): the chains of joints are the data sheets', profiles are ruckig's,
+Nothing of `coupole.kinematics`, `motion.collisions` or `motion.path_planner` is used, except the sizes of the
+arm's capsules if its meshes are not available: joint chains are from the data sheets, profiles from ruckig,
 bodies are triangle meshes and fcl's own shapes.
 """
 
@@ -28,22 +28,22 @@ STEP_S = 0.004
 
 @dataclass(frozen=True)
 class Figures:
-    """What the checker knows of an arm by itself."""
+    """The checker's own parameters of an arm."""
 
     joints_mm: tuple[tuple[float, float, float], ...]
     axes: tuple[tuple[int, int, int], ...]
     """Origins and axes of the joints with all angles 0, each in the frame of the one before."""
     flange_mm: tuple[float, float, float]
     flange_axis: tuple[int, int, int]
-    """From link 6 to the flange: where it is, and the axis that it is turned about by 90 deg."""
+    """From link 6 to the flange: its position, and the axis about which it is rotated by 90 deg."""
     top_deg_s: tuple[float, ...]
-    """What motions are timed with, before the rig's share."""
+    """Highest axis speeds, before the rig's fraction."""
     has_jerk: bool = True
-    """False: motions are trapezoids of speed."""
+    """False: trapezoidal speed profiles."""
 
 
 def _of_ur(top_deg_s: float, d1: float, a2: float, a3: float, d4: float, d5: float, d6: float) -> Figures:
-    """After Universal Robots' table of Denavit and Hartenberg's parameters, mm."""
+    """From Universal Robots' table of Denavit-Hartenberg parameters, mm."""
     joints = ((0, 0, d1), (0, 0, 0), (a2, 0, 0), (a3, 0, 0), (0, -d4, 0), (0, 0, -d5))
     axes = ((0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1), (0, -1, 0))
     return Figures(joints, axes, (0, -d6, 0), (1, 0, 0), (top_deg_s,) * 6, has_jerk=False)
@@ -60,7 +60,7 @@ ARMS = {
     "UR5e": _of_ur(179.9, 162.5, -425.0, -392.2, 133.3, 99.7, 99.6),
     "UR10e": _of_ur(120.0, 180.7, -612.7, -571.55, 174.15, 119.85, 116.55),
 }
-"""By the names of their descriptions."""
+"""By the names of the robot descriptions."""
 KR10 = ARMS["KR10 R1100 sixx"]
 _DISK_MM, _SHELL_MM = 50.0, 4
 FLANGE = 7
@@ -77,7 +77,7 @@ class Touch:
 
 
 def link_poses(joints_deg: Floats, arm: Figures = KR10) -> Floats:
-    """[n, 8, 4, 4] poses of the base, the six links and the flange, in the base's frame."""
+    """[n, 8, 4, 4] poses of base, six links and flange, in the base frame."""
     poses = np.tile(np.eye(4), (len(joints_deg), 8, 1, 1))
     for k, (origin_mm, axis) in enumerate(zip(arm.joints_mm, arm.axes, strict=True)):
         step = np.tile(np.eye(4), (len(joints_deg), 1, 1))
@@ -100,7 +100,7 @@ def _rotations(axis: Floats, angles: Floats) -> Floats:
 
 
 def arm_of(job: Job) -> Figures:
-    """What the checker knows of the arm of a job's rig."""
+    """The checker's parameters of the arm of a job's rig."""
     described = described_arm(job.cell.rig)
     assert described is not None
     return ARMS[described.name]
@@ -129,7 +129,7 @@ def motion(job: Job, start_deg: Floats, goal_deg: Floats) -> Floats:
 
 
 class ReplayCell:
-    """A job's cell in fcl; `touches` says what overlaps."""
+    """A job's cell in fcl; `touches` lists overlapping bodies."""
 
     def __init__(self, job: Job, meshes: Path | None) -> None:
         rig = job.cell.rig
@@ -141,7 +141,7 @@ class ReplayCell:
         links = _links_of_meshes(meshes) if meshes else _solids(capsules_of(described))
         self._moving = [*links, *_solids(tool)]
         self._around = self._surroundings(job)
-        least_apart = 2 if meshes else 3  # fat capsules of next neighbours but one overlap by their making
+        least_apart = 2 if meshes else 3  # capsules of links two apart overlap by construction
         self._own = [
             (i, j)
             for i, (_, link, _) in enumerate(self._moving)
@@ -175,7 +175,7 @@ class ReplayCell:
         return around
 
     def touches(self, joints_deg: Floats) -> list[Touch]:
-        """What overlaps anywhere on [n, 6]; each pair once, where it does first."""
+        """Pairs of bodies that overlap anywhere on [n, 6]; each once, at its first overlap."""
         found: dict[tuple[str, str], Touch] = {}
         for joints, links in zip(
             joints_deg, self._support_from_base @ link_poses(joints_deg, self._arm), strict=True

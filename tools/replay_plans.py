@@ -1,11 +1,11 @@
-"""Random plans, checked by preflight; each that passes is replayed every 4 ms by an independent checker.
+"""Random plans, checked by preflight; each accepted one is replayed every 4 ms by an independent checker.
 
     python tools/replay_plans.py [--arm ur10e] [--plans 500] [--seed 1] [--meshes DIR] [--check-meshes]
 
-`--meshes` is a folder with the links' meshes (base_link.stl, link_1.stl to link_6.stl); without it the replay has
-meshes made of the arm's capsules. With `--check-meshes` preflight uses those meshes too. Prints one JSON line: how
-many plans passed, why the others were refused, how many places were looked at, and what touched what. Exits with 1
-if anything did.
+`--meshes` is a folder with the links' meshes (base_link.stl, link_1.stl to link_6.stl); without it the replay uses
+meshes of the arm's capsules. With `--check-meshes` preflight uses those meshes too. Prints one JSON line: number
+of accepted plans, reasons for the refusal of the others, number of replayed postures, and collisions. Exits with
+1 if there were any.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ AROUND_DEG = {
     "simulated-cell-ur": (0.0, -90.0, 90.0, -90.0, -90.0, 0.0),
     "simulated-cell-ur5e": (0.0, -90.0, 90.0, -90.0, -90.0, 0.0),
 }
-"""Of each rig, the joint angles that views by joints are drawn round."""
+"""Joint angles about which views by joints are drawn, for each rig."""
 REASONS = {
     "touches the object": "the object;",
     "touches the dome": "the dome;",
@@ -49,11 +49,11 @@ REASONS = {
     "out of reach": "out of reach",
     "near a singularity": "singularity",
 }
-"""What a refusal is counted as, by a phrase of it."""
+"""Reasons by which refusals are counted, by a phrase of the message."""
 
 
 def random_object(random: np.random.Generator) -> tuple[NDArray[np.float64], list[float]]:
-    """Triangles [n, 3, 3] of one of four kinds of objects, somewhere on the support, and where it stands, mm."""
+    """Triangles [n, 3, 3] of one of four kinds of objects at a random place on the support, and its place, mm."""
     kind = random.choice(["relief", "box", "sphere", "bunny"])
     if kind == "relief":
         mesh: Any = trimesh.load(RELIEF, process=False, force="mesh")
@@ -103,7 +103,7 @@ def random_view(random: np.random.Generator, name: str, target_mm: list[float], 
 
 
 def random_job(random: np.random.Generator, demo: Job) -> Job:
-    """3 to 6 views, or a few more where one is a grid, of an object in the demo's cell."""
+    """3 to 6 views, or a few more if one is a grid, of an object in the demo's cell."""
     corners_mm, at_mm = random_object(random)
     plan = Plan.model_validate(
         {
@@ -123,14 +123,14 @@ def random_job(random: np.random.Generator, demo: Job) -> Job:
 
 
 def planned(job: Job, meshes: Path | None) -> Itinerary:
-    """The ways that preflight looks at: from home."""
+    """The paths that preflight checks, starting from home."""
     bodies = bodies_of(job.cell.rig, job.cell.leds, job.shape.corners_mm, meshes) if meshes else job.motion.bodies
     home_deg = job.cell.rig.motion.home_joints_deg
     return plan_itinerary(job.schedule.views, job.cell.rig, bodies, home_deg, job.plan.order)
 
 
 def replayed(job: Job, itinerary: Itinerary, cell: ReplayCell) -> tuple[int, list[Touch]]:
-    """How many places were looked at, and what touched there."""
+    """Number of replayed postures, and the collisions found."""
     here_deg = np.array(job.cell.rig.motion.home_joints_deg)
     places, touches = 0, []
     for index in itinerary.order:
@@ -145,7 +145,7 @@ def replayed(job: Job, itinerary: Itinerary, cell: ReplayCell) -> tuple[int, lis
 
 
 def reason(refusal: str) -> str:
-    """What a refusal is counted as."""
+    """The reason by which a refusal is counted."""
     what = next((name for name, phrase in REASONS.items() if phrase in refusal), "something else")
     return f"no way: {what}" if "no way to it" in refusal else what
 
@@ -159,7 +159,7 @@ def run(
     check_meshes: bool = False,
     tell: bool = False,
 ) -> dict[str, Any]:
-    """Figures of a whole replay; `touches` lists plan, bodies and joint angles of each collision found."""
+    """Results of a whole replay; `touches` lists plan, bodies and joint angles of each collision found."""
     demo = read_job(DEMO, rig)
     passed, places = 0, 0
     refused: Counter[str] = Counter()
@@ -191,8 +191,8 @@ def main() -> int:
     parser.add_argument("--plans", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--meshes", type=Path)
-    parser.add_argument("--check-meshes", action="store_true", help="preflight has the links' meshes as well")
-    parser.add_argument("--arm", choices=RIGS, default="kr10", help="whose simulated cell it is")
+    parser.add_argument("--check-meshes", action="store_true", help="preflight uses the links' meshes as well")
+    parser.add_argument("--arm", choices=RIGS, default="kr10", help="arm of the simulated cell")
     asked = parser.parse_args()
     rig = ROOT / f"configs/rigs/{RIGS[asked.arm]}.yaml"
     found = run(asked.plans, asked.seed, asked.meshes, rig, check_meshes=asked.check_meshes, tell=True)

@@ -163,7 +163,7 @@ class TextLineBox:
                 self._flash = _Flash(led, sent_ns, Deadline(self._clock, lasts_s))
                 threading.Thread(target=self._watch, args=(self._flash,), name="led box", daemon=True).start()
             except BaseException:
-                self._darken_somehow()
+                self._try_lights_off()
                 raise
 
     def lit(self) -> bool:
@@ -219,7 +219,7 @@ class TextLineBox:
 
     def close(self) -> None:
         """Lights off if the box still answers; never raises for a lost link."""
-        self._darken_somehow()
+        self._try_lights_off()
         self._link.close()
 
     # How a light ends.
@@ -247,10 +247,10 @@ class TextLineBox:
             flash.off_ns = self._clock.now_ns()
         except DeviceError as error:
             flash.failure = error
-            self._darken_somehow()
+            self._try_lights_off()
             raise
 
-    def _darken_somehow(self) -> None:
+    def _try_lights_off(self) -> None:
         """All LEDs off, if the box still answers."""
         with contextlib.suppress(DeviceError):
             self.lights_off()

@@ -25,7 +25,7 @@ from coupole import geometry
 from coupole.devices import ArmState, Clock, Deadline, Identity
 from coupole.errors import DeviceLost, DeviceRefused
 from coupole.kinematics import Arm
-from drivers.arm_motion import News, checked_target, overtaken, refused, wait_for
+from drivers.arm_motion import MessageTime, checked_target, overtaken, refused, wait_for
 from drivers.ur.messages import Ask, Config, Six, State
 from drivers.ur.process import UrProcess, raise_fault
 
@@ -104,13 +104,13 @@ class UrRobot:
         """
         self.settings = settings
         self._clock = clock
-        self._news = News(clock)
+        self._message_time = MessageTime(clock)
         self._number = 0
         self._motion_s = 0.0
         config = {field.name: getattr(settings, field.name) for field in fields(Config)}
         self._process = UrProcess(Config(**config))
         try:
-            self._last = self._process.first_word(settings.connect_timeout_s)
+            self._last = self._process.first_state(settings.connect_timeout_s)
             raise_fault(self._last)
             self._check_model(self._last.model)
         except BaseException:
@@ -176,7 +176,7 @@ class UrRobot:
             joints_deg=state.joints_deg,
             base_from_flange=_transform(state.tcp_pose_m_rad)
             @ geometry.inverse(_transform(state.tcp_offset_m_rad)),
-            t_ns=self._news.since_ns(state.samples),
+            t_ns=self._message_time.since_ns(state.samples),
             moving=state.still_samples < self.settings.settle_samples,
             fault=state.fault,
         )

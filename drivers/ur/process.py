@@ -46,7 +46,7 @@ class UrProcess:
     def pid(self) -> int:
         return self._process.pid
 
-    def first_word(self, timeout_s: float) -> State:
+    def first_state(self, timeout_s: float) -> State:
         """The state after opening; raises DeviceTimeout if it does not come, or the reason why it cannot."""
         self._link.settimeout(timeout_s)
         state = self._take(DeviceTimeout)

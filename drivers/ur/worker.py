@@ -185,9 +185,9 @@ class Link:
             max_gap_s=max(self.state.max_gap_s, age_s),
         )
         if not self.state.fault:
-            self._judge(_apart(joints_deg, wanted_deg))
+            self._evaluate(_apart(joints_deg, wanted_deg))
 
-    def _judge(self, astray_deg: float) -> None:
+    def _evaluate(self, astray_deg: float) -> None:
         """Latch the fault that the last sample shows, if any."""
         config = self.config
         self._astray_samples = self._astray_samples + 1 if astray_deg > config.follow_deg else 0

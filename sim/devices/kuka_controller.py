@@ -189,7 +189,7 @@ class KukaController:
                     self._stop_axes("link lost: no answer", _Does.WAIT, self._settings.restart_s)
                 return None
             except ConnectionRefusedError:
-                self._stop_axes("link lost: nobody listens", _Does.WAIT, self._settings.restart_s)
+                self._stop_axes("link lost: the client's port is closed", _Does.WAIT, self._settings.restart_s)
                 return None
             answer = self._read_answer(data)
             if answer is not None and answer.ipoc == awaited:

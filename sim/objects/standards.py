@@ -90,7 +90,7 @@ def sticker_poses(
     triangles on which centres may lie.
 
     Raises:
-        InputError: The surface has no room for so many.
+        InputError: The surface has no room for `count` stickers.
     """
     from scipy.spatial import cKDTree
 

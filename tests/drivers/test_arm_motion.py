@@ -9,7 +9,7 @@ import pytest
 
 from coupole.devices import Deadline
 from coupole.errors import DeviceFault, DeviceRefused, DeviceTimeout
-from drivers.arm_motion import News, checked_target, wait_for
+from drivers.arm_motion import MessageTime, checked_target, wait_for
 
 LIMITS_DEG = ((-170.0, 170.0),) * 6
 
@@ -63,13 +63,13 @@ def test_a_fault_ends_the_waiting_before_the_state_counts() -> None:
         waited(HandTurnedClock(), 3, faulty_at=3)
 
 
-def test_news_is_as_old_as_the_first_look_at_it() -> None:
+def test_a_message_count_has_the_time_at_which_it_was_first_read() -> None:
     clock = HandTurnedClock()
-    news = News(clock)
-    first_ns = news.since_ns(1)
+    message_time = MessageTime(clock)
+    first_ns = message_time.since_ns(1)
     clock.sleep(1.0)
-    assert news.since_ns(1) == first_ns
-    assert news.since_ns(2) == first_ns + 10**9
+    assert message_time.since_ns(1) == first_ns
+    assert message_time.since_ns(2) == first_ns + 10**9
 
 
 def test_a_target_out_of_limits_names_its_axes() -> None:

@@ -162,11 +162,11 @@ def call(device: str, doing: str, function: Any, *arguments: Any) -> Any:
     message = (error.contents.message or b"no message").decode(errors="replace")
     library = load()
     library.g_error_free(error)
-    kind, remedy = _judge(code if domain == library.arv_device_error_quark() else -1)
+    kind, remedy = _kind_and_remedy(code if domain == library.arv_device_error_quark() else -1)
     raise kind(device, expected=doing, happened=f"Aravis says: {message}", remedy=remedy)
 
 
-def _judge(code: int) -> tuple[type[DeviceError], str]:
+def _kind_and_remedy(code: int) -> tuple[type[DeviceError], str]:
     if code == _TIMEOUT:
         return DeviceTimeout, "Check the camera's cable and power, then resume the run."
     if code in {_NOT_CONNECTED, _TRANSFER_ERROR, _NOT_FOUND}:

@@ -134,11 +134,11 @@ class Stream:
             self._library.g_object_unref(handle)
             if not buffer:
                 return None
-            taken = self._judge(buffer, first_id, last_id)
+            taken = self._evaluate(buffer, first_id, last_id)
             if taken is not None:
                 return taken
 
-    def _judge(self, buffer: int, first_id: int, last_id: int) -> Taken | None:
+    def _evaluate(self, buffer: int, first_id: int, last_id: int) -> Taken | None:
         """A complete image, or None after its buffer was queued again."""
         library = self._library
         status = library.arv_buffer_get_status(buffer)

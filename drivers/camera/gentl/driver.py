@@ -23,7 +23,7 @@ from drivers.camera.genicam_image import frame_format, pixel_format, readout_us,
 from drivers.camera.genicam_trigger import counts, frame_id_range, set_exposure, since
 from drivers.camera.gentl.features import Features
 from drivers.camera.gentl.image import copy_pixels, timestamp_ns
-from drivers.camera.gentl.producer import Gaps, open_camera, reporting, told, when_incomplete
+from drivers.camera.gentl.producer import Gaps, open_camera, optional_int, reporting, when_incomplete
 from drivers.camera.gentl.settings import Settings
 from drivers.camera.misuse import misused
 from drivers.fair_lock import FairLock
@@ -199,7 +199,7 @@ class GenTLCamera:
     def _statistics(self) -> CameraStatistics:
         exposed, over_triggers = counts(self._features, self._settings)
         missing = self._gaps.missing
-        overflows = min(missing, int(told(self._acquirer.data_streams[0].module, "num_underrun") or 0))
+        overflows = min(missing, int(optional_int(self._acquirer.data_streams[0].module, "num_underrun") or 0))
         return CameraStatistics(
             exposed=since(exposed, self._counted_before[0]),
             delivered=self._gaps.delivered,

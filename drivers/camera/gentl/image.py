@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from coupole.devices import FrameFormat
 from coupole.errors import DeviceRefused
-from drivers.camera.gentl.producer import told
+from drivers.camera.gentl.producer import optional_int
 from drivers.camera.pixel_formats import PixelFormat, widen
 
 _PLAIN_IMAGE = 1
@@ -31,7 +31,7 @@ def copy_pixels(
         "padding_x": 0,
     }
     for what, value in wanted.items():
-        seen = told(buffer, what)
+        seen = optional_int(buffer, what)
         if seen not in {None, value}:
             raise DeviceRefused(
                 device,
@@ -39,7 +39,7 @@ def copy_pixels(
                 happened=f"one came with {seen}",
                 remedy="Set the camera up in the rig so that it sends plain images of one size and format.",
             )
-    offset = told(buffer, "image_offset") or 0
+    offset = optional_int(buffer, "image_offset") or 0
     wire_bytes = wire.wire_bytes(promised.height_px * promised.width_px)
     data = np.frombuffer(buffer.raw_buffer, np.uint8, wire_bytes, offset)
     pixels = memory.view(np.uint16)
@@ -53,10 +53,10 @@ def copy_pixels(
 def timestamp_ns(buffer: Any, camera: Any, device: str) -> int:
     """Start of the exposure by the camera's clock, ns. Older producers give ticks, whose frequency `camera` gives.
     Raises DeviceRefused if the producer gives neither."""
-    stamp_ns = told(buffer, "timestamp_ns")
+    stamp_ns = optional_int(buffer, "timestamp_ns")
     if stamp_ns is not None:
         return stamp_ns
-    ticks, ticks_hz = told(buffer, "timestamp"), told(camera, "timestamp_frequency")
+    ticks, ticks_hz = optional_int(buffer, "timestamp"), optional_int(camera, "timestamp_frequency")
     if ticks is None or not ticks_hz:
         raise DeviceRefused(
             device,

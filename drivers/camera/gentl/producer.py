@@ -36,7 +36,7 @@ def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
         harvester.update()
         if not harvester.device_info_list:
             harvester.reset()
-            _open_in_vain(str(settings.producer))
+            _raise_opening_error(str(settings.producer))
         found = [(one, _describe(one)) for one in harvester.device_info_list]
         wanted = {"serial": settings.serial, "model": settings.model}
         fitting = [
@@ -63,7 +63,7 @@ def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
     return harvester, acquirer, fitting[0][1]
 
 
-def _open_in_vain(producer: str) -> None:
+def _raise_opening_error(producer: str) -> None:
     """Raise the producer's error if it cannot be opened: harvesters hides it and finds no camera.
 
     A producer can be open only once in a process (GenTL standard, GCInitLib).
@@ -125,7 +125,7 @@ def reporting(name: str, expected: str) -> Iterator[None]:
         raise _lost(name, expected, str(error)) from error
 
 
-def told(module: Any, what: str) -> int | None:
+def optional_int(module: Any, what: str) -> int | None:
     """Value of an optional property; None if the producer does not provide it."""
     import genicam.gentl
 

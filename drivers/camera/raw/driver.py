@@ -217,22 +217,22 @@ class RawFiles:
         sample, exif, asked_us = self._sample, picture.exif, self._exposure.exposure_us
         body = (exif.make, exif.model, exif.serial)
         if body != (sample.exif.make, sample.exif.model, sample.exif.serial):
-            raise self._odd(path, f"a picture of {sample.exif.model} {sample.exif.serial}", " ".join(body))
+            raise self._bad_picture(path, f"a picture of {sample.exif.model} {sample.exif.serial}", " ".join(body))
         if picture.frame_format != self._format:
-            raise self._odd(path, f"a picture like {self._format}", f"it is {picture.frame_format}")
+            raise self._bad_picture(path, f"a picture like {self._format}", f"it is {picture.frame_format}")
         if exif.resolution_us > sample.exif.resolution_us:
-            raise self._odd(
+            raise self._bad_picture(
                 path,
                 f"a capture time to {sample.exif.resolution_us} us",
-                f"it is told to {exif.resolution_us} us",
+                f"it is recorded to {exif.resolution_us} us",
             )
         if abs(exif.exposure_us - asked_us) > _NOMINAL_EXPOSURE * asked_us:
-            raise self._odd(path, f"an exposure of {asked_us} us", f"it was {exif.exposure_us:.0f} us")
+            raise self._bad_picture(path, f"an exposure of {asked_us} us", f"it was {exif.exposure_us:.0f} us")
         before = self._last_taken
         if before is not None and exif.iso != before.iso:
-            raise self._odd(path, f"ISO {before.iso} as before", f"it was ISO {exif.iso}")
+            raise self._bad_picture(path, f"ISO {before.iso} as before", f"it was ISO {exif.iso}")
         if before is not None and exif.taken_ns <= before.taken_ns:
-            raise self._odd(path, "a capture time after that of the picture before", "it is not later")
+            raise self._bad_picture(path, "a capture time after that of the picture before", "it is not later")
 
     def trigger(self) -> None:
         if self._exposure is None or self._exposure.hardware_trigger:
@@ -273,7 +273,7 @@ class RawFiles:
 
     # -- errors -------------------------------------------------------------------------------------------
 
-    def _odd(self, path: Path, expected: str, happened: str) -> DeviceFault:
+    def _bad_picture(self, path: Path, expected: str, happened: str) -> DeviceFault:
         return DeviceFault(
             self._name,
             expected=f"{expected} in {path.name}",

@@ -298,9 +298,9 @@ class XiCamera:
         promised = self._format
         seen = (image.height, image.width, image.frm)
         if seen != (promised.height_px, promised.width_px, RAW16):
-            raise self._surprised(f"{promised.height_px} x {promised.width_px} pixels, RAW16", str(seen))
+            raise self._unexpected_image(f"{promised.height_px} x {promised.width_px} pixels, RAW16", str(seen))
         if self._settings.black_dn is None and image.black_level != promised.black_dn:
-            raise self._surprised(f"a black level of {promised.black_dn} DN", f"{image.black_level} DN")
+            raise self._unexpected_image(f"a black level of {promised.black_dn} DN", f"{image.black_level} DN")
         return Frame(
             frame_id=image.acq_nframe,
             timestamp_ns=self._timestamp_ns(image),
@@ -312,7 +312,7 @@ class XiCamera:
         if self._settings.timestamps == "4ns":
             return int(4 * (image.tsSec << 32 | image.tsUSec))
         if image.tsUSec > 999_999:
-            raise self._surprised("a timestamp in seconds and microseconds", f"{image.tsUSec} us")
+            raise self._unexpected_image("a timestamp in seconds and microseconds", f"{image.tsUSec} us")
         return int(image.tsSec * 1_000_000_000 + image.tsUSec * 1_000)
 
     def trigger(self) -> None:
@@ -361,7 +361,7 @@ class XiCamera:
 
     # -- errors -------------------------------------------------------------------------------------------
 
-    def _surprised(self, expected: str, happened: str) -> DeviceRefused:
+    def _unexpected_image(self, expected: str, happened: str) -> DeviceRefused:
         return DeviceRefused(
             self._name,
             expected=f"images with {expected}",

@@ -19,7 +19,7 @@ from coupole.devices import ArmState, Clock, Identity
 from coupole.errors import DeviceError, DeviceLost, DeviceTimeout
 from coupole.geometry import transform
 from coupole.kinematics import Arm, forward, move_duration_s, slowed
-from drivers.arm_motion import News, checked_target, farthest_stop_deg, longest_stop_s, overtaken, refused
+from drivers.arm_motion import MessageTime, checked_target, farthest_stop_deg, longest_stop_s, overtaken, refused
 from drivers.kuka.eki import wire
 from drivers.kuka.eki.link import Link, connect
 from drivers.kuka.eki.watch import Tolerances, Watch
@@ -102,7 +102,7 @@ class KukaEki:
         self.settings = settings
         self.arm = settings.arm()
         self._clock = clock
-        self._news = News(clock)
+        self._message_time = MessageTime(clock)
         self._number = 0
         self._motion_s = 0.0
         self._watch = Watch(
@@ -188,7 +188,7 @@ class KukaEki:
             return ArmState(
                 joints_deg=status.joints_deg,
                 base_from_flange=forward(self.arm, status.joints_deg),
-                t_ns=self._news.since_ns(self._watch.statuses),
+                t_ns=self._message_time.since_ns(self._watch.statuses),
                 moving=self._watch.moving,
                 fault=fault.text if fault else "",
             )
@@ -313,8 +313,8 @@ class KukaEki:
         if status.pose is None:
             return "the controller reports none"
         x, y, z, *abc_deg = status.pose
-        told = transform((x, y, z), (abc_deg[0], abc_deg[1], abc_deg[2]))
-        apart = np.abs(told - forward(self.arm, status.joints_deg))
+        reported = transform((x, y, z), (abc_deg[0], abc_deg[1], abc_deg[2]))
+        apart = np.abs(reported - forward(self.arm, status.joints_deg))
         if apart[:3, 3].max() > _SAME_POSE_MM or apart[:3, :3].max() > _SAME_ROTATION:
             raise DeviceError(
                 "robot",

@@ -95,9 +95,9 @@ class Watch:
         if status.fault != wire.NO_FAULT:
             kind = DeviceRefused if status.fault == wire.TARGET_REFUSED else DeviceFault
             self.fail(kind, wire.FAULTS.get(status.fault, f"the controller reports fault {status.fault}"))
-        self._judge_rest(status, known_speed=elapsed_ms > 0)
+        self._evaluate_rest(status, known_speed=elapsed_ms > 0)
 
-    def _judge_rest(self, status: Status, *, known_speed: bool) -> None:
+    def _evaluate_rest(self, status: Status, *, known_speed: bool) -> None:
         if self.moving:
             self.settled_cycles = self._astray_cycles = 0
             return

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from coupole.devices import ArmState, Clock, Deadline, Identity
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceTimeout
 from coupole.kinematics import Arm, forward, move_duration_s
-from drivers.arm_motion import News, checked_target, longest_stop_s, overtaken, refused, wait_for
+from drivers.arm_motion import MessageTime, checked_target, longest_stop_s, overtaken, refused, wait_for
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.limits import correction_violations
 from drivers.kuka.rsi.pose import Geometry
@@ -53,7 +53,7 @@ class KukaRsi:
         self._motion_s = 0.0
         self._target_deg: shared_state.Six = (0.0,) * 6
         """Target of the last motion."""
-        self._news = News(clock)
+        self._message_time = MessageTime(clock)
         self._process, self._block = _spawn(settings, self.arm)
         try:
             self._wait_for_session()
@@ -112,7 +112,7 @@ class KukaRsi:
         return ArmState(
             joints_deg=(joints[0], joints[1], joints[2], joints[3], joints[4], joints[5]),
             base_from_flange=forward(self.arm, joints),
-            t_ns=self._news.since_ns(state.packets),
+            t_ns=self._message_time.since_ns(state.packets),
             moving=self._moves(state),
             fault=state.fault_text.decode(errors="replace"),
         )
@@ -169,7 +169,7 @@ class KukaRsi:
                 raise DeviceTimeout(
                     "robot",
                     expected=f"RSI packets at {self.settings.listen}",
-                    happened=_why_no_session(state),
+                    happened=_no_session_reason(state),
                     remedy="Restart the RSI program on the controller, and check its IP_NUMBER and PORT",
                 )
             time.sleep(_POLL_S)
@@ -240,7 +240,7 @@ class KukaRsi:
         )
 
 
-def _why_no_session(state: shared_state.State) -> str:
+def _no_session_reason(state: shared_state.State) -> str:
     if state.refused:
         return f"{state.refused} packets belong to a running RSI session that another program may have begun"
     if state.malformed:

@@ -73,7 +73,7 @@ class ArmSupervisor:
                 meanwhile()
             self.hurry(move_duration_s(self._arm, here_deg, there_deg) + self._motion.settle_dwell_s)
             while (arm := self._watched()).moving:
-                self._keep_to(path, arm, "on its path")
+                self._keep_to(path, arm, "during its motion")
                 self._clock.sleep(_POLL_S)
         self._from_deg = path[-1]
         return self._settle()

@@ -1,1 +1,1 @@
-"""Where the arm goes and what it hides: bodies, collisions, paths, order of views, occlusion."""
+"""Motion of the arm: bodies, collisions, paths, order of views; occlusion of LEDs."""

@@ -8,14 +8,15 @@ import numpy as np
 
 @numba.njit(cache=True, nogil=True)
 def anneal(seconds, posture_cost_s, first, order, picked, rolls, hottest_s, coldest_s):  # type: ignore[no-untyped-def]
-    """The best order of groups [n], and the places picked in it [n], that random changes come across.
+    """The best order of groups [n], and the places chosen in it [n], found by random changes.
 
     `seconds` [places, places] between places, symmetric; place 0 is the start, those of group g are `first[g]` to
     `first[g + 1] - 1`; `posture_cost_s` [places] is added for each place that is used; `rolls` [changes, 5] are
     random numbers from 0 to 1.
 
-    A change reverses a stretch of the way, moves a visit elsewhere and to any place of its group, or changes its
-    place only. A worse way is taken with the probability of Metropolis at a temperature that falls geometrically.
+    A change reverses a section of the tour, moves a visit to another position and to any place of its group, or
+    changes its place only. A worse tour is accepted with the Metropolis probability at a temperature that falls
+    geometrically.
     """
     n = len(order)
     order, way = (
@@ -56,7 +57,7 @@ def anneal(seconds, posture_cost_s, first, order, picked, rolls, hottest_s, cold
 
 @numba.njit(cache=True, nogil=True)
 def _reversed_s(seconds, way, i, j):  # type: ignore[no-untyped-def]
-    """What it costs more to do visits i to j the other way round."""
+    """Additional cost of visits i to j in reversed order."""
     change_s = seconds[way[i - 1], way[j]] - seconds[way[i - 1], way[i]]
     if j + 1 < len(way):
         change_s += seconds[way[i], way[j + 1]] - seconds[way[j], way[j + 1]]
@@ -65,7 +66,7 @@ def _reversed_s(seconds, way, i, j):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _moved_s(seconds, way, i, j, place):  # type: ignore[no-untyped-def]
-    """What it costs more to do visit i as the j-th, at another place."""
+    """Additional cost of visit i as the j-th, at another place."""
     after_i, after_j = i + 1, j if j < i else j + 1
     before_j = way[j] if j > i else way[j - 1]
     change_s = seconds[before_j, place] - seconds[way[i - 1], way[i]]

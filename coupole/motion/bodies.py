@@ -1,4 +1,5 @@
-"""Bodies of the arm and its tool: their shapes as spheres in the frames of its links, and how far they reach."""
+"""Bodies of the arm and its tool: spheres in the frames of the links, and their greatest distances from the
+axes."""
 
 from __future__ import annotations
 
@@ -18,9 +19,9 @@ from coupole.plan.arm_description import ArmDescription
 from coupole.plan.link_meshes import LINKS, link_mesh_path
 
 LINK_MESH_STEP_MM = 12.0
-"""Spacing of the points on a link's mesh, when meshes are asked for instead of capsules."""
+"""Spacing of the points on a link's mesh, if meshes are used instead of capsules."""
 _METRES_BELOW = 10.0
-"""A link mesh no larger than this is in metres, as ROS has it; otherwise in mm."""
+"""A link mesh no larger than this is taken as metres (the ROS convention), otherwise as mm."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Capsule:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Something rigid: spheres in the frame of one link."""
+    """A rigid body: spheres in the frame of one link."""
 
     name: str
     link: int
@@ -44,7 +45,7 @@ class Body:
 
 
 def capsules_of(arm: ArmDescription) -> tuple[Capsule, ...]:
-    """The arm's own, from the base outwards as its description lists them."""
+    """The arm's capsules, from the base outwards as its description lists them."""
     return tuple(
         Capsule(link.name, link.link, part.from_mm, part.to_mm, part.radius_mm)
         for link in arm.links
@@ -64,7 +65,7 @@ def bodies_of_capsules(capsules: Sequence[Capsule]) -> list[Body]:
 
 def bodies_of_meshes(folder: Path, arm: ArmDescription) -> list[Body]:
     """The base and the six links from `base_link.stl` and `link_1.stl` to `link_6.stl`, in the links' frames, in
-    metres or mm, under the names that the arm's description gives them. Raises InputError where one of them cannot
+        metres or mm, with the names of the arm's description. Raises InputError if one of them cannot
     be read."""
     names = {link.link: link.name for link in arm.links}
     bodies = []
@@ -82,7 +83,7 @@ def link_corners(folder: Path, link: int) -> Floats:
     path = link_mesh_path(folder, link)
     try:
         mesh: Any = trimesh.load(path, process=False, force="mesh")
-    except Exception as error:  # whatever trimesh raises, the file is not a mesh to us
+    except Exception as error:  # any exception of trimesh means that the file is not a readable mesh
         raise InputError(f"{path}: expected the mesh of link {link}; {error}") from error
     corners: Floats = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]
     if len(corners) == 0 or not np.isfinite(corners).all():
@@ -91,8 +92,8 @@ def link_corners(folder: Path, link: int) -> Floats:
 
 
 def reach_mm(arm: Arm, body: Body, from_link: int = 0) -> Floats:
-    """[6] farthest that any point of a body can be from each axis; 0 for axes that do not move it against
-    `from_link`. Links are taken as stretched out, so no posture reaches farther."""
+    """[6] greatest distance of any point of a body from each axis; 0 for axes that do not move it relative to
+    `from_link`. Computed for links stretched out, so it bounds all postures."""
     centers, link = body.spheres.centers_mm, body.link
     if link == FLANGE:
         frames = link_frames(arm, np.zeros(6))

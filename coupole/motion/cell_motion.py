@@ -1,4 +1,4 @@
-"""The arm in its cell: bodies, paths and occlusion, computed when first asked for and kept."""
+"""The arm in its cell: bodies, paths and occlusion, computed on first use and cached."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SAME_PLACE_DEG = 1e-3
 
 
 class CellMotion:
-    """What depends on the cell and the object alone, for all views of a plan."""
+    """Bodies, paths and occlusion of a cell with an object, for all views of a plan."""
 
     def __init__(
         self,
@@ -28,31 +28,31 @@ class CellMotion:
         targets_mm: Sequence[Sequence[float]],
         order: Literal["fastest", "as_written"],
     ) -> None:
-        """`object_corners_mm` [triangles, 3, 3] and `targets_mm` are in the support frame; the targets stand for
-        the object where it has no mesh."""
+        """`object_corners_mm` [triangles, 3, 3] and `targets_mm` are in the support frame; the targets replace the
+        object if it has no mesh."""
         self._cell, self._object_corners_mm, self._order = cell, object_corners_mm, order
         self._targets_mm = targets_mm
         self._planned: list[tuple[tuple[str, ...], Sequence[float], Itinerary]] = []
 
     @cached_property
     def bodies(self) -> CellBodies:
-        """Arm, tool and everything that they must not touch."""
+        """Arm, tool and all obstacles."""
         cell = self._cell
         return bodies_of(cell.rig, cell.leds, self._object_corners_mm, cell.link_meshes)
 
     @cached_property
     def occlusions(self) -> Occlusions:
-        """What the object, and in each posture arm and tool, hide of the LEDs."""
+        """Occlusion of LEDs by the object, and by arm and tool in each posture."""
         targets = self._targets_mm or [(0.0, 0.0, 0.0)]
         return occlusions_of(self._cell.rig, self._cell.leds, self._object_corners_mm, targets)
 
     def occluded_leds(self, occlusion: Occlusion) -> list[int]:
-        """Ids of the LEDs that reach nothing of what a view sees."""
+        """Ids of the LEDs that light nothing that a view sees."""
         return [int(led) for led in self._cell.leds.ids[occlusion.occluded_leds()]]
 
     def itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
-        """Paths to views from where the arm stands, clear of everything; kept, so that what preflight planned
-        from home need not be planned again where the arm does stand there."""
+        """Collision-free paths to views from the arm's posture; cached, so that paths that preflight planned from
+        home are not planned again if the arm is at home."""
         names = tuple(view.name for view in views)
         for planned_names, planned_deg, itinerary in self._planned:
             if planned_names == names and np.allclose(planned_deg, start_deg, rtol=0, atol=_SAME_PLACE_DEG):
@@ -62,5 +62,5 @@ class CellMotion:
         return itinerary
 
     def unchecked_itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
-        """Postures and durations as if nothing stood in the way."""
+        """Postures and durations without regard to collisions."""
         return plan_itinerary(views, self._cell.rig, None, start_deg, self._order)

@@ -1,9 +1,9 @@
-"""Distances between the bodies of the cell: what the arm must not touch, and by how much.
+"""Distances between the arm and the other bodies of the cell, and the clearances to keep.
 
 The arm is a set of capsules that enclose its links, or meshes of the links themselves; the camera and an
-allowance for its cables are capsules too. Around it stand the object (its scanned mesh), the support disk, the
+allowance for its cables are capsules too. Obstacles are the object (its scanned mesh), the support disk, the
 dome seen from inside, and keep-out volumes. All distances are conservative: bodies are unions of spheres
-(`motion.sphere_tree`) that enclose what they stand for, and of motions nothing between two checked places is
+(`motion.sphere_tree`) that enclose the real ones, and no contact between two checked postures of a motion is
 missed.
 """
 
@@ -33,12 +33,12 @@ from coupole.motion.sphere_tree import MESH_STEP_MM, Floats, Spheres, sphere_tre
 from coupole.plan.arm_description import TOOL, ArmDescription
 
 _NEIGHBOURLY_MM = 25.0
-"""What comes no nearer than this in the postures that bodies are near in by design is kept apart all the same."""
+"""Parts of a body that stay farther than this in the postures `near_by_design_deg` are checked all the same."""
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Two bodies that come too close."""
+    """Two bodies that are too close."""
 
     body: str
     other: str
@@ -61,13 +61,14 @@ class Clearances:
     self_mm: float = 0.0
     keep_out_mm: float = 0.0
     path_tolerance_mm: float = 0.0
-    """How far the arm may be off its way (`motion.path_deviation`): every pair keeps at least as much as that can
-    bring it together."""
+    """Largest path deviation of the arm (`motion.path_deviation`): the clearance of every pair is at least as
+    large as
+its approach under such a deviation."""
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What stands round the arm, in the support frame."""
+    """Obstacles around the arm, in the support frame."""
 
     base_from_support: Transform
     support_radius_mm: float
@@ -82,7 +83,7 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class _Pair:
-    """A body and what it is kept from: a solid (`kind`, `figures`) or another body (`SHAPE`)."""
+    """A body and its obstacle: a solid (`kind`, `figures`) or another body (`SHAPE`)."""
 
     body: Body
     other_name: str
@@ -97,10 +98,10 @@ class _Pair:
 
 
 class CellBodies:
-    """The arm among its surroundings.
+    """The arm and its obstacles.
 
-    `link_meshes` is a folder with the links' meshes (`motion.bodies.bodies_of_meshes`), which then stand for the
-    arm instead of capsules round them: closer, and slower to check. Raises InputError if they cannot be read.
+    `link_meshes` is a folder with the links' meshes (`motion.bodies.bodies_of_meshes`), which then replace the
+    capsules: closer, and slower to check. Raises InputError if they cannot be read.
     """
 
     def __init__(
@@ -120,29 +121,29 @@ class CellBodies:
 
     @cached_property
     def reach_mm(self) -> Floats:
-        """[6] farthest that any point of arm and tool can be from each axis."""
+        """[6] greatest distance of any point of arm and tool from each axis."""
         reach: Floats = np.max([reach_mm(self._arm, body) for body in (*self._links, *self._tools)], axis=0)
         return reach
 
     def margins(self, joints_deg: ArrayLike, far_mm: float = np.inf) -> dict[tuple[str, str], Floats]:
-        """For each pair of bodies, distance minus what must be kept [n], of joint angles [n, 6]; mm, never more
-        than the true value, and never said to be more than `far_mm` (which saves time)."""
+        """For each pair of bodies distance minus clearance [n] at joint angles [n, 6]; mm, never more than the
+        true value, and at most `far_mm` (to save time)."""
         margins = self._margins(np.atleast_2d(np.asarray(joints_deg, dtype=np.float64)), far_mm)
         return {(pair.body.name, pair.other_name): margins[:, n] for n, pair in enumerate(self._pairs)}
 
     def tightest_mm(self, joints_deg: ArrayLike) -> Floats:
-        """[n] the least of all margins where it is negative, else 0; of joint angles [n, 6]."""
+        """[n] the least of all margins if it is negative, else 0; for joint angles [n, 6]."""
         tightest: Floats = self._margins(np.asarray(joints_deg, dtype=np.float64), 0.0).min(axis=1)
         return tightest
 
     def contacts(self, joints_deg: ArrayLike) -> list[Contact]:
-        """What comes too close in one place [6] of the arm, nearest first."""
+        """Pairs that are too close in one posture [6], nearest first."""
         (margins,) = self._margins(np.asarray(joints_deg, dtype=np.float64)[None], 0.0)
         order = np.argsort(margins, kind="stable")
         return [self._pairs[n].contact(margins[n]) for n in order if margins[n] < 0.0]
 
     def is_clear(self, from_deg: Floats, to_deg: Floats) -> bool:
-        """True if nothing comes too close on a straight motion in joint space."""
+        """True if no pair comes too close on a straight motion in joint space."""
         from coupole.motion.distances import CLEAR, blocked_at
 
         return bool(blocked_at(self._model, from_deg, to_deg)[0] == CLEAR)
@@ -165,7 +166,7 @@ class CellBodies:
         margins: Floats = margins_at(self._model, joints_deg, float(far_mm))
         return margins
 
-    # -- what is kept apart -------------------------------------------------------------------------------
+    # -- pairs that are checked -------------------------------------------------------------------------------
 
     def _pairs_with_surroundings(self) -> list[_Pair]:
         from coupole.motion.distances import BOX, DISK, DOME, SHAPE, SPHERE, SUPPORT_FRAME
@@ -221,15 +222,15 @@ class CellBodies:
         return kind == TOOL or not self._has_meshes
 
     def _required_mm(self, keep_mm: float, reach: Floats) -> float:
-        """What a pair must keep: the rig's clearance, and in any case what an arm off its way by the tube's width
-        could take from it. `path_deviation_mm` counts each axis' deviation times `reach_mm`, the pair feels it
-        times its own reach."""
+        """Clearance of a pair: the rig's, but at least the pair's possible approach under the largest path
+        deviation. `path_deviation_mm` multiplies each axis' deviation by `reach_mm`; the pair moves by the
+        deviation times its own reach."""
         share = np.divide(reach, self.reach_mm, out=np.zeros(6), where=self.reach_mm > 0.0)
         return max(keep_mm, self._keep.path_tolerance_mm * float(share.max()))
 
     @cached_property
     def _model(self) -> Any:
-        """All that as the compiled functions want it."""
+        """The pairs as arrays for the compiled functions."""
         from coupole.motion.distances import SUPPORT_FRAME, Model
 
         all_bodies = [body for pair in self._pairs for body in (pair.body, pair.other) if body is not None]

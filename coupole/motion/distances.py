@@ -1,8 +1,8 @@
-"""Compiled distances between an arm made of spheres and what stands round it; `motion.collisions` is the way in.
+"""Compiled distances between an arm made of spheres and its obstacles; the interface is `motion.collisions`.
 
-Every obstacle is a function that says how far a point is from it, negative inside, and that never changes by more
-than the point moves. So the least distance to a whole tree of spheres is found by looking only into those nodes
-whose bounding sphere could come nearer than what was found already.
+Every obstacle is a signed distance function of a point, negative inside, that never changes by more
+than the point moves. So the least distance to a tree of spheres is found by visiting only those nodes
+whose bounding sphere could be nearer than the least distance found so far.
 """
 
 from __future__ import annotations
@@ -14,38 +14,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 DISK, DOME, SPHERE, BOX, SHAPE = range(5)
-"""Kinds of obstacles: the disk and all below it, the dome and all beyond it, keep-outs, a tree of spheres."""
+"""Kinds of obstacles: the disk and everything below it, the dome and everything beyond it, keep-outs, a tree of
+spheres."""
 SUPPORT_FRAME = 8
-"""Number of the support's frame among the links' (0 the base, 1 to 6 the links, 7 the flange)."""
+"""Index of the support's frame among the links' (0 the base, 1 to 6 the links, 7 the flange)."""
 RESOLUTION_MM = 2.0
-"""A stretch of a motion as short as this that cannot be called clear is called blocked."""
+"""A segment of a motion as short as this that is not shown to be clear counts as blocked."""
 ROUNDING_MM = 1e-9
 CLEAR = -1
 
 
 class Model(NamedTuple):
-    """Arm, shapes and what is kept apart, as arrays."""
+    """Arm, shapes and checked pairs, as arrays."""
 
     base: NDArray[np.float64]
     """[4, 4] `support_from_base`, mm."""
     joints: NDArray[np.float64]
-    """[6, 5] of each joint its origin in the frame of the link before (mm), its sense (1 or -1), its axis (0 x,
-    1 y, 2 z)."""
+    """[6, 5] for each joint its origin in the frame of the previous link (mm), sense (1 or -1) and axis (0 x,
+1 y, 2 z)."""
     flange: NDArray[np.float64]
     """[4, 4] `link_6_from_flange`, mm."""
     nodes: NDArray[np.float64]
     trees: NDArray[np.int64]
     """The `SphereTrees` of all shapes."""
     numbers: NDArray[np.int64]
-    """[pairs, 6] a tree and its link; the kind of obstacle; of SHAPE the other tree and its link; the link against
-    which the tree moves (0 where the obstacle stands still)."""
+    """[pairs, 6] a tree and its link; the kind of obstacle; of SHAPE the other tree and its link; the link
+    relative to
+which the tree moves (0 if the obstacle is fixed)."""
     figures: NDArray[np.float64]
-    """[pairs, 13] 0: what must be kept, mm; 1 to 6: how far the two can move against each other for each radian of
-    an axis, mm; 7 on: DISK radius; DOME radius, sine and cosine of the opening's elevation; SPHERE centre, radius;
-    BOX lowest and highest corner."""
+    """[pairs, 13] 0: clearance, mm; 1 to 6: largest relative motion of the two per radian of each axis, mm; 7 on:
+    DISK radius; DOME radius, sine and cosine of the opening's elevation; SPHERE centre, radius; BOX lowest and
+    highest corner."""
 
 
-# Written with numbers, not with rows and slices: compiling takes seconds less.
+# Indexed by numbers, not by rows and slices: this saves seconds of compile time.
 
 
 @numba.njit(cache=True, nogil=True)
@@ -95,11 +97,12 @@ def _to_solid(kind, figures, pair, x, y, z):  # type: ignore[no-untyped-def]
     if kind == DISK:
         beside = out - f0
         return max(beside, z) if beside <= 0.0 or z <= 0.0 else _length(beside, z, 0.0)
-    along, above = out * f2 + z * f1, z * f2 - out * f1  # from the ray on which the rim of the opening lies
+    along, above = out * f2 + z * f1, z * f2 - out * f1  # distance from the ray through the rim of the opening
     if above > 0.0:
         return above if along >= f0 else _length(along - f0, above, 0.0)
     inside = f0 - _length(out, z, 0.0)
-    return max(inside, above) if inside < 0.0 and along > f0 else inside  # beyond the shell all is forbidden
+    # everything beyond the shell is forbidden
+    return max(inside, above) if inside < 0.0 and along > f0 else inside
 
 
 @numba.njit(cache=True, nogil=True)
@@ -117,8 +120,8 @@ def _to_node(nodes, n, x, y, z):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _to_tree(nodes, begin, first_leaf, x, y, z, best, hasty):  # type: ignore[no-untyped-def]
-    """Distance of a point, in the tree's own frame, to the nearest of its spheres; `best` if that is less. If
-    `hasty`, to any sphere that is nearer than `best`, probably one of the nearest."""
+    """Distance of a point, in the tree's own frame, to the nearest of its spheres, at most `best`. If `hasty`, to
+    the first sphere found that is nearer than `best`."""
     if _to_node(nodes, begin + 1, x, y, z) >= best:
         return best
     i = 1
@@ -146,8 +149,8 @@ def _to_tree(nodes, begin, first_leaf, x, y, z, best, hasty):  # type: ignore[no
 
 @numba.njit(cache=True, nogil=True)
 def _to_obstacle(nodes, trees, numbers, figures, frames, pair, n, best, hasty):  # type: ignore[no-untyped-def]
-    """Distance of node n, in the frame of the pair's link, to the pair's obstacle; `best` if that is less, and
-    `hasty` as `_to_tree`."""
+    """Distance of node n, in the frame of the pair's link, to the pair's obstacle, at most `best`; `hasty` as in
+    `_to_tree`."""
     link, other = numbers[pair, 1], numbers[pair, 4]
     bx, by, bz, radius = nodes[n, 0], nodes[n, 1], nodes[n, 2], nodes[n, 3]
     x = frames[link, 0, 0] * bx + frames[link, 0, 1] * by + frames[link, 0, 2] * bz + frames[link, 0, 3]
@@ -165,8 +168,8 @@ def _to_obstacle(nodes, trees, numbers, figures, frames, pair, n, best, hasty): 
 
 @numba.njit(cache=True, nogil=True)
 def _margin(nodes, trees, numbers, figures, frames, pair, far, hasty):  # type: ignore[no-untyped-def]
-    """Least distance of a pair minus what it must keep; `far` if that is less. If it is `hasty`, what is found
-    first of anything less than `far`."""
+    """Least distance of a pair minus its clearance, at most `far`. If `hasty`, the first value found below
+    `far`."""
     begin, first_leaf = trees[numbers[pair, 0], 0], trees[numbers[pair, 0], 1]
     required = figures[pair, 0]
     best = far
@@ -188,10 +191,10 @@ def _margin(nodes, trees, numbers, figures, frames, pair, far, hasty):  # type: 
 
 @numba.njit(cache=True, nogil=True)
 def _moved_mm(nodes, trees, numbers, figures, joints, frames, pair, turned):  # type: ignore[no-untyped-def]
-    """How far a pair can move against each other while the axes turn by at most `turned` [6] radians from a place.
+    """Bound of the relative motion of a pair while the axes turn by at most `turned` [6] radians from a posture.
 
-    A point moves by no more than each axis' turn times its greatest distance from that axis meanwhile, which is
-    the distance now and what the axes farther out move the point.
+    A point moves by at most each axis' turn times its greatest distance from that axis during the turn, which is
+    its present distance plus its motion by the axes farther out.
     """
     n, link = trees[numbers[pair, 0], 0] + 1, numbers[pair, 1]
     bx, by, bz, radius = nodes[n, 0], nodes[n, 1], nodes[n, 2], nodes[n, 3]
@@ -210,7 +213,7 @@ def _moved_mm(nodes, trees, numbers, figures, joints, frames, pair, turned):  # 
 
 @numba.njit(cache=True, nogil=True)
 def margins_at(model, joints_deg, far_mm):  # type: ignore[no-untyped-def]
-    """Distance minus what must be kept [n, pairs] with the arm at `joints_deg` [n, 6]; nothing above `far_mm`."""
+    """Distance minus clearance [n, pairs] with the arm at `joints_deg` [n, 6], at most `far_mm`."""
     frames = np.empty((9, 3, 4))
     margins = np.empty((joints_deg.shape[0], model.numbers.shape[0]))
     for n in range(margins.shape[0]):
@@ -224,11 +227,11 @@ def margins_at(model, joints_deg, far_mm):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def blocked_at(model, start_deg, end_deg):  # type: ignore[no-untyped-def]
-    """The first pair found to come too close on a straight motion in joint space, CLEAR if none does; where on the
-    way (0 to 1), and how far the pair can move against each other within the stretch that was looked at, mm.
+    """The first pair found to come too close on a straight motion in joint space, CLEAR if none does; its
+    parameter on the motion (0 to 1), and the bound of the pair's relative motion within the checked segment, mm.
 
-    A stretch is clear if, in its middle, each pair is farther apart than it can come together from there to the
-    stretch's ends; other stretches are halved.
+    A segment is clear if, at its middle, each pair is farther apart than it can approach from there to the
+    segment's ends; other segments are halved.
     """
     numbers, figures = model.numbers, model.figures
     frames, here_deg, turned = np.empty((9, 3, 4)), np.empty(6), np.empty(6)

@@ -1,4 +1,4 @@
-"""From views to motions: a posture of the arm for each view, and ways between them that touch nothing."""
+"""From views to motions: a posture of the arm for each view, and collision-free paths between them."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ KeptOutSphere: TypeAlias = tuple[str, Vector, float]
 KeptOutBox: TypeAlias = tuple[str, Vector, Vector]
 
 POSTURE_COST_S = 0.3
-"""So much time a posture may cost that is farther from limits and singularities."""
+"""Longest additional time that is accepted for a posture farther from limits and singularities."""
 
 
 @dataclass(frozen=True)
 class Visit:
-    """One view on the way: the joint angles there [6] and the leg that leads to them."""
+    """One visited view: its joint angles [6] and the leg that leads there."""
 
     joints_deg: Joints
     leg: Leg
@@ -43,18 +43,18 @@ class Visit:
 
 @dataclass(frozen=True)
 class Itinerary:
-    """Visits, one for each view, None where a view cannot be visited; why not is in `refusals`."""
+    """Visits, one for each view, None if a view cannot be visited; the reasons are in `refusals`."""
 
     visits: tuple[Visit | None, ...]
     refusals: tuple[str, ...]
     order: tuple[int, ...]
-    """Which view is visited when; each visit's leg begins at the one before it here. Views that are refused are
-    left out."""
+    """Indices of the views in the order of the visits; each leg begins at the previous visit. Refused views are
+left out."""
 
 
 def arm_of(rig: Rig) -> kinematics.Arm:
-    """The rig's arm with the speeds and limits that plans are run at: those of its driver, within the posture
-    limits of its description. Raises InputError where nothing describes it."""
+    """The rig's arm with the speeds and limits for plans: those of its driver, within the posture limits of its
+    description. Raises InputError if the arm has no description."""
     arm, described = planning_arm(rig), described_arm(rig)
     if arm is None or described is None:
         raise undescribed(rig)
@@ -63,17 +63,17 @@ def arm_of(rig: Rig) -> kinematics.Arm:
 
 
 def undescribed(rig: Rig) -> InputError:
-    """The error of a rig whose arm nothing describes."""
+    """The error of a rig whose arm has no description."""
     return InputError(f"nothing describes the arm that `{rig.robot.driver}` moves: name its file under `arm:`")
 
 
 def bodies_of(
     rig: Rig, leds: LedTable, object_corners_support_mm: NDArray[np.float64], link_meshes: Path | None = None
 ) -> CellBodies:
-    """The rig's arm, tool and surroundings, with the object's mesh ([triangles, 3, 3], support frame).
+    """The rig's arm, tool and obstacles, with the object's mesh ([triangles, 3, 3], support frame).
 
-    `link_meshes` is a folder of meshes that stand for the arm's links instead of capsules round them; InputError
-    if they cannot be read, or if nothing describes the arm.
+    `link_meshes` is a folder of meshes that replace the capsules of the arm's links; InputError
+    if they cannot be read, or if the arm has no description.
     """
     arm = described_arm(rig)
     if arm is None:
@@ -118,7 +118,7 @@ def _keep_outs(rig: Rig) -> tuple[tuple[KeptOutSphere, ...], tuple[KeptOutBox, .
 
 
 def base_from_flange(view: ViewPose, rig: Rig) -> Transform:
-    """Where the flange must be for a view that is given as a camera pose."""
+    """The flange's pose for a view that is given as a camera pose."""
     assert view.support_from_camera is not None
     base_from_camera = rig.support.base_from_support.matrix() @ view.support_from_camera
     flange: Transform = base_from_camera @ inverse(rig.flange_from_camera.matrix())
@@ -132,9 +132,9 @@ def plan_itinerary(
     start_deg: Sequence[float],
     order: Literal["fastest", "as_written"] = "fastest",
 ) -> Itinerary:
-    """Order, postures and legs of views, shortest in all from where the arm stands; or in the order given.
+    """Order, postures and legs of views with the least total time from the arm's posture; or in the given order.
 
-    Without `bodies` nothing is in the way: times of straight motions only.
+    Without `bodies` collisions are ignored: straight motions only.
     """
     arm = arm_of(rig)
     planner = PathPlanner(arm, bodies, [rig.motion.home_joints_deg])
@@ -162,7 +162,7 @@ def plan_itinerary(
         before = f"view {views[visited[cut_off - 1]].name}" if cut_off else "where the arm stands"
         name = views[visited[cut_off]].name
         refusals.append(f"view {name}: no way to it was found from {before}: {contacts[cut_off]}")
-        del choices[visited[cut_off]]  # what comes after it may be reached without it
+        del choices[visited[cut_off]]  # later views may still be reachable without it
     visits: list[Visit | None] = [None] * len(views)
     for index, joints, leg in zip(visited, tour.places, tour.legs, strict=True):
         visits[index] = Visit(joints, leg)
@@ -170,7 +170,7 @@ def plan_itinerary(
 
 
 def _rig_refusals(rig: Rig) -> list[str]:
-    """What no plan on this rig could make good."""
+    """Refusals that concern the rig and not the plan."""
     refusals = []
     if violation := kinematics.limit_violations(arm_of(rig), rig.motion.home_joints_deg):
         refusals.append(f"rig: at home {violation}")
@@ -178,7 +178,7 @@ def _rig_refusals(rig: Rig) -> list[str]:
 
 
 def _postures(view: ViewPose, rig: Rig, bodies: CellBodies | None) -> tuple[NDArray[np.float64], str]:
-    """Joint angles [k, 6] that give a view, touch nothing and are no singularity, or why there are none."""
+    """Joint angles [k, 6] of a view without contacts and singularities, or the reason why there are none."""
     arm = arm_of(rig)
     if view.joints_deg is not None:
         postures = np.array([view.joints_deg], dtype=np.float64)

@@ -1,8 +1,8 @@
-"""Robot shadow: which LEDs reach which parts of the object in a view, and what hides the others.
+"""Occlusion: which LEDs light which parts of the object in a view, and what hides the others.
 
 From the point of each patch of the object's surface, rays to the LEDs (points, too) are tested against the
-object's own mesh, which is the same for all views, and against the capsules of arm and tool in the view's
-posture. Capsules enclose the real bodies, so their shadows are rather too large than too small. All is in the
+object's own mesh, which is the same for all views, and against the capsules of arm and tool in the view's posture.
+Capsules enclose the real bodies, so occlusion is overestimated rather than underestimated. Coordinates are in the
 support frame, in mm.
 """
 
@@ -28,11 +28,11 @@ from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import described_arm
 
 REACHED, AWAY, BY_OBJECT, BY_ARM, BY_TOOL = range(5)
-"""Codes of a patch and an LED. AWAY: the LED is below the patch's horizon, or the patch is behind the LED. Where
-several hold, the smallest of them is given; REACHED where none does."""
+"""Codes of a patch and an LED. AWAY: the LED is below the patch's horizon, or the patch is behind the LED. If
+several apply, the smallest is given; REACHED if none does."""
 RAY_START_MM = 0.1
 """Rays start this far off the surface, along the patch's normal, so that a patch does not hide itself by rounding
-(Embree reckons with 24 bits: 0.00006 mm at 1 m). Steps of the surface that are lower cast no shadow."""
+(Embree computes with 24 bits: 0.00006 mm at 1 m). Lower steps of the surface cast no shadow."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Sight:
     def project(self, points_mm: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Column and row [..., 2] in pixels and depth [...] in mm of points [..., 3] of the support frame.
 
-        The first pixel's centre is (0, 0). Pixels mean nothing where the depth is not positive.
+        The first pixel's centre is (0, 0). Pixels are meaningless where the depth is not positive.
         """
         in_camera = apply(inverse(self.support_from_camera), points_mm)
         depth_mm = in_camera[..., 2]
@@ -58,7 +58,7 @@ class Sight:
 
 @dataclass(frozen=True)
 class Occlusion:
-    """What the patches get of the LEDs in one view: plain arrays, LEDs in the order of the dome's table."""
+    """Which LEDs light which patches in one view: plain arrays, LEDs in the order of the dome's table."""
 
     codes: NDArray[np.uint8]
     """[patches, leds] REACHED, AWAY, BY_OBJECT, BY_ARM or BY_TOOL."""
@@ -69,27 +69,28 @@ class Occlusion:
 
     @property
     def masks(self) -> NDArray[np.bool_]:
-        """[leds, patches] for each LED the patches that its light reaches."""
+        """[leds, patches] True where an LED's light reaches the patch."""
         return np.ascontiguousarray(self.codes.T == REACHED)
 
     def share(self, code: int = REACHED) -> NDArray[np.float64]:
-        """[leds] of the surface that the camera sees, the share that has this code; 0 where it sees none of it."""
+        """[leds] share of the surface seen by the camera that has this code; 0 if the camera sees nothing of
+        it."""
         weights = np.where(self.seen, self.areas_mm2, 0.0)
         share: NDArray[np.float64] = weights @ (self.codes == code) / max(weights.sum(), 1e-300)
         return share
 
     def occluded_leds(self) -> NDArray[np.bool_]:
-        """[leds] True where an LED reaches no patch that the camera sees; nowhere if it sees none.
+        """[leds] True where an LED reaches no patch that the camera sees; all False if it sees none.
 
-        What is smaller than a patch may be lit all the same.
+        Parts smaller than a patch may be lit all the same.
         """
         reaches: NDArray[np.bool_] = (self.codes[self.seen] == REACHED).any(axis=0)
         return ~reaches & self.seen.any()
 
     def arrays(self, patches: Patches) -> dict[str, NDArray[np.generic]]:
-        """Everything by name, to be stored beside a view's frames and read without this module.
+        """Arrays by name, to be stored with a view's frames and read without this module.
 
-        `codes` uint8 [patches, leds] and `seen` [patches] as above; of the patches, in the support frame,
+        `codes` uint8 [patches, leds] and `seen` [patches] as above; for the patches, in the support frame,
         `points_mm` and outward `normals` float32 [patches, 3] and `areas_mm2` float32 [patches].
         """
         return {
@@ -103,7 +104,7 @@ class Occlusion:
 
 @dataclass(frozen=True)
 class Occlusions:
-    """What is the same in all views, and the rig that makes the rest."""
+    """Data common to all views, and the rig for the rest."""
 
     rig: Rig
     arm: ArmDescription
@@ -116,9 +117,9 @@ class Occlusions:
     """[patches, leds] REACHED, AWAY or BY_OBJECT, of the object alone."""
 
     def at(self, joints_deg: ArrayLike) -> Occlusion:
-        """The shadows of a view with the arm at joint angles [6].
+        """Occlusion in a view with the arm at joint angles [6].
 
-        The camera's own bodies and what else the flange carries are taken to leave the view of its lens free.
+        The tool is assumed not to obstruct the camera's view.
         """
         support_from_base = inverse(self.rig.support.base_from_support.matrix())
         frames = support_from_base @ link_frames(self.arm.arm, joints_deg)
@@ -138,7 +139,7 @@ class Occlusions:
     def _seen(
         self, sight: Sight, axes_mm: NDArray[np.float64], radii_mm: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """[patches] True where a camera sees the patch: in its picture, turned to it, nothing in between."""
+        """[patches] True where a camera sees the patch: inside the image, facing the camera, unobstructed."""
         eye_mm = sight.support_from_camera[:3, 3]
         starts_mm = ray_starts(self.patches)
         pixels, depth_mm = sight.project(starts_mm)
@@ -154,10 +155,10 @@ class Occlusions:
 def occlusions_of(
     rig: Rig, leds: LedTable, corners_mm: NDArray[np.float64], targets_mm: ArrayLike, count: int = PATCHES
 ) -> Occlusions:
-    """Everything about an object's shadows that does not depend on the arm.
+    """The part of an object's occlusion that does not depend on the arm.
 
-    `corners_mm` [triangles, 3, 3] is its mesh in the support frame; without triangles `targets_mm` [n, 3]
-    stand for it. Raises InputError where nothing describes the rig's arm.
+    `corners_mm` [triangles, 3, 3] is its mesh in the support frame; without triangles `targets_mm` [n, 3] replace
+    it. Raises InputError if the rig's arm has no description.
     """
     arm = described_arm(rig)
     if arm is None:
@@ -176,7 +177,8 @@ def own_codes(
     leds_mm: NDArray[np.float64],
     led_normals: NDArray[np.float64],
 ) -> NDArray[np.uint8]:
-    """Codes [patches, leds] of an object alone, with LEDs at [leds, 3] that shine to the side of their normals."""
+    """Codes [patches, leds] of an object alone, with LEDs at [leds, 3] that emit into the half-space of their
+    normals."""
     starts_mm = ray_starts(patches)
     to_leds = leds_mm[None] - starts_mm[:, None]
     faces = np.einsum("plk,pk->pl", to_leds, patches.normals) > 0
@@ -188,13 +190,13 @@ def own_codes(
 
 
 def ray_starts(patches: Patches) -> NDArray[np.float64]:
-    """[patches, 3] where rays from the patches begin: RAY_START_MM above their points."""
+    """[patches, 3] starting points of rays from the patches: RAY_START_MM above their points."""
     starts_mm: NDArray[np.float64] = patches.points_mm + RAY_START_MM * patches.normals
     return starts_mm
 
 
 def ray_mesh(corners_mm: NDArray[np.float64]) -> Any:
-    """A mesh [triangles, 3, 3] made ready for rays (Embree); None without triangles."""
+    """A mesh [triangles, 3, 3] prepared for ray tracing (Embree); None without triangles."""
     if len(corners_mm) == 0:
         return None
     from embreex.mesh_construction import TriangleMesh
@@ -231,7 +233,7 @@ def hidden_by(
     asked: NDArray[np.bool_],
 ) -> NDArray[np.int16]:
     """For each segment from a start [n, 3] to an end [m, 3] the first capsule (axes [k, 2, 3], radii [k]) that it
-    meets, [n, m]; -1 where it meets none, or is not `asked` for [n, m]."""
+    meets, [n, m]; -1 where it meets none, or where `asked` [n, m] is False."""
     found = np.full(asked.shape, -1, np.int16)
     if len(starts_mm):
         center_mm = starts_mm.mean(axis=0)
@@ -241,7 +243,7 @@ def hidden_by(
 
 
 def sight_of(rig: Rig, support_from_camera: Transform) -> Sight:
-    """The rig's camera, somewhere. Its image lies where the lens equation has it for the distance of focus."""
+    """The rig's camera at a pose, with the image distance from the lens equation for the focus distance."""
     image_mm = 1 / (1 / rig.lens.focal_length_mm - 1 / rig.lens.focus_distance_mm)
     return Sight(
         support_from_camera,
@@ -255,8 +257,8 @@ def sight_of(rig: Rig, support_from_camera: Transform) -> Sight:
 def segment_distance_mm(p, q, a, b):  # type: ignore[no-untyped-def]
     """Distance between the segments from p to q and from a to b, points [3] each.
 
-    Ericson, Real-Time Collision Detection (2005), section 5.1.9: nearest points of the lines, moved into the
-    segments. Of parallel lines any point will do to begin with.
+    Ericson, Real-Time Collision Detection (2005), section 5.1.9: nearest points of the lines, clamped to the
+    segments. For parallel lines any starting point is valid.
     """
     ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
     vx, vy, vz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -275,8 +277,8 @@ def segment_distance_mm(p, q, a, b):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _first_met(starts, ends, axes, radii, asked, center, reach, found):  # type: ignore[no-untyped-def]
-    """Fill `found` [n, m]. No segment to an end is farther than `reach` from the one that starts at `center`: what
-    that one misses by more need not be tried for each start."""
+    """Fill `found` [n, m]. No segment to an end is farther than `reach` from the one that starts at `center`: a
+    capsule that this one misses by more is not tested for each start."""
     near = np.empty(len(radii), np.int64)
     for j in range(len(ends)):
         count = 0

@@ -1,10 +1,10 @@
-"""The order of views and their postures that make the whole way shortest.
+"""The order of views and their postures with the least total time.
 
-Which view comes when, and with which of the arm's solutions, is one problem: a travelling salesman who visits one
-place of each group (a generalised TSP; Noon, Bean 1993), on an open way from where the arm stands. To find the
-true time of a leg is dear, that of the straight motion is cheap and never more. So a way is sought under straight
-times; whether its legs are clear is looked at, then those that are not are found; what was learnt takes the place
-of the straight times, and so on until a way is best whose legs are all known.
+Order and choice of postures are one problem: a travelling salesman who visits one place of each group (a
+generalised TSP; Noon, Bean 1993), on an open tour from the arm's posture. The true time of a leg is expensive to
+compute; the time of the straight motion is cheap and a lower bound. So a tour is optimised with straight times;
+its legs are checked, and blocked ones are planned; their true times replace the straight ones, and this is
+repeated until the best tour consists of known legs.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ Floats = NDArray[np.float64]
 _RESTARTS, _ROUNDS = 3, 200
 _CHANGES_PER_PLACE, _MOST_CHANGES = 2_000, 600_000
 _AGAIN = 0.03
-"""Share of the changes, and of the first temperature, when a way is sought again after some legs were learnt."""
+"""Share of the changes, and of the first temperature, when a tour is optimised again after some legs became
+known."""
 _COLDEST_S = 1e-3
 _DETOUR_S = 0.5
-"""What a way round something costs at least, as a rule: another stop. Until it is known, that is added."""
+"""Typical least cost of a detour: one more stop. Added to a blocked leg until its true time is known."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class _Groups:
     places: Floats
     first: NDArray[np.int64]
     posture_cost_s: Floats
-    """[places] what is added to the time of a way that uses a place."""
+    """[places] cost added to the time of a tour that uses a place."""
 
 
 def shortest_tour(
@@ -57,10 +58,11 @@ def shortest_tour(
     *,
     as_written: bool = False,
 ) -> Tour:
-    """One place of each group (`choices` [k, 6] each) and the legs between, shortest in all, from `start` on.
+    """One place of each group (`choices` [k, 6] each) and the legs between, with the least total time from
+    `start`.
 
-    `posture_cost_s` [k] each is added to a place's time, so that of nearly equal ways the easier is taken. With
-    `as_written` the order of the groups stays. The same arguments give the same tour.
+    `posture_cost_s` [k] each is added to a place's time, so that among nearly equal tours that with better
+    postures is chosen. With `as_written` the order of the groups is kept. The same arguments give the same tour.
     """
     if not choices:
         return Tour((), (), ())
@@ -85,7 +87,7 @@ def shortest_tour(
 def _settled(
     times: _Times, groups: _Groups, order: NDArray[np.int64], seed: int, *, as_written: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """An order and the places picked in it that are still best when all legs of the way are known."""
+    """An order and its places that are still best when all legs of the tour are known."""
     picked = _best_places(times.seconds, groups, order)
     for count in range(_ROUNDS):
         if not as_written and len(order) > 1:
@@ -101,7 +103,7 @@ def _settled(
 
 
 class _Times:
-    """Times `seconds` [places, places] of legs, as far as they are known: at first of straight motions."""
+    """Times `seconds` [places, places] of legs: of straight motions until the true times are known."""
 
     def __init__(self, planner: PathPlanner, places: Floats) -> None:
         self._planner, self._places = planner, places
@@ -110,7 +112,8 @@ class _Times:
         self._to_find: set[tuple[int, int]] = set()
 
     def learn_blocked(self, picked: NDArray[np.int64]) -> bool:
-        """Look whether the straight motions of a way are clear; True if one is not; it costs a detour more now."""
+        """Check the straight motions of a tour; True if one is blocked, whose time is then increased by a
+        detour."""
         blocked = False
         for a, b in self._legs(picked):
             if not self._looked_at[a, b]:
@@ -122,7 +125,7 @@ class _Times:
         return blocked
 
     def learn_detours(self, picked: NDArray[np.int64]) -> bool:
-        """Find the legs of a way that are not straight; True if there was one to be found."""
+        """Plan the legs of a tour that are not straight; True if there was one to plan."""
         wanted = self._to_find.intersection(self._legs(picked))
         for a, b in sorted(wanted):
             self._set(a, b, self._planner.leg(self._places[a], self._places[b]).duration_s)
@@ -142,7 +145,7 @@ def _way_s(seconds: Floats, groups: _Groups, picked: NDArray[np.int64]) -> float
 
 
 def _best_places(seconds: Floats, groups: _Groups, order: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The place of each group that makes the way in a given order shortest, by dynamic programming."""
+    """The place of each group that gives the shortest tour in a given order, by dynamic programming."""
     before, total_s = slice(0, 1), np.zeros(1)
     came_from = []
     for group in order:
@@ -167,7 +170,7 @@ def _best_order(
     *,
     again: bool,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """A better order, by simulated annealing from the one given; warm when it is sought `again`."""
+    """A better order, by simulated annealing from the given one; at a lower temperature when called `again`."""
     from coupole.motion.annealing import anneal
 
     share = _AGAIN if again else 1.0

@@ -1,4 +1,4 @@
-"""Patches: an object's surface divided into parts of about the same area, each with a point that stands for it."""
+"""Patches: an object's surface divided into parts of about the same area, each represented by a point."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 PATCHES = 400
 _PIECE_EDGE, _LEAST_EDGE = 0.5, 1e-3
-"""Longest edge of the pieces that patches are made of, as a share of a patch's width, but not shorter than that
-share of the object's size (or slivers of a mesh would be cut without end)."""
+"""Longest edge of the pieces of patches, as a share of a patch's width, but not less than that share of the
+object's size (otherwise slivers of a mesh would be split without end)."""
 _TURN_WIDTHS = 2.0
-"""Surfaces that differ by a unit in their normals are kept apart like those so many patch widths away."""
+"""Weight of normals in clustering: a difference of 1 in the normals counts like this many patch widths."""
 
 
 @dataclass(frozen=True)
@@ -20,11 +20,11 @@ class Patches:
     """Parts of an object's surface, each of about the same area, in the support frame."""
 
     points_mm: NDArray[np.float64]
-    """[n, 3] a point on the surface that stands for the patch."""
+    """[n, 3] a point on the surface that represents the patch."""
     normals: NDArray[np.float64]
     """[n, 3] unit, outwards: the mean over the patch."""
     areas_mm2: NDArray[np.float64]
-    """[n]; 1 each where there is no mesh."""
+    """[n]; 1 each without a mesh."""
     piece_patch: NDArray[np.int64]
     """[pieces] the patch that each piece of a triangle belongs to."""
     piece_triangle: NDArray[np.int64]
@@ -40,9 +40,9 @@ class Patches:
 def patches_of(corners_mm: NDArray[np.float64], count: int = PATCHES) -> Patches:
     """Divide a mesh [triangles, 3, 3], corners counter-clockwise seen from outside, into about `count` patches.
 
-    Triangles are cut into pieces smaller than a patch; these are halved by area, again and again, across the
-    direction of place and normal in which they differ most. The same mesh gives the same patches, one without area
-    none.
+    Triangles are split into pieces smaller than a patch; these are repeatedly divided into halves of equal area,
+    across the direction of position and normal with the largest spread. The same mesh gives the same patches; a
+    mesh without area gives none.
     """
     width_mm = float(np.sqrt(_areas_and_normals(corners_mm)[0].sum() / count))
     if width_mm == 0.0:
@@ -63,13 +63,13 @@ def patches_of(corners_mm: NDArray[np.float64], count: int = PATCHES) -> Patches
     total_mm2 = np.bincount(patch, areas_mm2).astype(np.float64)
     mean_normals = np.stack([np.bincount(patch, areas_mm2 * component) for component in normals.T], axis=1)
     length = np.linalg.norm(mean_normals, axis=1, keepdims=True)
-    # A patch round a thin edge may have normals that cancel out: then the one of its point must do.
+    # The normals of a patch around a thin edge may cancel: then the normal of its point is used.
     unit = np.where(length > 1e-6 * total_mm2[:, None], mean_normals / np.maximum(length, 1e-300), normals[chosen])
     return Patches(centers_mm[chosen], unit, total_mm2, patch, triangle)
 
 
 def patches_at(points_mm: ArrayLike) -> Patches:
-    """Points [n, 3] that stand for an object without a mesh: patches of equal weight that face up."""
+    """Points [n, 3] in place of an object without a mesh: patches of equal weight that face up."""
     points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 3)
     nothing = np.zeros(0, np.int64)
     return Patches(points, np.tile((0.0, 0.0, 1.0), (len(points), 1)), np.ones(len(points)), nothing, nothing)
@@ -102,7 +102,7 @@ def _cut(corners_mm: NDArray[np.float64], edge_mm: float) -> tuple[NDArray[np.fl
 
 
 def _halved(traits: NDArray[np.float64], weights: NDArray[np.float64], count: int) -> list[NDArray[np.int64]]:
-    """Divide items with traits [n, k] into `count` groups of about equal weight whose members are alike."""
+    """Divide items with traits [n, k] into `count` groups of about equal weight with similar members."""
     groups, open_groups = [], [(np.arange(len(traits)), count)]
     while open_groups:
         members, parts = open_groups.pop()

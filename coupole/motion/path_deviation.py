@@ -1,4 +1,4 @@
-"""The tube round a leg that was found clear: how far an arm on its way is from where it would be."""
+"""Path deviation: distance of the moving arm from its planned path."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ PATH_TOLERANCE_MM = 10.0
 def path_deviation_mm(
     way_deg: Sequence[NDArray[np.float64]], joints_deg: NDArray[np.float64], reach_mm: NDArray[np.float64]
 ) -> float:
-    """How far, at most, any point of arm and tool is from where it would be on the straight motions of `way_deg`
-    ([6] each), with the axes at `joints_deg` [6]: the nearest place of the way is taken, and each axis' deviation
-    there times the farthest that anything can be from that axis, `reach_mm` [6] (`CellBodies.reach_mm`)."""
+    """Upper bound of the distance of any point of arm and tool from the straight motions of `way_deg` ([6] each),
+    with the axes at `joints_deg` [6]: for the nearest posture of the path, the sum over the axes of the deviation
+    times the greatest distance of any point from that axis, `reach_mm` [6] (`CellBodies.reach_mm`)."""
     best = np.inf
     for a, b in pairwise([*way_deg, way_deg[-1]]):
         along, off = (b - a) * reach_mm, (joints_deg - a) * reach_mm

@@ -1,8 +1,8 @@
-"""Ways of the arm between places that touch nothing.
+"""Collision-free paths of the arm between postures.
 
-A *leg* brings the arm from one view to the next: straight in joint space where that is clear, else over via
+A *leg* is the path from one view to the next: straight in joint space if that is clear, else through via
 points, else along paths that RRT-Connect finds (Kuffner, LaValle 2000: two trees that grow towards each other) to
-and from a resting place, shortened afterwards.
+and from a resting posture, shortened afterwards.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ class Leg:
     waypoints: tuple[Joints, ...]
     duration_s: float
     contact: Contact | None = None
-    """Where there is no way: what stands in it."""
+    """If there is no path: the contact that blocks it."""
 
 
 class PathPlanner:
-    """Legs among the cell's bodies, remembered; without bodies every straight motion is taken as clear.
+    """Legs among the cell's bodies, cached; without bodies every straight motion counts as clear.
 
-    The way back is the way there reversed, and what is found does not depend on what was asked before.
+    The return path is the path reversed, and results do not depend on earlier queries.
     """
 
     def __init__(
@@ -51,11 +51,12 @@ class PathPlanner:
         self._from_via: dict[tuple[int, bytes], list[Joints] | None] = {}
 
     def straight_s(self, places_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Times [n, n] of straight motions between places [n, 6], clear or not; lower bounds of the legs'."""
+        """Times [n, n] of straight motions between postures [n, 6], clear or not; lower bounds of the legs'
+        times."""
         return move_durations_s(self._arm, places_deg[:, None], places_deg)
 
     def is_straight(self, start: Joints, goal: Joints) -> bool:
-        """True if nothing is in the way of the straight motion."""
+        """True if the straight motion is clear."""
         a, b = _sorted(start, goal)
         key = (a.tobytes(), b.tobytes())
         if key not in self._straight:
@@ -63,7 +64,7 @@ class PathPlanner:
         return self._straight[key]
 
     def leg(self, start: Joints, goal: Joints) -> Leg:
-        """The way from one place to another."""
+        """The leg from one posture to another."""
         a, b = _sorted(start, goal)
         key = (a.tobytes(), b.tobytes())
         if key not in self._chains:
@@ -75,7 +76,7 @@ class PathPlanner:
         return Leg(tuple(chain[1:]), self._chain_s(chain))
 
     def _find(self, start: Joints, goal: Joints) -> list[Joints] | Contact:
-        """Places [k] from start to goal, straight motions between which are clear, or what is in the way."""
+        """Postures [k] from start to goal with clear straight motions between them, or the contact that blocks."""
         if self.is_straight(start, goal):
             return [start, goal]
         for place in (start, goal):
@@ -106,11 +107,11 @@ class PathPlanner:
         return None
 
     def _is_cut_off(self, place: Joints) -> bool:
-        """True if no way was found there from any resting place."""
+        """True if no path to the posture was found from any resting posture."""
         return all(self._way_from_via(number, place) is None for number in range(len(self._vias)))
 
     def _way_from_via(self, number: int, place: Joints) -> list[Joints] | None:
-        """From a resting place to another place; searched once."""
+        """Path from a resting posture to another posture; searched once."""
         key = (number, place.tobytes())
         if key not in self._from_via:
             via = self._vias[number]
@@ -125,8 +126,8 @@ class PathPlanner:
         return float(move_durations_s(self._arm, chain[:-1], chain[1:]).sum())
 
     def _via_chains(self, start: Joints, goal: Joints) -> list[list[Joints]]:
-        """Via points to try: a resting place of the arm, reached and left with axis 1 where start and goal have
-        it, so that the arm first draws back, then turns, then reaches out."""
+        """Via points to try: a resting posture of the arm, with axis 1 as at the start and then as at the goal, so
+        that the arm first retracts, then turns, then extends."""
         chains = []
         for via in self._vias:
             drawn_back, before_goal = via.copy(), via.copy()
@@ -157,7 +158,7 @@ class PathPlanner:
         return None
 
     def _extend(self, tree: list[Joints], parents: list[int], target: Joints, *, greedy: bool) -> int | None:
-        """Grow a tree towards `target` by one step, or until something is in the way; the last node reached."""
+        """Grow a tree towards `target` by one step, or until blocked; returns the last node reached."""
         node = int(np.argmin(np.abs(np.array(tree) - target).max(axis=1)))
         reached: int | None = None
         while True:
@@ -198,7 +199,7 @@ class PathPlanner:
 
 
 def _sorted(a: Joints, b: Joints) -> tuple[Joints, Joints]:
-    """The two places in an order that does not depend on which comes first."""
+    """The two postures in an order that does not depend on the order of the arguments."""
     return (b, a) if a.tobytes() > b.tobytes() else (a, b)
 
 

@@ -1,11 +1,12 @@
-"""Postures in which an axis would have to race for a small motion of the camera, and how far others are from them.
+"""Singularities of the arm, where small motions of the camera need large motions of an axis, and distances from
+them.
 
 An arm with a spherical wrist has three (Siciliano et al., "Robotics", 2009, sec. 3.3): the wrist stretched, so
 that axes 4 and 6 turn about one line; the elbow stretched or folded, so that the arm cannot reach farther or
-nearer; and the wrist's centre on axis 1, which then may stand anyhow. So has an arm with three parallel axes: axis
-6 parallel to them; the elbow; and the crossing of axes 5 and 6 in the plane of axes 1 and 2. Motions run straight
-in joint space and cross such places unharmed; views do not stay there, because what is corrected, or measured from
-the joints, loses its footing.
+nearer; and the wrist's centre on axis 1, whose angle is then undetermined. An arm with three parallel axes also
+has three: axis 6 parallel to them; the elbow; and the intersection of axes 5 and 6 in the plane of axes 1 and 2.
+Motions are straight in joint space and may cross singularities; views avoid them, because corrections of the pose
+and poses computed from the joints are ill-conditioned there.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from coupole.kinematics import Arm, limit_margin_deg, structure_of
 
 @dataclass(frozen=True)
 class SingularityMargin:
-    """How far a view's posture stays from singularities."""
+    """Least distances of a view's posture from singularities."""
 
     wrist_deg: float = 5.0
-    """Least angle of A5 from where the wrist is stretched."""
+    """Least angle of A5 from the stretched wrist."""
     elbow_deg: float = 5.0
     """Least angle between upper arm and forearm, from stretched and from folded."""
     shoulder_mm: float = 20.0
@@ -33,13 +34,13 @@ class SingularityMargin:
 
 SINGULARITY_MARGIN = SingularityMargin()
 _FREE_MARGIN = 3.0
-"""So many times the least distance from a singularity, a posture has no more to gain."""
+"""Singularity margin beyond which the posture cost is zero."""
 _FREE_LIMIT_MARGIN_DEG = 10.0
 
 
 def distances(arm: Arm, joints_deg: ArrayLike) -> tuple[NDArray[np.float64], ...]:
-    """How far joint angles [..., 6] are from the wrist's (deg), the elbow's (deg) and the shoulder's (mm)
-    singularity, [...] each. Raises ValueError for an arm without `structure_of`."""
+    """Distances of joint angles [..., 6] from the singularities of wrist (deg), elbow (deg) and shoulder (mm),
+    [...] each. Raises ValueError for an arm without `structure_of`."""
     found = structure_of(arm)
     if found is None:
         raise ValueError(f"the singularities of {arm.name} are not known: its chain has no closed solution")
@@ -57,13 +58,13 @@ def distances(arm: Arm, joints_deg: ArrayLike) -> tuple[NDArray[np.float64], ...
 
 
 def _from_half_turn_deg(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far an angle in radians is from the nearest whole number of half turns, degrees."""
+    """Distance of an angle in radians from the nearest multiple of pi, in degrees."""
     off: NDArray[np.float64] = np.abs((np.degrees(angle) + 90.0) % 180.0 - 90.0)
     return off
 
 
 def margin(arm: Arm, joints_deg: ArrayLike, kept: SingularityMargin = SINGULARITY_MARGIN) -> NDArray[np.float64]:
-    """[...] how many times as far as it must be a posture [..., 6] is from the nearest singularity."""
+    """[...] distance of a posture [..., 6] from the nearest singularity, over the least distance allowed."""
     wrist_deg, elbow_deg, shoulder_mm = distances(arm, joints_deg)
     shares = (wrist_deg / kept.wrist_deg, elbow_deg / kept.elbow_deg, shoulder_mm / kept.shoulder_mm)
     least: NDArray[np.float64] = np.minimum.reduce(shares)
@@ -71,7 +72,7 @@ def margin(arm: Arm, joints_deg: ArrayLike, kept: SingularityMargin = SINGULARIT
 
 
 def reason(arm: Arm, joints_deg: ArrayLike, kept: SingularityMargin = SINGULARITY_MARGIN) -> str:
-    """Which singularity a posture [6] is too near to, as a phrase for messages; empty if it is not."""
+    """The singularity that a posture [6] is too near to, as a phrase for messages; empty if there is none."""
     wrist_deg, elbow_deg, shoulder_mm = (float(distance) for distance in distances(arm, joints_deg))
     if wrist_deg < kept.wrist_deg:
         return (
@@ -93,7 +94,7 @@ def reason(arm: Arm, joints_deg: ArrayLike, kept: SingularityMargin = SINGULARIT
 
 
 def posture_cost(arm: Arm, postures_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[k] 0 for postures [k, 6] well away from singularities and limits, up to 1 for those just allowed."""
+    """[k] 0 for postures [k, 6] far from singularities and limits, up to 1 for those just allowed."""
     from_singular = (_FREE_MARGIN - margin(arm, postures_deg)) / (_FREE_MARGIN - 1.0)
     from_limit = 1.0 - limit_margin_deg(arm, postures_deg) / _FREE_LIMIT_MARGIN_DEG
     cost: NDArray[np.float64] = np.clip(np.maximum(from_singular, from_limit), 0.0, 1.0)

@@ -1,9 +1,9 @@
-"""Shapes as unions of spheres, in trees: the one vocabulary in which distances are reckoned.
+"""Shapes as trees of spheres, the common representation for distances.
 
-A capsule is a chain of spheres, a mesh is one sphere about each of many points of its surface. Both enclose what
-they stand for, so a distance between spheres is never more than the true one. A tree has one bounding sphere over
-all of a shape and halves it down to single spheres (Quinlan, "Efficient Distance Computation between Non-Convex
-Objects", 1994).
+A capsule is a chain of spheres, a mesh has one sphere about each of many points of its surface. Both enclose the
+real shape, so a distance between spheres is never more than the true one. The root of a tree bounds the whole
+shape, and each level halves it, down to single spheres (Quinlan, "Efficient Distance Computation between
+Non-Convex Objects", 1994).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 MESH_STEP_MM = 6.0
 """Spacing of the points on an object's surface."""
 _CHAIN_EXCESS_MM = 1.0
-"""How much a chain of spheres may be wider than the capsule that it covers."""
+"""Largest excess of a chain of spheres over the capsule that it covers."""
 
 
 class Spheres(NamedTuple):
@@ -30,20 +30,21 @@ class Spheres(NamedTuple):
 
 
 class SphereTrees(NamedTuple):
-    """Trees of spheres, one after the other (two arrays, because numba's compile time grows with their number)."""
+    """Trees of spheres, concatenated (two arrays only, because numba's compile time grows with their number)."""
 
     nodes: Floats
-    """[m, 4] centre and radius of each node's sphere, mm: what bounds all below it; of a leaf, the shape's own."""
+    """[m, 4] centre and radius of each node's sphere, mm: it bounds all its descendants; a leaf is a sphere of the
+    shape."""
     trees: NDArray[np.int64]
-    """[k, 2] of each tree where its nodes begin, and its first leaf. They are numbered like a heap: the root is 1,
-    the children of i are 2 i and 2 i + 1."""
+    """[k, 2] for each tree the index of its first node, and its first leaf. Nodes are numbered like a heap: the
+    root is 1, the children of i are 2 i and 2 i + 1."""
 
 
 def spheres_of(segments_mm: Floats, radii_mm: Floats) -> Spheres:
     """Chains of spheres that cover capsules: all within `radii_mm` [n] of segments [n, 2, 3].
 
-    The first and last sphere stand at the ends. Between them, a point that is at most h further along than the
-    centre of a sphere lies within sqrt(r^2 + h^2) of it.
+    The first and last sphere are at the ends. Between them, a point of the capsule at an axial distance of at most
+    h from the centre of a sphere is within sqrt(r^2 + h^2) of it.
     """
     centers, radii = [], []
     for (start, end), radius in zip(segments_mm, radii_mm, strict=True):
@@ -95,8 +96,8 @@ def sphere_trees_of(shapes: Sequence[Spheres]) -> SphereTrees:
 
 
 def _tree(shape: Spheres) -> Floats:
-    """[m, 4] nodes of a tree that halves a shape across its longest side; number 0 is not used, and the last
-    sphere stands several times to fill the leaves."""
+    """[m, 4] nodes of a tree that halves a shape across its longest side; index 0 is unused, and the last sphere
+    is repeated to fill the leaves."""
     spheres = np.column_stack([shape.centers_mm, shape.radii_mm])
     depth = int(np.ceil(np.log2(len(spheres))))
     spheres = spheres[np.minimum(np.arange(1 << depth), len(spheres) - 1)]

@@ -15,8 +15,9 @@ from pydantic import BaseModel
 
 from coupole.errors import Problem
 from coupole.kinematics import Arm, slowed
-from coupole.plan.arm_description import ArmDescription, arm_of_driver, read_arm
+from coupole.plan.arm_description import ArmDescription, arm_of_driver, read_arm, shipped_arm
 from coupole.plan.registry import (
+    ARMS_OF_DRIVERS,
     CAMERA_STAND_INS,
     DEFAULT_TWINS,
     LEDBOX_STAND_INS,
@@ -144,6 +145,8 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
     if not problems and not hasattr(load_class(rig.ledbox.driver), "runs_tables"):
         message = "expected a class that declares `runs_tables`, as `coupole.devices.LedBox` asks"
         problems.append(document.problem(("ledbox", "driver"), message))
+    if not problems:
+        problems += _unlike_stand_in(document, rig)
     if rig.world is not None:
         problems += world_problems(document, rig, rig.world.settings)
         kinds = {"camera": camera_kind(rig, dry_run=False), "ledbox": ledbox_stand_in(rig, dry_run=False).kind}
@@ -153,6 +156,22 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
                 message = f"expected {other_end}, which is at the other end of the {name}'s driver"
                 problems.append(document.problem(("world", "settings", name, "kind"), message))
     return problems
+
+
+def _unlike_stand_in(document: Document, rig: Rig) -> list[Problem]:
+    """An arm that the stand-in does not move, in a rig of stand-ins: poses would be the arm's, pictures the
+    stand-in's. (A UR's stand-in moves the driver's `model`, or its settings are refused.)"""
+    moved, described = ARMS_OF_DRIVERS.get(rig.robot.driver), described_arm(rig)
+    if moved is None or described is None or not in_world(rig, dry_run=False):
+        return []
+    stand_in = shipped_arm(moved)
+    if described.arm.chain == stand_in.arm.chain:
+        return []
+    message = (
+        f"expected the chain of a {stand_in.name}, the only one that the stand-in of `{rig.robot.driver}` moves, "
+        f"found that of `{described.name}`. Name your devices and leave `world:` out; `check` and `view` open none"
+    )
+    return [document.problem(("arm",), message)]
 
 
 def world_problems(document: Document, rig: Rig, settings: Mapping[str, Any]) -> list[Problem]:

@@ -19,12 +19,12 @@ from sim.devices.ur_arm import UrModel
 _COLUMN_MM, _SHOULDER_MM, _UPPER_MM, _FOREARM_MM, _WRIST_MM = 140.0, 150.0, 110.0, 80.0, 55.0
 """Radii, after KUKA's drawing of the KR10 R1100 sixx."""
 
-_UR_RADII_MM = {
+_UR_RADII_MM: dict[UrModel, dict[str, float]] = {
     "ur5e": {"column": 60.0, "shoulder": 65.0, "upper": 60.0, "forearm": 50.0, "wrist": 45.0},
     "ur10e": {"column": 78.0, "shoulder": 85.0, "upper": 75.0, "forearm": 60.0, "wrist": 48.0},
 }
 """From the outlines in Universal Robots' data sheets; each link is widest at its joints' housings."""
-_UR_ASIDE_MM = {"ur5e": (138.0, 7.0), "ur10e": (176.0, 39.0)}
+_UR_ASIDE_MM: dict[UrModel, tuple[float, float]] = {"ur5e": (138.0, 7.0), "ur10e": (176.0, 39.0)}
 """Distance of upper arm and forearm from the plane of axis 1, along axis 2."""
 
 Capsules = NDArray[np.float64]

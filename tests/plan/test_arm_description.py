@@ -156,6 +156,19 @@ def test_an_arm_that_rsi_cannot_steer_is_refused(tmp_path: Path) -> None:
         rig_with(tmp_path, arm=str(ROBOTS / "ur10e.yaml"))
 
 
+def test_an_arm_that_the_stand_in_does_not_move_is_planned_with_but_not_simulated(tmp_path: Path) -> None:
+    data = described(lambda d: d.update(name="mine"), "kr10_r1100_sixx")
+    data["joints"][2]["origin_mm"] = [455, 0, 0]
+    (tmp_path / "mine.yaml").write_text(json.dumps(data))
+    with pytest.raises(
+        InputError, match=r"rig\.yaml:1:\d+: arm: expected the chain of a KR10 .*found that of `mine`"
+    ):
+        rig_with(tmp_path, arm="mine.yaml")
+    real = (REPO / "configs/rigs/la-coupole.yaml").read_text().replace("../", f"{REPO}/configs/")
+    (tmp_path / "rig.yaml").write_text("arm: mine.yaml\n" + real)
+    assert arm_of(read_cell(tmp_path / "rig.yaml").rig).name == "mine"
+
+
 def test_an_arms_link_meshes_are_sought_beside_its_file(tmp_path: Path) -> None:
     data = described(lambda d: d.update(link_meshes="meshes"), "kr10_r1100_sixx")
     (tmp_path / "mine.yaml").write_text(json.dumps(data))
@@ -164,8 +177,9 @@ def test_an_arms_link_meshes_are_sought_beside_its_file(tmp_path: Path) -> None:
 
 
 def test_no_arm_of_another_name_is_shipped() -> None:
+    shipped = sorted(path.stem for path in ROBOTS.glob("*.yaml"))
     with pytest.raises(
-        InputError, match=r"no description of the arm `kr6`.*expected one of kr10_r1100_sixx, ur10e, ur5e"
+        InputError, match=f"no description of the arm `kr6`.*expected one of {', '.join(shipped)};"
     ):
         shipped_arm("kr6")
 

@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, assert_never, get_args
 
 import numpy as np
 
 from coupole.calibration import optics
 from coupole.calibration.budget.budget import Known
 from coupole.calibration.in_force import InForce, read_in_force
-from coupole.calibration.record import SEAL, Record, intrinsics_of, step_names
+from coupole.calibration.record import SEAL, Kind, Record, intrinsics_of, step_names
 from coupole.calibration.rotations import Floats, skew
 from coupole.errors import InputError
 
@@ -40,15 +40,15 @@ def read_records(paths: Sequence[Path]) -> tuple[InForce, ...]:
         if path.is_dir():
             inside = of_use(read_in_force([file for file in sorted(path.glob("*.yaml")) if _is_record(file)]))
             if not inside:
-                raise InputError(f"{path}: expected records of the kinds {', '.join(READERS)} in this folder")
+                raise InputError(f"{path}: expected records of the kinds {_KINDS} in this folder")
             found += inside
         else:
             found += read_in_force([path])
     for number, item in enumerate(found):
-        if item.record.kind not in READERS:
+        if reader_of(item.record.kind) is None:
             raise InputError(
                 f"{item.path}: a record of the kind `{item.record.kind}` is not used by a budget; expected "
-                f"{', '.join(READERS)}"
+                f"{_KINDS}"
             )
         if any(item.record.kind == other.record.kind for other in found[:number]):
             raise InputError(f"{item.path}: a second record of the kind `{item.record.kind}`; give one of each")
@@ -57,7 +57,7 @@ def read_records(paths: Sequence[Path]) -> tuple[InForce, ...]:
 
 def of_use(items: Sequence[InForce]) -> tuple[InForce, ...]:
     """Those of the kinds that a budget uses."""
-    return tuple(item for item in items if item.record.kind in READERS)
+    return tuple(item for item in items if reader_of(item.record.kind))
 
 
 def doubts(items: Sequence[InForce], now: datetime) -> tuple[str, ...]:
@@ -84,7 +84,9 @@ def known_from(items: Sequence[InForce], start: Known) -> Known:
     for item in items:
         if item.record.kind == "camera" and "hand-eye" in kinds:
             continue  # rays use the lens that the hand-eye record has, with their common covariance
-        said = READERS[item.record.kind](item.record, item.path)
+        read = reader_of(item.record.kind)
+        assert read is not None  # `read_records` and `of_use` let no other pass
+        said = read(item.record, item.path)
         changes |= said.figures
         sources += [(group, _called(item.record)) for group in said.sources]
     if {"leds", "mesh"} <= kinds:
@@ -179,16 +181,33 @@ def _of_hand_eye(record: Record, path: Path) -> Said:
     return Said(figures, ("camera", "lens"))
 
 
-READERS: dict[str, Callable[[Record, Path], Said]] = {
-    "camera": _of_camera,
-    "hand-eye": _of_hand_eye,
-    "leds": _of_leds,
-    "mesh": _of_mesh,
-    "flat-field": _of_flat_field,
-    "response": _of_response,
-    "led-power": _of_led_power,
-    "drift": _of_drift,
-}
+def reader_of(kind: Kind) -> Callable[[Record, Path], Said] | None:
+    """What reads a record of this kind for a budget; None if it says nothing to one."""
+    match kind:
+        case "camera":
+            return _of_camera
+        case "hand-eye":
+            return _of_hand_eye
+        case "leds":
+            return _of_leds
+        case "mesh":
+            return _of_mesh
+        case "flat-field":
+            return _of_flat_field
+        case "response":
+            return _of_response
+        case "led-power":
+            return _of_led_power
+        case "drift":
+            return _of_drift
+        case "chromatic" | "dark":
+            return None
+        case _:
+            assert_never(kind)
+
+
+_KINDS = ", ".join(kind for kind in get_args(Kind) if reader_of(kind))
+"""Those that a budget uses, for messages."""
 
 
 def camera_reach_mm(record: Record) -> float:

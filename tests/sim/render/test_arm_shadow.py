@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -60,7 +61,7 @@ def test_the_arms_capsules_reach_from_the_column_to_the_flange() -> None:
     assert wrist_to_flange == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("model", ["ur5e", "ur10e"])
+@pytest.mark.parametrize("model", get_args(UrModel))
 def test_a_urs_capsules_reach_from_the_column_to_the_flange_without_a_gap(model: UrModel) -> None:
     joints_deg = (10.0, -80.0, 95.0, 20.0, 40.0, -30.0)
     capsules: Capsules = ur_capsules(model, joints_deg)

@@ -20,7 +20,7 @@ from places import SHARED_DATA
 BUNNY = SHARED_DATA / "bunny/bun_zipper.ply"
 SUPPORT_FROM_OBJECT = {"translation_mm": [16.8, 0.0, -33.0], "abc_deg": [0, 0, 90]}
 """The scan's y points up and its feet stand 33 mm above its origin; on the support z points up."""
-VIEWS = {"above": (-90, 80), "left": (-130, 25), "front": (-90, 20), "right": (-50, 30)}
+VIEWS = {"above": (-110, 80), "left": (-130, 25), "front": (-90, 20), "right": (-50, 30)}
 """Azimuth and elevation, degrees."""
 SIDES = ("left", "front", "right")
 OBJECT_SHARE = 0.3

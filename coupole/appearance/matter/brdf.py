@@ -27,7 +27,7 @@ def lambert(wi: Array, wo: Array, *, reflectance: ArrayLike) -> Array:
 
 
 def oren_nayar(wi: Array, wo: Array, *, reflectance: ArrayLike, roughness: float) -> Array:
-    """Rough diffuse surfaces such as bole or plaster, in Fujii's form, which conserves energy.
+    """Rough diffuse surfaces such as bole or plaster, in Fujii's form, which creates no energy.
 
     Oren and Nayar, SIGGRAPH 1994; Fujii, "A tiny improvement of Oren-Nayar reflectance model" (2012). `roughness`
     goes from 0 (Lambert) to 1.

@@ -122,7 +122,8 @@ def _sample(source: Brdf, incidence: Array, theta: Array, phi: Array) -> tuple[A
 
 
 def _adapt(theta: Array, profiles: Array, cosines: Array, nodes: int) -> Array:
-    """`nodes` values of `theta`, dense where the logarithm of the profiles [i, theta, phi, bands] has high curvature.
+    """`nodes` values of `theta`, dense where the logarithm of the profiles [i, theta, phi, bands] has high
+    curvature.
 
     Linear interpolation of log f over a step h has the error h^2 f (log f)''/8 in f: equal errors need steps
     proportional to the inverse square root of f (log f)''. A tenth of the nodes is spread evenly.

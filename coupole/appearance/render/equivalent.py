@@ -1,7 +1,7 @@
 """An equivalent metal for a stack of films, because Mitsuba's rough conductor takes complex indices, but no films.
 
-At each wavelength the equivalent bulk index n + i k reflects as the stack does: exactly along the normal,
-and as nearly as possible at other angles. For a metal leaf it is nearly the leaf's own; for an interference film it is
+At each wavelength the equivalent bulk index n + i k reflects as the stack does: exactly along the normal, and as
+nearly as possible at other angles. For a metal leaf it is nearly the leaf's own; for an interference film it is
 not that of a real substance, and if the film's hue depends strongly on the angle there is no equivalent.
 """
 

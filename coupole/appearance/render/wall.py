@@ -26,7 +26,8 @@ _PART = 500_000
 def write_wall(
     scene: Scene, folder: Path, stem: Path, white: Array, progress: Callable[[int, int], None]
 ) -> dict[str, Any]:
-    """Write `stem`.png, the colour of a white wall, with the brightest 0.5 % of the cells shown as white; returns figures.
+    """Write `stem`.png, the colour of a white wall, with the brightest 0.5 % of the cells shown as white; returns
+    figures.
 
     Sunlight only: no sky, and no inter-reflection between stones. Raises InputError, OSError.
     """

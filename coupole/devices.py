@@ -389,7 +389,7 @@ class Robot(Protocol):
         ...
 
     def stopping_deg(self) -> NDArray[np.float64]:
-        """Largest further turn of each axis [6] after `stop`, from the driver's speeds, accelerations and delays."""
+        """Further turn of each axis [6] after `stop`, at most: by speeds, accelerations, delays."""
         ...
 
     def statistics(self) -> Mapping[str, float]:

@@ -389,7 +389,7 @@ class Robot(Protocol):
         ...
 
     def stopping_deg(self) -> NDArray[np.float64]:
-        """Further turn of each axis [6] after `stop`, at most: by speeds, accelerations, delays."""
+        """Largest further turn of each axis [6] after `stop`, from its speeds, accelerations and delays."""
         ...
 
     def statistics(self) -> Mapping[str, float]:

@@ -351,8 +351,7 @@ class ArmState:
     joints_deg: tuple[float, float, float, float, float, float]
     base_from_flange: Transform
     t_ns: int
-    """When this state was received, on the rig's clock: a later time means that the controller has reported
-    since."""
+    """When this state was received, on the rig's clock: each new report of the controller has a later time."""
     moving: bool
     fault: str = ""
     """Name and reason of a latched fault; empty when there is none."""
@@ -386,8 +385,7 @@ class Robot(Protocol):
         ...
 
     def stopping_deg(self) -> NDArray[np.float64]:
-        """Largest further turn of each axis [6] after `stop` is called, from this driver's speeds, accelerations
-        and delays."""
+        """Largest further turn of each axis [6] after `stop`, from its speeds, accelerations and delays."""
         ...
 
     def statistics(self) -> Mapping[str, float]:

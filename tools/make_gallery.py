@@ -127,7 +127,7 @@ _RENDERED = (
     ("sunset-gilding-main", "Gilding under a low sun"),
     (
         "arcature-main",
-        "A gilded niche in the sun, by path tracing: grainy, for the sun is found by way of gold by chance",
+        "A gilded niche in the sun, by path tracing: grainy, because paths hit the sun after gold only by chance",
     ),
     ("arcature-caustic", "The sun's light on the niche's ground and back wall, by photons (seed 001)"),
 )

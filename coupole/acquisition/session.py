@@ -265,7 +265,7 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> No
         console.print(f"  go on with --resume {run.folder}")
 
 
-# -- the rehearsal ----------------------------------------------------------------------------------------
+# -- the dry run ------------------------------------------------------------------------------------------
 
 
 def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any]) -> None:

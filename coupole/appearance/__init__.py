@@ -1,1 +1,2 @@
-"""Published physics of matter and light, by wavelength, and a spectral path tracer. Takes arrays, reads no rig."""
+"""Published spectral models of materials and light, and a spectral path tracer. Functions of arrays, without a
+rig."""

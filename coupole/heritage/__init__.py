@@ -1,1 +1,1 @@
-"""The conservator's bench: what an object is made of, and how it may have looked."""
+"""Analysis for conservation: materials of an object from measurements."""

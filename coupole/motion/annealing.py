@@ -19,12 +19,10 @@ def anneal(seconds, posture_cost_s, first, order, picked, rolls, hottest_s, cold
     geometrically.
     """
     n = len(order)
-    order, way = (
-        order.copy(),
-        np.zeros(n + 1, np.int64),
-    )  # visit i, from 1 to n, is at way[i], of group order[i - 1]
-    way[1:] = picked
-    best_order, best_way = order.copy(), way.copy()
+    # visit i, from 1 to n, is at tour[i], of group order[i - 1]
+    order, tour = order.copy(), np.zeros(n + 1, np.int64)
+    tour[1:] = picked
+    best_order, best_tour = order.copy(), tour.copy()
     gained_s, best_gained_s = 0.0, 0.0
     heat_s, cooling = hottest_s, (coldest_s / hottest_s) ** (1.0 / len(rolls))
     for roll in range(len(rolls)):
@@ -34,48 +32,48 @@ def anneal(seconds, posture_cost_s, first, order, picked, rolls, hottest_s, cold
         place = first[group] + int((first[group + 1] - first[group]) * rolls[roll, 3])
         if kind == 0:
             i, j = min(i, j), max(i, j)
-            change_s = _reversed_s(seconds, way, i, j)
+            change_s = _reversed_s(seconds, tour, i, j)
         else:
             j = i if kind == 1 else j
-            change_s = posture_cost_s[place] - posture_cost_s[way[i]] + _moved_s(seconds, way, i, j, place)
+            change_s = posture_cost_s[place] - posture_cost_s[tour[i]] + _moved_s(seconds, tour, i, j, place)
         if change_s > 0.0 and rolls[roll, 4] >= np.exp(-change_s / heat_s):
             continue
         gained_s -= change_s
         if kind == 0:
             order[i - 1 : j] = order[i - 1 : j][::-1].copy()
-            way[i : j + 1] = way[i : j + 1][::-1].copy()
+            tour[i : j + 1] = tour[i : j + 1][::-1].copy()
         else:
             step = 1 if j > i else -1
             for k in range(i, j, step):
-                order[k - 1], way[k] = order[k - 1 + step], way[k + step]
-            order[j - 1], way[j] = group, place
+                order[k - 1], tour[k] = order[k - 1 + step], tour[k + step]
+            order[j - 1], tour[j] = group, place
         if gained_s > best_gained_s + 1e-9:
             best_gained_s = gained_s
-            best_order[:], best_way[:] = order, way
-    return best_order, best_way[1:]
+            best_order[:], best_tour[:] = order, tour
+    return best_order, best_tour[1:]
 
 
 @numba.njit(cache=True, nogil=True)
-def _reversed_s(seconds, way, i, j):  # type: ignore[no-untyped-def]
+def _reversed_s(seconds, tour, i, j):  # type: ignore[no-untyped-def]
     """Additional cost of visits i to j in reversed order."""
-    change_s = seconds[way[i - 1], way[j]] - seconds[way[i - 1], way[i]]
-    if j + 1 < len(way):
-        change_s += seconds[way[i], way[j + 1]] - seconds[way[j], way[j + 1]]
+    change_s = seconds[tour[i - 1], tour[j]] - seconds[tour[i - 1], tour[i]]
+    if j + 1 < len(tour):
+        change_s += seconds[tour[i], tour[j + 1]] - seconds[tour[j], tour[j + 1]]
     return change_s
 
 
 @numba.njit(cache=True, nogil=True)
-def _moved_s(seconds, way, i, j, place):  # type: ignore[no-untyped-def]
+def _moved_s(seconds, tour, i, j, place):  # type: ignore[no-untyped-def]
     """Additional cost of visit i as the j-th, at another place."""
     after_i, after_j = i + 1, j if j < i else j + 1
-    before_j = way[j] if j > i else way[j - 1]
-    change_s = seconds[before_j, place] - seconds[way[i - 1], way[i]]
-    if after_j < len(way):
-        change_s += seconds[place, way[after_j]]
-    if after_i < len(way):
-        change_s -= seconds[way[i], way[after_i]]
-    if j != i and after_i < len(way):
-        change_s += seconds[way[i - 1], way[after_i]]
-    if j != i and after_j < len(way):
-        change_s -= seconds[before_j, way[after_j]]
+    before_j = tour[j] if j > i else tour[j - 1]
+    change_s = seconds[before_j, place] - seconds[tour[i - 1], tour[i]]
+    if after_j < len(tour):
+        change_s += seconds[place, tour[after_j]]
+    if after_i < len(tour):
+        change_s -= seconds[tour[i], tour[after_i]]
+    if j != i and after_i < len(tour):
+        change_s += seconds[tour[i - 1], tour[after_i]]
+    if j != i and after_j < len(tour):
+        change_s -= seconds[before_j, tour[after_j]]
     return change_s

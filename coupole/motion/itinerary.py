@@ -161,7 +161,7 @@ def plan_itinerary(
             break
         before = f"view {views[visited[cut_off - 1]].name}" if cut_off else "where the arm stands"
         name = views[visited[cut_off]].name
-        refusals.append(f"view {name}: no way to it was found from {before}: {contacts[cut_off]}")
+        refusals.append(f"view {name}: no path to it was found from {before}: {contacts[cut_off]}")
         del choices[visited[cut_off]]  # later views may still be reachable without it
     visits: list[Visit | None] = [None] * len(views)
     for index, joints, leg in zip(visited, tour.places, tour.legs, strict=True):

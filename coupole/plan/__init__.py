@@ -1,1 +1,1 @@
-"""What the operator writes, read and checked: plan, rig, LED table; and the shots that follow from them."""
+"""Reads and checks plan, rig and LED table; derives views, bursts and shots from them."""

@@ -1,8 +1,8 @@
-"""An arm, described: its chain of joints, how far and fast they turn, the bodies of its links.
+"""Description of an arm: chain of joints, their limits and speeds, bodies of the links.
 
-The files that come with Coupole lie in `configs/robots` of the project and in `coupole/robots` of an installed
+The files included with Coupole are in `configs/robots` of the project and in `coupole/robots` of an installed
 wheel (pyproject.toml puts them there); `shipped_arm` finds them in either. A rig names its arm's file under
-`arm:`, or leaves it to the robot's driver which of these it is.
+`arm:`; otherwise it is the default arm of the robot's driver.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from coupole.plan.validation_messages import KeyPath
 from coupole.plan.yamlfile import Document
 
 TOOL = "tool"
-"""Stands for all that the flange carries."""
+"""Name for everything mounted on the flange."""
 _PACKAGE = Path(__file__).resolve().parents[1]
 FOLDERS = (_PACKAGE / "robots", _PACKAGE.parent / "configs" / "robots")
-"""Where the arms lie that come with Coupole: in a wheel, and in a checkout."""
+"""Folders of the included arms: in a wheel, and in a checkout."""
 UR_MODEL = "ur10e"
-"""What a UR's driver moves where its settings do not say it."""
+"""The default arm of a UR's driver."""
 
 BodyName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}$")]
 Positive = Annotated[float, Field(gt=0)]
@@ -41,11 +41,11 @@ class JointDescription(Model):
 
     origin_mm: Vector
     axis: Axis
-    """What it turns about, right-handed."""
+    """Axis of rotation, right-handed."""
     limits_deg: Range
     """Lowest and highest angle, by the data sheet."""
     posture_limits_deg: Range | None = None
-    """The same for what is planned: narrower where links come near each other, or cables would wind up."""
+    """Limits for planned postures: narrower where links come near each other, or cables would twist."""
     speed_deg_s: Positive
     acceleration_deg_s2: Positive
     jerk_deg_s3: Positive = 3000.0
@@ -64,7 +64,7 @@ class LinkDescription(Model):
 
     name: BodyName
     link: Annotated[int, Field(ge=0, le=6)]
-    """0 is the base, which stands still; link k turns with joint k."""
+    """0 is the base, which is fixed; link k turns with joint k."""
     capsules: Annotated[tuple[CapsuleDescription, ...], Field(min_length=1)]
 
 
@@ -77,12 +77,13 @@ class KeptApart(Model):
     near_by_design_deg: Annotated[
         tuple[Annotated[tuple[float, ...], Field(min_length=1)], ...] | None, Field(min_length=6, max_length=6)
     ] = None
-    """Angles of each joint: in all their combinations what is near stays near by the joint between the two, or is
-    drawn too large; those parts of `body` are not kept from `other`."""
+    """Angles of each joint. Parts of `body` that are near `other` in all their combinations are always near
+    because of the joint between the two, or because their capsules are too large; they are not checked."""
 
 
 class ArmDescription(Model):
-    """One arm. Link frames lie in the joints and are parallel to the base's with all angles 0."""
+    """One arm. Link frames have their origins in the joints and are parallel to the base frame with all angles
+    0."""
 
     schema_version: Literal[1]
     name: Annotated[str, Field(min_length=1, max_length=64)]
@@ -91,11 +92,11 @@ class ArmDescription(Model):
     links: Annotated[tuple[LinkDescription, ...], Field(min_length=1)]
     kept_apart: tuple[KeptApart, ...] = ()
     link_meshes: Path | None = None
-    """Folder of meshes that stand for the links in place of their capsules; relative to the file."""
+    """Folder of meshes that replace the links' capsules; relative to the file."""
 
     @cached_property
     def arm(self) -> Arm:
-        """Its kinematics, with limits, speeds and accelerations of the data sheet."""
+        """The arm's kinematics, with limits, speeds and accelerations of the data sheet."""
         flange = self.link_6_from_flange.matrix().round(15) + 0.0
         chain = JointChain(
             tuple(joint.origin_mm for joint in self.joints),
@@ -113,7 +114,7 @@ class ArmDescription(Model):
 
     @property
     def posture_limits_deg(self) -> tuple[tuple[float, float], ...]:
-        """What plans keep to: of each joint its posture limits, or else its limits."""
+        """Limits for plans: each joint's posture limits, or else its limits."""
         return tuple(joint.posture_limits_deg or joint.limits_deg for joint in self.joints)
 
 
@@ -131,7 +132,7 @@ def read_arm(path: Path) -> ArmDescription:
 
 
 def description_problems(document: Document, description: ArmDescription, at: KeyPath = ()) -> list[Problem]:
-    """What no single key shows to be wrong with a description at key path `at` of a document."""
+    """Mistakes of a description that involve several keys; `at` is its key path in the document."""
     problems = []
     for k, joint in enumerate(description.joints):
         (low, high), planned = joint.limits_deg, joint.posture_limits_deg or joint.limits_deg
@@ -173,7 +174,7 @@ def _body_problems(document: Document, description: ArmDescription, at: KeyPath)
 
 @cache
 def shipped_arm(name: str) -> ArmDescription:
-    """The arm that comes with Coupole under this name. Raises InputError where there is none."""
+    """The included arm of this name. Raises InputError if there is none."""
     for folder in FOLDERS:
         if (path := folder / f"{name}.yaml").is_file():
             return read_arm(path)
@@ -185,7 +186,7 @@ def shipped_arm(name: str) -> ArmDescription:
 def arm_named(
     document: Document, named: Path | ArmDescription | None, driver: str, settings: Mapping[str, Any]
 ) -> tuple[ArmDescription | None, list[Problem]]:
-    """The arm that a rig's document gives under `arm:`, or else its driver's, and what is wrong with it."""
+    """The arm under `arm:` in a rig's document, or else its driver's, and the problems found in it."""
     if isinstance(named, ArmDescription):
         if named.link_meshes is not None:
             named = named.model_copy(update={"link_meshes": document.resolve(named.link_meshes)})
@@ -205,9 +206,9 @@ def arm_named(
 
 
 def arm_of_driver(driver: str, settings: Mapping[str, Any]) -> ArmDescription | None:
-    """The arm that a driver moves where the rig does not say it; None of a driver that did not come with Coupole.
+    """A driver's default arm; None for a driver that is not included with Coupole.
 
-    Raises InputError where a UR's `model` is none of those described.
+    Raises InputError if a UR's `model` has no description.
     """
     if driver == UR:
         return shipped_arm(str(settings.get("model", UR_MODEL)))

@@ -1,4 +1,4 @@
-"""Bursts: what one table in the box fires without the host, or the host light by light.
+"""Bursts: the shots of one table, executed by the box, or by the host light by light.
 
 Dark marks, dark frames, lights, marks again (`plan.marks`); all frames of a burst have one exposure.
 """
@@ -17,24 +17,24 @@ from coupole.plan.marks import MARKS_AT_ENDS, Marks, with_marks
 from coupole.plan.shot_id import Dark, Led, Light, Panel, PanelMark, ShotId, ShotLabel
 
 EXPOSURE_MARGIN_US = 200
-"""An LED stays on this long after the exposure's nominal end: the camera's exposure may start late."""
+"""On-time of an LED after the exposure's nominal end, because the camera's exposure may start late."""
 PERIOD_MARGIN_US, PERIOD_MARGIN_PPM = 10, 200
-"""Edges may come this much early, by jitter and by the drift of two quartzes; a camera at its limit would miss
+"""Margin for early edges, from jitter and from the drift between two quartzes; a camera at its limit would ignore
 them."""
 LED_GAP_US = 100
 """Least dark time between two lights."""
 SOFTWARE_LATENCY_US = 60_000
-"""With software trigger an LED stays on this much longer: the host's way to the camera and back."""
+"""Additional on-time of an LED with software trigger: the host's round trip to the camera."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """What holds the steps of a burst farther apart than camera and LED ask for."""
+    """Longer step periods than camera and LED need, because of disk or heat."""
 
     disk_us: int = 0
-    """The disk takes a frame in this time."""
+    """Time in which the disk writes a frame."""
     led_duty: float = 1.0
-    """Largest share of its step that an LED shines, for the heat."""
+    """Largest share of a step in which an LED is lit, because of heat."""
 
 
 FASTEST = Pace()
@@ -49,29 +49,29 @@ class BurstTiming:
     trigger_delay_us: int
     period_us: int
     bound: str
-    """What decides the period: `camera`, `LED`, `disk` or `heat`."""
+    """The limit that determines the period: `camera`, `LED`, `disk` or `heat`."""
 
 
 @dataclass(frozen=True)
 class Burst:
-    """The steps of one burst, and which shots its frames are."""
+    """The steps of one burst and the shots of its frames."""
 
     view: str
     exposure_index: int
     repeat: int
     panel: int
     hardware: bool
-    """The box triggers the camera; else the host does, light by light."""
+    """True if the box triggers the camera, False if the host does, light by light."""
     marks: Marks
     timing: BurstTiming
     table: NDArray[np.void]
     """STEP_DTYPE [steps]."""
     labels: tuple[ShotLabel | None, ...]
-    """Of the frame that each step triggers; None for a mark whose frame is not wanted (in a burst taken again)."""
+    """Label of the frame of each step; None for a mark whose frame is not needed (in a burst taken again)."""
 
     @cached_property
     def duration_s(self) -> float:
-        """The table's own time."""
+        """Duration of the table."""
         return float(self.table["period_us"].sum()) / 1e6
 
     @property
@@ -82,7 +82,7 @@ class Burst:
 
     @property
     def shots(self) -> list[ShotId | None]:
-        """Step by step; None for unwanted frames."""
+        """Shot of each step; None for frames that are not needed."""
         return [None if label is None else ShotId(self.view, label) for label in self.labels]
 
     def is_light(self) -> NDArray[np.bool_]:
@@ -95,7 +95,7 @@ class Burst:
         return self.only({label for label, drop in zip(self.labels, dropped, strict=True) if label and not drop})
 
     def only(self, wanted: Collection[ShotLabel]) -> Burst:
-        """The same burst with those shots only, and marks anew."""
+        """The same burst with those shots only, and new marks."""
         inner = self.inner
         keep = [i for i in inner if self.labels[i] in wanted]
         marks = [label if label in wanted else None for i, label in enumerate(self.labels) if i not in inner]
@@ -116,8 +116,8 @@ def burst_timing(
 ) -> BurstTiming:
     """Shortest times of a step that camera, LEDs and the given pace allow.
 
-    The LED is on for its rise, the exposure and a margin; the period is the longest of the camera's readout,
-    the exposure plus the sensor's gap, the LED's on-time plus a dark gap, and what disk and heat ask for.
+    The LED is on for its rise, the exposure and a margin; the period is the longest of the camera's readout, the
+    exposure plus the sensor's gap, the LED's on-time plus a dark gap, and the limits of disk and heat.
     """
     on_us = rise_us + exposure_us + EXPOSURE_MARGIN_US
     if not hardware:
@@ -159,7 +159,8 @@ def _burst(
     *,
     marks: Marks,
 ) -> Burst:
-    # A panel shines all through a burst that the box runs: what would be dark is one more picture of the panel.
+    # A panel is lit during the whole burst that the box runs, so a dark frame would be another picture of the
+    # panel.
     panel = lit.number if isinstance(lit, Panel) else 0
     hardware, mark_count = marks == "coded", sum(MARKS_AT_ENDS[marks])
     lights: list[Light] = [lit] if isinstance(lit, Panel) else [*_darks(mark_count, darks), *lit]

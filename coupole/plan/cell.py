@@ -1,4 +1,4 @@
-"""The cell: a rig file, read and checked with everything that it names."""
+"""The cell: a rig file, read and checked with all files that it names."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Cell:
     document: Document
     leds: LedTable
     remarks: tuple[str, ...] = ()
-    """What the operator should know of the file though it is right."""
+    """Warnings about a valid file."""
 
     @property
     def leds_path(self) -> Path:
@@ -31,7 +31,7 @@ class Cell:
 
     @property
     def link_meshes(self) -> Path | None:
-        """Folder of the meshes that stand for the arm's links: the rig's, or else the arm's."""
+        """Folder of the link meshes: the rig's, or else the arm's."""
         if self.rig.link_meshes is not None:
             return self.document.resolve(self.rig.link_meshes)
         arm = described_arm(self.rig)

@@ -1,4 +1,4 @@
-"""The LEDs of the dome: where each one is, where it points, how much light it gives."""
+"""The LED table of the dome: position, direction and flux of each LED."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class LedTable:
     flux_lm: NDArray[np.float64]
 
     def illuminance_lux(self, points_base_mm: ArrayLike, *, emission: str = "lambertian") -> NDArray[np.float64]:
-        """Illuminance [points, leds] on a surface that faces each LED: the most that a point can receive.
+        """Illuminance [points, leds] on a surface that faces each LED, the maximum at a point.
 
         E = Phi / (pi d^2) cos(emission angle) for a small Lambertian emitter; `paper` takes the cosine twice
         (seed 003, Eq. 2). Points are [points, 3] in mm in the base frame.
@@ -74,7 +74,7 @@ def read_led_table(path: Path) -> LedTable:
             continue
         led, norm = int(values[0]), float(np.linalg.norm(values[5:8]))
         if led in first_line_of_id:
-            wrong(line, f"LED {led} stands already in line {first_line_of_id[led]}", "id")
+            wrong(line, f"LED {led} is already defined in line {first_line_of_id[led]}", "id")
         if values[0] != led or not 0 <= led < 65535:
             wrong(line, f"expected an integer from 0 to 65534, found {values[0]:g}", "id")
         if abs(norm - 1.0) > 1e-3:

@@ -1,4 +1,4 @@
-"""Which LEDs a plan's `lights:` are, in a dome's table."""
+"""Selects the LEDs of a plan's `lights:` in a dome's table."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def leds_of_plan(plan: Plan, leds: LedTable, base_from_support: Transform) -> ND
 def select_leds(lights: Lights, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
     """Rows of the LED table that are lit, in the order of the table; none for panels and darks.
 
-    Raises KeyError for an LED or a board that the dome does not have (`missing_lights` says it better).
+    Raises KeyError for an LED or a board that the dome does not have (`missing_lights` gives messages).
     """
     match lights:
         case AllLights():
@@ -107,7 +107,7 @@ def _missing(
 
 
 def interleave(boards: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Order of LEDs [n] in which neighbours in time sit on different boards: one LED of each board in turn."""
+    """Order of LEDs [n] in which consecutive LEDs are on different boards: one LED of each board in turn."""
     turn = np.zeros(len(boards), np.int64)
     for board in np.unique(boards):
         mine = np.flatnonzero(boards == board)

@@ -1,7 +1,7 @@
-"""What the operator writes: which views, which lights, which exposures, of which object.
+"""The plan: views, lights, exposures and object.
 
-Positions are in the support frame (disk centre, z up), in mm; angles in degrees. Every model is frozen and
-refuses keys that it does not know. `coupole.plan.yamlfile` turns what is refused here into file:line:column.
+Positions are in the support frame (disk centre, z up), in mm; angles in degrees. Every model is frozen and refuses
+unknown keys. `coupole.plan.yamlfile` reports refusals with file:line:column.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Model(BaseModel):
 
 
 class Pose(Model):
-    """A rigid transform as people write it: translation in mm, KUKA's A, B, C in degrees."""
+    """A rigid transform in a file: translation in mm, KUKA's A, B, C in degrees."""
 
     translation_mm: Vector = (0.0, 0.0, 0.0)
     abc_deg: Vector = (0.0, 0.0, 0.0)
@@ -164,7 +164,7 @@ Exposures = Annotated[FixedExposure | BracketExposure, Field(discriminator="kind
 
 
 class MeasuredObject(Model):
-    """The object on the support: who it is, its shape, what light it may take."""
+    """The object on the support: its id, mesh, pose and dose budget."""
 
     id: Name
     mesh: Path | None = None
@@ -174,7 +174,7 @@ class MeasuredObject(Model):
 
 
 class Optics(Model):
-    """What the operator believes is set on the lens; preflight compares it with the rig."""
+    """The intended lens settings; preflight compares them with the rig."""
 
     focus_distance_mm: Annotated[float, Field(gt=0)] | None = None
     f_number: Annotated[float, Field(gt=0)] | None = None
@@ -192,12 +192,11 @@ class Plan(Model):
     """Records that must be in force; None: those that the rig names."""
     views: Annotated[tuple[View, ...], Field(min_length=1)]
     order: Literal["fastest", "as_written"] = "fastest"
-    """In which order the views are visited: on the shortest way, or as they stand here."""
+    """Order of the views: on the shortest path, or as written."""
     lights: Lights
     repeats: Annotated[int, Field(ge=1, le=1000)] = 1
     hidden_lights: Literal["mark", "skip"] = "mark"
-    """What becomes of LEDs that arm, camera or object hide from all that a view sees: taken and marked, or left
-    out."""
+    """LEDs that arm, camera or object hide from everything that a view sees: taken and marked, or left out."""
     exposure: Exposures
     gain_db: Annotated[float, Field(ge=0, le=42)] = 0.0
     darks_per_view: Annotated[int, Field(ge=0, le=1000)] = 2

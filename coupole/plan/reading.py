@@ -1,4 +1,4 @@
-"""A plan and the files that it names, read together: every mistake in them is found at once."""
+"""Reads a plan and the files that it names together, and reports all mistakes in them."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from coupole.plan.yamlfile import Document
 
 @dataclass(frozen=True)
 class PlanFiles:
-    """A plan as it was written, with its cell, and where the other files lie that it names."""
+    """A plan as written, with its cell, and the paths of the other files that it names."""
 
     plan: Plan
     document: Document
     cell: Cell
     mesh_path: Path | None
-    """The object's mesh; it is there."""
+    """The object's mesh; the file exists."""
     record_paths: tuple[Path, ...] | None
-    """The calibrations that plan or rig want in force; None if they want none."""
+    """The calibrations that plan or rig name as in force; None if `none`."""
 
 
 def read_plan(plan_path: Path, rig_path: Path | None = None) -> PlanFiles:
@@ -69,7 +69,7 @@ def _named_rig(document: Document) -> Path | None:
 
 
 def _named_records(document: Document, plan: Plan, cell: Cell) -> tuple[tuple[Path, ...] | None, list[Problem]]:
-    """Files of the records that the plan names, or else its rig, None if it wants none; and which are missing."""
+    """Files of the records that the plan names, or else its rig (None for `none`), and the missing ones."""
     named = plan.calibrations
     if named is None:
         document, named = cell.document, cell.rig.calibrations
@@ -84,7 +84,7 @@ def _named_records(document: Document, plan: Plan, cell: Cell) -> tuple[tuple[Pa
 
 
 def _bad_exposures(document: Document, plan: Plan, rig: Rig) -> list[Problem]:
-    """What no order of shots could make right."""
+    """Problems that do not depend on the order of the shots."""
     if plan.trigger == "software" and rig.led_limits.on_us[1] < max(plan.exposure.exposures_us):
         return [document.problem(("exposure",), "longer than the rig's LEDs may be on")]
     return []

@@ -1,8 +1,7 @@
-"""Every class that is named by a string: drivers, their stand-ins, the simulated world. And how they are loaded.
+"""All classes named by strings (drivers, their stand-ins, the simulated world), and their loading.
 
 `coupole` imports neither `drivers` nor `sim`: a rig names a class (`driver: drivers.ledbox:LedBox`), and it is
-loaded from here when it is needed. A driver's `settings:` are checked by the pydantic model `Settings` that stands
-beside its class.
+loaded from here on use. A driver's `settings:` are checked by the pydantic model `Settings` in the same module.
 """
 
 from __future__ import annotations
@@ -19,26 +18,26 @@ WORLD = "sim.world.client:World"
 STILLS = "sim.world.stills:Stills"
 """Frames of the simulated cell without devices."""
 SCANNER_EXPORT = "sim.devices.scanner:export_scan"
-"""What a scanner would export of the simulated object."""
+"""A simulated scanner's export of the simulated object."""
 
 DEFAULT_TWINS = {
     "ledbox": "drivers.ledbox:LedBox",
     "camera": "sim.devices.memory_camera:MemoryCamera",
     "robot": "drivers.kuka.rsi:KukaRsi",
 }
-"""What a dry run opens in place of a real device whose driver has no stand-in of its own."""
+"""Used in a dry run in place of a real device whose driver has no stand-in."""
 
 
 @dataclass(frozen=True)
 class StandIn:
-    """What a world has at the other end of a driver's wire."""
+    """The stand-in for a driver in a world."""
 
     kind: str
     """In `world.settings.robot` or `world.settings.ledbox`."""
     alike: tuple[str, ...] = ()
-    """Settings of the driver that must be the stand-in's too."""
+    """Settings of the driver that the stand-in must share."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """More of the stand-in's, where the rig does not say otherwise."""
+    """Further settings of the stand-in, unless the rig gives them."""
 
 
 ROBOT_STAND_INS = {
@@ -52,16 +51,16 @@ ROBOT_STAND_INS = {
     ),
     "drivers.ur:UrRobot": StandIn("ur", ("model",)),
 }
-"""For the robot drivers that come with Coupole; all choose an address that is free."""
+"""For the included robot drivers; all choose a free address."""
 ARMS_OF_DRIVERS = {"drivers.kuka.rsi:KukaRsi": "kr10_r1100_sixx", "drivers.kuka.eki:KukaEki": "kr10_r1100_sixx"}
-"""The arm (in `configs/robots`) that a driver moves where the rig does not say it."""
+"""The default arm (in `configs/robots`) of each driver."""
 UR = "drivers.ur:UrRobot"
 """Moves the arm that its setting `model` names."""
 LEDBOX_STAND_INS = {
     "drivers.ledbox:LedBox": StandIn("scpi"),
     "drivers.ledbox.text_lines:TextLineBox": StandIn("text", ("baud", "led_count", "first_led")),
 }
-"""For the LED boxes' drivers that come with Coupole: `world.settings.ledbox.kind`."""
+"""For the included LED box drivers: `world.settings.ledbox.kind`."""
 CAMERA_STAND_INS = {"drivers.camera.aravis:AravisCamera": "gige"}
 """For camera drivers whose stand-in is not the camera in shared memory: `world.settings.camera.kind`."""
 
@@ -79,7 +78,7 @@ RENAMED = {
 
 
 def current_name(name: str) -> str:
-    """Today's name of a class that a rig of version 0.1 may name otherwise."""
+    """Present name of a class that may have a version 0.1 name in a rig."""
     return RENAMED.get(name, name)
 
 
@@ -91,6 +90,6 @@ def load_class(name: str) -> type[Any]:
 
 
 def settings_class(name: str) -> type[BaseModel]:
-    """The `Settings` model that stands beside a driver's class."""
+    """The `Settings` model in the module of a driver's class."""
     found: type[BaseModel] = load_class(current_name(name).partition(":")[0] + ":Settings")
     return found

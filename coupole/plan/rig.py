@@ -1,4 +1,4 @@
-"""The rig as its YAML file describes it: which devices there are, where they stand, what they may do.
+"""The rig as described by its YAML file: devices, geometry and limits.
 
 Lengths are in mm, angles in degrees; poses are in the robot's base frame unless their names say otherwise.
 """
@@ -34,7 +34,7 @@ class Device(Model):
 
 
 class Sensor(Model):
-    """What the camera's frames look like; compared with what the camera says when it is opened."""
+    """Format of the camera's frames; compared with the camera's report when it is opened."""
 
     width_px: Annotated[int, Field(ge=8, le=65536)]
     height_px: Annotated[int, Field(ge=8, le=65536)]
@@ -68,7 +68,7 @@ class Dome(Model):
 
 
 class BoardThermal(Model):
-    """First-order thermal model of an LED board: each joule lifts it, it cools with one time constant."""
+    """First-order thermal model of an LED board: heated by each joule, cooling with one time constant."""
 
     led_power_w: Annotated[float, Field(gt=0)] = 15.0
     rise_c_per_j: Annotated[float, Field(gt=0)] = 0.02
@@ -78,27 +78,27 @@ class BoardThermal(Model):
 
 
 class LedLimits(Model):
-    """What an LED and its board may be asked; the box refuses more by itself as well."""
+    """Limits of LEDs and boards; the box also enforces its own."""
 
     on_us: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (1_000, 2_000_000)
     rise_us: Annotated[int, Field(ge=0)] = 1_000
-    """From switching on to full current: the trigger waits for it (facts: 1 ms)."""
+    """From switching on to full current: the trigger waits for it."""
     cooldown_ratio: Annotated[float, Field(ge=0)] = 2.0
-    """An LED that was lit for t rests at least `cooldown_ratio` * t."""
+    """An LED that was lit for t stays dark for at least `cooldown_ratio` * t."""
     board: BoardThermal = BoardThermal()
 
 
 class Motion(Model):
-    """How the arm moves between views: share of its joint speeds, acceleration, jerk, and how it settles."""
+    """Motion between views: share of the joint speeds, acceleration, jerk, and settling."""
 
     speed_fraction: Annotated[float, Field(gt=0, le=1)] = 0.3
     acceleration_deg_s2: Annotated[float, Field(gt=0)] = 300.0
     jerk_deg_s3: Annotated[float, Field(gt=0)] = 3000.0
     settle_dwell_s: Annotated[float, Field(ge=0)] = 0.3
     still_deg: Annotated[float, Field(gt=0)] = 0.01
-    """An axis that moves farther than this during a burst has moved: what was not proven before is taken again."""
+    """Largest change of an axis during a burst. Beyond it, shots that were not proven before are taken again."""
     home_joints_deg: tuple[float, float, float, float, float, float] = (0.0, -170.0, 150.0, 0.0, -70.0, 0.0)
-    """Where the arm is taken to be when a plan is checked without it."""
+    """Assumed start posture when a plan is checked without the arm."""
 
 
 class Support(Model):
@@ -128,7 +128,7 @@ KeepOut = Annotated[KeepOutSphere | KeepOutBox, Field(discriminator="kind")]
 
 
 class ToolBody(Model):
-    """Something that the flange carries: a capsule in the flange's frame."""
+    """A body on the flange: a capsule in the flange's frame."""
 
     name: Name
     from_mm: Vector
@@ -137,7 +137,7 @@ class ToolBody(Model):
 
 
 class Clearances(Model):
-    """Distances that the arm keeps from what stands round it, mm."""
+    """Clearances of the arm, mm."""
 
     object_mm: Annotated[float, Field(ge=0)] = 50.0
     support_mm: Annotated[float, Field(ge=0)] = 10.0
@@ -149,17 +149,17 @@ class Clearances(Model):
 class Storage(Model):
     folder: Path
     reserve_bytes: Annotated[int, Field(ge=0)] = 256 * 1024**2
-    """Free space that a run must leave on the disk."""
+    """Free space that a run leaves on the disk."""
     pixels: Literal["uint16", "packed12"] = "uint16"
-    """How frames lie on the disk: two bytes a pixel, or two pixels of at most 12 bits in three bytes."""
+    """Storage of pixels: two bytes each, or two pixels of at most 12 bits in three bytes."""
 
 
 class WorldSection(Model):
-    """The stand-ins: started with the rig (or for dry runs only), or joined where they already run."""
+    """The stand-ins: started with the rig (or for dry runs only), or joined if they already run."""
 
     serves: Literal["always", "dry_run"] = "always"
     join: Path | None = None
-    """File with the JSON line of a `coupole sim` that is running already."""
+    """File with the JSON line of a running `coupole sim`."""
     driver: DriverName = WORLD
     settings: dict[str, Any] = Field(default_factory=dict)
 
@@ -173,8 +173,7 @@ class Rig(Model):
     camera: Device
     robot: Device
     arm: Path | ArmDescription | None = None
-    """What the robot is: the file that describes it, or the description itself. Without it, what its driver
-    moves."""
+    """The file that describes the arm, or the description itself. Default: the arm of the robot's driver."""
     sensor: Sensor
     lens: Lens
     flange_from_camera: Pose
@@ -182,19 +181,19 @@ class Rig(Model):
     support: Support
     tool: tuple[ToolBody, ...]
     link_meshes: Path | None = None
-    """Folder of meshes (`base_link.stl`, `link_1.stl` to `link_6.stl`) that stand for the arm's links, in place of
-    capsules round them."""
+    """Folder of meshes (`base_link.stl`, `link_1.stl` to `link_6.stl`) that replace the capsules of the arm's
+    links."""
     clearances: Clearances = Clearances()
     keep_out: tuple[KeepOut, ...] = ()
     led_limits: LedLimits = LedLimits()
     motion: Motion = Motion()
     storage: Storage
     calibrations: Literal["none"] | tuple[Path, ...] = "none"
-    """Records that must be in force for plans that do not say otherwise."""
+    """Records that must be in force for plans without a list of their own."""
     world: WorldSection | None = None
 
     @property
     def frame_bytes(self) -> int:
-        """Of a frame on the disk."""
+        """Size of a frame on the disk."""
         pixels = self.sensor.width_px * self.sensor.height_px
         return pixels * 3 // 2 if self.storage.pixels == "packed12" else pixels * 2

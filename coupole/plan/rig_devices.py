@@ -1,7 +1,6 @@
-"""What a rig's devices are opened with: driver and settings of each, in a run or in a rehearsal; and what is wrong
-with them.
+"""Driver and settings of each device of a rig, in a run or in a dry run, and the problems found in them.
 
-A device is opened as the rig names it, or as its twin in a dry run. A world, where there is one, fills in
+A device is opened as the rig names it, or as its twin in a dry run. A world, if there is one, supplies the
 addresses.
 """
 
@@ -37,27 +36,27 @@ NOWHERE = {
     "camera": {"address": "/nowhere"},
     "robot": {"listen": "127.0.0.1:0", "address": "127.0.0.1:0", "host": "127.0.0.1"},
 }
-"""Stands for what a world's endpoint will fill in, while settings are checked and no world runs yet."""
+"""Placeholder for the address from a world's endpoint, for checking settings before a world runs."""
 _MOTION_SETTINGS = {
     "speed_fraction": "speed_fraction",
     "acceleration_deg_s2": "acceleration_deg_s2",
     "jerk_deg_s3": "jerk_deg_s3",
     "settle_dwell_s": "dwell_s",
 }
-"""Figures of the rig's `motion:` and the settings of a robot's driver that they become."""
+"""Keys of the rig's `motion:` and the corresponding settings of a robot's driver."""
 
 
 def described_arm(rig: Rig) -> ArmDescription | None:
-    """What the rig says of its arm, or else the arm of its driver; None where neither tells. A path is taken from
-    the working folder: who reads a rig's file puts the description in its place. Raises InputError."""
+    """The rig's arm, or else the arm of its driver; None if neither is given. A path is relative to the working
+    folder (reading a rig's file replaces the path by the description). Raises InputError."""
     if isinstance(rig.arm, ArmDescription):
         return rig.arm
     return read_arm(rig.arm) if rig.arm else arm_of_driver(rig.robot.driver, rig.robot.settings)
 
 
 def planning_arm(rig: Rig) -> Arm | None:
-    """The arm that the robot's driver moves, at the speeds that the rig gives it; None where nothing describes it,
-    so that neither postures nor collisions can be reckoned."""
+    """The arm of the robot's driver, with the rig's speeds; None if it has no description, so that neither
+    postures nor collisions can be computed."""
     description = described_arm(rig)
     if description is None:
         return None
@@ -81,7 +80,7 @@ def runs_tables(rig: Rig) -> bool:
 
 
 def upload_s(rig: Rig, steps: int) -> float:
-    """Time to bring a table of so many steps into the rig's LED box, as its driver says; 0 if it does not."""
+    """Time to bring a table of so many steps into the rig's LED box, from its driver; 0 if unknown."""
     model = settings_class(rig.ledbox.driver)
     described = model(**_known(NOWHERE["ledbox"], model) | rig.ledbox.settings)
     return float(described.upload_s(steps)) if hasattr(described, "upload_s") else 0.0
@@ -109,27 +108,27 @@ def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[
 
 
 def stand_in_for(rig: Rig, *, dry_run: bool) -> StandIn:
-    """What this rig's world has at the other end of the robot's wire: of its driver, or of its driver's twin where
-    the world takes no part but in dry runs. Of a driver that did not come with Coupole the rig must say it."""
+    """Kind of the robot's stand-in in this rig's world: that of its driver, or of the twin's driver if the world
+    is for dry runs only. For a driver not included with Coupole the rig must give it."""
     driver, _ = device_for(rig, "robot", dry_run=dry_run or not in_world(rig, dry_run=False))
     told = rig.world.settings.get("robot") if rig.world else None
     return ROBOT_STAND_INS.get(driver) or StandIn(told.get("kind", "rsi") if isinstance(told, dict) else "rsi")
 
 
 def ledbox_stand_in(rig: Rig, *, dry_run: bool) -> StandIn:
-    """What this rig's world has at the other end of the LED box's wire."""
+    """Kind of the LED box's stand-in in this rig's world."""
     driver, _ = device_for(rig, "ledbox", dry_run=dry_run or not in_world(rig, dry_run=False))
     return LEDBOX_STAND_INS.get(driver) or StandIn("scpi")
 
 
 def camera_kind(rig: Rig, *, dry_run: bool) -> str:
-    """Which camera this rig's world has at the other end of the driver's wire."""
+    """Kind of the camera's stand-in in this rig's world."""
     driver, _ = device_for(rig, "camera", dry_run=dry_run or not in_world(rig, dry_run=False))
     return CAMERA_STAND_INS.get(driver, "memory")
 
 
 def driver_problems(document: Document, rig: Rig) -> list[Problem]:
-    """Drivers that cannot be found and settings that their drivers do not take."""
+    """Drivers that cannot be found, and settings that drivers do not accept."""
     problems = []
     for kind in DEVICES:
         device: Device = getattr(rig, kind)
@@ -175,7 +174,7 @@ def _unlike_stand_in(document: Document, rig: Rig) -> list[Problem]:
 
 
 def world_problems(document: Document, rig: Rig, settings: Mapping[str, Any]) -> list[Problem]:
-    """What is wrong with the settings of the rig's world, with what follows from the rig filled in."""
+    """Problems in the settings of the rig's world, completed with values from the rig."""
     stand_in, robot = stand_in_for(rig, dry_run=False), settings.get("robot", {})
     if isinstance(robot, dict):
         if robot.get("kind", stand_in.kind) != stand_in.kind:
@@ -205,19 +204,19 @@ def _settings_problems(
 
 
 def _robot_settings(rig: Rig) -> dict[str, Any]:
-    """What the rig says to a robot's driver: of its `motion:`, and which arm it moves."""
+    """Settings for a robot's driver from the rig: from its `motion:`, and its arm."""
     description = described_arm(rig)
     arm = {"arm_model": asdict(description.arm)} if description else {}
     return arm | {setting: getattr(rig.motion, figure) for figure, setting in _MOTION_SETTINGS.items()}
 
 
 def _known(settings: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
-    """Of these settings those that the model has."""
+    """The settings that the model has."""
     return {name: value for name, value in settings.items() if name in model.model_fields}
 
 
 def renamed_drivers(document: Document) -> list[str]:
-    """A remark for each class that the rig's file names as version 0.1 did."""
+    """A warning for each class that the rig's file names by its version 0.1 name."""
     places: list[tuple[str | int, ...]] = [(*at, "driver") for at in (*((kind,) for kind in DEVICES), ("world",))]
     places += [(kind, "twin", "driver") for kind in DEVICES]
     remarks = []

@@ -17,7 +17,7 @@ from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotLabel
 
 @dataclass(frozen=True)
 class ViewPose:
-    """One place of the camera: where it looks from, or the joint angles that say so."""
+    """One view: a camera pose, or joint angles."""
 
     name: str
     support_from_camera: Transform | None
@@ -27,17 +27,17 @@ class ViewPose:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Everything that a plan asks for, in order."""
+    """All views and bursts of a plan, in order."""
 
     views: tuple[ViewPose, ...]
     bursts: tuple[tuple[Burst, ...], ...]
     """Bursts of each view."""
     labels: tuple[tuple[ShotLabel, ...], ...]
-    """Of all frames that each view can have, before any was left out, in the order of its bursts."""
+    """Labels of all frames that each view can have, before any was left out, in the order of its bursts."""
 
     @property
     def shots(self) -> int:
-        """Frames under a light, darks and marks apart."""
+        """Number of frames under a light, without darks and marks."""
         return sum(int(b.is_light().sum()) for bursts in self.bursts for b in bursts)
 
     @property
@@ -57,7 +57,7 @@ class Schedule:
 
 
 def expand_view(view: View) -> list[ViewPose]:
-    """The poses that one entry of a plan's views stands for: a grid has many."""
+    """The poses of one entry of a plan's views: a grid has many."""
     match view:
         case LookAt():
             pose = look_at(view.target_mm, view.distance_mm, view.azimuth_deg, view.elevation_deg, view.roll_deg)
@@ -90,9 +90,9 @@ def build_schedule(
     pace: Pace = FASTEST,
     runs_tables: bool = True,
 ) -> Schedule:
-    """All bursts of all views. Tables are shared between views: the box need not be loaded anew.
+    """All bursts of all views. Tables are shared between views, so that they need not be uploaded again.
 
-    Of a box that does not run tables, and so keeps no log, only marks can tell that its lights went off.
+    For a box that does not run tables, and so has no log, only marks can show that its lights went off.
     """
     bursts_of: dict[Lights, list[Burst]] = {}
     views: list[ViewPose] = []

@@ -1,4 +1,4 @@
-"""Which frame is which: a view, a light or the dark, an exposure. The only place that writes or reads shot ids.
+"""Shot ids: view, light or dark, exposure. Only this module writes and reads them.
 
 ::
 
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 MAX_CHARACTERS = 80
-"""Of a shot id: the width of its field in the frame table."""
+"""Greatest length of a shot id: the width of its field in the frame table."""
 _LABEL = re.compile(
     r"(?:led(?P<led>\d{4,5})|panel(?P<panel>\d)(?:-mark(?P<mark>\d+))?|dark(?P<dark>\d+))"
     r"/e(?P<exposure>\d+)(?:/r(?P<repeat>[1-9]\d*))?"
@@ -25,7 +25,7 @@ _LABEL = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Led:
-    """One LED shines, by its id in the dome's table."""
+    """One LED is lit, by its id in the dome's table."""
 
     id: int
 
@@ -35,7 +35,7 @@ class Led:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One flat panel shines."""
+    """One flat panel is lit."""
 
     number: int
 
@@ -45,7 +45,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class PanelMark:
-    """A coded step at the ends of a panel's burst: the panel shines, but the frame is none that was asked for."""
+    """A coded step at the ends of a panel's burst: the panel is lit, but the frame is not a shot of the plan."""
 
     panel: int
     number: int
@@ -56,7 +56,7 @@ class PanelMark:
 
 @dataclass(frozen=True, slots=True)
 class Dark:
-    """Nothing shines: a dark frame, or a coded dark step at the ends of a burst."""
+    """No light: a dark frame, or a coded dark step at the ends of a burst."""
 
     number: int
 

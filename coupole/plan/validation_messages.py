@@ -1,9 +1,9 @@
-"""What a pydantic model refused, in words for an operator: one `Mistake` for each thing that is wrong.
+"""Messages for the operator from pydantic's errors: one `Mistake` for each mistake.
 
-pydantic reports a flat list of errors whose locations mix keys with labels of unions. `mistakes_of` sorts them
-back along the model's core schema, where each level knows its valid keys, tags, bounds and lengths:
+pydantic reports a flat list of errors whose locations mix keys with labels of unions. `mistakes_of` assigns them
+to the nodes of the model's core schema, which has the valid keys, tags, bounds and lengths of each level:
 
-- a tagged union answers for the chosen tag only, or lists the valid tags;
+- a tagged union gives mistakes of the chosen tag only, or lists the valid tags;
 - a plain union gives one mistake: that of the member with the shape of the value, or all that it accepts;
 - an unknown key that is nearly a valid one takes the place of the missing key.
 """
@@ -45,7 +45,7 @@ _BOUNDS = (
 
 @dataclass(frozen=True)
 class Mistake:
-    """One thing wrong: where, below the part that was checked, and what to say about it."""
+    """One mistake: its key path below the checked part, and its message."""
 
     key_path: KeyPath
     message: str
@@ -81,7 +81,7 @@ class _Explainer:
         self.kind: str = self.node["type"]
 
     def _peel(self, node: Schema) -> Schema:
-        """The node that decides, below validators, defaults and references."""
+        """The node below validators, defaults and references."""
         while True:
             if node["type"] == "definition-ref":
                 node = self.definitions[node["schema_ref"]]
@@ -102,7 +102,7 @@ class _Explainer:
     # ---- mistakes ----
 
     def mistakes(self, path: KeyPath, value: Any, errors: Errors) -> Iterator[Mistake]:
-        """Mistakes of `value`, which stands at `path` and has this node's schema."""
+        """Mistakes of `value`, which is at `path` and has this node's schema."""
         own = [error for rest, error in errors if not rest]
         below: dict[str | int, Errors] = {}
         for rest, error in errors:
@@ -124,7 +124,7 @@ class _Explainer:
             yield from self._own(path, value, own or [error for _, error in errors])
 
     def _own(self, path: KeyPath, value: Any, own: list[dict[str, Any]]) -> Iterator[Mistake]:
-        """The first error of a value as such: a validator's words, or what was expected and found."""
+        """The first error of the value itself: a validator's message, or what was expected and found."""
         for error in own[:1]:
             if error["type"] in ("value_error", "assertion_error"):
                 yield Mistake(path, str(error["ctx"]["error"]))
@@ -139,7 +139,7 @@ class _Explainer:
         return f"; did you mean `{near}`?" if near else ""
 
     def _union(self, path: KeyPath, value: Any, by_member: list[Errors]) -> Iterator[Mistake]:
-        """Each member of a plain union failed, in order; answer for the one that has the value's shape."""
+        """All members of a plain union failed; gives the mistakes of the one with the value's shape."""
         members = [self._inner(choice) for choice in self._choices()]
         if len(members) == len(by_member):
             for member, errors in zip(members, by_member, strict=True):
@@ -186,7 +186,7 @@ class _Explainer:
                 yield from self._inner(fields[key]).mistakes((*path, key), value.get(key), errors)
 
     def _list(self, path: KeyPath, value: list[Any], own: list[Any], below: Any) -> Iterator[Mistake]:
-        # pydantic calls a list whose items failed too short as well: it does not count the failed ones.
+        # pydantic also reports a list with failed items as too short, because it does not count these.
         fits = self.node.get("min_length", 0) <= len(value) <= self.node.get("max_length", math.inf)
         lengths = [error for error in own if error["type"] in ("too_short", "too_long")]
         absent = [index for index, errors in below.items() if _only(errors) == "missing" and index >= len(value)]
@@ -278,5 +278,5 @@ def _quoted(words: Iterable[Any]) -> str:
 
 
 def _only(errors: Errors) -> str:
-    """The type of the error of a key as such, empty when the errors lie deeper."""
+    """The type of the error of the key itself, empty if the errors are deeper."""
     return str(errors[0][1]["type"]) if not errors[0][0] else ""

@@ -1,12 +1,12 @@
 """YAML files with file:line:column, all errors at once.
 
-`read` turns a file into a `Document`: plain data, and where each key and value stands.
-`Document.validate` checks a part of it against a pydantic model; what the model refuses becomes
-`Problem`s in the order of the file, in words from `coupole.plan.validation_messages`.
+`read` turns a file into a `Document`: plain data, and the position of each key and value. `Document.validate`
+checks a part of it against a pydantic model; its errors become `Problem`s in the order of the file, with messages
+from `coupole.plan.validation_messages`.
 
-Typing is YAML 1.2's core schema: `yes` and `on` are text, `014` is fourteen, `0o14` is twelve. Keys are
-always text. Models are checked as strictly as JSON would be: `"5"` is no number, 1.5 and 5.0 are no whole
-numbers, while lists serve as tuples and text as paths.
+Typing is YAML 1.2's core schema: `yes` and `on` are text, `014` is fourteen, `0o14` is twelve. Keys are always
+text. Models are checked as strictly as JSON would be: `"5"` is not a number, 1.5 and 5.0 are not integers, while
+lists are accepted as tuples and text as paths.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MAX_FILE_BYTES = 16 * 1024**2
 MAX_DEPTH = 50
 MAX_VALUES = 200_000
 MAX_DIGITS = 40
-"""Limits of what can be a plan or a rig; aliases that multiply each other reach MAX_VALUES."""
+"""Limits for plans and rigs; aliases that multiply each other reach MAX_VALUES."""
 
 _YAML_TAG = "tag:yaml.org,2002:"
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
@@ -49,12 +49,12 @@ _PLAIN: tuple[tuple[re.Pattern[str], Callable[[str], int | float | bool | None]]
     (_FLOAT, float),
     (re.compile(r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"), lambda text: float(text.replace(".", ""))),
 )
-"""Forms of plain scalars in YAML 1.2's core schema (chapter 10.3.2), and what they stand for."""
+"""Forms of plain scalars in YAML 1.2's core schema (chapter 10.3.2), and their values."""
 
 
 @dataclass(frozen=True)
 class Document:
-    """One YAML file: its data and the places of its keys and values."""
+    """One YAML file: its data and the positions of its keys and values."""
 
     path: Path
     data: dict[str, Any]
@@ -86,7 +86,7 @@ class Document:
     ) -> tuple[M | None, list[Problem]]:
         """The part at key path `at` as a `model`, or None with all problems, in the order of the file.
 
-        A part that is not in the file counts as an empty mapping. Values `given` need not stand in the file.
+        A part that is not in the file counts as an empty mapping. Values `given` need not be in the file.
         """
         part = self._part(at)
         if given and isinstance(part, dict):
@@ -107,7 +107,7 @@ class Document:
         return part
 
     def _mistake(self, at: KeyPath, mistake: Mistake) -> Problem:
-        """At the key itself, or at the value; what is missing stands at the mapping or list that lacks it."""
+        """Position of the key or the value; for a missing key that of the mapping or list that lacks it."""
         key_path = (*at, *mistake.key_path)
         if mistake.at_key and key_path in self.key_places:
             return self._at(self.key_places[key_path], key_path, mistake.message)
@@ -170,7 +170,7 @@ def _text(path: Path) -> str:
 def _compose(path: Path, text: str) -> Node | None:
     """The graph of YAML nodes, None when the file has no content."""
     yaml = YAML(typ="safe", pure=True)
-    yaml.composer.warn_double_anchors = False  # YAML 1.2 (3.2.2.2) lets a later anchor take an earlier one's place
+    yaml.composer.warn_double_anchors = False  # YAML 1.2 (3.2.2.2): a later anchor may replace an earlier one
     try:
         root: Node | None = yaml.compose(text)
     except MarkedYAMLError as error:
@@ -195,7 +195,7 @@ def _problem_after(path: Path, before: str, message: str) -> Problem:
 
 
 def _finite(value: Any) -> Any:
-    """`value` for JSON, which knows no NaN or infinity: they go as text, which no number field accepts."""
+    """`value` for JSON, which has no NaN or infinity: they become text, which no number field accepts."""
     if isinstance(value, dict):
         return {key: _finite(inner) for key, inner in value.items()}
     if isinstance(value, list):
@@ -204,7 +204,7 @@ def _finite(value: Any) -> Any:
 
 
 class _Builder:
-    """Builds plain data from YAML nodes; collects places and problems."""
+    """Builds plain data from YAML nodes; collects positions and problems."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

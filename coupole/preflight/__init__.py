@@ -1,1 +1,1 @@
-"""Everything that is known before the robot moves."""
+"""All checks before the robot moves."""

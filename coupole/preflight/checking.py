@@ -21,16 +21,16 @@ from coupole.storage.write_speed import measure_write_speed
 
 _DISK_GRAIN_US = 100
 _LED_DUTIES = tuple(0.9**k for k in range(1, 33))
-"""Tried in turn where LEDs get too hot: down to a thirtieth of the time alight."""
+"""Largest on-time shares, tried in turn if LEDs get too hot."""
 
 
 def preflight_of(
     job: Job, folder: Path, *, paths: bool = True, allocated_bytes: int = 0, share_left: float = 1.0
 ) -> tuple[Job, Report]:
-    """Preflight's report on a job whose run would lie in `folder`, and the job at the pace that LEDs and the disk
-    there, which is measured, allow.
+    """Preflight's report on a job whose run would be in `folder`, and the job at the pace that LEDs and the
+    measured speed of that disk allow.
 
-    Without `paths` nothing is checked for collisions. Of a run to be resumed, `allocated_bytes` lie there already
+    Without `paths` collisions are not checked. For a resumed run, `allocated_bytes` are already on the disk
     and `share_left` of its frames are still to be taken.
     """
     existing = folder
@@ -47,7 +47,7 @@ def preflight_of(
 def check_job(
     job: Job, storage: StorageFacts, *, paths: bool = True, share_left: float = 1.0
 ) -> tuple[Job, Report]:
-    """Preflight's report on a job, given what is known of the disk; and the job at the pace that both allow."""
+    """Preflight's report on a job, given the disk's state; and the job at the pace that LEDs and disk allow."""
     rig = job.cell.rig
     home_deg = rig.motion.home_joints_deg
     if paths:
@@ -81,8 +81,8 @@ def check_job(
 
 
 def calibration_refusals(job: Job, *, camera: str | None = None, temperature_c: float | None = None) -> list[str]:
-    """Why the records that plan or rig names do not hold here. Which camera there is and how warm the cell is,
-    only its devices know (`Situation`)."""
+    """Reasons why the records that plan or rig names are not valid here. Camera and temperature are compared
+    later, with the opened devices (`Situation`)."""
     if job.calibrations is None:
         return []
     from coupole.calibration.in_force import Situation, refusals
@@ -102,8 +102,8 @@ def calibration_refusals(job: Job, *, camera: str | None = None, temperature_c: 
 
 
 def _disk_us(rig: Rig, storage: StorageFacts) -> int:
-    """Time in which the disk takes a frame, rounded up so that small fluctuations do not change the
-    schedule; 0 if unknown."""
+    """Time in which the disk writes a frame, rounded up so that small fluctuations do not change the schedule; 0
+    if unknown."""
     if not storage.write_bytes_s:
         return 0
     seconds = rig.frame_bytes / (DISK_SHARE * storage.write_bytes_s)
@@ -111,7 +111,7 @@ def _disk_us(rig: Rig, storage: StorageFacts) -> int:
 
 
 def _cooled(job: Job, report: Report, checked: Callable[[Pace], tuple[Job, Report]]) -> tuple[Job, Report]:
-    """Where LEDs get too hot: the fastest pace at which they do not; as it was if none of those tried will do."""
+    """The fastest pace at which LEDs do not get too hot; unchanged if none of the tried ones is sufficient."""
     if not report.too_hot:
         return job, report
     paces = [replace(job.pace, led_duty=duty) for duty in _LED_DUTIES]

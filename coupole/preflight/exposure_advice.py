@@ -1,10 +1,10 @@
-"""Exposure advice: a few lights, a few exposures, each twice; what follows for the exposure of a whole plan.
+"""Exposure advice for a plan, from pictures under a few lights at a few exposures, each taken twice.
 
-Two wishes bound the exposure. From above: of no picture may more than a share of the pixels be saturated. From
-below: of the object's pixels a share must reach a signal-to-noise ratio under the light that suits them best.
-Noise is measured, not assumed: differences of pairs give the photon transfer line, variance = read^2 + gain *
-signal (Janesick, "Photon Transfer", 2007, eq. 3.5, in DN). Where one exposure meets both wishes the shortest that
-does is proposed, as it gives the object least light; else a bracket.
+Two criteria bound the exposure. Upper bound: in each picture at most a given share of the pixels is saturated.
+Lower bound: a given share of the object's pixels reaches a signal-to-noise ratio under their most favourable
+light. Noise is measured, not assumed: differences of pairs give the photon transfer line, variance = read^2 + gain
+* signal (Janesick, "Photon Transfer", 2007, eq. 3.5, in DN). If one exposure meets both criteria, the shortest
+such exposure is proposed, because it gives the least dose; otherwise a bracket.
 """
 
 from __future__ import annotations
@@ -32,15 +32,16 @@ SHORTER = (16, 4, 1)
 """Metering exposures are the plan's shortest divided by these."""
 _REPEATS = 2
 _CELL_STEP = 4
-"""Of the Bayer cells every n-th in both directions is sampled."""
+"""Every n-th Bayer cell in both directions is sampled."""
 _BRACKET_STEP = 4.0
 _FULL = 0.95
-"""Of the range above black that counts as full: noise must not reach saturation."""
+"""Share of the range above black that counts as full, so that noise does not reach saturation."""
 _UNSEEN_LIGHTS = 0.8
-"""Lights that were not metered may be brighter by as much."""
+"""Factor by which lights that were not metered may be brighter."""
 _NOISE_MARGIN = 1.25
 _SEEN_SIGMA = 5.0
-"""A pixel shows the object if, in the longest exposure, its best light lifts it so far above the read noise."""
+"""A pixel shows the object if, in the longest exposure, its signal under its best light exceeds the read noise by
+this factor."""
 _LEVELS = 48
 _ROUNDING_DN = math.sqrt(1.0 / 12.0)
 _SHORTEST_US = 10
@@ -49,14 +50,14 @@ _SHORTEST_US = 10
 
 @dataclass(frozen=True)
 class Request:
-    """What pictures shall be like."""
+    """Criteria for the pictures."""
 
     saturated_share: float = 1e-3
-    """Of the pixels of any picture, at most."""
+    """Largest share of saturated pixels in any picture."""
     snr: float = 30.0
     """Signal-to-noise ratio of a single pixel in a single picture."""
     object_share: float = 0.9
-    """Of the object's pixels that must reach it."""
+    """Share of the object's pixels that must reach it."""
 
 
 @dataclass(frozen=True)
@@ -79,18 +80,18 @@ class ViewAdvice:
 
     view: str
     longest_us: float
-    """Beyond it more than the wished share of some picture is saturated."""
+    """Beyond it more than the allowed share of some picture is saturated."""
     shortest_us: float
-    """Below it too few of the object's pixels reach the wished signal-to-noise ratio."""
+    """Below it too few of the object's pixels reach the required signal-to-noise ratio."""
     object_share: float
-    """Pixels that show the object, of all."""
+    """Share of the pixels that show the object."""
     saturated_at_shortest: bool
-    """Even the shortest metering exposure saturated more than was wished: `longest_us` may be too long."""
+    """Even the shortest metering exposure saturated more than allowed: `longest_us` may be too long."""
 
 
 @dataclass(frozen=True)
 class Advice:
-    """For the whole plan."""
+    """Advice for the whole plan."""
 
     noise: Noise
     views: tuple[ViewAdvice, ...]
@@ -135,7 +136,7 @@ class Metered:
 
 
 class MeterRecorder:
-    """`coupole.acquisition.recorder.Recorder` that keeps a sample of the pixels in memory, and nothing else."""
+    """A `coupole.acquisition.recorder.Recorder` that only keeps a sample of the pixels in memory."""
 
     def __init__(self) -> None:
         self.views: dict[str, Metered] = {}
@@ -190,7 +191,8 @@ class MeterRecorder:
 
 def noise_of(views: Iterable[Metered]) -> Noise:
     """Photon transfer line through all pairs: mean squared difference / 2 against mean signal, in levels with as
-    many pixels each, weighted by how well a level's variance is known; rounding alone where all is saturated."""
+    many pixels each, weighted by the uncertainty of a level's variance; rounding noise only if everything is
+    saturated."""
     signal, squared = [np.zeros(0)], [np.zeros(0)]
     for metered in views:
         white = metered.frame_format.white_dn - metered.frame_format.black_dn
@@ -227,7 +229,7 @@ def advise_view(view: str, metered: Metered, request: Request, noise: Noise) -> 
     per_light = np.minimum(np.array(rates), white / shortest_metered_us)
     brightest = np.quantile(per_light, 1.0 - request.saturated_share, axis=1).max()
     best = per_light.max(axis=0)
-    # The best of many lights is lifted by noise: of n looks at nothing the highest lies sqrt(2 ln n) sigma up.
+    # The best of many lights is biased by noise: the highest of n values of pure noise is near sqrt(2 ln n) sigma.
     looks = math.sqrt(2.0 * math.log(max(2, len(rates)))) + _SEEN_SIGMA
     of_object = best * longest_metered_us > looks * noise.read_dn
     longest_us = _FULL * _UNSEEN_LIGHTS * white / max(brightest, 1e-12)
@@ -240,14 +242,14 @@ def advise_view(view: str, metered: Metered, request: Request, noise: Noise) -> 
 
 
 def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -> Advice:
-    """The exposure or bracket that all views can be taken with; LEDs can be on for one of `longest_us`."""
+    """The exposure or bracket for all views; LEDs can be on for an exposure of at most `longest_us`."""
     noise = noise_of(views.values())
     found = tuple(advise_view(view, metered, request, noise) for view, metered in views.items())
     remarks = [
         f"view {a.view}: nothing but noise is seen; is the object lit?" for a in found if not a.object_share
     ]
     remarks += [
-        f"view {a.view}: saturated at all that was metered; meter again from this"
+        f"view {a.view}: saturated at all metered exposures; meter again with this exposure"
         for a in found
         if a.saturated_at_shortest
     ]
@@ -256,10 +258,11 @@ def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -
     seen = [a.shortest_us for a in found if a.object_share]
     shortest_us = max(seen, default=brightest_us)
     if brightest_us < low_us:
-        remarks.append(f"even {low_us} us saturate more than wished: close the aperture or dim the lights")
+        remarks.append(f"even {low_us} us saturate more than allowed: close the aperture or dim the lights")
     if shortest_us > high_us:
         remarks.append(
-            f"even {high_us} us are too short for the wished noise: open the aperture or raise the gain"
+            f"even {high_us} us are too short for the required signal-to-noise ratio: "
+            "open the aperture or raise the gain"
         )
     first = _rounded(min(max(min(shortest_us, brightest_us), low_us), high_us), up=shortest_us <= brightest_us)
     if shortest_us <= brightest_us:
@@ -277,8 +280,8 @@ def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -
 
 
 def write_plan(plan_path: Path, out: Path, exposure: FixedExposure | BracketExposure) -> None:
-    """Copy a plan, comments and all, with another exposure. `out` lies in the plan's folder, as the paths in a
-    plan are relative to it; raises InputError where it does not, or stands there already."""
+    """Copy a plan including comments, with another exposure. `out` must be in the plan's folder, because the paths
+    in a plan are relative to it; raises InputError if it is not, or exists already."""
     from ruamel.yaml import YAML
     from ruamel.yaml.comments import CommentedMap
 

@@ -1,9 +1,9 @@
-"""The job: a plan with everything that it names, and the schedule that follows. What the commands work on.
+"""The job: a plan with all files that it names, and its schedule. The commands work on jobs.
 
 ::
 
     read       plan.reading      plan, rig, LED table: files to models
-    resolve    object_shape, calibration.in_force: the files that these name
+        resolve    object_shape, calibration.in_force: the files that these name
     schedule   plan.schedule     views, bursts, tables
     check      checking          Report, and the pace that heat and disk allow
 """
@@ -41,11 +41,11 @@ class Job:
     schedule: Schedule
     motion: CellMotion
     calibrations: tuple[InForce, ...] | None = None
-    """The records that the plan names, or else its rig; None if they want none."""
+    """The records that the plan names, or else its rig; None for `none`."""
     hidden_leds: Mapping[str, Sequence[int]] = field(default_factory=dict)
-    """LEDs that were left out of views, by name of view."""
+    """LEDs left out of views, by name of view."""
     pace: Pace = FASTEST
-    """What holds the schedule's steps apart beside camera and LEDs."""
+    """Limits of the schedule's step periods in addition to camera and LEDs."""
 
     @property
     def inputs(self) -> Inputs:
@@ -56,7 +56,7 @@ class Job:
 
 
 def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
-    """Read a plan and everything that it names. Raises InputError with all problems of all files."""
+    """Read a plan and all files that it names. Raises InputError with all problems of all files."""
     files = read_plan(plan_path, rig_path)
     shape = read_object(files)
     calibrations = None
@@ -70,13 +70,13 @@ def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
 
 
 def motion_of(plan: Plan, cell: Cell, shape: ObjectShape, schedule: Schedule) -> CellMotion:
-    """The arm among the things of this cell."""
+    """The arm's motion in this cell."""
     targets = [view.target_mm for view in schedule.views if view.target_mm is not None]
     return CellMotion(cell, shape.corners_mm, targets, plan.order)
 
 
 def schedule_of(plan: Plan, cell: Cell, pace: Pace = FASTEST) -> Schedule:
-    """All bursts of all views of a plan, at the times that the cell's camera and LEDs and the pace allow."""
+    """All bursts of all views of a plan, with the periods that camera, LEDs and pace allow."""
     return build_schedule(
         plan,
         cell.leds,
@@ -98,8 +98,8 @@ def at_pace(job: Job, pace: Pace) -> Job:
 
 
 def without_hidden(job: Job, known: Mapping[str, Sequence[int]] | None = None) -> Job:
-    """Where the plan wants hidden lights skipped: the same job without the LEDs that reach nothing of what a view
-    sees; those that are `known`, if a run began without them, else as paths from home place the arm."""
+    """With `hidden_lights: skip`: the same job without the LEDs that light nothing that a view sees. These are the
+    `known` ones, if a run began without them, otherwise those for the postures of the paths from home."""
     if job.plan.hidden_lights != "skip":
         return job
     hidden = dict(known) if known is not None else _hidden_from_home(job)

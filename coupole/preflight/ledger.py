@@ -1,6 +1,6 @@
-"""Light that each object has received in its life here: `<storage>/ledger/<object id>.jsonl`.
+"""The dose ledger of each object: `<storage>/ledger/<object id>.jsonl`.
 
-Only real light counts: simulated and dry runs never write here.
+Only real light counts: simulated and dry runs do not write here.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def ledger_path(storage_folder: Path, object_id: str) -> Path:
 
 
 def total_lux_h(storage_folder: Path, object_id: str) -> float:
-    """Sum of all doses in the object's ledger, lux hours. A line torn by a crash is passed over."""
+    """Sum of all doses in the object's ledger, lux hours. An incomplete line (after a crash) is ignored."""
     path = ledger_path(storage_folder, object_id)
     try:
         lines = path.read_bytes().splitlines()

@@ -29,13 +29,13 @@ class ObjectShape:
 
 
 def read_object(files: PlanFiles) -> ObjectShape:
-    """Raises InputError with the place in the plan where its mesh cannot be read."""
+    """Raises InputError with the line in the plan if its mesh cannot be read."""
     corners = np.zeros((0, 3, 3))
     if files.mesh_path is not None:
         assert files.plan.object is not None
         try:
             corners = load_corners(files.mesh_path, files.plan.object)
-        except Exception as error:  # whatever trimesh raises, the file is not a mesh to us
+        except Exception as error:  # any exception of trimesh means that the file is not a readable mesh
             message = f"cannot read the mesh {files.mesh_path}: {error}"
             raise InputError([files.document.problem(("object", "mesh"), message)]) from error
     targets = [view.target_mm for view in files.plan.views if hasattr(view, "target_mm")]
@@ -43,7 +43,7 @@ def read_object(files: PlanFiles) -> ObjectShape:
 
 
 def load_corners(mesh_path: Path, measured: MeasuredObject) -> NDArray[np.float64]:
-    """Triangles [n, 3, 3] of a mesh file in the support frame, mm. Raises whatever trimesh raises."""
+    """Triangles [n, 3, 3] of a mesh file in the support frame, mm. Raises trimesh's exceptions."""
     import trimesh
 
     loaded: Any = trimesh.load(mesh_path, process=False, force="mesh")

@@ -1,7 +1,7 @@
-"""Everything that can be known before the robot moves: one report, no device touched.
+"""All checks before the robot moves, in one report, without opening a device.
 
-Pure: what has to be looked up (disk, ledger) comes in as figures. A refusal names what is refused (view, shot,
-LED), the limit and the value.
+Pure functions: data from disk and ledger are arguments. A refusal names the view, shot or
+LED, the limit and the value.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from coupole.plan.schedule import Schedule
 BURST_OVERHEAD_S = 0.14
 """Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""
 SETTLE_CHECK_S = 0.1
-"""From the end of a motion to 'settled', dwell apart (measured on the simulated cell)."""
+"""From the end of a motion to 'settled', without the dwell (measured on the simulated cell)."""
 DISK_SHARE = 0.9
-"""Of the disk's measured speed, that frames may come at."""
+"""Share of the disk's measured speed that the frame rate may use."""
 PAGE_BYTES = 4096
 
 
 @dataclass(frozen=True)
 class StorageFacts:
-    """What is known of the disk: free bytes, and the speed measured on it (0: not measured)."""
+    """State of the disk: free bytes, and its measured speed (0: not measured)."""
 
     free_bytes: int
     write_bytes_s: float = 0.0
@@ -41,7 +41,7 @@ class StorageFacts:
 
 @dataclass(frozen=True)
 class ViewReport:
-    """What one view will cost."""
+    """Duration, size and dose of one view."""
 
     name: str
     joints_deg: tuple[float, ...] | None
@@ -52,24 +52,24 @@ class ViewReport:
 
 @dataclass
 class Report:
-    """What will happen, and why it must not, if it must not."""
+    """The expected course of a plan, and the refusals."""
 
     views: list[ViewReport] = field(default_factory=list)
-    """In the order in which they are visited; those that cannot be come last."""
+    """In the order of the visits; unreachable ones last."""
     shots: int = 0
     frames: int = 0
     bytes: int = 0
     duration_s: float = 0.0
     ideal_s: float = 0.0
-    """The tables' own time plus motion and settling: what no controller could be faster than."""
+    """Duration of the tables plus motion and settling: a lower bound for any controller."""
     dose_lux_h: float = 0.0
     dose_before_lux_h: float = 0.0
     dose_budget_lux_h: float | None = None
     peak_board_c: float = 0.0
     too_hot: bool = False
-    """Boards beyond their limit, or LEDs that rest too short: what a slower pace may cure."""
+    """Boards beyond their limit, or LEDs with too short dark times: a slower pace may help."""
     timings: tuple[BurstTiming, ...] = ()
-    """Of each exposure, with what decides its period."""
+    """Timing of each exposure, with the limit that determines its period."""
     asked_bytes_s: float = 0.0
     disk_bytes_s: float = 0.0
     refusals: list[str] = field(default_factory=list)
@@ -88,9 +88,9 @@ def check(
     dose_before_lux_h: float = 0.0,
     share_left: float = 1.0,
 ) -> Report:
-    """Check a whole plan. `object_points_support_mm` [n, 3] are where the dose is reckoned; the worst counts.
+    """Check a whole plan. The dose is computed at `object_points_support_mm` [n, 3]; the highest counts.
 
-    Of a plan that is resumed, `share_left` of its light is still to come.
+    For a resumed plan, `share_left` of its light is still to come.
     """
     report = Report(shots=schedule.shots, frames=schedule.frames)
     report.timings = tuple(dict.fromkeys(burst.timing for burst in schedule.bursts[0]))
@@ -139,7 +139,7 @@ def _refuse_on_times(bursts: Sequence[Burst], limits: LedLimits) -> list[str]:
 
 
 def _order(itinerary: Itinerary) -> list[int]:
-    """Views as they are visited, then those that cannot be."""
+    """Views in the order of the visits, then unreachable ones."""
     return [*itinerary.order, *sorted(set(range(len(itinerary.visits))) - set(itinerary.order))]
 
 
@@ -197,7 +197,7 @@ def _time_and_dose(
 def _thermal(
     report: Report, limits: LedLimits, bursts_of_views: Sequence[Sequence[Burst]], leds: LedTable
 ) -> None:
-    """Board temperatures (first order) and rest of each LED, over the bursts of the report's views."""
+    """Board temperatures (first order) and dark times of each LED, over the bursts of the report's views."""
     model = limits.board
     board_of_led = dict(zip(leds.ids.tolist(), leds.boards.tolist(), strict=True))
     n_boards = int(leds.boards.max()) + 1

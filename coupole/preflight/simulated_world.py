@@ -1,4 +1,4 @@
-"""The world that a rig describes: what its stand-ins are started with."""
+"""The settings of a rig's world and its stand-ins."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coupole.preflight.job import Job
 
 DRY_RUN_WIDTH_PX = 128
 DRY_RUN_PICTURES = 48
-"""Frames of each burst that a dry run renders, about: the sample that exposure is judged on."""
+"""Approximate number of frames of each burst that a dry run renders, for evaluating the exposure."""
 
 
 def coarse(sensor: Sensor) -> Sensor:
@@ -31,8 +31,8 @@ def coarse(sensor: Sensor) -> Sensor:
 def world_config(
     cell: Cell, job: Job | None, sensor: Sensor, *, dry_run: bool = False, speed: float | None = None
 ) -> dict[str, Any]:
-    """The world that a rig describes, as `sim.world.config.Config` in JSON form. Raises InputError where there is
-    no such world."""
+    """The rig's world, as `sim.world.config.Config` in JSON form. Raises InputError if the world's settings are
+    invalid."""
     rig = cell.rig
     settings: dict[str, Any] = dict(rig.world.settings) if rig.world else {}
     if speed is not None:
@@ -76,7 +76,7 @@ def world_config(
 
 
 def _robot_config(rig: Rig, given: Mapping[str, Any], *, dry_run: bool) -> dict[str, Any]:
-    """The robot's stand-in: what the rig says of it, and what follows from the driver at the other end."""
+    """Settings of the robot's stand-in: from the rig, and from its driver's settings."""
     _, settings = device_for(rig, "robot", dry_run=dry_run)
     stand_in = stand_in_for(rig, dry_run=dry_run)
     alike = {name: settings[name] for name in stand_in.alike if name in settings}
@@ -85,7 +85,7 @@ def _robot_config(rig: Rig, given: Mapping[str, Any], *, dry_run: bool) -> dict[
 
 
 def _ledbox_config(rig: Rig, given: Mapping[str, Any], *, dry_run: bool) -> dict[str, Any]:
-    """The LED box's stand-in: what the rig says of it, and what follows from the driver at the other end."""
+    """Settings of the LED box's stand-in: from the rig, and from its driver's settings."""
     _, settings = device_for(rig, "ledbox", dry_run=dry_run)
     stand_in = ledbox_stand_in(rig, dry_run=dry_run)
     alike = {name: settings[name] for name in stand_in.alike if name in settings}
@@ -93,7 +93,7 @@ def _ledbox_config(rig: Rig, given: Mapping[str, Any], *, dry_run: bool) -> dict
 
 
 def _camera_config(rig: Rig, given: Mapping[str, Any], rehearsed: Job | None, *, dry_run: bool) -> dict[str, Any]:
-    """The camera's stand-in, as the rig describes it; not where a rehearsal has another kind of camera."""
+    """Settings of the camera's stand-in from the rig; none if a dry run uses another kind of camera."""
     kind = camera_kind(rig, dry_run=dry_run)
     if rehearsed is not None:
         every = max(1, rehearsed.schedule.frames // len(rehearsed.schedule.views) // DRY_RUN_PICTURES)

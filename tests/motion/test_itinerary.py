@@ -141,7 +141,7 @@ def test_a_view_that_is_hemmed_in_is_refused_alone_and_says_by_what(order: str) 
     assert sorted(itinerary.order) == [0, 2]
     (said,) = itinerary.refusals
     assert re.match(
-        r"view hemmed: no way to it was found from [\w ]+: \w+ would be .* keep-out `(left|right)`;", said
+        r"view hemmed: no path to it was found from [\w ]+: \w+ would be .* keep-out `(left|right)`;", said
     )
 
 

@@ -1,4 +1,4 @@
-"""How far an arm on its way is from where it would be: zero on the way, and never said to be less than it is."""
+"""Path deviation of a moving arm: zero on the path, and never less than the true distance."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def test_pictures_that_are_all_saturated_ask_for_another_metering() -> None:
 def test_an_exposure_longer_than_leds_can_be_on_is_not_proposed() -> None:
     advice = advise({"top": metered(lambertian(0.0005))}, Request(snr=40.0), longest_us=20_000)
     assert max(advice.exposure.exposures_us) <= 20_000
-    assert any("too short for the wished noise" in remark for remark in advice.remarks)
+    assert any("too short for the required signal-to-noise ratio" in remark for remark in advice.remarks)
 
 
 PLAN = "schema_version: 1  # this stays\nname: x\nexposure: {kind: fixed, exposure_us: 8000}\n"

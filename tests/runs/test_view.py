@@ -163,7 +163,7 @@ def test_a_way_that_is_blocked_is_shown_where_it_first_touches(cell: CellFolder)
     goal_deg = _behind_something(read_job(cell.plan))
     cell.write(views=[{"kind": "joints", "name": "behind", "joints_deg": goal_deg.tolist()}])
     job = read_job(cell.plan)
-    nowhere = Itinerary((None,), ("view behind: no way to it was found",), ())
+    nowhere = Itinerary((None,), ("view behind: no path to it was found",), ())
     scene = scene_of(job, nowhere, job.motion.bodies, nowhere.refusals)
     (stop,) = scene.stops
     assert stop.clash is not None

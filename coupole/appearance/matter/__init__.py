@@ -1,4 +1,4 @@
-"""How heritage materials look, by wavelength: metals, films, paints, gilts, lacquer, and their light.
+"""Spectral appearance of heritage materials: metals, films, paints, gilts, lacquer.
 
 Plain functions on arrays, from the papers named in each file. Spectra are [..., 81] on the grid of `grid`, 380 to
 780 nm by 5 nm; thicknesses carry their unit; complex indices are n + i k.

@@ -1,9 +1,9 @@
 """Reflectance distribution functions f(wi, wo), per steradian, at one point of a surface.
 
-Directions are unit vectors [..., 3] away from the surface in its own frame, z along the normal: `wi` to the
-light, `wo` to the eye. Results are [..., bands]; they are 0 where either direction is at or below the horizon.
-The radiance that a light of irradiance E (on a plane facing it) sends on is f E wi_z. Other parameters are bound
-with `functools.partial`, which makes any of these a `Brdf`.
+Directions are unit vectors [..., 3] away from the surface in its own frame, z along the normal: `wi` to the light,
+`wo` to the eye. Results are [..., bands]; they are 0 where either direction is at or below the horizon. The
+radiance reflected from a light of irradiance E (on a plane facing it) is f E wi_z. Other parameters are bound with
+`functools.partial`, which makes any of these a `Brdf`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from coupole.appearance.spectra.grid import Array
 
 Brdf = Callable[[Array, Array], Array]
 LEAST_ROUGHNESS = 1e-3
-"""Smoother than this is a mirror, whose BRDF is no function."""
+"""Least roughness; below it the surface is a mirror, whose BRDF is not a function."""
 
 
 def lambert(wi: Array, wo: Array, *, reflectance: ArrayLike) -> Array:
@@ -27,7 +27,7 @@ def lambert(wi: Array, wo: Array, *, reflectance: ArrayLike) -> Array:
 
 
 def oren_nayar(wi: Array, wo: Array, *, reflectance: ArrayLike, roughness: float) -> Array:
-    """Rough diffuse surfaces such as bole or plaster, in the form of Fujii that does not gain energy.
+    """Rough diffuse surfaces such as bole or plaster, in Fujii's form, which creates no energy.
 
     Oren and Nayar, SIGGRAPH 1994; Fujii, "A tiny improvement of Oren-Nayar reflectance model" (2012). `roughness`
     goes from 0 (Lambert) to 1.
@@ -41,7 +41,7 @@ def oren_nayar(wi: Array, wo: Array, *, reflectance: ArrayLike, roughness: float
 
 
 def ggx(wi: Array, wo: Array, *, roughness: float, fresnel: Fresnel) -> Array:
-    """Facets with the GGX distribution and Smith's height-correlated shadowing; light that strikes one facet only.
+    """Facets with the GGX distribution and Smith's height-correlated shadowing; single reflection only.
 
     Walter et al., EGSR 2007; Heitz, JCGT 3(2), 2014, Eqs 72 and 99. `roughness` is alpha.
     """
@@ -82,5 +82,5 @@ def _above(wi: Array, wo: Array) -> Array:
 
 
 def _cosines(wi: Array, wo: Array) -> tuple[Array, Array, Array]:
-    """Cosines to the normal, kept off zero, and 1 where both directions are above the horizon."""
+    """Cosines to the normal, bounded away from zero, and 1 where both directions are above the horizon."""
     return np.maximum(wi[..., 2], 1e-9), np.maximum(wo[..., 2], 1e-9), _above(wi, wo)

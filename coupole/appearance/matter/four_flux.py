@@ -7,10 +7,10 @@ With z downward, l the directional and L the diffuse fluxes, mu = k + s_i + s_j:
 
     l+(0) = 1    L+(0) = 0    l-(h) = r_s l+(h)    L-(h) = Rg L+(h) + Rcg l+(h)
 
-The paper solves this with p and q, which blow up where mu = b S though the fluxes do not. Here the scattered
-light is integrated with the layer's Green's function instead. Of diffuse light born at depth z and going down,
-the layer alone sends sinh(bS(h-z))/A up through its top and A(z)/A through its bottom, where A(z) = a sinh(bSz)
-+ b cosh(bSz) and A = A(h); for light going up, the two are exchanged. The integrals of these with exp(-mu z) are
+The paper solves this with p and q, which diverge where mu = b S although the fluxes do not. Here the scattered
+light is integrated with the layer's Green's function instead. Of diffuse light that starts at depth z downwards,
+the layer alone sends sinh(bS(h-z))/A up through its top and A(z)/A through its bottom, where A(z) = a sinh(bSz) +
+b cosh(bSz) and A = A(h); for light going up, the two are exchanged. The integrals of these with exp(-mu z) are
 divided differences of exponentials, finite everywhere.
 """
 
@@ -25,8 +25,8 @@ from coupole.appearance.matter.kubelka_munk import decay
 from coupole.appearance.spectra.grid import Array, within
 
 _LEAST_X = 1e-5
-"""x = bSh is kept above this: a layer that absorbs no diffuse light is taken as one that hardly does. The results
-depend on x^2, so this is worth 1e-10, as much as rounding in the differences divided by x."""
+"""x = bSh is kept above this: a layer without absorption of diffuse light gets a very small one. The results
+depend on x^2, so the error is 1e-10, as large as rounding in the differences divided by x."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,15 @@ class Layer:
     direct_absorption: ArrayLike
     """k."""
     forward: ArrayLike
-    """s_i: from directional light to diffuse light that goes the same way."""
+    """s_i: from directional light to diffuse light in the same direction."""
     backward: ArrayLike
-    """s_j: ... that goes the other way."""
+    """s_j: ... in the opposite direction."""
     thickness_mm: ArrayLike
 
 
 @dataclass(frozen=True)
 class Background:
-    """What lies under the layer."""
+    """The background under the layer."""
 
     diffuse: ArrayLike = 0.0
     """Rg, diffuse to diffuse."""
@@ -81,7 +81,7 @@ def response(layer: Layer) -> tuple[Array, Array, Array, Array, Array]:
     )
     m = (k_direct + forward + backward) * h
     x = np.maximum(np.sqrt(k * (k + 2.0 * s)) * h, _LEAST_X)
-    # All of A/b, sinh/b and the integrals below carry the same factor exp(x), which is left out of each.
+    # A/b, sinh/b and the integrals below have the common factor exp(x), which is omitted.
     shrink = np.exp(-x)
     a_over_b = (k + s) * h * decay(2.0 * x) + 0.5 * (1.0 + shrink**2)
     fading, growing = decay(m + x), decay(np.abs(m - x)) * np.exp(np.maximum(x - m, 0.0) - x)
@@ -97,7 +97,7 @@ def response(layer: Layer) -> tuple[Array, Array, Array, Array, Array]:
 
 
 def opaque(layer: Layer) -> Array:
-    """Diffuse reflectance for directional light of a layer without end; its thickness is not used.
+    """Diffuse reflectance of an infinitely thick layer for directional light; its thickness is not used.
 
     R_inf,dir = rho1 p - q, which reduces to rho1 s_i/(mu + bS) + s_j/(mu + bS).
     """

@@ -1,12 +1,12 @@
-"""Gold leaf on bole (seed 001, section 5): Eq. 7, made definite.
+"""Gold leaf on bole (seed 001, section 5): Eq. 7 with all terms defined.
 
     R = f R_bole + (1 - f) (R(d) + T_in T_out R_b/(1 - R_int R_b))
 
-f is the share of the surface that holes and cracks leave bare, R(d) the reflectance of a leaf of thickness d,
-T_in its transmittance, T_out and R_int its transmittance and reflectance for the bole's diffuse light from
+f is the share of the surface not covered because of holes and cracks, R(d) the reflectance of a leaf of thickness
+d, T_in its transmittance, T_out and R_int its transmittance and reflectance for the bole's diffuse light from
 below, and R_b the bole's reflectance inside its binder. The paper's "R_gold - T_p + R_plasmon" has no definition
-of R_plasmon; a thin film has all three in it (docs/decisions/0010). Towards thickness 0 the result is the bole
-as measured, towards thick leaves it is bulk gold.
+of R_plasmon; a thin film includes all three (docs/decisions/0010). For thickness 0 the result is the measured
+bole, for thick leaves bulk gold.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Gilt:
 
     leaf: layered.Sheet
     bare: layered.Sheet
-    """Where no leaf is: the bole's binder against the air."""
+    """Surface without leaf: the bole's binder against air."""
     bole_inside: Array
     """[bands], inside the binder."""
     uncovered: float
@@ -38,15 +38,15 @@ class Gilt:
 def leaf_index(
     metal: Complex, holes_share: float, *, flatness: float = 20.0, filling: float = indices.EGG_WHITE
 ) -> Complex:
-    """Effective index of a leaf of `metal` with a share of nanoscopic lens-shaped holes full of egg white, seen
-    along its normal (Eqs 2-5). `flatness` is a hole's width over its height."""
+    """Effective index of a leaf of `metal` with a share of nanoscopic lens-shaped holes filled with egg white, for
+    light along its normal (Eqs 2-5). `flatness` is a hole's width over its height."""
     depolarisation = effective_medium.depolarisation_in_plane(flatness)
     return effective_medium.maxwell_garnett(metal, filling, holes_share, depolarisation)
 
 
 def uncovered(holes: float, crack_width_um: float, crack_length_mm_per_mm2: float) -> float:
-    """Share of the surface that neither holes (share of area) nor cracks of burnishing leave covered; they overlap
-    by chance."""
+    """Share of the surface left bare by holes (share of area) and cracks of burnishing, which overlap at
+    random."""
     cracks = within("cracks", crack_width_um * 1e-3 * crack_length_mm_per_mm2, 0.0, 1.0)
     return float(1.0 - (1.0 - within("holes", holes, 0.0, 1.0)) * (1.0 - cracks))
 
@@ -92,7 +92,7 @@ def step_wedge(index: Complex, thicknesses_nm: Sequence[float], bole_seen: Array
 
 @dataclass(frozen=True)
 class GiltCoats:
-    """A gilt's two kinds of surface with their roughness."""
+    """The two surfaces of a gilt with their roughness."""
 
     gilded: Gilt
     leaf: layered.Coat
@@ -100,7 +100,7 @@ class GiltCoats:
 
 
 def coats(gilded: Gilt, *, leaf_roughness: float, bole_roughness: float) -> GiltCoats:
-    """Burnished gold has GGX roughness of some 0.05 to 0.2, bare bole 0.3 and more (assumed)."""
+    """Burnished gold has a GGX roughness of about 0.05 to 0.2, bare bole 0.3 and more (assumed)."""
     return GiltCoats(gilded, layered.coat(gilded.leaf, leaf_roughness), layered.coat(gilded.bare, bole_roughness))
 
 

@@ -1,4 +1,4 @@
-"""Integrals over the hemisphere: how much a surface reflects in all, whatever its BRDF."""
+"""Integrals of any BRDF over the hemisphere: total reflectance."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def directions(cosines: Array, azimuths: Array) -> Array:
 def albedo(brdf: Brdf, cosines: Array, *, nodes: int = 64) -> Array:
     """Directional-hemispherical reflectance [n, bands] at n cosines of incidence.
 
-    This is also what the surface shows in a white furnace (radiance 1 from everywhere), if it is reciprocal.
-    Light is caught on a polar grid about the specular direction, with polar angles squeezed towards it (`nodes`
-    Gauss points of theta = (pi/2 + theta_i) u^3, `nodes` midpoints of azimuth), so narrow lobes are resolved;
-    the horizon cuts through the grid, which leaves an error of some 1/nodes of what is reflected there.
+    For a reciprocal BRDF this is also its radiance in a white furnace (radiance 1 from all directions). The
+    integral uses a polar grid about the specular direction, with polar angles concentrated there (`nodes` Gauss
+    points of theta = (pi/2 + theta_i) u^3, `nodes` midpoints of azimuth), so narrow lobes are resolved; the
+    horizon cuts through the grid, which gives an error of about 1/nodes of the light reflected there.
     """
     u, weight = np.polynomial.legendre.leggauss(nodes)
     u, weight = 0.5 * (u + 1.0), 0.5 * weight

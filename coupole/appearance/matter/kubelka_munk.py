@@ -1,9 +1,9 @@
 """Two diffuse fluxes in a scattering layer (Kubelka and Munk 1931; seed 000, Eqs 5-7), and its glossy surface.
 
-K and S are absorption and scattering per mm, h is the thickness in mm; all arguments broadcast. With a = 1 +
-K/S, b = sqrt(a^2 - 1) and x = b S h, a layer reflects rho = sinh x/A and passes tau = b/A, where A = a sinh x +
-b cosh x. Here A is divided by b exp(x), and K/S never formed: then thick layers, layers that do not absorb and
-layers that do not scatter need no cases of their own.
+K and S are absorption and scattering per mm, h is the thickness in mm; all arguments broadcast. With a = 1 + K/S,
+b = sqrt(a^2 - 1) and x = b S h, a layer reflects rho = sinh x/A and transmits tau = b/A, where A = a sinh x + b
+cosh x. Here A is divided by b exp(x), and K/S is not formed, so that thick layers, layers without absorption and
+layers without scattering need no special cases.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from coupole.appearance.spectra.grid import Array, within
 
 _ROUNDING = 1e-12
-"""So much more than 1 a reflectance may become by rounding."""
+"""Largest excess of a reflectance over 1 from rounding."""
 
 
 def decay(x: ArrayLike) -> Array:
@@ -43,9 +43,9 @@ def over(rho: ArrayLike, tau: ArrayLike, background: ArrayLike) -> Array:
 
 
 def opaque(k_over_s: ArrayLike) -> Array:
-    """R_inf, the reflectance of a layer so thick that nothing below it shows.
+    """R_inf, the reflectance of an opaque layer.
 
-    1/(a + b), which equals a - b but loses no digits for dark layers.
+    1/(a + b), which equals a - b without loss of digits for dark layers.
     """
     ratio = within("K/S", k_over_s, 0.0, 1e12)
     return np.asarray(1.0 / (1.0 + ratio + np.sqrt(ratio * (ratio + 2.0))))
@@ -74,18 +74,18 @@ def coefficients(
 
 
 def saunderson(internal: ArrayLike, external_k1: ArrayLike, internal_k2: ArrayLike) -> Array:
-    """What is seen from air of a layer with reflectance `internal` under a glossy surface, gloss excluded.
+    """Reflectance in air of a layer with reflectance `internal` under a glossy surface, gloss excluded.
 
-    Saunderson, J. Opt. Soc. Am. 32, 727 (1942). `external_k1` is the surface's reflectance for the light that
-    comes (`fresnel.reflectance`), `internal_k2` for diffuse light from within (`fresnel.diffuse_internal`). An
-    instrument that includes the gloss sees `external_k1` more.
+    Saunderson, J. Opt. Soc. Am. 32, 727 (1942). `external_k1` is the surface's reflectance for the incident light
+    (`fresnel.reflectance`), `internal_k2` for diffuse light from within (`fresnel.diffuse_internal`). An
+    instrument that includes the gloss measures `external_k1` in addition.
     """
     r, k1, k2 = (np.asarray(v, dtype=float) for v in (internal, external_k1, internal_k2))
     return np.asarray((1.0 - k1) * (1.0 - k2) * r / (1.0 - k2 * r))
 
 
 def saunderson_inverse(seen: ArrayLike, external_k1: ArrayLike, internal_k2: ArrayLike) -> Array:
-    """The layer's own reflectance from what is seen of it, gloss excluded: the inverse of `saunderson`."""
+    """The layer's internal reflectance from that in air, gloss excluded: the inverse of `saunderson`."""
     k1, k2 = (np.asarray(v, dtype=float) for v in (external_k1, internal_k2))
     r = np.asarray(seen, dtype=float)
     inside = r / ((1.0 - k1) * (1.0 - k2) + k2 * r)

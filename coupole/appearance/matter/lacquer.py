@@ -1,4 +1,4 @@
-"""Clear lacquer over metal: absorption on the way in and out (Beer and Lambert), refraction at the top."""
+"""Clear lacquer over metal: absorption along the path in and out (Beer and Lambert), refraction at the surface."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array, within
 def urushi_absorption(at_450_nm_per_mm: float = 6.0, fall_per_nm: float = 0.016) -> Array:
     """Absorption [81] per mm of transparent (suki) urushi: amber, fading exponentially towards the red.
 
-    The shape is that of the tail of aromatic chromophores; both numbers are assumed, of the order at which 0.1
-    mm of lacquer looks amber. Whoever has a transmittance measures it instead: `absorption_from`.
+    The shape is the tail of aromatic chromophores; both numbers are assumed, such that 0.1 mm of lacquer looks
+    amber. From a measured transmittance use `absorption_from`.
     """
     return at_450_nm_per_mm * np.exp(-fall_per_nm * (WAVELENGTHS_NM - 450.0))
 
@@ -32,7 +32,7 @@ def absorption_from(transmittance: ArrayLike, thickness_mm: float, index: float 
 def transmittance(
     depth_mm: ArrayLike, cos_in_air: ArrayLike, absorption_per_mm: Array, index: float = indices.URUSHI
 ) -> Array:
-    """Share [..., bands] of light that is left at a depth, for light that came from air at an angle [...]."""
+    """Share [..., bands] of light that reaches a depth, for light from air at an angle [...]."""
     cosine = fresnel.cos_inside(cos_in_air, 1.0, index).real
     path_mm = within("depth", depth_mm, 0.0, np.inf) / cosine
     return np.exp(-path_mm[..., None] * absorption_per_mm)
@@ -41,11 +41,11 @@ def transmittance(
 def seen_through(
     wi: Array, wo: Array, metal_normal: Array, depth_mm: ArrayLike, absorption_per_mm: Array, index: float
 ) -> tuple[Array, Array]:
-    """A mirror at a depth in lacquer: how far from alignment it is, and what the lacquer leaves of the light.
+    """A mirror at a depth in lacquer: its angle from the mirror condition, and the transmittance of the lacquer.
 
     `wi`, `wo` [..., 3] are directions in air, `metal_normal` [..., 3] of the mirror, in the surface's frame.
-    Returns the angle in degrees [...] between that normal and the one which would send wi to wo, and the
-    transmittance [..., bands] both ways through absorption and surface (Fresnel).
+    Returns the angle in degrees [...] between that normal and the one that reflects wi to wo, and the
+    transmittance [..., bands] along both paths, with absorption and surface (Fresnel).
     """
     inside = [_refracted(w, index) for w in (wi, wo)]
     needed = inside[0] + inside[1]

@@ -1,10 +1,10 @@
 """A rough sheet over a diffuse body: varnish or lacquer on paint, a gold leaf on bole.
 
-The sheet is what lies between the air and the body's medium: a bare surface, or thin films. Part of the light is
-reflected by the sheet's facets (GGX); the rest enters, is scattered by the body, and comes out again, some of it
-after the sheet has thrown it back. The books balance by construction: what is not reflected at an angle is all
-that can enter there, what comes out is spread over the angles as the sheet passes light, and the result is
-reciprocal.
+The sheet is the interface between air and the body's medium: a bare surface, or thin films. Part of the light is
+reflected by the sheet's facets (GGX); the rest enters, is scattered by the body and leaves again, partly after
+reflection at the sheet's inner side. Energy is conserved by construction: light that is not reflected at an angle
+enters or is absorbed there, and the emerging light has the angular distribution of the sheet's transmittance, so
+that the result is reciprocal.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array, within
 _ANGLES = 65
 _FACETS = 32
 _GAUSS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(48)
-# Squares of equal steps: reflectance bends most at grazing incidence.
+# Squares of equal steps: reflectance varies most at grazing incidence.
 _COSINES: Array = np.linspace(0.0, 1.0, _ANGLES) ** 2
 
 
@@ -38,7 +38,7 @@ class Sheet:
     internal_reflectance: Array
     """[bands], for diffuse light from the body."""
     internal_transmittance: Array
-    """[bands], to air, for diffuse light from the body; what the two leave to 1 is absorbed in the sheet."""
+    """[bands], to air, for diffuse light from the body; the remainder to 1 is absorbed in the sheet."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def sheet(films: Sequence[thin_film.Film], body_index: float) -> Sheet:
 def coat(smooth: Sheet, roughness: float) -> Coat:
     """The sheet on a rough surface, in facets of GGX `roughness`.
 
-    Of what the rough sheet does not reflect at an angle, it passes the same part as the smooth one.
+    Of the light that it does not reflect at an angle, the rough sheet transmits the same share as the smooth one.
     """
     lost = 1.0 - _facets(roughness) @ smooth.reflectance
     entering = lost * smooth.transmittance / np.maximum(1.0 - smooth.reflectance, 1e-12)
@@ -101,7 +101,7 @@ def layered(wi: Array, wo: Array, *, coat: Coat, body: Array) -> Array:
 
 
 def emerging(sheet: Sheet, body: Array) -> Array:
-    """Share [bands] of the light that enters which comes out again, all bounces between sheet and body summed."""
+    """Share [bands] of the entering light that leaves again, with all reflections between sheet and body."""
     return np.asarray(sheet.internal_transmittance * body / (1.0 - sheet.internal_reflectance * body))
 
 
@@ -120,11 +120,12 @@ def _over_angles(table: Array) -> Array:
 
 
 def _facets(roughness: float) -> Array:
-    """[angles, angles]: row i holds how much of the light from angle i GGX facets reflect at each of their angles.
+    """[angles, angles]: row i holds the share of the light from angle i that GGX facets reflect, by local angle at
+    the facet.
 
-    Its product with a sheet's reflectances gives those of the rough sheet: facets are taken as the light sees them
-    (Heitz, "Sampling the GGX distribution of visible normals", JCGT 7(4), 2018), on Gauss points of a disk, each
-    weighted with the shadowing G2/G1 of the way out.
+    Its product with a sheet's reflectances gives those of the rough sheet: facets are weighted by their visible
+    area (Heitz, "Sampling the GGX distribution of visible normals", JCGT 7(4), 2018), on Gauss points of a disk,
+    each weighted with the shadowing G2/G1 of the reflected direction.
     """
     alpha = max(roughness, brdf.LEAST_ROUGHNESS)
     radius2, weight = np.polynomial.legendre.leggauss(_FACETS)

@@ -1,13 +1,13 @@
-"""Makie: metal powder sprinkled on lacquer, taken apart from a photograph (seed 002, section 4).
+"""Makie: decomposition of a photograph of metal powder on lacquer (seed 002, section 4).
 
 A pixel of the picture is T = p m + sum of q_l c_l: m is the colour of the metallic finish alone, c_l those of up
-to three lacquers, photographed under the same light, all linear and not negative. p becomes the alpha channel:
-the weight of the metallic BRDF. What is left, T - p m, becomes the colour channels: the lacquers' diffuse light.
+to three lacquers, photographed under the same light, all linear and not negative. p becomes the alpha channel: the
+weight of the metallic BRDF. The residual T - p m becomes the colour channels: the lacquers' diffuse light.
 
 With three lacquers there are four unknowns and three channels. Eq. 4 takes the largest p that leaves no lacquer
 negative, which is exact where at least one lacquer whose m' is positive is absent, and too large elsewhere. Where
 the weights are known to sum to 1 (inside the drawing), p follows without that assumption. With one or two lacquers
-the system is not short of equations, and least squares solve it.
+the system is determined, and is solved by least squares.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from coupole.errors import InputError
 
 _SINGULAR = 1e-9
 _SUM_IS_ONE = 1e-3
-"""Where the metal's weights m' sum to 1 within this, the sum says nothing about p."""
+"""If the metal's weights m' sum to 1 within this, the sum does not determine p."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def decompose(
     *,
     region: Literal["anywhere", "inside"] = "anywhere",
 ) -> Makie:
-    """Take `picture` [..., 3] (linear) apart into `metal` [3] and `lacquers` [1 to 3, 3].
+    """Decompose `picture` [..., 3] (linear) into `metal` [3] and `lacquers` [1 to 3, 3].
 
     `region` says whether all pixels lie inside the drawing, where the weights sum to 1; with three lacquers p is
     then (1 - sum T')/(1 - sum m') instead of Eq. 4.

@@ -1,9 +1,8 @@
 """Nashiji: metal flakes at random depths in clear lacquer (seed 002, section 5).
 
-A flake is a superquadric (Barr 1981), |x/a|^(2/e2) + |y/b|^(2/e2) to the power e2/e1, plus |z/c|^(2/e1), equal
-to 1: a, b, c are its half axes. Flakes lie in a slab of lacquer whose surface is z = 0 and whose substrate is at
-z = -depth; x and y go from 0 to the slab's size. The same slab and seed give the same flakes. Flakes may cross
-each other, as they do in the real thing.
+A flake is a superquadric (Barr 1981), |x/a|^(2/e2) + |y/b|^(2/e2) to the power e2/e1, plus |z/c|^(2/e1), equal to
+1: a, b, c are its half axes. Flakes lie in a slab of lacquer whose surface is z = 0 and whose substrate is at z =
+-depth; x and y go from 0 to the slab's size. The same slab and seed give the same flakes. Flakes may intersect.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from coupole.errors import InputError
 
 @dataclass(frozen=True)
 class Slab:
-    """A piece of nashiji; defaults are assumed, of the order that the paper describes (depth below 1 mm)."""
+    """A piece of nashiji; defaults are assumed, of the paper's order of magnitude (depth below 1 mm)."""
 
     size_mm: tuple[float, float] = (20.0, 20.0)
     depth_mm: float = 0.4
@@ -59,7 +58,7 @@ class Flakes:
 
 
 def flakes(slab: Slab) -> Flakes:
-    """The slab's flakes, each wholly under the surface and above the substrate."""
+    """The slab's flakes, each entirely between surface and substrate."""
     rng = np.random.default_rng(slab.seed)
     n = rng.poisson(slab.flakes_per_mm2 * slab.size_mm[0] * slab.size_mm[1])
     radius = slab.flake_radius_mm * np.exp(slab.radius_spread * rng.standard_normal(n))
@@ -69,7 +68,7 @@ def flakes(slab: Slab) -> Flakes:
     # Slopes along x and y are normal and independent, so that the tilt's tangent is Rayleigh distributed.
     tilt = np.arctan(np.tan(np.radians(slab.tilt_deg)) * np.sqrt(0.5) * rng.rayleigh(1.0, n))
     rotation = _about_z(turn) @ _about_y(tilt) @ _about_z(spin)
-    # The box of the flake's half axes encloses it: as far as it reaches up, its centre stays down.
+    # The box of the flake's half axes encloses it, so its vertical extent bounds the centre's depth.
     reach = np.einsum("nk,nk->n", np.abs(rotation[:, 2, :]), half_axes)
     room = slab.depth_mm - 2.0 * reach
     if np.any(room < 0.0):
@@ -115,8 +114,8 @@ def sparkles(
     """Brightness [n, bands] of each flake for a distant light and an eye: 1 is a mirror that meets the eye in air.
 
     `to_light` [3] and `to_eye` [3] or [n, 3] are unit vectors. A flake's mirror is blurred by `spread_deg`
-    (standard deviation of its facets' normals, with the light's own size in it). Two eyes see different flakes
-    shine, which is the rivalry that the paper's depth effect rests on. Flakes that shade each other are left to
+    (standard deviation of its facets' normals, with the light's own size in it). Different flakes are bright for
+    the two eyes, the binocular rivalry that causes the paper's depth effect. Mutual shadowing of flakes is left to
     a renderer.
     """
     wi, wo = (np.broadcast_to(w, found.centres_mm.shape) for w in (to_light, to_eye))

@@ -33,15 +33,15 @@ class Recipe:
     """What `fit` found."""
 
     concentrations: dict[str, float]
-    """They sum to 1; a pigment that is not needed has 0."""
+    """They sum to 1; an unused pigment has 0."""
     reflectance: Array
     """[bands] of the mixture, inside its binder."""
     rms: float
-    """Root of the mean square of what the mixture misses, in reflectance."""
+    """Root mean square residual of the mixture, in reflectance."""
 
 
 def mixture(pigments: Sequence[Pigment], concentrations: ArrayLike) -> Pigment:
-    """The mixture as a pigment; concentrations are made to sum to 1."""
+    """The mixture as a pigment; concentrations are normalised to sum 1."""
     shares = within("concentration", concentrations, 0.0, 1e12)
     if shares.shape != (len(pigments),) or shares.sum() == 0.0:
         raise InputError(
@@ -86,17 +86,17 @@ def opaque_reflectance(pigment: Pigment) -> Array:
 
 
 def fit(target: Array, pigments: Sequence[Pigment]) -> Recipe:
-    """The mixture whose opaque reflectance comes nearest to `target` [bands], inside the binder, by least squares.
+    """The mixture whose opaque reflectance is nearest to `target` [bands], inside the binder, by least squares.
 
-    First the linear problem sum c_i (K_i - Q S_i) = 0 with Q the target's K/S, each band weighted so that it
-    counts in reflectance; from there Gauss-Newton on reflectance itself, concentrations not negative.
+    First the linear problem sum c_i (K_i - Q S_i) = 0 with Q the target's K/S, with bands weighted to give
+    residuals in reflectance; then Gauss-Newton on reflectance itself, with concentrations not negative.
     """
     from scipy.optimize import least_squares, nnls
 
     k = np.stack([p.absorption for p in pigments], axis=1)
     s = np.stack([p.scattering for p in pigments], axis=1)
     q = kubelka_munk.k_over_s(target)
-    # dR/dQ of R = 1/(1 + Q + sqrt(Q^2 + 2Q)) is -R/sqrt(Q^2 + 2Q); a pure white has no slope to weigh by.
+    # dR/dQ of R = 1/(1 + Q + sqrt(Q^2 + 2Q)) is -R/sqrt(Q^2 + 2Q); the slope of a pure white is infinite.
     weight = target / np.sqrt(np.maximum(q * (q + 2.0), 1e-12)) / s.mean()
     system = weight[:, None] * (k - q[:, None] * s)
     emphasis = 10.0 * np.abs(system).max() + 1.0
@@ -108,7 +108,7 @@ def fit(target: Array, pigments: Sequence[Pigment]) -> Recipe:
     if len(pigments) == 1:
         shares = np.ones(1)
     else:
-        # The sum of concentrations does not matter to R; one more residual keeps it at 1.
+        # R does not depend on the sum of concentrations; an additional residual fixes it at 1.
         found = least_squares(
             lambda c: np.append(missing(c), c.sum() - 1.0),
             np.maximum(start / start.sum(), 1e-6),

@@ -1,11 +1,11 @@
 """A tabulated BRDF in coordinates about the specular direction (seed 002, section 3.1).
 
 For light from wi, the polar axis is its mirror direction s'; theta is the angle of wo to s', phi the angle about
-s' from the plane of incidence, upward side. The peak of a metallic finish then always stands at theta = 0, and
-the grid of theta can be dense there and sparse elsewhere: nodes are placed so that linear interpolation between
-them misses equally much everywhere. The surface is isotropic: phi goes from 0 to pi only, and of wi only the
-angle of incidence counts. What is interpolated is the logarithm, which keeps values positive; over phi, where it
-is even and periodic, with cosines, so that a few nodes are enough.
+s' from the plane of incidence, upward side. The peak of a metallic finish is then always at theta = 0, and the
+grid of theta can be dense there and sparse elsewhere: nodes are placed so that the error of linear interpolation
+is the same everywhere. The surface is isotropic: phi goes from 0 to pi only, and of wi only the angle of incidence
+matters. The logarithm is interpolated, which keeps values positive; over phi, where it is even and periodic, by
+cosines, so that a few nodes are enough.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from coupole.errors import InputError
 Indices = NDArray[np.intp]
 _PROFILE = 2001
 _FLOOR = 1e-9
-"""Zeros are taken as this share of the peak: they have no logarithm."""
+"""Zeros are replaced by this share of the peak, because they have no logarithm."""
 _HORIZON_Z = 0.01
-"""Lower than this is not looked at when nodes are placed: the bend at the horizon is of our own making."""
+"""Lower values are ignored when nodes are placed: the bend at the horizon is an artefact of the table."""
 _LOWEST_Z = 1e-3
-"""Directions of the grid below the horizon take the value just above it, so that interpolation there has ends."""
+"""Directions of the grid below the horizon take the value just above it, for interpolation."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,12 @@ class SpecularTable:
 
     @property
     def entries_per_incidence(self) -> int:
-        """What the paper counts."""
+        """Number of entries as the paper counts them."""
         return int(np.prod(self.log_cosines.shape[1:3]))
 
 
 def tabulate(source: Brdf, incidence_deg: Array, *, theta_nodes: int = 40, phi_nodes: int = 7) -> SpecularTable:
-    """The table of `source`, or of what measures one, at the given angles of incidence (increasing, below 90)."""
+    """The table of `source`, a BRDF or a measurement of one, at angles of incidence (increasing, below 90)."""
     incidence = np.deg2rad(np.atleast_1d(np.asarray(incidence_deg, dtype=float)))
     if np.any(np.diff(incidence) <= 0.0) or incidence[0] < 0.0 or incidence[-1] >= 0.5 * np.pi:
         raise InputError(
@@ -64,7 +64,7 @@ def tabulate(source: Brdf, incidence_deg: Array, *, theta_nodes: int = 40, phi_n
 
 
 def tabulated(wi: Array, wo: Array, *, table: SpecularTable) -> Array:
-    """The table's BRDF; the mean of both ways through the light's path, which makes it reciprocal."""
+    """The table's BRDF, averaged over exchange of wi and wo, which makes it reciprocal."""
     above = ((wi[..., 2] > 0.0) & (wo[..., 2] > 0.0))[..., None]
     return (
         above
@@ -101,7 +101,7 @@ def _frame(wi: Array) -> tuple[Array, Array, Array]:
     """Mirror direction, the perpendicular to it in the plane of incidence on the upper side, and their cross."""
     mirror = wi * np.array([-1.0, -1.0, 1.0])
     sine = np.hypot(wi[..., 0], wi[..., 1])
-    # At normal incidence any azimuth will do, and f depends on none.
+    # At normal incidence the azimuth is arbitrary, and f does not depend on it.
     flat = np.where(
         sine[..., None] > 1e-12,
         wi * np.array([1.0, 1.0, 0.0]) / np.maximum(sine, 1e-12)[..., None],
@@ -122,10 +122,11 @@ def _sample(source: Brdf, incidence: Array, theta: Array, phi: Array) -> tuple[A
 
 
 def _adapt(theta: Array, profiles: Array, cosines: Array, nodes: int) -> Array:
-    """`nodes` places in `theta`, dense where the logarithm of the profiles [i, theta, phi, bands] bends.
+    """`nodes` values of `theta`, dense where the logarithm of the profiles [i, theta, phi, bands] has high
+    curvature.
 
-    Linear interpolation of log f over a step h misses h^2 f (log f)''/8 of f: equal misses need steps as the
-    inverse square root. A tenth of the nodes is spread evenly.
+    Linear interpolation of log f over a step h has the error h^2 f (log f)''/8 in f: equal errors need steps
+    proportional to the inverse square root of f (log f)''. A tenth of the nodes is spread evenly.
     """
     peak = np.maximum(profiles.max(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
     scaled = np.maximum(profiles / peak, _FLOOR)
@@ -139,7 +140,8 @@ def _adapt(theta: Array, profiles: Array, cosines: Array, nodes: int) -> Array:
 
 
 def look_up(incidence: Array, theta: Array, phi: Array, table: SpecularTable) -> Array:
-    """The table [..., bands] at coordinates [...], one way only: not reciprocal between its nodes."""
+    """The table [..., bands] at coordinates [...], for one order of the directions: not reciprocal between its
+    nodes."""
     cosines = np.cos(phi[..., None] * np.arange(table.log_cosines.shape[2]))
     first, second = _place(table.incidence, incidence), _place(table.theta, theta)
     total: Array = np.zeros(1)

@@ -1,10 +1,10 @@
 """Typical reflectances of the paints that the papers name, as formulas: for virtual objects, not for
 identification.
 
-They are not measurements. Each is K/S as a sum of a floor, edges (reds and yellows: absorption below a
-wavelength) and bands (blues and greens), placed where the seeds and general knowledge of reflectance
-spectroscopy put them: lapis-lazuli reflects about 455 nm and again towards 780 nm, azurite has one peak (seed
-000, section 3.5). Whoever has spectra uses `measured` instead.
+They are not measurements. Each is K/S as a sum of a floor, edges (reds and yellows: absorption below a wavelength)
+and bands (blues and greens), placed where the seeds and general knowledge of reflectance spectroscopy put them:
+lapis-lazuli reflects about 455 nm and again towards 780 nm, azurite has one peak (seed 000, section 3.5). Use
+`measured` for measured spectra.
 """
 
 from __future__ import annotations

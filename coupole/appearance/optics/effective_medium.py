@@ -1,8 +1,8 @@
 """Effective index of a host with small spheroids in it (Maxwell Garnett 1904; seed 001, Eqs 2-5).
 
 For gilts the host is gold, a continuous leaf, and the inclusions are nanoscopic holes filled with egg white; the
-other way round describes separate grains of gold. Lengths are much smaller than the wavelength; shares up to
-about a third, below percolation.
+reverse describes separate grains of gold. Lengths are much smaller than the wavelength; shares up to about a
+third, below percolation.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def depolarisation_short(flatness: ArrayLike) -> Array:
 def depolarisation_in_plane(flatness: ArrayLike) -> Array:
     """The factor along a long axis: (1 - A)/2, since the three factors sum to 1.
 
-    This one counts for light that comes along the leaf's normal: its electric field lies in the leaf's plane.
+    It applies to light along the leaf's normal, whose electric field is in the leaf's plane.
     """
     return 0.5 * (1.0 - depolarisation_short(flatness))
 
@@ -43,7 +43,7 @@ def maxwell_garnett(
         * (e_i * (a + p * (1.0 - a)) + e_m * (1.0 - p) * (1.0 - a))
         / (e_i * a * (1.0 - p) + e_m * (1.0 - a * (1.0 - p)))
     )
-    # The root with a positive real part is that whose wave fades, since what absorbs mixes to what absorbs; what
-    # rounding leaves of gain is none.
+    # A mixture of absorbing media absorbs, so the root with positive real part is the decaying wave; a negative
+    # imaginary part is rounding.
     index: Complex = np.sqrt(effective)
     return index.real + 1j * np.abs(index.imag)

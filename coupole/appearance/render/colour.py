@@ -28,7 +28,7 @@ def tristimulus(radiance: NDArray[np.floating], bands: Sequence[int], step_nm: f
 
 
 def adapted(xyz: Array, white: Array, transform: str) -> Array:
-    """XYZ [..., 3] as they would have to be under D65 to look as they do under `white` [3] (von Kries)."""
+    """Corresponding XYZ [..., 3] under D65 for XYZ under `white` [3] (von Kries adaptation)."""
     if transform == "none":
         return xyz
     cones = np.array(_CONES[transform])
@@ -37,9 +37,9 @@ def adapted(xyz: Array, white: Array, transform: str) -> Array:
 
 
 def displayed(xyz: Array) -> tuple[NDArray[np.uint8], float]:
-    """sRGB [h, w, 3] of XYZ with white at Y = 1, and the share of pixels that the screen cannot show.
+    """sRGB [h, w, 3] of XYZ with white at Y = 1, and the share of pixels outside the gamut.
 
-    What is too bright is scaled down in its own hue; what is too saturated is cut at 0.
+    Pixels that are too bright are scaled down with constant hue; too saturated ones are clipped at 0.
     """
     linear = light.linear_srgb(xyz)
     brightest = linear.max(axis=-1, keepdims=True)

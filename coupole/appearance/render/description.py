@@ -1,4 +1,4 @@
-"""A scene and one of its cameras as Mitsuba's own description, with arrays [81] where spectra stand."""
+"""A scene and one of its cameras as Mitsuba's own description, with arrays [81] for spectra."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def contents(scene: Scene, folder: Path, meshes: Path, mi: Any) -> Description:
 
 
 def seen(scene: Scene, camera: Camera, parts: Description, mi: Any, through: Filter | None = None) -> Description:
-    """The whole scene, seen by `camera`, if need be through a polariser."""
+    """The whole scene, seen by `camera`, optionally through a polariser."""
     look = mi.ScalarTransform4f().look_at(
         origin=list(camera.position_mm), target=list(camera.target_mm), up=list(unit(camera.up))
     )
@@ -53,7 +53,7 @@ def seen(scene: Scene, camera: Camera, parts: Description, mi: Any, through: Fil
         "film": bands.film(camera.width_px, camera.height_px),
         "sampler": {"type": "independent"},
     }
-    # Russian roulette would end paths by the brightness of four bands, other paths in each group.
+    # Russian roulette would end paths by the brightness of four bands, so different paths in each group.
     depth = scene.depth + 1 + (through is not None)
     description = {
         "type": "scene",

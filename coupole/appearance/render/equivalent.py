@@ -1,8 +1,8 @@
-"""A stack of films as one metal: Mitsuba's rough conductor knows complex indices, but no films.
+"""An equivalent metal for a stack of films, because Mitsuba's rough conductor takes complex indices, but no films.
 
-At each wavelength the index n + i k of bulk is sought that reflects as the stack does: exactly along the normal,
-and as well as it can at other angles. A metal leaf finds itself nearly unchanged; a film that interferes finds an
-index that is no substance's, and where its hues shift much with the angle none serves.
+At each wavelength the equivalent bulk index n + i k reflects as the stack does: exactly along the normal, and as
+nearly as possible at other angles. For a metal leaf it is nearly the leaf's own; for an interference film it is
+not that of a real substance, and if the film's hue depends strongly on the angle there is no equivalent.
 """
 
 from __future__ import annotations

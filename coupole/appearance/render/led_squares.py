@@ -1,4 +1,4 @@
-"""The LEDs of a dome's table, as a renderer needs them."""
+"""The LEDs of a dome's table for the renderer."""
 
 from __future__ import annotations
 

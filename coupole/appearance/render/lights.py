@@ -1,4 +1,4 @@
-"""Lights of a scene file, in photometric units: spectra give the shape, lm, lux or cd/m^2 the amount."""
+"""Lights of a scene file, in photometric units: spectra give the shape, lm, lux or cd/m^2 the scale."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from coupole.errors import InputError
 
 LED_SIDE_MM = 7.0
 _FAR_MM = 1e5
-"""How far away the sun's disk is hung: as many millimetres as keep single precision."""
+"""Distance of the sun's disk in mm, limited by single precision."""
 _MM2 = 1e-6
 
 
@@ -43,7 +43,7 @@ class Distant(Model):
 
 
 class Area(Model):
-    """A rectangle that shines on the side of its target."""
+    """A rectangle that emits towards its target."""
 
     kind: Literal["area"]
     position_mm: Vector

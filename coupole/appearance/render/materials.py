@@ -1,9 +1,9 @@
-"""Materials of a scene file, and what each is in Mitsuba: its own plugins, with spectra of `appearance.matter`.
+"""Materials of a scene file as Mitsuba's plugins, with spectra of `appearance.matter`.
 
 Kept: complex indices of metals, interference in films by reflectance at every angle, Kubelka and Munk's layers,
-Fresnel's surface with all inner reflections (Saunderson), GGX facets, polarisation by surfaces. Simplified: bodies
-under films scatter as Lambert says, metals under lacquer are dimmed as along the normal, facets bounce light once
-(docs/decisions/0013).
+Fresnel surfaces with all internal reflections (Saunderson), GGX facets, polarisation by surfaces. Simplified:
+bodies under films are Lambertian, absorption over metals under lacquer is that along the normal, facets reflect
+once (docs/decisions/0013).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Comple
 
 _THINNEST_NM = 1e-3
 _LEAST_SHARE = 0.1
-"""Each part of a sum gets so many of the paths at least."""
+"""Least share of the paths for each part of a sum."""
 
 
 class Diffuse(Model):
@@ -72,7 +72,7 @@ class Metal(Model):
 
 
 class Gilt(Model):
-    """Gold leaf on bole (seed 001, Eq. 7, as `coupole.appearance.matter.gilding` makes it definite)."""
+    """Gold leaf on bole (seed 001, Eq. 7, as defined in `coupole.appearance.matter.gilding`)."""
 
     kind: Literal["gilt"]
     thickness_nm: Annotated[float, Field(ge=0)] = 100.0
@@ -80,7 +80,7 @@ class Gilt(Model):
     holes: Annotated[float, Field(ge=0, le=0.3)] = 0.0
     """Nanoscopic, by volume (Maxwell Garnett)."""
     uncovered: Share = 0.0
-    """Share of the surface that cracks and large holes leave bare."""
+    """Share of the surface left bare by cracks and large holes."""
     bole: Reflectance = Bole(kind="bole")
     """In air, gloss excluded."""
     roughness: Roughness = 0.12
@@ -139,9 +139,9 @@ def metal(index: Complex, roughness: float, factor: Array | float = 1.0) -> Desc
 def coated(body: Array, index: float, roughness: float) -> Description:
     """A body of reflectance `body` [81] inside a medium with a glossy face.
 
-    Mitsuba's polarised plastic (Baek et al. 2020) lets light in and out once. All inner reflections together make
-    it body/(n^2 (1 - k2 body)), with k2 the face's reflectance for diffuse light from within: then light that
-    comes along the normal is returned as Saunderson says.
+    Mitsuba's polarised plastic (Baek et al. 2020) transmits light in and out once. With all internal reflections
+    the factor is body/(n^2 (1 - k2 body)), with k2 the face's reflectance for diffuse light from within: for light
+    along the normal this agrees with Saunderson.
     """
     return {
         "type": "pplastic",

@@ -1,4 +1,4 @@
-"""What the parts of a scene file have in common."""
+"""Common models of the parts of a scene file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Vector = tuple[float, float, float]
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
 Roughness = Annotated[float, Field(ge=0.01, le=1)]
-"""GGX alpha. A perfect mirror has none: lights that are points would never be seen in it."""
+"""GGX alpha. Perfect mirrors are excluded, because point lights would be invisible in them."""
 Index = Annotated[float, Field(gt=1, le=3)]
 """Of refraction, of something transparent."""
 
@@ -25,7 +25,7 @@ class Model(BaseModel):
 
 
 class Pose(Model):
-    """Where a thing stands: translation in mm, KUKA's A, B, C in degrees."""
+    """Pose of an object: translation in mm, KUKA's A, B, C in degrees."""
 
     translation_mm: Vector = (0.0, 0.0, 0.0)
     abc_deg: Vector = (0.0, 0.0, 0.0)

@@ -40,7 +40,7 @@ class Piece:
     """[triangles, 3, 3] in the scene's frame, counter-clockwise seen from outside."""
     material: Material
     smooth: bool = False
-    """Shaded as if it were curved."""
+    """True for smooth shading."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Plane(Pose):
 
 
 class Sphere(Pose):
-    """It stands on z = 0."""
+    """It rests on z = 0."""
 
     kind: Literal["sphere"]
     radius_mm: Positive
@@ -119,8 +119,8 @@ class MakieTile(Pose):
 class NashijiSlab(Pose):
     """Gold flakes in clear lacquer over black (seed 002, section 5); x and y go from 0 to the slab's size.
 
-    Rays are bent at the lacquer's face, which mirrors the lights, and meet the flakes where they are. What the
-    lacquer absorbs is taken as along the normal, in `_NASHIJI_LEVELS` depths.
+    Rays are refracted at the lacquer's face, which also reflects the lights, and hit the flakes at their
+    positions. Absorption in the lacquer is taken along the normal, for `_NASHIJI_LEVELS` depths.
     """
 
     kind: Literal["nashiji_slab"]
@@ -152,7 +152,7 @@ Object = Annotated[LocalObject | Sphere, Field(discriminator="kind")]
 
 
 def pieces(thing: Object, folder: Path) -> list[Piece | Ball]:
-    """What the object is made of, in the scene's frame; paths are relative to `folder`."""
+    """The object's parts in the scene's frame; paths are relative to `folder`."""
     if isinstance(thing, Sphere):
         centre = thing.scene_from_thing() @ [0.0, 0.0, thing.radius_mm, 1.0]
         return [Ball(centre[:3], thing.radius_mm, thing.material)]
@@ -202,7 +202,7 @@ def _panel(panel: samples.SteppedPanel, materials: Sequence[Material]) -> list[P
 
 
 def _paint_fields(thing: PaintWedge) -> list[Material]:
-    """In the generator's order: row by row, black ground first, as thick as the steps."""
+    """In the generator's order: row by row, black ground first, with the steps' thicknesses."""
     return [
         Paint(
             kind="paint",
@@ -217,7 +217,7 @@ def _paint_fields(thing: PaintWedge) -> list[Material]:
 
 
 def _nashiji(thing: NashijiSlab) -> list[Piece]:
-    """Black body, flakes, and the clear lacquer as a closed body round the flakes that lets rays in."""
+    """Black body, flakes, and the clear lacquer as a closed refracting body around the flakes."""
     found = nashiji.flakes(
         nashiji.Slab(
             size_mm=thing.size_mm,
@@ -244,7 +244,8 @@ def _nashiji(thing: NashijiSlab) -> list[Piece]:
 
 
 def _clear(width: float, length: float, thickness_mm: float, rim_mm: float) -> Piece:
-    """The lacquer's outside: it dips into the body, and is a little wider, as flakes at the rim reach over it."""
+    """The lacquer's outside: it extends into the body, and is slightly wider, because flakes at the rim extend
+    over it."""
     box = slab(width + 2 * rim_mm, length + 2 * rim_mm, thickness_mm + _DIP_MM)
     lift = np.array([0.5 * width, 0.5 * length, _NASHIJI_BODY_MM - _DIP_MM])
     return Piece(box + lift, Glass(kind="glass", index=indices.URUSHI))

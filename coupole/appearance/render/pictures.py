@@ -1,4 +1,5 @@
-"""Files of a spectral picture: an EXR of all bands, a PNG to look at, and what they are. All say: simulated."""
+"""Files of a spectral picture: an EXR of all bands and a PNG for viewing, with metadata. All are marked as
+simulated."""
 
 from __future__ import annotations
 
@@ -37,7 +38,7 @@ def tristimulus(scene: Scene, found: Spectral) -> Array:
 def write(scene: Scene, found: Spectral, stem: Path, *, white: Array, written_by: str) -> dict[str, Any]:
     """Write `stem`.exr and `stem`.png, with polarisation also `stem`-polarisation.png; returns their summary.
 
-    `white` is the XYZ that shall look white, `written_by` names renderer and variant. Raises OSError, InputError.
+    `white` is the XYZ shown as white, `written_by` names renderer and variant. Raises OSError, InputError.
     """
     xyz = tristimulus(scene, found)
     shown_white = scene.display.white_cd_m2 or float(np.quantile(xyz[..., 1], 1.0 - scene.display.clipped))

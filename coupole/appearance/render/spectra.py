@@ -1,4 +1,4 @@
-"""Spectra that a scene file can name: how things reflect, and what lights give; [81] on the materials' grid."""
+"""Spectra of a scene file: reflectances and lights; [81] on the materials' grid."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class LowSun(Model):
     """The sun at an elevation, through clear air: computed, not measured.
 
     A black body of 5778 K behind Rayleigh scattering 0.008735 um^-4.08 and haze beta um^-1.3 (Leckner 1978), over
-    the air mass of Kasten and Young 1989. Ozone is left away.
+    the air mass of Kasten and Young 1989. Ozone is neglected.
     """
 
     kind: Literal["low_sun"]
@@ -138,7 +138,7 @@ def scaled(relative: Array, photometric: float) -> Array:
 
 
 def air_mass(elevation_deg: float) -> float:
-    """Way through the air over that straight up (Kasten and Young, Appl. Opt. 28, 4735, 1989)."""
+    """Relative optical air mass (Kasten and Young, Appl. Opt. 28, 4735, 1989)."""
     return float(1.0 / (np.sin(np.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.07995) ** -1.6364))
 
 
@@ -149,6 +149,6 @@ def _low_sun(sun: LowSun) -> Array:
 
 
 def _planck(kelvin: float) -> Array:
-    """Planck's law, 1 at its greatest value of the grid."""
+    """Planck's law, normalised to a maximum of 1 on the grid."""
     shape = WAVELENGTHS_NM**-5.0 / np.expm1(_C2_NM_K / (WAVELENGTHS_NM * kelvin))
     return np.asarray(shape / shape.max())

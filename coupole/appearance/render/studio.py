@@ -27,14 +27,14 @@ def reduced(scene: Scene, *, samples: int | None, width_px: int | None, step_nm:
 
 
 def variant_of(scene: Scene) -> str:
-    """Mitsuba's variant that will render it."""
+    """Mitsuba's variant for rendering."""
     return variant.spectral(polarised=scene.polarisation)
 
 
 def render(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[str, Any]:
-    """Render all cameras into the folder `out`; returns the summary. `folder` is where a scene's paths begin.
+    """Render all cameras into the folder `out`; returns the summary. The scene's paths are relative to `folder`.
 
-    Raises InputError for what the scene cannot mean or this machine lacks, OSError for files.
+    Raises InputError for an inconsistent scene or a missing library, OSError for files.
     """
     with opened(scene, folder) as renderer:
         white = pictures.white_of(scene, folder)

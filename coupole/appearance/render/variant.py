@@ -1,4 +1,4 @@
-"""Mitsuba, if it is there, in the variant that this machine can run."""
+"""Imports Mitsuba, if installed, in a variant that this machine supports."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 from coupole.errors import InputError
 
 LEAST_LLVM = 19
-"""LLVM 15 and 16 abort the interpreter (facts on materials); they are never tried."""
+"""LLVM 15 and 16 abort the interpreter; they are not tried."""
 
 
 def mitsuba(variant: str) -> Any:
@@ -23,9 +23,9 @@ def mitsuba(variant: str) -> Any:
 
 
 def loaded(mi: Any, description: Any) -> Any:
-    """Mitsuba's scene of a description, with lights in its order.
+    """Mitsuba's scene of a description, with lights in the given order.
 
-    Loaded in parallel, or with equal parts merged, lights come in any order and meet other random numbers.
+    With parallel loading or merging of equal parts, the order of lights varies and with it their random numbers.
     """
     return mi.load_dict(description, parallel=False, optimize=False)
 
@@ -42,19 +42,19 @@ def needed(name: str) -> Any:
 
 
 def spectral(*, polarised: bool) -> str:
-    """Name of the spectral variant: compiled by LLVM where there is one that works, scalar elsewhere."""
+    """Name of the spectral variant: LLVM if a suitable library is found, otherwise scalar."""
     library = os.environ.get("DRJIT_LIBLLVM_PATH") or ctypes.util.find_library("LLVM") or ""
     kind = "scalar"
     if llvm_version(library) >= LEAST_LLVM:
         kind = "llvm_ad"
-        os.environ["DRJIT_LIBLLVM_PATH"] = library  # Dr.Jit would search in its own way, and find another
+        os.environ["DRJIT_LIBLLVM_PATH"] = library  # Dr.Jit's own search might find another library
     return f"{kind}_spectral_polarized" if polarised else f"{kind}_spectral"
 
 
 def llvm_version(library: str) -> int:
-    """Major version of an LLVM library by its file's name, links followed; 0 if that does not say.
+    """Major version of an LLVM library from its file name, after following links; 0 if unknown.
 
-    The library is not loaded: an old one must not come into the process.
+    The library is not loaded, because an old one would abort the process.
     """
     named = re.search(r"LLVM(?:-|\.so\.|\.)(\d+)", Path(library).resolve().name)
     return int(named.group(1)) if named else 0

@@ -26,9 +26,10 @@ _PART = 500_000
 def write_wall(
     scene: Scene, folder: Path, stem: Path, white: Array, progress: Callable[[int, int], None]
 ) -> dict[str, Any]:
-    """Write `stem`.png, the wall's colour were it white, brightest cells but 0.5 % white; returns figures.
+    """Write `stem`.png, the colour of a white wall, with the brightest 0.5 % of the cells shown as white; returns
+    figures.
 
-    Light of the sun only: no sky, and no light from stone to stone. Raises InputError, OSError.
+    Sunlight only: no sky, and no inter-reflection between stones. Raises InputError, OSError.
     """
     assert scene.caustic is not None
     thing = next(thing for thing in scene.objects if isinstance(thing, Arcature))
@@ -57,7 +58,7 @@ def _lit(
     sun: caustic.Sun,
     progress: Callable[[int, int], None],
 ) -> tuple[Array, float]:
-    """Irradiance [rows, columns, 81] of the wall, and the luminous share of the light that gold threw on stone.
+    """Irradiance [rows, columns, 81] of the wall, and the luminous share of the light that reached stone by gold.
 
     In parts, as a photon takes 324 bytes.
     """
@@ -96,7 +97,7 @@ def _niche(thing: Arcature, folder: Path) -> caustic.Niche:
 
 
 def _leaf(gilt: Gilt, folder: Path) -> Array:
-    """Mirror part of the covered share, as `layered.Sheet` holds it; the bole's light is left away."""
+    """Specular part of the covered share, as in `layered.Sheet`; the bole's light is neglected."""
     index = metal_index(gilt.gold)
     if gilt.holes > 0.0:
         index = gilding.leaf_index(index, gilt.holes)

@@ -18,7 +18,7 @@ _TILE_MM = 6.0
 
 @dataclass(frozen=True)
 class SteppedPanel:
-    """A plate that stands on z = 0, its top divided into fields."""
+    """A plate that rests on z = 0, its top divided into fields."""
 
     fields: tuple[Array, ...]
     """Corners of each field: row by row along y, steps along x."""
@@ -38,7 +38,7 @@ def stepped_panel(rows: int, steps: int, step_mm: float, row_mm: float) -> Stepp
 
 @dataclass(frozen=True)
 class MakieTile:
-    """A tile that stands on z = 0, with a flower of sprinkled powder on its face; corners of each part."""
+    """A tile that rests on z = 0, with a flower of sprinkled powder on its face; corners of each part."""
 
     powder: Array
     ground: Array

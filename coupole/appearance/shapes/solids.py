@@ -28,9 +28,9 @@ def unit_sphere(n: int) -> Array:
 
 
 def relief(size_mm: float, triangles: int, depth_mm: float, seed: int) -> Array:
-    """Corners of a carved square tile that stands on z = 0: a boss of petals in a frame, and tool marks; closed.
+    """Corners of a carved square tile that rests on z = 0: a boss of petals in a frame, and tool marks; closed.
 
-    About `triangles` triangles, of which the carved top has nearly all. Each seed carves another tile.
+    About `triangles` triangles, most of them in the carved top. Each seed gives a different tile.
     """
     columns, rows = cells_for(triangles, size_mm, size_mm)
     random = np.random.default_rng(seed)

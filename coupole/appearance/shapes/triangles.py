@@ -57,16 +57,16 @@ def cells_for(triangles: int, width_mm: float, depth_mm: float) -> tuple[int, in
 
 
 def slab(width_mm: float, depth_mm: float, thickness_mm: float) -> Array:
-    """Corners of a closed box that stands on z = 0 about the origin; the first two triangles are its top."""
+    """Corners of a closed box that rests on z = 0 about the origin; the first two triangles are its top."""
     lid = rectangle(width_mm, depth_mm, z_mm=thickness_mm)
     return np.concatenate([lid, skirt(lid)])
 
 
 def skirt(top: Array, bottom_mm: float = 0.0) -> Array:
-    """Corners of the walls from a sheet's rim down to z = `bottom_mm`, and of the bottom: it becomes a body.
+    """Corners of the walls from a sheet's rim down to z = `bottom_mm`, and of the bottom, to make a closed body.
 
-    The rim's edges are those that only one triangle has, so that nothing gapes. The bottom is a fan about their
-    middle, from which all of the rim must be in view.
+    The rim consists of the edges with one triangle only. The bottom is a fan about the rim's centre, from
+    which all of the rim must be visible.
     """
     points, faces = welded(top)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

@@ -1,1 +1,1 @@
-"""The wavelength grid, light sources, measured spectra and what a camera makes of them."""
+"""The wavelength grid, light sources, measured spectra and camera channels."""

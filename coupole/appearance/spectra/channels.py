@@ -1,7 +1,7 @@
-"""From spectra to what a camera measures, normalised by a white tile as the instrument does.
+"""From spectra to a camera's channel values, normalised by a white tile as in the instrument.
 
-The truth of a frame's channel c is f_c = integral(E S_c f)/integral(E S_c), with the light's spectrum E and the
-camera's sensitivity S_c: a mean of the BRDF over the light that counts, not a colorimetric value.
+The true value of a frame's channel c is f_c = integral(E S_c f)/integral(E S_c), with the light's spectrum E and
+the camera's sensitivity S_c: a weighted mean of the BRDF, not a colorimetric value.
 """
 
 from __future__ import annotations

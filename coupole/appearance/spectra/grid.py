@@ -1,4 +1,4 @@
-"""The wavelengths of every spectrum in this room: 380 to 780 nm by 5 nm, as in the papers (seed 000, section
+"""The wavelengths of every spectrum in this package: 380 to 780 nm by 5 nm, as in the papers (seed 000, section
 3.4)."""
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ WAVELENGTHS_NM.setflags(write=False)
 
 
 def within(name: str, values: ArrayLike, low: float, high: float) -> Array:
-    """`values` as float64, or InputError where one of them is outside `low` to `high` or not a number."""
+    """`values` as float64, or InputError if one of them is outside `low` to `high` or not a number."""
     array = np.asarray(values, dtype=float)
     if not np.all((array >= low) & (array <= high)):
         worst = array[~((array >= low) & (array <= high))].flat[0]

@@ -1,6 +1,6 @@
 """Illuminants, LEDs and observers on the grid, from colour-science (data of the CIE), and tristimulus values.
 
-The library takes seconds to import: it is imported when the first of its data is asked for.
+The library takes seconds to import: it is imported on first use of its data.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def led(name: str) -> Array:
 def camera(name: str = "Nikon 5100 (NPL)") -> Array:
     """Relative sensitivities [3, 81] (red, green, blue) of a camera that colour-science knows.
 
-    Measured by the NPL; they stand in for a sensor whose own curves have not been measured.
+    Measured by the NPL; used in place of a sensor whose curves have not been measured.
     """
     sensitivities = _on_grid(_named(_colour().MSDS_CAMERA_SENSITIVITIES, "camera", name)).T.copy()
     sensitivities.setflags(write=False)
@@ -88,8 +88,7 @@ def lab(xyz: Array, white: Array) -> Array:
 
 
 def linear_srgb(xyz: Array) -> Array:
-    """Linear sRGB [..., 3] of XYZ (white D65, 2-degree observer); outside 0 to 1 where the screen cannot show
-    it."""
+    """Linear sRGB [..., 3] of XYZ (white D65, 2-degree observer); outside 0 to 1 for colours outside the gamut."""
     return np.asarray(np.asarray(xyz, dtype=float) @ _SRGB_FROM_XYZ.T)
 
 
@@ -102,7 +101,7 @@ def _named(known: Any, what: str, name: str) -> Any:
 def _on_grid(distribution: Any) -> Array:
     """Values [81], or [81, n], at the grid's wavelengths, 0 beyond the table.
 
-    Nearly all tables stand at 1 or 5 nm and are taken as they are; coarser ones are linear in between.
+    Nearly all tables have steps of 1 or 5 nm and are used unchanged; coarser ones are interpolated linearly.
     """
     wavelengths, values = np.asarray(distribution.wavelengths), np.asarray(distribution.values, dtype=float)
     columns = [
@@ -115,7 +114,7 @@ def _on_grid(distribution: Any) -> Array:
 @cache
 def _colour() -> Any:
     with warnings.catch_warnings():
-        # It says so at every import where matplotlib is not installed; its plots are not used here.
+        # The library warns at every import if matplotlib is missing; its plots are not used here.
         warnings.filterwarnings("ignore", message='"Matplotlib" related')
         import colour
 

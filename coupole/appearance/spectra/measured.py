@@ -1,9 +1,9 @@
 """Spectra from the exports of spectrophotometers.
 
-What is read: lines of numbers, the wavelength in nm first, separated by tabs, semicolons, commas or blanks, with
-decimal points or decimal commas, rising or falling; as percent, as fraction, or as power of a light. Lines
-without a number among their fields are remarks, wherever they stand; so are lines that begin with `#`, and what
-precedes the first row. What could be read in two ways is refused, with the line.
+Accepted are lines of numbers, the wavelength in nm first, separated by tabs, semicolons, commas or blanks, with
+decimal points or decimal commas, ascending or descending; as percent, as fraction, or as power of a light. Lines
+without a number among their fields are comments anywhere; so are lines that begin with `#`, and all text before
+the first row. Ambiguous input is refused, with the line.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ _SEPARATORS = (("tab", "\t"), ("semicolon", ";"), ("comma", ","), ("blank", None
 _LEAST_ROWS = 3
 _NM = (150.0, 3000.0)
 _FRACTION_AT_MOST = 1.05
-"""A white tile may read a little above 1. Percent that stay below this look like fractions: say `unit` for black
-samples of such instruments."""
+"""A white tile may read a little above 1. Percent values all below this would be read as fractions: give `unit`
+for black samples of such instruments."""
 _PERCENT_AT_LEAST = 2.5
 _REFLECTANCE = (-0.02, 1.5)
-"""Noise goes below 0, fluorescence and gloss above 1; farther out something else was measured."""
+"""Noise goes below 0, fluorescence and gloss above 1; values beyond these limits are not reflectances."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One spectrum as the instrument gave it."""
+    """One spectrum as exported by the instrument."""
 
     name: str
     wavelengths_nm: Array
@@ -54,7 +54,7 @@ class _Row:
 class _Table:
     rows: list[_Row]
     header: str
-    """The line before the first row, if it is a remark."""
+    """The line before the first row, if it is a comment."""
     remarks: tuple[str, ...]
     separator: str
 
@@ -67,7 +67,7 @@ def read_spectrum(path: Path, *, unit: Unit = "auto", column: int | None = None)
 def parse_spectrum(
     text: str, file: str, *, name: str = "", unit: Unit = "auto", column: int | None = None
 ) -> Measured:
-    """As `read_spectrum`, from text; `file` is what errors name. InputError for all that is not clear."""
+    """As `read_spectrum`, from text; `file` is the name in errors. Raises InputError for ambiguous input."""
     table = _table(text, file)
     rows = table.rows
     _check_columns(table, file)
@@ -93,12 +93,12 @@ def _decoded(raw: bytes) -> str:
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
-        # Older instruments write the code page of Windows; only remarks can hold such letters.
+        # Older instruments write a Windows code page; only comments can contain such letters.
         return raw.decode("latin-1")
 
 
 def _table(text: str, file: str) -> _Table:
-    """Rows of numbers under the separator that makes most lines rows, and what else the file says."""
+    """Rows of numbers with the separator that gives the most rows, and the file's other information."""
     lines = [(number, line.strip(" \r")) for number, line in enumerate(text.split("\n"), start=1) if line.strip()]
     counts = {name: sum(_is_row(_fields(line, mark)) for _, line in lines) for name, mark in _SEPARATORS}
     separator = max(counts, key=lambda name: counts[name])
@@ -195,7 +195,7 @@ def _scale(values: Array, table: _Table, unit: Unit, file: str) -> float:
     peak = float(values[highest])
     if _speaks_of_percent(table.header) or peak >= _PERCENT_AT_LEAST:
         return 0.01
-    # Another remark may mean the humidity.
+    # A percent sign in another comment may refer to humidity.
     if peak <= _FRACTION_AT_MOST and not any(_speaks_of_percent(remark) for remark in table.remarks):
         return 1.0
     raise _wrong(file, table.rows[highest].line, f"{peak:g} may be percent or a fraction; say which with `unit`")

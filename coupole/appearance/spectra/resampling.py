@@ -1,8 +1,8 @@
 """Measured spectra on the grid of 380 to 780 nm by 5 nm.
 
-Samples at 5 nm or coarser are interpolated with PCHIP (Fritsch and Butland 1984), which does not overshoot: what
-was between 0 and 1 stays there. Finer samples are averaged with a triangle of 5 nm width at half height, the
-bandpass of a 5 nm instrument, which takes noise away. Nothing is made up: bands that were not measured are NaN.
+Samples at 5 nm or coarser are interpolated with PCHIP (Fritsch and Butland 1984), which does not overshoot: values
+between 0 and 1 remain so. Finer samples are averaged with a triangle of 5 nm width at half height, the bandpass of
+a 5 nm instrument, which reduces noise. Bands that were not measured are NaN.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class OnGrid:
     """Estimate of the largest error that resampling makes, in the unit of the values.
 
     Interpolated: a quarter of the largest error with which every other sample is found from its neighbours,
-    because PCHIP's error falls at least as the square of the spacing. Averaged: the largest difference between
-    the band mean and the sampled curve in the band's middle, noise included.
+    because PCHIP's error falls at least as the square of the spacing. Averaged: the largest difference between the
+    band mean and the sampled curve at the band's centre, noise included.
     """
 
 
@@ -82,7 +82,7 @@ def _interpolated(nm: Array, values: Array, at: Array) -> tuple[Array, float]:
 
 
 def _averaged(nm: Array, values: Array, at: Array) -> tuple[Array, float]:
-    # At the ends of the range the triangle gets narrower, so that it stays even about the band's middle.
+    # At the ends of the range the triangle is narrower, so that it remains symmetric about the band's centre.
     half = np.minimum(STEP_NM, np.maximum(np.minimum(at - nm[0], nm[-1] - at), 0.0))
     u = np.linspace(-1.0, 1.0, _TRIANGLE)
     weight = (1.0 - np.abs(u)) / np.sum(1.0 - np.abs(u))

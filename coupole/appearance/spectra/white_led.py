@@ -11,8 +11,8 @@ from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
 
 @dataclass(frozen=True)
 class LedSpectrum:
-    """A blue chip under a yellow phosphor. Both bands are normal curves; the figures are those of a white LED of
-    about 5500 K (assumed)."""
+    """A blue chip under a yellow phosphor. Both bands are Gaussian; the figures are those of a white LED of about
+    5500 K (assumed)."""
 
     pump_nm: float = 450.0
     pump_fwhm_nm: float = 20.0
@@ -33,6 +33,6 @@ def spectral_power(spectrum: LedSpectrum) -> Array:
 
 
 def _band(centre_nm: float, fwhm_nm: float) -> Array:
-    """A normal curve on the grid; its sum is 1."""
+    """A Gaussian on the grid; its sum is 1."""
     curve = np.exp(-4.0 * np.log(2.0) * ((WAVELENGTHS_NM - centre_nm) / fwhm_nm) ** 2)
     return np.asarray(curve / curve.sum())

@@ -1,15 +1,16 @@
-"""Which of several reference spectra a spectrum taken in situ resembles, or none of them (seed 000, section 3.5).
+"""Identifies the reference spectrum that a spectrum taken in situ resembles, if any (seed 000, section 3.5).
 
-Old paint is dirty: dust adds white, varnish takes light away, and the contrast of the spectrum falls while its
-shape stays. Three measures that look at shape are therefore averaged, each a correlation over the bands that
+On old paint dust adds white and varnish absorbs, and the contrast of the spectrum falls while its
+shape remains. Three measures of shape are therefore averaged, each a correlation over the bands that
 both spectra cover, 1 for equal shapes:
 
-- of reflectance (its spectral angle after the means are taken off: added white and a factor do not count),
-- of log(K/S) (a factor on K/S, such as another concentration in white, does not count),
+- of reflectance (cosine of the spectral angle after subtraction of the means: independent of added white and of a
+factor),
+- of log(K/S) (independent of a factor on K/S, such as another concentration in white),
 - of the slope over 20 nm (where the edges and peaks are).
 
-The usual spectral angle is reported beside them. It alone is a poor judge: all spectra are positive, so all angles
-are small.
+The usual spectral angle is also reported. It alone discriminates poorly, because all spectra are positive and so
+all angles are small.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _FLAT = 0.01
 
 @dataclass(frozen=True)
 class Candidate:
-    """How much one reference resembles the spectrum."""
+    """Similarity of one reference to the spectrum."""
 
     name: str
     score: float
@@ -46,7 +47,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What can be said."""
+    """Result of an identification."""
 
     finding: Literal["match", "ambiguous", "none"]
     reason: str
@@ -62,14 +63,14 @@ def identify(
     """Compare `spectrum` [81] with each of `references` [81]; NaN marks bands that were not measured.
 
     "match" needs the best score to reach `least_score` and to lead by `least_margin`; "ambiguous" reaches the
-    first only; otherwise it is none of these. A mixture, or a pigment that the references lack, is none of
-    these: see `pigments.fit`.
+    first only; otherwise it is "none". A mixture, or a pigment that the references lack, gives "none": see
+    `pigments.fit`.
     """
     if not references:
         raise InputError("identification: expected reference spectra, found none; give some")
     known = spectrum[np.isfinite(spectrum)]
     if known.size and known.std() < _FLAT:
-        return Verdict("none", f"flat: it varies by less than {_FLAT:g}, so its shape says nothing", 0.0, ())
+        return Verdict("none", f"flat: it varies by less than {_FLAT:g}, so it has no shape to compare", 0.0, ())
     candidates = sorted(
         (compare(name, spectrum, reference) for name, reference in references.items()), key=lambda c: -c.score
     )
@@ -112,7 +113,7 @@ def compare(name: str, spectrum: Array, reference: Array) -> Candidate:
 
 
 def _correlation(a: Array, b: Array) -> float:
-    """Pearson's; 0 where one of the two is constant, for it has no shape in common with anything."""
+    """Pearson's correlation; 0 if one of the two is constant, because it has no shape."""
     a, b = a - a.mean(), b - b.mean()
     norm = float(np.linalg.norm(a) * np.linalg.norm(b))
     return float(a @ b) / norm if norm > 1e-12 else 0.0

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from coupole.acquisition.frame_matching import UNLABELLED
 
 
-@examples(4000)
+@examples(2000)
 @given(takes())
 def test_no_frame_of_a_finished_burst_gets_a_wrong_label(what: Take) -> None:
     assert_no_wrong_label(what, what.verdict())
 
 
-@examples(2000)
+@examples(1000)
 @given(takes(), st.integers(0, 2**32))
 def test_no_frame_of_a_running_burst_gets_a_wrong_label_and_no_label_is_changed_later(
     what: Take, seed: int

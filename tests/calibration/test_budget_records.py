@@ -137,7 +137,7 @@ def test_of_a_folder_only_records_of_use_are_taken(folder: Path) -> None:
 
 
 def test_a_record_of_no_use_and_two_of_one_kind_are_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"dark.yaml: a record of the kind `dark` says nothing to this budget"):
+    with pytest.raises(InputError, match=r"dark.yaml: a record of the kind `dark` is not used by a budget"):
         read_records([folder / "dark.yaml"])
     with pytest.raises(InputError, match=r"a second record of the kind `drift`"):
         read_records([folder, folder / "drift.yaml"])

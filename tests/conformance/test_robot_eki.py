@@ -195,7 +195,7 @@ def test_a_nudge_after_the_arm_settled_is_told_by_the_next_wait(cell: EkiCell, r
     robot.move_to(AWAY_DEG)
     robot.wait_settled()
     cell.in_world(lambda: cell.controller.nudge((0.0, 0.0, 0.0, 0.0, 0.0, 3.0)))
-    with pytest.raises(DeviceFault, match=r"does not follow: it stands 3.00 deg"):
+    with pytest.raises(DeviceFault, match=r"does not follow: it is 3.00 deg"):
         robot.wait_settled()
 
 

@@ -40,7 +40,7 @@ def test_each_shipped_description_is_read_and_names_its_sources(path: Path) -> N
     assert read_arm(path).joints
     text = path.read_text()
     assert "Origins and axes:" in text
-    assert "Fitted round the collision meshes" in text
+    assert "Enclosing the collision meshes" in text
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def test_records_are_made_from_nothing_and_not_made_twice(rig: Path, tmp_path: P
     refused = cells.here("calibrate", "all", "--rig", rig, "--out", out, *STEPS, "--json")
     assert refused.code == 3
     assert "response.yaml: not accepted" in refused.err
-    assert "take response.* away" in refused.err
+    assert "remove response.*" in refused.err
 
     take_away(out, "response")
     plan = out / "plans" / "response.yaml"

@@ -51,6 +51,7 @@ class Browser:
         self.driver.set_page_load_timeout(cells.PATIENCE_S)
 
     def open(self, url: str) -> None:
+        self.driver.get("about:blank")  # the page before asks its server no more
         self.driver.get_log("browser")
         self.driver.get(url)
 

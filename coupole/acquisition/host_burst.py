@@ -10,17 +10,18 @@ and no frame of the burst is proven until both marks have been found dark.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coupole.acquisition.arm_supervisor import ArmSupervisor
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import NOTHING_TO_MATCH, Verdict
 from coupole.devices import (
+    NO_LED,
     STEP_RECORD_DTYPE,
     UNKNOWN_NS,
     Frame,
@@ -78,8 +79,10 @@ class HostBurst:
         self._tell, self._wait_while_paused, self._note = tell, wait_while_paused, note
 
     def fire(self, burst: Burst, frame_format: FrameFormat) -> Verdict:
-        """Fire one light after the other; the dose is recorded even if this raises. Raises ArmMovedError."""
-        logs: list[NDArray[np.void]] = []
+        """Fire one light after the other; the dose is recorded even if this raises, that of the light which was on
+        then included. Raises ArmMovedError."""
+        given: list[StepRecord] = []
+        taken_frames = 0
         dead: list[ShotId] = []
         kept: list[_Kept] = []
         marks = set(range(len(burst.labels))) - set(burst.inner)
@@ -89,8 +92,8 @@ class HostBurst:
             for index, shot in enumerate(burst.shots):
                 self._arm.attend()
                 self._wait_while_paused()
-                taken = self._fire_one(burst, index)
-                logs.append(np.array([astuple(taken.record)], STEP_RECORD_DTYPE))
+                taken = self._fire_one(burst, index, given)
+                taken_frames += 1
                 if shot is not None and taken.record.invalid_exposure:
                     dead.append(shot)
                 arm_after = None
@@ -110,8 +113,8 @@ class HostBurst:
         finally:
             for one in kept:
                 self._recorder.free(one.slot)
-            log = np.concatenate([np.zeros(0, STEP_RECORD_DTYPE), *logs])
-            self._note(burst, log, arm_before, arm_after, frames=len(log))
+            log = np.array([astuple(record) for record in given], STEP_RECORD_DTYPE)
+            self._note(burst, log, arm_before, arm_after, frames=taken_frames)
         return Verdict(replace(NOTHING_TO_MATCH, reason=reason), dead)
 
     def _keep(self, taken: _Taken, frame: Frame, burst: Burst, shot: ShotId | None) -> list[_Kept]:
@@ -128,15 +131,17 @@ class HostBurst:
             one = kept.pop(0)
             self._recorder.prove(one.slot, one.shot, one.fields)
 
-    def _fire_one(self, burst: Burst, index: int) -> _Taken:
-        """Light one step, trigger the camera, wait for the light's end, and keep the burst's period."""
+    def _fire_one(self, burst: Burst, index: int, given: list[StepRecord]) -> _Taken:
+        """Light one step, trigger the camera, wait for the light's end, and keep the burst's period. The light is
+        appended to `given` even if this raises."""
         box, camera, clock = self._cell.ledbox, self._cell.camera, self._cell.clock
         step, timing = burst.table[index], burst.timing
+        record: StepRecord | None = None
         camera.arm(_ONE_SHOT_BUFFERS)
+        started_ns = clock.now_ns()
         try:
             if burst.panel and index in burst.inner:
                 box.panel(burst.panel, True)
-            started_ns = clock.now_ns()
             box.flash(int(step["led"]), int(step["on_us"]))
             clock.sleep(timing.trigger_delay_us * 1e-6)
             t_trigger_ns = clock.now_ns()
@@ -145,8 +150,11 @@ class HostBurst:
             alone = box.lit() and self._alone()
             record = box.end_flash()
         finally:
-            box.lights_off()
-            camera.disarm()
+            try:
+                box.lights_off()
+            finally:
+                given.append(record or _cut_short(int(step["led"]), (clock.now_ns() - started_ns) / 1e3))
+                camera.disarm()
         clock.sleep(max(0.0, timing.period_us * 1e-6 - (clock.now_ns() - started_ns) / 1e9))
         if record.t_on_ns != UNKNOWN_NS:
             t_trigger_ns = record.t_on_ns + timing.trigger_delay_us * 1000
@@ -161,6 +169,23 @@ class HostBurst:
         if other is not None:
             other.release()
         return other is None
+
+
+def _cut_short(led: int, on_us: float) -> StepRecord:
+    """Of a flash whose end the box did not report: it may have shone for all of this time."""
+    return StepRecord(
+        step=0,
+        led=led,
+        edge_sent=False,
+        led_open=False,
+        over_temperature=False,
+        waited=False,
+        on_us=0.0 if led == NO_LED else on_us,
+        t_on_ns=UNKNOWN_NS,
+        t_trigger_ns=UNKNOWN_NS,
+        board_temperature_c=math.nan,
+        led_current_ma=math.nan,
+    )
 
 
 def too_bright(frame: Frame, frame_format: FrameFormat) -> str:

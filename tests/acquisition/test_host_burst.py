@@ -52,7 +52,7 @@ class Cell:
 
     script: Mapping[int, str] = field(default_factory=dict)
     """By step: `dark` (ended before the frame came), `twice` (exposed twice), `none` (no frame), `bright`,
-    `fails` (the camera raises)."""
+    `fails` (the camera raises), `all fail` (and so does the box when all is to be switched off)."""
     counts: bool = True
     """The camera counts its exposures."""
     done: list[str] = field(default_factory=list)
@@ -91,6 +91,9 @@ class Cell:
 
     def lights_off(self) -> None:
         self.done.append("all off")
+        if self.what() == "all fail":
+            self.now_ns_ += 700_000_000
+            raise ZeroDivisionError
 
     def panel(self, panel: int, on: bool) -> None:
         self.done.append(f"panel {panel}")
@@ -107,7 +110,7 @@ class Cell:
     def next_frame(self, timeout_s: float) -> Frame | None:
         if timeout_s:
             self.done.append("frame")
-        if self.what() == "fails":
+        if self.what() in ("fails", "all fail"):
             raise ZeroDivisionError
         if not self.frames:
             return None
@@ -215,14 +218,25 @@ def test_of_a_box_with_a_log_each_frame_is_proven_when_it_has_come() -> None:
 
 
 def test_a_failure_leaves_no_light_and_notes_what_was_given() -> None:
-    cell = Cell({2: "fails"})
+    cell, burst = Cell({2: "fails"}), burst_of()
     with pytest.raises(ZeroDivisionError):
-        cell.fire(burst_of())
+        cell.fire(burst)
     assert cell.done[-2:] == ["all off", "disarm"]
     assert cell.proven == {}
     assert len(cell.freed) == cell.slots == 2
     ((_, log, *_),) = cell.noted
-    assert len(log) == 2
+    assert list(log["led"]) == list(burst.table["led"][:3])
+    assert log["on_us"][2] >= burst.timing.trigger_delay_us  # the light was on when the camera failed
+
+
+def test_a_light_that_cannot_be_switched_off_is_counted_as_long_as_that_was_tried() -> None:
+    cell, burst = Cell({1: "all fail"}), burst_of()
+    with pytest.raises(ZeroDivisionError):
+        cell.fire(burst)
+    assert cell.done[-1] == "disarm"
+    ((_, log, *_),) = cell.noted
+    assert list(log["led"]) == list(burst.table["led"][:2])
+    assert log["on_us"][1] >= 700_000
 
 
 def test_a_panel_is_dark_in_its_marks() -> None:

@@ -182,6 +182,8 @@ def test_a_box_that_is_lost_ends_the_run_with_four_and_names_it(cell: CellFolder
         assert ended.code == 4, ended.err
         assert "led box: expected an answer to `" in ended.err
         cells.wait_until(lambda: cells.safe(world), "darkness: the box itself ends the light")
+    *_, burst = cells.events(cell.run_folder, "burst")
+    assert burst["on_s"] > 0.009  # the light that the box no longer reported is counted
 
 
 def test_a_plan_that_wants_a_trigger_cable_is_refused_with_what_to_do(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ from sim.world.client import World
 
 BLACK_DN = 64
 PIXEL_STEP = 3
-"""Of the object's pixels every so-manieth is looked at to tell LEDs apart."""
+"""Of the object's pixels every so-manieth is looked at to tell LEDs apart, in frames of 128 columns."""
 PATIENCE_S = 60.0
 """How long a test waits for what must come; only a broken program lets it run out."""
 
@@ -82,6 +82,7 @@ class CellFolder:
         rig = YAML(typ="safe").load(REPO / "configs/rigs/sim.yaml")
         rig["sensor"] |= {"width_px": 128, "height_px": 96, "pixel_pitch_um": 176.0}
         rig["dome"]["leds"] = str(REPO / "configs/domes/coupole.csv")
+        rig["robot"]["settings"] = {"cycle_ms": 12}  # a third of the work that one of 4 ms is
         rig["ledbox"]["settings"]["watchdog_s"] = 4 * self.speed  # of the world's time; the machine may be busy
         rig["storage"] = {"folder": str(self.folder / "storage"), "reserve_bytes": 0}
         settings = {"seed": 1, "speed": self.speed, "arm_shadows": False}  # `Expectation` knows of no arm
@@ -333,7 +334,8 @@ class Expectation:
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         points = corners.mean(axis=1)
         triangle = _triangle_of_pixel(cell, base_from_camera, corners, normals)
-        self._rows, self._columns = (places[::PIXEL_STEP] for places in np.nonzero(triangle >= 0))
+        step = PIXEL_STEP * max(1, cell.rig_data["sensor"]["width_px"] // 128) ** 2
+        self._rows, self._columns = (places[::step] for places in np.nonzero(triangle >= 0))
         seen = triangle[self._rows, self._columns]
         self._cell = 2 * (self._rows % 2) + self._columns % 2
         table = np.loadtxt(

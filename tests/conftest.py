@@ -11,7 +11,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy comes: the te
 import pytest
 from cells import CellFolder
 from hypothesis import settings
+from nursery import Nursery
 from skip_budget import over_budget
+
+from sim.world import client
+
+client._launch = Nursery().start  # type: ignore[assignment] # for what runs in the tests' own process
 
 settings.register_profile("coupole", deadline=None)  # no test asserts wall-clock speed
 settings.load_profile("coupole")

@@ -35,7 +35,10 @@ def warm_up() -> None:
 
 @numba.njit(cache=True, nogil=True)
 def distance_mm(a, b, c, d):  # type: ignore[no-untyped-def]
-    """Distance of the segments a b and c d (Ericson, Real-Time Collision Detection, 5.1.9)."""
+    """Distance of the segments a b and c d (Ericson, Real-Time Collision Detection, 5.1.9).
+
+    Lines that are parallel to 1e-6 rad count as parallel: up to a millionth of their length too far.
+    """
     along, across, between = b - a, d - c, a - c
     aa, cc, f = along @ along, across @ across, across @ between
     if aa < 1e-12:

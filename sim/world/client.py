@@ -35,13 +35,7 @@ class World:
         `config` is the JSON form of `Config`. Raises DeviceError if the world does not start.
         """
         line = Config.model_validate(config).model_dump_json()
-        process = subprocess.Popen(
-            [sys.executable, "-m", "sim.world.world"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
+        process = _launch()
         assert process.stdin is not None
         assert process.stdout is not None
         process.stdin.write(line + "\n")
@@ -99,6 +93,17 @@ class World:
         """Wait until the world ends; returns its exit code."""
         assert self._process is not None
         return self._process.wait()
+
+
+def _launch() -> subprocess.Popen[str]:
+    """A world that waits for its configuration."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "sim.world.world"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
 
 
 def _first_line(stream: IO[str]) -> dict[str, Any]:

@@ -52,7 +52,7 @@ def test_a_disk_slower_than_the_camera_slows_the_run_and_loses_nothing(
     cell: CellFolder, slowed: Callable[..., dict[str, str]]
 ) -> None:
     cell.rig_data["sensor"] |= {"width_px": 512, "height_px": 384, "pixel_pitch_um": 44.0}
-    cell.write()
+    cell.write(lights={"kind": "every", "every": 54})
     slow_bytes_s = 30e6  # the camera gives 39 MB/s
     ended = cells.finish(cell.start_acquire(env=slowed(SLOW_BYTES_S=slow_bytes_s)))
     assert ended.code == 0, ended.err

@@ -140,6 +140,7 @@ def test_a_campaign_finds_the_mesh_where_the_world_has_it(
     }
 
 
+@pytest.mark.full
 @pytest.mark.timeout(600)
 def test_a_third_of_the_stickers_may_be_missing_and_as_many_false(
     tmp_path: Path, make_rig: Callable[..., Path], scale: Callable[[int, int], int]

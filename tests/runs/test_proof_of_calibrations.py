@@ -21,7 +21,7 @@ def proof(tmp_path_factory: pytest.TempPathFactory, scale: Callable[[int, int], 
     """Lines of the tool: small frames, few boards of LEDs."""
     kept = tmp_path_factory.mktemp("proof") / "cells.jsonl"
     options = ["--images", "16", "--samples", "3", "--led-boards", "24", "--keep", str(kept)]
-    width, count = str(scale(512, 1024)), str(scale(3, 100))
+    width, count = str(scale(512, 1024)), str(scale(2, 100))
     ended = subprocess.run(
         [*COMMAND, "--cells", count, "--width", width, *options], capture_output=True, text=True, check=False
     )
@@ -44,8 +44,8 @@ def test_stated_intervals_hold_the_truth(proof: list[dict[str, Any]]) -> None:
     mean_square = sum(line["rms_over_u"] ** 2 * line["values"] for line in judged) / values
     assert 0.90 <= covered <= 0.99
     assert 0.8 < mean_square**0.5 < 1.25
-    for line in judged:  # three cells, a parameter each: one may lie outside, and none far
-        assert line["covered"] >= 0.6, line
+    for line in judged:  # two cells, a parameter each: one may lie outside, and none far
+        assert line["covered"] >= 0.5, line
         assert line["rms_over_u"] < 2.0, line
 
 

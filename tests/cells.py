@@ -34,7 +34,7 @@ from coupole.preflight.simulated_world import world_config
 from sim.world.client import World
 
 BLACK_DN = 64
-PIXEL_STEP = 3
+PIXEL_STEP = 7
 """Of the object's pixels every so-manieth is looked at to tell LEDs apart, in frames of 128 columns."""
 PATIENCE_S = 60.0
 """How long a test waits for what must come; only a broken program lets it run out."""

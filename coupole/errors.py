@@ -2,20 +2,27 @@
 
 ::
 
-    CoupoleError ├── InputError            2    plan, rig or arguments are wrong ├── PreflightRefused      3    the
-    plan is well formed but must not be run ├── CalibrationRefused    3    the calibration misses its limits:
-    written, but not to be used ├── DeviceError           4    a device failed │   ├── DeviceTimeout     4    ...
-    did not answer in time │   ├── DeviceLost        4    ... its link is gone │   ├── DeviceRefused     4    ...
-    refused a command │   └── DeviceFault       4    ... is in a latched fault; only an operator may clear it ├──
-    UnprovenError         5    frames are missing or unproven after re-shooting ├── StorageError          6 the
-    disk │   ├── DiskFull          6    ... has no space left │   └── ChecksumMismatch  6    ... does not give back
-    what was written └── Interrupted         130    the operator stopped the run
+    CoupoleError
+    ├── InputError            2  plan, rig or arguments are wrong
+    ├── PreflightRefused      3  the plan is well formed but must not be run
+    ├── CalibrationRefused    3  the calibration misses its limits: written, but not to be used
+    ├── DeviceError           4  a device failed
+    │   ├── DeviceTimeout     4  ... did not answer in time
+    │   ├── DeviceLost        4  ... its link is gone
+    │   ├── DeviceRefused     4  ... refused a command
+    │   └── DeviceFault       4  ... is in a latched fault; only an operator may clear it
+    ├── UnprovenError         5  frames are missing or unproven after re-shooting
+    ├── StorageError          6  the disk
+    │   ├── DiskFull          6  ... has no space left
+    │   └── ChecksumMismatch  6  ... does not give back what was written
+    └── Interrupted         130  the operator stopped the run (129: hang-up, 143: SIGTERM)
 
 A message names what was expected, what happened and what to do next.
 """
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -124,6 +131,13 @@ class ChecksumMismatch(StorageError):
 
 
 class Interrupted(CoupoleError):
-    """The operator asked to stop (Ctrl-C, SIGTERM); the run can be resumed."""
+    """The operator asked to stop, or a signal did; the run can be resumed.
 
-    exit_code = 130
+    Exit code 128 + the signal's number, as shells have it: 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP.
+    """
+
+    exit_code = 128 + signal.SIGINT
+
+    def __init__(self, message: str, signal_number: int = signal.SIGINT) -> None:
+        super().__init__(message)
+        self.exit_code = 128 + signal_number

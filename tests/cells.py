@@ -28,6 +28,7 @@ from places import REPO
 from ruamel.yaml import YAML
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
+from coupole.acquisition.signals import ENDING
 from coupole.commands import cli
 from coupole.preflight.job import read_job
 from coupole.preflight.simulated_world import world_config
@@ -141,6 +142,10 @@ class CellFolder:
         """The same as a process of its own, still running."""
         return start("acquire", self.plan, "--json", "--yes", *options, **popen)
 
+    def confirm(self) -> None:
+        """A person's word after a fault of the arm."""
+        assert here("confirm", self.rig, "--name", "an operator").code == 0
+
     @property
     def run_folder(self) -> Path:
         """The only run in the storage folder, waited for if need be."""
@@ -175,7 +180,7 @@ class CellFolder:
 def here(*arguments: str | Path, typed: str = "") -> Ended:
     """Run a command in this process; `typed` is what the operator answers."""
     out, err = io.StringIO(), io.StringIO()
-    before = signal.getsignal(signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in ENDING}
     with (
         mock.patch.object(sys, "argv", ["coupole", *map(str, arguments)]),
         mock.patch.object(sys, "stdin", io.StringIO(typed)),
@@ -187,7 +192,8 @@ def here(*arguments: str | Path, typed: str = "") -> Ended:
         except SystemExit as ended:
             code = int(ended.code or 0)
         finally:
-            signal.signal(signal.SIGTERM, before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
     return Ended(code, out.getvalue(), err.getvalue())
 
 

@@ -5,7 +5,7 @@ Frames are proven only while the arm reports that it is at the posture measured 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ import numpy as np
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.devices import ArmState, Deadline
-from coupole.errors import DeviceFault, DeviceLost, DeviceRefused, Interrupted, PreflightRefused
+from coupole.errors import DeviceFault, DeviceLost, PreflightRefused
 from coupole.geometry import Transform
 from coupole.kinematics import move_duration_s
 from coupole.motion.itinerary import Itinerary, Visit, arm_of
@@ -25,6 +25,8 @@ from coupole.preflight.job import Job
 
 _POLL_S = 0.01
 _NEWS_S = 1.0
+_SPRING_BACK_S = 2.0
+"""Time that a pushed arm has to come back by itself."""
 
 
 class ArmMovedError(Exception):
@@ -62,15 +64,14 @@ class ArmSupervisor:
         """Raise Interrupted after the operator's stop, DeviceFault if the arm is in a fault."""
         self._watched()
 
-    def go(self, visit: Visit, meanwhile: Callable[[], None]) -> SettledPose:
-        """Follow the leg of a visit, call `meanwhile` during its first motion; returns the measured pose."""
+    def go(self, visit: Visit) -> SettledPose:
+        """Follow the leg of a visit; returns the measured pose."""
         self._settled = None
         path = (self._from_deg, *visit.leg.waypoints)
         self._keep_to(path, self._watched(), "before it started")
         for here_deg, there_deg in pairwise(path):
+            self._control.go_on()
             self._robot.move_to(there_deg)
-            if here_deg is self._from_deg:
-                meanwhile()
             self.hurry(move_duration_s(self._arm, here_deg, there_deg) + self._motion.settle_dwell_s)
             while (arm := self._watched()).moving:
                 self._keep_to(path, arm, "during its motion")
@@ -78,31 +79,31 @@ class ArmSupervisor:
         self._from_deg = path[-1]
         return self._settle()
 
-    def return_to_view(self) -> SettledPose:
-        """Move a displaced arm back to its posture; returns the newly measured pose.
+    def await_return(self, moved: ArmMovedError) -> SettledPose:
+        """After a push: wait for the arm to spring back by itself; returns the newly measured pose.
 
-        Raises DeviceRefused if the straight path back is blocked.
+        Raises DeviceFault if it does not: then only a person may say that it can move again.
         """
         assert self._settled is not None
-        here_deg = np.array(self._robot.measured().joints_deg)
-        there_deg = np.array(self._settled.arm.joints_deg)
-        contact = self._job.motion.bodies.contact_on_the_way(here_deg, there_deg)
-        if contact is not None:
-            raise DeviceRefused(
-                "robot",
-                expected="a clear path back to the view from which the arm was pushed",
-                happened=str(contact),
-                remedy="Move the arm away from it by hand, then resume the run.",
-            )
-        self._robot.move_to(there_deg)
-        return self._settle()
+        deadline = Deadline(self._clock, _SPRING_BACK_S)
+        while not deadline.expired:
+            self._clock.sleep(_POLL_S)
+            arm = self._watched()
+            if not arm.moving and self._off_deg(arm) <= self._motion.still_deg:
+                return self._settle()
+        raise DeviceFault(
+            "robot",
+            expected="an arm that stays where it was measured",
+            happened=f"{moved} and has not come back by itself",
+            remedy="Find what pushed it and see that the cell is clear.",
+        )
 
     def heard_at_rest(self) -> int:
         """Time of the arm's last reading, on the rig's clock; raises ArmMovedError if the arm is not at its
         measured posture."""
         assert self._settled is not None
         arm = self._watched()
-        off_deg = float(np.abs(np.subtract(arm.joints_deg, self._settled.arm.joints_deg)).max())
+        off_deg = self._off_deg(arm)
         if off_deg > self._motion.still_deg:
             raise ArmMovedError(f"the arm moved by {off_deg:.3f} deg during a burst")
         return arm.t_ns
@@ -126,9 +127,13 @@ class ArmSupervisor:
         """The caller only waits for these seconds: the clock of a dry run may run fast."""
         self._clock.hurry(self._clock.now_ns() + int(max(0.0, seconds) * 1e9))
 
+    def _off_deg(self, arm: ArmState) -> float:
+        """Largest distance of an axis from its settled place."""
+        assert self._settled is not None
+        return float(np.abs(np.subtract(arm.joints_deg, self._settled.arm.joints_deg)).max())
+
     def _watched(self) -> ArmState:
-        if self._control.stop.is_set():
-            raise Interrupted("stopped by the operator; everything proven so far is kept")
+        self._control.go_on()
         arm = self._robot.measured()
         if arm.fault:
             raise DeviceFault(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from concurrent import futures
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.acquisition.arm_supervisor import ArmSupervisor
+from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_grabber import FrameGrabber, buffers_for, memory_for_buffers
 from coupole.acquisition.frame_matching import UNLABELLED, FaultModel, Match, match
@@ -28,7 +29,7 @@ from coupole.devices import (
     StepRecord,
     table_box,
 )
-from coupole.errors import CoupoleError, DeviceError, DeviceTimeout
+from coupole.errors import DeviceError, DeviceTimeout
 from coupole.plan.bursts import Burst
 from coupole.plan.shot_id import ShotId
 from coupole.storage.journal_events import BurstEnded, Joints
@@ -78,6 +79,8 @@ class BurstRunner:
         self._outcome, self._gain_db, self._max_frames_per_s = outcome, gain_db, max_frames_per_s
         self._tell = tell
         self._by_host = HostBurst(cell, recorder, arm, tell, wait_while_paused, self._note)
+        self._uploader = futures.ThreadPoolExecutor(1, "upload")
+        self._upload: futures.Future[None] | None = None
         self._buffer_memory_bytes = memory_for_buffers()
         self._buffers = 0
         """Buffers of the previous burst; never reduced, because a new size means newly allocated memory."""
@@ -89,9 +92,18 @@ class BurstRunner:
         return Exposure(burst.timing.exposure_us, self._gain_db, burst.hardware)
 
     def prepare(self, burst: Burst) -> None:
-        """Upload the burst's table while the arm is moving."""
+        """Begin to upload the burst's table, in another thread: the arm is watched meanwhile."""
         if burst.hardware:
-            table_box(self._cell.ledbox).load(burst.table)
+            box = table_box(self._cell.ledbox)
+            self._upload = self._uploader.submit(box.load, burst.table)
+
+    def _await_upload(self) -> None:
+        """Wait with an eye on the arm until the table is in the box. Raises what the upload raised."""
+        while self._upload is not None:
+            self._arm.attend()
+            if futures.wait([self._upload], timeout=_POLL_S).done:
+                upload, self._upload = self._upload, None
+                upload.result()
 
     def fire(self, burst: Burst, following: Burst | None) -> Verdict:
         """Run one burst and prove its frames; dose and figures are recorded even if this raises.
@@ -101,7 +113,9 @@ class BurstRunner:
         frame_format = self._cell.camera.configure(self.exposure(burst))
         if not burst.hardware:
             return self._by_host.fire(burst, frame_format)
-        self.prepare(burst)
+        self._await_upload()
+        self.prepare(burst)  # nothing to upload, unless the burst was reduced
+        self._await_upload()
         needed_us = self._cell.camera.min_period_us(self.exposure(burst))
         if burst.timing.period_us < needed_us:
             raise DeviceError(
@@ -122,21 +136,26 @@ class BurstRunner:
         camera.arm(buffers)
         try:
             grabber.start()
+            self._arm.attend()
             if burst.panel:
                 box.panel(burst.panel, True)
             started_ns = clock.now_ns()
             box.start(burst.table)
             if following is not None:
-                box.load(following.table)
+                self.prepare(following)
             self._arm.hurry(burst.duration_s - _LAST_STRETCH_S)
             self._follow(running)
             self.times_s.append((clock.now_ns() - started_ns) / 1e9)
             if burst.panel:
                 box.panel(burst.panel, False)
+        except ArmMovedError:
+            box.lights_off()
+            camera.disarm()
+            self._end(running, camera=None)
+            raise
         except BaseException:
-            with contextlib.suppress(DeviceError):
-                camera.disarm()
-            with contextlib.suppress(CoupoleError):
+            self._cell.make_safe()
+            with contextlib.suppress(Exception):  # the disk; it must not hide the error that ended the burst
                 self._end(running, camera=None)
             raise
         statistics = camera.statistics()

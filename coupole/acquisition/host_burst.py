@@ -16,7 +16,7 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
-from coupole.acquisition.arm_supervisor import ArmSupervisor
+from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import NOTHING_TO_MATCH, Verdict
@@ -110,6 +110,11 @@ class HostBurst:
             reason = reason or ("a dark mark was not seen" if marks else "")
             if not reason:
                 self._prove(kept)
+        except ArmMovedError:
+            raise  # `_fire_one` has switched the light off
+        except BaseException:
+            self._cell.make_safe()
+            raise
         finally:
             for one in kept:
                 self._recorder.free(one.slot)

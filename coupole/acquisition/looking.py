@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,10 +18,10 @@ from coupole.acquisition.operator import (
     enter_dose,
     identity_printer,
     longest_exposure_us,
-    operator_at,
     refuse,
 )
 from coupole.acquisition.sequencer import Sequencer
+from coupole.acquisition.signals import obeyed_by
 from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.plan.cell import Cell
@@ -29,6 +30,7 @@ from coupole.preflight import exposure_advice
 from coupole.preflight.checking import check_job
 from coupole.preflight.job import Job, schedule_of
 from coupole.preflight.preflight import StorageFacts
+from coupole.storage.arm_faults import ArmFaults
 from coupole.viewing.live import Choice, RunSource, Source, Studio, choice_from, run_source
 from coupole.viewing.live_page import serve
 from coupole.viewing.terminal import LiveFigures, RunObserver
@@ -49,13 +51,14 @@ def meter(
     small = replace(job, plan=few, schedule=schedule_of(few, job.cell))
     small, preflight = check_job(small, StorageFacts(UNLIMITED_BYTES))
     refuse(preflight)
+    ArmFaults(job.cell.state_folder).refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)
     recorder, control = exposure_advice.MeterRecorder(), Control()
     with open_cell(job.cell, job=small, on_opened=identity_printer(console)) as cell:
         observer = RunObserver(console, job.cell.rig.frame_bytes, 0)
         sequencer = Sequencer(small, cell, recorder, observer=observer, control=control)
         try:
-            with operator_at(control), observer.showing(small.schedule.frames, len(small.schedule.views)):
+            with obeyed_by(control, cell.halt), observer.showing(small.schedule.frames, len(small.schedule.views)):
                 sequencer.acquire()
         finally:
             cell.make_safe()
@@ -76,12 +79,14 @@ def watch_cell(
     lux = dict(zip(leds.ids.tolist(), lux_of_row.tolist(), strict=True))
     ids = tuple(leds.ids.tolist())
     studio = Studio(choice_from(vars(choice), choice, ids, longest_exposure_us(rig)))
+    ArmFaults(rig_cell.state_folder).refuse(rig_cell.document.path)
     ask_to_begin(rig_cell, confirm=confirm)
     with open_cell(rig_cell, job=job, on_opened=identity_printer(console)) as cell:
         source = CellSource(cell, rig, leds, lux.__getitem__, frames_per_s=frames_per_s)
         try:
-            _show_live(source, studio, console, port, longest_us=longest_exposure_us(rig))
+            _show_live(source, studio, console, port, longest_us=longest_exposure_us(rig), halt=cell.halt)
         finally:
+            cell.make_safe()
             given = studio.shown.dose_lux_h if studio.shown else 0.0
             if job is not None and given:
                 enter_dose(job, cell, given, "live")
@@ -89,10 +94,19 @@ def watch_cell(
 
 def watch_run(folder: Path, console: Console, *, port: int) -> None:
     """Show the newest proven frame of a run until the operator stops it."""
-    _show_live(RunSource(folder), Studio(Choice(None, 0)), console, port, longest_us=0)
+    _show_live(RunSource(folder), Studio(Choice(None, 0)), console, port, longest_us=0, halt=lambda: None)
 
 
-def _show_live(source: Source, studio: Studio, console: Console, port: int, *, longest_us: int) -> None:
+def _show_live(
+    source: Source,
+    studio: Studio,
+    console: Console,
+    port: int,
+    *,
+    longest_us: int,
+    halt: Callable[[], object],
+) -> None:
+    """Until the operator stops it; `halt` is called as soon as he does."""
     try:
         server = serve(studio, source.leds, longest_us, port)
     except OSError as error:
@@ -102,7 +116,7 @@ def _show_live(source: Source, studio: Studio, console: Console, port: int, *, l
     page = threading.Thread(target=server.serve_forever, name="page", daemon=True)
     page.start()
     console.print(f"live at http://127.0.0.1:{server.server_port}/  (Ctrl-C ends it)")
-    with operator_at(control):
+    with obeyed_by(control, halt):
         filling = run_source(source, studio, failures.append)
         try:
             with LiveFigures(console) as figures:

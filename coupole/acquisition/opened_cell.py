@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from coupole.acquisition.signals import held
 from coupole.devices import Camera, Clock, Identity, LedBox, Robot, SystemClock
-from coupole.errors import CoupoleError
 from coupole.plan.cell import Cell
 from coupole.plan.registry import WORLD, load_class, settings_class
 from coupole.plan.rig import Rig, Sensor
@@ -18,6 +19,8 @@ from coupole.preflight.job import Job
 from coupole.preflight.simulated_world import coarse, world_config
 
 _LONGEST_WATCHDOG_S = 60.0
+_SAFE_WITHIN_S = 15.0
+"""Longer than any driver's time-outs for switching off and stopping; what hangs longer is given up and told."""
 
 
 @dataclass
@@ -34,18 +37,55 @@ class OpenedCell:
     world_endpoints: Mapping[str, Any] | None
     identities: dict[str, Identity]
     trouble: list[str] = field(default_factory=list)
+    arm_confirmed: bool = True
+    """False if the arm was not confirmed to be at rest at the end."""
+    _made_safe: bool = False
+
+    def halt(self) -> list[Safeguard]:
+        """Begin to switch the lights off and to stop the arm, side by side; returns at once. From any thread."""
+        return [
+            Safeguard("lights off", self.ledbox.lights_off),
+            Safeguard("arm stopped", self.robot.stop),
+        ]
 
     def make_safe(self) -> None:
-        """Lights off, arm stopped, camera disarmed; each is tried even if another fails."""
-        for what, act in (
-            ("lights off", self.ledbox.lights_off),
-            ("arm stopped", self.robot.stop),
-            ("camera disarmed", self.camera.disarm),
-        ):
-            try:
-                act()
-            except CoupoleError as error:
-                self.trouble.append(f"not sure that it is safe ({what}): {error}")
+        """Lights off and arm stopped, side by side, then the camera disarmed; each is tried even if another fails
+        or hangs. Signals wait. Only the first call acts: nothing may be lit or moved after it."""
+        if self._made_safe:
+            return
+        self._made_safe = True
+        with held():
+            done = self.halt()
+            for safeguard in done:
+                safeguard.wait()
+            done.append(Safeguard("camera disarmed", self.camera.disarm))
+            done[-1].wait()
+        for safeguard in done:
+            if safeguard.trouble:
+                self.trouble.append(f"not sure that it is safe ({safeguard.what}): {safeguard.trouble}")
+        self.arm_confirmed = not done[1].trouble
+
+
+class Safeguard:
+    """One action that makes a cell safe, in a thread of its own, so that none waits for another."""
+
+    def __init__(self, what: str, act: Callable[[], None]) -> None:
+        self.what, self._act = what, act
+        self.trouble = f"no answer within {_SAFE_WITHIN_S:g} s"
+        """Why it is not sure to be done; empty when it is done."""
+        self._thread = threading.Thread(target=self._run, name=what, daemon=True)
+        self._thread.start()
+
+    def wait(self) -> None:
+        self._thread.join(_SAFE_WITHIN_S)
+
+    def _run(self) -> None:
+        try:
+            self._act()
+        except BaseException as error:  # noqa: BLE001  whatever it is, the other safeguards go on
+            self.trouble = str(error) or type(error).__name__
+        else:
+            self.trouble = ""
 
 
 @contextmanager

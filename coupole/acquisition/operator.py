@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
 
-from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.devices import Identity
 from coupole.errors import Interrupted, PreflightRefused
@@ -30,28 +25,6 @@ UNLIMITED_BYTES = 2**62
 def refuse(found: Report) -> None:
     if found.refusals:
         raise PreflightRefused(found.refusals)
-
-
-@contextmanager
-def operator_at(control: Control) -> Iterator[None]:
-    """Ctrl-C and SIGTERM stop, SIGUSR1 pauses or continues; the former handlers are restored at the end."""
-
-    def stop(*_: Any) -> None:
-        control.stop.set()
-
-    def pause(*_: Any) -> None:
-        (control.pause.clear if control.pause.is_set() else control.pause.set)()
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    wanted = {signal.SIGINT: stop, signal.SIGTERM: stop, signal.SIGUSR1: pause}
-    before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def ask_to_begin(cell: Cell, *, confirm: bool) -> None:

@@ -1,8 +1,8 @@
 """Runs a schedule: moves the arm, fires bursts, takes unproven shots again.
 
 Only this module, the arm supervisor and the burst runner command devices, always in the same order: arm at rest
-and measured, camera armed, lights; and the reverse order at the end. On every exit
-`coupole.acquisition.opened_cell` makes the devices safe.
+and measured, camera armed, lights; and the reverse order at the end. On every exit the devices are made safe
+(`coupole.acquisition.opened_cell`) before anything is written.
 """
 
 from __future__ import annotations
@@ -96,6 +96,9 @@ class Sequencer:
                 view = schedule.views[number]
                 self._view_number, self._view_name = len(schedule.views) - len(left) + count, view.name
                 self._acquire_view(view, visit, left[number], schedule.bursts[number])
+        except BaseException:
+            self._cell.make_safe()
+            raise
         finally:
             self.outcome.duration_s = (self._cell.clock.now_ns() - start_ns) / 1e9
             self.outcome.dose_lux_h = self._dose.lux_h
@@ -127,7 +130,8 @@ class Sequencer:
         self.outcome.ideal_s += motion_s + sum(burst.duration_s for burst in left)
         waypoints_deg = tuple(tuple(np.round(place, 6).tolist()) for place in visit.leg.waypoints)
         self._recorder.note(MoveBegun(view=view.name, joints_deg=waypoints_deg))
-        settled = self._arm.go(visit, lambda: self._burst_runner.prepare(left[0]))
+        self._burst_runner.prepare(left[0])
+        settled = self._arm.go(visit)
         frame_format = self._cell.camera.configure(self._burst_runner.exposure(left[0]))
         self._check_format(frame_format)
         frames = sum(len(burst.labels) for burst in all_bursts)
@@ -150,6 +154,9 @@ class Sequencer:
                 following = left[index + 1] if index + 1 < len(left) else None
                 self._acquire_burst(burst, following, begin)
             self._recorder.note(ViewSealed(view=view.name))
+        except BaseException:
+            self._cell.make_safe()  # before the disk, which may take its time
+            raise
         finally:
             self._recorder.end_view()
 
@@ -166,7 +173,8 @@ class Sequencer:
     def _acquire_burst(self, burst: Burst, following: Burst | None, begin: Callable[[SettledPose], None]) -> None:
         """Fire a burst and then its unproven shots again, up to the plan's limit.
 
-        An arm that was pushed is moved back, and `begin` is called again for the frames after that.
+        If an arm that was pushed springs back, `begin` is called again for the frames after that. It is never
+        driven back: a person may be what pushed it.
         """
         todo = burst
         for attempt in range(self._job.plan.reshoot_limit + 1):
@@ -179,9 +187,9 @@ class Sequencer:
                 verdict = self._burst_runner.fire(todo, following if attempt == 0 else None)
             except ArmMovedError as moved:
                 self._cell.ledbox.lights_off()
-                self._observer.note(f"{burst.view}: {moved}; back to the view")
+                self._observer.note(f"{burst.view}: {moved}")
                 self._recorder.note(FaultNoted(kind="ArmMoved", message=f"{burst.view}: {moved}"))
-                begin(self._arm.return_to_view())
+                begin(self._arm.await_return(moved))
                 verdict = Verdict(NOTHING_TO_MATCH, [])
             done = self._recorder.proven()
             left = [shot for shot in todo.shots if shot and shot not in done]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+import traceback
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,16 +19,15 @@ from coupole.acquisition.operator import (
     ask_to_begin,
     enter_dose,
     identity_printer,
-    operator_at,
     refuse,
 )
 from coupole.acquisition.recorder import DryRecorder, RunRecorder
 from coupole.acquisition.sequencer import Sequencer
+from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.verdict import PROOF_BY
 from coupole.errors import (
     CoupoleError,
     DeviceError,
-    DeviceFault,
     Interrupted,
     PreflightRefused,
     StorageError,
@@ -36,11 +36,13 @@ from coupole.plan.schedule import Schedule
 from coupole.preflight.checking import calibration_refusals, check_job, preflight_of
 from coupole.preflight.job import Job, without_hidden
 from coupole.preflight.preflight import StorageFacts
+from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
+from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
 from coupole.viewing import report
 from coupole.viewing.progress import Outcome
-from coupole.viewing.terminal import RunObserver, ask, show_dry_run, show_preflight
+from coupole.viewing.terminal import RunObserver, alarm, show_dry_run, show_preflight
 
 _ASKED_BOARDS = 12
 """Number of boards, spread over the dome, whose temperature is read."""
@@ -89,7 +91,8 @@ def _acquire_into(
     )
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     refuse(preflight)
-    acknowledged = _ask_whether_clear(run.robot_fault()) if run else ""
+    faults = ArmFaults(job.cell.state_folder)
+    faults.refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=identity_printer(console)) as cell:
@@ -102,12 +105,11 @@ def _acquire_into(
         recorder = RunRecorder(run, metadata_of_views(job, cell), packed=packed)
         try:
             begun = SessionResumed if resumed else SessionStarted
+            acknowledged = faults.begin_session(run.folder.name)
             recorder.note(begun(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledged))
-            _acquire(job, cell, run, recorder, console, found=found)
-        except CoupoleError:
-            with contextlib.suppress(
-                StorageError
-            ):  # An error in the report must not hide the error that ended the run.
+            _acquire(job, cell, run, recorder, console, faults, found=found)
+        except BaseException:
+            with contextlib.suppress(Exception):  # it must not hide the error that ended the run
                 report.write(run)
             raise
         else:
@@ -133,25 +135,6 @@ def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float | None:
 def _camera_name(cell: OpenedCell) -> str:
     """The camera's name in calibration records."""
     return " ".join((cell.identities["camera"].model, cell.identities["camera"].serial))
-
-
-def _ask_whether_clear(fault: str) -> str:
-    """After a fault of the arm a person must confirm that it may move again; `--yes` is no confirmation.
-
-    Returns the acknowledged fault, empty if there was none. Raises DeviceFault without confirmation.
-    """
-    if not fault:
-        return ""
-    if not ask(
-        f"The arm stopped in a fault: {fault}\nIs the cause found, the cell clear, and may the arm move again?"
-    ):
-        raise DeviceFault(
-            "robot",
-            expected="the word of a person who has been to the cell",
-            happened="there was no confirmation that the arm may move again",
-            remedy="Check the cell, then resume from a terminal and answer the question (`--yes` does not).",
-        )
-    return fault
 
 
 def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
@@ -208,32 +191,74 @@ def _acquire(
     run: Run,
     recorder: RunRecorder,
     console: Console,
+    faults: ArmFaults,
     *,
     found: dict[str, Any],
 ) -> None:
+    """The session itself. First the cell is made safe, whatever ended it; then the disk hears of it."""
     control = Control()
     observer = RunObserver(console, job.cell.rig.frame_bytes, len(recorder.proven()))
     sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
     outcome = sequencer.outcome
-    ended: Literal["done", "interrupted", "failed"] = "done"
+    ended: Literal["done", "interrupted", "failed"] = "failed"
+    failure: BaseException | None = None
     try:
-        with operator_at(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
-            sequencer.acquire()
-    except CoupoleError as error:
-        ended = "interrupted" if isinstance(error, Interrupted) else "failed"
-        device = error.device if isinstance(error, DeviceError) else ""
-        recorder.note(FaultNoted(kind=type(error).__name__, message=str(error), device=device))
+        with obeyed_by(control, cell.halt), observer.showing(job.schedule.frames, len(job.schedule.views)):
+            try:
+                sequencer.acquire()
+                ended = "done"
+            finally:
+                cell.make_safe()
+    except BaseException as error:
+        failure = control.interrupted() if control.stop.is_set() and ended != "done" else error
+        ended = "interrupted" if isinstance(failure, Interrupted) else "failed"
+        if isinstance(failure, Interrupted):
+            raise failure from error
+        _note_failure(error, cell, run, recorder)
         raise
     finally:
-        cell.make_safe()
+        _note_faults_of_the_arm(failure, cell, run, faults)
         for trouble in cell.trouble:
             recorder.note(FaultNoted(kind="unsafe", message=trouble))
-            console.print(f"[red]{trouble}[/]")
-        recorder.note(SessionStopped(outcome=ended, robot=dict(cell.robot.statistics())))
+            alarm(trouble)
+        recorder.note(SessionStopped(outcome=ended, robot=_statistics(cell)))
         recorder.close_quietly()
         enter_dose(job, cell, outcome.dose_lux_h, run.folder.name)
-        found.update(_figures(run, job, outcome))
+        found.update({**_figures(run, job, outcome), "unsafe": cell.trouble})
         _say_outcome(console, run, outcome, ended)
+
+
+def _statistics(cell: OpenedCell) -> dict[str, float]:
+    """Of the arm's link; empty if its driver has none to give any more."""
+    try:
+        return dict(cell.robot.statistics())
+    except DeviceError:
+        return {}
+
+
+def _note_failure(error: BaseException, cell: OpenedCell, run: Run, recorder: RunRecorder) -> None:
+    """The journal's line; an unexpected error also leaves its trace in the run's folder and says so."""
+    device = error.device if isinstance(error, DeviceError) else ""
+    recorder.note(FaultNoted(kind=type(error).__name__, message=str(error), device=device))
+    if isinstance(error, CoupoleError):
+        return
+    path = run.folder / f"trace-{utc_now().replace(':', '')}.txt"
+    with contextlib.suppress(OSError):
+        path.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
+    safe = "; ".join(cell.trouble) or "lights are off, the arm is at rest, the camera is disarmed"
+    error.add_note(f"{safe}; the trace is in {path}; go on with --resume {run.folder}")
+
+
+def _note_faults_of_the_arm(failure: BaseException | None, cell: OpenedCell, run: Run, faults: ArmFaults) -> None:
+    """They stay with the cell until a person confirms that the arm may move again."""
+    found = str(failure) if isinstance(failure, DeviceError) and failure.device == "robot" else ""
+    if not found and not cell.arm_confirmed:
+        found = "; ".join(cell.trouble)
+    if found:
+        try:
+            faults.note(found, run.folder.name)
+        except StorageError as error:
+            cell.trouble.append(f"the arm's fault could not be recorded: {error}")
 
 
 def _figures(run: Run, job: Job, outcome: Outcome) -> dict[str, Any]:
@@ -281,7 +306,7 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
         outcome = sequencer.outcome
         started_s = time.monotonic()
         try:
-            with operator_at(control), observer.showing(job.schedule.frames, len(job.schedule.views)):
+            with obeyed_by(control, cell.halt), observer.showing(job.schedule.frames, len(job.schedule.views)):
                 sequencer.acquire()
         finally:
             machine_s = time.monotonic() - started_s

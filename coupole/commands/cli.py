@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import signal
+import contextlib
 import sys
-from typing import Any
+import traceback
 
 import typer
 
+from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
 from coupole.commands import keeping, planning, running
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.render_scene import render
@@ -29,6 +30,7 @@ for command in (
     running.meter,
     running.live,
     running.devices,
+    running.confirm,
     running.sim,
     keeping.status,
     keeping.verify,
@@ -47,32 +49,34 @@ app.add_typer(calibrate_app, name="calibrate")
 
 def main() -> None:
     """Entry point: runs a command and turns Coupole's errors into messages and exit codes."""
-    signal.signal(signal.SIGTERM, _as_interrupt)
+    raise_outside_sessions()
     try:
         code = app(standalone_mode=False)
     except CoupoleError as error:
         _say(error)
         code = error.exit_code
-    except KeyboardInterrupt:
-        _say(Interrupted("stopped by the operator"))
-        code = Interrupted.exit_code
+    except SignalReceived as received:
+        interrupted = Interrupted("stopped by the operator", received.number)
+        _say(interrupted)
+        code = interrupted.exit_code
     except typer.Abort:
         code = Interrupted.exit_code
-    except Exception as error:  # click's usage errors, which know their own exit code
-        if not hasattr(error, "exit_code") or not hasattr(error, "show"):
-            raise
-        error.show()
-        code = error.exit_code
+    except Exception as error:  # noqa: BLE001  click's usage errors, which know their own exit code, and defects
+        if hasattr(error, "exit_code") and hasattr(error, "show"):
+            error.show()
+            code = error.exit_code
+        else:
+            with contextlib.suppress(OSError):
+                traceback.print_exception(error)
+                print("This is a defect of Coupole: please report it, with the lines above.", file=sys.stderr)
+            code = 1
     sys.exit(code or 0)
-
-
-def _as_interrupt(*_: Any) -> None:
-    raise KeyboardInterrupt
 
 
 def _say(error: CoupoleError) -> None:
     kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
-    print(f"{kind}{error}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        print(f"{kind}{error}", file=sys.stderr)
 
 
 if __name__ == "__main__":

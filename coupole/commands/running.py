@@ -157,6 +157,35 @@ def live(
     watch_cell(source, console, choice, frames_per_s=frames_per_s, port=port, confirm=not yes)
 
 
+def confirm(
+    rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
+    name: Annotated[str, typer.Option("--name", help="Who has been to the cell.", show_default=False)],
+    note: Annotated[str, typer.Option("--note", help="What the cause was.")] = "",
+    as_json: JsonOption = False,
+) -> None:
+    """A named person's word that, after a fault of the arm, its cause is found, the cell is clear and the arm may
+    move again.
+    """
+    from coupole.errors import InputError
+    from coupole.plan.cell import read_cell
+    from coupole.storage.arm_faults import ArmFaults
+    from coupole.viewing.terminal import make_console
+
+    if not name.strip():
+        raise InputError("--name: expected the name of the person who has been to the cell")
+    console, faults = make_console(quiet=as_json), ArmFaults(read_cell(rig).state_folder)
+    standing = faults.standing()
+    for fault in standing:
+        console.print(f"{fault.t}  {fault.message}", markup=False)
+    if standing:
+        faults.confirm(name.strip(), note)
+        console.print(f"confirmed by {name.strip()}: the arm may move again", markup=False)
+    else:
+        console.print("no fault of the arm stands; nothing to confirm")
+    if as_json:
+        print(json.dumps({"confirmed": [fault.model_dump() for fault in standing], "name": name.strip()}))
+
+
 def sim(
     rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
     plan: Annotated[Path | None, typer.Option("--plan", help="Put this plan's object on the support.")] = None,

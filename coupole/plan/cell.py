@@ -41,6 +41,12 @@ class Cell:
     def storage_folder(self) -> Path:
         return self.document.resolve(self.rig.storage.folder)
 
+    @property
+    def state_folder(self) -> Path:
+        """What is true of the cell whatever is acquired."""
+        given = self.rig.storage.state
+        return self.document.resolve(given) if given is not None else self.storage_folder / "state"
+
 
 def read_cell(path: Path) -> Cell:
     """Read a rig and its dome. Raises InputError with all problems."""

@@ -152,6 +152,9 @@ class Storage(Model):
     """Free space that a run leaves on the disk."""
     pixels: Literal["uint16", "packed12"] = "uint16"
     """Storage of pixels: two bytes each, or two pixels of at most 12 bits in three bytes."""
+    state: Path | None = None
+    """Folder for what is true of the cell whatever is acquired, such as faults of the arm; the same for all who
+    use the cell. `state` in `folder` if not given."""
 
 
 class WorldSection(Model):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -29,7 +30,33 @@ _PLAIN_LINE_EVERY_S = 5.0
 
 def make_console(*, quiet: bool) -> Console:
     """The console for text: standard error, so that standard output is free for `--json`."""
-    return Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=not sys.stderr.isatty())
+    stream: Any = _Terminal(sys.stderr)
+    return Console(file=stream, quiet=quiet, highlight=False, soft_wrap=not sys.stderr.isatty())
+
+
+class _Terminal:
+    """A stream that may go away (a closed window, a broken pipe): what it does not take is dropped, so that the
+    session ends in order."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def alarm(message: str) -> None:
+    """A message that a person must see: on standard error, even with `--json`."""
+    print(message, file=_Terminal(sys.stderr), flush=True)
 
 
 def ask(question: str) -> bool:

@@ -11,6 +11,7 @@ from typing import NoReturn, Protocol
 
 from coupole.devices import Clock, Deadline
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.fair_lock import FairLock
 
 REPLY_MARGIN_S = 2.0
 """Time that a device may take to answer, without the transmission of the bytes."""
@@ -42,6 +43,7 @@ class ScpiSession:
     def __init__(self, name: str, port: str, link: Link, clock: Clock) -> None:
         self._name, self._port, self._link, self._clock = name, port, link, clock
         self.bytes_per_s = link.bytes_per_s
+        self._lock = FairLock()
         self._out_of_step = True
 
     def ask(self, command: str | bytes, replies: int, reply_bytes: int = 0) -> tuple[Unit, ...]:
@@ -52,8 +54,9 @@ class ScpiSession:
         message = (command if isinstance(command, bytes) else command.encode("ascii")) + b";:SYST:ERR?\n"
         shown = (command if isinstance(command, str) else command[:40].split(b"#")[0].decode("ascii")).strip()
         seconds = REPLY_MARGIN_S + (len(message) + reply_bytes + _SHORT_REPLY_BYTES) / self.bytes_per_s
-        units = self._exchange(message, shown, seconds)
-        self._raise_errors(units[-1], shown)
+        with self._lock:
+            units = self._exchange(message, shown, seconds)
+            self._raise_errors(units[-1], shown)
         if len(units) != replies + 1:
             self.unexpected(f"{replies} replies to {shown}", f"{len(units) - 1} came")
         return tuple(units[:-1])

@@ -28,11 +28,11 @@ def assert_told(cell: CellFolder, ended: Ended, device: str) -> None:
     assert cells.events(cell.run_folder, "fault")[0]["device"] == device
 
 
-def assert_complete_once_mended(cell: CellFolder, typed: str = "") -> None:
-    """In a new world the run is resumed to its end; `typed` is what the operator answers."""
+def assert_complete_once_mended(cell: CellFolder) -> None:
+    """In a new world the run is resumed to its end."""
     run = cell.run_folder
     with cell.world():
-        resumed = cell.acquire("--resume", run, typed=typed)
+        resumed = cell.acquire("--resume", run)
     assert resumed.code == 0, resumed.err
     cells.assert_each_shot_proven_once(run)
     assert cells.mislabelled(cell, run) == []

@@ -44,8 +44,9 @@ def test_whatever_goes_wrong_labels_are_true_and_the_run_can_be_completed(cell: 
     assert cells.mislabelled(cell, run) == [], faults
     if ended.code != 0:
         assert cells.events(run, "stop")[-1]["outcome"] == "failed", faults
+        cell.confirm()
         with cell.world():
-            ended = cell.acquire("--resume", run, typed="yes\n")
+            ended = cell.acquire("--resume", run)
         assert ended.code == 0, (faults, ended)
     cells.assert_each_shot_proven_once(run)
     assert cells.mislabelled(cell, run) == [], faults

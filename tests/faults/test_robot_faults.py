@@ -7,12 +7,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import cells
 import pytest
 from cells import SIDE, TOP, CellFolder
 from failures import MORE_LIGHTS, assert_complete_once_mended, assert_told, fail_in_a_burst
 
+from coupole.errors import DeviceLost
+from coupole.storage.arm_faults import ArmFaults
+from drivers.kuka.rsi import KukaRsi
 from sim.world.client import World
 
 ROBOT_FAULTS = pytest.mark.parametrize(
@@ -65,7 +69,8 @@ def test_a_robot_that_fails_in_a_burst_ends_the_run_with_four_and_a_safe_cell(
 ) -> None:
     ended = fail_in_a_burst(lifelike, fault)
     assert_told(lifelike, ended, "robot")
-    assert_complete_once_mended(lifelike, typed="y\n")
+    lifelike.confirm()
+    assert_complete_once_mended(lifelike)
 
 
 @ROBOT_FAULTS
@@ -79,7 +84,8 @@ def test_a_robot_that_fails_in_a_motion_ends_the_run_with_four_and_is_resumed_af
         assert_told(joining, ended, "robot")
         assert cells.events(joining.run_folder, "burst") == []
         world.ask("reset_robot")
-        resumed = joining.acquire("--resume", joining.run_folder, typed="y\n")
+        joining.confirm()
+        resumed = joining.acquire("--resume", joining.run_folder)
     assert resumed.code == 0, resumed.err
     cells.assert_each_shot_proven_once(joining.run_folder)
     assert cells.mislabelled(joining, joining.run_folder) == []
@@ -89,25 +95,38 @@ def test_a_latched_emergency_stop_is_not_run_over_until_it_is_reset(joining: Cel
     with joining.world() as world:
         with _once(world, _moves, {"kind": "emergency_stop"}):
             assert joining.acquire().code == 4
-        assert joining.acquire("--resume", joining.run_folder, typed="y\n").code == 4
+        joining.confirm()
+        assert joining.acquire("--resume", joining.run_folder).code == 4
         assert cells.events(joining.run_folder, "burst") == []
 
 
-@pytest.mark.parametrize("typed", ["", "\n", "n\n"], ids=["nobody", "nothing", "no"])
 def test_after_a_fault_of_the_arm_nothing_moves_without_a_persons_word_and_yes_does_not_give_it(
-    joining: CellFolder, typed: str
+    joining: CellFolder,
 ) -> None:
     with joining.world() as world:
         with _once(world, _moves, {"kind": "emergency_stop"}):
             joining.acquire()
         world.ask("reset_robot")
         before = world.ask("state")["joints_deg"]
-        ended = joining.acquire("--resume", joining.run_folder, "--yes", typed=typed)
-        assert ended.code == 4, ended
-        assert "robot: expected the word of a person" in ended.document["error"]
-        assert "emergency stop" in ended.err
+        run = joining.run_folder
+        for again in (("--resume", run), ("--output", joining.folder / "elsewhere")):
+            ended = joining.acquire(*again, "--yes", typed="y\n")
+            assert ended.code == 4, ended
+            assert "robot: expected the word of a person" in ended.document["error"]
+            assert "emergency stop" in ended.err
+        live = cells.here("live", joining.plan, "--yes")
+        assert live.code == 4, live
+        assert cells.here("meter", joining.plan, "--yes").code == 4
         assert world.ask("state")["joints_deg"] == before
-        assert cells.events(joining.run_folder, "resume") == []
+    assert cells.events(run, "resume") == []
+    assert not (joining.folder / "elsewhere").exists()
+
+
+def test_a_word_without_a_name_is_none(joining: CellFolder) -> None:
+    ArmFaults(joining.folder / "storage" / "state").note("emergency stop")
+    assert cells.here("confirm", joining.rig, "--name", " ").code == 2
+    assert cells.here("confirm", joining.rig).code == 2
+    assert joining.acquire().code == 4
 
 
 def test_the_word_is_kept_in_the_journal_and_asked_for_once(joining: CellFolder) -> None:
@@ -117,17 +136,35 @@ def test_the_word_is_kept_in_the_journal_and_asked_for_once(joining: CellFolder)
             joining.acquire()
         world.ask("reset_robot")
         run = joining.run_folder
+        joining.confirm()
         with _once(world, lambda state: bool(state["shining"]), {"kind": "unplug_camera"}):
-            assert joining.acquire("--resume", run, typed="y\n").code == 4
+            assert joining.acquire("--resume", run).code == 4
     (resumed,) = cells.events(run, "resume")
     assert "emergency stop" in resumed["acknowledged"]
+    assert "an operator" in resumed["acknowledged"]
     with joining.world():
         assert joining.acquire("--resume", run).code == 0
     assert cells.events(run, "resume")[-1]["acknowledged"] == ""
 
 
-def test_an_arm_pushed_in_a_burst_has_just_that_burst_taken_again(joining: CellFolder) -> None:
-    """It springs back, or is brought back; the views before and after stay as they were taken."""
+def test_an_arm_that_is_not_confirmed_to_be_at_rest_counts_as_a_fault_of_the_cell(joining: CellFolder) -> None:
+    class Deaf(KukaRsi):
+        def stop(self) -> None:
+            raise DeviceLost("robot", expected="an answer", happened="there was none", remedy="Look at it.")
+
+    joining.faults({"kind": "unplug_camera", "at_edge": 20})
+    with joining.world({"kind": "unplug_camera", "at_edge": 20}), mock.patch("drivers.kuka.rsi.KukaRsi", Deaf):
+        ended = joining.acquire()
+    assert ended.code == 4
+    assert "not sure that it is safe (arm stopped)" in ended.err
+    (fault,) = ArmFaults(joining.folder / "storage" / "state").standing()
+    assert "arm stopped" in fault.message
+    with joining.world():
+        assert "word of a person" in joining.acquire("--resume", joining.run_folder).err
+
+
+def test_an_arm_pushed_in_a_burst_that_springs_back_has_just_that_burst_taken_again(joining: CellFolder) -> None:
+    """The views before and after stay as they were taken."""
     joining.write(views=[TOP, SIDE], lights=MORE_LIGHTS, order="as_written")
     first_edge = 270 + 12  # of the second view
     edge = first_edge + 100
@@ -144,6 +181,26 @@ def test_an_arm_pushed_in_a_burst_has_just_that_burst_taken_again(joining: CellF
     side = [frame.record for shot, frame in cells.stored(run).items() if shot.startswith("side/")]
     assert max(record["step"] for record in side if record["pose"] == 0) < edge - first_edge
     assert {int(record["pose"]) for record in side} == {0, 1}
+
+
+def test_an_arm_that_stays_pushed_is_never_driven_back_unasked(joining: CellFolder) -> None:
+    """A person may be what pushed it. It stays where it is, in the dark, until there is a word."""
+    joining.write(lights=MORE_LIGHTS)
+    with joining.world({"kind": "nudge_arm", "deg": 0.3, "at_edge": 100}) as world:
+        ended = joining.acquire()
+        pushed_deg = world.ask("state")["joints_deg"]
+        assert cells.safe(world)
+        assert_told(joining, ended, "robot")
+        assert "has not come back by itself" in ended.err
+        run = joining.run_folder
+        stood_deg = cells.events(run, "settled")[-1]["joints_deg"]
+        assert min(abs(a - b) for a, b in zip(pushed_deg, stood_deg, strict=True)) > 0.2
+        assert joining.acquire("--resume", run).code == 4
+        assert world.ask("state")["joints_deg"] == pushed_deg
+        joining.confirm()
+        assert joining.acquire("--resume", run).code == 0
+    cells.assert_each_shot_proven_once(run)
+    assert cells.mislabelled(joining, run) == []
 
 
 def test_where_the_arm_stood_before_and_after_each_burst_is_in_the_journal(joining: CellFolder) -> None:

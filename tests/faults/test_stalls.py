@@ -107,7 +107,8 @@ def test_a_controller_that_stands_still_for_ten_seconds_in_a_burst_is_told_of_an
         assert not state["shining"]
         if ended.code:
             assert ended.code == 4, ended
-            assert cell.acquire("--resume", run, typed="y\n").code == 0
+            cell.confirm()
+            assert cell.acquire("--resume", run).code == 0
     assert_whole(cell)
 
 

@@ -94,7 +94,7 @@ def test_a_fault_of_the_controller_in_a_burst_ends_the_run_with_four_and_a_safe_
 
 def test_an_arm_pushed_in_a_burst_has_it_taken_again(eki: CellFolder) -> None:
     eki.write(views=[TOP], lights={"kind": "every", "every": 4})
-    eki.faults({"kind": "nudge_arm", "deg": 0.05, "seconds": 2.0, "at_edge": 100})
+    eki.faults({"kind": "nudge_arm", "deg": 0.05, "seconds": 1.0, "at_edge": 100})
     ended = eki.acquire()
     assert ended.code == 0, ended.err
     run = eki.run_folder

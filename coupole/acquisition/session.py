@@ -206,11 +206,12 @@ def _acquire(
         with obeyed_by(control, cell.halt), observer.showing(job.schedule.frames, len(job.schedule.views)):
             try:
                 sequencer.acquire()
-                ended = "done"
             finally:
                 cell.make_safe()
+            _refuse_unsafe_end(cell)
+            ended = "done"
     except BaseException as error:
-        failure = control.interrupted() if control.stop.is_set() and ended != "done" else error
+        failure = control.interrupted() if control.stop.is_set() else error
         ended = "interrupted" if isinstance(failure, Interrupted) else "failed"
         if isinstance(failure, Interrupted):
             raise failure from error
@@ -228,11 +229,22 @@ def _acquire(
         _say_outcome(console, run, outcome, ended)
 
 
+def _refuse_unsafe_end(cell: OpenedCell) -> None:
+    """Raise DeviceError if it is not sure that all is off and at rest, though every frame is there."""
+    if cell.trouble:
+        raise DeviceError(
+            "cell",
+            expected="lights off, the arm at rest and the camera disarmed at the end",
+            happened="; ".join(cell.trouble),
+            remedy="Look at the cell; all frames are stored.",
+        )
+
+
 def _statistics(cell: OpenedCell) -> dict[str, float]:
     """Of the arm's link; empty if its driver has none to give any more."""
     try:
         return dict(cell.robot.statistics())
-    except DeviceError:
+    except Exception:  # noqa: BLE001  the session's end is told without them
         return {}
 
 

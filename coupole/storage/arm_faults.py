@@ -38,7 +38,7 @@ class Confirmation(_Line):
 
 
 class SessionOfArm(_Line):
-    """A session that may move the arm has begun."""
+    """The first session after a confirmation has begun."""
 
     event: Literal["session"] = "session"
     run: str = ""
@@ -94,15 +94,16 @@ class ArmFaults:
         self._append(Confirmation(name=name, note=note))
 
     def begin_session(self, run: str) -> str:
-        """A session of this run begins; returns what was confirmed since the last one, empty if nothing was."""
+        """A session of this run begins; returns the words that no earlier session has begun with, empty if there
+        are none."""
         lines = self.lines()
         since = max((i for i, line in enumerate(lines) if isinstance(line, SessionOfArm)), default=-1) + 1
         faults = [line.message for line in lines if isinstance(line, ArmFault)]
         words = [line for line in lines[since:] if isinstance(line, Confirmation)]
-        self._append(SessionOfArm(run=run))
-        if not words or not faults:
+        if not words:
             return ""
-        return f"{faults[-1]} (confirmed by {words[-1].name}, {words[-1].t})"
+        self._append(SessionOfArm(run=run))
+        return f"{faults[-1] if faults else 'no fault'} (confirmed by {words[-1].name}, {words[-1].t})"
 
     def _append(self, line: _Line) -> None:
         try:

@@ -11,17 +11,21 @@ own work then takes as much world time as in a real cell, and only its waiting i
 from __future__ import annotations
 
 import mmap
+import os
+import select
 import struct
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
-_BLOCK = struct.Struct("<QqqdqqQ")
+_BLOCK = struct.Struct("<QqqdqqQQ")
 """Sequence (odd while being written), machine ns and world ns at the anchor, speed, hurry-until ns, horizon ns,
-1 while the world runs. The client's request, hurry-until ns, follows it."""
+1 while the world runs, its process. The client's request, hurry-until ns, follows it."""
 _SEQUENCE, _WISH = struct.Struct("<Q"), struct.Struct("<q")
 BLOCK_BYTES = _BLOCK.size + _WISH.size
 _NAP_S = 0.02
+_LOOK_EVERY_NS = 20_000_000
+"""How often, by the machine's clock, a reader looks whether the world's process still runs."""
 FOREVER_NS = 2**62
 
 
@@ -79,9 +83,9 @@ class ClockWriter:
     def publish(self, horizon_ns: int, *, alive: bool = True) -> None:
         self._sequence += 2
         pace = self._pace
-        fields = (pace.machine_ns, pace.world_ns, pace.speed, pace.hurry_until_ns, horizon_ns, int(alive))
+        anchor = (pace.machine_ns, pace.world_ns, pace.speed, pace.hurry_until_ns)
         # Whole slices, in this order: `pack_into` would zero the block first, which a reader could see.
-        block = _BLOCK.pack(self._sequence, *fields)
+        block = _BLOCK.pack(self._sequence, *anchor, horizon_ns, int(alive), os.getpid())
         self._memory[:8] = _SEQUENCE.pack(self._sequence - 1)
         self._memory[8 : _BLOCK.size] = block[8:]
         self._memory[:8] = block[:8]
@@ -92,33 +96,69 @@ class ClockWriter:
 
 
 class SharedClock:
-    """A reader's side: `coupole.devices.Clock` on the block at `path`."""
+    """A reader's side: `coupole.devices.Clock` on the block at `path`.
+
+    When the world has ended, or its process was killed, time goes on at the world's speed: whoever waits for
+    something by this clock must not wait for ever.
+    """
+
+    _process: int | None = None
+    """A descriptor that can be read once the world's process has ended; None where there are none."""
 
     def __init__(self, path: Path) -> None:
         with path.open("r+b") as file:
             self._memory = mmap.mmap(file.fileno(), BLOCK_BYTES)
         self._last_ns = 0
+        self._looked_ns = time.monotonic_ns()
+        self._gone_since_ns: int | None = None
+        try:
+            self._process = os.pidfd_open(self._read()[3])
+        except ProcessLookupError:
+            self._gone_since_ns = self._looked_ns
+        except (AttributeError, OSError):  # neither Linux nor a new one: a killed world is not noticed
+            pass
 
-    def _read(self) -> tuple[Pace, int, bool]:
+    def __del__(self) -> None:
+        if self._process is not None:
+            os.close(self._process)
+
+    def _read(self) -> tuple[Pace, int, bool, int]:
         while True:
-            sequence, *pace, horizon_ns, alive = _BLOCK.unpack_from(self._memory)
-            if sequence % 2 == 0 and _SEQUENCE.unpack_from(self._memory)[0] == sequence:
-                return Pace(*pace), horizon_ns, bool(alive)
+            sequence, *pace, horizon_ns, alive, pid = _BLOCK.unpack_from(self._memory)
+            written = sequence % 2 == 0 and _SEQUENCE.unpack_from(self._memory)[0] == sequence
+            if written or self._gone_since_ns is not None:
+                return Pace(*pace), horizon_ns, bool(alive), pid
+            self._look()
 
     @property
     def alive(self) -> bool:
-        return self._read()[2]
+        """True while the world runs."""
+        self._look()
+        return self._gone_since_ns is None
+
+    def _look(self) -> None:
+        """Every now and then, look whether the world has ended."""
+        now_ns = time.monotonic_ns()
+        if self._gone_since_ns is not None or now_ns - self._looked_ns < _LOOK_EVERY_NS:
+            return
+        self._looked_ns = now_ns
+        says_so = not _BLOCK.unpack_from(self._memory)[6]
+        if says_so or (self._process is not None and select.select([self._process], [], [], 0)[0]):
+            self._gone_since_ns = now_ns
 
     def now_ns(self) -> int:
         """World time; it never runs backwards."""
-        pace, horizon_ns, _ = self._read()
+        self._look()
+        if self._gone_since_ns is not None:
+            return self._last_ns + int((time.monotonic_ns() - self._gone_since_ns) * self._read()[0].speed)
+        pace, horizon_ns, _, _ = self._read()
         self._last_ns = max(self._last_ns, min(pace.world_at(time.monotonic_ns()), horizon_ns))
         return self._last_ns
 
     def sleep(self, seconds: float) -> None:
         end_ns = self.now_ns() + int(seconds * 1e9)
         speed = self._read()[0].speed
-        while self.alive and (left_ns := end_ns - self.now_ns()) > 0:
+        while (left_ns := end_ns - self.now_ns()) > 0:
             time.sleep(min(_NAP_S, max(left_ns / 1e9 / speed, 2e-5)))
 
     def hurry(self, until_ns: int) -> None:

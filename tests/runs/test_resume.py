@@ -212,9 +212,9 @@ def standing(tmp_path: Path) -> Iterator[tuple[CellFolder, World]]:
         yield cell, world
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stopped_run_ends_with_130_leaves_the_cell_safe_and_is_resumed(
-    standing: tuple[CellFolder, World], number: signal.Signals
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_stopped_run_ends_with_its_signal_leaves_the_cell_safe_and_is_resumed(
+    standing: tuple[CellFolder, World], number: signal.Signals, code: int
 ) -> None:
     cell, world = standing
     process = cell.start_acquire()
@@ -223,8 +223,8 @@ def test_a_stopped_run_ends_with_130_leaves_the_cell_safe_and_is_resumed(
     process.send_signal(number)
     ended = cells.finish(process)
     assert cells.safe(world)
-    assert ended.code == 130
-    assert ended.document["exit_code"] == 130
+    assert ended.code == code
+    assert ended.document["exit_code"] == code
     assert cells.events(run, "stop")[-1]["outcome"] == "interrupted"
     assert cells.here("status", run, "--json").document["state"] == "interrupted"
     assert cell.acquire("--resume", run).code == 0

@@ -1,0 +1,116 @@
+"""Making a cell safe: everything is tried, nothing waits for another, no signal cuts it short."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from coupole.acquisition import opened_cell
+from coupole.acquisition.opened_cell import OpenedCell
+from coupole.errors import DeviceLost
+
+LOST = DeviceLost("device", expected="an answer", happened="there was none", remedy="None.")
+
+
+def nothing() -> None:
+    """What a device does that has nothing to do."""
+
+
+def cell_of(
+    lights_off: Callable[[], None] = nothing,
+    stop: Callable[[], None] = nothing,
+    disarm: Callable[[], None] = nothing,
+) -> OpenedCell:
+    """A cell whose three devices do just this."""
+    devices: dict[str, Any] = {
+        "ledbox": SimpleNamespace(lights_off=lights_off),
+        "robot": SimpleNamespace(stop=stop),
+        "camera": SimpleNamespace(disarm=disarm),
+    }
+    unused: Any = None
+    return OpenedCell(clock=unused, sensor=unused, simulated=True, world_endpoints=None, identities={}, **devices)
+
+
+def raising(error: BaseException, called: list[str], what: str) -> Callable[[], None]:
+    def act() -> None:
+        called.append(what)
+        raise error
+
+    return act
+
+
+@pytest.mark.parametrize("error", [LOST, ValueError("a defect"), SystemExit(3), KeyboardInterrupt()], ids=repr)
+def test_each_device_is_made_safe_though_the_others_raise_and_all_is_told(error: BaseException) -> None:
+    called: list[str] = []
+    cell = cell_of(*(raising(error, called, what) for what in ("lights off", "arm stopped", "camera disarmed")))
+    cell.make_safe()
+    assert sorted(called) == ["arm stopped", "camera disarmed", "lights off"]
+    assert called[-1] == "camera disarmed"
+    assert [trouble.partition("(")[2].partition(")")[0] for trouble in cell.trouble] == [
+        "lights off",
+        "arm stopped",
+        "camera disarmed",
+    ]
+    assert not cell.arm_confirmed
+
+
+def test_lights_and_arm_wait_neither_for_each_other() -> None:
+    """Each of them ends only when the other has begun."""
+    begun = {"lights": threading.Event(), "arm": threading.Event()}
+    met: list[bool] = []
+
+    def act(mine: str, other: str) -> Callable[[], None]:
+        def run() -> None:
+            begun[mine].set()
+            met.append(begun[other].wait(10.0))
+
+        return run
+
+    cell = cell_of(act("lights", "arm"), act("arm", "lights"))
+    cell.make_safe()
+    assert met == [True, True]
+    assert cell.trouble == []
+    assert cell.arm_confirmed
+
+
+def test_what_hangs_is_given_up_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opened_cell, "_SAFE_WITHIN_S", 0.05)
+    for_ever, disarmed = threading.Event(), threading.Event()
+    cell = cell_of(stop=lambda: for_ever.wait() and None, disarm=disarmed.set)
+    cell.make_safe()
+    for_ever.set()
+    assert disarmed.is_set()
+    assert cell.trouble == ["not sure that it is safe (arm stopped): no answer within 0.05 s"]
+    assert not cell.arm_confirmed
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_second_signal_does_not_cut_it_short(number: signal.Signals) -> None:
+    class CutShortError(Exception):
+        """What the handler outside raises."""
+
+    def handler(*_: Any) -> None:
+        raise CutShortError
+
+    disarmed = threading.Event()
+    before = signal.signal(number, handler)
+    try:
+        cell_of(lights_off=lambda: os.kill(os.getpid(), number), disarm=disarmed.set).make_safe()
+        assert disarmed.is_set()
+        assert signal.getsignal(number) is handler
+    finally:
+        signal.signal(number, before)
+
+
+def test_a_cell_that_is_safe_is_not_commanded_again() -> None:
+    called: list[str] = []
+    cell = cell_of(lights_off=lambda: called.append("off"))
+    cell.make_safe()
+    cell.make_safe()
+    assert called == ["off"]

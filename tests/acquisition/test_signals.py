@@ -1,0 +1,90 @@
+"""Signals that end a session are obeyed at once, whatever the main thread is in."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from coupole.acquisition.observer import Control
+from coupole.acquisition.signals import ENDING, SignalReceived, held, obeyed_by, raise_outside_sessions
+from coupole.errors import Interrupted
+
+BLOCKED_S = 0.8
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_a_session_obeys_while_the_main_thread_is_held_by_a_call(number: signal.Signals) -> None:
+    """The call is one that a signal does not end, as of a disk that stands still."""
+    control, acted_s = Control(), [0.0]
+
+    def act() -> None:
+        acted_s[0] = time.monotonic()
+
+    sender = threading.Timer(0.1, os.kill, (os.getpid(), number))
+    with obeyed_by(control, act):
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {number})  # so that another thread takes the signal
+        try:
+            sender.start()
+            ctypes.CDLL(None).usleep(int(BLOCKED_S * 1e6))
+            ended_s = time.monotonic()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+    assert 0.0 < acted_s[0] < ended_s - BLOCKED_S / 4
+    with pytest.raises(Interrupted) as stopped:
+        control.go_on()
+    assert stopped.value.exit_code == 128 + number
+
+
+def test_the_first_signal_counts() -> None:
+    control = Control()
+    control.stop_by(signal.SIGTERM)
+    control.stop_by(signal.SIGINT)
+    assert control.interrupted().exit_code == 143
+
+
+def test_sigusr1_pauses_and_continues_and_stops_nothing() -> None:
+    control, acts = Control(), []
+    with obeyed_by(control, lambda: acts.append(1)):
+        os.kill(os.getpid(), signal.SIGUSR1)
+        assert control.pause.wait(5.0)
+        os.kill(os.getpid(), signal.SIGUSR1)
+        assert not control.pause.is_set()
+    assert not control.stop.is_set()
+    assert acts == []
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_outside_sessions_a_signal_raises_and_after_one_again(number: signal.Signals) -> None:
+    before = {one: signal.getsignal(one) for one in ENDING}
+    try:
+        raise_outside_sessions()
+        for _ in range(2):
+            with pytest.raises(SignalReceived) as received:
+                os.kill(os.getpid(), number)
+            assert received.value.number == number
+            with obeyed_by(Control(), lambda: None):
+                os.kill(os.getpid(), number)
+            with held():
+                os.kill(os.getpid(), number)
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
+def test_a_hang_up_that_is_ignored_stays_ignored() -> None:
+    before = {one: signal.getsignal(one) for one in ENDING}
+    control = Control()
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        raise_outside_sessions()
+        with obeyed_by(control, lambda: None):
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert not control.stop.is_set()
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)

@@ -1,0 +1,300 @@
+"""A small run in which the k-th call of any device fails, and what must be true after it.
+
+The failure is put between the session and the real drivers, which speak to a real world. Used by a test that draws
+a few cases, and by `tools/fail_every_call.py`, which goes through all.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import cells
+from cells import SIDE, TOP, CellFolder, Ended
+from places import REPO
+
+from coupole.acquisition import opened_cell
+from coupole.errors import DeviceError, DeviceTimeout
+from sim.world.client import World
+
+LIGHTS = {"kind": "every", "every": 45}
+"""24 LEDs."""
+SPEED = 2.0
+HANG_S = 2.5
+"""Of the world's time; longer than any driver waits for an answer by default."""
+SIGNALS = {"sigint": signal.SIGINT, "sigterm": signal.SIGTERM, "sighup": signal.SIGHUP}
+KINDS = ("error", "unexpected", "hang", *SIGNALS, "sigkill", "world")
+CODES = {
+    "error": {0, 4},
+    "unexpected": {1, 4},
+    "hang": {0, 4},
+    "sigint": {0, 130},
+    "sigterm": {0, 143},
+    "sighup": {0, 129},
+    "sigkill": {-signal.SIGKILL},
+    "world": {0, 4},
+}
+"""Exit codes; 0 where the call was one whose failure the run bears, or came when all was done."""
+DARK_WITHIN_S, STILL_WITHIN_S = 0.1, 2.5
+"""From the event, on the world's clock, where box and arm still listen. To brake from full speed takes 1.74 s."""
+WATCHDOG_S = 2.0
+
+
+class UnexpectedError(Exception):
+    """A defect, such as any line may have."""
+
+
+@dataclass
+class Failure:
+    """Counts the calls of all devices; the k-th one fails in its own way, or the first one of a name."""
+
+    k: int
+    kind: str
+    name: str = ""
+    world_pid: int = 0
+    on_event: Callable[[], None] = lambda: None
+    calls: list[str] = field(default_factory=list)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def __call__(self, device: str, method: str, clock: Any) -> None:
+        with self._lock:
+            called = f"{device}.{method}"
+            mine = len(self.calls) + 1 == self.k or (called == self.name and called not in self.calls)
+            self.calls.append(called)
+        if not mine:
+            return
+        self.on_event()
+        match self.kind:
+            case "error":
+                raise DeviceError(device, expected="an answer", happened="an error was put in", remedy="None.")
+            case "unexpected":
+                raise UnexpectedError(f"put into {device}.{method}")
+            case "hang":
+                clock.sleep(HANG_S)
+                raise DeviceTimeout(device, expected="an answer", happened="it hung", remedy="None.")
+            case "world":
+                os.kill(self.world_pid, signal.SIGKILL)
+            case "sigkill":
+                os.kill(os.getpid(), signal.SIGKILL)
+            case name:
+                os.kill(os.getpid(), SIGNALS[name])
+
+
+class Watched:
+    """A driver each of whose calls is counted, and may fail before it reaches the device."""
+
+    def __init__(self, real: Any, device: str, failure: Failure, clock: Any) -> None:
+        self._real, self._device, self._failure, self._clock = real, device, failure, clock
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._real, name)
+        if not callable(value):
+            return value
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            self._failure(self._device, name, self._clock)
+            return value(*arguments, **named)
+
+        return call
+
+    def close(self) -> None:
+        """The real one is closed, whatever is put in: processes and sockets of a case must not outlive it."""
+        try:
+            self._failure(self._device, "close", self._clock)
+        finally:
+            self._real.close()
+
+
+def cell_in(folder: Path) -> CellFolder:
+    """Two views of 24 LEDs whose world is kept outside; the box drops one edge, so that a shot is taken again."""
+    cell = CellFolder(folder, speed=SPEED)
+    cell.rig_data["ledbox"]["settings"]["watchdog_s"] = WATCHDOG_S * SPEED
+    cell.join()
+    cell.write(views=[TOP, SIDE], lights=LIGHTS)
+    return cell
+
+
+def acquire(cell: CellFolder, failure: Failure, *options: str | Path) -> Ended:
+    """The session in this process, its devices watched."""
+    open_device = opened_cell._open_device
+
+    def open_watched(rig: Any, kind: str, clock: Any, *arguments: Any, **named: Any) -> Any:
+        name = {"ledbox": "led box"}.get(kind, kind)
+        return Watched(open_device(rig, kind, clock, *arguments, **named), name, failure, clock)
+
+    with mock.patch.object(opened_cell, "_open_device", open_watched):
+        return cell.acquire(*options)
+
+
+@dataclass
+class Case:
+    """What came of one case."""
+
+    k: int
+    kind: str
+    call: str = ""
+    code: int = 0
+    dark_s: float | None = None
+    """From the event until no lamp shone, on the world's clock; None if none shone, or the world died."""
+    still_s: float | None = None
+    """From the event until the arm stood; None if it did, or the world died."""
+    wrong: list[str] = field(default_factory=list)
+
+    def line(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def count_calls(folder: Path) -> list[str]:
+    """Names of all calls of a session without failure, in their order."""
+    cell, failure = cell_in(folder), Failure(0, "")
+    with cell.world({"kind": "drop_trigger", "edge": 9}):
+        ended = acquire(cell, failure)
+    assert ended.code == 0, ended
+    assert ended.document["reshot"] == 1
+    return failure.calls
+
+
+def run_case(folder: Path, k: int, kind: str) -> Case:
+    """Run the plan with the k-th call failing, look at the cell, resume the run, look at what is stored."""
+    cell, case = cell_in(folder), Case(k, kind)
+    with cell.world({"kind": "drop_trigger", "edge": 9}) as world:
+        watch = _Watch(world)
+        failure = Failure(k, kind, world.endpoints["pid"], watch.begin)
+        if kind == "sigkill":
+            ended = _killed(cell, k, watch)
+        else:
+            ended = acquire(cell, failure)
+            case.call = failure.calls[k - 1] if len(failure.calls) >= k else ""
+        case.code = ended.code
+        if ended.code not in CODES[kind]:
+            case.wrong.append(f"exit code {ended.code}: {ended.err[-500:]}")
+        if kind != "world":
+            case.dark_s, case.still_s = watch.end()
+            case.wrong += _wrong_in_the_cell(case, world)
+    runs = sorted((folder / "storage").glob("2*/run.json"))
+    if runs and kind != "sigkill":
+        case.wrong += _wrong_in_the_journal(runs[0].parent, ended)
+    case.wrong += _wrong_after_resuming(cell, runs[0].parent if runs else None, ended)
+    return case
+
+
+class _Watch:
+    """Looks at the world every few milliseconds, from the event until the session has ended, nothing shines and
+    the arm stands."""
+
+    def __init__(self, world: World) -> None:
+        self._world, self._thread = world, threading.Thread(target=self._look, daemon=True)
+        self._session_over = threading.Event()
+        self._dark_s: float | None = None
+        self._still_s: float | None = None
+
+    def begin(self) -> None:
+        """The event is now."""
+        self._event_s = self._world.clock.now_ns() / 1e9
+        self._thread.start()
+
+    def end(self) -> tuple[float | None, float | None]:
+        """Seconds from the event until it was dark, and until the arm stood."""
+        self._session_over.set()
+        if self._thread.ident is not None:
+            self._thread.join(cells.PATIENCE_S)
+        return self._dark_s, self._still_s
+
+    def _look(self) -> None:
+        end_s = time.monotonic() + cells.PATIENCE_S
+        while time.monotonic() < end_s:
+            try:
+                state = self._world.ask("state")
+            except (DeviceError, ValueError):  # the world was killed
+                return
+            late_s = state["t_s"] - self._event_s
+            lit, moves = bool(state["shining"] or state["panels"]), state["arm_moving"]
+            if lit:
+                self._dark_s = late_s
+            if moves:
+                self._still_s = late_s
+            if self._session_over.is_set() and not lit and not moves:
+                return
+            time.sleep(0.002)
+
+
+def _killed(cell: CellFolder, k: int, watch: _Watch) -> Ended:
+    """The session in a process of its own, which kills itself at its k-th call."""
+    code = (
+        "import sys; sys.path[:0] = sys.argv[1:3]\n"
+        "import failing_calls\n"
+        "failing_calls.acquire_and_die(sys.argv[3], int(sys.argv[4]))\n"
+    )
+    arguments = [str(REPO / "tests"), str(REPO / "tests" / "faults"), str(cell.folder), str(k)]
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=REPO,
+    ) as process:
+        out, err = process.communicate(timeout=cells.PATIENCE_S)
+        watch.begin()
+    return Ended(process.returncode, out, err)
+
+
+def acquire_and_die(folder: str, k: int) -> None:
+    """In a process of its own: kills it at the k-th call of its devices."""
+    cell = CellFolder(Path(folder), speed=SPEED, write_now=False)
+    sys.exit(acquire(cell, Failure(k, "sigkill")).code)
+
+
+def _wrong_in_the_cell(case: Case, world: World) -> list[str]:
+    wrong = []
+    state = world.ask("state")
+    if state["shining"] or state["panels"] or state["arm_moving"]:
+        wrong.append(f"the cell is not safe: {state}")
+    listens = case.kind != "sigkill" and not case.call.startswith("led box")
+    limit_s = (DARK_WITHIN_S if listens else WATCHDOG_S * SPEED) + (HANG_S if case.kind == "hang" else 0.0)
+    if case.dark_s is not None and case.dark_s > limit_s + 0.1 * SPEED:
+        wrong.append(f"dark {case.dark_s:.3f} s after the event, {limit_s:g} s promised")
+    if case.still_s is not None and case.still_s > STILL_WITHIN_S + (HANG_S if case.kind == "hang" else 0.0):
+        wrong.append(f"the arm stood {case.still_s:.3f} s after the event")
+    return wrong
+
+
+def _wrong_in_the_journal(run: Path, ended: Ended) -> list[str]:
+    stops = cells.events(run, "stop")
+    if not stops:
+        return [] if not cells.events(run) else ["the journal has no line of the session's end"]
+    done = stops[-1]["outcome"] == "done"
+    expected = {0: "done", 130: "interrupted", 143: "interrupted", 129: "interrupted"}.get(ended.code, "failed")
+    if stops[-1]["outcome"] != expected and not (ended.code == 4 and done):
+        return [f"the journal says {stops[-1]['outcome']}, the exit code was {ended.code}"]
+    proven = len({event["shot"] for event in cells.events(run, "frame")})
+    return (
+        ["the journal says done, but frames are missing"]
+        if done and proven < cells.about(run)["expected"]["frames"]
+        else []
+    )
+
+
+def _wrong_after_resuming(cell: CellFolder, run: Path | None, ended: Ended) -> list[str]:
+    """In a new world; a fault of the arm is confirmed first, and must be asked for."""
+    again = ("--resume", run) if run is not None else ()
+    with cell.world():
+        resumed = cell.acquire(*again)
+        if resumed.code == 4 and "word of a person" in resumed.err:
+            cell.confirm()
+            resumed = cell.acquire(*again)
+    if resumed.code != 0:
+        return [f"the run was not resumed: {resumed.code} {resumed.err[-500:]}"]
+    try:
+        cells.assert_each_shot_proven_once(cell.run_folder)
+    except AssertionError as error:
+        return [f"after resuming: {str(error)[:500]}"]
+    return [f"mislabelled: {line}" for line in cells.mislabelled(cell, cell.run_folder)]

@@ -1,0 +1,56 @@
+"""A few of the thousands of cases of `tools/fail_every_call.py`, others every day."""
+
+from __future__ import annotations
+
+import datetime
+import random
+from pathlib import Path
+
+import cells
+import pytest
+from failing_calls import KINDS, Failure, acquire, cell_in, count_calls, run_case
+
+CASES = 6
+
+
+@pytest.mark.timeout(600)
+def test_whatever_call_fails_in_whatever_way_the_cell_is_safe_and_the_run_goes_on(tmp_path: Path) -> None:
+    today = datetime.datetime.now(datetime.UTC).date()
+    drawn = random.Random(today.toordinal())
+    (tmp_path / "calls").mkdir()
+    calls = len(count_calls(tmp_path / "calls"))
+    for number in range(CASES):
+        k, kind = drawn.randint(1, calls), drawn.choice(KINDS)
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        case = run_case(folder, k, kind)
+        assert not case.wrong, (today, case)
+
+
+def test_an_unexpected_error_ends_with_one_a_safe_cell_a_true_journal_and_its_trace(tmp_path: Path) -> None:
+    cell = cell_in(tmp_path)
+    with cell.world() as world:
+        ended = acquire(cell, Failure(0, "unexpected", "led box.edges"))
+        assert cells.safe(world)
+    assert ended.code == 1
+    run = cell.run_folder
+    assert cells.events(run, "stop")[-1]["outcome"] == "failed"
+    (fault,) = cells.events(run, "fault")
+    assert fault["kind"] == "UnexpectedError"
+    (trace,) = run.glob("trace-*.txt")
+    assert "put into led box.edges" in trace.read_text()
+    assert "lights are off, the arm is at rest, the camera is disarmed" in ended.err
+    assert str(trace) in ended.err
+    assert f"--resume {run}" in ended.err
+    assert (run / "report.html").exists()
+
+
+def test_an_unsafe_end_is_told_and_is_no_success(tmp_path: Path) -> None:
+    """All frames are there, but nobody knows whether the lights went off."""
+    cell = cell_in(tmp_path)
+    with cell.world():
+        ended = acquire(cell, Failure(0, "unexpected", "led box.lights_off"))
+    assert ended.code == 4
+    assert "not sure that it is safe (lights off)" in ended.err
+    assert ended.document["missing"] == 0
+    assert "lights off" in cells.events(cell.run_folder, "fault")[-1]["message"]

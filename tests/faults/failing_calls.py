@@ -28,6 +28,7 @@ from sim.world.client import World
 
 LIGHTS = {"kind": "every", "every": 45}
 """24 LEDs."""
+EXPOSURE_US = 20_000
 SPEED = 2.0
 HANG_S = 2.5
 """Of the world's time; longer than any driver waits for an answer by default."""
@@ -55,20 +56,25 @@ class UnexpectedError(Exception):
 
 @dataclass
 class Failure:
-    """Counts the calls of all devices; the k-th one fails in its own way, or the first one of a name."""
+    """Counts the calls of all devices; the k-th one fails in its own way, or the first one of a `name`, if given
+    `after` the first one of another."""
 
     k: int
     kind: str
     name: str = ""
+    after: str = ""
     world_pid: int = 0
     on_event: Callable[[], None] = lambda: None
     calls: list[str] = field(default_factory=list)
+    _named: bool = False
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def __call__(self, device: str, method: str, clock: Any) -> None:
         with self._lock:
             called = f"{device}.{method}"
-            mine = len(self.calls) + 1 == self.k or (called == self.name and called not in self.calls)
+            named = called == self.name and not self._named and (not self.after or self.after in self.calls)
+            self._named |= named
+            mine = named or len(self.calls) + 1 == self.k
             self.calls.append(called)
         if not mine:
             return
@@ -119,7 +125,7 @@ def cell_in(folder: Path) -> CellFolder:
     cell = CellFolder(folder, speed=SPEED)
     cell.rig_data["ledbox"]["settings"]["watchdog_s"] = WATCHDOG_S * SPEED
     cell.join()
-    cell.write(views=[TOP, SIDE], lights=LIGHTS)
+    cell.write(views=[TOP, SIDE], lights=LIGHTS, exposure={"kind": "fixed", "exposure_us": EXPOSURE_US})
     return cell
 
 
@@ -166,9 +172,10 @@ def count_calls(folder: Path) -> list[str]:
 def run_case(folder: Path, k: int, kind: str) -> Case:
     """Run the plan with the k-th call failing, look at the cell, resume the run, look at what is stored."""
     cell, case = cell_in(folder), Case(k, kind)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs this may have ignored it
     with cell.world({"kind": "drop_trigger", "edge": 9}) as world:
         watch = _Watch(world)
-        failure = Failure(k, kind, world.endpoints["pid"], watch.begin)
+        failure = Failure(k, kind, world_pid=world.endpoints["pid"], on_event=watch.begin)
         if kind == "sigkill":
             ended = _killed(cell, k, watch)
         else:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import datetime
 import random
+import threading
 from pathlib import Path
 
 import cells
 import pytest
+from cells import TOP
 from failing_calls import KINDS, Failure, acquire, cell_in, count_calls, run_case
+
+from coupole.acquisition.recorder import RunRecorder
 
 CASES = 6
 
@@ -54,3 +58,28 @@ def test_an_unsafe_end_is_told_and_is_no_success(tmp_path: Path) -> None:
     assert "not sure that it is safe (lights off)" in ended.err
     assert ended.document["missing"] == 0
     assert "lights off" in cells.events(cell.run_folder, "fault")[-1]["message"]
+
+
+@pytest.mark.parametrize("call", ["camera.next_frame", "led box.poll_log", "robot.measured"])
+def test_lights_are_off_before_the_disk_hears_of_an_error(
+    tmp_path: Path, call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk may take seconds: nothing shines when it is asked to keep what was taken."""
+    cell = cell_in(tmp_path)
+    cell.write(views=[TOP], lights={"kind": "every", "every": 4})
+    shone: list[list[int]] = []
+    commit = RunRecorder.commit
+    with cell.world() as world:
+        failed = threading.Event()
+
+        def watched_commit(self: RunRecorder, *, now: bool) -> None:
+            if failed.is_set() and now:
+                shone.extend(world.ask("state")["shining"] for _ in range(20))
+            commit(self, now=now)
+
+        monkeypatch.setattr(RunRecorder, "commit", watched_commit)
+        in_a_burst = Failure(0, "unexpected", call, on_event=failed.set, after="led box.start")
+        ended = acquire(cell, in_a_burst)
+    assert ended.code == 1
+    assert len(shone) >= 20
+    assert not any(shone)

@@ -28,10 +28,15 @@ class SignalReceived(KeyboardInterrupt):
 
 
 def raise_outside_sessions() -> None:
-    """Have each signal raise SignalReceived from now on. A hang-up that is ignored (`nohup`) stays so."""
+    """Have each signal raise SignalReceived from now on. A hang-up that is ignored (`nohup`) stays so; Ctrl-C and
+    SIGTERM always count, also in the background of a script."""
     for number in ENDING:
-        if signal.getsignal(number) is not signal.SIG_IGN:
+        if not _stays_ignored(number):
             signal.signal(number, _raise)
+
+
+def _stays_ignored(number: int) -> bool:
+    return number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
 
 
 def _raise(number: int, _: Any) -> None:
@@ -84,11 +89,11 @@ def obeyed_by(control: Control, act: Callable[[], object]) -> Iterator[None]:
 
 @contextmanager
 def _handlers(wanted: dict[signal.Signals, Any]) -> Iterator[None]:
-    """These handlers, in the main thread, but not for signals that are ignored; the former ones at the end."""
+    """These handlers, in the main thread; the former ones at the end."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    wanted = {n: handler for n, handler in wanted.items() if signal.getsignal(n) is not signal.SIG_IGN}
+    wanted = {number: handler for number, handler in wanted.items() if not _stays_ignored(number)}
     before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
     try:
         yield

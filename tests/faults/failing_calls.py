@@ -266,6 +266,8 @@ def _wrong_in_the_cell(case: Case, world: World) -> list[str]:
     state = world.ask("state")
     if state["shining"] or state["panels"] or state["arm_moving"]:
         wrong.append(f"the cell is not safe: {state}")
+    if case.code == 0:  # the failure was borne: there was nothing to end
+        return wrong
     listens = case.kind != "sigkill" and not case.call.startswith("led box")
     limit_s = (DARK_WITHIN_S if listens else WATCHDOG_S * SPEED) + (HANG_S if case.kind == "hang" else 0.0)
     if case.dark_s is not None and case.dark_s > limit_s + 0.1 * SPEED:

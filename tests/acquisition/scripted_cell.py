@@ -1,7 +1,7 @@
 """A cell in memory for the burst's loop: box, camera, arm, clock and recorder that do what a take says.
 
-Time stands still but for the clock's `sleep`. Frames reach the grabber's thread while the clock sleeps, or while the
-box is asked for its log; the cell waits until the thread has them, so that nothing depends on the machine.
+Time stands still but for the clock's `sleep`. Frames reach the grabber's thread while the clock sleeps, or while
+the box is asked for its log; the cell waits until the thread has them, so that nothing depends on the machine.
 """
 
 from __future__ import annotations
@@ -137,6 +137,9 @@ class Cell:
     arrived: int = 0
     frames_at_poll: int = 0
     heard_ns: int = 1
+    confirmed: int = 0
+    """Frames that had come one round before the arm was last heard of."""
+    arrived_last_round: int = 0
     awaited_news: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -206,7 +209,8 @@ class Cell:
         if self.burst_us >= 1e6 * self.moves_at_s:
             raise MOVED
         if self.burst_us <= 1e6 * self.heard_until_s:
-            self.heard_ns = max(self.heard_ns, self.now_ns())
+            self.heard_ns, self.confirmed = max(self.heard_ns, self.now_ns()), self.arrived_last_round
+        self.arrived_last_round = self.arrived
         return self.heard_ns
 
     def await_news(self) -> ArmState:

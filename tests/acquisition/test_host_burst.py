@@ -124,10 +124,6 @@ class Cell:
     def disarm(self) -> None:
         self.done.append("disarm")
 
-    # the cell
-    def make_safe(self) -> None:
-        self.done.append("made safe")
-
     # recorder
     def put(self, frame: Frame, exposure_us: int) -> int:
         self.slots += 1
@@ -144,8 +140,7 @@ class Cell:
 
     def fire(self, burst: Burst) -> Verdict:
         arm = SimpleNamespace(attend=lambda: None, await_news=lambda: None)
-        robot = SimpleNamespace(measured=lambda: None)
-        cell = SimpleNamespace(ledbox=self, camera=self, clock=self, robot=robot, make_safe=self.make_safe)
+        cell = SimpleNamespace(ledbox=self, camera=self, clock=self, robot=SimpleNamespace(measured=lambda: None))
         note = lambda *given, **more: self.noted.append(given)  # noqa: E731
         runner = HostBurst(cell, self, arm, lambda *_: None, lambda: None, note)  # type: ignore[arg-type]
         return runner.fire(burst, FORMAT)
@@ -226,7 +221,7 @@ def test_a_failure_leaves_no_light_and_notes_what_was_given() -> None:
     cell, burst = Cell({2: "fails"}), burst_of()
     with pytest.raises(ZeroDivisionError):
         cell.fire(burst)
-    assert cell.done[-3:] == ["all off", "disarm", "made safe"]
+    assert cell.done[-2:] == ["all off", "disarm"]
     assert cell.proven == {}
     assert len(cell.freed) == cell.slots == 2
     ((_, log, *_),) = cell.noted
@@ -238,7 +233,7 @@ def test_a_light_that_cannot_be_switched_off_is_counted_as_long_as_that_was_trie
     cell, burst = Cell({1: "all fail"}), burst_of()
     with pytest.raises(ZeroDivisionError):
         cell.fire(burst)
-    assert cell.done[-2:] == ["disarm", "made safe"]
+    assert cell.done[-1] == "disarm"
     ((_, log, *_),) = cell.noted
     assert list(log["led"]) == list(burst.table["led"][:2])
     assert log["on_us"][1] >= 700_000

@@ -251,6 +251,6 @@ def test_all_errors_of_the_queue_are_told_and_none_is_left_for_the_next_call(
     box: LedBox, world: LedBoxWorld
 ) -> None:
     send_behind_its_back(world, b"FOO\nOUTP:PAN7 1\nBAR\n")
-    with pytest.raises(DeviceRefused, match="-113 .*FOO; -114 .*panel 7.*; -113 .*BAR"):
+    with pytest.raises(DeviceRefused, match=r"-113 .*FOO; -114 .*panel 7.*; -113 .*BAR"):
         box.running()
     assert not box.running()

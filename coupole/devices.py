@@ -184,7 +184,12 @@ class LedBox(Protocol):
         ...
 
     def lights_off(self) -> None:
-        """Abort a running burst, switch all LEDs and panels off. Safe to call at any time."""
+        """Abort a running burst, switch all LEDs and panels off; returns when the box has confirmed it.
+
+        May be called from any thread at any moment, also while another call is in progress. It does not wait for
+        that call: a box that knows a device clear is dark within 100 ms even while a table is being uploaded.
+        Other calls in progress end with a DeviceError, and light nothing after this one has returned.
+        """
         ...
 
     def panel(self, panel: int, on: bool) -> None:

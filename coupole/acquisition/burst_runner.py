@@ -150,6 +150,7 @@ class BurstRunner:
                 box.panel(burst.panel, False)
         except ArmMovedError:
             box.lights_off()
+            self._upload = None  # that has ended it: `fire` uploads anew
             camera.disarm()
             self._end(running, camera=None)
             raise

@@ -1,7 +1,8 @@
 """The LED control box, by SCPI over a serial line or USBTMC (docs/reference/ledbox-protocol.md).
 
 Every message ends in `SYSTem:ERRor?`, so every command is confirmed and costs one round trip. The box's two
-table banks are used alternately: while one runs, the next table is uploaded into the other.
+table banks are used alternately: while one runs, the next table is uploaded into the other, in blocks between
+which other messages pass. `lights_off` waits for none of them: it begins with a device clear.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from coupole.devices import STEP_DTYPE, Clock, Deadline, Identity, Step, StepRecord
 from coupole.errors import DeviceError, DeviceFault, DeviceRefused, DeviceTimeout
-from drivers.ledbox.scpi import REPLY_MARGIN_S, Link, ScpiSession
+from drivers.ledbox.link import CallEnded, Link
+from drivers.ledbox.scpi import REPLY_MARGIN_S, ScpiSession
 from drivers.ledbox.serial_link import no_port, open_serial
 from drivers.ledbox.usbtmc import UsbtmcLink
 from drivers.ledbox.wire import RECORD_BYTES, STEP_BYTES, pack, unpack_log
@@ -28,7 +30,14 @@ _BLOCK_TIMEOUT_S = 2.2
 _POLL_S, _POLL_OVERHEAD_BYTES = 0.055, 130
 """Duration of a poll during a burst, and its bytes on the line apart from records."""
 _MAX_RECORDS_PER_POLL = 512
+_BLOCK_BYTES = 512
+"""Largest part of a table in one message: what a box that lacks the device clear lets another command wait for."""
+_BLOCK_OVERHEAD_BYTES, _BLOCK_OVERHEAD_S = 70, 0.003
 _UPLOAD_OVERHEAD_S, _BITS_PER_BYTE = 0.1, 10
+_UNDEFINED_HEADER = "-113"
+_FIRST_PROTOCOL = "1.0"
+_CLEARS_AT_ONCE = 5
+"""Threads that may switch the lights off at the same time; each clears the box, and ends the others' messages."""
 _SHORTEST_PERIOD_US = 100
 _FLASH_MARGIN_S = 5.0
 """A flash that lasts this much longer than requested counts as not ended."""
@@ -55,14 +64,18 @@ class Settings(BaseModel):
 
     def upload_s(self, steps: int) -> float:
         """Time to upload a table of `steps` steps over a serial line."""
-        return STEP_BYTES * steps * _BITS_PER_BYTE / self.baud + _UPLOAD_OVERHEAD_S
+        table_bytes = STEP_BYTES * steps
+        blocks = -(-table_bytes // _BLOCK_BYTES)
+        line_s = (table_bytes + blocks * _BLOCK_OVERHEAD_BYTES) * _BITS_PER_BYTE / self.baud
+        return line_s + blocks * _BLOCK_OVERHEAD_S + _UPLOAD_OVERHEAD_S
 
 
 class LedBox:
     """The box: a `coupole.devices.TableLedBox`.
 
     Opening resets it, which also clears a latched fault of the box (watchdog, over-temperature).
-    Each call may raise DeviceTimeout, DeviceLost, DeviceRefused (with the box's error) or DeviceFault.
+    Each call may raise DeviceTimeout, DeviceLost, DeviceRefused (with the box's error), DeviceFault, or another
+    DeviceError if `lights_off` was called meanwhile.
     """
 
     runs_tables = True
@@ -75,9 +88,11 @@ class LedBox:
         self._running_bank: int | None = None
         self._started: NDArray[np.void] = np.empty(0, STEP_DTYPE)
         self._next_record = 0
+        self._protocol = _FIRST_PROTOCOL
         self._scpi = ScpiSession(settings.name, settings.port, self._open(), clock)
         try:
             self._identity = self._greet()
+            self._protocol = self._ask_protocol()
             self.led_count = self._set_up()
         except BaseException:
             self.close()
@@ -96,35 +111,24 @@ class LedBox:
             "LEDs": str(self.led_count),
             "hottest board": f"{self._scpi.number(celsius)} C",
             "watchdog": f"{self._scpi.number(watchdog_s):g} s",
+            "device clear": "yes" if self._clears else f"no: the box speaks protocol {self._protocol}",
         }
 
     def load(self, table: NDArray[np.void]) -> None:
-        """Upload into the bank that is not running. At 115200 baud 1080 records take 1.5 s, during which
-        nothing is polled; the box keeps the log."""
+        """Upload into the bank that is not running. At 115200 baud 1080 records take 1.8 s, or longer while other
+        threads poll between their blocks."""
         payload = self._payload(table)
         if payload in self._banks:
             return
         bank = 1 - (self._last_loaded if self._running_bank is None else self._running_bank)
-        self._upload(bank, payload)
+        with self._scpi.call():
+            self._upload(bank, payload)
 
     def start(self, table: NDArray[np.void]) -> None:
         """Run a loaded table. A bank with a wrong CRC-32 is uploaded once more; if still wrong, it is refused."""
         payload = self._payload(table)
-        if payload not in self._banks:
-            self._refuse("a loaded table", "neither bank holds this one", "Call load() first.")
-        bank = self._banks.index(payload)
-        if self._crc(bank) != zlib.crc32(payload):
-            self._upload(bank, payload)
-            if (found := self._crc(bank)) != (wanted := zlib.crc32(payload)):
-                self._banks[bank] = None
-                self._refuse(
-                    f"CRC-32 {wanted} in bank {bank}",
-                    f"it is {found} after two uploads",
-                    "Check the cable for interference.",
-                )
-        self._scpi.ask("INIT", 0)
-        self._running_bank, self._next_record = bank, 0
-        self._started = table.copy()
+        with self._scpi.call():
+            self._start(payload, table)
 
     def poll_log(self) -> NDArray[np.void]:
         """New records, STEP_RECORD_DTYPE [k]: all steps that had finished when the last round trip of this call
@@ -148,8 +152,9 @@ class LedBox:
         """Run a table of one step without edge: the box times the flash, and runs as long as the LED is lit."""
         step = Step(led, on_us, 0, max(on_us, _SHORTEST_PERIOD_US), sends_edge=False)
         table = np.array([astuple(step)], STEP_DTYPE)
-        self.load(table)
-        self.start(table)
+        with self._scpi.call():
+            self.load(table)
+            self.start(table)
 
     def lit(self) -> bool:
         return self.running()
@@ -158,6 +163,10 @@ class LedBox:
         """Wait until the box reports that the step has ended, and read its record."""
         on_s = float(self._started["on_us"].sum()) * 1e-6
         deadline = Deadline(self._clock, on_s + _FLASH_MARGIN_S)
+        with self._scpi.call():
+            return self._await_end(on_s, deadline)
+
+    def _await_end(self, on_s: float, deadline: Deadline) -> StepRecord:
         while self.running():
             if deadline.expired:
                 raise DeviceTimeout(
@@ -173,9 +182,18 @@ class LedBox:
         return StepRecord(*records[0].tolist())
 
     def lights_off(self) -> None:
-        """Abort, and wait for the confirmation. Raises only if a second try fails too: by then a box that waited
-        for the rest of an incomplete upload has discarded it. Takes about 5 s at most."""
+        """Device clear, at which the box goes dark whatever it is being sent; then abort, and wait for the
+        confirmation. Calls of other threads end with DeviceError and light nothing any more.
+
+        A box without device clear first gets the rest of the message that is being sent. Raises only if a second
+        try fails too: by then such a box has discarded an incomplete upload. Takes about 5 s at most.
+        """
         self._running_bank = None
+        if self._clears:
+            with contextlib.suppress(DeviceError):  # a link that is lost is told below
+                self._scpi.device_clear()
+        else:
+            self._scpi.end_calls()
         try:
             self._abort()
         except DeviceTimeout:
@@ -196,8 +214,11 @@ class LedBox:
         self._scpi.close()
 
     def _abort(self) -> None:
-        with contextlib.suppress(DeviceFault, DeviceRefused):  # older errors in the queue: ABORt was executed
-            self._scpi.ask("ABOR", 0)
+        for _ in range(_CLEARS_AT_ONCE):
+            with contextlib.suppress(CallEnded):  # by another thread's lights_off: ask again
+                with contextlib.suppress(DeviceFault, DeviceRefused):  # older errors: ABORt was executed
+                    self._scpi.ask("ABOR", 0)
+                return
 
     # Opening.
 
@@ -224,6 +245,21 @@ class LedBox:
         vendor, model, serial, firmware = fields
         return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
 
+    def _ask_protocol(self) -> str:
+        """Version of the protocol that the box speaks; the first one could not be asked."""
+        try:
+            (version,) = self._scpi.ask("SYST:PROT?", 1)
+        except DeviceRefused as refused:
+            if _UNDEFINED_HEADER not in refused.happened:
+                raise
+            return _FIRST_PROTOCOL
+        return str(version)
+
+    @property
+    def _clears(self) -> bool:
+        """The box knows the device clear, and tables in blocks."""
+        return self._protocol != _FIRST_PROTOCOL
+
     def _set_up(self) -> int:
         settings = self._settings
         commands = [
@@ -244,11 +280,29 @@ class LedBox:
 
     # Tables and log.
 
+    def _start(self, payload: bytes, table: NDArray[np.void]) -> None:
+        if payload not in self._banks:
+            self._refuse("a loaded table", "neither bank holds this one", "Call load() first.")
+        bank = self._banks.index(payload)
+        if self._crc(bank) != zlib.crc32(payload):
+            self._upload(bank, payload)
+            if (found := self._crc(bank)) != (wanted := zlib.crc32(payload)):
+                self._banks[bank] = None
+                self._refuse(
+                    f"CRC-32 {wanted} in bank {bank}",
+                    f"it is {found} after two uploads",
+                    "Check the cable for interference.",
+                )
+        self._scpi.ask("INIT", 0)
+        self._running_bank, self._next_record = bank, 0
+        self._started = table.copy()
+
     def _upload(self, bank: int, payload: bytes) -> None:
         self._banks[bank] = None
-        length = str(len(payload))
-        block = f"#{len(length)}{length}".encode("ascii") + payload
-        self._scpi.ask(f"SEQ:BANK {bank};DATA ".encode("ascii") + block, 0)
+        size = _BLOCK_BYTES if self._clears else max(1, len(payload))
+        for first in range(0, max(1, len(payload)), size):
+            header = f"SEQ:BANK {bank};DATA{':APP' if first else ''} ".encode("ascii")
+            self._scpi.ask(header + _block(payload[first : first + size]), 0)
         self._banks[bank], self._last_loaded = payload, bank
 
     def _payload(self, table: NDArray[np.void]) -> bytes:
@@ -305,3 +359,9 @@ class LedBox:
 
     def _refuse(self, expected: str, happened: str, remedy: str) -> NoReturn:
         raise DeviceRefused(self._settings.name, expected=expected, happened=happened, remedy=remedy)
+
+
+def _block(payload: bytes) -> bytes:
+    """`payload` as an IEEE 488.2 definite-length block."""
+    length = str(len(payload))
+    return f"#{len(length)}{length}".encode("ascii") + payload

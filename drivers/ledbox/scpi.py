@@ -5,13 +5,16 @@ Responses follow IEEE 488.2, chapter 8: units separated by `;`, ended by LF; a u
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Callable
-from typing import NoReturn, Protocol
+import threading
+from collections.abc import Callable, Iterator
+from typing import NoReturn
 
 from coupole.devices import Clock, Deadline
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.fair_lock import FairLock
+from drivers.ledbox.link import CallEnded, Cleared, Link
 
 REPLY_MARGIN_S = 2.0
 """Time that a device may take to answer, without the transmission of the bytes."""
@@ -21,17 +24,6 @@ _MAX_TEXT_BYTES = 4096
 
 Unit = str | bytes
 """Text as received, or the content of a definite-length block."""
-
-
-class Link(Protocol):
-    """Transports bytes. Raises TimeoutError when a deadline passes, ConnectionError when the link is lost."""
-
-    bytes_per_s: float
-
-    def write(self, data: bytes, deadline: Deadline) -> None: ...
-    def read(self, deadline: Deadline) -> bytes: ...
-    def clear(self) -> None: ...
-    def close(self) -> None: ...
 
 
 class ScpiSession:
@@ -44,22 +36,53 @@ class ScpiSession:
         self._name, self._port, self._link, self._clock = name, port, link, clock
         self.bytes_per_s = link.bytes_per_s
         self._lock = FairLock()
-        self._out_of_step = True
+        self._in_step: int | None = None
+        """Device clears so far when both ends were last in step; None if an exchange has gone wrong since."""
+        self._calls = threading.local()
+        self._ends = 0
+        """How often all calls in progress were ended."""
 
     def ask(self, command: str | bytes, replies: int, reply_bytes: int = 0) -> tuple[Unit, ...]:
         """Send a message and return its `replies` response units, which may contain `reply_bytes` of blocks.
 
-        Raises DeviceRefused or DeviceFault with the device's error, DeviceTimeout, DeviceLost.
+        Raises DeviceRefused or DeviceFault with the device's error, DeviceTimeout, DeviceLost, CallEnded.
         """
         message = (command if isinstance(command, bytes) else command.encode("ascii")) + b";:SYST:ERR?\n"
         shown = (command if isinstance(command, str) else command[:40].split(b"#")[0].decode("ascii")).strip()
         seconds = REPLY_MARGIN_S + (len(message) + reply_bytes + _SHORT_REPLY_BYTES) / self.bytes_per_s
-        with self._lock:
-            units = self._exchange(message, shown, seconds)
-            self._raise_errors(units[-1], shown)
+        with self._lock, self.call() as ends:
+            clears = self._link.clears  # read before `ends` is compared: then no end of calls is overlooked
+            if self._ends != ends:
+                raise CallEnded(self._name, shown)
+            units = self._exchange(message, shown, seconds, clears)
+            self._raise_errors(units[-1], shown, clears)
         if len(units) != replies + 1:
             self.unexpected(f"{replies} replies to {shown}", f"{len(units) - 1} came")
         return tuple(units[:-1])
+
+    @contextlib.contextmanager
+    def call(self) -> Iterator[int]:
+        """The messages within belong to one call of the driver: after `end_calls` no other of them is sent.
+        Gives how often calls had been ended when the outermost call of this thread began."""
+        outer = getattr(self._calls, "ends", None)
+        self._calls.ends = self._ends if outer is None else outer
+        try:
+            yield self._calls.ends
+        finally:
+            self._calls.ends = outer
+
+    def end_calls(self) -> None:
+        """Calls in progress, but for the message that is being sent, end with CallEnded. From any thread."""
+        self._ends += 1
+
+    def device_clear(self) -> None:
+        """Clear the device out of band, from any thread: it waits for no message that is being sent, and ends all
+        calls in progress with CallEnded. Raises DeviceLost."""
+        self.end_calls()
+        try:
+            self._link.device_clear()
+        except ConnectionError as error:
+            raise self._lost("a device clear", error) from error
 
     def number(self, unit: Unit) -> float:
         """A response unit that must be a decimal number."""
@@ -70,7 +93,7 @@ class ScpiSession:
 
     def unexpected(self, expected: str, happened: str) -> NoReturn:
         """Raise DeviceError for an invalid reply; before the next message the line is cleared."""
-        self._out_of_step = True
+        self._in_step = None
         raise DeviceError(
             self._name,
             expected=expected,
@@ -81,16 +104,19 @@ class ScpiSession:
     def close(self) -> None:
         self._link.close()
 
-    def _exchange(self, message: bytes, shown: str, seconds: float) -> list[Unit]:
+    def _exchange(self, message: bytes, shown: str, seconds: float, clears: int) -> list[Unit]:
+        link = self._link
         try:
-            if self._out_of_step:
-                self._link.clear()
+            if self._in_step != clears:
+                link.clear()
                 message = b"\n" + message
-            self._out_of_step = True
+            self._in_step = None
             deadline = Deadline(self._clock, seconds)
-            self._link.write(message, deadline)
-            units = _read_response(lambda: self._link.read(deadline))
-            self._out_of_step = False
+            link.write(message, deadline, clears)
+            units = _read_response(lambda: link.read(deadline, clears))
+            self._in_step = clears
+        except Cleared as cleared:
+            raise CallEnded(self._name, shown) from cleared
         except TimeoutError as error:
             raise DeviceTimeout(
                 self._name,
@@ -99,21 +125,24 @@ class ScpiSession:
                 remedy=f"Check that the device at {self._port} has power and the rig's baud rate, then resume.",
             ) from error
         except ConnectionError as error:
-            raise DeviceLost(
-                self._name,
-                expected=f"an answer to {shown}",
-                happened=str(error),
-                remedy=f"Check the cable at {self._port} and the device's power, then resume.",
-            ) from error
+            raise self._lost(f"an answer to {shown}", error) from error
         except ValueError as error:
             self.unexpected(f"a SCPI response to {shown}", str(error))
         return units
 
-    def _raise_errors(self, unit: Unit, shown: str) -> None:
+    def _lost(self, expected: str, error: Exception) -> DeviceLost:
+        return DeviceLost(
+            self._name,
+            expected=expected,
+            happened=str(error),
+            remedy=f"Check the cable at {self._port} and the device's power, then resume.",
+        )
+
+    def _raise_errors(self, unit: Unit, shown: str, clears: int) -> None:
         """Empty the device's error queue, whose first entry is `unit`, and raise if it holds errors."""
         errors = [self._error(unit, shown)]
         while errors[-1][0]:
-            units = self._exchange(b"SYST:ERR?\n", "SYST:ERR?", REPLY_MARGIN_S)
+            units = self._exchange(b"SYST:ERR?\n", "SYST:ERR?", REPLY_MARGIN_S, clears)
             errors.append(self._error(units[-1], "SYST:ERR?"))
         if len(errors) == 1:
             return

@@ -2,6 +2,9 @@
 
 Time-outs are counted on the rig's clock, so that they hold in a simulated world that runs faster or slower.
 pyserial's own time-outs, in machine time, only set how often the rig's clock is read.
+
+Device clear is a BREAK on a serial line, RFC 2217's on an `rfc2217://` port, and the end of the connection on a
+`socket://`, which carries bytes only.
 """
 
 from __future__ import annotations
@@ -9,65 +12,71 @@ from __future__ import annotations
 import contextlib
 import io
 import select
+import socket
+import struct
+import threading
 from typing import Any
 
 from coupole.devices import Clock, Deadline
 from coupole.errors import DeviceLost
+from drivers.ledbox.link import Cleared
 
 _LOOK_S = 0.02
 """Machine time between two readings of the rig's clock."""
 _BITS_PER_BYTE = 10
 _QUIET_S, _DRAIN_S = 0.05, 2.0
+_BREAK_BITS, _SHORTEST_BREAK_S = 25, 0.002
+"""A BREAK is longer than any character: 10 bits, 12 with parity and a second stop bit."""
+_RECONNECT_S = 2.0
+"""A server may need a while until it takes the next connection."""
 
 
 class SerialLink:
-    """An open serial port: a `drivers.ledbox.scpi.Link`."""
+    """An open serial port: a `drivers.ledbox.link.Link`."""
 
     def __init__(self, url: str, baud: int, clock: Clock) -> None:
         import serial
 
-        self._lost: tuple[type[Exception], ...] = (serial.SerialException, OSError)
+        # ValueError: a socket that another thread has closed has no file descriptor
+        self._lost: tuple[type[Exception], ...] = (serial.SerialException, OSError, ValueError)
         with contextlib.suppress(ImportError):  # termios does not exist on Windows
             import termios
 
             self._lost += (termios.error,)  # pyserial does not convert it when it flushes a hung-up terminal
-        self._clock = clock
+        self._url, self._baud, self._clock = url, baud, clock
         self.bytes_per_s = baud / _BITS_PER_BYTE
-        own_port = {} if "://" in url else {"exclusive": True}
-        try:
-            self._port: Any = serial.serial_for_url(url, baudrate=baud, timeout=_LOOK_S, **own_port)
-        except (serial.SerialException, OSError, ValueError) as error:
-            raise ConnectionError(str(error)) from error
-        try:
-            self._fileno: int | None = self._port.fileno()
-            self._port.write_timeout = 0
-        except (AttributeError, io.UnsupportedOperation):
-            self._fileno = None  # rfc2217: writes go to a socket, all at once
+        self.clears = 0
+        self._gate = threading.Lock()
+        """Held for the moment of one write, and to begin a device clear: no byte of an exchange follows it."""
+        self._is_socket, self._hung_up = url.startswith("socket://"), False
+        self._port: Any = self._opened()
 
-    def write(self, data: bytes, deadline: Deadline) -> None:
+    def write(self, data: bytes, deadline: Deadline, clears: int) -> None:
         """Send all of `data`."""
-        self._refuse_closed()
+        self._refuse_closed(clears)
         rest = memoryview(data)
         while rest:
             try:
                 # A non-blocking write of pyserial 3.5 to a full port loops for ever: wait for room first
                 if self._fileno is None or select.select([], [self._fileno], [], _LOOK_S)[1]:
-                    rest = rest[self._port.write(rest) :]
+                    with self._gate:
+                        self._refuse_closed(clears)
+                        rest = rest[self._port.write(rest) :]
                     continue
             except self._lost as error:
-                raise ConnectionError(str(error)) from error
+                raise self._failure(error, clears) from error
             if deadline.expired:
                 raise TimeoutError(f"{len(rest)} of {len(data)} bytes could not be sent")
 
-    def read(self, deadline: Deadline) -> bytes:
+    def read(self, deadline: Deadline, clears: int) -> bytes:
         """At least one byte, and all others that have arrived."""
-        self._refuse_closed()
         while True:
+            self._refuse_closed(clears)
             late = deadline.expired  # read first: bytes that arrived in time are accepted even if read late
             try:
                 data: bytes = self._port.read(max(1, self._port.in_waiting))
             except self._lost as error:
-                raise ConnectionError(str(error)) from error
+                raise self._failure(error, clears) from error
             if data:
                 return data
             if late:
@@ -75,35 +84,106 @@ class SerialLink:
 
     def waiting(self) -> bytes:
         """Bytes that have already arrived, possibly none; does not wait."""
-        self._refuse_closed()
+        self._refuse_closed(self.clears)
         try:
             data: bytes = self._port.read(count) if (count := self._port.in_waiting) else b""
         except self._lost as error:
             raise ConnectionError(str(error)) from error
         return data
 
+    def end_exchanges(self) -> None:
+        """A device clear on this side only: nothing is sent, and running exchanges end with Cleared."""
+        with self._gate:
+            self.clears += 1
+
+    def device_clear(self) -> None:
+        """Discard unsent bytes, then BREAK; on a socket, end the connection with what it still holds."""
+        self.end_exchanges()
+        with self._gate:
+            if not self._port.is_open:
+                return
+            if self._is_socket:
+                self._hang_up()
+                return
+            try:
+                self._port.reset_output_buffer()
+            except self._lost as error:
+                raise ConnectionError(str(error)) from error
+            with contextlib.suppress(*self._lost):  # an adapter without BREAK: what follows is heard all the same
+                self._port.break_condition = True
+                self._clock.sleep(max(_SHORTEST_BREAK_S, _BREAK_BITS / self._baud))
+                self._port.break_condition = False
+
     def clear(self) -> None:
-        """Discard input until the line is quiet."""
-        deadline = Deadline(self._clock, _DRAIN_S)
+        """Discard input until the line is quiet; connect again where a device clear has ended the connection."""
+        if self._hung_up:
+            self._connect_again()
+        deadline, clears = Deadline(self._clock, _DRAIN_S), self.clears
         with contextlib.suppress(TimeoutError):
             while not deadline.expired:
-                self.read(Deadline(self._clock, _QUIET_S))
+                self.read(Deadline(self._clock, _QUIET_S), clears)
 
     def close(self) -> None:
         """Release the port; a second call does nothing."""
+        self._url = ""
         if not self._port.is_open:
             return
         with contextlib.suppress(*self._lost):
             self._port.reset_output_buffer()  # else close() may wait for a dead line to drain
-        socket = getattr(self._port, "_socket", None)
+        connection = getattr(self._port, "_socket", None)
         with contextlib.suppress(*self._lost):
             self._port.close()
-        if socket is not None:
-            socket.close()  # pyserial 3.5 does not, if the other side of a socket:// has hung up
+        if connection is not None:
+            connection.close()  # pyserial 3.5 does not, if the other side of a socket:// has hung up
 
-    def _refuse_closed(self) -> None:
+    def _opened(self) -> Any:
+        import serial
+
+        own_port = {} if "://" in self._url else {"exclusive": True}
+        try:
+            port = serial.serial_for_url(self._url, baudrate=self._baud, timeout=_LOOK_S, **own_port)
+        except (serial.SerialException, OSError, ValueError) as error:
+            raise ConnectionError(str(error)) from error
+        try:
+            self._fileno: int | None = port.fileno()
+            port.write_timeout = 0
+        except (AttributeError, io.UnsupportedOperation):
+            self._fileno = None  # rfc2217: writes go to a socket, all at once
+        return port
+
+    def _hang_up(self) -> None:
+        """Reset the connection: bytes that are still on their way are thrown away, here and at the box. The port
+        is left open, since another thread may be reading from it; its socket is closed."""
+        connection: socket.socket = self._port._socket
+        with contextlib.suppress(OSError):  # it is closed already
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        connection.close()
+        self._hung_up = True
+
+    def _connect_again(self) -> None:
+        self._port._socket, self._port.is_open = None, False  # else pyserial would wait 0.3 s for it to close
+        deadline = Deadline(self._clock, _RECONNECT_S)
+        while True:
+            if not self._url:
+                raise ConnectionError("the port was closed")
+            try:
+                self._port, self._hung_up = self._opened(), False
+            except ConnectionError:
+                if deadline.expired:
+                    raise
+                self._clock.sleep(_QUIET_S)
+            else:
+                return
+
+    def _refuse_closed(self, clears: int) -> None:
+        if self.clears != clears:
+            raise Cleared
         if not self._port.is_open:
             raise ConnectionError("the port was closed")
+
+    def _failure(self, error: Exception, clears: int) -> Exception:
+        """What to raise for an error of the port: a device clear may have closed it."""
+        return Cleared() if self.clears != clears else ConnectionError(str(error))
 
 
 def open_serial(name: str, url: str, baud: int, clock: Clock) -> SerialLink:

@@ -2,7 +2,8 @@
 
 Each command is a line made from a template in the rig; the box answers each with one line. Such
 a box has no table, log, clock or watchdog. Therefore this driver limits the light: a thread ends each flash in
-time, whatever the caller does, and all LEDs are switched off at opening, at closing and after any failure.
+time, whatever the caller does, and all LEDs are switched off at opening, at closing and after any failure. It has
+no device clear either: `lights_off` waits for the rest of a line, but for no answer.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from coupole.devices import NO_LED, UNKNOWN_NS, Clock, Deadline, Identity, StepRecord
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.ledbox.link import CallEnded, Cleared
 from drivers.ledbox.serial_link import SerialLink, open_serial
 
 _REPLY_MARGIN_S = 2.0
@@ -30,6 +32,8 @@ _BOX_PATIENCE = 1.5
 """The box's own bound on a light over the driver's, its clock being a cheap one."""
 _LOOK_S = 0.001
 """Machine time between two readings of the rig's clock during a flash."""
+_ENDED_AT_ONCE = 5
+"""Threads that may switch the lights off at the same time; each ends the others' exchanges."""
 _ENDINGS = {"lf": "\n", "crlf": "\r\n", "cr": "\r"}
 _FIELDS: dict[str, tuple[frozenset[str], frozenset[str]]] = {
     "on": (frozenset({"led"}), frozenset({"led", "on_ms"})),
@@ -115,7 +119,8 @@ class _Flash:
 class TextLineBox:
     """The box: a `coupole.devices.LedBox`.
 
-    Each call may raise DeviceTimeout, DeviceLost, or DeviceRefused with the box's reply.
+    Each call may raise DeviceTimeout, DeviceLost, DeviceRefused with the box's reply, or another DeviceError if
+    `lights_off` was called meanwhile.
     """
 
     runs_tables = False
@@ -125,6 +130,8 @@ class TextLineBox:
         self._settings, self._clock = settings, clock
         self.led_count = settings.led_count
         self._lock = threading.RLock()
+        self._ends = 0
+        """How often `lights_off` has ended the calls in progress."""
         self._flash: _Flash | None = None
         self._in_step = False
         """True if the next line from the box is the answer to the next command."""
@@ -151,14 +158,15 @@ class TextLineBox:
             self._refuse(
                 f"an LED from 0 to {self.led_count - 1}", f"{led} was asked for", "Correct the LED table."
             )
+        ends = self._ends
         longest_s = on_us * 1e-6 + _CONFIRMS_S
         on_ms = math.ceil(_BOX_PATIENCE * longest_s * 1e3)  # by then the driver has ended it, or the host is gone
         with self._lock:
             try:
-                self._end()
+                self._end(ends)
                 from_sending, sent_ns = Deadline(self._clock, longest_s), self._clock.now_ns()
                 if led != NO_LED:
-                    self._command(self._settings.on.format(led=led + self._settings.first_led, on_ms=on_ms))
+                    self._command(self._settings.on.format(led=led + self._settings.first_led, on_ms=on_ms), ends)
                 lasts_s = min(on_us * 1e-6, from_sending.remaining_s)
                 self._flash = _Flash(led, sent_ns, Deadline(self._clock, lasts_s))
                 threading.Thread(target=self._watch, args=(self._flash,), name="led box", daemon=True).start()
@@ -177,8 +185,9 @@ class TextLineBox:
         flash = self._flash
         if flash is None:
             self._refuse("a flash to end", "none was begun", "This is a fault of the program that drives the box.")
+        ends = self._ends
         with self._lock:
-            self._end()
+            self._end(ends)
             if flash.failure is not None:
                 raise flash.failure
             if flash.off_ns is None:  # lights_off() failed
@@ -199,15 +208,17 @@ class TextLineBox:
         )
 
     def lights_off(self) -> None:
-        """All LEDs off, confirmed by the box. Raises only if a second try fails too: the first may have been
-        appended to an incomplete line that the box had received before."""
+        """All LEDs off, confirmed by the box. Calls of other threads end with DeviceError. Raises only if a second
+        try fails too: the first may have been appended to an incomplete line that the box had received before."""
+        self._ends += 1
+        self._link.end_exchanges()
         with self._lock:
             if self._flash is not None:
                 self._flash.ended.set()
-            try:
-                self._command(self._settings.all_off)
-            except (DeviceTimeout, DeviceRefused):
-                self._command(self._settings.all_off)
+            for _ in range(_ENDED_AT_ONCE):
+                with contextlib.suppress(CallEnded):  # by another thread's lights_off: say it again
+                    self._all_off()
+                    break
             if self._flash is not None and self._flash.off_ns is None:
                 self._flash.off_ns = self._clock.now_ns()
 
@@ -222,19 +233,26 @@ class TextLineBox:
         self._try_lights_off()
         self._link.close()
 
+    def _all_off(self) -> None:
+        try:
+            self._command(self._settings.all_off, self._ends)
+        except (DeviceTimeout, DeviceRefused):
+            self._command(self._settings.all_off, self._ends)
+
     # How a light ends.
 
     def _watch(self, flash: _Flash) -> None:
         """End a flash when its time is over. Runs in its own thread."""
+        ends = self._ends
         while not flash.deadline.expired:
             if flash.ended.wait(_LOOK_S):
                 return
         with self._lock:
             if not flash.ended.is_set():
                 with contextlib.suppress(DeviceError):  # kept in flash.failure, for the caller
-                    self._end()
+                    self._end(ends)
 
-    def _end(self) -> None:
+    def _end(self, ends: int) -> None:
         """End the present flash, if it has not ended."""
         flash = self._flash
         if flash is None or flash.ended.is_set():
@@ -243,7 +261,8 @@ class TextLineBox:
         try:
             if flash.led != NO_LED:
                 settings = self._settings
-                self._command((settings.off or settings.all_off).format(led=flash.led + settings.first_led))
+                off = (settings.off or settings.all_off).format(led=flash.led + settings.first_led)
+                self._command(off, ends)
             flash.off_ns = self._clock.now_ns()
         except DeviceError as error:
             flash.failure = error
@@ -261,26 +280,29 @@ class TextLineBox:
         """Identity from a reply `vendor,model,serial,firmware`; any other reply is taken as the model."""
         if self._settings.identify is None:
             return Identity("unknown", "box of text lines", "unknown", "unknown")
-        text = self._exchange(self._settings.identify)
+        text = self._exchange(self._settings.identify, self._ends)
         fields = [one.strip() for one in text.split(",")]
         vendor, model, serial, firmware = fields if len(fields) == 4 else ("unknown", text, "unknown", "unknown")
         return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
 
-    def _command(self, line: str) -> None:
+    def _command(self, line: str, ends: int) -> None:
         """Have a command executed. Raises DeviceRefused for any reply but the expected one."""
         expected = self._settings.expected_reply
-        reply = self._exchange(line)
+        reply = self._exchange(line, ends)
         if reply != expected:
             self._in_step = False
             self._refuse(
                 f"`{expected}` in answer to `{line}`", f"it said `{reply}`", "Check the box's reply and the rig."
             )
 
-    def _exchange(self, line: str) -> str:
-        """Send a line and return the box's answer without its ending."""
+    def _exchange(self, line: str, ends: int) -> str:
+        """Send a line and return the box's answer without its ending; `ends`, from when the call began."""
         settings, link = self._settings, self._link
         data = (line + _ENDINGS[settings.line_ending]).encode("ascii")
         seconds = _REPLY_MARGIN_S + (len(data) + _SHORT_REPLY_BYTES) / link.bytes_per_s
+        clears = link.clears  # read before `ends` is compared: then no end of calls is overlooked
+        if self._ends != ends:
+            raise CallEnded(settings.name, f"`{line}`")
         try:
             if not self._in_step:
                 link.clear()
@@ -293,9 +315,11 @@ class TextLineBox:
                 )
             self._in_step = False
             deadline = Deadline(self._clock, seconds)
-            link.write(data, deadline)
-            reply = read_reply(lambda: link.read(deadline), settings.line_ending)
+            link.write(data, deadline, clears)
+            reply = read_reply(lambda: link.read(deadline, clears), settings.line_ending)
             self._in_step = True
+        except Cleared as cleared:
+            raise CallEnded(settings.name, f"`{line}`") from cleared
         except TimeoutError as error:
             raise DeviceTimeout(
                 settings.name,

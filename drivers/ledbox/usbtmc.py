@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import struct
+import threading
 from typing import Any
 
 from coupole.devices import Clock, Deadline
+from drivers.ledbox.link import Cleared
 
 _HEADER = struct.Struct("<BBBxIB3x")
 """Tables 1, 3, 4 and 9: MsgID, bTag, its complement, TransferSize, bmTransferAttributes."""
@@ -31,7 +33,7 @@ _CLEAR_TRIES = 50
 
 
 class UsbtmcLink:
-    """An open USBTMC interface: a `drivers.ledbox.scpi.Link`."""
+    """An open USBTMC interface: a `drivers.ledbox.link.Link`."""
 
     bytes_per_s = 1e6
     """Least rate of full-speed USB."""
@@ -45,6 +47,8 @@ class UsbtmcLink:
         self._clock = clock
         self._tag = 0
         self._requested_tag: int | None = None
+        self.clears = 0
+        self._counting = threading.Lock()
         try:
             self._device: Any = _find(vendor, product, serial)
             interface = _claim(self._device)
@@ -55,9 +59,11 @@ class UsbtmcLink:
         bulk = [one for one in interface if usb.util.endpoint_type(one.bmAttributes) == 2]
         self._out, self._in = sorted((one.bEndpointAddress for one in bulk), key=lambda address: address & 0x80)
 
-    def write(self, data: bytes, deadline: Deadline) -> None:
-        """Send `data` as one message: DEV_DEP_MSG_OUT transfers, EOM on the last."""
+    def write(self, data: bytes, deadline: Deadline, clears: int) -> None:
+        """Send `data` as one message: DEV_DEP_MSG_OUT transfers, EOM on the last. During a device clear the
+        device halts the endpoint, so that what is sent too late is refused."""
         for start in range(0, len(data), _MAX_OUT_BYTES):
+            self._refuse_cleared(clears)
             piece = data[start : start + _MAX_OUT_BYTES]
             last = start + len(piece) == len(data)
             header = self._header(_DEV_DEP_MSG_OUT, len(piece), _EOM if last else 0)
@@ -66,22 +72,23 @@ class UsbtmcLink:
             try:
                 self._device.write(self._out, header + piece + padding, timeout_ms)
             except self._usb_timeout as error:
-                raise TimeoutError("a Bulk-OUT transfer was not taken") from error
+                raise self._failure(TimeoutError("a Bulk-OUT transfer was not taken"), clears) from error
             except self._usb_error as error:
-                raise ConnectionError(str(error)) from error
+                raise self._failure(ConnectionError(str(error)), clears) from error
 
-    def read(self, deadline: Deadline) -> bytes:
+    def read(self, deadline: Deadline, clears: int) -> bytes:
         """The payload of one DEV_DEP_MSG_IN transfer; a response may take several."""
+        self._refuse_cleared(clears)
         if self._requested_tag is None:
             request = self._header(_REQUEST_DEV_DEP_MSG_IN, _MAX_IN_BYTES, 0)
             try:
                 self._device.write(self._out, request, 1000)
             except self._usb_timeout as error:
-                raise TimeoutError("the request for a response was not taken") from error
+                raise self._failure(TimeoutError("the request for a response was not taken"), clears) from error
             except self._usb_error as error:
-                raise ConnectionError(str(error)) from error
+                raise self._failure(ConnectionError(str(error)), clears) from error
             self._requested_tag = self._tag
-        transfer = self._read_bulk(deadline)
+        transfer = self._read_bulk(deadline, clears)
         if len(transfer) < _HEADER.size:
             raise ConnectionError(f"a Bulk-IN transfer of {len(transfer)} bytes has no header")
         kind, tag, complement, size, _ = _HEADER.unpack_from(transfer)
@@ -93,15 +100,20 @@ class UsbtmcLink:
             raise ConnectionError(f"Bulk-IN header {transfer[:12].hex(' ')} does not answer the request")
         self._requested_tag = None
         while len(transfer) < _HEADER.size + size:
-            transfer += self._read_bulk(deadline)
+            transfer += self._read_bulk(deadline, clears)
         return transfer[_HEADER.size : _HEADER.size + size]
+
+    def device_clear(self) -> None:
+        """INITIATE_CLEAR, on the control endpoint: it waits for no bulk transfer (section 4.2.1.6)."""
+        with self._counting:
+            self.clears += 1
+        self._initiate_clear()
 
     def clear(self) -> None:
         """Discard pending messages in both directions (section 4.2.1.6)."""
         self._requested_tag = None
+        self._initiate_clear()
         try:
-            if self._class_request(_INITIATE_CLEAR, 1) != (_STATUS_SUCCESS,):
-                raise ConnectionError("the device refuses INITIATE_CLEAR")
             for _ in range(_CLEAR_TRIES):
                 status, pending_in = self._class_request(_CHECK_CLEAR_STATUS, 2)
                 if status == _STATUS_SUCCESS:
@@ -125,8 +137,16 @@ class UsbtmcLink:
         self._tag = self._tag % 255 + 1
         return _HEADER.pack(kind, self._tag, self._tag ^ 0xFF, size, attributes)
 
-    def _read_bulk(self, deadline: Deadline) -> bytes:
+    def _initiate_clear(self) -> None:
+        try:
+            if self._class_request(_INITIATE_CLEAR, 1) != (_STATUS_SUCCESS,):
+                raise ConnectionError("the device refuses INITIATE_CLEAR")
+        except self._usb_error as error:
+            raise ConnectionError(str(error)) from error
+
+    def _read_bulk(self, deadline: Deadline, clears: int) -> bytes:
         while True:
+            self._refuse_cleared(clears)
             late = deadline.expired
             try:
                 return bytes(self._device.read(self._in, _HEADER.size + _MAX_IN_BYTES + 4, _LOOK_MS))
@@ -134,7 +154,15 @@ class UsbtmcLink:
                 if late:
                     raise TimeoutError("nothing came") from error
             except self._usb_error as error:
-                raise ConnectionError(str(error)) from error
+                raise self._failure(ConnectionError(str(error)), clears) from error
+
+    def _refuse_cleared(self, clears: int) -> None:
+        if self.clears != clears:
+            raise Cleared
+
+    def _failure(self, error: Exception, clears: int) -> Exception:
+        """What to raise for an error of a transfer: a device clear may have ended it."""
+        return Cleared() if self.clears != clears else error
 
     def _class_request(self, request: int, length: int) -> tuple[int, ...]:
         reply = self._device.ctrl_transfer(_CLASS_INTERFACE_IN, request, 0, self._interface, length, 1000)

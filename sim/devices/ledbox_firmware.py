@@ -53,6 +53,8 @@ class Settings(BaseModel):
     edge_jitter_us: float = Field(default=1.0, ge=0, le=3)
     """Rms lateness of trigger edges."""
     seed: int = 1
+    protocol: Literal["1.0", "1.1"] = "1.1"
+    """1.0: the box knows neither device clear nor tables in blocks, nor the question for this version."""
     led_current_ma: int = Field(default=700, ge=0, le=65535)
     led_power_w: float = Field(default=15.0, ge=0)
     heat_k_per_j: float = Field(default=0.02, ge=0)
@@ -66,12 +68,15 @@ class Settings(BaseModel):
 
 
 class Link(Protocol):
-    """Transport of bytes to and from the box: a `PtyPort`, or the far end of a USB cable."""
+    """Transport of bytes to and from the box: a `PtyPort`, or the far end of a USB cable.
+
+    `on_break` is its device clear: a BREAK, INITIATE_CLEAR, the end of a TCP connection."""
 
     port: str
 
-    def listen(self, received: Callable[[bytes], None]) -> None: ...
+    def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None: ...
     def send(self, data: bytes) -> None: ...
+    def drop_output(self) -> None: ...
     def mute(self) -> None: ...
     def close(self) -> None: ...
 
@@ -125,7 +130,7 @@ class LedBoxFirmware:
         self._scpi = Interpreter(self._commands(), MAX_RECORDS * STEP.itemsize)
         self._link: Link = link or PtyPort(reactor, settings.baud)
         self.port = self._link.port
-        self._link.listen(self._receive)
+        self._link.listen(self._receive, self._device_clear if self._clears else None)
 
     # Faults for the fault script.
 
@@ -176,6 +181,16 @@ class LedBoxFirmware:
         if self._scpi.inside_block and self._block_timer is None:
             self._check_block()
 
+    def _device_clear(self) -> None:
+        """Everything dark at once; the incomplete message and the unsent responses are forgotten."""
+        self._abort()
+        self._scpi.clear()
+        self._link.drop_output()
+
+    @property
+    def _clears(self) -> bool:
+        return self._settings.protocol != "1.0"
+
     def _check_block(self) -> None:
         """Check for the time-out of an incomplete block; one timer per time-out, not per byte."""
         self._block_timer = None
@@ -188,7 +203,11 @@ class LedBoxFirmware:
             self._block_timer = self._reactor.at(due_ns, self._check_block)
 
     def _commands(self) -> dict[str, Command]:
-        return {
+        newer = {
+            "SYSTem:PROTocol?": Command(lambda: self._settings.protocol),
+            "SEQuence:DATA:APPend": Command(self._append_data, 1, 1),
+        }
+        return (newer if self._clears else {}) | {
             "*IDN?": Command(lambda: f"Coupole,LED control box,{self._settings.serial_number},1.0"),
             "*RST": Command(self._reset),
             "ABORt": Command(self._abort),
@@ -275,11 +294,17 @@ class LedBoxFirmware:
         self._bank = integer(bank, 0, 1)
 
     def _set_data(self, payload: Argument) -> None:
+        self._upload(np.empty(0, STEP), payload)
+
+    def _append_data(self, payload: Argument) -> None:
+        self._upload(self._tables[self._bank], payload)
+
+    def _upload(self, before: NDArray[np.void], payload: Argument) -> None:
         if isinstance(payload, str):
             raise ScpiError(-161, "a block is wanted")
         if self._running and self._bank == self._running_bank:
             raise ScpiError(-221, f"bank {self._bank} is running")
-        self._tables[self._bank] = read_table(payload, self._settings.led_count, self._width_us)
+        self._tables[self._bank] = read_table(before, payload, self._settings.led_count, self._width_us)
 
     def _state(self) -> str:
         if self._burst is not None and self._burst.state != "IDLE":

@@ -28,13 +28,13 @@ REST_PER_ON = 2
 """An LED that was lit for t must be off for at least REST_PER_ON * t before the table lights it again."""
 
 
-def read_table(payload: bytes, led_count: int, edge_width_us: int) -> NDArray[np.void]:
-    """The records (STEP [n]) of an uploaded block; raises ScpiError for one that is out of limits."""
+def read_table(before: NDArray[np.void], payload: bytes, led_count: int, edge_width_us: int) -> NDArray[np.void]:
+    """The records `before` (STEP [n]) and those of an uploaded block; raises ScpiError for one out of limits."""
     if len(payload) % STEP.itemsize:
         raise ScpiError(-161, f"{len(payload)} bytes are not a multiple of {STEP.itemsize}")
-    if len(payload) > MAX_RECORDS * STEP.itemsize:
-        raise ScpiError(-222, f"{len(payload) // STEP.itemsize} records exceed {MAX_RECORDS}")
-    table = np.frombuffer(payload, STEP)
+    table = np.concatenate([before, np.frombuffer(payload, STEP)])
+    if len(table) > MAX_RECORDS:
+        raise ScpiError(-222, f"{len(table)} records exceed {MAX_RECORDS}")
     check_table(table, led_count, edge_width_us)
     return table
 

@@ -1,15 +1,23 @@
-"""A serial port without a wire: a pseudo-terminal, read by the world at the rate of a serial line."""
+"""A serial port without a wire: a pseudo-terminal, read by the world at the rate of a serial line.
+
+A pseudo-terminal carries no BREAK: the kernel drops it. But in packet mode (tty_ioctl(2), TIOCPKT) it tells the
+master, ahead of all bytes, that the client has discarded its output (tcflush(3), TCOFLUSH). A host does that
+before a BREAK, so that the BREAK does not wait for what is unsent; here it stands for the BREAK.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import os
+import struct
+import termios
 import tty
 from collections.abc import Callable
 
 from sim.world.reactor import Reactor, Timer
 
-_PIECE_BYTES = 64
-"""Bytes are transferred in pieces of this size: 5.6 ms at 115200 baud."""
+_PIECE_BYTES, _PIECE_S = 64, 0.006
+"""Bytes are transferred in pieces of at most this size and duration, at least one byte."""
 _RETRY_S = 0.001
 _BITS_PER_BYTE = 10
 
@@ -23,19 +31,26 @@ class PtyPort:
     def __init__(self, reactor: Reactor, baud: int) -> None:
         self._reactor = reactor
         self._byte_s = _BITS_PER_BYTE / baud if baud else 0.0
+        self._piece_bytes = max(1, min(_PIECE_BYTES, int(_PIECE_S / self._byte_s))) if baud else 65536
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.port = os.ttyname(self._slave)
         self._received: Callable[[bytes], None] | None = None
+        self._on_break: Callable[[], None] | None = None
         self._output = bytearray()
         self._timers: dict[str, Timer] = {}
         self._reading = self._sending = False
 
-    def listen(self, received: Callable[[bytes], None]) -> None:
-        """Call `received` with bytes as they arrive."""
-        self._received = received
+    def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
+        """Call `received` with bytes as they arrive, and `on_break`, if given, at a BREAK."""
+        self._received, self._on_break = received, on_break
+        fcntl.ioctl(self._master, termios.TIOCPKT, struct.pack("i", 1))
         self._wait_for_bytes()
+
+    def drop_output(self) -> None:
+        """Forget the bytes that are queued for the client."""
+        self._output.clear()
 
     def send(self, data: bytes) -> None:
         """Queue bytes for the client."""
@@ -78,9 +93,13 @@ class PtyPort:
     def _read_piece(self) -> None:
         """Read a piece from the terminal; it is passed on at the time at which its last bit would have arrived."""
         try:
-            piece = os.read(self._master, _PIECE_BYTES if self._byte_s else 65536)
+            packet = os.read(self._master, 1 + self._piece_bytes)
         except BlockingIOError:
             self._wait_for_bytes()
+            return
+        piece = packet[1:]
+        if not piece:
+            self._take_status(packet[0])
             return
         if self._byte_s:
             self._stop_waiting()
@@ -88,6 +107,13 @@ class PtyPort:
             self._timers["read"] = self._reactor.after(len(piece) * self._byte_s, callback)
         elif self._received is not None:
             self._received(piece)
+
+    def _take_status(self, status: int) -> None:
+        """What a packet without bytes reports; on input that the client has discarded, a BREAK follows."""
+        if status & termios.TIOCPKT_FLUSHWRITE and self._on_break is not None:
+            termios.tcflush(self._master, termios.TCIFLUSH)  # what the kernel had already passed on
+            self._on_break()
+        self._wait_for_bytes()
 
     def _deliver_and_read_on(self, piece: bytes) -> Callable[[], None]:
         def callback() -> None:
@@ -101,7 +127,7 @@ class PtyPort:
     def _write(self) -> None:
         """Write what the terminal accepts of a piece; call again when the bits of the next one have passed."""
         try:
-            written = os.write(self._master, self._output[:_PIECE_BYTES] if self._byte_s else self._output)
+            written = os.write(self._master, self._output[: self._piece_bytes])
         except BlockingIOError:
             written = 0
         del self._output[:written]
@@ -110,5 +136,5 @@ class PtyPort:
             self._write_later()
 
     def _write_later(self) -> None:
-        piece_s = min(len(self._output), _PIECE_BYTES) * self._byte_s
+        piece_s = min(len(self._output), self._piece_bytes) * self._byte_s
         self._timers["write"] = self._reactor.after(piece_s or _RETRY_S, self._write)

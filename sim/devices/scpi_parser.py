@@ -89,6 +89,10 @@ class Interpreter:
         """Execute the messages completed by `data`; returns one response line for each message with a query."""
         return b"".join(self._execute(message) for message in self._splitter.feed(data))
 
+    def clear(self) -> None:
+        """Device clear (IEEE 488.2, 5.8): forget the incomplete message; error queue and event status stay."""
+        self._splitter.reset()
+
     def drop_block(self) -> None:
         """Discard an incomplete message whose block's bytes did not come in time."""
         self._splitter.reset()

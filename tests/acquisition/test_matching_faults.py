@@ -11,6 +11,7 @@ from matching_takes import (
     GIGE,
     MODEL,
     START,
+    Take,
     assert_all_proven,
     assert_no_wrong_label,
     edge_us,
@@ -191,3 +192,97 @@ def test_the_clock_fit_recovers_drift_and_offset() -> None:
     assert np.allclose(told_ns, what.timestamps_ns, rtol=0, atol=40e3)
     assert 1.0 < clocks.residual_rms_us < 20.0
     assert clocks.residual_rms_us <= clocks.residual_max_us <= 40.0
+
+
+# -- fixed cases at the edges of the tolerances -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("late_us", [250.0, 320.0, 390.0])
+def test_nine_seconds_into_a_burst_a_late_frame_does_not_get_the_label_of_a_missing_one(late_us: float) -> None:
+    """Drift alone would allow 900 us there; the clocks' line allows twice the jitter."""
+    burst = whole_burst(12, 1_500_000)
+    step = next(k for k in range(len(burst.table)) if edge_us(burst, k) > 9e6)
+    what = take(
+        burst, missed=(step,), surplus_us=(edge_us(burst, step) + late_us,), jitter_us=0.0, relative_ppm=0.0
+    )
+    verdict = what.verdict()
+    labelled = verdict.step_of_frame
+    assert labelled[step] == UNLABELLED
+    assert_no_wrong_label(what, verdict)
+    assert np.count_nonzero(labelled >= 0) > len(labelled) // 2
+
+
+@pytest.mark.parametrize("after_us", [230.0, 300.0, 390.0])
+def test_a_bounce_just_beyond_the_window_is_surplus_and_its_step_is_proven(after_us: float) -> None:
+    burst = whole_burst(12)
+    what = take(
+        burst, surplus_us=(edge_us(burst, LIGHT) + 3.0 + after_us,), jitter_us=0.0, relative_ppm=0.0, box_ppm=0.0
+    )
+    verdict = what.verdict()
+    assert np.array_equal(verdict.step_of_frame, what.truth)
+    assert np.flatnonzero(verdict.surplus).tolist() == [LIGHT + 1]
+    assert not verdict.ambiguous
+
+
+@pytest.mark.parametrize("step", range(len(whole_burst(12).table)))
+def test_a_double_edge_within_the_window_leaves_its_step_unproven_wherever_it_is(step: int) -> None:
+    burst = whole_burst(12)
+    what = take(burst, surplus_us=(edge_us(burst, step) + 50.0,), jitter_us=0.0, relative_ppm=0.0)
+    verdict = what.verdict()
+    assert np.flatnonzero(verdict.step_of_frame == UNLABELLED).tolist() == [step, step + 1]
+    assert verdict.ambiguous
+
+
+def test_four_double_edges_within_the_window_prove_nothing() -> None:
+    """One more than the fault model allows, though each of them lies on a step."""
+    burst = whole_burst(12)
+    doubles = tuple(edge_us(burst, step) + 50.0 for step in range(LIGHT, LIGHT + MODEL.max_surplus + 1))
+    verdict = take(burst, surplus_us=doubles, jitter_us=0.0, relative_ppm=0.0).verdict()
+    assert np.all(verdict.step_of_frame == UNLABELLED)
+    assert "leaves 3 frames or fewer unexplained" in verdict.reason
+
+
+def test_as_many_surplus_frames_before_a_burst_as_are_allowed_hide_no_label() -> None:
+    """The true alignment then has its first anchor at the fourth frame."""
+    what = take(
+        whole_burst(12),
+        surplus_us=(-51_234.0, -30_777.0, -11_111.0),
+        jitter_us=0.0,
+        relative_ppm=0.0,
+    )
+    verdict = what.verdict()
+    assert what.truth[:4].tolist() == [-1, -1, -1, 0]
+    assert np.array_equal(verdict.step_of_frame, what.truth)
+    assert np.flatnonzero(verdict.surplus).tolist() == [0, 1, 2]
+    assert not verdict.ambiguous
+
+
+def test_no_more_frames_than_may_be_surplus_prove_nothing() -> None:
+    what = take(whole_burst(12), missed=tuple(range(3, len(whole_burst(12).table))))
+    assert len(what.truth) == MODEL.max_surplus
+    verdict = what.verdict()
+    assert np.all(verdict.step_of_frame == UNLABELLED)
+    assert "too few frames" in verdict.reason
+
+
+def with_two_steps_more(gap_s: float) -> Take:
+    """A clean burst, then a gap, then two steps 20 ms apart, of which the second has a frame."""
+    before, apart_ns, gap_ns = take(whole_burst(12), jitter_us=0.0, relative_ppm=0.0), 20_000_000, int(gap_s * 1e9)
+    log = np.concatenate([before.log, before.log[-2:]])
+    log["t_trigger_ns"][-2:] = before.log["t_trigger_ns"][-1] + gap_ns + np.array([0, apart_ns])
+    stamps = np.append(before.timestamps_ns, before.timestamps_ns[-1] + gap_ns + apart_ns)
+    return replace(before, log=log, frame_ids=np.arange(len(stamps)), timestamps_ns=stamps)
+
+
+def test_a_gap_in_which_the_clocks_may_drift_by_a_step_proves_nothing() -> None:
+    """100 ppm of 250 s are 25 ms."""
+    verdict = with_two_steps_more(250.0).verdict()
+    assert np.all(verdict.step_of_frame == UNLABELLED)
+    assert "drift hides which step comes next" in verdict.reason
+
+
+def test_half_that_gap_hides_nothing() -> None:
+    what = with_two_steps_more(125.0)
+    verdict = what.verdict()
+    assert verdict.step_of_frame[-1] == len(what.log) - 1
+    assert not verdict.ambiguous

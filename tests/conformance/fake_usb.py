@@ -30,21 +30,28 @@ class UsbLink:
     def __init__(self, reactor: Reactor) -> None:
         self._reactor = reactor
         self._received: Callable[[bytes], None] = lambda data: None
+        self._on_break: Callable[[], None] | None = None
         self._message = b""
         self._response = b""
         self._ready = threading.Condition()
         self._request: tuple[int, int] | None = None
         self._muted = False
+        self.halted = False
+        """Between INITIATE_CLEAR and CLEAR_FEATURE: the Bulk-OUT endpoint takes nothing."""
         self.gone = False
 
-    def listen(self, received: Callable[[bytes], None]) -> None:
-        self._received = received
+    def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
+        self._received, self._on_break = received, on_break
 
     def send(self, data: bytes) -> None:
         with self._ready:
             if not self._muted:
                 self._response += data
                 self._ready.notify_all()
+
+    def drop_output(self) -> None:
+        with self._ready:
+            self._response = b""
 
     def mute(self) -> None:
         self._muted = True
@@ -80,8 +87,12 @@ class UsbLink:
         return header + payload + bytes(-count % 4)
 
     def clear(self) -> None:
+        """INITIATE_CLEAR: both buffers, and what the box makes of it."""
         with self._ready:
-            self._message, self._response, self._request = b"", b"", None
+            self._message, self._response, self._request, self.halted = b"", b"", None, True
+            self._ready.notify_all()
+        if self._on_break is not None and not self._muted:
+            self._reactor.call_threadsafe(self._on_break)
 
 
 class Backend(usb.backend.IBackend):
@@ -181,11 +192,15 @@ class Backend(usb.backend.IBackend):
     def is_kernel_driver_active(self, dev_handle: Any, intf: int) -> bool:
         return False
 
-    def clear_halt(self, dev_handle: Any, ep: int) -> None: ...
+    def clear_halt(self, dev_handle: Any, ep: int) -> None:
+        assert ep == OUT
+        self._link.halted = False
 
     def bulk_write(self, dev_handle: Any, ep: int, intf: int, data: Any, timeout: int) -> int:
         self._check()
         assert ep == OUT
+        if self._link.halted:
+            raise usb.core.USBError("Pipe error", -9, errno.EPIPE)
         self._link.take_out(bytes(data))
         return len(data)
 

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from ledbox_world import LedBoxWorld, dark_table, run_to_end, table
+from ledbox_world import Call, LedBoxWorld, dark_table, run_to_end, table, wait_until
 
 from coupole.devices import NO_LED, LedBox, TableLedBox, table_box
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
@@ -108,6 +108,41 @@ class LedBoxConformance:
         box.lights_off()
         assert world.shining() == []
         assert not box.lit()
+
+    def test_lights_off_from_another_thread_waits_for_no_call(self, box: LedBox, world: LedBoxWorld) -> None:
+        world.slow_down()
+        box.flash(5, self.long_us)
+        lost = world.lose_answers(1)
+        call = Call(lambda: box.flash(6, self.long_us))
+        wait_until(lambda: bool(lost), "a call that waits for its answer")
+        box.lights_off()
+        assert world.shining() == []
+        error = call.ended()
+        assert isinstance(error, DeviceError), error
+        assert not isinstance(error, DeviceTimeout)  # its own time-out is what it would have waited for
+        assert world.shining() == []
+        box.flash(7, self.long_us)
+        wait_until(lambda: world.shining() == [7], "the next flash")
+
+    def test_a_call_that_lights_off_overtakes_lights_nothing(self, box: LedBox, world: LedBoxWorld) -> None:
+        """It waits for its turn while another call is answered; then it is too late for it."""
+        world.slow_down()
+        lost = world.lose_answers(1)
+        first = Call(lambda: box.flash(5, self.long_us))
+        wait_until(lambda: bool(lost), "a call that waits for its answer")
+        second = Call(lambda: box.flash(6, self.long_us))
+        wait_until(second.waits_for_a_lock, "a second call behind it")
+        box.lights_off()
+        assert isinstance(first.ended(), DeviceError)
+        assert isinstance(second.ended(), DeviceError)
+        assert world.shining() == []
+        assert 6 not in [led for led, _, _ in world.lights]
+
+    def test_lights_off_of_two_threads_at_once_is_confirmed_to_both(self, box: LedBox, world: LedBoxWorld) -> None:
+        box.flash(5, self.long_us)
+        calls = [Call(box.lights_off) for _ in range(3)]
+        assert [call.ended() for call in calls] == [None, None, None]
+        assert world.shining() == []
 
     def test_lights_off_in_the_dark_does_no_harm(self, box: LedBox, world: LedBoxWorld) -> None:
         box.lights_off()

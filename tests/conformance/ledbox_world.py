@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import linecache
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -54,6 +56,30 @@ class LedBoxWorld:
         assert done.wait(10)
         return given[0]
 
+    def lose_answers(self, count: int) -> list[bytes]:
+        """The box's next `count` answers get lost on their way; the list that they are collected in."""
+        lost: list[bytes] = []
+        link = self.box._link
+        send = link.send
+
+        def lose(data: bytes) -> None:
+            if len(lost) < count:
+                lost.append(data)
+            else:
+                send(data)
+
+        self.do(lambda: setattr(link, "send", lose))
+        return lost
+
+    def slow_down(self) -> None:
+        """From now on a time-out of the driver takes longer than anything the machine is busy with."""
+
+        def act() -> None:
+            self.reactor.clock.speed = 0.5
+            self.reactor.clock.slip_to(self.reactor.now_ns)
+
+        self.do(act)
+
     def shining(self) -> list[int]:
         """LEDs that shine now."""
         found: list[int] = self.do(lambda: self.lighting.shining(self.reactor.now_ns))
@@ -76,6 +102,36 @@ class LedBoxWorld:
     def dark(self, t_ns: int) -> None:
         self.darkened_ns.append(t_ns)
         self.lighting.dark(t_ns)
+
+
+class Call:
+    """A call of the driver in a thread of its own."""
+
+    def __init__(self, action: Callable[[], Any]) -> None:
+        self.error: BaseException | None = None
+        self._action = action
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def ended(self) -> BaseException | None:
+        """Wait for its end; what it raised."""
+        self._thread.join(20.0)
+        assert not self._thread.is_alive()
+        return self.error
+
+    def waits_for_a_lock(self) -> bool:
+        """True if its thread is about to take a lock: the line of code that it stands in says so."""
+        frame = sys._current_frames().get(self._thread.ident or 0)
+        if frame is None:
+            return False
+        file = frame.f_code.co_filename
+        return file.endswith("fair_lock.py") or "with self._lock" in linecache.getline(file, frame.f_lineno)
+
+    def _run(self) -> None:
+        try:
+            self._action()
+        except BaseException as error:  # noqa: BLE001  the test looks at it
+            self.error = error
 
 
 def wait_until(condition: Callable[[], bool], what: str) -> None:

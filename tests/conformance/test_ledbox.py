@@ -12,14 +12,16 @@ import pytest
 import usb.backend.libusb1
 from fake_usb import Backend, UsbLink
 from ledbox_conformance import LedBoxConformance, TableLedBoxConformance
-from ledbox_world import LedBoxWorld, ledbox_world, opened, run_to_end, table
+from ledbox_world import SPEED, LedBoxWorld, ledbox_world, opened, run_to_end, table
 
 from coupole.errors import DeviceLost, DeviceRefused
 from drivers.ledbox.driver import LedBox
 from sim.world.reactor import Reactor
 
 
-def usb_world(folder: Path, monkeypatch: pytest.MonkeyPatch) -> AbstractContextManager[LedBoxWorld]:
+def usb_world(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, speed: float = SPEED
+) -> AbstractContextManager[LedBoxWorld]:
     """A world whose box hangs on a USB cable that pyusb finds by itself."""
 
     def plug_in(reactor: Any) -> UsbLink:
@@ -27,7 +29,7 @@ def usb_world(folder: Path, monkeypatch: pytest.MonkeyPatch) -> AbstractContextM
         monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: Backend(link))
         return link
 
-    return ledbox_world(folder, link=plug_in)
+    return ledbox_world(folder, link=plug_in, speed=speed)
 
 
 class TcpLink:
@@ -38,18 +40,22 @@ class TcpLink:
         self._server = socket.create_server(("127.0.0.1", 0))
         self._client: socket.socket | None = None
         self._received: Callable[[bytes], None] | None = None
+        self._on_break: Callable[[], None] | None = None
         self.port = f"socket://127.0.0.1:{self._server.getsockname()[1]}"
         reactor.add_reader(self._server, self._accept)
 
-    def listen(self, received: Callable[[bytes], None]) -> None:
-        self._received = received
+    def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
+        self._received, self._on_break = received, on_break
 
     def send(self, data: bytes) -> None:
         if self._client is not None and self._received is not None:
             self._client.sendall(data)
 
+    def drop_output(self) -> None:
+        """Every byte has left with `send`."""
+
     def mute(self) -> None:
-        self._received = None
+        self._received = self._on_break = None
 
     def close(self) -> None:
         self._hang_up()
@@ -64,7 +70,10 @@ class TcpLink:
 
     def _read(self) -> None:
         assert self._client is not None
-        data = self._client.recv(65536)
+        try:
+            data = self._client.recv(65536)
+        except ConnectionError:
+            data = b""
         if not data:
             self._hang_up()
         elif self._received is not None:
@@ -75,6 +84,8 @@ class TcpLink:
             self._reactor.remove_reader(self._client)
             self._client.close()
             self._client = None
+            if self._on_break is not None:
+                self._on_break()
 
 
 @pytest.fixture(params=["serial", "socket", "usbtmc"])
@@ -136,13 +147,13 @@ class TestLedBoxOverScpi(LedBoxConformance, TableLedBoxConformance):
 
     def test_lights_off_is_obeyed_after_an_upload_was_cut_off(self, box: LedBox, world: LedBoxWorld) -> None:
         box.panel(1, on=True)
-        box._scpi._link.write(b"SEQ:DATA #532000abc", _NoDeadline())
+        box._scpi._link.write(b"SEQ:DATA #532000abc", _NoDeadline(), box._scpi._link.clears)
         box.lights_off()
         assert world.panels[-1] == (1, False)
 
     def test_after_a_crash_in_an_upload_the_box_can_be_opened_again(self, world: LedBoxWorld) -> None:
         with opened(world) as box:
-            box._scpi._link.write(b"SEQ:DATA #532000abc", _NoDeadline())
+            box._scpi._link.write(b"SEQ:DATA #532000abc", _NoDeadline(), box._scpi._link.clears)
         with opened(world) as box:
             assert not box.running()
 

@@ -245,3 +245,12 @@ def test_a_dark_step_is_no_step_of_an_led(box: LedBox, world: LedBoxWorld) -> No
     box.load(steps)
     box.start(steps)
     assert run_to_end(box, world)["led_current_ma"].tolist() == [700, 0, 700]
+
+
+def test_all_errors_of_the_queue_are_told_and_none_is_left_for_the_next_call(
+    box: LedBox, world: LedBoxWorld
+) -> None:
+    send_behind_its_back(world, b"FOO\nOUTP:PAN7 1\nBAR\n")
+    with pytest.raises(DeviceRefused, match=r"-113 .*FOO; -114 .*panel 7.*; -113 .*BAR"):
+        box.running()
+    assert not box.running()

@@ -1,0 +1,184 @@
+"""The watch over the arm, with an arm that reports what the test says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from arms import KR10_R1100_SIXX
+
+from coupole.acquisition import arm_supervisor
+from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor
+from coupole.acquisition.observer import Control
+from coupole.devices import ArmState
+from coupole.errors import DeviceFault, DeviceLost
+
+HERE_DEG = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
+THERE_DEG = np.add(HERE_DEG, [0.0, 20.0, 0.0, 0.0, 0.0, 0.0])
+REACH_MM = np.full(6, 1000.0)
+"""So that an axis off by a mrad moves a point by a mm at most."""
+MRAD_DEG = float(np.degrees(1e-3))
+
+
+class Arm:
+    """A `Robot` and its clock: at each reading it has gone on by a tenth of its way, `off_mrad` beside it."""
+
+    def __init__(self, off_mrad: Callable[[float], float] = lambda share: 0.0) -> None:
+        self._off_mrad = off_mrad
+        self.share, self.t_ns, self.now = 1.0, 1, 0.0
+        self.done: list[str] = []
+        self.still_deg: Any = HERE_DEG
+        self.silent, self.fault = False, ""
+
+    def now_ns(self) -> int:
+        return int(self.now * 1e9)
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+    def hurry(self, until_ns: int) -> None:
+        """No matter here."""
+
+    def move_to(self, joints_deg: Any) -> None:
+        self.done.append("move")
+        self.from_deg, self.to_deg, self.share = self.still_deg, joints_deg, 0.0
+
+    def measured(self) -> ArmState:
+        self.t_ns += not self.silent
+        if self.share >= 1.0:
+            return self._state(self.still_deg, moving=False)
+        self.share += 0.1
+        joints_deg = self.from_deg + min(1.0, self.share) * (self.to_deg - self.from_deg)
+        joints_deg = np.add(joints_deg, [MRAD_DEG * self._off_mrad(self.share), 0, 0, 0, 0, 0])
+        if self.share >= 1.0:
+            self.still_deg = self.to_deg
+        return self._state(joints_deg, moving=True)
+
+    def wait_settled(self) -> ArmState:
+        return self._state(self.still_deg, moving=False)
+
+    def stop(self) -> None:
+        self.done.append("stop")
+
+    def _state(self, joints_deg: Any, *, moving: bool) -> ArmState:
+        return ArmState(tuple(joints_deg), np.eye(4), self.t_ns, moving, self.fault)
+
+
+@pytest.fixture
+def supervised(monkeypatch: pytest.MonkeyPatch) -> Callable[[Arm], ArmSupervisor]:
+    monkeypatch.setattr(arm_supervisor, "arm_of", lambda rig: KR10_R1100_SIXX)
+    flange = SimpleNamespace(matrix=lambda: np.eye(4))
+    rig = SimpleNamespace(motion=SimpleNamespace(settle_dwell_s=0.1, still_deg=0.01), flange_from_camera=flange)
+
+    def supervise(arm: Arm) -> ArmSupervisor:
+        found = SimpleNamespace(legs=[], refusals=[])
+        bodies = SimpleNamespace(reach_mm=REACH_MM)
+        motion = SimpleNamespace(bodies=bodies, itinerary=lambda views, start_deg: found)
+        job: Any = SimpleNamespace(cell=SimpleNamespace(rig=rig), motion=motion)
+        cell: Any = SimpleNamespace(robot=arm, clock=arm)
+        supervisor = ArmSupervisor(job, cell, Control())
+        supervisor.itinerary([])
+        return supervisor
+
+    return supervise
+
+
+VISIT: Any = SimpleNamespace(leg=SimpleNamespace(waypoints=[THERE_DEG]))
+Supervise = Callable[[Arm], ArmSupervisor]
+
+
+def test_an_arm_on_its_path_arrives(supervised: Supervise) -> None:
+    arm = Arm()
+    pose = supervised(arm).go(VISIT)
+    assert pose.arm.joints_deg == tuple(THERE_DEG)
+    assert arm.done == ["move"]
+
+
+@pytest.mark.parametrize("off_mm", [10.5, 14.0, -14.0, 19.0])
+def test_an_arm_more_than_10_mm_beside_its_path_is_stopped(supervised: Supervise, off_mm: float) -> None:
+    arm = Arm(lambda share: off_mm if share > 0.5 else 0.0)
+    with pytest.raises(DeviceFault, match=f"during its motion it deviated by up to {abs(off_mm):.1f} mm"):
+        supervised(arm).go(VISIT)
+    assert arm.done == ["move", "stop"]
+
+
+def test_an_arm_9_mm_beside_its_path_goes_on(supervised: Supervise) -> None:
+    arm = Arm(lambda share: 9.0 if 0.3 < share < 0.9 else 0.0)
+    supervised(arm).go(VISIT)
+    assert arm.done == ["move"]
+
+
+def test_an_arm_that_is_not_where_its_path_begins_does_not_start(supervised: Supervise) -> None:
+    arm = Arm()
+    supervisor = supervised(arm)
+    arm.still_deg = np.add(HERE_DEG, [14 * MRAD_DEG, 0, 0, 0, 0, 0])
+    with pytest.raises(DeviceFault, match=r"before it started it deviated by up to 14\.0 mm"):
+        supervisor.go(VISIT)
+    assert "move" not in arm.done
+
+
+def test_a_fault_in_motion_ends_the_motion(supervised: Supervise) -> None:
+    arm = Arm()
+    supervisor = supervised(arm)
+
+    def fail(share: float) -> float:
+        arm.fault = "emergency stop" if share > 0.5 else ""
+        return 0.0
+
+    arm._off_mrad = fail
+    with pytest.raises(DeviceFault, match="emergency stop"):
+        supervisor.go(VISIT)
+
+
+@pytest.mark.parametrize(("off_deg", "moved"), [(0.009, False), (0.011, True), (-0.011, True)])
+def test_an_arm_at_rest_may_be_off_by_what_the_rig_calls_still(
+    supervised: Supervise, off_deg: float, moved: bool
+) -> None:
+    arm = Arm()
+    supervisor = supervised(arm)
+    supervisor.go(VISIT)
+    arm.still_deg = np.add(THERE_DEG, [0, 0, 0, 0, 0, off_deg])
+    if not moved:
+        supervisor.heard_at_rest()
+        return
+    with pytest.raises(ArmMovedError, match=r"moved by 0\.011 deg"):
+        supervisor.heard_at_rest()
+
+
+def test_news_are_newer_than_the_moment_at_which_they_are_asked_for(supervised: Supervise) -> None:
+    arm = Arm()
+    supervisor = supervised(arm)
+    supervisor.go(VISIT)
+    before_ns = arm.t_ns
+    assert supervisor.await_news().t_ns > before_ns + 1
+
+
+def test_an_arm_that_says_nothing_more_is_lost(supervised: Supervise) -> None:
+    arm = Arm()
+    supervisor = supervised(arm)
+    supervisor.go(VISIT)
+    arm.silent = True
+    with pytest.raises(DeviceLost, match="its controller sent none"):
+        supervisor.await_news()
+
+
+def test_an_arm_that_was_pushed_and_springs_back_is_measured_anew_and_never_driven(supervised: Supervise) -> None:
+    arm = Arm()
+    supervisor = supervised(arm)
+    supervisor.go(VISIT)
+    arm.still_deg = np.add(THERE_DEG, [0.004, 0, 0, 0, 0, 0])
+    assert supervisor.await_return(ArmMovedError("it moved")).arm.joints_deg == tuple(arm.still_deg)
+    assert arm.done == ["move"]
+
+
+def test_an_arm_that_stays_pushed_is_a_fault_and_never_driven(supervised: Supervise) -> None:
+    arm = Arm()
+    supervisor = supervised(arm)
+    supervisor.go(VISIT)
+    arm.still_deg = np.add(THERE_DEG, [0.02, 0, 0, 0, 0, 0])
+    with pytest.raises(DeviceFault, match="has not come back by itself"):
+        supervisor.await_return(ArmMovedError("it moved"))
+    assert arm.done == ["move"]

@@ -1,0 +1,144 @@
+"""The burst's loop: what counts as proven, round by round, with devices that do as the test says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from matching_takes import take, whole_burst
+from scripted_cell import Cell
+
+from coupole.acquisition import burst_runner
+from coupole.acquisition.arm_supervisor import ArmMovedError
+from coupole.acquisition.frame_matching import Match, match
+from coupole.errors import DeviceError, DeviceTimeout
+
+BURST = whole_burst(40)
+"""0.5 s: ten rounds of the loop."""
+MIDDLE_S = BURST.duration_s / 2
+
+
+def shots_of(cell: Cell) -> set[str]:
+    return {str(shot) for shot in cell.burst.shots if shot}
+
+
+def test_a_clean_burst_is_proven_whole_with_every_frame_under_its_own_light() -> None:
+    cell = Cell(BURST, take(BURST))
+    cell.fire()
+    assert {str(shot) for shot in cell.proven} == shots_of(cell)
+    for shot, frame in zip(cell.proven, cell.proven_frames, strict=True):
+        assert shot == cell.burst.shots[cell.what.truth[frame]]
+
+
+def test_most_of_a_burst_is_proven_while_it_runs() -> None:
+    cell = Cell(BURST, take(BURST), moves_at_s=BURST.duration_s - 0.1)
+    with pytest.raises(ArmMovedError):
+        cell.fire()
+    assert len(cell.proven) > len(shots_of(cell)) // 2
+
+
+def test_frames_that_came_after_the_arms_last_word_are_not_proven() -> None:
+    """It had moved by then, which was learnt five rounds later."""
+    cell = Cell(BURST, take(BURST), heard_until_s=MIDDLE_S, moves_at_s=MIDDLE_S + 0.25)
+    with pytest.raises(ArmMovedError):
+        cell.fire()
+    assert max(cell.proven_frames) < cell.confirmed
+    assert cell.arrives_us(cell.confirmed - 1) <= 1e6 * MIDDLE_S
+    assert len(cell.proven) > 5
+    assert len(cell.proven) + len(cell.freed) == cell.arrived
+
+
+def test_the_last_frames_are_not_proven_before_the_arm_was_heard_of_once_more() -> None:
+    cell = Cell(BURST, take(BURST), heard_until_s=MIDDLE_S, moves_at_s=BURST.duration_s + 10.0)
+    with pytest.raises(ArmMovedError):
+        cell.fire()
+    assert cell.awaited_news == 1
+    assert max(cell.proven_frames) < cell.confirmed
+    assert cell.arrives_us(cell.confirmed - 1) <= 1e6 * MIDDLE_S
+
+
+def test_the_proof_gets_no_frame_that_is_newer_than_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reading the log takes so long that frames come meanwhile."""
+    cell = Cell(BURST, take(BURST), poll_takes_s=0.06)
+    given: list[tuple[int, int]] = []
+
+    def spy(log: Any, frame_ids: Any, timestamps_ns: Any, *, complete: bool, **more: Any) -> Match:
+        if not complete:
+            given.append((len(frame_ids), cell.frames_at_poll))
+        return match(log, frame_ids, timestamps_ns, complete=complete, **more)
+
+    monkeypatch.setattr(burst_runner, "match", spy)
+    cell.fire()
+    assert {str(shot) for shot in cell.proven} == shots_of(cell)
+    assert max(frames for frames, _ in given) > 5
+    assert all(frames <= at_poll for frames, at_poll in given)
+
+
+def test_a_frame_that_comes_after_the_last_edges_one_is_still_looked_at() -> None:
+    """A surplus frame in the middle of the burst lets the count be full before the last frame is there."""
+    what = take(BURST, surplus_us=(1e6 * MIDDLE_S,))
+    cell = Cell(BURST, what)
+    verdict = cell.fire()
+    assert verdict.match.surplus.sum() == 1
+    assert {str(shot) for shot in cell.proven} == shots_of(cell)
+
+
+def test_a_step_whose_led_drew_no_current_is_not_proven_but_told() -> None:
+    what = take(BURST)
+    log = what.log.copy()
+    log["led_open"][10] = True
+    cell = Cell(BURST, replace(what, log=log))
+    verdict = cell.fire()
+    assert verdict.dead == [BURST.shots[10]]
+    assert BURST.shots[10] not in cell.proven
+
+
+def test_a_step_that_ended_over_temperature_is_not_proven() -> None:
+    what = take(BURST)
+    log = what.log.copy()
+    log["over_temperature"][10] = True
+    cell = Cell(BURST, replace(what, log=log))
+    cell.fire()
+    assert BURST.shots[10] not in cell.proven
+
+
+def test_an_arm_that_moves_finds_the_lights_off_before_anything_else() -> None:
+    cell = Cell(BURST, take(BURST), moves_at_s=MIDDLE_S)
+    with pytest.raises(ArmMovedError):
+        cell.fire()
+    assert cell.done[cell.done.index("started") + 1 :] == ["lights off", "camera disarmed", "BurstEnded"]
+
+
+def test_after_a_push_the_upload_that_lights_off_ended_is_made_anew() -> None:
+    def ended(table: Any) -> None:
+        if len(table) == len(following.table) and not tried:
+            tried.append(len(table))
+            raise DeviceError("led box", expected="time", happened="lights off", remedy="")
+
+    tried: list[int] = []
+    following = whole_burst(12)
+    cell = Cell(BURST, take(BURST), moves_at_s=MIDDLE_S, on_load=ended)
+    with pytest.raises(ArmMovedError):
+        cell.fire(following)
+    cell.moves_at_s, cell.arrived = np.inf, 0
+    cell.proven.clear()
+    cell.fire(following)
+    assert tried
+    assert {str(shot) for shot in cell.proven} == shots_of(cell)
+
+
+def test_a_box_that_logs_nothing_more_is_a_time_out_and_the_cell_is_made_safe_first() -> None:
+    what = take(BURST)
+    cell = Cell(BURST, replace(what, edges_us=np.where(np.arange(len(what.edges_us)) < 20, what.edges_us, np.inf)))
+    with pytest.raises(DeviceTimeout, match=f"20 of {len(BURST.table)} are in its log"):
+        cell.fire()
+    assert cell.done[cell.done.index("started") + 1] == "made safe"
+
+
+def test_slots_of_frames_without_proof_are_freed() -> None:
+    what = take(BURST, surplus_us=(1e6 * MIDDLE_S + 3000.0,))
+    cell = Cell(BURST, what)
+    cell.fire()
+    assert len(cell.freed) == len(what.truth) - len(cell.proven)

@@ -1,0 +1,217 @@
+"""Device clear: the box goes dark at once, whatever is on the line, over each of its wires."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ledbox_world import Call, LedBoxWorld, ledbox_world, opened, run_to_end, table, wait_until
+from test_ledbox import TcpLink, usb_world
+
+from coupole.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.ledbox.driver import LedBox, Settings
+from drivers.ledbox.wire import pack
+
+PROMISED_S = 0.1
+SLOW = 0.25
+"""World time over machine time: a busy machine must not be taken for a slow box."""
+LONG_FLASH = table(1, led=900, on_us=2_000_000, period_us=2_000_000)
+
+
+def dark_after_s(world: LedBoxWorld, lights_off: Callable[[], None]) -> float:
+    """World time from the call to the moment at which the light and the panel are off."""
+    dark_ns: list[int] = []
+    world.box._on_panel = lambda panel, on, t_ns: dark_ns.append(t_ns)
+    called_ns = world.clock.now_ns()
+    lights_off()
+    assert len(dark_ns) == len(world.darkened_ns) == 1
+    return (max(dark_ns[0], world.darkened_ns[0]) - called_ns) / 1e9
+
+
+def light_up(box: LedBox, world: LedBoxWorld) -> None:
+    box.load(LONG_FLASH)
+    box.start(LONG_FLASH)
+    box.panel(2, on=True)
+    wait_until(lambda: bool(world.lights), "light")
+
+
+def upload_in_the_middle(box: LedBox, world: LedBoxWorld) -> Call:
+    """An upload in another thread, a part of which has reached the box."""
+    call = Call(lambda: box.load(table(1080, on_us=1000)))
+    wait_until(lambda: any(32 <= len(bank) < 1080 for bank in world.box._tables), "an upload in its middle")
+    return call
+
+
+@pytest.mark.parametrize("baud", [9600, 57_600, 115_200, 921_600])
+def test_lights_off_overtakes_an_upload_on_a_serial_line(tmp_path: Path, baud: int) -> None:
+    speed = SLOW if baud > 9600 else 2 * SLOW
+    with (
+        ledbox_world(tmp_path, speed=speed, baud=baud) as world,
+        opened(world, baud=baud, watchdog_s=0) as box,
+    ):
+        light_up(box, world)
+        upload = upload_in_the_middle(box, world)
+        assert dark_after_s(world, box.lights_off) < PROMISED_S
+        error = upload.ended()
+    assert isinstance(error, DeviceError)
+    assert "meanwhile the lights were switched off" in str(error)
+
+
+@pytest.fixture(params=["serial", "socket", "usbtmc"])
+def world(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[LedBoxWorld]:
+    made = {
+        "serial": lambda: ledbox_world(tmp_path, speed=SLOW),
+        "socket": lambda: ledbox_world(tmp_path, link=TcpLink, speed=SLOW),
+        "usbtmc": lambda: usb_world(tmp_path, monkeypatch, speed=SLOW),
+    }[request.param]
+    with made() as running:
+        yield running
+
+
+@pytest.fixture
+def box(world: LedBoxWorld) -> Iterator[LedBox]:
+    with opened(world, watchdog_s=0) as driver:
+        yield driver
+
+
+def test_lights_off_does_not_wait_for_an_upload_that_hangs(box: LedBox, world: LedBoxWorld) -> None:
+    light_up(box, world)
+    lost = world.lose_answers(1)
+    upload = Call(lambda: box.load(table(1080, on_us=1000)))
+    wait_until(lambda: bool(lost), "a block that is not confirmed")
+    assert dark_after_s(world, box.lights_off) < PROMISED_S
+    assert not isinstance(upload.ended(), DeviceTimeout)
+
+
+def test_a_device_clear_reaches_a_box_that_waits_for_the_rest_of_a_block(box: LedBox, world: LedBoxWorld) -> None:
+    light_up(box, world)
+    box._scpi._link.write(b"SEQ:DATA #532000abc", _NoDeadline(), box._scpi._link.clears)
+    if not world.box.port.startswith("usbtmc"):  # whose messages arrive whole
+        wait_until(lambda: world.box._scpi.inside_block, "the block's first bytes")
+    assert dark_after_s(world, box.lights_off) < PROMISED_S
+    assert not world.do(lambda: world.box._scpi.inside_block)
+
+
+def test_after_a_device_clear_the_next_upload_and_burst_are_whole(box: LedBox, world: LedBoxWorld) -> None:
+    steps = table(200, on_us=1000, period_us=1000)
+    lost = world.lose_answers(1)
+    upload = Call(lambda: box.load(steps))
+    wait_until(lambda: bool(lost), "a block that is not confirmed")
+    box.lights_off()
+    assert upload.ended() is not None
+    box.load(steps)
+    box.start(steps)
+    assert run_to_end(box, world)["led"].tolist() == list(range(200))
+
+
+def test_a_device_clear_keeps_tables_settings_and_the_error_queue(box: LedBox, world: LedBoxWorld) -> None:
+    steps = table(7)
+    box.load(steps)
+    world.do(lambda: world.box._scpi.receive(b"FOO\n"))
+    box._scpi.device_clear()
+    with pytest.raises(DeviceRefused, match="-113 Undefined header; FOO"):
+        box.running()
+    assert box._scpi.ask("SEQ:COUN?;:TRIG:OUTP:WIDT?", 2) == ("7", "50")
+
+
+class _NoDeadline:
+    remaining_s, expired = 1.0, False
+
+
+# -- tables in blocks ---------------------------------------------------------------------------------------
+
+
+def test_tables_go_up_in_blocks_of_at_most_512_bytes(tmp_path: Path) -> None:
+    with ledbox_world(tmp_path) as world, opened(world) as box:
+        blocks: list[int] = []
+        upload = world.box._upload
+
+        def note(before: Any, payload: bytes) -> None:
+            blocks.append(len(payload))
+            upload(before, payload)
+
+        world.box._upload = note
+        box.load(table(1080, on_us=1000))
+    assert max(blocks) == 512
+    assert sum(blocks) == 1080 * 16
+
+
+def test_other_messages_pass_between_the_blocks_of_an_upload(tmp_path: Path) -> None:
+    with ledbox_world(tmp_path) as world, opened(world) as box:
+        upload = upload_in_the_middle(box, world)
+        assert box.board_temperature_c(0) == 22.0
+        seen = len(world.box._tables[0])
+        assert upload.ended() is None
+    assert seen < 1080
+
+
+@pytest.mark.parametrize("record", [5, 32, 100])
+def test_a_record_out_of_limits_is_named_whichever_block_it_is_in(tmp_path: Path, record: int) -> None:
+    with ledbox_world(tmp_path) as world, opened(world) as box:
+        steps = table(120)
+        steps["on_us"][record] = 999
+        with pytest.raises(DeviceRefused, match=f"-222.*record {record}: on_us must be"):
+            box.load(steps)
+        with pytest.raises(DeviceRefused, match="neither bank"):
+            box.start(steps)
+
+
+def test_an_led_lit_again_too_soon_is_refused_across_blocks(tmp_path: Path) -> None:
+    with ledbox_world(tmp_path) as world, opened(world) as box:
+        steps = table(40)
+        steps["led"][32] = steps["led"][31]
+        with pytest.raises(DeviceRefused, match="record 32: led 31 rests 2000 us after record 31"):
+            box.load(steps)
+
+
+def test_a_bank_takes_no_more_records_than_it_has_room_for(tmp_path: Path) -> None:
+    def send(message: bytes) -> bytes:
+        answer: bytes = world.do(lambda: world.box._scpi.receive(message))
+        return answer
+
+    dark = pack(table(1, on_us=0))
+    dark = b"\xff\xff" + dark[2:]
+    with ledbox_world(tmp_path) as world:
+        send(b"SEQ:DATA #565520" + 4095 * dark + b"\n")
+        assert send(b"SEQ:DATA:APP #216" + dark + b";:SYST:ERR?;:SEQ:COUN?\n") == b'0,"No error";4096\n'
+        refused = send(b"SEQ:DATA:APPend #216" + dark + b";:SYST:ERR?;:SEQ:COUN?\n")
+    assert refused == b'-222,"Data out of range; 4097 records exceed 4096";4096\n'
+
+
+def test_the_time_of_an_upload_is_foretold(tmp_path: Path) -> None:
+    """On the world's clock: what preflight waits for."""
+    with ledbox_world(tmp_path, speed=0.5) as world, opened(world) as box:
+        started_ns = world.clock.now_ns()
+        box.load(table(320, on_us=1000))
+        took_s = (world.clock.now_ns() - started_ns) / 1e9
+    assert Settings(port="any").upload_s(320) == pytest.approx(took_s, rel=0.5)
+
+
+# -- boxes of protocol 1.0 ----------------------------------------------------------------------------------
+
+
+def test_a_box_without_device_clear_gets_tables_whole_and_says_so(tmp_path: Path) -> None:
+    with ledbox_world(tmp_path, protocol="1.0") as world, opened(world) as box:
+        assert box.self_test()["device clear"] == "no: the box speaks protocol 1.0"
+        steps = table(1080, on_us=1000, period_us=1000)
+        box.load(steps)
+        box.start(steps)
+        assert len(run_to_end(box, world)) == 1080
+
+
+def test_lights_off_of_a_box_without_device_clear_comes_behind_the_upload(tmp_path: Path) -> None:
+    with ledbox_world(tmp_path, protocol="1.0") as world, opened(world, watchdog_s=0) as box:
+        light_up(box, world)
+        sent = Call(lambda: box.load(table(600, on_us=1000)))
+        wait_until(lambda: world.box._scpi.inside_block, "an upload in its middle")
+        assert 0.2 < dark_after_s(world, box.lights_off) < 2.0
+        assert sent.ended() is None
+
+
+def test_a_box_with_device_clear_says_so(tmp_path: Path) -> None:
+    with ledbox_world(tmp_path) as world, opened(world) as box:
+        assert box.self_test()["device clear"] == "yes"

@@ -140,9 +140,12 @@ class Cell:
 
     def fire(self, burst: Burst) -> Verdict:
         arm = SimpleNamespace(attend=lambda: None, await_news=lambda: None)
-        cell = SimpleNamespace(ledbox=self, camera=self, clock=self, robot=SimpleNamespace(measured=lambda: None))
+        robot = SimpleNamespace(measured=lambda: None)
+        cell = SimpleNamespace(ledbox=self, camera=self, clock=self, robot=robot, make_safe=lambda: None)
         note = lambda *given, **more: self.noted.append(given)  # noqa: E731
-        runner = HostBurst(cell, self, arm, lambda *_: None, lambda: None, note)  # type: ignore[arg-type]
+        runner = HostBurst(  # type: ignore[arg-type]
+            cell, self, arm, lambda *_: None, lambda: None, lambda _: None, note
+        )
         return runner.fire(burst, FORMAT)
 
 

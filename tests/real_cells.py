@@ -1,4 +1,4 @@
-"""A cell that is not simulated, as far as the program knows: its rig names real drivers and their addresses, and no
+"""A cell that is not simulated, as far as the program knows: its rig names real drivers and their addresses, no
 world. At the other end of the wires is one nevertheless, which keeps its own account of the light that it gives.
 """
 
@@ -44,9 +44,9 @@ def real_cell(folder: Path, *, text_box: bool = False, **plan: Any) -> Iterator[
         yield cell, world
 
 
-def true_dose_lux_h(cell: CellFolder, world: World) -> float:
-    """What the object has received by the world's own account, at the corner or centre of its box that received
-    most: Lambert's law, from the dome's file, with nothing of Coupole's."""
+def true_dose_lux_h(cell: CellFolder, world: World) -> np.ndarray:
+    """[9] What the corners and the centre of the object's box have received by the world's own account: Lambert's
+    law, from the dome's file, with nothing of Coupole's."""
     light = world.ask("light")
     points = _box_points(cell)
     rows = [line.split(",") for line in Path(cell.rig_data["dome"]["leds"]).read_text().splitlines()]
@@ -58,7 +58,7 @@ def true_dose_lux_h(cell: CellFolder, world: World) -> float:
         distance = np.linalg.norm(away, axis=1)
         lux_s += seconds * flux_lm / np.pi * np.clip(away @ normal / distance, 0, None) / distance**2
     lux_s += cell.rig_data["dome"]["panel_lux"] * sum(light["panels_s"].values())
-    return float(lux_s.max() / 3600)
+    return np.asarray(lux_s / 3600)
 
 
 def _box_points(cell: CellFolder) -> np.ndarray:

@@ -68,11 +68,11 @@ class Source(Protocol):
 class Studio:
     """The newest frame, and the viewers' choice."""
 
-    def __init__(self, choice: Choice, *, unwatched_s: float = UNWATCHED_S) -> None:
+    def __init__(self, choice: Choice) -> None:
         self.closing = threading.Event()
         self.remark = ""
         """What the source has to say; empty if nothing."""
-        self._unwatched_s, self._asked_s = unwatched_s, time.monotonic()
+        self._asked_s = time.monotonic()
         self._lock = threading.Lock()
         self._shown: Shown | None = None
         self._choice = choice
@@ -80,7 +80,7 @@ class Studio:
     @property
     def watched(self) -> bool:
         """False if no page has asked for some seconds (at the beginning: none has come)."""
-        return time.monotonic() - self._asked_s < self._unwatched_s
+        return time.monotonic() - self._asked_s < UNWATCHED_S
 
     def asked(self) -> None:
         """A page asks, so that somebody may be watching."""

@@ -117,6 +117,7 @@ class LiveServer(ThreadingHTTPServer):
     """Serves the page on 127.0.0.1; call `serve_forever` on a thread, `shutdown` to end."""
 
     daemon_threads = True
+    request_queue_size = 2 * MOST_CONNECTIONS
 
     def __init__(self, page: _Page, port: int) -> None:
         self._page, self.policy = page, _policy(page.html)

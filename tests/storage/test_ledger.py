@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
 import os
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,14 @@ from typing import Any
 import cells
 import pytest
 from cells import CellFolder
+from forks import fork_context
 
 from coupole.errors import InputError, StorageError
 from coupole.plan.cell import read_cell, users_ledger_folder
 from coupole.storage import ledger as ledger_module
 from coupole.storage.ledger import Ledger, similar_ids
 
-EACH = 40
+EACH = 15
 
 
 def lines(ledger: Ledger) -> list[dict[str, Any]]:
@@ -96,8 +96,7 @@ def _plan_and_correct(folder: Path, name: str) -> None:
 
 
 def test_two_processes_at_once_lose_nothing(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("forkserver")
-    writers = [context.Process(target=_plan_and_correct, args=(tmp_path, name)) for name in ("a", "b")]
+    writers = [fork_context().Process(target=_plan_and_correct, args=(tmp_path, name)) for name in ("a", "b")]
     for writer in writers:
         writer.start()
     for writer in writers:
@@ -127,7 +126,7 @@ def test_a_line_is_synced_before_the_call_returns(tmp_path: Path, monkeypatch: p
     synced: list[tuple[str, int]] = []
 
     def note(fd: int) -> None:
-        place = Path(os.readlink(f"/proc/self/fd/{fd}"))
+        place = Path(f"/proc/self/fd/{fd}").readlink()
         synced.append((place.name, place.stat().st_size if place.is_file() else 0))
 
     monkeypatch.setattr(os, "fdatasync", note)

@@ -5,6 +5,7 @@
     CoupoleError
     ├── InputError            2  plan, rig or arguments are wrong
     ├── PreflightRefused      3  the plan is well formed but must not be run
+    ├── DoseBudgetReached     3  more light would exceed the object's budget
     ├── CalibrationRefused    3  the calibration misses its limits: written, but not to be used
     ├── DeviceError           4  a device failed
     │   ├── DeviceTimeout     4  ... did not answer in time
@@ -69,6 +70,12 @@ class PreflightRefused(CoupoleError):
     def __init__(self, refusals: Sequence[str]) -> None:
         self.refusals = tuple(refusals)
         super().__init__("\n".join(refusals))
+
+
+class DoseBudgetReached(CoupoleError):
+    """The next light would take the object beyond its dose budget; it was not given."""
+
+    exit_code = 3
 
 
 class CalibrationRefused(CoupoleError):

@@ -86,6 +86,7 @@ class CellFolder:
         rig["robot"]["settings"] = {"cycle_ms": 12}  # a third of the work that one of 4 ms is
         rig["ledbox"]["settings"]["watchdog_s"] = 4 * self.speed  # of the world's time; the machine may be busy
         rig["storage"] = {"folder": str(self.folder / "storage"), "reserve_bytes": 0}
+        rig["ledger"] = str(self.folder / "ledger")
         settings = {"seed": 1, "speed": self.speed, "arm_shadows": False}  # `Expectation` knows of no arm
         rig["world"] = {"serves": "always", "settings": settings}
         self.rig_data = rig

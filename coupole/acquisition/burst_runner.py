@@ -57,6 +57,10 @@ class _RunningBurst:
     judged: Match | None = None
     proven: set[int] = field(default_factory=set)
     """Frames already passed to the recorder."""
+    started_ns: int | None = None
+    """When the box was told to run the table, on the rig's clock; None until then."""
+    panel_since_ns: int | None = None
+    """When the panel was switched on; None without one."""
 
 
 class BurstRunner:
@@ -78,7 +82,7 @@ class BurstRunner:
         self._cell, self._recorder, self._arm, self._dose = cell, recorder, arm, dose
         self._outcome, self._gain_db, self._max_frames_per_s = outcome, gain_db, max_frames_per_s
         self._tell = tell
-        self._by_host = HostBurst(cell, recorder, arm, tell, wait_while_paused, self._note)
+        self._by_host = HostBurst(cell, recorder, arm, tell, wait_while_paused, dose.begin, self._note)
         self._uploader = futures.ThreadPoolExecutor(1, "upload")
         self._upload: futures.Future[None] | None = None
         self._buffer_memory_bytes = memory_for_buffers()
@@ -136,10 +140,12 @@ class BurstRunner:
         camera.arm(buffers)
         try:
             grabber.start()
+            self._dose.begin(burst)
             self._arm.attend()
             if burst.panel:
+                running.panel_since_ns = clock.now_ns()
                 box.panel(burst.panel, True)
-            started_ns = clock.now_ns()
+            running.started_ns = started_ns = clock.now_ns()
             box.start(burst.table)
             if following is not None:
                 self.prepare(following)
@@ -239,7 +245,7 @@ class BurstRunner:
 
     def _end(self, running: _RunningBurst, camera: CameraStatistics | None) -> None:
         """Record dose and figures, release unproven frames, commit the proven ones."""
-        log, grabber = running.log, running.grabber
+        log, grabber, dark_ns = running.log, running.grabber, self._cell.clock.now_ns()
         grabber.stop()
         for frame in range(grabber.count):
             if frame not in running.proven:
@@ -253,6 +259,8 @@ class BurstRunner:
             log,
             running.arm_before,
             running.arm_after,
+            table_ran_s=_since_s(running.started_ns, dark_ns),
+            panel_s=_since_s(running.panel_since_ns, dark_ns),
             frames=grabber.count,
             table_s=running.burst.duration_s,
             clocks=None if clocks is None else vars(clocks),
@@ -266,20 +274,30 @@ class BurstRunner:
         log: NDArray[np.void],
         arm_before: ArmState,
         arm_after: ArmState | None,
+        *,
+        table_ran_s: float = 0.0,
+        panel_s: float,
         **figures: Any,
     ) -> None:
-        """The burst's line in the journal."""
+        """Count the burst's light, and write its line in the journal."""
+        given_lux_h = self._dose.end(burst, log, table_ran_s=table_ran_s, panel_s=panel_s)
         self._recorder.note(
             BurstEnded(
                 view=burst.view,
                 steps=len(log),
-                on_s=self._dose.add(burst, log),
+                on_s=round(float(log["on_us"][log["led"] != NO_LED].sum()) * 1e-6, 6),
+                given_lux_h=given_lux_h,
                 joints_before_deg=_rounded(arm_before),
                 joints_after_deg=_rounded(arm_after) if arm_after else None,
                 **figures,
             )
         )
         self._recorder.commit(now=True)
+
+
+def _since_s(begun_ns: int | None, ended_ns: int) -> float:
+    """Seconds; 0 for what has not begun."""
+    return 0.0 if begun_ns is None else (ended_ns - begun_ns) / 1e9
 
 
 def _hottest_c(log: NDArray[np.void]) -> float | None:

@@ -1,37 +1,217 @@
-"""The light dose of a run, computed from the box's log."""
+"""The light that a session gives the object: entered in its ledger before it is given, corrected afterwards.
+
+Whoever gives light asks here first, burst by burst (`DoseMeter`) or second by second (the live view): the object's
+budget is checked, and what is planned is on the disk before the first lamp is lit. A session that ends without a
+word (kill -9, power cut) leaves the plan of one burst, which is at least what was given.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.acquisition.opened_cell import OpenedCell
+from coupole.acquisition.recorder import Recorder
 from coupole.devices import NO_LED
+from coupole.errors import DoseBudgetReached
 from coupole.geometry import apply
 from coupole.plan.bursts import Burst
+from coupole.plan.rig_devices import longest_light_s, watchdog_s
 from coupole.preflight.job import Job
+from coupole.preflight.preflight import BURST_OVERHEAD_S
+from coupole.storage.journal_events import BurstBegun
+from coupole.storage.ledger import History, ledger_of
+
+LuxHours = NDArray[np.float64]
+"""[points] at each of the object's dose points."""
+_CLOCKS_PPM, _START_US = 1000, 1000
+"""Allowance for the box's clock, and for its start of a table, where steps are counted that its log lacks."""
+_DIGITS = 9
+_ROUNDING = 1e-9
+
+
+class LightOnObject:
+    """Light on one object in one session. The dose is that of the point which has received most.
+
+    In a simulated cell nothing is entered; the budget is asked as in a real one. Without an object there is none.
+    """
+
+    def __init__(
+        self, job: Job, cell: OpenedCell, what_for: str, before_lux_h: tuple[float, ...] | LuxHours = ()
+    ) -> None:
+        """`before_lux_h` [points] was given by earlier sessions of the same run. Raises StorageError if the ledger
+        cannot be read and written."""
+        measured = job.plan.object
+        ledger = ledger_of(job.cell, measured.id) if measured else None
+        history = ledger.read() if ledger else History()
+        self._ledger = None if cell.simulated else ledger
+        if self._ledger is not None:
+            self._ledger.prove_writable()
+        self._id, self._what_for = measured.id if measured else "", what_for
+        self._budget_lux_h = math.inf
+        if measured and measured.dose_budget_lux_h is not None:
+            self._budget_lux_h = measured.dose_budget_lux_h * (1.0 + _ROUNDING)
+        self._warn_above_lux_h = history.warn_above_lux_h
+        self.total_lux_h = history.total_lux_h
+        """Of the object's life, by the ledger, and of this session."""
+        points = len(job.shape.dose_points_mm)
+        self._given_lux_h = np.array(before_lux_h) if len(before_lux_h) else np.zeros(points)
+        self._planned: tuple[LuxHours, float | None, str] | None = None
+
+    @property
+    def lux_h(self) -> float:
+        """Of the run so far, or of the live view."""
+        return float(self._given_lux_h.max())
+
+    @property
+    def left_lux_h(self) -> float:
+        """Until the budget is reached; infinite without one."""
+        return self._budget_lux_h - self.total_lux_h
+
+    @property
+    def warning(self) -> str:
+        """Why the object's light is to be watched; empty if it is not."""
+        limit = self._warn_above_lux_h
+        if limit is None or self.total_lux_h <= limit:
+            return ""
+        return f"object {self._id}: {self.total_lux_h:.3f} lux.h in all; its ledger warns above {limit:g}"
+
+    def begin(self, at_most: LuxHours, expected: LuxHours | None = None, w_per_lm: float | None = None) -> None:
+        """Light is about to be given, `at_most` this; the budget is asked for what is `expected` (default: the
+        same). `w_per_lm`: its damaging power, if known.
+
+        Raises DoseBudgetReached, and StorageError if it cannot be entered: no light may then be given.
+        """
+        more_lux_h = self._more_lux_h(at_most if expected is None else expected)
+        if more_lux_h > self.left_lux_h:
+            raise DoseBudgetReached(
+                f"object {self._id}: the next {more_lux_h:.3g} lux.h after {self.total_lux_h:.3f} lux.h would "
+                f"exceed its budget of {self._budget_lux_h:g} lux.h. Raise `dose_budget_lux_h` in the plan if the "
+                "object may receive it"
+            )
+        plan_id = ""
+        if self._ledger is not None:
+            plan_id = self._ledger.plan(self._what_for, *self._entry(at_most, w_per_lm))
+        self._planned = at_most, w_per_lm, plan_id
+
+    def end(self, given: LuxHours | None) -> LuxHours:
+        """The light of the last `begin` is over; `given` None: what was planned stands. Returns what counts."""
+        if self._planned is None:
+            return np.zeros_like(self._given_lux_h)
+        (at_most, w_per_lm, plan_id), self._planned = self._planned, None
+        counts = at_most if given is None else given
+        if self._ledger is not None and given is not None:
+            self._ledger.correct(plan_id, *self._entry(counts, w_per_lm))
+        self.total_lux_h += self._more_lux_h(counts)
+        self._given_lux_h = self._given_lux_h + counts
+        return counts
+
+    def _more_lux_h(self, lux_h: LuxHours) -> float:
+        """What these add to the dose, so that a run's entries sum to the dose of its highest point."""
+        return float((self._given_lux_h + lux_h).max() - self._given_lux_h.max())
+
+    def _entry(self, lux_h: LuxHours, w_per_lm: float | None) -> tuple[float, float | None]:
+        more_lux_h = max(0.0, round(self._more_lux_h(lux_h), _DIGITS))
+        return more_lux_h, None if w_per_lm is None else round(more_lux_h * w_per_lm, _DIGITS)
+
+
+class FlashMeter:
+    """The light of single flashes, planned for about a second of them at a time: a file is not synced for each."""
+
+    def __init__(self, job: Job, cell: OpenedCell, what_for: str, flashes_per_s: float) -> None:
+        self._light = LightOnObject(job, cell, what_for)
+        self._cell, self._w_per_lm = cell, job.cell.led_damage_w_per_lm
+        self._at_once = max(1, round(flashes_per_s))
+        self._flash_lux_h: LuxHours | None = None
+        self._left = 0
+        self._given_lux_h = np.zeros(len(job.shape.dose_points_mm))
+
+    @property
+    def warning(self) -> str:
+        return self._light.warning
+
+    def begin(self, lux_h: LuxHours, at_most_lux_h: LuxHours) -> None:
+        """A flash of `lux_h` [points] is about to be given; should this process be killed, the box may give
+        `at_most_lux_h` instead. Raises DoseBudgetReached and StorageError: it may then not be given."""
+        if not self._left or self._flash_lux_h is None or not np.array_equal(lux_h, self._flash_lux_h):
+            self.settle()
+            count = self._at_once if self._at_once * lux_h.max() <= self._light.left_lux_h else 1
+            self._light.begin(count * lux_h + (at_most_lux_h - lux_h), count * lux_h, self._w_per_lm)
+            self._flash_lux_h, self._left = lux_h, count
+        self._left -= 1
+        self._given_lux_h = self._given_lux_h + lux_h
+
+    def add(self, lux_h: LuxHours) -> None:
+        """The last flash gave so much more."""
+        self._given_lux_h = self._given_lux_h + lux_h
+
+    def settle(self) -> None:
+        """Enter what was given of the last plan; all of it if it is not sure that the lights are off."""
+        self._light.end(self._given_lux_h if self._cell.lights_confirmed else None)
+        self._given_lux_h, self._left = np.zeros_like(self._given_lux_h), 0
 
 
 class DoseMeter:
-    """Sums lux hours at the job's points on the object; the highest is the run's dose."""
+    """The light of bursts."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, cell: OpenedCell, recorder: Recorder) -> None:
         rig = job.cell.rig
         points_base = apply(rig.support.base_from_support.matrix(), job.shape.dose_points_mm)
         self._lux = job.cell.leds.illuminance_lux(points_base, emission=rig.dome.emission)
         self._row_of_led = {int(led): row for row, led in enumerate(job.cell.leds.ids)}
-        self._panel_lux = rig.dome.panel_lux
-        self._given_lux_h = np.zeros(len(points_base))
+        self._job, self._cell, self._recorder = job, cell, recorder
+        self._light = LightOnObject(job, cell, recorder.name, recorder.light_before_lux_h())
 
     @property
     def lux_h(self) -> float:
-        """At the point with the highest dose."""
-        return float(self._given_lux_h.max())
+        """Of the run so far, all its sessions."""
+        return self._light.lux_h
 
-    def add(self, burst: Burst, log: NDArray[np.void]) -> float:
-        """Add the dose of a burst from its `log` (STEP_RECORD_DTYPE [n]); returns seconds of LED light."""
-        lit = log[log["led"] != NO_LED]
-        rows = [self._row_of_led[int(led)] for led in lit["led"]]
-        self._given_lux_h += self._lux[:, rows] @ lit["on_us"] / 3.6e9
+    def begin(self, burst: Burst) -> None:
+        """To be called before a burst gives light: its plan is on the disk when this returns.
+
+        Raises DoseBudgetReached and StorageError: no light may then be given.
+        """
+        rig, cell = self._job.cell.rig, self._job.cell
+        expected = self._of_leds(burst.table["led"], burst.table["on_us"])
+        at_most = expected
         if burst.panel:
-            self._given_lux_h += self._panel_lux * burst.duration_s / 3600.0
-        return round(float(lit["on_us"].sum()) * 1e-6, 6)
+            expected = expected + self._of_panel(burst.duration_s + BURST_OVERHEAD_S)
+            at_most = expected + self._of_panel(watchdog_s(rig))
+        elif not burst.hardware:
+            lit = np.flatnonzero(burst.table["led"] != NO_LED)
+            over_us = longest_light_s(rig, burst.timing.on_us) * 1e6 - burst.timing.on_us
+            rows = [self._row_of_led[int(led)] for led in burst.table["led"][lit]]
+            if rows:
+                at_most = expected + self._lux[:, rows].max(axis=1) * max(0.0, over_us) / 3.6e9
+        w_per_lm = cell.panel_damage_w_per_lm if burst.panel else cell.led_damage_w_per_lm
+        self._light.begin(at_most, expected, w_per_lm)
+        planned = tuple(np.round(at_most, _DIGITS).tolist())
+        self._recorder.note(BurstBegun(view=burst.view, planned_lux_h=planned))
+        self._recorder.commit(now=True)
+
+    def end(self, burst: Burst, log: NDArray[np.void], *, table_ran_s: float, panel_s: float) -> tuple[float, ...]:
+        """Count what a burst has given: by its `log` (STEP_RECORD_DTYPE [n]); steps that the log lacks and that
+        may have begun while the box ran the table for `table_ran_s`; and a panel that was on for `panel_s`.
+
+        If it is not sure that the lights are off, all that was planned counts. Returns lux hours at each point.
+        """
+        if not self._cell.lights_confirmed:
+            return tuple(np.round(self._light.end(None), _DIGITS).tolist())
+        given = self._of_leds(log["led"], log["on_us"])
+        begins_us = np.cumsum(burst.table["period_us"]) - burst.table["period_us"]
+        allowed_us = table_ran_s * (1e6 + _CLOCKS_PPM) + _START_US
+        begun = (begins_us <= allowed_us) if table_ran_s > 0 else np.zeros(len(begins_us), bool)
+        unlogged = burst.table[begun & ~np.isin(np.arange(len(begun)), log["step"])]
+        given = given + self._of_leds(unlogged["led"], unlogged["on_us"]) + self._of_panel(panel_s)
+        return tuple(np.round(self._light.end(given), _DIGITS).tolist())
+
+    def _of_leds(self, leds: NDArray[np.int64], on_us: NDArray[np.float64]) -> LuxHours:
+        lit = leds != NO_LED
+        rows = [self._row_of_led[int(led)] for led in leds[lit]]
+        return np.asarray(self._lux[:, rows] @ on_us[lit] / 3.6e9)
+
+    def _of_panel(self, seconds: float) -> LuxHours:
+        return np.full(len(self._lux), self._job.cell.rig.dome.panel_lux * seconds / 3600.0)

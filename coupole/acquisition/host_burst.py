@@ -63,8 +63,8 @@ class _Kept:
 
 
 class HostBurst:
-    """Fires bursts with software trigger. `tell(burst, step)` is called during a burst, `note` writes its journal
-    line."""
+    """Fires bursts with software trigger. `begin(burst)` is called before its first light, `tell(burst, step)`
+    during a burst; `note` counts its light and writes its journal line."""
 
     def __init__(
         self,
@@ -73,10 +73,13 @@ class HostBurst:
         arm: ArmSupervisor,
         tell: Callable[[Burst, int], None],
         wait_while_paused: Callable[[], None],
+        begin: Callable[[Burst], None],
         note: Callable[..., None],
     ) -> None:
         self._cell, self._recorder, self._arm = cell, recorder, arm
-        self._tell, self._wait_while_paused, self._note = tell, wait_while_paused, note
+        self._tell, self._wait_while_paused, self._begin, self._note = tell, wait_while_paused, begin, note
+        self._panel_s = 0.0
+        """For which the panel of this burst was on, at most."""
 
     def fire(self, burst: Burst, frame_format: FrameFormat) -> Verdict:
         """Fire one light after the other; the dose is recorded even if this raises, that of the light which was on
@@ -88,7 +91,9 @@ class HostBurst:
         marks = set(range(len(burst.labels))) - set(burst.inner)
         reason = ""
         arm_before, arm_after = self._cell.robot.measured(), None
+        self._panel_s = 0.0
         try:
+            self._begin(burst)
             for index, shot in enumerate(burst.shots):
                 self._arm.attend()
                 self._wait_while_paused()
@@ -119,7 +124,7 @@ class HostBurst:
             for one in kept:
                 self._recorder.free(one.slot)
             log = np.array([astuple(record) for record in given], STEP_RECORD_DTYPE)
-            self._note(burst, log, arm_before, arm_after, frames=taken_frames)
+            self._note(burst, log, arm_before, arm_after, panel_s=self._panel_s, frames=taken_frames)
         return Verdict(replace(NOTHING_TO_MATCH, reason=reason), dead)
 
     def _keep(self, taken: _Taken, frame: Frame, burst: Burst, shot: ShotId | None) -> list[_Kept]:
@@ -158,7 +163,9 @@ class HostBurst:
             try:
                 box.lights_off()
             finally:
-                given.append(record or _cut_short(int(step["led"]), (clock.now_ns() - started_ns) / 1e3))
+                lasted_ns = clock.now_ns() - started_ns
+                given.append(record or _cut_short(int(step["led"]), lasted_ns / 1e3))
+                self._panel_s += lasted_ns / 1e9 if burst.panel else 0.0
                 camera.disarm()
         clock.sleep(max(0.0, timing.period_us * 1e-6 - (clock.now_ns() - started_ns) / 1e9))
         if record.t_on_ns != UNKNOWN_NS:

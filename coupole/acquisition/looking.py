@@ -9,29 +9,30 @@ from pathlib import Path
 
 from rich.console import Console
 
+from coupole.acquisition.dose import FlashMeter
 from coupole.acquisition.live_cell import CellSource
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import open_cell
 from coupole.acquisition.operator import (
     UNLIMITED_BYTES,
     ask_to_begin,
-    enter_dose,
     identity_printer,
     longest_exposure_us,
     refuse,
 )
 from coupole.acquisition.sequencer import Sequencer
 from coupole.acquisition.signals import obeyed_by
-from coupole.errors import InputError
+from coupole.errors import InputError, PreflightRefused
 from coupole.geometry import apply
 from coupole.plan.cell import Cell
 from coupole.plan.light_selection import leds_of_plan
 from coupole.preflight import exposure_advice
-from coupole.preflight.checking import check_job
+from coupole.preflight.checking import check_job, ledger_warnings, light_refusals
 from coupole.preflight.job import Job, schedule_of
 from coupole.preflight.preflight import StorageFacts
 from coupole.storage.arm_faults import ArmFaults
-from coupole.viewing.live import Choice, RunSource, Source, Studio, choice_from, run_source
+from coupole.storage.ledger import ledger_of
+from coupole.viewing.live import Choice, RunSource, Source, Studio, Wanted, choice_from, run_source
 from coupole.viewing.live_page import serve
 from coupole.viewing.terminal import LiveFigures, RunObserver
 
@@ -62,34 +63,46 @@ def meter(
                 sequencer.acquire()
         finally:
             cell.make_safe()
-            enter_dose(job, cell, sequencer.outcome.dose_lux_h, "meter")
     return exposure_advice.advise(recorder.views, request, longest_us=longest_exposure_us(job.cell.rig))
 
 
 def watch_cell(
     job_or_cell: Job | Cell, console: Console, choice: Choice, *, frames_per_s: float, port: int, confirm: bool
 ) -> None:
-    """Show a cell's camera until the operator stops it; the arm does not move."""
+    """Show a cell's camera until the operator stops it, or the object's budget is reached; the arm does not move.
+
+    The light on a plan's object is entered in its dose ledger. Raises PreflightRefused,
+    DoseBudgetReached, DeviceError.
+    """
     job = job_or_cell if isinstance(job_or_cell, Job) else None
     rig_cell = job_or_cell.cell if isinstance(job_or_cell, Job) else job_or_cell
     rig, leds = rig_cell.rig, rig_cell.leds
-    centre = rig.support.base_from_support.matrix()[:3, 3]
-    points = apply(rig.support.base_from_support.matrix(), job.shape.dose_points_mm) if job else centre[None]
-    lux_of_row = leds.illuminance_lux(points, emission=rig.dome.emission).max(axis=0)
-    lux = dict(zip(leds.ids.tolist(), lux_of_row.tolist(), strict=True))
-    ids = tuple(leds.ids.tolist())
-    studio = Studio(choice_from(vars(choice), choice, ids, longest_exposure_us(rig)))
+    base_from_support = rig.support.base_from_support.matrix()
+    points = apply(base_from_support, job.shape.dose_points_mm) if job else base_from_support[None, :3, 3]
+    lux = leds.illuminance_lux(points, emission=rig.dome.emission)
+    longest_us = longest_exposure_us(rig)
+    wanted = Wanted(led=choice.led, exposure_us=choice.exposure_us)
+    studio = Studio(choice_from(wanted, choice, tuple(leds.ids.tolist()), longest_us))
+    if job is None or job.plan.object is None:
+        console.print("no object is known, so no light is counted; to have it counted, give a plan")
+    else:
+        _ask_the_ledger(job, console)
     ArmFaults(rig_cell.state_folder).refuse(rig_cell.document.path)
     ask_to_begin(rig_cell, confirm=confirm)
     with open_cell(rig_cell, job=job, on_opened=identity_printer(console)) as cell:
-        source = CellSource(cell, rig, leds, lux.__getitem__, frames_per_s=frames_per_s)
-        try:
-            _show_live(source, studio, console, port, longest_us=longest_exposure_us(rig), halt=cell.halt)
-        finally:
-            cell.make_safe()
-            given = studio.shown.dose_lux_h if studio.shown else 0.0
-            if job is not None and given:
-                enter_dose(job, cell, given, "live")
+        meter = FlashMeter(job, cell, "live", frames_per_s) if job else None
+        source = CellSource(cell, rig, leds, lux, meter, frames_per_s=frames_per_s)
+        _show_live(source, studio, console, port, longest_us=longest_us, halt=cell.halt)
+
+
+def _ask_the_ledger(job: Job, console: Console) -> None:
+    """Raise PreflightRefused if the object may receive no more light; print what its ledger warns of."""
+    assert job.plan.object is not None
+    history = ledger_of(job.cell, job.plan.object.id).read()
+    if refusals := light_refusals(job, history):
+        raise PreflightRefused(refusals)
+    for warning in ledger_warnings(job, history, 0.0):
+        console.print(f"[yellow]note:[/] {warning}")
 
 
 def watch_run(folder: Path, console: Console, *, port: int) -> None:
@@ -115,13 +128,17 @@ def _show_live(
     control = Control()
     page = threading.Thread(target=server.serve_forever, name="page", daemon=True)
     page.start()
-    console.print(f"live at http://127.0.0.1:{server.server_port}/  (Ctrl-C ends it)")
+    console.print(f"live at {server.url}  (Ctrl-C ends it)", soft_wrap=True)
+    said = ""
     with obeyed_by(control, halt):
         filling = run_source(source, studio, failures.append)
         try:
             with LiveFigures(console) as figures:
                 while not studio.closing.is_set() and not control.stop.is_set():
                     figures.show(studio.shown)
+                    if studio.remark != said:
+                        said = studio.remark
+                        console.print(said or "a page is open", markup=False)
                     studio.closing.wait(_FIGURES_EVERY_S)
         finally:
             studio.closing.set()

@@ -39,6 +39,8 @@ class OpenedCell:
     trouble: list[str] = field(default_factory=list)
     arm_confirmed: bool = True
     """False if the arm was not confirmed to be at rest at the end."""
+    lights_confirmed: bool = True
+    """False if the lights were not confirmed to be off at the end."""
     _made_safe: bool = False
 
     def halt(self) -> list[Safeguard]:
@@ -63,7 +65,7 @@ class OpenedCell:
         for safeguard in done:
             if safeguard.trouble:
                 self.trouble.append(f"not sure that it is safe ({safeguard.what}): {safeguard.trouble}")
-        self.arm_confirmed = not done[1].trouble
+        self.lights_confirmed, self.arm_confirmed = not done[0].trouble, not done[1].trouble
 
 
 class Safeguard:

@@ -1,4 +1,4 @@
-"""Common parts of all sessions at a cell: signals, confirmation, identities of devices, the dose ledger."""
+"""Common parts of all sessions at a cell: confirmation and identities of devices."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ from typing import Any
 
 from rich.console import Console
 
-from coupole.acquisition.opened_cell import OpenedCell
 from coupole.devices import Identity
 from coupole.errors import Interrupted, PreflightRefused
 from coupole.plan.bursts import EXPOSURE_MARGIN_US
 from coupole.plan.cell import Cell
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import in_world
-from coupole.preflight import ledger
-from coupole.preflight.job import Job
 from coupole.preflight.preflight import Report
 from coupole.viewing.terminal import ask
 
@@ -37,12 +34,6 @@ def ask_to_begin(cell: Cell, *, confirm: bool) -> None:
 def longest_exposure_us(rig: Rig) -> int:
     """Longest exposure that the LEDs' longest on-time allows."""
     return rig.led_limits.on_us[1] - rig.led_limits.rise_us - EXPOSURE_MARGIN_US
-
-
-def enter_dose(job: Job, cell: OpenedCell, dose_lux_h: float, what_for: str) -> None:
-    """Enter the light of a real cell in the object's dose ledger."""
-    if job.plan.object and not cell.simulated:
-        ledger.add(job.cell.storage_folder, job.plan.object.id, run=what_for, dose_lux_h=dose_lux_h)
 
 
 def identity_printer(console: Console) -> Any:

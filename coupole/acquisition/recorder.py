@@ -14,6 +14,7 @@ from coupole.devices import ArmState, Frame, FrameFormat
 from coupole.errors import StorageError
 from coupole.geometry import Transform
 from coupole.plan.shot_id import ShotId
+from coupole.storage import journal, run_dose
 from coupole.storage.frame_file_creation import Collections, create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import Event, FrameProven
@@ -28,6 +29,13 @@ SPARE_SLOTS = 32
 
 class Recorder(Protocol):
     """The recorder that the sequencer needs. `put` may be called from several threads, all else from one."""
+
+    name: str
+    """What the light is for, in the object's dose ledger: the run's name, or `meter`."""
+
+    def light_before_lux_h(self) -> tuple[float, ...]:
+        """Light that earlier sessions of the run gave each of the object's dose points; empty if none did."""
+        ...
 
     def proven(self) -> set[ShotId]:
         """Shots proven so far, also in an earlier session of the run."""
@@ -73,6 +81,7 @@ class RunRecorder:
     def __init__(self, run: Run, metadata: Mapping[str, Any], *, packed: bool = False) -> None:
         """Frames may be stored `packed`, two pixels in three bytes."""
         self._run, self._metadata, self._packed = run, dict(metadata), packed
+        self.name = run.folder.name
         self._journal = Journal(run.journal_path)
         self._proven = {shot: frame.index for shot, frame in run.proven().items()}
         self._writer: ViewWriter | None = None
@@ -81,6 +90,9 @@ class RunRecorder:
         self._committed_s = time.monotonic()
         self._committer = ThreadPoolExecutor(1, "commit")
         self._committing: Future[None] | None = None
+
+    def light_before_lux_h(self) -> tuple[float, ...]:
+        return run_dose.lux_h_of_points(journal.read(self._run.journal_path))
 
     def proven(self) -> set[ShotId]:
         return set(self._proven)
@@ -180,6 +192,8 @@ class RunRecorder:
 class DryRecorder:
     """For a dry run: counts proven frames, evaluates the exposure of frames with a picture."""
 
+    name = "dry run"
+
     def __init__(self) -> None:
         self._proven: set[ShotId] = set()
         self.events: list[Event] = []
@@ -187,6 +201,9 @@ class DryRecorder:
         self._format: FrameFormat | None = None
         self._slots: list[tuple[float, float] | None] = []
         self._view = ""
+
+    def light_before_lux_h(self) -> tuple[float, ...]:
+        return ()
 
     def proven(self) -> set[ShotId]:
         return self._proven

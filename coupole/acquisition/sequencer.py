@@ -56,7 +56,7 @@ class Sequencer:
     ) -> None:
         self._job, self._cell, self._recorder = job, cell, recorder
         self._observer, self._control = observer or Unwatched(), control or Control()
-        self._dose = DoseMeter(job)
+        self._dose = DoseMeter(job, cell, recorder)
         self._view_number = 0
         self._view_name = ""
         self.outcome = Outcome(shots=job.schedule.shots)

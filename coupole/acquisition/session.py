@@ -17,7 +17,6 @@ from coupole.acquisition.opened_cell import OpenedCell, open_cell
 from coupole.acquisition.operator import (
     UNLIMITED_BYTES,
     ask_to_begin,
-    enter_dose,
     identity_printer,
     refuse,
 )
@@ -224,7 +223,6 @@ def _acquire(
             alarm(trouble)
         recorder.note(SessionStopped(outcome=ended, robot=_statistics(cell)))
         recorder.close_quietly()
-        enter_dose(job, cell, outcome.dose_lux_h, run.folder.name)
         found.update({**_figures(run, job, outcome), "unsafe": cell.trouble})
         _say_outcome(console, run, outcome, ended)
 

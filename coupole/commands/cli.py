@@ -11,6 +11,7 @@ import typer
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
 from coupole.commands import keeping, planning, running
 from coupole.commands.calibrate import calibrate_app
+from coupole.commands.dose_ledger import dose
 from coupole.commands.render_scene import render
 from coupole.commands.uncertainty import budget
 from coupole.errors import CoupoleError, InputError, Interrupted
@@ -37,6 +38,7 @@ for command in (
     keeping.archive,
     keeping.export,
     keeping.scan,
+    dose,
     render,
     budget,
     planning.schema,

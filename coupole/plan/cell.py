@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from coupole.errors import InputError
+from coupole.errors import InputError, Problem
 from coupole.plan import yamlfile
 from coupole.plan.arm_description import arm_named
 from coupole.plan.led_table import LedTable, read_led_table
@@ -24,6 +25,10 @@ class Cell:
     leds: LedTable
     remarks: tuple[str, ...] = ()
     """Warnings about a valid file."""
+    led_damage_w_per_lm: float | None = None
+    """Damaging power of the LEDs' light (`coupole.appearance.spectra.damage`); None if their spectrum is not
+    known."""
+    panel_damage_w_per_lm: float | None = None
 
     @property
     def leds_path(self) -> Path:
@@ -46,6 +51,23 @@ class Cell:
         """What is true of the cell whatever is acquired."""
         given = self.rig.storage.state
         return self.document.resolve(given) if given is not None else self.storage_folder / "state"
+
+    @property
+    def ledger_folder(self) -> Path:
+        """Where the objects' dose ledgers are."""
+        return self.document.resolve(self.rig.ledger) if self.rig.ledger is not None else users_ledger_folder()
+
+    @property
+    def former_ledger_folder(self) -> Path:
+        """Where version 0.1 kept them."""
+        return self.storage_folder / "ledger"
+
+
+def users_ledger_folder() -> Path:
+    """Of rigs that name none: in the user's data folder (XDG Base Directory Specification; a relative path is
+    ignored there)."""
+    given = Path(os.environ.get("XDG_DATA_HOME", ""))
+    return (given if given.is_absolute() else Path.home() / ".local/share") / "coupole/ledger"
 
 
 def read_cell(path: Path) -> Cell:
@@ -71,10 +93,29 @@ def read_cell(path: Path) -> Cell:
     if rig.storage.pixels == "packed12" and (rig.sensor.bit_depth > 12 or rig.sensor.width_px % 2):
         why = f"expected an even width and 12 bits at most, found {rig.sensor.width_px} and {rig.sensor.bit_depth}"
         problems.append(document.problem(("storage", "pixels"), f"frames cannot be packed: {why}"))
+    led_w_per_lm = _damage_w_per_lm(document, "spectrum", rig.dome.spectrum, problems)
+    panel_w_per_lm = _damage_w_per_lm(document, "panel_spectrum", rig.dome.panel_spectrum, problems)
     if problems or leds is None:
         raise InputError(problems)
-    cell = Cell(rig, document, leds, tuple(renamed_drivers(document)))
+    cell = Cell(rig, document, leds, tuple(renamed_drivers(document)), led_w_per_lm, panel_w_per_lm)
     if cell.link_meshes is not None and (missing := missing_link_meshes(cell.link_meshes)):
         at = ("link_meshes",) if rig.link_meshes else ("arm",)
         raise InputError([document.problem(at, f"expected the links' meshes; there is no {missing[0]}")])
     return cell
+
+
+def _damage_w_per_lm(document: Document, key: str, given: Path | None, problems: list[Problem]) -> float | None:
+    """Of the lamps whose spectrum is in this file; None if none is given, or it adds to `problems`."""
+    if given is None:
+        return None
+    from coupole.appearance.spectra.damage import damage_w_per_lm
+    from coupole.appearance.spectra.measured import read_spectrum
+
+    path = document.resolve(given)
+    try:
+        return damage_w_per_lm(read_spectrum(path, unit="power"))
+    except (OSError, UnicodeDecodeError) as error:
+        problems.append(document.problem(("dome", key), f"cannot read the spectrum {path}: {error}"))
+    except InputError as error:
+        problems += error.problems or [document.problem(("dome", key), str(error))]
+    return None

@@ -65,6 +65,10 @@ class Dome(Model):
     emission: Literal["lambertian", "paper"] = "lambertian"
     panel_lux: Annotated[float, Field(ge=0)] = 0.0
     """Illuminance at the support's centre with one flat panel on, for the light dose."""
+    spectrum: Path | None = None
+    """Relative spectral power of the LEDs (CSV: nm, power), for the radiant exposure weighted by damage."""
+    panel_spectrum: Path | None = None
+    """The same of the panels."""
 
 
 class BoardThermal(Model):
@@ -191,6 +195,9 @@ class Rig(Model):
     led_limits: LedLimits = LedLimits()
     motion: Motion = Motion()
     storage: Storage
+    ledger: Path | None = None
+    """Folder of the objects' dose ledgers, the same for all rigs under which they lie. `coupole/ledger` in the
+    user's data folder (XDG) if not given."""
     calibrations: Literal["none"] | tuple[Path, ...] = "none"
     """Records that must be in force for plans without a list of their own."""
     world: WorldSection | None = None

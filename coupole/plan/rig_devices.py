@@ -81,9 +81,25 @@ def runs_tables(rig: Rig) -> bool:
 
 def upload_s(rig: Rig, steps: int) -> float:
     """Time to bring a table of so many steps into the rig's LED box, from its driver; 0 if unknown."""
-    model = settings_class(rig.ledbox.driver)
-    described = model(**_known(NOWHERE["ledbox"], model) | rig.ledbox.settings)
+    described = _ledbox_settings(rig)
     return float(described.upload_s(steps)) if hasattr(described, "upload_s") else 0.0
+
+
+def _ledbox_settings(rig: Rig) -> BaseModel:
+    model = settings_class(rig.ledbox.driver)
+    return model(**_known(NOWHERE["ledbox"], model) | rig.ledbox.settings)
+
+
+def longest_light_s(rig: Rig, on_us: int) -> float:
+    """Longest time that the rig's LED box leaves a light of `on_us` on, should the host die: by its driver's
+    settings, or else that time."""
+    described = _ledbox_settings(rig)
+    return float(described.longest_light_s(on_us)) if hasattr(described, "longest_light_s") else on_us * 1e-6
+
+
+def watchdog_s(rig: Rig) -> float:
+    """Time after which the rig's LED box switches its panels off, should the host die; 0 if unknown."""
+    return float(getattr(_ledbox_settings(rig), "watchdog_s", 0.0))
 
 
 def in_world(rig: Rig, *, dry_run: bool) -> bool:

@@ -14,9 +14,9 @@ from coupole.errors import StorageError
 from coupole.plan.bursts import Pace
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import in_world, runs_tables
-from coupole.preflight import ledger
 from coupole.preflight.job import Job, at_pace
 from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, check
+from coupole.storage.ledger import History, ledger_of, similar_ids
 from coupole.storage.write_speed import measure_write_speed
 
 _DISK_GRAIN_US = 100
@@ -54,7 +54,7 @@ def check_job(
         itinerary = job.motion.itinerary(job.schedule.views, home_deg)
     else:
         itinerary = job.motion.unchecked_itinerary(job.schedule.views, home_deg)
-    before = ledger.total_lux_h(job.cell.storage_folder, job.plan.object.id) if job.plan.object else 0.0
+    history = ledger_of(job.cell, job.plan.object.id).read() if job.plan.object else History()
 
     def checked(pace: Pace) -> tuple[Job, Report]:
         paced = at_pace(job, pace)
@@ -66,7 +66,7 @@ def check_job(
             storage,
             itinerary,
             object_points_support_mm=job.shape.dose_points_mm,
-            dose_before_lux_h=before,
+            dose_before_lux_h=history.total_lux_h,
             share_left=share_left,
         )
         return paced, report
@@ -77,7 +77,40 @@ def check_job(
         why = "cannot trigger the camera: it runs no tables. Set `trigger: software` in the plan"
         report.refusals.insert(0, f"led box {rig.ledbox.driver}: {why}")
     report.warnings += job.cell.remarks
+    report.warnings += ledger_warnings(job, history, report.dose_lux_h)
     return job, report
+
+
+def light_refusals(job: Job, history: History) -> list[str]:
+    """Reasons why the object may receive no more light at all."""
+    measured = job.plan.object
+    budget = measured.dose_budget_lux_h if measured else None
+    if measured is None or budget is None or history.total_lux_h < budget:
+        return []
+    return [
+        f"object {measured.id}: it has received {history.total_lux_h:.2f} lux.h; its budget is {budget:g} lux.h"
+    ]
+
+
+def ledger_warnings(job: Job, history: History, more_lux_h: float) -> list[str]:
+    """What the operator should know of the object's ledger before it receives so much more light."""
+    if job.plan.object is None:
+        return []
+    name, warnings = job.plan.object.id, []
+    limit_lux_h = history.warn_above_lux_h
+    if limit_lux_h is not None and history.total_lux_h + more_lux_h > limit_lux_h:
+        warnings.append(
+            f"object {name}: {more_lux_h:.3f} lux.h after {history.total_lux_h:.3f} lux.h before; its ledger "
+            f"warns above {limit_lux_h:g} lux.h"
+        )
+    if others := similar_ids(job.cell.ledger_folder, name):
+        warnings.append(
+            f"object {name}: there is also a ledger of `{others[0]}`, whose light is not counted. Is it the same "
+            "object?"
+        )
+    if history.unreadable:
+        warnings.append(f"object {name}: {history.unreadable} lines of its ledger cannot be read")
+    return warnings
 
 
 def calibration_refusals(job: Job, *, camera: str | None = None, temperature_c: float | None = None) -> list[str]:

@@ -138,12 +138,17 @@ class Metered:
 class MeterRecorder:
     """A `coupole.acquisition.recorder.Recorder` that only keeps a sample of the pixels in memory."""
 
+    name = "meter"
+
     def __init__(self) -> None:
         self.views: dict[str, Metered] = {}
         self.events: list[Event] = []
         self._proven: set[ShotId] = set()
         self._slots: list[tuple[int, NDArray[np.int32]]] = []
         self._view = ""
+
+    def light_before_lux_h(self) -> tuple[float, ...]:
+        return ()
 
     def proven(self) -> set[ShotId]:
         return self._proven

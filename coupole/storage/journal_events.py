@@ -102,6 +102,15 @@ class FrameProven(JournalEvent):
     """Of the frame's bytes, 16 hexadecimal digits."""
 
 
+class BurstBegun(JournalEvent):
+    """A burst is about to give light; synced before it does."""
+
+    event: Literal["begin"] = "begin"
+    view: str
+    planned_lux_h: tuple[float, ...]
+    """At each of the object's dose points, at most."""
+
+
 class BurstEnded(JournalEvent):
     """A burst has ended, complete or not; the light that it gave."""
 
@@ -120,6 +129,8 @@ class BurstEnded(JournalEvent):
     camera: dict[str, int] | None = None
     """The camera's counters."""
     hottest_board_c: float | None = None
+    given_lux_h: tuple[float, ...] | None = None
+    """At each of the object's dose points, in place of what was planned; None in version 0.1."""
 
 
 class GapFound(JournalEvent):
@@ -191,6 +202,7 @@ Event: TypeAlias = (
     | MoveBegun
     | ArmSettled
     | FrameProven
+    | BurstBegun
     | BurstEnded
     | GapFound
     | ReshootBegun

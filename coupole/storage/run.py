@@ -27,10 +27,11 @@ from typing import Any, assert_never
 import coupole
 from coupole.errors import InputError, StorageError
 from coupole.plan.shot_id import Led, ShotId, ShotLabel
-from coupole.storage import frame_file, journal
+from coupole.storage import frame_file, journal, run_dose
 from coupole.storage.journal_events import (
     JOURNAL_VERSION,
     ArmSettled,
+    BurstBegun,
     BurstEnded,
     Continued,
     Event,
@@ -248,6 +249,8 @@ class Status:
     views: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Proven and expected frames of each view."""
     last_event: str = ""
+    dose_lux_h: float = 0.0
+    """Light on the object in all sessions."""
 
     @property
     def missing(self) -> int:
@@ -267,6 +270,7 @@ def status(run: Run) -> Status:
     found.views = {view: (proven_per_view[view], count) for view, count in per_view.items()}
     for event in journal.read(run.journal_path):
         _note_event(found, event)
+    found.dose_lux_h = run_dose.highest_lux_h(journal.read(run.journal_path))
     return found
 
 
@@ -283,9 +287,9 @@ def _note_event(found: Status, event: Event) -> None:
             found.reshot += len(event.shots)
         case FaultNoted():
             found.faults.append(event.message)
-        case JournalBegun() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven() | BurstEnded():
+        case JournalBegun() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
             pass
-        case GapFound() | ViewSealed():
+        case BurstBegun() | BurstEnded() | GapFound() | ViewSealed():
             pass
         case _:
             assert_never(event)

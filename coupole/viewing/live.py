@@ -11,10 +11,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coupole.errors import InputError
 from coupole.plan.shot_id import Led
@@ -24,6 +25,9 @@ from coupole.storage.run import Run
 from coupole.viewing.raw_preview import Coding, Figures, figures
 
 _POLL_S = 0.2
+UNWATCHED_S = 5.0
+"""A source of light stops when no page has asked for so long; an open page asks five times a second, one in the
+background once."""
 
 
 @dataclass(frozen=True)
@@ -66,9 +70,21 @@ class Studio:
 
     def __init__(self, choice: Choice) -> None:
         self.closing = threading.Event()
+        self.remark = ""
+        """What the source has to say; empty if nothing."""
+        self._asked_s = time.monotonic()
         self._lock = threading.Lock()
         self._shown: Shown | None = None
         self._choice = choice
+
+    @property
+    def watched(self) -> bool:
+        """False if no page has asked for some seconds (at the beginning: none has come)."""
+        return time.monotonic() - self._asked_s < UNWATCHED_S
+
+    def asked(self) -> None:
+        """A page asks, so that somebody may be watching."""
+        self._asked_s = time.monotonic()
 
     @property
     def choice(self) -> Choice:
@@ -138,12 +154,32 @@ class RunSource:
         return Shown(number, str(event.shot), raw, coding, exposure_us, led, seen, 0.0, 0.0)
 
 
-def choice_from(wanted: dict[str, Any], before: Choice, leds: tuple[int, ...], longest_us: int) -> Choice:
+class Wanted(BaseModel):
+    """A viewer's choice as it comes: numbers are whole numbers, nothing is converted. What is left out stays."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+    led: int | None = None
+    exposure_us: int = 0
+
+
+def read_wanted(posted: bytes) -> Wanted:
+    """Raises InputError for anything else than JSON like {"led": 417, "exposure_us": 8000}."""
+    try:
+        return Wanted.model_validate_json(posted)
+    except ValidationError as error:
+        what = error.errors()[0]
+        where = ".".join(map(str, what["loc"])) or "choice"
+        raise InputError(f'{where}: expected whole numbers, like {{"led": 417}}: {what["msg"]}') from error
+
+
+def choice_from(wanted: Wanted, before: Choice, leds: tuple[int, ...], longest_us: int) -> Choice:
     """A viewer's choice, checked. Raises InputError for an LED or an exposure that the cell does not have."""
-    led, exposure_us = wanted.get("led", before.led), wanted.get("exposure_us", before.exposure_us)
+    led = wanted.led if "led" in wanted.model_fields_set else before.led
+    exposure_us = wanted.exposure_us if "exposure_us" in wanted.model_fields_set else before.exposure_us
     if led is not None and led not in leds:
         raise InputError(f"led: expected one of the dome's, found {led!r}")
-    if not isinstance(exposure_us, int) or not 10 <= exposure_us <= longest_us:
+    if not 10 <= exposure_us <= longest_us:
         raise InputError(f"exposure_us: expected a whole number from 10 to {longest_us}, found {exposure_us!r}")
     return Choice(led, exposure_us)
 

@@ -1,24 +1,62 @@
-"""The live view's web page, served to this machine only, on daemon threads."""
+"""The live view's web page, served to this machine only, to those who know its address.
+
+The address contains a token that is new each time. Requests by another host name (DNS rebinding), from pages of
+other sites, or that are not exactly what the page sends are refused. Each connection has one request, a bounded
+time and one of a few threads, so that clients which are slow or hang hold nobody up.
+"""
 
 from __future__ import annotations
 
+import base64
+import contextlib
+import hashlib
+import hmac
 import json
+import re
+import secrets
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from coupole.errors import InputError
-from coupole.viewing.live import Studio, choice_from
+from coupole.viewing.live import Studio, choice_from, read_wanted
 from coupole.viewing.raw_preview import look
 
 _WIDTH_PX = 960
-_VIEWER_S = 10.0
-"""The connection of a viewer that takes no bytes for so long is closed."""
+_REQUEST_S = 10.0
+"""A connection is closed after this time, whatever it is doing."""
+MOST_CONNECTIONS = 16
+"""At once; one more closes the oldest. A page has two, for some milliseconds each."""
 _MOST_POSTED = 4096
 _OURS = "X-Coupole-Live"
 """Browsers send this header only for pages of this server, so no other site can switch LEDs."""
+_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]{1,5})?", re.ASCII)
+_ORIGIN = re.compile(r"http://" + _HOST.pattern, re.ASCII)
+_LENGTH = re.compile(r"[0-9]{1,4}", re.ASCII)
+
+
+class Refused(Exception):
+    """A request that is not answered with what it asks for."""
+
+    def __init__(self, status: HTTPStatus, message: str) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Content type and body."""
+
+    kind: str
+    body: bytes
 
 
 @dataclass(frozen=True)
@@ -30,90 +68,203 @@ class _Page:
     leds: tuple[int, ...]
     """Ids that may be chosen; empty while a run is watched."""
     longest_us: int
+    token: str
 
-    def get(self, target: str) -> tuple[int, str, bytes]:
-        """Status, content type and body for a path with its query: page, figures or picture."""
-        url = urlsplit(target)
+    def get(self, target: str) -> Answer:
+        """Page, figures or picture, by a path with its query. Raises Refused."""
+        path, query = self._place(target)
+        if path == "":
+            return Answer("text/html; charset=utf-8", self.html)
+        if path == "figures":
+            self.studio.asked()
+            return Answer("application/json", self._figures())
         shown = self.studio.shown
-        if url.path == "/":
-            return 200, "text/html; charset=utf-8", self.html
-        if url.path == "/figures":
-            return 200, "application/json", self._figures()
-        if url.path == "/picture" and shown is not None:
-            marks = parse_qs(url.query).get("mark", [""])[0].split(",")
+        if path == "picture" and shown is not None:
+            self.studio.asked()
+            marks = parse_qs(query).get("mark", [""])[0].split(",")
             picture = look(
                 shown.raw, shown.coding, _WIDTH_PX, saturation="saturation" in marks, focus="focus" in marks
             )
-            return 200, "image/jpeg", picture
-        return 404, "text/plain", b"nothing here yet"
+            return Answer("image/jpeg", picture)
+        raise Refused(HTTPStatus.NOT_FOUND, "nothing here yet")
 
-    def choose(self, posted: bytes) -> bytes:
-        """Take a viewer's choice and return the figures. Raises InputError or ValueError if it is not valid."""
-        wanted = json.loads(posted)
-        if not isinstance(wanted, dict):
-            raise InputError('expected an object, like {"led": 417}')
-        self.studio.choose(choice_from(wanted, self.studio.choice, self.leds, self.longest_us))
-        return self._figures()
+    def choose(self, target: str, posted: bytes) -> Answer:
+        """Take a viewer's choice and return the figures. Raises Refused, or InputError if it is not valid."""
+        if self._place(target)[0] != "choose":
+            raise Refused(HTTPStatus.NOT_FOUND, "choices go to `choose`")
+        if not self.leds:
+            raise InputError("this is a run: light and exposure follow its plan")
+        self.studio.choose(choice_from(read_wanted(posted), self.studio.choice, self.leds, self.longest_us))
+        return Answer("application/json", self._figures())
+
+    def _place(self, target: str) -> tuple[str, str]:
+        """Path below the token, and query. Raises Refused without the right token."""
+        try:
+            url = urlsplit(target)
+        except ValueError as error:
+            raise Refused(HTTPStatus.BAD_REQUEST, "this is no path") from error
+        _, _, below = url.path.partition("/")
+        token, slash, path = below.partition("/")
+        if not slash or not hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode()):
+            raise Refused(HTTPStatus.FORBIDDEN, "use the whole address that the terminal shows")
+        return path, url.query
 
     def _figures(self) -> bytes:
         return json.dumps(_figures(self.studio, self.leds)).encode()
 
 
-def serve(studio: Studio, leds: tuple[int, ...], longest_us: int, port: int) -> ThreadingHTTPServer:
-    """A server on 127.0.0.1, its port in `server_port`; call `serve_forever` on a thread, `shutdown` to end.
+class LiveServer(ThreadingHTTPServer):
+    """Serves the page on 127.0.0.1; call `serve_forever` on a thread, `shutdown` to end."""
 
-    `leds` are the ids that a viewer may choose, `longest_us` the longest exposure.
-    """
+    daemon_threads = True
+    request_queue_size = 2 * MOST_CONNECTIONS
+
+    def __init__(self, page: _Page, port: int) -> None:
+        self._page, self.policy = page, _policy(page.html)
+        self._lock = threading.Lock()
+        self._since_s: dict[socket.socket, float] = {}
+        """Open connections, oldest first."""
+        super().__init__(("127.0.0.1", port), _Viewer)
+
+    @property
+    def page(self) -> _Page:
+        return self._page
+
+    @property
+    def url(self) -> str:
+        """The page's address, with its token."""
+        return f"http://127.0.0.1:{self.server_port}/{self._page.token}/"
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Take a connection; beyond `MOST_CONNECTIONS` the oldest is closed."""
+        with self._lock:
+            if len(self._since_s) >= MOST_CONNECTIONS:
+                oldest = next(iter(self._since_s))
+                del self._since_s[oldest]
+                _hang_up(oldest)
+            self._since_s[request] = time.monotonic()
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        with self._lock:
+            self._since_s.pop(request, None)
+        super().shutdown_request(request)
+
+    def service_actions(self) -> None:
+        """Called twice a second: close connections whose time is over."""
+        with self._lock:
+            for request, since_s in self._since_s.items():
+                if time.monotonic() - since_s > _REQUEST_S:
+                    _hang_up(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A connection that breaks is none of our errors; anything else is, and is told."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
+
+class _Viewer(BaseHTTPRequestHandler):
+    """One viewer's connection."""
+
+    server: LiveServer
+    server_version, sys_version = "coupole", ""
+    timeout = _REQUEST_S
+
+    def do_GET(self) -> None:
+        """Page, picture or figures."""
+        self._answer_with(lambda: self.server.page.get(self.path))
+
+    def do_POST(self) -> None:
+        """A viewer's choice: {"led": 417, "exposure_us": 8000}, led null for none."""
+        self._answer_with(lambda: self.server.page.choose(self.path, self._posted()))
+
+    def _answer_with(self, work: Callable[[], Answer]) -> None:
+        try:
+            self._refuse_others()
+            found = work()
+        except Refused as refused:
+            self._send(refused.status, Answer("text/plain; charset=utf-8", str(refused).encode()))
+        except InputError as error:
+            self._send(HTTPStatus.BAD_REQUEST, Answer("text/plain; charset=utf-8", str(error).encode()))
+        else:
+            self._send(HTTPStatus.OK, found)
+
+    def _refuse_others(self) -> None:
+        """Refuse a request to another name than this machine's own: another site may have sent it."""
+        hosts, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
+        if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
+            raise Refused(HTTPStatus.FORBIDDEN, "ask 127.0.0.1")
+        if any(not _ORIGIN.fullmatch(origin) for origin in origins):
+            raise Refused(HTTPStatus.FORBIDDEN, "another site's page may not ask")
+        if self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
+            raise Refused(HTTPStatus.FORBIDDEN, "another site's page may not ask")
+
+    def _posted(self) -> bytes:
+        if self.headers.get(_OURS) != "1":
+            raise InputError("only the page of this server may change light and exposure")
+        lengths = self.headers.get_all("Content-Length", [])
+        if len(lengths) != 1 or not _LENGTH.fullmatch(lengths[0]) or "Transfer-Encoding" in self.headers:
+            raise InputError(f"expected one Content-Length of at most {_MOST_POSTED} bytes")
+        size = int(lengths[0])
+        if size > _MOST_POSTED:
+            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"expected at most {_MOST_POSTED} bytes")
+        return self.rfile.read(size)
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """In place of the base class's page: for requests that it cannot read, and for other methods."""
+        self._send(HTTPStatus(code), Answer("text/plain; charset=utf-8", HTTPStatus(code).phrase.encode()))
+
+    def _send(self, status: HTTPStatus, answer: Answer) -> None:
+        self.close_connection = True
+        self.send_response(status)
+        for name, value in {
+            "Content-Type": answer.kind,
+            "Content-Length": str(len(answer.body)),
+            "Cache-Control": "no-store",
+            "Content-Security-Policy": self.server.policy,
+            "Cross-Origin-Opener-Policy": "same-origin",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+            "X-Frame-Options": "DENY",
+        }.items():
+            self.send_header(name, value)
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(answer.body)
+
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002  the base class names it so
+        """Requests are not logged."""
+
+
+def serve(studio: Studio, leds: tuple[int, ...], longest_us: int, port: int) -> LiveServer:
+    """A server whose page is at its `url`. `leds` are the ids that a viewer may choose, `longest_us` the longest
+    exposure. Raises OSError if the port cannot be taken."""
     html = resources.files("coupole.viewing").joinpath("live.html").read_bytes()
-    page = _Page(html, studio, leds, longest_us)
+    return LiveServer(_Page(html, studio, leds, longest_us, secrets.token_urlsafe(16)), port)
 
-    class Viewer(BaseHTTPRequestHandler):
-        """One viewer's connection."""
 
-        timeout = _VIEWER_S
+def _policy(html: bytes) -> str:
+    """Nothing runs but the page's own script and style, known by their hashes; nobody may frame the page."""
+    hashes = {
+        tag: base64.b64encode(hashlib.sha256(_content(html, tag)).digest()).decode() for tag in ("script", "style")
+    }
+    return (
+        f"default-src 'none'; script-src 'sha256-{hashes['script']}'; style-src 'sha256-{hashes['style']}'; "
+        "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
 
-        def do_GET(self) -> None:
-            """Page, picture or figures."""
-            if not self._foreign():
-                self._answer(*page.get(self.path))
 
-        def do_POST(self) -> None:
-            """A viewer's choice: {"led": 417, "exposure_us": 8000}, led null for none."""
-            if self._foreign():
-                return
-            try:
-                if self.headers.get(_OURS) != "1":
-                    raise InputError("only the page of this server may change light and exposure")
-                if not leds:
-                    raise InputError("this is a run: light and exposure follow its plan")
-                size = min(int(self.headers.get("Content-Length") or 0), _MOST_POSTED)
-                figures = page.choose(self.rfile.read(size))
-            except (InputError, ValueError) as error:
-                self._answer(400, "text/plain; charset=utf-8", str(error).encode())
-            else:
-                self._answer(200, "application/json", figures)
+def _content(html: bytes, tag: str) -> bytes:
+    """Of the page's one element of this name."""
+    _, _, after = html.partition(f"<{tag}>".encode())
+    return after.partition(f"</{tag}>".encode())[0]
 
-        def _foreign(self) -> bool:
-            """Refuse a request to another name than this machine's own: another site may have sent it."""
-            foreign = (self.headers.get("Host") or "").partition(":")[0] not in {"127.0.0.1", "localhost"}
-            if foreign:
-                self._answer(403, "text/plain", b"ask 127.0.0.1")
-            return foreign
 
-        def _answer(self, code: int, kind: str, body: bytes) -> None:
-            self.send_response(code)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(body)))
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, format: str, *args: Any) -> None:  # noqa: A002  the base class names it so
-            """Requests are not logged."""
-
-    server = ThreadingHTTPServer(("127.0.0.1", port), Viewer)
-    server.daemon_threads = True
-    return server
+def _hang_up(connection: socket.socket) -> None:
+    """Its thread then finds the connection closed."""
+    with contextlib.suppress(OSError):  # it is closed already
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 def _figures(studio: Studio, leds: tuple[int, ...]) -> dict[str, Any]:
@@ -129,4 +280,9 @@ def _figures(studio: Studio, leds: tuple[int, ...]) -> dict[str, Any]:
             "dose_lux_h": shown.dose_lux_h,
             **asdict(shown.figures),
         }
-    return {"shown": seen, "choice": asdict(choice), "leds": len(leds) and [min(leds), max(leds)]}
+    return {
+        "shown": seen,
+        "choice": asdict(choice),
+        "leds": len(leds) and [min(leds), max(leds)],
+        "remark": studio.remark,
+    }

@@ -182,6 +182,7 @@ def show_status(console: Console, status: Status) -> None:
         f"{status.reshot} re-shot; last event {status.last_event or 'none'}"
     )
     console.print(f"  proof: {status.proof}")
+    console.print(f"  light on the object: {status.dose_lux_h:.3f} lux.h")
     for view, (proven, expected) in status.views.items():
         console.print(f"  {view}: {proven} of {expected} frames")
     for fault in status.faults:

@@ -72,6 +72,11 @@ class Settings(BaseModel):
     """From opening the port until the box accepts commands: many microcontrollers reset when it is opened."""
     name: str = "led box"
 
+    def longest_light_s(self, on_us: int) -> float:
+        """Longest time that the box leaves a light of `on_us` on if the host dies: its own bound. (If `on` has no
+        `{on_ms}`, the box has none: it then leaves the light on until it is told otherwise.)"""
+        return _box_bound_ms(on_us) * 1e-3
+
     @model_validator(mode="after")
     def _templates_are_right(self) -> Self:
         for name in _FIELDS:
@@ -98,6 +103,11 @@ def _check_template(name: str, template: str) -> None:
         raise ValueError(f"`{name}`: `{template}` is no template of a command: {error}") from error
     if not line.isascii() or not line.isprintable() or not line:
         raise ValueError(f"`{name}`: expected one line of printable ASCII, found {line!r}")
+
+
+def _box_bound_ms(on_us: int) -> int:
+    """The box's own bound on a light of `on_us`."""
+    return math.ceil(_BOX_PATIENCE * (on_us * 1e-6 + _CONFIRMS_S) * 1e3)
 
 
 @dataclass
@@ -160,7 +170,7 @@ class TextLineBox:
             )
         ends = self._ends
         longest_s = on_us * 1e-6 + _CONFIRMS_S
-        on_ms = math.ceil(_BOX_PATIENCE * longest_s * 1e3)  # by then the driver has ended it, or the host is gone
+        on_ms = _box_bound_ms(on_us)  # by then the driver has ended it, or the host is gone
         with self._lock:
             try:
                 self._end(ends)

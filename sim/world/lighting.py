@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 
 _KEEP_NS = 10_000_000_000
 
@@ -13,12 +13,16 @@ class Lighting:
     def __init__(self) -> None:
         self._lit: deque[tuple[int, int, int, float]] = deque()
         self._panels_since_ns: dict[int, int] = {}
+        self._led_ns: Counter[int] = Counter()
+        """Time for which each LED was lit, without the intervals that are still in `_lit`."""
+        self._panel_ns: Counter[int] = Counter()
 
     def light(self, led: int, t_on_ns: int, t_off_ns: int, flux: float = 1.0) -> None:
         """LED `led` is switched on at `t_on_ns` and off at `t_off_ns` unless `dark` comes first, with `flux` times
         its tabulated flux."""
         while self._lit and self._lit[0][2] < t_on_ns - _KEEP_NS:
-            self._lit.popleft()
+            led_before, on, off, _ = self._lit.popleft()
+            self._led_ns[led_before] += off - on
         self._lit.append((led, t_on_ns, t_off_ns, flux))
 
     def dark(self, t_ns: int) -> None:
@@ -35,7 +39,8 @@ class Lighting:
         if on:
             self._panels_since_ns.setdefault(panel, t_ns)
         else:
-            self._panels_since_ns.pop(panel, None)
+            since_ns = self._panels_since_ns.pop(panel, t_ns)
+            self._panel_ns[panel] += t_ns - since_ns
 
     def shining(self, t_ns: int) -> list[int]:
         """LEDs that are lit at `t_ns`."""
@@ -44,6 +49,15 @@ class Lighting:
     def panels(self, t_ns: int) -> list[int]:
         """Panels that are lit at `t_ns`."""
         return [panel for panel, since in self._panels_since_ns.items() if since <= t_ns]
+
+    def given_s(self, t_ns: int) -> tuple[dict[int, float], dict[int, float]]:
+        """Seconds for which each LED and each panel has been lit until `t_ns`, since the world began."""
+        leds, panels = self._led_ns.copy(), self._panel_ns.copy()
+        for led, on, off, _ in self._lit:
+            leds[led] += max(0, min(off, t_ns) - on)
+        for panel, since_ns in self._panels_since_ns.items():
+            panels[panel] += t_ns - since_ns
+        return {led: ns / 1e9 for led, ns in leds.items()}, {panel: ns / 1e9 for panel, ns in panels.items()}
 
     def exposure_s(self, start_ns: int, end_ns: int) -> dict[int, float]:
         """Seconds for which each LED was lit between two times, at its tabulated flux; unlit LEDs are left out."""

@@ -219,6 +219,9 @@ class World:
                     "joints_deg": list(self.robot.joints_deg),
                     "camera_armed": self.camera.armed,
                 }
+            case "light":
+                leds_s, panels_s = self.lighting.given_s(self.reactor.now_ns)
+                return {"leds_s": leds_s, "panels_s": panels_s}
             case "fault":
                 fault = OneFault.model_validate({"fault": command["fault"]}).fault
                 if why := (

@@ -138,11 +138,17 @@ class Cell:
     def commit(self, *, now: bool) -> None:
         pass
 
+    def begin(self, burst: Burst) -> None:
+        self.done.append("begin")
+
     def fire(self, burst: Burst) -> Verdict:
         arm = SimpleNamespace(attend=lambda: None, await_news=lambda: None)
-        cell = SimpleNamespace(ledbox=self, camera=self, clock=self, robot=SimpleNamespace(measured=lambda: None))
+        robot = SimpleNamespace(measured=lambda: None)
+        cell = SimpleNamespace(ledbox=self, camera=self, clock=self, robot=robot, make_safe=lambda: None)
         note = lambda *given, **more: self.noted.append(given)  # noqa: E731
-        runner = HostBurst(cell, self, arm, lambda *_: None, lambda: None, note)  # type: ignore[arg-type]
+        runner = HostBurst(  # type: ignore[arg-type]
+            cell, self, arm, lambda *_: None, lambda: None, self.begin, note
+        )
         return runner.fire(burst, FORMAT)
 
 
@@ -161,9 +167,9 @@ def test_all_frames_are_proven_where_all_is_well() -> None:
 def test_each_step_is_armed_in_the_dark_lit_triggered_taken_and_ended_in_this_order() -> None:
     cell = Cell()
     cell.fire(burst_of())
-    assert cell.done[7:14] == [
+    assert cell.done[8:15] == [
         "arm",
-        f"on {cell.done[8].split()[1]}",
+        f"on {cell.done[9].split()[1]}",
         "trigger",
         "frame",
         "off",
@@ -259,3 +265,18 @@ def test_a_mark_is_bright_when_more_than_a_hundredth_of_it_is() -> None:
 
 def test_a_mark_without_a_picture_is_taken_for_dark_in_a_rehearsal() -> None:
     assert too_bright(frame_of(10_000, 4095, rendered=False), FORMAT) == ""
+
+
+def test_the_burst_is_planned_before_its_first_light() -> None:
+    cell = Cell()
+    cell.fire(burst_of())
+    assert cell.done[0] == "begin"
+    assert sum(one == "begin" for one in cell.done) == 1
+
+
+def test_a_burst_that_may_not_begin_gives_no_light() -> None:
+    cell = Cell()
+    cell.begin = lambda _: 1 // 0  # type: ignore[assignment,method-assign]
+    with pytest.raises(ZeroDivisionError):
+        cell.fire(burst_of())
+    assert not [one for one in cell.done if one.startswith(("on", "panel"))]

@@ -22,8 +22,8 @@ from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import upload_s
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.yamlfile import read
-from coupole.preflight import ledger
 from coupole.preflight.preflight import BURST_OVERHEAD_S, SETTLE_CHECK_S, Report, StorageFacts, check
+from coupole.storage.ledger import Ledger
 
 ROOT = REPO
 RIG, _ = read(ROOT / "configs/rigs/sim.yaml").problems(Rig)
@@ -154,9 +154,10 @@ def test_a_plan_over_the_objects_budget_is_refused_with_dose_and_budget() -> Non
 
 
 def test_what_the_ledger_says_counts_against_the_budget(tmp_path: Path) -> None:
-    ledger.add(tmp_path, "shroud", run="earlier", dose_lux_h=1.25)
-    ledger.add(tmp_path, "shroud", run="later", dose_lux_h=1.25)
-    before = ledger.total_lux_h(tmp_path, "shroud")
+    ledger = Ledger(tmp_path, "shroud")
+    ledger.enter(1.25, "earlier")
+    ledger.enter(1.25, "later")
+    before = ledger.read().total_lux_h
     refusal = only_refusal(checked(with_budget(4.0), leds=sphere(), dose_before_lux_h=before))
     assert "after 2.50 lux.h before; its budget is 4 lux.h" in refusal
 

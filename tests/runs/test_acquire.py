@@ -73,7 +73,7 @@ def test_every_shot_is_proven_once_and_verify_finds_it_whole(clean: Clean) -> No
 def test_the_journal_tells_each_view_from_move_to_seal(clean: Clean) -> None:
     kinds = [event["event"] for event in cells.events(clean.run)]
     told = [kind for kind in kinds if kind != "frame"]
-    assert told == ["journal", "start", *["view", "move", "settled", "burst", "seal"] * 2, "stop"]
+    assert told == ["journal", "start", *["view", "move", "settled", "begin", "burst", "seal"] * 2, "stop"]
     assert kinds.count("frame") == 2 * 66
 
 
@@ -95,6 +95,17 @@ def test_a_simulated_run_says_so_in_run_file_journal_and_frames(clean: Clean) ->
 
 def test_a_simulated_run_gives_the_object_no_dose_in_the_ledger(clean: Clean) -> None:
     assert not (clean.cell.folder / "storage/ledger").exists()
+    assert not (clean.cell.folder / "ledger").exists()
+
+
+def test_the_runs_dose_is_what_preflight_foresaw_and_the_journal_tells(clean: Clean) -> None:
+    foreseen = cells.here("check", clean.cell.plan, "--no-paths", "--json").document["dose_lux_h"]
+    assert clean.ended.document["dose_lux_h"] == pytest.approx(foreseen, rel=1e-6)
+    begun, ended = (cells.events(clean.run, kind) for kind in ("begin", "burst"))
+    assert [event["given_lux_h"] for event in ended] == [pytest.approx(event["planned_lux_h"]) for event in begun]
+    assert np.sum([event["given_lux_h"] for event in ended], axis=0).max() == pytest.approx(foreseen, rel=1e-6)
+    status = cells.here("status", clean.run, "--json").document
+    assert status["dose_lux_h"] == pytest.approx(foreseen, rel=1e-6)
 
 
 def test_frames_read_with_plain_hdf5_are_those_of_the_journal(clean: Clean) -> None:

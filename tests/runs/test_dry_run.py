@@ -54,13 +54,14 @@ def test_a_dry_run_writes_nothing(rehearsed: tuple[CellFolder, Ended]) -> None:
 
 
 def test_a_dry_run_leaves_the_ledger_alone(cell: CellFolder) -> None:
-    ledger = cell.folder / "storage/ledger/relief.jsonl"
+    ledger = cell.folder / "ledger/relief.jsonl"
     ledger.parent.mkdir(parents=True)
-    before = '{"run": "earlier", "dose_lux_h": 1.0, "t": "2026-01-01T00:00:00Z"}\n'
+    before = '{"event": "dose", "run": "earlier", "dose_lux_h": 1.0, "t": "2026-01-01T00:00:00Z"}\n'
     ledger.write_text(before)
     assert cell.acquire("--dry-run").code == 0
     assert ledger.read_text() == before
-    assert [path.name for path in ledger.parent.parent.iterdir()] == ["ledger"]
+    assert [path.name for path in ledger.parent.iterdir()] == [ledger.name]
+    assert not (cell.folder / "storage").exists()
 
 
 @pytest.mark.parametrize(

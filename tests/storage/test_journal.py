@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from coupole.errors import StorageError
 from coupole.plan.shot_id import Led, ShotId, ShotLabel
-from coupole.preflight import ledger
 from coupole.storage import journal
 from coupole.storage.journal import Journal, event_line
 from coupole.storage.journal_events import (
@@ -160,14 +159,3 @@ def test_the_tail_of_a_journal_begins_with_a_whole_line(tmp_path: Path) -> None:
     written(path, [FRAME] * 50)
     size = len(event_line(FRAME))
     assert journal.tail(path, 3 * size + size // 2) == [FRAME] * 3
-
-
-def test_the_ledger_sums_all_doses_of_an_object(tmp_path: Path) -> None:
-    for run_name, dose in (("one", 1.7), ("two", 0.4)):
-        ledger.add(tmp_path, "shroud", run=run_name, dose_lux_h=dose)
-    ledger.add(tmp_path, "other", run="three", dose_lux_h=9.0)
-    assert ledger.total_lux_h(tmp_path, "shroud") == pytest.approx(2.1)
-
-
-def test_an_object_without_a_ledger_has_received_nothing(tmp_path: Path) -> None:
-    assert ledger.total_lux_h(tmp_path, "shroud") == 0.0

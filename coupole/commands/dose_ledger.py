@@ -1,0 +1,45 @@
+"""The light that an object has received: `coupole dose`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coupole.commands.common import JsonOption
+from coupole.errors import InputError
+
+
+def dose(
+    object_id: Annotated[str, typer.Argument(metavar="OBJECT", help="Its id in plans.", show_default=False)],
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="Where this rig keeps its ledgers; else the user's data folder.")
+    ] = None,
+    add: Annotated[
+        float | None, typer.Option("--add", min=0, help="Enter light given elsewhere, lux hours; needs --note.")
+    ] = None,
+    note: Annotated[str, typer.Option("--note", help="What that light was.")] = "",
+    warn_above: Annotated[
+        float | None, typer.Option("--warn-above", min=0, help="Warn when the total exceeds this, lux hours.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """All light that an object has received, run by run; light given elsewhere is entered by hand."""
+    from coupole.plan.cell import read_cell, users_ledger_folder
+    from coupole.storage.ledger import Ledger, ledger_of, similar_ids
+    from coupole.viewing.dose_table import document, show_dose
+    from coupole.viewing.terminal import make_console
+
+    if (add is not None) != bool(note.strip()):
+        raise InputError("--add and --note belong together: how many lux hours, and what that light was")
+    ledger = ledger_of(read_cell(rig), object_id) if rig else Ledger(users_ledger_folder(), object_id)
+    if add is not None:
+        ledger.enter(add, note.strip())
+    if warn_above is not None:
+        ledger.warn_above(warn_above)
+    history, others = ledger.read(), similar_ids(ledger.folder, object_id)
+    show_dose(make_console(quiet=as_json), ledger, history, others)
+    if as_json:
+        print(json.dumps(document(ledger, history, others)))

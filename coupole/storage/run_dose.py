@@ -1,0 +1,32 @@
+"""The light that a run has given the object in all its sessions, from its journal.
+
+A burst whose end was not recorded (its process was killed) counts as planned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import zip_longest
+
+from coupole.storage.journal_events import BurstBegun, BurstEnded, Event
+
+
+def lux_h_of_points(events: Iterable[Event]) -> tuple[float, ...]:
+    """Lux hours at each of the object's dose points; empty if no light is recorded."""
+    total: tuple[float, ...] = ()
+    planned: tuple[float, ...] = ()
+    for event in events:
+        if isinstance(event, BurstBegun):
+            total, planned = _sum(total, planned), event.planned_lux_h
+        elif isinstance(event, BurstEnded) and event.given_lux_h is not None:
+            total, planned = _sum(total, event.given_lux_h), ()
+    return _sum(total, planned)
+
+
+def highest_lux_h(events: Iterable[Event]) -> float:
+    """At the point with the highest dose, which is the run's."""
+    return max(lux_h_of_points(events), default=0.0)
+
+
+def _sum(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(x + y for x, y in zip_longest(a, b, fillvalue=0.0))

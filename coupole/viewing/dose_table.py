@@ -1,0 +1,72 @@
+"""An object's ledger as a table and as JSON."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from coupole.appearance.spectra.damage import B_PER_NM
+from coupole.storage.ledger import History, Ledger
+
+NOT_KNOWN = "not known"
+
+
+def show_dose(console: Console, ledger: Ledger, history: History, others: list[str]) -> None:
+    """Light of each run, the total, and remarks. `others`: objects with nearly the same id."""
+    title = f"{ledger.object_id}: light received"
+    table = Table("run", "first", "lux.h", "damage, mW.h/m2", "", box=None, title=title, title_justify="left")
+    for run in history.runs:
+        part = history.of_run(run)
+        notes = [entry.note for entry in part.entries if entry.note]
+        if part.unsettled_lux_h:
+            notes.append(f"of which {part.unsettled_lux_h:.3f} at most: how it ended is not known")
+        table.add_row(
+            escape(run), part.entries[0].t, f"{part.total_lux_h:.3f}", _damage(part), escape("; ".join(notes))
+        )
+    table.add_row("[bold]total[/]", "", f"[bold]{history.total_lux_h:.3f}[/]", _damage(history), "")
+    console.print(table)
+    limit_lux_h = history.warn_above_lux_h
+    if limit_lux_h is not None and history.total_lux_h > limit_lux_h:
+        console.print(f"[yellow]note:[/] the total is above {limit_lux_h:g} lux.h")
+    for other in others:
+        console.print(f"[yellow]note:[/] there is also a ledger of `{other}`: is it the same object?")
+    if history.unreadable:
+        console.print(f"[yellow]note:[/] {history.unreadable} lines of the ledger cannot be read")
+    console.print(f"  {escape(str(ledger.path))}", soft_wrap=True)
+
+
+def document(ledger: Ledger, history: History, others: list[str]) -> dict[str, Any]:
+    """For `--json`."""
+    return {
+        "object": ledger.object_id,
+        "ledger": str(ledger.path),
+        **_sums(history),
+        "warn_above_lux_h": history.warn_above_lux_h,
+        "above_warning": history.warn_above_lux_h is not None and history.total_lux_h > history.warn_above_lux_h,
+        "similar_ids": others,
+        "unreadable_lines": history.unreadable,
+        "damage_b_per_nm": B_PER_NM,
+        "runs": {run: _sums(history.of_run(run)) for run in history.runs},
+        "entries": [vars(entry) for entry in history.entries if entry.note],
+    }
+
+
+def _sums(history: History) -> dict[str, float]:
+    return {
+        "dose_lux_h": history.total_lux_h,
+        "unsettled_lux_h": history.unsettled_lux_h,
+        "damage_wh_m2": history.damage_wh_m2,
+        "of_unknown_spectrum_lux_h": history.of_unknown_spectrum_lux_h,
+    }
+
+
+def _damage(history: History) -> str:
+    """Radiant exposure weighted by damage, and the light for which it is not known."""
+    unknown_lux_h = history.of_unknown_spectrum_lux_h
+    if unknown_lux_h and unknown_lux_h == history.total_lux_h:
+        return NOT_KNOWN
+    known = f"{1e3 * history.damage_wh_m2:.4f}"
+    return f"{known}, and {unknown_lux_h:.3f} lux.h {NOT_KNOWN}" if unknown_lux_h else known

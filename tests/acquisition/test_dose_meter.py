@@ -1,0 +1,195 @@
+"""What counts as given: by the box's log, by the time that the table ran, or all that was planned."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import astuple, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from cells import CellFolder
+from places import REPO
+
+from coupole.acquisition.dose import DoseMeter
+from coupole.devices import NO_LED, STEP_RECORD_DTYPE, StepRecord
+from coupole.errors import DoseBudgetReached
+from coupole.plan.bursts import Burst
+from coupole.preflight.job import Job, read_job
+from coupole.storage.ledger import ledger_of
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
+    cell = CellFolder(tmp_path_factory.mktemp("dose"), write_now=False)
+    relief = {"id": "relief", "mesh": str(REPO / "configs/objects/relief.ply")}
+    cell.write(lights={"kind": "every", "every": 100}, object=relief)
+    return read_job(cell.plan)
+
+
+@pytest.fixture
+def burst(job: Job) -> Burst:
+    return job.schedule.bursts[0][0]
+
+
+class Recorder:
+    """Keeps events in memory."""
+
+    name = "a run"
+
+    def __init__(self, before: tuple[float, ...] = ()) -> None:
+        self.events: list[Any] = []
+        self.committed = 0
+        self._before = before
+
+    def light_before_lux_h(self) -> tuple[float, ...]:
+        return self._before
+
+    def note(self, event: Any) -> None:
+        self.events.append(event)
+
+    def commit(self, *, now: bool) -> None:
+        self.committed = len(self.events)
+
+
+@pytest.fixture(autouse=True)
+def ledger_of_its_own(job: Job) -> Iterator[None]:
+    yield
+    ledger_of(job.cell, "relief").path.unlink(missing_ok=True)
+
+
+def meter(job: Job, recorder: Recorder | None = None, **cell: Any) -> DoseMeter:
+    opened = SimpleNamespace(**{"simulated": False, "lights_confirmed": True, **cell})
+    return DoseMeter(job, opened, recorder or Recorder())  # type: ignore[arg-type]
+
+
+def log_of(burst: Burst, steps: int) -> np.ndarray:
+    records = [
+        StepRecord(k, int(row["led"]), True, False, False, False, float(row["on_us"]), 0, 0, 25.0, 700.0)
+        for k, row in enumerate(burst.table[:steps])
+    ]
+    return np.array([astuple(record) for record in records], STEP_RECORD_DTYPE)
+
+
+def total(job: Job) -> float:
+    return ledger_of(job.cell, "relief").read().total_lux_h
+
+
+def lit(burst: Burst) -> np.ndarray:
+    return np.flatnonzero(burst.table["led"] != NO_LED)
+
+
+def test_the_whole_plan_is_entered_first_and_noted_on_disk(job: Job, burst: Burst) -> None:
+    recorder = Recorder()
+    found = meter(job, recorder)
+    found.begin(burst)
+    assert recorder.committed == len(recorder.events) == 1
+    planned = recorder.events[0].planned_lux_h
+    assert total(job) == pytest.approx(max(planned), abs=1e-8)
+    given = found.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    assert given == pytest.approx(planned)
+    assert total(job) == pytest.approx(found.lux_h, abs=1e-8)
+
+
+def test_a_burst_that_ended_early_counts_its_log(job: Job, burst: Burst) -> None:
+    found = meter(job)
+    found.begin(burst)
+    whole = total(job)
+    steps = int(lit(burst)[3]) + 1
+    ran_s = float(burst.table["period_us"][: steps - 1].sum()) * 1e-6
+    found.end(burst, log_of(burst, steps), table_ran_s=ran_s, panel_s=0.0)
+    assert 0 < total(job) < 0.6 * whole
+
+
+def test_steps_that_may_have_begun_count_though_the_log_lacks_them(job: Job, burst: Burst) -> None:
+    steps = int(lit(burst)[3]) + 1
+    doses = []
+    for logged in (steps, 0):
+        found = meter(job)
+        before = total(job)
+        found.begin(burst)
+        ran_s = float(burst.table["period_us"][: steps - 1].sum()) * 1e-6
+        found.end(burst, log_of(burst, logged), table_ran_s=ran_s, panel_s=0.0)
+        doses.append(total(job) - before)
+    assert doses[1] == pytest.approx(doses[0], rel=1e-6)
+
+
+def test_a_burst_that_never_started_gave_nothing(job: Job, burst: Burst) -> None:
+    found = meter(job)
+    found.begin(burst)
+    found.end(burst, log_of(burst, 0), table_ran_s=0.0, panel_s=0.0)
+    assert total(job) == 0
+
+
+def test_if_it_is_not_sure_that_the_lights_are_off_all_that_was_planned_counts(job: Job, burst: Burst) -> None:
+    found = meter(job, lights_confirmed=False)
+    found.begin(burst)
+    whole = total(job)
+    found.end(burst, log_of(burst, 3), table_ran_s=0.01, panel_s=0.0)
+    history = ledger_of(job.cell, "relief").read()
+    assert history.total_lux_h == history.unsettled_lux_h == whole
+    assert found.lux_h == pytest.approx(whole, abs=1e-8)
+
+
+def test_a_panel_counts_for_its_time_and_is_planned_until_the_boxs_watchdog(job: Job, burst: Burst) -> None:
+    panel = replace(burst, panel=1, table=burst.table[:2])
+    found = meter(job)
+    found.begin(panel)
+    watchdog_s = job.cell.rig.ledbox.settings["watchdog_s"]
+    lux = job.cell.rig.dome.panel_lux
+    assert total(job) == pytest.approx(lux * (panel.duration_s + 0.14 + watchdog_s) / 3600, rel=1e-6)
+    found.end(panel, log_of(panel, 0), table_ran_s=0.0, panel_s=1.5)
+    assert total(job) == pytest.approx(lux * 1.5 / 3600, rel=1e-6)
+
+
+def test_a_resumed_run_goes_on_from_the_points_of_its_earlier_sessions(job: Job, burst: Burst) -> None:
+    points = len(job.shape.dose_points_mm)
+    before = tuple(float(k == 0) for k in range(points))  # one corner has received 1 lux.h
+    found = meter(job, Recorder(before))
+    found.begin(burst)
+    given = found.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    assert found.lux_h == pytest.approx(1.0 + given[0])
+    assert total(job) == pytest.approx(given[0], abs=1e-8), "the entries sum to the dose of the highest point"
+
+
+def test_a_burst_that_would_exceed_the_budget_is_not_planned(job: Job, burst: Burst) -> None:
+    one = meter(job)
+    one.begin(burst)
+    dose = total(job)
+    one.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    assert job.plan.object is not None
+    limited = job.plan.object.model_copy(update={"dose_budget_lux_h": 2 * dose})
+    poor = replace(job, plan=job.plan.model_copy(update={"object": limited}))
+    found = meter(poor)
+    found.begin(burst)  # exactly to the budget
+    found.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    with pytest.raises(DoseBudgetReached, match="object relief"):
+        found.begin(burst)
+    assert total(job) == pytest.approx(2 * dose)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_a_simulated_cell_enters_nothing_and_asks_the_budget_all_the_same(
+    job: Job, burst: Burst, simulated: bool
+) -> None:
+    ledger_of(job.cell, "relief").enter(5.0, "elsewhere")
+    assert job.plan.object is not None
+    limited = job.plan.object.model_copy(update={"dose_budget_lux_h": 5.0})
+    poor = replace(job, plan=job.plan.model_copy(update={"object": limited}))
+    with pytest.raises(DoseBudgetReached):
+        meter(poor, simulated=simulated).begin(burst)
+    found = meter(job, simulated=simulated)
+    found.begin(burst)
+    assert (total(job) == 5.0) is simulated
+
+
+def test_damage_is_entered_where_the_lamps_spectrum_is_known(job: Job, burst: Burst, tmp_path: Path) -> None:
+    known = replace(job, cell=replace(job.cell, led_damage_w_per_lm=1e-3))
+    found = meter(known)
+    found.begin(burst)
+    found.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    history = ledger_of(job.cell, "relief").read()
+    assert history.damage_wh_m2 == pytest.approx(1e-3 * history.total_lux_h, rel=1e-5)
+    assert history.of_unknown_spectrum_lux_h == 0

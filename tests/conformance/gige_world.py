@@ -34,6 +34,13 @@ def arv_tool(*arguments: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
 
 
+def _written(value: Any) -> str:
+    """A feature's value in the words of `arv-tool`."""
+    if isinstance(value, str):
+        return value
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}"
+
+
 class GigeWorld:
     """See `CameraWorld`."""
 
@@ -64,9 +71,9 @@ class GigeWorld:
 
     def leave(self, left: Left) -> None:
         """Through Aravis's own command line."""
-        values = [f"{name}={str(value).lower() if isinstance(value, bool) else value}" for name, value in left]
-        said = arv_tool("control", *values)
-        assert all(name in said for name, _ in left), said
+        said = arv_tool("control", *(f"{name}={_written(value)}" for name, value in left))
+        taken = [line.split()[:3] for line in said.splitlines() if line]
+        assert taken == [[name, "=", _written(value)] for name, value in left]
 
     def begun_ns(self, frame: Frame) -> int:
         return begun_ns(frame)

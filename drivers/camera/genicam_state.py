@@ -19,7 +19,7 @@ from drivers.camera.genicam_settings import GenICamSettings, Value
 
 @dataclass(frozen=True)
 class Line:
-    """One line of the table: the first of `names` that the camera has gets the first of `values` that it offers."""
+    """The first of `names` that the camera has gets the first of `values` that it offers."""
 
     names: tuple[str, ...]
     values: tuple[Value, ...]
@@ -83,7 +83,10 @@ TRIGGER_LINE = (
     _line("LineInverter", False),
 )
 """Of the line that the trigger comes on."""
-_ONE_OF_SEVERAL = (("RegionSelector", "RegionMode", "Region0"), ("ComponentSelector", "ComponentEnable", "Intensity"))
+_ONE_OF_SEVERAL = (
+    ("RegionSelector", "RegionMode", "Region0"),
+    ("ComponentSelector", "ComponentEnable", "Intensity"),
+)
 """Selector, what switches the selected one on, and the only one that is to be on."""
 _WHOLE_GAINS = ("All", "AnalogAll")
 _ALSO_READ = (
@@ -185,16 +188,16 @@ class State:
     def _apply(self, line: Line) -> None:
         if self._rigs.intersection(line.names):
             return
-        name = next((name for name in line.names if self._features.has(name) or self._has_selected(name, line)), None)
+        name = next((name for name in line.names if self._has(name, line.selector)), None)
         if name is None:
             return
         for entry in self._entries_of(line.selector):
             if self._features.has(name):  # which may depend on what is selected
                 self._set_first(line, name, entry)
 
-    def _has_selected(self, name: str, line: Line) -> bool:
-        """True if the camera has the feature for some entry of its selector, though not for the present one."""
-        return any(self._features.has(name) for _ in self._entries_of(line.selector))
+    def _has(self, name: str, selector: str) -> bool:
+        """True if the camera has the feature, perhaps for some entries of its selector only."""
+        return self._features.has(name) or any(self._features.has(name) for _ in self._entries_of(selector))
 
     def _entries_of(self, selector: str) -> Iterator[str]:
         """Each entry of the selector, selected in turn; once the empty text without selector."""

@@ -261,7 +261,8 @@ class GigeCamera:
     def _exposure(self) -> tuple[int, float]:
         """Exposure time in ns, and gain as a factor; automatic ones are twice what is set."""
         registers = self._registers
-        exposure_ns = round(registers.real(reg.EXPOSURE_US) * 1e3) * (1 + bool(registers.integer(reg.EXPOSURE_AUTO)))
+        exposure_ns = round(registers.real(reg.EXPOSURE_US) * 1e3)
+        exposure_ns *= 1 + bool(registers.integer(reg.EXPOSURE_AUTO))
         if registers.integer(reg.EXPOSURE_MODE) == reg.TRIGGER_WIDTH:
             exposure_ns = _PULSE_NS
         gain_db = registers.real(reg.GAIN_DB) + registers.real(reg.GAIN_DB + 8)
@@ -325,15 +326,15 @@ class GigeCamera:
             self._await_link()
         if self._link is None:
             return False
-        registers = self._registers
-        picture = self._picture()
-        pixel_format, size = registers.integer(reg.PIXEL_FORMAT), registers.payload_bytes()
-        slot = self._free_on_wire.popleft()
-        start = reg.REGISTER_BYTES + slot * self._slot_bytes
-        out = np.frombuffer(self._memory, np.uint8, size, start)
+        picture, pixel_format = self._picture(), self._registers.integer(reg.PIXEL_FORMAT)
         image = read_out(self._frames[shot.slot], picture, (1 << self._bit_depth) - 1)
-        encode(out, image, pixel_format, self._bit_depth)
         self._free.append(shot.slot)
+        if image.shape != (picture.height_px, picture.width_px):
+            return True  # a client stopped the camera and changed the image while this looked
+        size = image.size * (pixel_format >> 16 & 0xFF) // 8
+        slot = self._free_on_wire.popleft()
+        out = np.frombuffer(self._memory, np.uint8, size, reg.REGISTER_BYTES + slot * self._slot_bytes)
+        encode(out, image, pixel_format, self._bit_depth)
         region = (picture.width_px, picture.height_px, picture.left_px, picture.top_px)
         self._tell(
             gige_server.SEND.pack(
@@ -384,6 +385,8 @@ class GigeCamera:
             except OSError:
                 message = b""
             if not message:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(_START_S)
                 self.unplug()
                 code = self._process.returncode
                 print(f"the simulated GigE Vision camera is gone: its process ended ({code})", file=sys.stderr)

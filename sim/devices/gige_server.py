@@ -286,7 +286,7 @@ class GigeServer:
             self._packet(image.frame_id, _LEADER, 0, leader)
             start, piece = image.slot * self._start.slot_bytes, self._payload_bytes()
             number = 0
-            for number, at in enumerate(range(start, start + image.size, piece), start=1):  # noqa: B007
+            for number, at in enumerate(range(start, start + image.size, piece), start=1):
                 end = min(at + piece, start + image.size)
                 self._packet(image.frame_id, _PAYLOAD, number, self._images[at:end])
             self._packet(image.frame_id, _TRAILER, number + 1, struct.pack(">HHI", 0, _IMAGE, image.height))

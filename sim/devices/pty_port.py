@@ -10,6 +10,10 @@ from sim.world.reactor import Reactor, Timer
 
 _PIECE_BYTES = 64
 """Bytes are transferred in pieces of this size: 5.6 ms at 115200 baud."""
+_UNPACED_BYTES = 4096
+"""... or of this, if the rate is not limited."""
+_MOST_UNREAD_BYTES = 2**20
+"""Largest output buffer: what a client that does not read misses is lost."""
 _RETRY_S = 0.001
 _BITS_PER_BYTE = 10
 
@@ -37,10 +41,12 @@ class PtyPort:
         self._received = received
         self._wait_for_bytes()
 
-    def send(self, data: bytes) -> None:
-        """Queue bytes for the client."""
+    def send(self, data: bytes) -> bool:
+        """Queue bytes for the client; False if the client has left too many unread, and these are lost."""
         if self._received is None:
-            return
+            return True
+        if len(self._output) + len(data) > _MOST_UNREAD_BYTES:
+            return False
         self._output += data
         if not self._sending:
             self._sending = True
@@ -48,6 +54,7 @@ class PtyPort:
                 self._write_later()
             else:
                 self._write()
+        return True
 
     def mute(self) -> None:
         """Stop reading and writing; the line stays up."""
@@ -78,7 +85,7 @@ class PtyPort:
     def _read_piece(self) -> None:
         """Read a piece from the terminal; it is passed on at the time at which its last bit would have arrived."""
         try:
-            piece = os.read(self._master, _PIECE_BYTES if self._byte_s else 65536)
+            piece = os.read(self._master, _PIECE_BYTES if self._byte_s else _UNPACED_BYTES)
         except BlockingIOError:
             self._wait_for_bytes()
             return

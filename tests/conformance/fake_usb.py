@@ -40,11 +40,12 @@ class UsbLink:
     def listen(self, received: Callable[[bytes], None]) -> None:
         self._received = received
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes) -> bool:
         with self._ready:
             if not self._muted:
                 self._response += data
                 self._ready.notify_all()
+        return True
 
     def mute(self) -> None:
         self._muted = True

@@ -75,7 +75,7 @@ def assert_right_frames(world: ForeignStateWorld, camera: Camera) -> None:
 
 
 class ForeignStateConformance:
-    """Any driver passes that decides the camera's state itself; `world` holds a camera, `left` what it was left in."""
+    """Any driver passes that decides the camera's state itself; `left` is what its `world`'s was left in."""
 
     def test_frames_are_right_whatever_the_camera_was_left_in(self, world: ForeignStateWorld, left: Left) -> None:
         world.leave(left)

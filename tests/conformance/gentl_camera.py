@@ -219,7 +219,8 @@ class StandIn:
         left, top, width, height = (self.integer(at) for at in (OFFSET_X, OFFSET_Y, WIDTH, HEIGHT))
         code = self.integer(PIXEL_FORMAT)
         image = np.empty(width * height * (code >> 16 & 0xFF) // 8, np.uint8)
-        encode(image, read_out(self._frames[shot.slot], self._picture(), (1 << self._depth) - 1), code, self._depth)
+        shown = read_out(self._frames[shot.slot], self._picture(), (1 << self._depth) - 1)
+        encode(image, shown, code, self._depth)
         ticks = shot.timestamp_ns * self._ticks_hz // 10**9
         head = HEAD.pack(shot.frame_id, ticks, width, height, left, top, code, len(image))
         sent = image[: len(image) // 2] if shot.frame_id in self.torn else image

@@ -81,6 +81,37 @@ class TestForeignState(ForeignStateConformance):
         return {what: left for what, left in LEFT.items() if not what.startswith(("columns", "rows"))}
 
 
+NOT_SIMULATED = (
+    "shutter_type",
+    "concat_img_mode",
+    "auto_wb",
+    "bpc",
+    "ffc",
+    "hdr",
+    "trans_data_black_level_ovr_en",
+    "exposure_time_selector",
+    "interline_exposure_mode",
+)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "left", "right"), [*((name, 1, 0) for name in NOT_SIMULATED), ("gammaY", 0, 1), ("gammaC", 0, 1)]
+)
+def test_what_the_stand_in_does_not_simulate_is_set_too(
+    world: XiWorld, parameter: str, left: int, right: int
+) -> None:
+    world.leave(((parameter, left),))
+    camera = world.open()
+    assert world.parameter(parameter) == right
+    assert camera.identify().settings[parameter] == str(right)
+
+
+def test_a_parameter_that_the_rig_leaves_stays(world: XiWorld) -> None:
+    world.leave((("bpc", 1),))
+    world.open(leave=["bpc"])
+    assert world.parameter("bpc") == 1
+
+
 class ShowingWorld(XiWorld):
     """Frames show the ramp; 11 ms after each edge of the box something else sends one to input 2."""
 

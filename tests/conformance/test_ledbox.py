@@ -44,9 +44,10 @@ class TcpLink:
     def listen(self, received: Callable[[bytes], None]) -> None:
         self._received = received
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes) -> bool:
         if self._client is not None and self._received is not None:
             self._client.sendall(data)
+        return True
 
     def mute(self) -> None:
         self._received = None

@@ -93,9 +93,7 @@ class Features:
         if self._kind(node) != "IEnumeration":
             self._refuse(f"`{name}` to be an enumeration", f"it is a {self._kind(node)[1:].lower()}")
         try:
-            return [
-                str(entry.symbolic) for entry in node.entries if self._genapi.is_available(entry.node)
-            ]
+            return [str(entry.symbolic) for entry in node.entries if self._genapi.is_available(entry.node)]
         except self._errors as error:
             self._failed(f"the entries of `{name}`", error)
 

@@ -26,7 +26,7 @@ class Settings(BaseModel):
     region: Region | None = None
     """None: the whole sensor."""
     features: dict[str, Value] = Field(default_factory=dict)
-    """GenICam features to set at opening, in this order. The driver's own table (`genicam_state`) leaves them out."""
+    """GenICam features to set at opening, in this order; the driver's own table (`genicam_state`) leaves them."""
     leave: tuple[str, ...] = ()
     """Features of the driver's own table that stay as they are in the camera."""
     black_dn: Annotated[int, Field(ge=0)] | None = None

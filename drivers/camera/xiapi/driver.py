@@ -58,6 +58,8 @@ _IN_HAND = 16
 """Most frames in memory on their way to the disk."""
 _KIB = 1024
 _COUNTERS = range(6)
+
+
 class XiCamera:
     """`coupole.devices.Camera`; see the module's text."""
 

@@ -71,7 +71,7 @@ FRAME_TRIGGER = (
 class State:
     """Sets parameters of an open camera and keeps what was read back.
 
-    `rigs`: parameters that are the rig's, whose lines are not used. Each method raises DeviceRefused or DeviceLost.
+    `rigs`: parameters that are the rig's, whose lines are not used. Methods raise DeviceRefused or DeviceLost.
     """
 
     def __init__(self, device: XiDevice, rigs: Collection[str]) -> None:

@@ -141,6 +141,8 @@ class Identity:
     serial: str
     firmware: str
     simulated: bool = False
+    settings: Mapping[str, str] = field(default_factory=dict, hash=False)
+    """Settings as read back from the device once its driver has set them; a run records them."""
 
 
 class LedBox(Protocol):

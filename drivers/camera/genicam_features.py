@@ -25,6 +25,10 @@ class Features(Protocol):
 
     def bounds(self, name: str) -> tuple[float, float]: ...
 
+    def largest(self, name: str) -> int: ...
+
+    def entries(self, name: str) -> list[str]: ...
+
     def write(self, name: str, value: Value) -> None: ...
 
     def write_all(self, values: Mapping[str, Value]) -> None: ...
@@ -32,6 +36,8 @@ class Features(Protocol):
 
 def alike(held: Value, wanted: Value) -> bool:
     """True if `held`, read back, is the value that was set, within the rounding of cameras."""
+    if isinstance(held, bool) != isinstance(wanted, bool):
+        return False
     if isinstance(held, float) and not isinstance(wanted, str):
         return math.isclose(held, wanted, rel_tol=_READBACK_TOLERANCE, abs_tol=1e-9)
     return held == wanted

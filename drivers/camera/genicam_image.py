@@ -11,15 +11,32 @@ from coupole.devices import FrameFormat
 from coupole.errors import DeviceRefused
 from drivers.camera.genicam_features import Features
 from drivers.camera.genicam_settings import GenICamSettings, Region
+from drivers.camera.genicam_state import AT_OPENING, State
+from drivers.camera.genicam_trigger import set_trigger
 from drivers.camera.pixel_formats import FORMATS, PixelFormat, pixels_in_a_group
 
 
-def set_image(features: Features, settings: GenICamSettings) -> None:
-    """Set the rig's features in their order, then the region and the pixel format."""
+def set_up(features: Features, settings: GenICamSettings, *, triggered: bool) -> dict[str, str]:
+    """Bring a camera that was just opened into its state, whatever it was left in; returns what was read back.
+
+    First the driver's table, then the rig's features in their order, the region, the pixel format and, if frames
+    are `triggered`, the trigger. Raises DeviceRefused, naming the feature that does not take its value.
+    """
+    state = State(features, settings)
+    state.apply(AT_OPENING)
+    state.neutralise_gains()
+    state.use_one_region_and_component()
     features.write_all(settings.features)
     if settings.region is not None:
         _set_region(features, settings.region)
+    else:
+        state.use_whole_sensor()
     features.write("PixelFormat", settings.pixel_format)
+    if triggered:
+        set_trigger(state, features, settings, by_edges=True)
+    state.note(*settings.features, *settings.leave)
+    state.note_all()
+    return state.held
 
 
 def _set_region(features: Features, region: Region) -> None:

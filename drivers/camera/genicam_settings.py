@@ -40,6 +40,9 @@ class GenICamSettings(Protocol):
     def features(self) -> dict[str, Value]: ...
 
     @property
+    def leave(self) -> tuple[str, ...]: ...
+
+    @property
     def pixel_format(self) -> str: ...
 
     @property

@@ -5,24 +5,31 @@ from __future__ import annotations
 from coupole.devices import Exposure
 from drivers.camera.genicam_features import Features
 from drivers.camera.genicam_settings import Counter, GenICamSettings
+from drivers.camera.genicam_state import FRAME_TRIGGER, TRIGGER_LINE, State
 
 _LAST_WIDE_ID = 2**62
 """End of 64-bit ids, which is never reached."""
 
 
 def set_exposure(features: Features, settings: GenICamSettings, exposure: Exposure) -> None:
-    """Each frame starts at an edge of the box or at a software trigger; automatic exposure and gain are off."""
-    for name, entry in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("TriggerSelector", "FrameStart")):
-        if features.has(name):
-            features.write(name, entry)
-    features.write("TriggerMode", "On")
-    by_edges = exposure.hardware_trigger
-    features.write("TriggerSource", settings.trigger_line if by_edges else settings.software_trigger)
-    if by_edges and features.has("TriggerActivation"):
-        features.write("TriggerActivation", settings.trigger_activation)
+    """Each frame starts at an edge of the box or at a software trigger, and is exposed for the time given."""
+    set_trigger(State(features, settings), features, settings, by_edges=exposure.hardware_trigger)
     features.write(features.first_of("ExposureTimeAbs") or "ExposureTime", float(exposure.exposure_us))
     if exposure.gain_db or features.has("Gain"):
         features.write("Gain", float(exposure.gain_db))
+
+
+def set_trigger(state: State, features: Features, settings: GenICamSettings, *, by_edges: bool) -> None:
+    """Have each edge of the trigger line, or each software trigger, start one frame, at once."""
+    state.select("TriggerSelector", "FrameStart")
+    state.set("TriggerMode", "On", "FrameStart")
+    state.set("TriggerSource", settings.trigger_line if by_edges else settings.software_trigger, "FrameStart")
+    if by_edges and features.has("TriggerActivation"):
+        state.set("TriggerActivation", settings.trigger_activation)
+    state.apply(FRAME_TRIGGER)
+    if features.has("LineSelector") and settings.trigger_line in features.entries("LineSelector"):
+        features.write("LineSelector", settings.trigger_line)
+        state.apply(TRIGGER_LINE)
 
 
 def frame_id_range(features: Features, *, gige: bool) -> tuple[int, int]:

@@ -123,6 +123,23 @@ class Surroundings:
     """Parts of the arm that block light at present."""
 
 
+@dataclass(frozen=True)
+class Triggering:
+    """How the camera is set to take triggers; the default is an exposure at each edge."""
+
+    delay_ns: int = 0
+    divider: int = 1
+    """Only each n-th edge triggers."""
+    latches: bool = False
+    """An early edge is remembered, and exposes as soon as the sensor is ready."""
+    least_period_ns: int = 0
+    """From one exposure's start to the next; 0: what the sensor needs."""
+    most_frames: int = 0
+    """After so many exposures the acquisition is over; 0: never."""
+    edges_to_start: int = 0
+    """First edges of a session, which start the acquisition and expose nothing."""
+
+
 class CameraBody:
     """One camera without its wire; `edge(t_ns)` is the trigger input."""
 
@@ -146,8 +163,11 @@ class CameraBody:
         """True: edges start exposures; False: only `expose` does."""
         self.exposure_ns = 8_000_000
         self.gain = 1.0
+        self.triggering = Triggering()
         self._session = 0
         self._ready_ns = self._readout_until_ns = 0
+        self._edges_of_session = self._frames_of_session = 0
+        self._latched = False
         self._frame_id = settings.first_frame_id
         self._number = self._edge_number = 0
         self.counters = dict.fromkeys(("exposed", "delivered", "lost_transfers", "over_triggers", "overflows"), 0)
@@ -164,8 +184,28 @@ class CameraBody:
     def edge(self, t_ns: int) -> None:
         """A rising edge on the trigger line at world time `t_ns`."""
         number, self._edge_number = self._edge_number, self._edge_number + 1
-        if self.armed and self.hardware and number not in self.ignore_edges:
+        if not self.armed or not self.hardware or number in self.ignore_edges:
+            return
+        triggering = self.triggering
+        self._edges_of_session += 1
+        counted = self._edges_of_session - triggering.edges_to_start
+        if counted < 1 or counted % triggering.divider:
+            return
+        if triggering.delay_ns:
+            self._expose_at(t_ns + triggering.delay_ns)
+        else:
             self.expose(t_ns)
+
+    def _expose_at(self, t_ns: int) -> None:
+        """Begin an exposure later, if the session still lasts then."""
+        session = self._session
+
+        def begin() -> None:
+            self._latched = False
+            if session == self._session:
+                self.expose(t_ns)
+
+        self._reactor.at(t_ns, begin)
 
     def ready(self) -> bool:
         """The exposure-ready line: an edge now would start an exposure."""
@@ -176,12 +216,20 @@ class CameraBody:
         return max(self._ready_ns, self._readout_until_ns - self.exposure_ns)
 
     def expose(self, t_ns: int) -> None:
-        """Begin an exposure, unless the sensor is not ready yet."""
-        if t_ns < self._next_start_ns():
-            self.counters["over_triggers"] += 1
+        """Begin an exposure, unless the sensor is not ready yet or the acquisition is over."""
+        triggering = self.triggering
+        if triggering.most_frames and self._frames_of_session >= triggering.most_frames:
             return
+        if t_ns < self._next_start_ns():
+            if triggering.latches and not self._latched:
+                self._latched = True
+                self._expose_at(self._next_start_ns())
+            else:
+                self.counters["over_triggers"] += 1
+            return
+        self._frames_of_session += 1
         end_ns = t_ns + self.exposure_ns
-        self._ready_ns = end_ns + self.gap_ns
+        self._ready_ns = max(end_ns + self.gap_ns, t_ns + triggering.least_period_ns)
         self._readout_until_ns = end_ns + self.readout_ns
         self.counters["exposed"] += 1
         frame_id = self._frame_id
@@ -260,6 +308,7 @@ class CameraBody:
         """Begin a session: from now on edges or `expose` start exposures."""
         self.disarm()
         self._ready_ns = self._readout_until_ns = 0
+        self._edges_of_session = self._frames_of_session = 0
         self.armed = True
 
     def disarm(self) -> None:

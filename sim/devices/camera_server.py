@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from sim.devices import camera_body
 from sim.devices.camera_body import CameraBody, Shot, Surroundings
@@ -37,6 +37,32 @@ class Settings(camera_body.Settings):
 
     kind: Literal["memory"] = "memory"
     slots: Annotated[int, Field(ge=8)] = 48
+
+
+class _Command(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class _Configure(_Command):
+    do: Literal["configure"]
+    exposure_us: Annotated[int, Field(ge=1, le=10**9)]
+    gain_db: Annotated[float, Field(ge=-100, le=100)]
+    hardware_trigger: bool
+
+
+class _Arm(_Command):
+    do: Literal["arm"]
+    buffers: Annotated[int, Field(ge=0, le=65535)]
+
+
+class _Plain(_Command):
+    do: Literal["limits", "memory", "trigger", "statistics", "disarm"]
+
+
+_COMMAND: TypeAdapter[_Configure | _Arm | _Plain] = TypeAdapter(
+    Annotated[_Configure | _Arm | _Plain, Field(discriminator="do")]
+)
+"""What a client may ask for."""
 
 
 def _received(client: socket.socket, size: int) -> bytes:
@@ -112,13 +138,21 @@ class CameraServer:
     # -- the client ---------------------------------------------------------------------------------------
 
     def _accept(self) -> None:
-        client, _ = self._listener.accept()
+        try:
+            client, _ = self._listener.accept()
+        except OSError:  # it has left already
+            return
+        client.setblocking(False)
+        self._reactor.add_reader(client, lambda: self._welcome(client))
+
+    def _welcome(self, client: socket.socket) -> None:
+        """A new client has said what it wants."""
+        self._reactor.remove_reader(client)
         purpose = _received(client, 64)
         if purpose == b"control" and self._control is None:
             self._control = client
             self._reactor.add_reader(client, self._on_command)
         elif purpose == b"frames" and self._stream is None:
-            client.setblocking(False)
             self._stream = client
             self._reactor.add_reader(client, self._take_slots_back)
         else:
@@ -135,22 +169,35 @@ class CameraServer:
         if not data:
             self._drop_control()
             return
-        command = json.loads(data)
         try:
-            reply: dict[str, Any] = getattr(self, f"_do_{command.pop('do')}")(**command)
-            self._control.send(json.dumps(reply).encode())
-        except BrokenPipeError:
+            self._control.send(json.dumps(self._answer(data)).encode())
+        except OSError:  # it is gone, or reads nothing
             self._drop_control()
 
-    def _do_configure(self, exposure_us: int, gain_db: float, hardware_trigger: bool) -> dict[str, Any]:
-        self._body.exposure_ns, self._body.hardware = exposure_us * 1000, hardware_trigger
-        self._body.gain = 10.0 ** (gain_db / 20.0)
+    def _answer(self, data: bytes) -> dict[str, Any]:
+        """Do what the client asks for; what is no command is answered with an error."""
+        try:
+            command = _COMMAND.validate_json(data)
+        except ValidationError as error:
+            return {"error": str(error)}
+        match command:
+            case _Configure():
+                return self._configure(command)
+            case _Arm():
+                return self._arm(command.buffers)
+            case _Plain():
+                reply: dict[str, Any] = getattr(self, f"_do_{command.do}")()
+                return reply
+
+    def _configure(self, command: _Configure) -> dict[str, Any]:
+        self._body.exposure_ns, self._body.hardware = command.exposure_us * 1000, command.hardware_trigger
+        self._body.gain = 10.0 ** (command.gain_db / 20.0)
         return self._format
 
     def _do_limits(self) -> dict[str, Any]:
         return {"readout_us": math.ceil(self._body.readout_ns / 1e3), "exposure_gap_us": self._body.gap_ns // 1000}
 
-    def _do_arm(self, buffers: int) -> dict[str, Any]:
+    def _arm(self, buffers: int) -> dict[str, Any]:
         self._end_session()
         self._allocate(max(buffers, self._settings.slots))
         self._counted_before = dict(self._body.counters)
@@ -160,6 +207,8 @@ class CameraServer:
     def _do_memory(self) -> dict[str, Any]:
         """Send the ring's file descriptor before the reply."""
         assert self._control is not None
+        if self._memory_fd < 0:
+            return {"error": "the camera was never armed"}
         socket.send_fds(self._control, [b"memory"], [self._memory_fd])
         return {}
 
@@ -209,8 +258,10 @@ class CameraServer:
             if not data:
                 self._drop_stream()
                 return
+            if len(data) != SLOT_MESSAGE.size:
+                continue
             slot, session = divmod(SLOT_MESSAGE.unpack(data)[0], 65536)
-            if session == self._session % 65536:
+            if session == self._session % 65536 and slot < len(self._frames) and slot not in self._free:
                 self._free.append(slot)
 
     def _drop_stream(self) -> None:

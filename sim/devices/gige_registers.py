@@ -1,128 +1,227 @@
-"""Registers of the simulated GigE Vision camera, and the functions of libaravis that access them.
+"""Registers of the simulated GigE Vision camera: where they are, and which values a client may write.
 
-Clients read and write registers over the wire, on the fake camera's own thread; the stand-in polls those and
-writes its own. No register is written from both sides, since no lock spans the wire.
+Clients read and write them over the wire, in the camera's own process (`gige_server`); the world reads them in
+shared memory and writes its own there. No register is written from both sides. Needs only the standard library.
 """
 
 from __future__ import annotations
 
-import ctypes
-import ctypes.util
-import importlib.util
+import math
 import struct
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from coupole.errors import DeviceError
 
 DESCRIPTION = Path(__file__).with_name("gige.xml")
 
-# Fixed by GigE Vision (bootstrap registers) and by Aravis's fake camera.
-VENDOR, MODEL, VERSION = 0x48, 0x68, 0x88
+# Fixed by GigE Vision (bootstrap registers).
+VERSION_OF_STANDARD, DEVICE_MODE = 0x0, 0x4
+ADDRESS, VENDOR, MODEL, VERSION, SERIAL, DESCRIPTION_URL = 0x24, 0x48, 0x68, 0x88, 0xD8, 0x200
+INTERFACES, STREAMS, CAPABILITIES = 0x600, 0x904, 0x934
+HEARTBEAT_MS, TICKS_HZ_HIGH, TICKS_HZ_LOW = 0x938, 0x93C, 0x940
 CONTROL_PRIVILEGE = 0xA00
-WIDTH, HEIGHT, OFFSET_X, OFFSET_Y = 0x100, 0x104, 0x130, 0x134
-SENSOR_HEIGHT, SENSOR_WIDTH, PIXEL_FORMAT = 0x118, 0x11C, 0x128
-ACQUISITION = 0x124
-"""Number of the session that the client started; 0 while none is active."""
-FAKE_TRIGGER_MODE, FAKE_TRIGGER_SOURCE, FAKE_TRIGGER = 0x300, 0x304, 0x30C
-"""The fake sends one frame when the third register is 1, if mode and source are 1."""
+HOST_PORT, PACKET_SIZE, PACKET_DELAY, HOST_ADDRESS = 0xD00, 0xD04, 0xD08, 0xD18
 
-# Coupole's own: 64-bit floats, then 32-bit integers; gige.xml has the same addresses.
+# The camera's own, as gige.xml has them: 32-bit integers; 64-bit floats from TEMPERATURE_C on.
+WIDTH, HEIGHT, OFFSET_X, OFFSET_Y = 0x1100, 0x1104, 0x1108, 0x110C
+SENSOR_WIDTH, SENSOR_HEIGHT, PIXEL_FORMAT = 0x1110, 0x1114, 0x1118
+BINNING_X, BINNING_Y, DECIMATION_X, DECIMATION_Y = 0x1120, 0x1124, 0x1128, 0x112C
+REVERSE_X, REVERSE_Y, TEST_PATTERN = 0x1130, 0x1134, 0x1138
+ACQUISITION_MODE, ACQUISITION, FRAME_COUNT, FRAME_RATE_ENABLE = 0x1140, 0x1144, 0x1148, 0x114C
+SESSION = 0x1150
+"""Number of the present acquisition; 0 while there is none."""
+EXPOSURE_MODE, EXPOSURE_AUTO, GAIN_AUTO, GAIN_SELECTOR = 0x1154, 0x1158, 0x115C, 0x1160
+GAMMA_ENABLE, LUT_ENABLE, BALANCE_SELECTOR, LINE_INVERTER = 0x1164, 0x1168, 0x116C, 0x1170
+TRIGGER_SELECTOR, TRIGGER_MODE, TRIGGER_SOURCE = 0x1180, 0x1184, 0x118C
+"""Mode and source are two registers each: those of AcquisitionStart, then those of FrameStart."""
+TRIGGER_ACTIVATION, TRIGGER_OVERLAP, TRIGGER_DIVIDER, TRIGGER_SOFTWARE = 0x1194, 0x1198, 0x119C, 0x11A0
+TRIGGERS = 0x11A4
+"""Counts software triggers."""
+COUNTER_SELECTOR, EXPOSED, OVER_TRIGGERS = 0x11A8, 0x11AC, 0x11B0
 TEMPERATURE_C, FRAME_RATE_HZ, FRAME_RATE_MAX_HZ, EXPOSURE_US = 0x2000, 0x2008, 0x2010, 0x2018
-READOUT_US, GAIN_DB, BLACK_LEVEL_DN = 0x2020, 0x2028, 0x2030
-NEXT_SESSION, TRIGGER_MODE, TRIGGER_SOURCE, TRIGGERS = 0x2040, 0x2048, 0x204C, 0x2054
-EXPOSED, OVER_TRIGGERS = 0x205C, 0x2060
+READOUT_US, BLACK_LEVEL_DN, TRIGGER_DELAY_US, GAMMA = 0x2020, 0x2028, 0x2030, 0x2038
+GAIN_DB, BALANCE_RATIO = 0x2040, 0x2050
+"""Two registers each: analogue and digital gain; ratios of red and blue."""
+REGISTER_BYTES = 0x3000
+DESCRIPTION_PLACE = 0x10000
+
+ACQUISITION_START, FRAME_START = 0, 1
 LINE0, SOFTWARE = 0, 1
-"""Values of TRIGGER_SOURCE."""
+CONTINUOUS, SINGLE_FRAME, MULTI_FRAME = 1, 2, 3
+TIMED, TRIGGER_WIDTH = 0, 1
+OVERLAP_READ_OUT, OVERLAP_PREVIOUS_FRAME = 1, 2
+PIXEL_FORMATS = frozenset(
+    {
+        0x01080001,
+        0x0108000A,
+        0x010A0046,
+        0x010A0054,
+        0x01100005,
+        0x01100012,
+        0x010C0047,
+        0x010C0055,
+        0x010C0006,
+        0x01100007,
+        0x01100030,
+    }
+)
 
-FILL = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32)
-"""Called when a frame is to be sent: buffer, user data, exposure us, gain, pixel format."""
+# Status codes of GVCP.
+DONE, NOT_IMPLEMENTED, INVALID_PARAMETER, INVALID_ADDRESS = 0x0000, 0x8001, 0x8002, 0x8003
+WRITE_PROTECTED, BAD_ALIGNMENT, ACCESS_DENIED, INVALID_HEADER = 0x8004, 0x8005, 0x8006, 0x800E
 
-_POINTER, _TEXT, _U32, _U64 = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_uint32, ctypes.c_uint64
-_PROTOTYPES: dict[str, tuple[Any, list[Any]]] = {
-    "arv_gv_fake_camera_new_full": (_POINTER, [_TEXT, _TEXT, _TEXT]),
-    "arv_gv_fake_camera_is_running": (ctypes.c_int, [_POINTER]),
-    "arv_gv_fake_camera_get_fake_camera": (_POINTER, [_POINTER]),
-    "arv_fake_camera_read_memory": (ctypes.c_int, [_POINTER, _U32, _U32, _POINTER]),
-    "arv_fake_camera_write_memory": (ctypes.c_int, [_POINTER, _U32, _U32, _POINTER]),
-    "arv_fake_camera_get_payload": (ctypes.c_size_t, [_POINTER]),
-    "arv_fake_camera_set_fill_pattern": (None, [_POINTER, FILL, _POINTER]),
-    "arv_fake_camera_set_trigger_frequency": (None, [_POINTER, ctypes.c_double]),
-    "arv_buffer_get_data": (_POINTER, [_POINTER, ctypes.POINTER(ctypes.c_size_t)]),
-    "arv_buffer_set_frame_id": (None, [_POINTER, _U64]),
-    "arv_buffer_set_timestamp": (None, [_POINTER, _U64]),
-    "g_object_unref": (None, [_POINTER]),
-    "g_object_set_property": (None, [_POINTER, _TEXT, _POINTER]),
-    "g_value_init": (_POINTER, [_POINTER, ctypes.c_size_t]),
-    "g_value_set_double": (None, [_POINTER, ctypes.c_double]),
-}
-_G_TYPE_DOUBLE = 15 << 2
-
-
-def load_library() -> Any:
-    """libaravis-0.8, with the GObject functions. Raises DeviceError if it is not installed."""
-    names = [ctypes.util.find_library("aravis-0.8"), "libaravis-0.8.so.0"]
-    wheel = importlib.util.find_spec("aravis")
-    if wheel is not None and wheel.origin is not None:
-        names.append(str(Path(wheel.origin).with_name("lib") / "libaravis-0.8.so.0"))
-    for name in filter(None, names):
-        try:
-            library = ctypes.CDLL(name)
-        except OSError:
-            continue
-        for function, (result, arguments) in _PROTOTYPES.items():
-            getattr(library, function).restype = result
-            getattr(library, function).argtypes = arguments
-        return library
-    raise DeviceError(
-        "world",
-        expected="libaravis-0.8, whose fake GigE Vision camera the simulation uses",
-        happened="it is not installed",
-        remedy="Install it (Debian: apt install libaravis-0.8-0; else pip install aravis-python), or use the rig "
-        "with the camera in shared memory.",
-    )
+_FIRE_TEST_PACKET = 1 << 31
 
 
 class Registers:
-    """Register memory of one fake camera, big-endian as on the wire."""
+    """Register memory of one camera, big-endian as on the wire."""
 
-    def __init__(self, library: Any, fake: int) -> None:
-        self._library, self._fake = library, fake
+    def __init__(self, memory: memoryview) -> None:
+        self._memory = memory
 
-    def _read(self, address: int, size: int) -> bytes:
-        data = ctypes.create_string_buffer(size)
-        self._library.arv_fake_camera_read_memory(self._fake, address, size, data)
-        return data.raw
+    def read(self, address: int, size: int) -> bytes:
+        return bytes(self._memory[address : address + size])
 
-    def _write(self, address: int, data: bytes) -> None:
-        self._library.arv_fake_camera_write_memory(self._fake, address, len(data), data)
+    def write(self, address: int, data: bytes) -> None:
+        self._memory[address : address + len(data)] = data
 
     def integer(self, address: int) -> int:
-        number: int = struct.unpack(">I", self._read(address, 4))[0]
-        return number
+        return int.from_bytes(self._memory[address : address + 4], "big")
 
     def real(self, address: int) -> float:
-        number: float = struct.unpack(">d", self._read(address, 8))[0]
+        number: float = struct.unpack_from(">d", self._memory, address)[0]
         return number
+
+    def set_integer(self, address: int, number: int) -> None:
+        self.write(address, struct.pack(">I", number % 2**32))
+
+    def set_real(self, address: int, number: float) -> None:
+        self.write(address, struct.pack(">d", number))
+
+    def set_text(self, address: int, text: str, size: int = 32) -> None:
+        self.write(address, text.encode().ljust(size, b"\0"))
 
     def payload_bytes(self) -> int:
         """Size of an image with the present width, height and pixel format."""
-        size: int = self._library.arv_fake_camera_get_payload(self._fake)
-        return size
+        bits_per_pixel = self.integer(PIXEL_FORMAT) >> 16 & 0xFF
+        return self.integer(WIDTH) * self.integer(HEIGHT) * bits_per_pixel // 8
 
-    def set_integer(self, address: int, number: int) -> None:
-        self._write(address, struct.pack(">I", number % 2**32))
+    def widest(self) -> int:
+        """Columns of a whole image with the present binning and decimation."""
+        return self.integer(SENSOR_WIDTH) // (self.integer(BINNING_X) * self.integer(DECIMATION_X))
 
-    def set_real(self, address: int, number: float) -> None:
-        self._write(address, struct.pack(">d", number))
-
-    def set_text(self, address: int, text: str, size: int = 32) -> None:
-        self._write(address, text.encode().ljust(size, b"\0"))
+    def highest(self) -> int:
+        """Rows of a whole image with the present binning and decimation."""
+        return self.integer(SENSOR_HEIGHT) // (self.integer(BINNING_Y) * self.integer(DECIMATION_Y))
 
 
-def set_double_property(library: Any, instance: int, name: str, number: float) -> None:
-    """`g_object_set_property` for a double. A GValue is 24 bytes, initially zero."""
-    value = ctypes.create_string_buffer(24)
-    library.g_value_init(value, _G_TYPE_DOUBLE)
-    library.g_value_set_double(value, number)
-    library.g_object_set_property(instance, name.encode(), value)
+@dataclass(frozen=True)
+class Writable:
+    """What a client may write to a register: `low` to `high`, from `low` in steps of `step` if that is not 0."""
+
+    low: float
+    high: float
+    step: int = 0
+    size: int = 4
+    """8: a float."""
+    locked: bool = False
+    """Not while the camera acquires."""
+    most: Callable[[Registers], float] | None = None
+    """Upper limit that depends on other registers."""
+    among: frozenset[int] = frozenset()
+    """All values that there are; empty: all between `low` and `high`."""
+
+    def allows(self, number: float, registers: Registers) -> bool:
+        """False for a number out of the limits, and for what is no number."""
+        high = self.high if self.most is None else min(self.high, self.most(registers))
+        if not self.low <= number <= high or (self.among and number not in self.among):
+            return False
+        return not self.step or (number - self.low) % self.step == 0
+
+
+def _image(low: int, step: int, most: Callable[[Registers], float]) -> Writable:
+    return Writable(low, math.inf, step, locked=True, most=most)
+
+
+def _real(low: float, high: float, most: Callable[[Registers], float] | None = None) -> Writable:
+    return Writable(low, high, size=8, most=most)
+
+
+_ANY, _SWITCH = Writable(0, 2**32 - 1), Writable(0, 1)
+_LOCKED_SWITCH, _FACTOR = Writable(0, 1, locked=True), Writable(1, 2, locked=True)
+_GAIN, _RATIO = _real(0.0, 24.0), _real(0.125, 8.0)
+WRITABLE: dict[int, Writable] = {
+    HEARTBEAT_MS: Writable(500, 2**32 - 1),
+    CONTROL_PRIVILEGE: Writable(0, 3),
+    HOST_PORT: Writable(0, 65535),
+    PACKET_SIZE: Writable(576, 65500, 4),
+    PACKET_DELAY: _ANY,
+    HOST_ADDRESS: _ANY,
+    WIDTH: _image(8, 4, lambda held: held.widest() - held.integer(OFFSET_X)),
+    HEIGHT: _image(8, 2, lambda held: held.highest() - held.integer(OFFSET_Y)),
+    OFFSET_X: _image(0, 4, lambda held: held.widest() - held.integer(WIDTH)),
+    OFFSET_Y: _image(0, 2, lambda held: held.highest() - held.integer(HEIGHT)),
+    PIXEL_FORMAT: Writable(0, 2**32 - 1, locked=True, among=PIXEL_FORMATS),
+    BINNING_X: _FACTOR,
+    BINNING_Y: _FACTOR,
+    DECIMATION_X: _FACTOR,
+    DECIMATION_Y: _FACTOR,
+    REVERSE_X: _LOCKED_SWITCH,
+    REVERSE_Y: _LOCKED_SWITCH,
+    TEST_PATTERN: _SWITCH,
+    ACQUISITION_MODE: Writable(CONTINUOUS, MULTI_FRAME, locked=True),
+    ACQUISITION: _SWITCH,
+    FRAME_COUNT: Writable(1, 65535),
+    FRAME_RATE_ENABLE: _SWITCH,
+    EXPOSURE_MODE: _SWITCH,
+    EXPOSURE_AUTO: Writable(0, 2),
+    GAIN_AUTO: Writable(0, 2),
+    GAIN_SELECTOR: _SWITCH,
+    GAMMA_ENABLE: _SWITCH,
+    LUT_ENABLE: _SWITCH,
+    BALANCE_SELECTOR: _SWITCH,
+    LINE_INVERTER: _SWITCH,
+    TRIGGER_SELECTOR: _SWITCH,
+    TRIGGER_MODE: _SWITCH,
+    TRIGGER_MODE + 4: _SWITCH,
+    TRIGGER_SOURCE: _SWITCH,
+    TRIGGER_SOURCE + 4: _SWITCH,
+    TRIGGER_ACTIVATION: _SWITCH,
+    TRIGGER_OVERLAP: Writable(0, 2),
+    TRIGGER_DIVIDER: Writable(1, 16),
+    TRIGGER_SOFTWARE: Writable(1, 1),
+    COUNTER_SELECTOR: _SWITCH,
+    FRAME_RATE_HZ: _real(0.1, math.inf, lambda held: held.real(FRAME_RATE_MAX_HZ)),
+    EXPOSURE_US: _real(10.0, 1e7),
+    TRIGGER_DELAY_US: _real(0.0, 1e6),
+    GAMMA: _real(0.25, 4.0),
+    GAIN_DB: _GAIN,
+    GAIN_DB + 8: _GAIN,
+    BALANCE_RATIO: _RATIO,
+    BALANCE_RATIO + 8: _RATIO,
+}
+"""Limits as in gige.xml, which tells them to clients that ask."""
+
+
+def refusal(registers: Registers, address: int, data: bytes) -> int:
+    """Status with which the camera refuses `data` for the register at `address`; DONE if it takes them."""
+    if address % 4 or len(data) % 4:
+        return BAD_ALIGNMENT
+    if not 0 <= address <= REGISTER_BYTES - len(data):
+        return INVALID_ADDRESS
+    rule = WRITABLE.get(address)
+    if rule is None or (rule.locked and registers.integer(ACQUISITION)):
+        return WRITE_PROTECTED
+    if len(data) != rule.size:
+        return BAD_ALIGNMENT
+    number: float = struct.unpack(">I" if rule.size == 4 else ">d", data)[0]
+    if address == PACKET_SIZE:
+        number = int(number) & 0xFFFF  # the other bits are flags
+    return DONE if rule.allows(number, registers) else INVALID_PARAMETER
+
+
+def fires_test_packet(registers: Registers) -> bool:
+    """True if the client's last write to PACKET_SIZE asked for a test packet; the flag is then cleared."""
+    held = registers.integer(PACKET_SIZE)
+    registers.set_integer(PACKET_SIZE, held & ~_FIRE_TEST_PACKET)
+    return bool(held & _FIRE_TEST_PACKET)

@@ -75,7 +75,7 @@ class Link(Protocol):
     port: str
 
     def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None: ...
-    def send(self, data: bytes) -> None: ...
+    def send(self, data: bytes) -> bool: ...
     def drop_output(self) -> None: ...
     def mute(self) -> None: ...
     def close(self) -> None: ...
@@ -175,9 +175,9 @@ class LedBoxFirmware:
 
     def _receive(self, data: bytes) -> None:
         self._heard_ns = self._reactor.now_ns
-        reply = self._scpi.receive(data)
-        if reply:
-            self._link.send(reply)
+        for reply in self._scpi.replies(data):
+            if reply and not self._link.send(reply):
+                self._scpi.report(ScpiError(-430, "responses were not read"))
         if self._scpi.inside_block and self._block_timer is None:
             self._check_block()
 

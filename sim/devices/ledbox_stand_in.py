@@ -55,6 +55,9 @@ def impossible(fault: faults.Fault, settings: LedBoxSettings) -> str:
     """Why this stand-in cannot simulate the fault; empty if it can."""
     match settings:
         case ledbox_firmware.Settings():
+            boards = -(-settings.led_count // settings.leds_per_board)
+            if isinstance(fault, faults.OverTemperature) and fault.board >= boards:
+                return f"`{fault.kind}`: the LED box has boards 0 to {boards - 1}, not {fault.board}"
             if isinstance(fault, faults.StuckLed):
                 return f"`{fault.kind}` cannot happen to an LED box of kind `scpi`: it switches all current off"
         case text_box.Settings():

@@ -18,6 +18,10 @@ from sim.world.reactor import Reactor, Timer
 
 _PIECE_BYTES, _PIECE_S = 64, 0.006
 """Bytes are transferred in pieces of at most this size and duration, at least one byte."""
+_UNPACED_BYTES = 4096
+"""... or of this, if the rate is not limited."""
+_MOST_UNREAD_BYTES = 2**20
+"""Largest output buffer: what a client that does not read misses is lost."""
 _RETRY_S = 0.001
 _BITS_PER_BYTE = 10
 
@@ -31,7 +35,7 @@ class PtyPort:
     def __init__(self, reactor: Reactor, baud: int) -> None:
         self._reactor = reactor
         self._byte_s = _BITS_PER_BYTE / baud if baud else 0.0
-        self._piece_bytes = max(1, min(_PIECE_BYTES, int(_PIECE_S / self._byte_s))) if baud else 65536
+        self._piece_bytes = max(1, min(_PIECE_BYTES, int(_PIECE_S / self._byte_s))) if baud else _UNPACED_BYTES
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -52,10 +56,12 @@ class PtyPort:
         """Forget the bytes that are queued for the client."""
         self._output.clear()
 
-    def send(self, data: bytes) -> None:
-        """Queue bytes for the client."""
+    def send(self, data: bytes) -> bool:
+        """Queue bytes for the client; False if the client has left too many unread, and these are lost."""
         if self._received is None:
-            return
+            return True
+        if len(self._output) + len(data) > _MOST_UNREAD_BYTES:
+            return False
         self._output += data
         if not self._sending:
             self._sending = True
@@ -63,6 +69,7 @@ class PtyPort:
                 self._write_later()
             else:
                 self._write()
+        return True
 
     def mute(self) -> None:
         """Stop reading and writing; the line stays up."""

@@ -31,6 +31,7 @@ STANDARD_ERRORS = {
     -224: "Illegal parameter value",
     -350: "Queue overflow",
     -363: "Input buffer overrun",
+    -430: "Query DEADLOCKED",
     101: "Watchdog expired",
     102: "Over-temperature",
 }
@@ -87,7 +88,11 @@ class Interpreter:
 
     def receive(self, data: bytes) -> bytes:
         """Execute the messages completed by `data`; returns one response line for each message with a query."""
-        return b"".join(self._execute(message) for message in self._splitter.feed(data))
+        return b"".join(self.replies(data))
+
+    def replies(self, data: bytes) -> Iterator[bytes]:
+        """As `receive`, one message after the other; the response of a message without query is empty."""
+        return (self._execute(message) for message in self._splitter.feed(data))
 
     def clear(self) -> None:
         """Device clear (IEEE 488.2, 5.8): forget the incomplete message; error queue and event status stay."""
@@ -101,7 +106,8 @@ class Interpreter:
     def report(self, error: ScpiError) -> None:
         """Put an error in the queue; a full queue ends in -350."""
         text = STANDARD_ERRORS[error.code] + (f"; {error.detail}" if error.detail else "")
-        self._event_bits |= 32 if -200 < error.code <= -100 else 16 if -300 < error.code <= -200 else 8
+        kinds = {-1: 32, -2: 16, -4: 4}  # command, execution and query errors; else a device's own
+        self._event_bits |= kinds.get(-(-error.code // 100), 8)
         if len(self._errors) < QUEUE_LENGTH:
             self._errors.append(f'{error.code},"{_quotable(text)}"')
         else:

@@ -92,7 +92,8 @@ class TextBox:
     def _receive(self, data: bytes) -> None:
         for byte in data:
             if byte != ord("\n"):
-                self._line.append(byte)
+                if len(self._line) <= _LONGEST_LINE:
+                    self._line.append(byte)
                 continue
             line = self._line.decode("latin-1").strip()
             too_long = len(self._line) > _LONGEST_LINE

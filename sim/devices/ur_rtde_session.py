@@ -50,6 +50,8 @@ class RtdeSession:
 
     def _take_packet(self, kind: int, payload: bytes) -> None:
         if kind == wire.DATA:
+            if not 1 <= payload[0] <= len(self._inputs):
+                raise ValueError(f"there is no recipe {payload[0]}")
             self._on_inputs(wire.unpack(self._inputs[payload[0] - 1], payload[1:]))
         elif kind == wire.PROTOCOL_VERSION:
             self._answer(kind, bytes([payload == b"\x00\x02"]))
@@ -60,11 +62,15 @@ class RtdeSession:
             if not 1.0 <= frequency_hz <= _FREQUENCY_HZ:
                 raise ValueError(f"{frequency_hz} Hz")
             self._every_cycles = round(_FREQUENCY_HZ / frequency_hz)
-            self._outputs = _names(payload[8:])
-            self._answer(kind, _recipe(1, self._outputs))
+            asked = _names(payload[8:])
+            answer = _recipe(1, asked)
+            self._outputs = asked if answer[0] else []
+            self._answer(kind, answer)
         elif kind == wire.SETUP_INPUTS:
-            self._inputs.append(_names(payload))
-            self._answer(kind, _recipe(len(self._inputs), self._inputs[-1]))
+            asked = _names(payload)
+            answer = _recipe(len(self._inputs) + 1, asked)
+            self._inputs.append(asked if answer[0] else [])
+            self._answer(kind, answer)
         elif kind in {wire.START, wire.PAUSE}:
             self._started = kind == wire.START
             self._answer(kind, b"\x01")
@@ -80,6 +86,6 @@ def _names(payload: bytes) -> list[str]:
 
 
 def _recipe(number: int, names: list[str]) -> bytes:
-    """Recipe id and types; id 0, which is invalid, if a variable does not exist."""
+    """Recipe id and types; id 0, which is invalid, if a variable does not exist. Raises ValueError above 255."""
     types = [wire.variable_type(name) for name in names]
     return bytes([0 if wire.NOT_FOUND in types else number]) + ",".join(types).encode()

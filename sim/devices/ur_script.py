@@ -7,7 +7,7 @@ output_int_register_0: 1 ready, 2 done. Then the client writes 0, and the progra
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from sim.devices.ur_arm import Six
@@ -16,6 +16,8 @@ from sim.devices.ur_rtde_wire import Value
 _NONE, _MOVEJ, _MOVEL, _STOPJ, _SET_WATCHDOG, _GET_TCP_OFFSET, _END = 0, 1, 3, 34, 35, 40, 255
 _READY, _DONE = 1, 2
 _ASYNC_RUNNING = 0x8000
+_FULL_TURN_RAD = 2.0 * math.pi
+"""Joint limit; larger than any coordinate of the tool in m or rad, too."""
 
 
 class Arm(Protocol):
@@ -60,7 +62,9 @@ class ControlScript:
     def _process(self, command: int, inputs: Mapping[str, Value]) -> None:
         numbers = [_number(inputs, f"input_double_register_{i}") for i in range(8)]
         asynchronous = _number(inputs, "input_int_register_1") == 1
-        if command == _MOVEJ:
+        if not _possible(command, numbers):
+            self.ended = f"runtime error: command {command} with {numbers}"
+        elif command == _MOVEJ:
             self._arm.start_movej(
                 tuple(map(math.degrees, numbers[:6])), math.degrees(numbers[6]), math.degrees(numbers[7])
             )
@@ -88,6 +92,15 @@ class ControlScript:
         self._async_operation = (self._async_operation + running) % 128
         register = self._async_operation << 24 | self._async_count << 16 | _ASYNC_RUNNING * running
         self.outputs["output_int_register_2"] = register
+
+
+def _possible(command: int, numbers: Sequence[float]) -> bool:
+    """False for arguments with which URScript's functions end the program."""
+    if not all(map(math.isfinite, numbers)):
+        return False
+    if command in {_MOVEJ, _MOVEL}:
+        return max(map(abs, numbers[:6])) <= _FULL_TURN_RAD and min(numbers[6:8]) > 0
+    return numbers[0] > 0 if command in {_STOPJ, _SET_WATCHDOG} else True
 
 
 def _number(inputs: Mapping[str, Value], name: str) -> float:

@@ -7,6 +7,9 @@ from collections.abc import Callable
 
 from sim.world.reactor import Reactor
 
+_MOST_BYTES = 2**20
+"""Largest unfinished input of a client, which is then disconnected."""
+
 
 class Connection:
     """One client's connection: received bytes that are not yet processed, and a way to answer."""
@@ -74,7 +77,10 @@ class TcpPort:
         self._listener.close()
 
     def _accept(self) -> None:
-        link, _ = self._listener.accept()
+        try:
+            link, _ = self._listener.accept()
+        except OSError:  # it has left already
+            return
         link.setblocking(False)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection = Connection(link)
@@ -90,6 +96,8 @@ class TcpPort:
         except OSError:
             data = b""
         connection.inbox += data
+        if len(connection.inbox) > _MOST_BYTES:
+            connection.gone = True  # no program and no packet is that long
         if data and not connection.gone:
             self._on_bytes(connection)
         if not data or connection.gone:

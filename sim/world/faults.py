@@ -15,7 +15,8 @@ class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-Count = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=0, lt=2**31)]
+Seconds = Annotated[float, Field(ge=0, le=1e6)]
 
 
 class When(BaseModel):
@@ -24,7 +25,7 @@ class When(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     at_edge: Count | None = None
-    at_s: Annotated[float, Field(ge=0)] | None = None
+    at_s: Seconds | None = None
 
     @model_validator(mode="after")
     def _one_moment(self) -> When:
@@ -45,7 +46,7 @@ class DoubleTrigger(_Model):
 
     kind: Literal["double_trigger"]
     edge: Count
-    delay_us: Annotated[int, Field(ge=1)] = 9_500
+    delay_us: Annotated[int, Field(ge=1, lt=2**31)] = 9_500
 
 
 class LostTransfer(_Model):
@@ -118,22 +119,22 @@ class LateRsi(When):
     """`cycles` answers in a row come too late for the robot's controller."""
 
     kind: Literal["late_rsi"]
-    cycles: Annotated[int, Field(ge=1)] = 200
+    cycles: Annotated[int, Field(ge=1, lt=2**31)] = 200
 
 
 class RsiLinkLoss(When):
     """The robot's controller sends no packets for `seconds`, then restarts its program."""
 
     kind: Literal["rsi_link_loss"]
-    seconds: Annotated[float, Field(gt=0)] = 10.0
+    seconds: Annotated[float, Field(gt=0, le=1e6)] = 10.0
 
 
 class NudgeArm(When):
     """A displacement of the arm by `deg` on every axis; after `seconds` it springs back (None: it stays)."""
 
     kind: Literal["nudge_arm"]
-    deg: float = 0.05
-    seconds: Annotated[float, Field(gt=0)] | None = None
+    deg: Annotated[float, Field(ge=-360, le=360)] = 0.05
+    seconds: Annotated[float, Field(gt=0, le=1e6)] | None = None
 
 
 Fault = Annotated[

@@ -9,17 +9,15 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 import signal
 import socket
 import sys
-import tempfile
 import threading
 from pathlib import Path
 from typing import Any, assert_never
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from sim.devices import camera_stand_in, gige_camera, kuka_controller, ledbox_stand_in, robot
 from sim.devices.arm_bodies import NONE, Capsules, arm_capsules, tool_capsules, ur_capsules
@@ -33,8 +31,9 @@ from sim.world.clock import ClockWriter
 from sim.world.config import CameraConfig, Config
 from sim.world.lighting import Lighting
 from sim.world.reactor import Reactor
+from sim.world.scratch import world_folder
 
-SCRATCH = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gettempdir())
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class World:
@@ -65,6 +64,7 @@ class World:
         self._control = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.bind(str(folder / "control"))
         self._control.listen(4)
+        self._control.setblocking(False)
         self.reactor.add_reader(self._control, self._accept)
         self._faults_at_edge: dict[int, list[script.Fault]] = {}
         for fault in settings.faults:
@@ -193,22 +193,36 @@ class World:
     # -- control ------------------------------------------------------------------------------------------
 
     def _accept(self) -> None:
-        client, _ = self._control.accept()
+        try:
+            client, _ = self._control.accept()
+        except OSError:  # it has left already
+            return
+        client.setblocking(False)
         self.reactor.add_reader(client, lambda: self._on_command(client))
 
     def _on_command(self, client: socket.socket) -> None:
         try:
             data = client.recv(4096)
             if data:
-                client.send(json.dumps(self._do(json.loads(data))).encode())
+                client.send(json.dumps(self._answer(data)).encode())
                 return
-        except (ConnectionResetError, BrokenPipeError):  # killed before it read the answer
+        except OSError:  # killed before it read the answer, or it reads none
             pass
         self.reactor.remove_reader(client)
         client.close()
 
+    def _answer(self, data: bytes) -> dict[str, Any]:
+        """Do what a client asks for; what is no command is answered with an error."""
+        try:
+            command = json.loads(data)
+        except (ValueError, RecursionError):
+            return {"error": "a command is a JSON object"}
+        if not isinstance(command, dict):
+            return {"error": "a command is a JSON object"}
+        return self._do(command)
+
     def _do(self, command: dict[str, Any]) -> dict[str, Any]:
-        match command["do"]:
+        match command.get("do"):
             case "state":
                 now_ns = self.reactor.now_ns
                 return {
@@ -223,7 +237,10 @@ class World:
                 leds_s, panels_s = self.lighting.given_s(self.reactor.now_ns)
                 return {"leds_s": leds_s, "panels_s": panels_s}
             case "fault":
-                fault = OneFault.model_validate({"fault": command["fault"]}).fault
+                try:
+                    fault = OneFault.model_validate({"fault": command.get("fault")}).fault
+                except ValidationError as error:
+                    return {"error": str(error)}
                 if why := (
                     robot.impossible(fault, self._robot_settings)
                     or camera_stand_in.impossible(fault, self._camera_settings)
@@ -239,7 +256,7 @@ class World:
                 self.reactor.stop()
                 return {}
             case other:
-                return {"error": f"unknown command {other}"}
+                return {"error": f"unknown command {other!r:.40}"}
 
     def close(self) -> None:
         self.camera.close()
@@ -257,17 +274,18 @@ class OneFault(BaseModel):
 def main() -> int:
     """Serve one world; see the module's text."""
     config = Config.model_validate_json(sys.stdin.readline())
-    folder = Path(tempfile.mkdtemp(prefix="coupole-world-", dir=SCRATCH))
-    try:
+    for number in _ENDING:
+        signal.signal(number, lambda *_: sys.exit(0))  # until there is a world to stop
+    with world_folder() as folder:
         world = World(config, folder)
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in _ENDING:
             signal.signal(number, lambda *_: world.reactor.stop())
         threading.Thread(target=_stop_when_parent_is_gone, args=(world.reactor,), daemon=True).start()
         print(json.dumps(world.endpoints), flush=True)
-        world.reactor.run()
-        world.close()
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        try:
+            world.reactor.run()
+        finally:
+            world.close()
     return 0
 
 

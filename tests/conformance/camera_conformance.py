@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from coupole.devices import Camera, Exposure, Frame
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused
-from sim.devices.camera_body import Exposed, Surroundings
+from sim.devices import camera_body
+from sim.devices.camera_body import Exposed, Render, Surroundings
 from sim.world.lighting import Lighting
 from sim.world.reactor import Reactor
 
-HEIGHT_PX, WIDTH_PX = 24, 40
+HEIGHT_PX, WIDTH_PX, WHITE_DN = 24, 40, 4095
 EXPOSURE = Exposure(exposure_us=2_000)
 BY_SOFTWARE = Exposure(exposure_us=2_000, hardware_trigger=False)
 PATIENCE_S = 10.0
@@ -46,7 +47,23 @@ class CameraWorld(Protocol):
     def armed(self) -> bool: ...
 
 
-def sensor(height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX) -> dict[str, Any]:
+def flat(out: NDArray[np.uint16], exposed: Exposed) -> None:
+    """A frame filled with the number of its exposure."""
+    out[:] = exposed.number
+
+
+def ramp(out: NDArray[np.uint16], exposed: Exposed) -> None:
+    """A frame whose pixels tell its number and their own places, if it is exposed as asked; else all is white."""
+    as_asked = (exposed.exposure_s, exposed.gain) == (EXPOSURE.exposure_us / 1e6, 1.0)
+    out[:] = expected_ramp(exposed.number) if as_asked else WHITE_DN
+
+
+def expected_ramp(number: int) -> NDArray[np.uint16]:
+    """What `ramp` shows [HEIGHT_PX, WIDTH_PX]: 1000 a frame, 40 a row, 1 a column."""
+    return (1000 * number + np.arange(HEIGHT_PX * WIDTH_PX).reshape(HEIGHT_PX, WIDTH_PX)).astype(np.uint16)
+
+
+def sensor(height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX, render: Render = flat) -> dict[str, Any]:
     """What a stand-in for a camera is made with, whatever its wire."""
     return {
         "frame_format": {
@@ -55,20 +72,22 @@ def sensor(height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX) -> dict[str, An
             "bit_depth": 12,
             "bayer_pattern": "GBRG",
             "black_dn": 64,
-            "white_dn": 4095,
+            "white_dn": WHITE_DN,
         },
         "surroundings": Surroundings(
             readout_us=10_000,
             exposure_gap_us=100,
             lighting=Lighting(),
             pose=lambda: np.eye(4),
-            render=_render,
+            render=render,
         ),
     }
 
 
-def _render(out: NDArray[np.uint16], exposed: Exposed) -> None:
-    out[:] = exposed.number
+def begun_ns(frame: Frame) -> int:
+    """World time at which a frame's exposure began: the clock of `sim.devices.camera_body`, read backwards."""
+    clock = camera_body.Settings()
+    return round((frame.timestamp_ns - clock.clock_offset_ns) / (1 + clock.clock_ppm * 1e-6))
 
 
 def in_world(reactor: Reactor, action: Callable[[], object]) -> None:

@@ -43,11 +43,12 @@ class UsbLink:
     def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
         self._received, self._on_break = received, on_break
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes) -> bool:
         with self._ready:
             if not self._muted:
                 self._response += data
                 self._ready.notify_all()
+        return True
 
     def drop_output(self) -> None:
         with self._ready:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import shutil
 import subprocess
@@ -12,9 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from camera_conformance import begun_ns
+from foreign_state import Left
 from gentl_camera import serve
+from harvesters.core import Harvester
 
-from coupole.devices import Camera
+from coupole.devices import Camera, Frame
 from drivers.camera.gentl.driver import GenTLCamera
 from drivers.camera.gentl.settings import Settings
 from sim.world.clock import SharedClock
@@ -23,6 +27,8 @@ SOURCES = Path(__file__).with_name("gentl_producer")
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler for the GenTL producer")
 SERIAL = "00000120"
+_QUIET = logging.getLogger("foreign-client")
+_QUIET.addHandler(logging.NullHandler())
 SETTINGS: dict[str, Any] = {
     "exposed_counter": {"select": {"CounterSelector": "Counter0"}},
     "over_trigger_counter": {"select": {"CounterSelector": "Counter1"}},
@@ -75,10 +81,11 @@ class GenTLWorld:
         *,
         tl_type: str = "U3V",
         ticks_hz: int = 10**9,
+        ramp: bool = False,
         **settings: Any,
     ) -> None:
         self._producer, self._cameras = producer, cameras
-        character = {"tl_type": tl_type, "ticks_hz": ticks_hz}
+        character = {"tl_type": tl_type, "ticks_hz": ticks_hz, "ramp": ramp}
         given = {"id_modulus": 65535 if tl_type == "GEV" else 2**62, **settings}
         self._ask("begin", producer.with_name(f"{SERIAL}.camera"), folder / "clock", given, character)
         self._clock = SharedClock(folder / "clock")
@@ -91,6 +98,21 @@ class GenTLWorld:
     def open(self, **settings: Any) -> GenTLCamera:
         checked = Settings.model_validate({"producer": self._producer, **SETTINGS, **settings})
         return self._drivers.enter_context(closing(GenTLCamera(checked, self._clock)))
+
+    def leave(self, left: Left) -> None:
+        """Through harvesters and the producer, without our driver."""
+        harvester = Harvester(logger=_QUIET)
+        harvester.add_file(str(self._producer))
+        harvester.update()
+        acquirer = harvester.create(0)
+        nodes = acquirer.remote_device.node_map
+        for name, value in left:
+            nodes.get_node(name).value = value
+        acquirer.destroy()
+        harvester.reset()
+
+    def begun_ns(self, frame: Frame) -> int:
+        return begun_ns(frame)
 
     def open_nothing(self) -> Camera:
         return self.open(serial="99999999")

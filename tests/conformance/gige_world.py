@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import subprocess
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from camera_conformance import fire, in_world, sensor
+from camera_conformance import begun_ns, fire, flat, in_world, sensor
+from foreign_state import Left
 from gige import gige_port
 
+from coupole.devices import Frame
 from drivers.camera.aravis.driver import AravisCamera, Settings
 from sim.devices import gige_camera
+from sim.devices.camera_body import Render
 from sim.world.clock import ClockWriter, SharedClock
 from sim.world.reactor import Reactor
 
@@ -24,14 +28,29 @@ SETTINGS: dict[str, Any] = {
 }
 
 
+def arv_tool(*arguments: str) -> str:
+    """What Aravis's own client says of the camera."""
+    command = ["arv-tool-0.8", "-a", SETTINGS["address"], *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+
+
+def _written(value: Any) -> str:
+    """A feature's value in the words of `arv-tool`."""
+    if isinstance(value, str):
+        return value
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}"
+
+
 class GigeWorld:
     """See `CameraWorld`."""
 
-    def __init__(self, folder: Path, *, height_px: int = 24, width_px: int = 40, **settings: Any) -> None:
+    def __init__(
+        self, folder: Path, *, height_px: int = 24, width_px: int = 40, render: Render = flat, **settings: Any
+    ) -> None:
         self.reactor = Reactor(ClockWriter(folder / "clock", speed=1.0))
         self.clock = SharedClock(folder / "clock")
         self.camera = gige_camera.GigeCamera(
-            self.reactor, gige_camera.Settings(**settings), **sensor(height_px, width_px)
+            self.reactor, gige_camera.Settings(**settings), **sensor(height_px, width_px, render)
         )
         self._thread = threading.Thread(target=self.reactor.run)
         self._thread.start()
@@ -49,6 +68,15 @@ class GigeWorld:
 
     def unplug(self) -> None:
         in_world(self.reactor, self.camera.unplug)
+
+    def leave(self, left: Left) -> None:
+        """Through Aravis's own command line."""
+        said = arv_tool("control", *(f"{name}={_written(value)}" for name, value in left))
+        taken = [line.split()[:3] for line in said.splitlines() if line]
+        assert taken == [[name, "=", _written(value)] for name, value in left]
+
+    def begun_ns(self, frame: Frame) -> int:
+        return begun_ns(frame)
 
     @property
     def armed(self) -> bool:

@@ -10,15 +10,16 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from camera_conformance import A_MOMENT_S, EXPOSURE, CameraConformance, in_world, take
+from camera_conformance import A_MOMENT_S, EXPOSURE, CameraConformance, in_world, ramp, take
+from foreign_state import LEFT_BY_SFNC, ForeignStateConformance, Left
 from gige import needs_aravis
-from gige_world import SETTINGS, GigeWorld, gige_world
+from gige_world import SETTINGS, GigeWorld, arv_tool, gige_world
 
 from coupole.errors import DeviceLost, DeviceRefused
 from drivers.camera.aravis.discovery import discover
@@ -35,6 +36,24 @@ def world(tmp_path: Path) -> Iterator[GigeWorld]:
 
 class TestAravisCamera(CameraConformance):
     """The contract, over GigE Vision."""
+
+
+@pytest.mark.skipif(shutil.which("arv-tool-0.8") is None, reason="arv-tool-0.8 is not installed")
+class TestForeignState(ForeignStateConformance):
+    """After Aravis's command line."""
+
+    @pytest.fixture
+    def world(self, tmp_path: Path) -> Iterator[GigeWorld]:
+        with gige_world(tmp_path, render=ramp) as world:
+            yield world
+
+    @pytest.fixture(params=list(LEFT_BY_SFNC))
+    def left(self, request: pytest.FixtureRequest) -> Left:
+        return LEFT_BY_SFNC[request.param]
+
+    @pytest.fixture
+    def all_left(self) -> Mapping[str, Left]:
+        return LEFT_BY_SFNC
 
 
 # -- features -------------------------------------------------------------------------------------------------
@@ -220,12 +239,6 @@ def test_a_serial_number_that_no_camera_has_is_told_with_those_that_answer(world
 
 
 # -- other clients ----------------------------------------------------------------------------------------------
-
-
-def arv_tool(*arguments: str) -> str:
-    """What Aravis's own client says of the camera."""
-    command = ["arv-tool-0.8", "-a", SETTINGS["address"], *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
 
 
 @pytest.mark.skipif(shutil.which("arv-tool-0.8") is None, reason="arv-tool-0.8 is not installed")

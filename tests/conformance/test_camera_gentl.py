@@ -6,7 +6,7 @@ import logging
 import signal
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_conformance import EXPOSURE, PATIENCE_S, CameraConformance, take, take_numbers
+from foreign_state import LEFT_BY_SFNC, ForeignStateConformance, Left
 from gentl_camera import EXPOSURE_AUTO, OFFSET_X, OFFSET_Y, TRIGGER_MODE, TRIGGER_SOURCE
 from gentl_world import SERIAL, GenTLWorld, camera_process, compile_producer, needs_compiler
 from hypothesis import given, settings
@@ -62,6 +63,22 @@ def armed(world: GenTLWorld, **settings: Any) -> GenTLCamera:
 
 class TestGenTLCamera(CameraConformance):
     """The contract, over GenTL's functions."""
+
+
+class TestForeignState(ForeignStateConformance):
+    """After another program over harvesters."""
+
+    @pytest.fixture
+    def character(self) -> dict[str, Any]:
+        return {"ramp": True}
+
+    @pytest.fixture(params=list(LEFT_BY_SFNC))
+    def left(self, request: pytest.FixtureRequest) -> Left:
+        return LEFT_BY_SFNC[request.param]
+
+    @pytest.fixture
+    def all_left(self) -> Mapping[str, Left]:
+        return LEFT_BY_SFNC
 
 
 class TestLosses:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 from camera_conformance import EXPOSURE, HEIGHT_PX, WIDTH_PX, CameraConformance, take, take_numbers
+from foreign_state import ForeignStateConformance, Left
 from xiapi_world import XiWorld, compile_stub, needs_compiler
 
 from coupole.devices import Exposure
@@ -34,6 +35,93 @@ def world(library: Path) -> Iterator[XiWorld]:
 
 class TestXiCamera(CameraConformance):
     """The contract, over xiAPI's functions."""
+
+
+LEFT: Mapping[str, Left] = {
+    "exposure 5 ms after the edge": (("trigger_delay", 5000),),
+    "input is debounced": (("gpi_selector", 1), ("dbnc_en", 1)),
+    "early edges are latched": (("trigger_overlap", 2),),
+    "exposure lasts as long as the trigger": (("trigger_selector", 1),),
+    "another input triggers too": (("gpi_selector", 2), ("gpi_mode", 1)),
+    "frame rate is limited": (("acq_timing_mode", 2),),
+    "several exposures in a frame": (("exposure_burst_count", 3),),
+    "exposure is automatic": (("aeag", 1),),
+    "gain by numbers": (("gain_selector", 2), ("gain", 6), ("gain_selector", 0)),
+    "a part of the sensor": (("width", 16), ("height", 8), ("offsetX", 8), ("offsetY", 4)),
+    "sampled down": (("downsampling", 2),),
+    "columns are binned": (("binning_horizontal", 2),),
+    "rows are binned": (("binning_vertical", 2),),
+    "columns are skipped": (("decimation_horizontal", 2),),
+    "rows are skipped": (("decimation_vertical", 2),),
+    "mirrored left to right": (("horizontal_flip", 1),),
+    "mirrored top to bottom": (("vertical_flip", 1),),
+    "a test pattern of the sensor": (("test_pattern", 2),),
+    "a test pattern of the FPGA": (("test_pattern_generator_selector", 1), ("test_pattern", 2)),
+    "a look-up table": (("LUTEnable", 1),),
+    "newest frame first": (("recent_frame", 1),),
+    "12 bits are 8": (("output_bit_depth", 8),),
+}
+
+
+class TestForeignState(ForeignStateConformance):
+    """After another program over xiAPI."""
+
+    @pytest.fixture
+    def world(self, library: Path) -> Iterator[ShowingWorld]:
+        world = ShowingWorld(library)
+        yield world
+        world.close()
+
+    @pytest.fixture(params=list(LEFT))
+    def left(self, request: pytest.FixtureRequest) -> Left:
+        return LEFT[request.param]
+
+    @pytest.fixture
+    def all_left(self) -> Mapping[str, Left]:
+        return {what: left for what, left in LEFT.items() if not what.startswith(("columns", "rows"))}
+
+
+NOT_SIMULATED = (
+    "shutter_type",
+    "concat_img_mode",
+    "auto_wb",
+    "bpc",
+    "ffc",
+    "hdr",
+    "trans_data_black_level_ovr_en",
+    "exposure_time_selector",
+    "interline_exposure_mode",
+)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "left", "right"), [*((name, 1, 0) for name in NOT_SIMULATED), ("gammaY", 0, 1), ("gammaC", 0, 1)]
+)
+def test_what_the_stand_in_does_not_simulate_is_set_too(
+    world: XiWorld, parameter: str, left: int, right: int
+) -> None:
+    world.leave(((parameter, left),))
+    camera = world.open()
+    assert world.parameter(parameter) == right
+    assert camera.identify().settings[parameter] == str(right)
+
+
+def test_a_parameter_that_the_rig_leaves_stays(world: XiWorld) -> None:
+    world.leave((("bpc", 1),))
+    world.open(leave=["bpc"])
+    assert world.parameter("bpc") == 1
+
+
+class ShowingWorld(XiWorld):
+    """Frames show the ramp; 11 ms after each edge of the box something else sends one to input 2."""
+
+    def __init__(self, library: Path) -> None:
+        super().__init__(library)
+        self.stub.stub_show_ramp()
+
+    def edge(self, t_ns: int, trigger_input: int = 1) -> None:
+        super().edge(t_ns, trigger_input)
+        self.stub.stub_edge(2, t_ns + 11_000_000)
 
 
 class TestLosses:

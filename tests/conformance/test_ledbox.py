@@ -47,9 +47,10 @@ class TcpLink:
     def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
         self._received, self._on_break = received, on_break
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes) -> bool:
         if self._client is not None and self._received is not None:
             self._client.sendall(data)
+        return True
 
     def drop_output(self) -> None:
         """Every byte has left with `send`."""

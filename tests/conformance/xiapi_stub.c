@@ -40,10 +40,13 @@ typedef struct {
 
 enum { RAW16 = 6, SAFE = 1, GBRG = 6 };
 enum { TRIGGER_OFF = 0, TRIGGER_RISING = 1, TRIGGER_SOFTWARE = 3 };
+enum { EXPOSURE_ACTIVE = 1, PREV_FRAME = 2, WHITE = 4095 };
 enum { SKIPPED_TRANSPORT, SKIPPED_API, TRANSFERRED, MISSED_OVERLAP, MISSED_FULL, OVERFLOWS, COUNTERS };
 
 #define SHORTEST_NS 10000000ull
 #define GAP_NS 100000ull
+#define LIMITED_NS 40000000ull /* while the frame rate is limited */
+#define PULSE_US 50            /* of the box's trigger */
 #define SENSOR_WIDTH 40
 #define SENSOR_HEIGHT 24
 #define LARGEST_QUEUE 4096
@@ -73,6 +76,33 @@ static const Parameter FACTORY[] = {
     {"cfa", GBRG, 0, 8, READ_ONLY},
     {"image_black_level", 64, 0, 4095, READ_ONLY},
     {"aeag", 1, 0, 1, 0},
+    {"downsampling", 1, 1, 2, 0},
+    {"binning_selector", 0, 0, 2, 0},
+    {"binning_horizontal", 1, 1, 2, 0},
+    {"binning_vertical", 1, 1, 2, 0},
+    {"decimation_horizontal", 1, 1, 2, 0},
+    {"decimation_vertical", 1, 1, 2, 0},
+    {"horizontal_flip", 0, 0, 1, 0},
+    {"vertical_flip", 0, 0, 1, 0},
+    {"test_pattern_generator_selector", 0, 0, 1, 0},
+    {"test_pattern", 0, 0, 6, 0},
+    {"LUTEnable", 0, 0, 1, 0},
+    {"acq_timing_mode", 0, 0, 2, 0},
+    {"exposure_burst_count", 1, 1, 16, 0},
+    {"gain_selector", 0, 0, 2, 0},
+    {"trigger_delay", 0, 0, 1000000, 0},
+    {"dbnc_en", 0, 0, 1, 0},
+    {"shutter_type", 0, 0, 2, 0},
+    {"concat_img_mode", 0, 0, 1, 0},
+    {"auto_wb", 0, 0, 1, 0},
+    {"bpc", 0, 0, 1, 0},
+    {"ffc", 0, 0, 1, 0},
+    {"hdr", 0, 0, 1, 0},
+    {"gammaY", 1, 0, 1, 0},
+    {"gammaC", 1, 0, 1, 0},
+    {"trans_data_black_level_ovr_en", 0, 0, 1, 0},
+    {"exposure_time_selector", 0, 0, 2, 0},
+    {"interline_exposure_mode", 0, 0, 1, 0},
     {"trigger_source", TRIGGER_OFF, 0, 5, 0},
     {"trigger_selector", 0, 0, 7, 0},
     {"trigger_overlap", 0, 0, 2, 0},
@@ -101,12 +131,15 @@ static const char *TEXTS[][2] = {
 typedef struct {
     uint64_t start_ns;
     DWORD number, id;
+    int as_asked; /* exposed for 2 ms, without gain */
 } Exposed;
 
 static pthread_mutex_t mutex = PTHREAD_MUTEX_INITIALIZER;
 static pthread_cond_t arrived = PTHREAD_COND_INITIALIZER;
 static Parameter parameters[PARAMETERS];
-static int opened, acquiring, unplugged, ticks;
+static int opened, acquiring, unplugged, ticks, ramp, latched;
+static double gains[3];
+static double input_modes[7], patterns[2];
 static DWORD devices, exposures, acquired, padding_bytes, black_offset;
 static uint64_t now_ns, ready_ns, exposure_end_ns;
 static DWORD counters[COUNTERS], to_lose, to_overflow, to_miss;
@@ -121,6 +154,11 @@ static Parameter *find(const char *name) {
 
 static DWORD whole(const char *name) { return (DWORD)find(name)->value; }
 
+static DWORD factor(int across) {
+    return whole("downsampling") * whole(across ? "binning_horizontal" : "binning_vertical") *
+           whole(across ? "decimation_horizontal" : "decimation_vertical");
+}
+
 static DWORD image_bytes(void) { return whole("height") * (2 * whole("width") + padding_bytes); }
 
 static double queue_limit(void) {
@@ -131,19 +169,28 @@ static double queue_limit(void) {
 
 /* An edge or a software trigger, as sensor and transport see it. */
 static void expose(uint64_t at_ns) {
-    uint64_t exposure_ns = (uint64_t)(find("exposure")->value * 1000);
-    if (at_ns < ready_ns || at_ns < exposure_end_ns + GAP_NS) {
-        counters[MISSED_OVERLAP]++;
-        return;
+    double exposure_us = find("exposure")->value * whole("exposure_burst_count") * (1 + whole("aeag"));
+    if (whole("trigger_selector") == EXPOSURE_ACTIVE) exposure_us = PULSE_US;
+    uint64_t exposure_ns = (uint64_t)(exposure_us * 1000);
+    uint64_t free_ns = exposure_end_ns + GAP_NS > ready_ns ? exposure_end_ns + GAP_NS : ready_ns;
+    if (at_ns < free_ns) {
+        if (whole("trigger_overlap") != PREV_FRAME || latched) {
+            counters[MISSED_OVERLAP]++;
+            return;
+        }
+        latched = 1;
+        at_ns = free_ns;
+    } else {
+        latched = 0;
     }
     if (to_miss) {
         to_miss--;
         counters[MISSED_FULL]++;
         return;
     }
-    ready_ns = at_ns + SHORTEST_NS;
+    ready_ns = at_ns + (whole("acq_timing_mode") ? LIMITED_NS : SHORTEST_NS);
     exposure_end_ns = at_ns + exposure_ns;
-    Exposed image = {at_ns, exposures++, acquired++};
+    Exposed image = {at_ns, exposures++, acquired++, exposure_us == 2000 && gains[0] + gains[1] + gains[2] == 0};
     if (to_lose) {
         to_lose--;
         counters[SKIPPED_TRANSPORT]++;
@@ -181,8 +228,7 @@ XI_RETURN xiOpenDevice(DWORD index, HANDLE *handle) {
     pthread_mutex_lock(&mutex);
     if (unplugged || index >= devices) return leave(XI_NO_DEVICES_FOUND);
     if (opened) return leave(XI_LOCKED); /* guess: which code a second client gets */
-    memcpy(parameters, FACTORY, sizeof FACTORY);
-    opened = 1;
+    opened = 1; /* guess: the camera keeps what the last program set */
     *handle = &opened;
     return leave(XI_OK);
 }
@@ -198,19 +244,47 @@ XI_RETURN xiCloseDevice(HANDLE handle) {
     return leave(XI_OK);
 }
 
+/* Upper limit of a parameter, which may depend on others. */
+static double most_of(const Parameter *parameter) {
+    const char *name = parameter->name;
+    if (!strcmp(name, "buffers_queue_size")) return queue_limit();
+    if (!strcmp(name, "width")) return SENSOR_WIDTH / factor(1) - whole("offsetX");
+    if (!strcmp(name, "height")) return SENSOR_HEIGHT / factor(0) - whole("offsetY");
+    if (!strcmp(name, "offsetX")) return SENSOR_WIDTH / factor(1) - whole("width");
+    if (!strcmp(name, "offsetY")) return SENSOR_HEIGHT / factor(0) - whole("height");
+    return parameter->most;
+}
+
+/* Where a parameter's value is: some have one for each value of their selector. */
+static double *place_of(Parameter *parameter) {
+    if (!strcmp(parameter->name, "gain")) return &gains[whole("gain_selector")];
+    if (!strcmp(parameter->name, "gpi_mode")) return &input_modes[whole("gpi_selector")];
+    if (!strcmp(parameter->name, "test_pattern")) return &patterns[whole("test_pattern_generator_selector")];
+    return &parameter->value;
+}
+
+/* An image that has become larger than the sensor gives is made whole; a smaller one stays as it is. */
+static void fit_image(void) {
+    if (whole("width") + whole("offsetX") > SENSOR_WIDTH / factor(1))
+        find("offsetX")->value = 0, find("width")->value = SENSOR_WIDTH / factor(1);
+    if (whole("height") + whole("offsetY") > SENSOR_HEIGHT / factor(0))
+        find("offsetY")->value = 0, find("height")->value = SENSOR_HEIGHT / factor(0);
+}
+
 static XI_RETURN set(HANDLE handle, const char *name, double value) {
     ENTER(handle);
     Parameter *parameter = find(name);
     if (!parameter) return leave(XI_UNKNOWN_PARAM);
     if (parameter->flags & READ_ONLY) return leave(XI_READ_ONLY_PARAM);
     if (acquiring && !(parameter->flags & WHILE_ACQUIRING)) return leave(XI_PARAM_NOT_SETTABLE);
-    double most = strcmp(name, "buffers_queue_size") ? parameter->most : queue_limit();
+    double most = most_of(parameter);
     if (value < parameter->least || value > most) return leave(XI_OUT_OF_RANGE);
     if (!strcmp(name, "trigger_software")) {
         if (acquiring) expose(now_ns += SHORTEST_NS + (uint64_t)(find("exposure")->value * 1000) + GAP_NS);
         return leave(XI_OK);
     }
-    parameter->value = value;
+    *place_of(parameter) = value;
+    if (strstr(name, "ing_") || !strcmp(name, "downsampling")) fit_image();
     if (!strcmp(name, "output_bit_depth")) find("image_data_bit_depth")->value = value;
     return leave(XI_OK);
 }
@@ -230,10 +304,10 @@ static XI_RETURN get(HANDLE handle, const char *asked, double *value) {
     if (info) *info++ = 0;
     Parameter *parameter = find(name);
     if (!parameter) return leave(XI_UNKNOWN_PARAM);
-    *value = parameter->value;
+    *value = *place_of(parameter);
     if (info && !strcmp(info, "min")) *value = parameter->least;
     else if (info && !strcmp(info, "max"))
-        *value = strcmp(name, "buffers_queue_size") ? parameter->most : queue_limit();
+        *value = most_of(parameter);
     else if (info) return leave(XI_NOT_SUPPORTED_PARAM_INFO);
     else if (!strcmp(name, "imgpayloadsize")) *value = image_bytes();
     else if (!strcmp(name, "counter_value")) *value = counters[whole("counter_selector")];
@@ -268,7 +342,7 @@ XI_RETURN xiGetParamString(HANDLE handle, const char *name, void *value, DWORD s
 XI_RETURN xiStartAcquisition(HANDLE handle) {
     ENTER(handle);
     if (acquiring) return leave(XI_ACQUISITION_ALREADY_UP);
-    queued = acquired = 0;
+    queued = acquired = latched = 0;
     memset(counters, 0, sizeof counters); /* guess: all of them, as the header says of TRANSFERRED */
     acquiring = 1;
     return leave(XI_OK);
@@ -281,11 +355,22 @@ XI_RETURN xiStopAcquisition(HANDLE handle) {
     return leave(XI_OK);
 }
 
+/* What a pixel of the image shows. The look-up table inverts, and a test pattern is white. */
+static uint16_t shown(Exposed image, DWORD row, DWORD column) {
+    if (!ramp) return (uint16_t)image.number;
+    if (patterns[0] || patterns[1] || !image.as_asked) return WHITE;
+    row = (row + whole("offsetY")) * factor(0), column = (column + whole("offsetX")) * factor(1);
+    if (whole("vertical_flip")) row = SENSOR_HEIGHT - 1 - row;
+    if (whole("horizontal_flip")) column = SENSOR_WIDTH - 1 - column;
+    DWORD value = 1000 * image.number + SENSOR_WIDTH * row + column;
+    return (uint16_t)(whole("LUTEnable") ? WHITE - value : value);
+}
+
 static void render(XI_IMG *out, Exposed image) {
     DWORD width = whole("width"), height = whole("height"), pitch = 2 * width + padding_bytes;
     for (DWORD row = 0; row < height; row++) {
         uint16_t *pixels = (uint16_t *)((char *)out->bp + row * pitch);
-        for (DWORD column = 0; column < width; column++) pixels[column] = (uint16_t)image.number;
+        for (DWORD column = 0; column < width; column++) pixels[column] = shown(image, row, column);
         memset(pixels + width, 0xEE, padding_bytes);
     }
     out->bp_size = height * pitch;
@@ -298,7 +383,7 @@ static void render(XI_IMG *out, Exposed image) {
     out->tsUSec = ticks ? (DWORD)(image.start_ns / 4) : (DWORD)(image.start_ns % 1000000000u / 1000u);
     out->black_level = whole("image_black_level") + black_offset;
     out->exposure_time_us = whole("exposure");
-    out->gain_db = (float)find("gain")->value;
+    out->gain_db = (float)gains[0];
     out->color_filter_array = whole("cfa");
 }
 
@@ -327,7 +412,10 @@ XI_RETURN xiGetImage(HANDLE handle, DWORD timeout_ms, XI_IMG *out) {
 /* A camera as it leaves the factory, `count` of them connected. */
 void stub_reset(DWORD count) {
     memcpy(parameters, FACTORY, sizeof FACTORY);
-    opened = acquiring = unplugged = ticks = 0;
+    memset(gains, 0, sizeof gains);
+    memset(input_modes, 0, sizeof input_modes);
+    memset(patterns, 0, sizeof patterns);
+    opened = acquiring = unplugged = ticks = ramp = latched = 0;
     exposures = acquired = padding_bytes = black_offset = to_lose = to_overflow = to_miss = 0;
     now_ns = ready_ns = exposure_end_ns = queued = 0;
     devices = count;
@@ -337,9 +425,8 @@ void stub_reset(DWORD count) {
 void stub_edge(DWORD input, uint64_t at_ns) {
     pthread_mutex_lock(&mutex);
     now_ns = at_ns;
-    if (acquiring && !unplugged && whole("trigger_source") == TRIGGER_RISING && whole("gpi_mode") == 1 &&
-        whole("gpi_selector") == input)
-        expose(at_ns);
+    if (acquiring && !unplugged && whole("trigger_source") == TRIGGER_RISING && input_modes[input] == 1)
+        expose(at_ns + 1000ull * whole("trigger_delay") + 50000ull * whole("dbnc_en"));
     leave(XI_OK);
 }
 
@@ -348,6 +435,7 @@ void stub_overflow(DWORD images) { to_overflow = images; } /* in the camera's ow
 void stub_miss(DWORD edges) { to_miss = edges; }          /* because the camera's memory is full */
 void stub_pad(DWORD bytes) { padding_bytes = bytes; }     /* at the end of each row */
 void stub_shift_black(DWORD dn) { black_offset = dn; }    /* of images, not of the parameter */
+void stub_show_ramp(void) { ramp = 1; }                   /* in place of the image's number */
 void stub_use_ticks(void) { ticks = 1; }                   /* of 4 ns, for timestamps */
 void stub_unplug(void) { unplugged = 1; }
 int stub_acquiring(void) { return acquiring; }

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from foreign_state import Left
 
-from coupole.devices import Camera, SystemClock
+from coupole.devices import Camera, Frame, SystemClock
 from drivers.camera.xiapi.driver import Settings, XiCamera
 
 SOURCE = Path(__file__).with_name("xiapi_stub.c")
@@ -47,6 +48,17 @@ class XiWorld:
         given = {"library": self._library, "buffers": BUFFERS, **settings}
         camera = XiCamera(Settings.model_validate(given), SystemClock())
         return self._drivers.enter_context(closing(camera))
+
+    def leave(self, left: Left) -> None:
+        """Through xiAPI's functions, without our driver."""
+        handle = ctypes.c_void_p()
+        assert self.stub.xiOpenDevice(0, ctypes.byref(handle)) == 0
+        for name, value in left:
+            assert self.stub.xiSetParamFloat(handle, name.encode(), ctypes.c_float(value)) == 0, name
+        assert self.stub.xiCloseDevice(handle) == 0
+
+    def begun_ns(self, frame: Frame) -> int:
+        return frame.timestamp_ns
 
     def open_nothing(self) -> Camera:
         return self.open(serial="99999999")

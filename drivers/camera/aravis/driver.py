@@ -23,7 +23,7 @@ from drivers.camera.aravis.features import Features
 from drivers.camera.aravis.library import ON_CONTROL_LOST, call, is_a, require
 from drivers.camera.aravis.settings import Settings
 from drivers.camera.aravis.stream import Pool, Stream, StreamStatistics
-from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_image
+from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_up
 from drivers.camera.genicam_trigger import counts, frame_id_range, set_exposure, since
 from drivers.camera.misuse import misused
 from drivers.camera.pixel_formats import widen
@@ -71,9 +71,9 @@ class AravisCamera:
     def _set_up(self) -> None:
         with contextlib.suppress(DeviceRefused):  # a client that died may have left an acquisition running
             self._features.execute("AcquisitionStop")
-        set_image(self._features, self._settings)
         if self._is_gige:
             self._set_packets()
+        self._state = set_up(self._features, self._settings, triggered=True)
 
     def _set_packets(self) -> None:
         library, handle, size = self._library, self._handle, self._settings.packet_size
@@ -104,7 +104,7 @@ class AravisCamera:
                 ("DeviceFirmwareVersion", "DeviceVersion"),
             )
         )
-        return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
+        return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"), settings=self._state)
 
     def _text(self, *names: str) -> str:
         name = self._features.first_of(*names)

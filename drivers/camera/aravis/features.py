@@ -94,6 +94,12 @@ class Features:
             self._call(f"get_{kind}_feature_bounds", name, ctypes.byref(least), ctypes.byref(most))
         return least.value, most.value
 
+    def largest(self, name: str) -> int:
+        """Greatest value of an integer feature, in its steps."""
+        with self._lock:
+            least, most = (int(end) for end in self.bounds(name))
+            return most - (most - least) % max(1, int(self._call("get_integer_feature_increment", name)))
+
     def entries(self, name: str) -> list[str]:
         """Names of the enumeration's entries that are available now."""
         count = ctypes.c_uint()

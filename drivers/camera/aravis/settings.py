@@ -20,9 +20,11 @@ class Settings(BaseModel):
     """IP address, serial number or Aravis id; empty: the only camera connected."""
     pixel_format: str = "BayerGB12"
     region: Region | None = None
-    """None: as set in the camera."""
+    """None: the whole sensor."""
     features: dict[str, Value] = Field(default_factory=dict)
-    """GenICam features to set at opening, in this order, before all others."""
+    """GenICam features to set at opening, in this order; the driver's own table (`genicam_state`) leaves them."""
+    leave: tuple[str, ...] = ()
+    """Features of the driver's own table that stay as they are in the camera."""
     black_dn: Annotated[int, Field(ge=0)] | None = None
     """Black level, DN; None: the value of the feature `BlackLevel`, if that is in DN."""
     trigger_line: str = "Line0"

@@ -19,7 +19,7 @@ from typing import Any
 from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceRefused
 from drivers.camera.frame_pool import FramePool, Slot
-from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_image
+from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_up
 from drivers.camera.genicam_trigger import counts, frame_id_range, set_exposure, since
 from drivers.camera.gentl.features import Features
 from drivers.camera.gentl.image import copy_pixels, timestamp_ns
@@ -61,13 +61,21 @@ class GenTLCamera:
                 self._acquirer.Events.INCOMPLETE_BUFFER, when_incomplete(self._gaps.incomplete)
             )
             self._acquirer.timeout_period_on_update_event_data_call = 0
-            set_image(self._features, settings)
+            self._stop_what_runs()
+            self._state = set_up(self._features, settings, triggered=not settings.free_running)
             self.id_modulus = frame_id_range(self._features, gige=self._info["tl_type"] == "GEV")
         except BaseException:
             self.close()
             raise
 
     # -- opening and closing ------------------------------------------------------------------------------
+
+    def _stop_what_runs(self) -> None:
+        """A client that died may have left an acquisition running, and the features that it locks locked."""
+        with contextlib.suppress(DeviceRefused):
+            self._features.write("AcquisitionStop", True)
+        if self._features.has("TLParamsLocked"):
+            self._features.write("TLParamsLocked", 0)
 
     def close(self) -> None:
         with contextlib.suppress(DeviceError):
@@ -84,7 +92,7 @@ class GenTLCamera:
         vendor, model, serial, version = (
             self._info[what] or "unknown" for what in ("vendor", "model", "serial", "version")
         )
-        return Identity(vendor, model, serial, version)
+        return Identity(vendor, model, serial, version, settings=self._state)
 
     def self_test(self) -> Mapping[str, str]:
         """Raises DeviceError if the camera does not answer."""

@@ -82,6 +82,21 @@ class Features:
         except self._errors as error:
             self._failed(f"the bounds of `{name}`", error)
 
+    def largest(self, name: str) -> int:
+        """Greatest value of an integer feature, in its steps."""
+        least, most = (int(end) for end in self.bounds(name))
+        return most - (most - least) % max(1, int(self._node(name).inc))
+
+    def entries(self, name: str) -> list[str]:
+        """Names of the enumeration's entries that are available now."""
+        node = self._node(name)
+        if self._kind(node) != "IEnumeration":
+            self._refuse(f"`{name}` to be an enumeration", f"it is a {self._kind(node)[1:].lower()}")
+        try:
+            return [str(entry.symbolic) for entry in node.entries if self._genapi.is_available(entry.node)]
+        except self._errors as error:
+            self._failed(f"the entries of `{name}`", error)
+
     def write(self, name: str, value: Value) -> None:
         """Set a feature and read it back; `True` runs a command."""
         node = self._node(name)

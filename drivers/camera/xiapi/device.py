@@ -32,7 +32,8 @@ class XiDevice:
     """Each method may raise DeviceLost, or DeviceRefused with xiAPI's error name."""
 
     def __init__(self, library: str, serial: str, name: str) -> None:
-        self._name = name
+        self.name = name
+        """The camera's name in messages."""
         self._library = load(library, name)
         self._lock = FairLock()
         self._handle = ctypes.c_void_p()
@@ -44,7 +45,7 @@ class XiDevice:
         self._check(self._library.xiGetNumberDevices(found), "a list of the XIMEA cameras")
         if found.value == 0 or (found.value > 1 and not serial):
             raise DeviceLost(
-                self._name,
+                self.name,
                 expected=f"XIMEA camera {serial}" if serial else "exactly one XIMEA camera",
                 happened=f"{found.value} are connected",
                 remedy="Give the camera's `serial` in the rig." if found.value else "Check cable, power, driver.",
@@ -55,7 +56,7 @@ class XiDevice:
             code = self._library.xiOpenDevice(0, self._handle)
         if code == LOCKED:
             raise DeviceRefused(
-                self._name,
+                self.name,
                 expected="a free camera",
                 happened=f"it is in use ({code_name(code)})",
                 remedy="Close the other program.",
@@ -67,7 +68,7 @@ class XiDevice:
             return
         kind: type[DeviceError] = DeviceLost if code in GONE else DeviceRefused
         raise kind(
-            self._name,
+            self.name,
             expected=expected,
             happened=f"xiAPI answered {code_name(code)} ({code})",
             remedy="Check cable and power, then resume the run."
@@ -140,7 +141,7 @@ class XiDevice:
         slack = 1e-6 * max(abs(low), abs(high)) if math.isfinite(low + high) else 0.0
         if not low - slack <= value <= high + slack:
             raise DeviceRefused(
-                self._name,
+                self.name,
                 expected=f"`{parameter}` from {low:g} to {high:g}",
                 happened=f"{value:g} was asked for",
                 remedy="Change it in plan or rig.",
@@ -172,7 +173,7 @@ class XiDevice:
         self._check(code, "an image")
         if image.bp != address:
             raise DeviceRefused(
-                self._name,
+                self.name,
                 expected="the image in the buffer that was given",
                 happened="xiAPI put it elsewhere",
                 remedy="This version of libm3api does not honour the safe buffer policy: install another.",

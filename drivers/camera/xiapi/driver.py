@@ -38,7 +38,6 @@ from drivers.camera.xiapi.library import (
     GPO_TRIGGER_WAIT_NEGATED,
     MISSED_BUFFER_FULL,
     MISSED_OVERLAP,
-    OVERLAP_READ_OUT,
     RAW16,
     TRANSFERRED,
     TRANSPORT_SKIPPED,
@@ -46,10 +45,10 @@ from drivers.camera.xiapi.library import (
     TRIGGER_OFF,
     TRIGGER_RISING,
     TRIGGER_SOFTWARE,
-    TRIGGER_STARTS_FRAME,
     Image,
 )
 from drivers.camera.xiapi.settings import Region, Settings
+from drivers.camera.xiapi.state import AT_OPENING, FRAME_TRIGGER, State
 
 _SLICE_S = 0.05
 """Longest wait for an image in one call, which is also the longest wait of other calls."""
@@ -59,8 +58,6 @@ _IN_HAND = 16
 """Most frames in memory on their way to the disk."""
 _KIB = 1024
 _COUNTERS = range(6)
-_UNTOUCHED = {"aeag": 0, "auto_wb": 0, "bpc": 0, "ffc": 0, "hdr": 0, "LUTEnable": 0}
-"""Processing that would change pixels or exposure is switched off, if a model has it."""
 
 
 class XiCamera:
@@ -79,6 +76,7 @@ class XiCamera:
         self._counted_before: dict[int, int] = {}
         self._last = CameraStatistics(-1, 0, -1, -1, -1)
         self._device = XiDevice(settings.library, settings.serial, settings.device)
+        self._state = State(self._device, {*settings.parameters, *settings.leave})
         try:
             self._set_up()
             self._readout_us = settings.readout_us or self._measure_readout_us()
@@ -90,25 +88,32 @@ class XiCamera:
 
     def _set_up(self) -> None:
         settings, device = self._settings, self._device
+        state = self._state
         device.set("trigger_source", TRIGGER_OFF)
-        for parameter, value in _UNTOUCHED.items():
-            device.set_if_present(parameter, value)
-        device.set("imgdataformat", RAW16)
-        device.set_if_present("sensor_bit_depth", settings.bit_depth)
-        device.set_if_present("output_bit_depth", settings.bit_depth)
+        state.apply(AT_OPENING)
+        state.neutralise_gains()
+        state.set("imgdataformat", RAW16)
+        state.set_if_present("sensor_bit_depth", settings.bit_depth)
+        state.set_if_present("output_bit_depth", settings.bit_depth)
         if settings.bit_depth > 8:
-            device.set_if_present("output_bit_packing", int(settings.packed))
+            state.set_if_present("output_bit_packing", int(settings.packed))
         if settings.region is not None:
             self._set_region(settings.region)
+        else:
+            state.use_whole_sensor()
         device.set("buffer_policy", BUFFERS_SAFE)
         device.set("recent_frame", 0)
-        device.set("gpi_selector", settings.trigger_input)
-        device.set("gpi_mode", GPI_TRIGGER)
+        state.free_other_inputs(settings.trigger_input)
+        state.set("gpi_selector", settings.trigger_input)
+        state.set("gpi_mode", GPI_TRIGGER)
+        state.apply(FRAME_TRIGGER)
         if settings.ready_output is not None:
             device.set("gpo_selector", settings.ready_output)
             device.set("gpo_mode", GPO_TRIGGER_WAIT_NEGATED if settings.ready_inverted else GPO_TRIGGER_WAIT)
         for parameter, given in settings.parameters.items():
             device.set(parameter, given)
+        state.note(*(name for name, given in settings.parameters.items() if not isinstance(given, str)))
+        state.note("width", "height", "offsetX", "offsetY", "image_black_level", "framerate")
 
     def _set_region(self, region: Region) -> None:
         """Offsets are set to zero first, because offset and size limit each other."""
@@ -150,7 +155,8 @@ class XiCamera:
             if device.has(parameter)
         ]
         firmware = ", ".join(versions) or "unknown"
-        return Identity("XIMEA", device.text("device_name"), device.text("device_sn"), firmware)
+        names = device.text("device_name"), device.text("device_sn")
+        return Identity("XIMEA", *names, firmware, settings=self._state.held)
 
     def self_test(self) -> Mapping[str, str]:
         """Raises DeviceLost if the camera is gone."""
@@ -182,10 +188,7 @@ class XiCamera:
         device, settings = self._device, self._settings
         edge = TRIGGER_RISING if settings.trigger_edge == "rising" else TRIGGER_FALLING
         device.set("trigger_source", edge if exposure.hardware_trigger else TRIGGER_SOFTWARE)
-        device.set("trigger_selector", TRIGGER_STARTS_FRAME)
-        # An edge that comes too early must be ignored: if latched (XI_TRG_OVERLAP_PREV_FRAME), it would start the
-        # exposure late, under the light of another step.
-        device.set_if_present("trigger_overlap", OVERLAP_READ_OUT)
+        self._state.apply(FRAME_TRIGGER)
         device.set("exposure", exposure.exposure_us)
         self._check_exposure(exposure.exposure_us)
         device.set("gain", float(exposure.gain_db))

@@ -32,7 +32,7 @@ class Settings(BaseModel):
     library: str = LIBRARY
     """Name or path of libm3api."""
     region: Region | None = None
-    """None: as set in the camera."""
+    """None: the whole sensor."""
     bit_depth: Literal[8, 10, 12] = 12
     packed: bool = True
     """Pixels of 10 and 12 bits are packed: 12 megapixels of 12 bits are 18.9 MB instead of 25.2 MB."""
@@ -57,4 +57,6 @@ class Settings(BaseModel):
     buffers: Annotated[int, Field(ge=2)] = 16
     """Least number of images queued."""
     parameters: dict[str, int | float | str] = Field(default_factory=dict)
-    """Further xiAPI parameters, set at opening in this order."""
+    """Further xiAPI parameters, set at opening in this order. The driver's own table (`state`) leaves them out."""
+    leave: tuple[str, ...] = ()
+    """Parameters of the driver's own table that stay as they are in the camera."""

@@ -1,0 +1,230 @@
+"""The state that a GenICam camera must be in, whatever it was left in: one table for all GenICam drivers.
+
+A camera keeps what the last program set, and some keep it over power-off. So each feature that decides when, for
+how long and how a frame is exposed, or what happens to its pixels, is set and read back when the camera is opened.
+Names and entries are those of the GenICam Standard Features Naming Convention (SFNC) 2.7. A feature that the
+camera lacks is left out; one that it has and that does not take the value is an error. Features named in the rig
+(`features`, or `leave`) are the rig's: their lines of the table are not used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+from drivers.camera.genicam_features import Features, alike
+from drivers.camera.genicam_settings import GenICamSettings, Value
+
+
+@dataclass(frozen=True)
+class Line:
+    """The first of `names` that the camera has gets the first of `values` that it offers."""
+
+    names: tuple[str, ...]
+    values: tuple[Value, ...]
+    selector: str = ""
+    """The feature is set for each entry of this one, if the camera has it."""
+    if_offered: bool = False
+    """An enumeration without any of the values stays as it is."""
+
+
+def _line(name: str, value: Value, selector: str = "") -> Line:
+    return Line((name,), (value,), selector)
+
+
+AT_OPENING = (
+    _line("SequencerMode", "Off"),
+    _line("SequencerConfigurationMode", "Off"),
+    # transport
+    Line(("TransferControlMode",), ("Basic", "Automatic")),
+    _line("ChunkModeActive", False),
+    _line("ImageCompressionMode", "Off"),
+    _line("PtpEnable", False),
+    _line("GevIEEE1588", False),
+    # image
+    Line(("DeviceScanType",), ("Areascan",), if_offered=True),
+    Line(("SensorShutterMode",), ("Global",), if_offered=True),
+    _line("BinningHorizontal", 1, "BinningSelector"),
+    _line("BinningVertical", 1, "BinningSelector"),
+    _line("DecimationHorizontal", 1),
+    _line("DecimationVertical", 1),
+    _line("ReverseX", False),
+    _line("ReverseY", False),
+    _line("TestPattern", "Off", "TestPatternGeneratorSelector"),
+    _line("TestImageSelector", "Off"),
+    # pixels
+    _line("BlackLevelAuto", "Off"),
+    _line("BalanceWhiteAuto", "Off"),
+    _line("BalanceRatio", 1.0, "BalanceRatioSelector"),
+    Line(("GammaEnable", "Gamma"), (False, 1.0)),
+    _line("LUTEnable", False, "LUTSelector"),
+    _line("ColorTransformationEnable", False),
+    _line("GainAuto", "Off"),
+    # exposure
+    _line("AcquisitionMode", "Continuous"),
+    Line(("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled"), (False,)),
+    _line("ExposureAuto", "Off"),
+    _line("ExposureMode", "Timed"),
+    _line("ExposureTimeMode", "Common"),
+    Line(("ExposureTimeSelector",), ("Common",), if_offered=True),
+    _line("TriggerMode", "Off", "TriggerSelector"),
+)
+FRAME_TRIGGER = (
+    Line(("TriggerDelay", "TriggerDelayAbs"), (0.0,)),
+    # An early edge is ignored and counted. If latched (PreviousFrame), it would expose later, under another light.
+    Line(("TriggerOverlap",), ("ReadOut", "Off")),
+    _line("TriggerDivider", 1),
+    _line("TriggerMultiplier", 1),
+)
+"""Of the trigger that starts frames, once it is on: some cameras lock them before."""
+TRIGGER_LINE = (
+    Line(("LineMode",), ("Input",)),
+    _line("LineInverter", False),
+)
+"""Of the line that the trigger comes on."""
+_ONE_OF_SEVERAL = (
+    ("RegionSelector", "RegionMode", "Region0"),
+    ("ComponentSelector", "ComponentEnable", "Intensity"),
+)
+"""Selector, what switches the selected one on, and the only one that is to be on."""
+_WHOLE_GAINS = ("All", "AnalogAll")
+_ALSO_READ = (
+    "PixelFormat",
+    "Width",
+    "Height",
+    "OffsetX",
+    "OffsetY",
+    "BlackLevel",
+    "SensorReadoutTime",
+    "DeviceLinkThroughputLimitMode",
+    "DeviceLinkThroughputLimit",
+    "GevSCPD",
+    "GevSCPSPacketSize",
+)
+
+
+class State:
+    """Sets features of an open camera and keeps what was read back.
+
+    Each method raises DeviceRefused if the camera has the feature and does not take the value, DeviceLost.
+    """
+
+    def __init__(self, features: Features, settings: GenICamSettings) -> None:
+        self._features = features
+        self._rigs = {*settings.features, *settings.leave}
+        self.held: dict[str, str] = {}
+        """By feature, or feature[entry of its selector]: values as read back."""
+
+    def apply(self, lines: Collection[Line]) -> None:
+        """Set the features of these lines, in their order."""
+        for line in lines:
+            self._apply(line)
+
+    def set(self, name: str, value: Value, entry: str = "") -> None:
+        """Set a feature, unless it holds the value already, and keep what it then holds."""
+        held = self._features.read(name)
+        if not alike(held, value):
+            self._features.write(name, value)
+            held = self._features.read(name)
+        self.held[f"{name}[{entry}]" if entry else name] = str(held)
+
+    def select(self, selector: str, entry: str) -> None:
+        """Select an entry, if the camera has it; raises DeviceRefused if the selector lacks it."""
+        if self._features.has(selector):
+            self._features.write(selector, entry)
+
+    def note(self, *names: str) -> None:
+        """Keep what these features hold, where the camera has them."""
+        for name in names:
+            if self._features.has(name):
+                self.held[name] = str(self._features.read(name))
+
+    def note_all(self) -> None:
+        """Keep what is worth knowing beside what was set."""
+        self.note(*_ALSO_READ)
+
+    def use_one_region_and_component(self) -> None:
+        """Switch off all regions of the sensor but the first, and all components of an image but intensity."""
+        for selector, switch, wanted in _ONE_OF_SEVERAL:
+            if selector in self._rigs or switch in self._rigs or not self._features.has(selector):
+                continue
+            entries = self._features.entries(selector)
+            kept = wanted if wanted in entries else entries[0]
+            for entry in sorted(entries, key=lambda entry: entry == kept):
+                self._features.write(selector, entry)
+                if self._features.has(switch):
+                    self.set(switch, self._switched(switch, on=entry == kept), entry)
+
+    def _switched(self, name: str, *, on: bool) -> Value:
+        if isinstance(self._features.read(name), bool):
+            return on
+        return "On" if on else "Off"
+
+    def neutralise_gains(self) -> None:
+        """Set the gains of single channels and stages to 0 dB, or their least, and select the gain as a whole."""
+        features = self._features
+        if {"Gain", "GainSelector"} & self._rigs or not features.has("GainSelector"):
+            return
+        entries = features.entries("GainSelector")
+        whole = next((entry for entry in _WHOLE_GAINS if entry in entries), entries[0])
+        for entry in entries:
+            if entry != whole and not entry.startswith("Tap"):
+                features.write("GainSelector", entry)
+                if features.has("Gain"):
+                    self.set("Gain", max(0.0, features.bounds("Gain")[0]), entry)
+        features.write("GainSelector", whole)
+
+    def use_whole_sensor(self) -> None:
+        """Read out all that the sensor has, with the present binning."""
+        for offset, size in (("OffsetX", "Width"), ("OffsetY", "Height")):
+            if self._features.has(offset) and offset not in self._rigs:
+                self.set(offset, 0)
+            if size not in self._rigs:
+                largest = self._features.largest(size)
+                if largest < 2**31:  # else the camera does not say
+                    self.set(size, largest)
+
+    def _apply(self, line: Line) -> None:
+        if self._rigs.intersection(line.names):
+            return
+        name = next((name for name in line.names if self._has(name, line.selector)), None)
+        if name is None:
+            return
+        for entry in self._entries_of(line.selector):
+            if self._features.has(name):  # which may depend on what is selected
+                self._set_first(line, name, entry)
+
+    def _has(self, name: str, selector: str) -> bool:
+        """True if the camera has the feature, perhaps for some entries of its selector only."""
+        return self._features.has(name) or any(self._features.has(name) for _ in self._entries_of(selector))
+
+    def _entries_of(self, selector: str) -> Iterator[str]:
+        """Each entry of the selector, selected in turn; once the empty text without selector."""
+        if not selector or selector in self._rigs or not self._features.has(selector):
+            yield ""
+            return
+        for entry in self._features.entries(selector):
+            self._features.write(selector, entry)
+            yield entry
+
+    def _set_first(self, line: Line, name: str, entry: str) -> None:
+        """Set the feature to the first value of the line that suits it."""
+        value = line.values[min(line.names.index(name), len(line.values) - 1)]
+        if isinstance(value, str):
+            offered = self._features.entries(name)
+            fitting = [one for one in line.values if one in offered]
+            if line.if_offered and not fitting:
+                self.note(name)
+                return
+            value = fitting[0] if fitting else value
+        self.set(name, _typed(value, self._features.read(name)), entry)
+
+
+def _typed(value: Value, held: Value) -> Value:
+    """A number in the type in which the camera has the feature."""
+    if isinstance(value, float) and isinstance(held, int) and math.isfinite(value):
+        return int(value)
+    if isinstance(value, bool) and not isinstance(held, bool) and isinstance(held, int | str):
+        return ("On" if value else "Off") if isinstance(held, str) else int(value)
+    return value

@@ -1,12 +1,12 @@
 """An RSI controller written from the facts of the wire alone, for tests of the driver.
 
-It shares no line, no settings and no kinematics with the stand-in of `sim`. It has a cycle of its own, sends before
-it is asked, and commands its axes what the answers say, without any limit: what a wrong answer would do to an arm is
-seen in `peak_speed_deg_s`.
+It shares no line, no settings and no kinematics with the stand-in of `sim`. It has a cycle of its own, sends
+before it is asked, and commands its axes what the answers say, without any limit: what a wrong answer would do to
+an arm is seen in `peak_speed_deg_s`.
 
 Two clocks: `lock_step` waits for the answer of each cycle, so that time is counted in cycles and a busy machine
-changes nothing; otherwise the machine's clock paces the cycles, and an answer that is not there when the cycle ends
-is a missed one.
+changes nothing; otherwise the machine's clock paces the cycles, and an answer that is not there when the cycle
+ends is a missed one.
 """
 
 import re
@@ -175,7 +175,7 @@ class BareRsiController:
         except OSError as trouble:
             if not self._over.is_set():
                 self.error = trouble
-        except BaseException as trouble:  # noqa: BLE001: told by close(), in the test's thread
+        except BaseException as trouble:  # noqa: BLE001  told by close(), in the test's thread
             self.error = trouble
 
     def _cycle(self, due_s: float) -> None:

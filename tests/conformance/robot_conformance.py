@@ -122,6 +122,8 @@ class KukaCell(RobotCell):
         arm = KukaController(reactor, ControllerSettings.model_validate(theirs | delay | controller))
         ours = {"listen": self.address, "cycle_ms": cycle_ms, "link_timeout_s": 0.5, "connect_timeout_s": 20.0}
         alike = {name: value for name, value in controller.items() if name in ALIKE}
+        if lock_step:
+            ours["declared_cycle_ms"] = cycle_ms
         self.settings = Settings.model_validate({"arm_model": KR10_R1100_SIXX} | ours | delay | alike)
         super().__init__(folder / "clock", reactor, arm, cycle_ms)
 

@@ -4,9 +4,10 @@ It shares no line, no settings and no kinematics with the stand-in of `sim`. It 
 before it is asked, and commands its axes what the answers say, without any limit: what a wrong answer would do to
 an arm is seen in `peak_speed_deg_s`.
 
-Two clocks: `lock_step` waits for the answer of each cycle, so that time is counted in cycles and a busy machine
-changes nothing; otherwise the machine's clock paces the cycles, and an answer that is not there when the cycle
-ends is a missed one.
+Two clocks, neither faster than the cycle: `lock_step` waits for the answer of each cycle, so that time is counted
+in cycles and a busy machine changes nothing; otherwise the machine's clock paces the cycles, and an answer that is
+not there when the cycle ends is a missed one. Until the first answer it repeats its first packet: a person would
+start the program once the driver waits for it.
 """
 
 import re
@@ -172,6 +173,9 @@ class BareRsiController:
                     continue
                 due_s += self.cycle_s
                 self._cycle(due_s)
+                if self.lock_step:
+                    due_s = max(due_s, time.monotonic())
+                    self._over.wait(due_s - time.monotonic())
         except OSError as trouble:
             if not self._over.is_set():
                 self.error = trouble
@@ -185,6 +189,8 @@ class BareRsiController:
         self._send(packet)
         self.sent.append(packet)
         answer = self._answer(due_s)
+        if answer is None and not self.history:
+            return
         if answer is not None:
             self.held_deg = answer
             if not self.delay_is_cumulative:
@@ -204,7 +210,8 @@ class BareRsiController:
 
     def _answer(self, due_s: float) -> np.ndarray | None:
         """Take in what answers this cycle; on the machine's clock until the cycle ends."""
-        until_s = time.monotonic() + self.lock_step_patience_s if self.lock_step else due_s
+        patient = self.lock_step and self.history
+        until_s = time.monotonic() + self.lock_step_patience_s if patient else due_s
         answer = None
         while (left_s := until_s - time.monotonic()) > 0 and not self._over.is_set():
             self.socket.settimeout(min(left_s, 0.05))
@@ -213,7 +220,7 @@ class BareRsiController:
             except (TimeoutError, ConnectionRefusedError):
                 continue
             answer = self._taken(data) if answer is None else answer
-            if self.ended_by_stop or (answer is not None and self.lock_step):
+            if self.ended_by_stop or self._silent.is_set() or (answer is not None and self.lock_step):
                 break
         return answer
 

@@ -8,6 +8,7 @@ in `configs/kuka/eki/`; in the cell, start them before this driver is opened.
 from __future__ import annotations
 
 import secrets
+import threading
 from collections.abc import Callable, Mapping
 from typing import Literal, Self
 
@@ -104,6 +105,9 @@ class KukaEki:
         self._clock = clock
         self._message_time = MessageTime(clock)
         self._number = 0
+        self._sending = threading.Lock()
+        """Held while a command is numbered and sent: `stop` may come from any thread."""
+        self._stops = 0
         self._motion_s = 0.0
         self._watch = Watch(
             1 + secrets.randbelow(2**31 - 2),
@@ -147,6 +151,7 @@ class KukaEki:
         }
 
     def move_to(self, joints_deg: NDArray[np.float64]) -> None:
+        stops = self._stops
         target_deg = checked_target(joints_deg, self.arm.limits_deg)
         self._raise_fault()
         status = self._status()
@@ -154,15 +159,19 @@ class KukaEki:
             raise refused("an override above 0 %", "the controller's program override is at 0 %")
         # If the arm is moving it brakes first, which lengthens the motion by up to twice the braking time.
         move_s = move_duration_s(self.arm, status.joints_deg, target_deg) + self._stop_s()
-        self._motion_s = move_s * _slower(status)
-        self._order(wire.MOVE, target_deg)
+        with self._sending:
+            if self._stops != stops:  # by another thread, since this call began
+                raise overtaken()
+            self._motion_s = move_s * _slower(status)
+            self._order(wire.MOVE, target_deg)
 
     def wait_settled(self) -> ArmState:
         settings, watch = self.settings, self._watch
         order = watch.order
-        with self._link.changed:  # only statuses sent after the controller has taken ASK count
-            watch.asked(self._number + 1)
-        self._send(wire.ASK)
+        with self._sending:
+            with self._link.changed:  # only statuses sent after the controller has taken ASK count
+                watch.asked(self._number + 1)
+            self._send(wire.ASK)
         self._wait_taken()
         settle_s = settings.settle_cycles * settings.status_ms / 1e3
         limit_s = 1.5 * self._motion_s + settle_s + settings.dwell_s + 1.0
@@ -201,7 +210,9 @@ class KukaEki:
         watch = self._watch
         if watch.link_lost:
             return
-        self._order(wire.STOP, None)
+        with self._sending:
+            self._stops += 1
+            self._order(wire.STOP, None)
         self._wait_taken()
         self._wait(lambda: not watch.moving, 2.0 * self._stop_s() + 1.0, "the arm at rest", faults=False)
 
@@ -233,7 +244,8 @@ class KukaEki:
 
     def _begin_session(self) -> None:
         """Send a first STOP; its answers carry this session's number, so older statuses are recognised."""
-        self._order(wire.STOP, None)
+        with self._sending:
+            self._order(wire.STOP, None)
         watch = self._watch
         self._link.wait_for(
             lambda: watch.fault or (watch.status and not watch.moving), self.settings.connect_timeout_s
@@ -249,6 +261,7 @@ class KukaEki:
             )
 
     def _order(self, verb: int, target_deg: Six | None) -> None:
+        """Send a STOP or a MOVE; `_sending` must be held."""
         with self._link.changed:
             self._watch.ordered(self._number + 1, target_deg)
         self._send(verb, target_deg)

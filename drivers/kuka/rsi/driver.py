@@ -90,8 +90,8 @@ class KukaRsi:
         }
 
     def move_to(self, joints_deg: NDArray[np.float64]) -> None:
-        target_deg = checked_target(joints_deg, self.arm.limits_deg)
         stops = self._stops
+        target_deg = checked_target(joints_deg, self.arm.limits_deg)
         state = self._state()
         self._raise_fault(state)
         # A new target during a motion: the arm may start from anywhere on the rest of the present line.

@@ -155,6 +155,7 @@ class RsiSession:
             self._corrections.taken()
         self._watch(packet)
         self._late_in_row = self._late_in_row + 1 if rose else 0
+        rested = self.motion.phase == shared_state.STANDING
         if not applied:  # repeat the last answer instead of advancing ahead of the arm
             if self._late_in_row >= _HALTED_PACKETS:
                 self.motion.halted()
@@ -162,20 +163,20 @@ class RsiSession:
         elif not self.motion.step():
             self._bounds.at_rest()
             self.fail(shared_state.NO_TRAJECTORY, "no trajectory within the limits leads to the target")
-        self._last_answer = None if self._silent() else self._formed(packet.ipoc, advances=applied)
+        self._last_answer = None if self._silent() else self._formed(packet.ipoc, applied, rested)
         self.answers += self._last_answer is not None
         return self._last_answer
 
-    def _formed(self, ipoc: bytes, *, advances: bool) -> bytes | None:
+    def _formed(self, ipoc: bytes, advances: bool, rested: bool) -> bytes | None:
         """The answer, or None if it would break the bounds: the controller then ends the session by itself. Once
-        the arm is at rest after a fault, its corrections cause no further motion."""
-        stands = self.motion.phase == shared_state.STANDING
-        holds = stands and self.fault != shared_state.NO_FAULT
+        the arm is at rest after a fault, its corrections cause no further motion. `rested`: the axes were at rest
+        in the answer before."""
+        holds = self.motion.phase == shared_state.STANDING and self.fault != shared_state.NO_FAULT
         values = self._corrections.hold() if holds else self._corrections.to(self.motion.commanded_deg)
         if violation := self._bounds.violation(self._corrections.step(values), advances=advances and not holds):
             self.fail(shared_state.OUT_OF_BOUNDS, f"an answer was withheld: {violation}")
             return None
-        ends = self._leaves and stands and not holds and bool(self._config.stop_tag)
+        ends = self._leaves and rested and self.fault == shared_state.NO_FAULT and bool(self._config.stop_tag)
         self.stop_answers += ends
         return (self._stop_template if ends else self._template) % (*values, ipoc)
 

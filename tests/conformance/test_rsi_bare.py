@@ -6,7 +6,6 @@ never shorter than it says.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import socket
 import subprocess
@@ -112,7 +111,7 @@ def test_it_moves_within_its_limits_though_packets_come_late_twice_and_from_the_
             assert np.allclose(robot.wait_settled().joints_deg, target_deg, atol=1e-3)
             for age in (1, 30, 90):
                 arm.repeat_old(age)
-        assert robot.statistics()["cycle_ms"] == pytest.approx(1e3 * arm.cycle_s, rel=0.5)
+        assert robot.statistics()["cycle_ms"] > 0.85 * 1e3 * arm.cycle_s
         assert robot.statistics()["astray_packets"] >= 4
         assert np.allclose(arm.commanded_deg, HOME_DEG, atol=1e-4)
         assert_within_limits(robot, arm)
@@ -140,17 +139,28 @@ def test_absurd_delay_counters_are_no_packets_and_end_no_process(port: int) -> N
 
 
 @contextmanager
-def stranger(port: int, on_answer: Callable[[], None]) -> Iterator[None]:
-    """Somebody at another address whose packets look right; `on_answer` is called once one is answered."""
+def stranger(
+    port: int, on_answer: Callable[[], None], on_many: Callable[[], None] = lambda: None
+) -> Iterator[None]:
+    """Somebody at another address whose packets look right; `on_answer` is called once one is answered, `on_many`
+    when many have been sent without an answer."""
     over = threading.Event()
 
     def speak(link: socket.socket) -> None:
+        unanswered = 0
         for ipoc in itertools.count(5000, 4):
-            link.send(packet_of(HOME_DEG, 0, ipoc))
-            with contextlib.suppress(TimeoutError, ConnectionRefusedError):
+            try:
+                link.send(packet_of(HOME_DEG, 0, ipoc))
                 link.recv(4096)
+            except ConnectionRefusedError:  # the port is not bound yet
+                pass
+            except TimeoutError:
+                unanswered += 1
+            else:
                 on_answer()
                 return
+            if unanswered == 40:
+                on_many()
             if over.wait(0.01):
                 return
 
@@ -178,14 +188,17 @@ def test_one_packet_of_a_stranger_that_came_first_is_named_when_opening_fails(po
 
 
 def test_a_controller_named_in_the_rig_is_the_only_one_that_is_answered(port: int) -> None:
-    pinned = {"controller": "127.0.0.2"}
-    with (
-        stranger(port, lambda: pytest.fail("a stranger was answered")),
-        opened(port, pinned, host="127.0.0.2") as (robot, arm),
-    ):
-        robot.move_to(THERE_DEG)
-        assert np.allclose(robot.wait_settled().joints_deg, THERE_DEG, atol=1e-3)
-        assert robot.statistics()["foreign_packets"] > 10
+    answered: list[bool] = []
+    with BareRsiController(("127.0.0.1", port), host="127.0.0.2") as arm:
+        arm.fall_silent()
+        with (
+            stranger(port, lambda: answered.append(True), arm.speak_again),
+            closing(KukaRsi(settings_for(port, controller="127.0.0.2"), SystemClock())) as robot,
+        ):
+            robot.move_to(THERE_DEG)
+            assert np.allclose(robot.wait_settled().joints_deg, THERE_DEG, atol=1e-3)
+            assert robot.statistics()["foreign_packets"] > 10
+        assert answered == []
         assert_within_limits(robot, arm)
 
 

@@ -144,6 +144,7 @@ def happen(arm: Arm, events: list[tuple[str, object]]) -> Iterator[None]:
 @example("absolute", [*UNDER_WAY, ("ipoc", -90_000), ("go on", 60)])
 @example("absolute", [*UNDER_WAY, ("go on", 400), ("ipoc", -90_000), ("move", (0.0,) * 6), ("go on", 9)])
 @example("absolute", [*UNDER_WAY, ("late", 9), ("go on", 60), ("late", 3), ("stop", None), ("go on", 60)])
+@example("absolute", [("move", (1e-77,) * 6), ("go on", 3)])
 @example("relative", [*UNDER_WAY, ("late", 9), ("pushed", 5.0), ("go on", 60)])
 def test_no_answer_steps_by_more_than_the_limits_whatever_comes_in(
     mode: str, events: list[tuple[str, object]]
@@ -235,15 +236,31 @@ def test_a_cycle_that_becomes_shorter_in_a_session_is_noticed_within_two_hundred
     assert "its packets come every 4.00 ms" in reason
 
 
-def test_one_stall_of_the_machine_is_no_other_cycle() -> None:
+def test_stalls_of_the_machine_are_no_longer_cycle() -> None:
     meter = CycleMeter(0.004, None)
-    now_s, _ = beat(meter, 0.004, WINDOW // 2)
-    now_s, reason = beat(meter, 0.004, WINDOW // 2 + 1, now_s + 0.5)
-    assert reason == ""
+    now_s = 0.0
+    for _ in range(12):
+        now_s, reason = beat(meter, 0.004, 20, now_s + 0.2)
+        assert reason == ""
+    assert meter.measured_ns > 10_000_000
+
+
+def test_a_stall_before_the_first_packet_is_no_shorter_cycle() -> None:
+    """It was read late, and those behind it at once; the next window is right."""
+    meter = CycleMeter(0.004, None)
+    now_s, reason = beat(meter, 0.0, 25, 0.1)
+    now_s, more = beat(meter, 0.004, WINDOW - 24, now_s)
+    assert reason + more == ""
     assert meter.measured_ns == 0
-    _, reason = beat(meter, 0.004, WINDOW, now_s)
-    assert reason == ""
+    assert beat(meter, 0.004, WINDOW, now_s)[1] == ""
     assert meter.measured_ns == pytest.approx(4_000_000, abs=1)
+
+
+def test_a_longer_cycle_is_told_after_two_hundred_packets() -> None:
+    meter = CycleMeter(0.004, None)
+    now_s, reason = beat(meter, 0.012, 2 * WINDOW, step=1)
+    assert reason == ""
+    assert "its packets come every 12.00 ms" in beat(meter, 0.012, 1, now_s, step=1)[1]
 
 
 def test_an_ipoc_that_counts_in_ms_must_agree_with_the_arrival() -> None:
@@ -255,3 +272,13 @@ def test_a_declared_cycle_is_compared_and_still_witnessed_by_the_ipoc() -> None:
     assert beat(CycleMeter(0.004, 0.004), 0.0, 20)[1] == ""
     assert "declares 12.00 ms" in beat(CycleMeter(0.004, 0.012), 0.0, 20)[1]
     assert "its IPOC counts 12 a packet" in beat(CycleMeter(0.004, 0.004), 0.0, 20, step=12)[1]
+
+
+def test_a_trajectory_that_cannot_be_computed_ends_in_a_fault_and_not_in_an_exception() -> None:
+    endless = {"velocity_deg_s": (1e79,) * 6, "acceleration_deg_s2": (3e79,) * 6, "jerk_deg_s3": (3e80,) * 6}
+    session = RsiSession(replace(CONFIG, **endless))
+    for ipoc in range(100, 140, 4):
+        session.answer(packet(ipoc), 0)
+    session.obey(shared_state.Command(1, shared_state.MOVE, (1.0, *HOME_DEG[1:])))
+    assert session.answer(packet(140), 0) is not None
+    assert session.fault == shared_state.NO_TRAJECTORY

@@ -36,17 +36,21 @@ class CycleMeter:
         self._declared_ms = 1e3 * declared_s if declared_s else None
         self._advances: Counter[int] = Counter()
         self._begun_ns: int | None = None
-        self._cycles = self._wrong = 0
+        self._last_ns = self._cycles = self._wrong = 0
+        self._gaps_ms: list[float] = []
+        """Time per cycle between packets, in the windows before the cycle is known."""
 
     def packet(self, now_ns: int, advance: int, cycles: int) -> str:
         """A packet came whose IPOC is `advance` higher than the last one's, `cycles` cycles later. Returns why the
         cycle is not the one that was set, or "" while nothing proves that."""
         if self._begun_ns is None:
-            self._begun_ns = now_ns
+            self._begun_ns = self._last_ns = now_ns
             return ""
         self._cycles += cycles
         if not self.ipoc_step:
             self._advances[advance] += 1
+            self._gaps_ms.append((now_ns - self._last_ns) / 1e6 / cycles)
+            self._last_ns = now_ns
         if self._cycles < (WINDOW if self._declared_ms is None else _DECLARED_WINDOW):
             return ""
         arrived_ms = (now_ns - self._begun_ns) / 1e6 / self._cycles
@@ -56,8 +60,13 @@ class CycleMeter:
     def _judged(self, cycle_ms: float) -> str:
         first = not self.measured_ns
         ratio = cycle_ms / self._cycle_ms
-        # Once the cycle is known, a longer mean is a link that falters: late answers are counted elsewhere.
-        wrong = ratio < _FASTEST or (first and ratio > _SLOWEST)
+        wrong = ratio < _FASTEST
+        if first and ratio > _SLOWEST:
+            # A link that falters makes the mean longer, but few of the gaps. Later it is not judged here any more:
+            # a longer cycle makes the arm slower, and late answers are counted elsewhere.
+            median_ms = sorted(self._gaps_ms)[len(self._gaps_ms) // 2]
+            wrong |= self._declared_ms is not None or median_ms > _SLOWEST * self._cycle_ms
+        self._gaps_ms.clear()
         self._wrong = self._wrong + 1 if wrong else 0
         step = self.ipoc_step or self._step()
         if self._wrong >= _WRONG_WINDOWS or (wrong and self._declared_ms is not None):

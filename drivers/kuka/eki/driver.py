@@ -10,6 +10,7 @@ from __future__ import annotations
 import secrets
 import threading
 from collections.abc import Callable, Mapping
+from ipaddress import IPv4Address
 from typing import Literal, Self
 
 import numpy as np
@@ -43,6 +44,9 @@ class Settings(BaseModel):
     """host:port of the controller, or of this machine where the controller is the client."""
     controller_is: Literal["server", "client"] = "server"
     """Which side listens for the connection; EKI's own configuration (EXTERNAL/TYPE) names the opposite side."""
+    controller: Literal[""] | IPv4Address = ""
+    """The controller's address, where it is the client: connections of any other are turned away and counted. (A
+    controller that is the server is reached at `address`.)"""
     status_ms: int = Field(default=20, ge=4)
     """Period of the controller's status messages, in controller time."""
     link_timeout_s: float = Field(default=2.0, gt=0)
@@ -65,6 +69,12 @@ class Settings(BaseModel):
     follow_cycles: int = Field(default=3, ge=1)
     """The arm does not follow: motion done, but farther than `follow_deg` from the target for this many
     statuses."""
+
+    @model_validator(mode="after")
+    def _controller_can_be_checked(self) -> Self:
+        if self.controller and self.controller_is == "server":
+            raise ValueError("`controller` is for `controller_is: client`; a server is reached at `address`")
+        return self
 
     @model_validator(mode="after")
     def _percents_exist(self) -> Self:
@@ -114,7 +124,9 @@ class KukaEki:
             Tolerances(settings.settle_deg, settings.settle_deg_s, settings.follow_deg, settings.follow_cycles),
         )
         try:
-            link = connect(settings.address, settings.controller_is, settings.connect_timeout_s)
+            link, self._strangers = connect(
+                settings.address, settings.controller_is, str(settings.controller), settings.connect_timeout_s
+            )
         except OSError as error:
             raise DeviceLost(
                 "robot",
@@ -228,6 +240,7 @@ class KukaEki:
         return {
             "statuses": watch.statuses,
             "foreign_statuses": watch.foreign,
+            "strangers": self._strangers,
             "malformed_statuses": self._link.reader.malformed,
             "max_gap_ms": watch.max_gap_ms,
         }

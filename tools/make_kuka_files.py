@@ -28,6 +28,14 @@ TEMPLATES = ROOT / "tools" / "kuka"
 EKI_NAME, RSI_CONTEXT, RSI_CONFIG = "CoupoleEki", "coupole_rsi", "coupole_rsi_ethernet.xml"
 ALIVE_FLAG, RECEIVED_FLAG, ORDER_FLAG = 501, 502, 503
 """Elements of $FLAG: connection alive, message received, order for the robot program."""
+STOP_OUTPUT = 7
+"""Output of the ETHERNET object that ends the program; 1 to 6 are the corrections."""
+STOP_NOTE = """\
+- `STOP1` ends RSI_MOVECORR when the driver is closed, with the arm at rest: the program goes on to RSI_OFF and its
+  end, without an error. Whatever else silences the PC still ends in KSS29002. RSI_MOVECORR must be what runs: outside
+  of it the same input is an error.
+"""
+"""About the object that ends the program."""
 PING_S = 1
 """EKI's shortest interval for detecting that the PC is gone."""
 
@@ -78,6 +86,8 @@ def rsi_xml(settings: kuka_rsi.Settings, pc_address: str) -> str:
         f'      <ELEMENT TAG="{settings.tag}.{name}" TYPE="DOUBLE" INDX="{index}" HOLDON="{hold_on}"/>'
         for index, name in enumerate(NAMES[settings.corrects], start=1)
     )
+    if settings.stop_tag:  # without HOLDON: it must not outlast the program that it ends
+        received += f'\n      <ELEMENT TAG="{settings.stop_tag}" TYPE="BOOL" INDX="{STOP_OUTPUT}" HOLDON="0"/>'
     return f"""\
 <ROOT>
   <CONFIG>
@@ -158,8 +168,8 @@ def krl_set() -> str:
 
 
 def correction_rows(settings: kuka_rsi.Settings) -> str:
-    """Rows of the table of objects: the correction and its monitor. The monitor stops RSI before the correction is
-    clamped: its limits are tighter by a degree or a millimetre."""
+    """Rows of the table of objects: the correction and its monitor, and what ends the program. The monitor stops
+    RSI before the correction is clamped: its limits are tighter by a degree or a millimetre."""
     clamp, monitor, inputs = {
         "axes": ("AXISCORR1", "AXISCORRMON1", "CorrA1 to CorrA6"),
         "pose": ("POSCORR1", "POSCORRMON1", "CorrX, CorrY, CorrZ, CorrA, CorrB, CorrC"),
@@ -175,9 +185,10 @@ def correction_rows(settings: kuka_rsi.Settings) -> str:
             f"`MaxRotAngle` = {min(180.0, settings.pose_correction_deg + 1):g}; `RefCorrSys` = BASE"
         )
         watched = f"`MaxTrans` = {settings.pose_correction_mm:g}; `MaxRotAngle` = {settings.pose_correction_deg:g}"
+    stop = f"\n| `STOP1` | input from output {STOP_OUTPUT} of `ETHERNET1` | `Mode` = ExitMoveCorr |"
     return (
         f"| `{clamp}` | inputs {inputs} from outputs 1 to 6 of `ETHERNET1` | {clamped} |\n"
-        f"| `{monitor}` | - (watches the sum of all corrections) | {watched} |"
+        f"| `{monitor}` | - (watches the sum of all corrections) | {watched} |{stop if settings.stop_tag else ''}"
     )
 
 
@@ -205,6 +216,7 @@ def files(rsi: kuka_rsi.Settings, eki: kuka_eki.Settings, pc_address: str, load:
         "IPO_MODE": {4: "#IPO_FAST", 12: "#IPO"}[rsi.cycle_ms],
         "RSI_MODE": {"absolute": "#ABSOLUTE", "relative": "#RELATIVE"}[rsi.mode],
         "DELAY_LIMIT": str(rsi.delay_limit),
+        "STOP_NOTE": STOP_NOTE if rsi.stop_tag else "",
         "CORRECTION_ROWS": correction_rows(rsi),
         "NOTES": "".join(
             (TEMPLATES / f"context-{name}.md").read_text() for name in (rsi.mode, rsi.corrects)

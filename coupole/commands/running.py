@@ -191,8 +191,8 @@ def sim(
     plan: Annotated[Path | None, typer.Option("--plan", help="Put this plan's object on the support.")] = None,
     speed: Annotated[float | None, typer.Option("--speed", min=0.01, help="Pace of the world.")] = None,
 ) -> None:
-    """Serve the simulated devices of a rig for other clients; prints one JSON line with their endpoints. Ctrl-C
-    ends it."""
+    """Serve the simulated devices of a rig for other clients; prints one JSON line with their endpoints, and on
+    standard error what the robot's controller refuses, and why. Ctrl-C ends it."""
     from coupole.plan.cell import read_cell
     from coupole.plan.registry import WORLD, load_class
     from coupole.preflight.job import read_job
@@ -201,7 +201,8 @@ def sim(
     job = read_job(plan, rig) if plan else None
     cell = job.cell if job else read_cell(rig)
     driver = cell.rig.world.driver if cell.rig.world else WORLD
-    world = load_class(driver).start(world_config(cell, job, cell.rig.sensor, speed=speed))
+    config = world_config(cell, job, cell.rig.sensor, speed=speed) | {"tells_refusals": True}
+    world = load_class(driver).start(config)
     try:
         print(json.dumps(world.endpoints), flush=True)
         world.wait()

@@ -35,7 +35,7 @@ class StandIn:
     kind: str
     """In `world.settings.robot` or `world.settings.ledbox`."""
     alike: tuple[str, ...] = ()
-    """Settings of the driver that the stand-in must share."""
+    """Settings of the driver that the stand-in shares, unless the rig's world gives its own."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Further settings of the stand-in, unless the rig gives them."""
 
@@ -43,7 +43,7 @@ class StandIn:
 ROBOT_STAND_INS = {
     "drivers.kuka.rsi:KukaRsi": StandIn(
         "rsi",
-        ("cycle_ms", "corrects", "mode", "sen_type", "measured_tag", "delay_tag", "correction_tag"),
+        ("cycle_ms", "corrects", "mode", "sen_type", "measured_tag", "delay_tag", "correction_tag", "stop_tag"),
         {"sends_to": "127.0.0.1:0"},
     ),
     "drivers.kuka.eki:KukaEki": StandIn(

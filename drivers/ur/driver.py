@@ -26,6 +26,7 @@ from coupole.devices import ArmState, Clock, Deadline, Identity
 from coupole.errors import DeviceLost, DeviceRefused
 from coupole.kinematics import Arm
 from drivers.arm_motion import MessageTime, checked_target, overtaken, refused, wait_for
+from drivers.fair_lock import FairLock
 from drivers.ur.messages import Ask, Config, Six, State
 from drivers.ur.process import UrProcess, raise_fault
 
@@ -106,6 +107,9 @@ class UrRobot:
         self._clock = clock
         self._message_time = MessageTime(clock)
         self._number = 0
+        self._asking = FairLock()
+        """Held while the process is asked and answers: `stop` may come from any thread."""
+        self._stops = 0
         self._motion_s = 0.0
         config = {field.name: getattr(settings, field.name) for field in fields(Config)}
         self._process = UrProcess(Config(**config))
@@ -150,8 +154,9 @@ class UrRobot:
 
     def move_to(self, joints_deg: NDArray[np.float64]) -> None:
         """Start movej; a moving arm is first brought to rest. Raises DeviceRefused for a target out of limits."""
+        stops = self._stops
         target_deg = checked_target(joints_deg, self.settings.limits_deg)
-        state = self._command("move", target_deg)
+        state = self._command("move", target_deg, stops)
         raise_fault(state)
         if state.speed_fraction <= 0.0:
             raise refused("a speed slider above 0 %", "it is at 0 %: the arm will not move")
@@ -214,14 +219,23 @@ class UrRobot:
 
     def close(self) -> None:
         """Bring the arm to rest, end the controller's program and the process. Safe to call again."""
-        self._process.close()
+        with self._asking:
+            self._stops += 1
+            self._process.close()
 
-    def _command(self, verb: Literal["move", "stop"], target_deg: Six | None = None) -> State:
-        self._number += 1
-        return self._process.ask(Ask(verb, self._number, target_deg))
+    def _command(self, verb: Literal["move", "stop"], target_deg: Six | None = None, stops: int = 0) -> State:
+        """`stops` is the count of stops when the call of a motion began."""
+        with self._asking:
+            if verb == "stop":
+                self._stops += 1
+            elif self._stops != stops:  # by another thread, since that call began
+                raise overtaken()
+            self._number += 1
+            return self._process.ask(Ask(verb, self._number, target_deg))
 
     def _state(self) -> State:
-        return self._process.ask(Ask("state"))
+        with self._asking:
+            return self._process.ask(Ask("state"))
 
     def _wait(
         self, done: Callable[[State], bool], deadline: Deadline, expected: str, *, faults: bool = True

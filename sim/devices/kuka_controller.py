@@ -3,7 +3,8 @@
 In every cycle of world time it applies the client's last answer and sends the axes. It stops as the real one does
 on: limits of axes and corrections, corrections that are too fast, poses without solution, workspaces, late
 answers, a silent client, an emergency stop. Then the brakes close, and the arm stays where it is until the RSI
-program is restarted.
+program is restarted. An answer with the stop element ends the program without a fault. What is refused, and why,
+is told: the client itself sees no more than that packets stop.
 
 In lock-step the world waits for each answer, so a client on a busy machine is never late; late answers are then
 produced only by the fault script (`late`).
@@ -11,22 +12,24 @@ produced only by the fault script (`late`).
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 
 from coupole.geometry import Transform
 from sim.devices.kuka_axes import Axes
 from sim.devices.kuka_corrections import Corrections
 from sim.devices.kuka_kinematics import PoseErrors
-from sim.devices.kuka_rsi_wire import PacketWriter, answer_reader
+from sim.devices.kuka_rsi_wire import Answer, PacketWriter, answer_reader
 from sim.devices.kuka_settings import Settings
+from sim.devices.refusals import Refusals, untold
 from sim.world.reactor import Reactor, Timer
 
 __all__ = ["ALIKE", "KukaController", "Settings"]
 
-ALIKE = ("cycle_ms", "corrects", "mode", "sen_type", "measured_tag", "correction_tag")
+ALIKE = ("corrects", "mode", "sen_type", "measured_tag", "correction_tag", "stop_tag")
 """Settings that must be equal at both ends of the wire; the driver's settings have the same names."""
 _FIRST_IPOC = 4208163634
 _SEND_AGAIN_S = 0.05
@@ -43,9 +46,13 @@ class _Does(Enum):
 class KukaController:
     """See the module. All methods must be called on the reactor's thread."""
 
-    def __init__(self, reactor: Reactor, settings: Settings) -> None:
+    def __init__(self, reactor: Reactor, settings: Settings, tell: Callable[[str], None] = untold) -> None:
+        """`tell` gets a line for everything that is refused."""
         self.fault = ""
         """Why RSI stopped; empty while it runs or waits for a client."""
+        self.ended_programs = 0
+        """Programs that a client has ended with the stop element."""
+        self._refusals = Refusals("robot", tell)
         self.errors = PoseErrors(
             seed=settings.seed,
             repeatability_um=settings.repeatability_um,
@@ -66,6 +73,7 @@ class KukaController:
         self._delay = self._late_cycles = 0
         self._changes_ns = 0
         self._after_braking = _Does.WAIT
+        self._end_requested = False
         self._packet = b""
         self._sent_s = 0.0
         """Machine time of the last packet."""
@@ -163,14 +171,19 @@ class KukaController:
             values = None
         if values is None:
             self._delay += 1
+            self._refusals.refused("a cycle without an answer in time", f"delay counter {self._delay}")
             if self._delay >= self._settings.delay_limit:
                 self._stop_axes(f"KSS29002: {self._delay} late answers", _Does.WAIT, self._settings.restart_s)
                 return
         elif self._settings.delay_counts == "consecutive":
             self._delay = 0
         target_deg, fault = self._corrections.take(values)
+        if self._corrections.clamped:
+            self._refusals.refused("a correction is clamped", self._corrections.clamped)
         if fault := fault or self._axes.follow(target_deg, self._reactor.now_ns):
             self._stop_axes(fault, _Does.REST, 0.0)
+        elif self._end_requested and values is not None:
+            self._end_program()
 
     def _take_answer(self) -> tuple[float, ...] | None:
         """The corrections that answer the last packet; None if they are late or the client has left."""
@@ -192,7 +205,17 @@ class KukaController:
                 self._stop_axes("link lost: the client's port is closed", _Does.WAIT, self._settings.restart_s)
                 return None
             answer = self._read_answer(data)
-            if answer is not None and answer.ipoc == awaited:
+            if not isinstance(answer, Answer):
+                self._refusals.refused(*answer)
+            elif answer.ipoc != awaited:
+                self._refusals.refused(
+                    "an answer with another IPOC than that of the last packet is ignored",
+                    f"{answer.ipoc}, expected {awaited}",
+                )
+            else:
+                self._end_requested = answer.stops
+                if answer.remark:
+                    self._refusals.refused(answer.remark)
                 return answer.values
 
     def _patience_s(self) -> float:
@@ -207,13 +230,13 @@ class KukaController:
         """Any answer to a packet of the present RSI program run begins a session."""
         if self._axes.brakes_closed:
             self._release_axes()  # the program was restarted
-        try:
-            answer = self._read_answer(self._socket.recv(4096))
-            while answer is not None and answer.ipoc <= self._ended_ipoc:
+        answer = None
+        with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
+            while not isinstance(answer, Answer) or answer.ipoc <= self._ended_ipoc:
                 answer = self._read_answer(self._socket.recv(4096))
-        except (BlockingIOError, ConnectionRefusedError):
-            return
-        if answer is not None:
+                if not isinstance(answer, Answer):
+                    self._refusals.refused(*answer)
+        if isinstance(answer, Answer) and answer.ipoc > self._ended_ipoc:
             self.fault = ""
             self._does = _Does.FOLLOW
             self._release_axes()
@@ -228,7 +251,16 @@ class KukaController:
 
     def _stop_axes(self, fault: str, then: _Does, seconds: float) -> None:
         """End the session: brake, then stop sending (REST) or resume sending (WAIT) `seconds` from now."""
+        self._refusals.refused("RSI stops", fault)
         self.fault = self.fault or fault
+        self._brake(then, seconds)
+
+    def _end_program(self) -> None:
+        """The client has ended the program: no fault. The stand-in starts it again, in place of a person."""
+        self.ended_programs += 1
+        self._brake(_Does.WAIT, self._settings.restart_s)
+
+    def _brake(self, then: _Does, seconds: float) -> None:
         self._does, self._after_braking = _Does.BRAKE, then
         self._changes_ns = self._reactor.now_ns + round(seconds * 1e9)
         self._ended_ipoc = self._ipoc

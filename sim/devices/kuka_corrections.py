@@ -39,6 +39,12 @@ class Corrections:
         self._sum = self._makes_sum(axes_deg, self._limits)
         self._last = _NOTHING
 
+    @property
+    def clamped(self) -> str:
+        """What the last correction was clamped to; empty if it was applied as it came."""
+        found: str = self._sum.clamped
+        return found
+
     def take(self, values: Axes6 | None) -> tuple[Axes6, str]:
         """Target axes after one cycle's correction, and the reason if RSI stops instead. `values` is None if none
         came in time (HOLDON)."""
@@ -54,6 +60,7 @@ class _AxesSum:
 
     def __init__(self, axes_deg: Axes6, limits: Limits) -> None:
         self.axes_deg = self._start_deg = axes_deg
+        self.clamped = ""
         self._limits = limits
         self._sum_deg: Axes6 = _NOTHING
 
@@ -63,6 +70,7 @@ class _AxesSum:
     def replace(self, values: Axes6) -> str:
         clamps = self._limits.axis_clamp_deg
         self._sum_deg = tuple(max(-c, min(c, value)) for c, value in zip(clamps, values, strict=True))
+        self.clamped = "" if self._sum_deg == values else f"to {np.round(self._sum_deg, 3).tolist()} deg"
         for axis, (value, most) in enumerate(zip(self._sum_deg, self._limits.axis_monitor_deg, strict=True), 1):
             if not abs(value) <= most:
                 return f"AXISCORRMON: correction of A{axis} by {value:.3f} deg"
@@ -75,6 +83,7 @@ class _PoseSum:
 
     def __init__(self, axes_deg: Axes6, limits: Limits) -> None:
         self.axes_deg = axes_deg
+        self.clamped = ""
         self._limits = limits
         self._start: Transform = flange_pose(axes_deg)
         self._moved_mm: NDArray[np.float64] = np.zeros(3)
@@ -90,11 +99,14 @@ class _PoseSum:
 
     def _lead(self, moved_mm: NDArray[np.float64], turned: NDArray[np.float64]) -> str:
         limits = self._limits
+        wanted_mm = moved_mm
         moved_mm = np.clip(moved_mm, -limits.pose_clamp_mm, limits.pose_clamp_mm)
+        self.clamped = "" if np.array_equal(moved_mm, wanted_mm) else f"to {np.round(moved_mm, 1).tolist()} mm"
         vector = rotation_vector(turned)
         angle_deg = float(np.degrees(np.linalg.norm(vector)))
         if angle_deg > limits.pose_clamp_deg:
             angle_deg, turned = limits.pose_clamp_deg, turn(_unit(vector), limits.pose_clamp_deg)
+            self.clamped = f"to a turn of {angle_deg:g} deg"
         if not np.linalg.norm(moved_mm) <= limits.pose_monitor_mm or not angle_deg <= limits.pose_monitor_deg:
             return f"POSCORRMON: correction by {np.round(moved_mm, 1).tolist()} mm, {angle_deg:.1f} deg"
         if np.array_equal(moved_mm, self._moved_mm) and np.array_equal(turned, self._turned):

@@ -22,28 +22,46 @@ class Answer(NamedTuple):
     ipoc: int
     values: tuple[float, ...]
     """Six corrections, degrees or millimetres; a missing one is 0."""
+    stops: bool = False
+    """The program is to end."""
+    remark: str = ""
+    """What the client may not have meant; empty if all is as configured."""
 
 
-def answer_reader(settings: Settings) -> Callable[[bytes], Answer | None]:
-    """A parser of answers; it returns None for anything else, or for another SENTYPE."""
+class Unread(NamedTuple):
+    """Something that is no answer to this controller."""
+
+    reason: str
+    details: str
+
+
+def answer_reader(settings: Settings) -> Callable[[bytes], Answer | Unread]:
+    """A parser of answers."""
     tag = re.escape(settings.correction_tag or TAGS[settings.corrects]).encode()
     names = [name.encode() for name in VALUE_NAMES[settings.corrects]]
     begins = re.compile(rb'<Sen\b[^>]*\bType="%s"' % re.escape(settings.sen_type).encode())
     correction = re.compile(rb"<%s\s([^>]*)/>" % tag)
+    stop = re.compile(rb"<%s>\s*(?:1|TRUE)\s*<" % re.escape(settings.stop_tag).encode(), re.IGNORECASE)
+    ends = bool(settings.stop_tag)
     in_order = re.compile(rb"<%s " % tag + rb" ".join(rb'%s="([^"]+)"' % name for name in names) + rb"\s*/>")
 
-    def read(data: bytes) -> Answer | None:
-        ipoc = _IPOC.search(data)
-        if ipoc is None or not begins.search(data):
-            return None
+    def read(data: bytes) -> Answer | Unread:
+        ipoc, text = _IPOC.search(data), data[:200].decode(errors="replace")
+        if ipoc is None:
+            return Unread("an answer without IPOC is ignored", text)
+        if not begins.search(data):
+            return Unread(f"an answer whose SENTYPE is not {settings.sen_type} is ignored", text)
+        stops = ends and stop.search(data) is not None
         try:
             if values := in_order.search(data):
-                return Answer(int(ipoc[1]), tuple(map(float, values.groups())))
+                return Answer(int(ipoc[1]), tuple(map(float, values.groups())), stops)
             found = correction.search(data)
             pairs = dict(_PAIR.findall(found[1])) if found else {}
-            return Answer(int(ipoc[1]), tuple(float(pairs.get(name, b"0")) for name in names))
+            missing = [name.decode() for name in names if name not in pairs]
+            remark = f"corrections without {' '.join(missing)} in {tag.decode()} are taken as 0" if missing else ""
+            return Answer(int(ipoc[1]), tuple(float(pairs.get(name, b"0")) for name in names), stops, remark)
         except ValueError:
-            return None
+            return Unread("an answer with a correction that is no number is ignored", text)
 
     return read
 

@@ -67,6 +67,8 @@ class Settings(_Model):
     """Empty: the counter of late answers is not sent."""
     correction_tag: str = Field(default="", pattern=_TAG + "|^$")
     """Empty: AKorr for axes, RKorr for the pose."""
+    stop_tag: str = Field(default="Stop", pattern=_TAG + "|^$")
+    """The element that ends the RSI program; empty: none does."""
     sends_pose: bool = False
     """Packets also carry RIst, the flange's pose."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Protocol, assert_never
 
 from pydantic import Discriminator, Tag
@@ -64,15 +64,20 @@ def impossible(fault: faults.Fault, settings: RobotSettings) -> str:
     return ""
 
 
-def build(reactor: Reactor, settings: RobotSettings) -> tuple[RobotStandIn, dict[str, Any]]:
-    """The stand-in, and the driver settings with which a client reaches it."""
+def build(
+    reactor: Reactor, settings: RobotSettings, tell: Callable[[str], None]
+) -> tuple[RobotStandIn, dict[str, Any]]:
+    """The stand-in, and the driver settings with which a client reaches it. `tell` gets a line for every
+    correction that is refused."""
     match settings:
         case kuka_controller.Settings():
             alike = {name: getattr(settings, name) for name in kuka_controller.ALIKE}
             sends_to = _with_free_port(settings.sends_to)
             settings = settings.model_copy(update={"sends_to": sends_to})
-            endpoint = {"listen": sends_to, "sends_to": sends_to, **alike}
-            return kuka_controller.KukaController(reactor, settings), endpoint
+            paced = settings.lock_step or reactor.clock.speed != 1.0
+            declared = {"declared_cycle_ms": settings.cycle_ms} if paced else {}
+            endpoint = {"listen": sends_to, "sends_to": sends_to, **alike, **declared}
+            return kuka_controller.KukaController(reactor, settings, tell), endpoint
         case kuka_eki_controller.Settings():
             eki = kuka_eki_controller.KukaEkiController(reactor, settings)
             theirs = {"controller_is": settings.controller_is, "status_ms": settings.status_ms}

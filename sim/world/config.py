@@ -170,6 +170,8 @@ class Config(_Model):
     settings: Settings
     scene: SceneConfig
     camera: CameraConfig
+    tells_refusals: bool = False
+    """Stand-ins tell on standard error what they refuse, for clients that are not Coupole."""
 
     @property
     def photographed(self) -> CameraConfig:

@@ -23,6 +23,7 @@ from sim.devices import camera_stand_in, gige_camera, kuka_controller, ledbox_st
 from sim.devices.arm_bodies import NONE, Capsules, arm_capsules, tool_capsules, ur_capsules
 from sim.devices.camera_body import Exposed, Surroundings
 from sim.devices.ledbox_firmware import LedBoxFirmware
+from sim.devices.refusals import untold
 from sim.devices.text_box import TextBox
 from sim.optics.led_light import Flashes
 from sim.optics.photographer import Photographer
@@ -51,7 +52,8 @@ class World:
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
         self._ledbox_settings = settings.ledbox
         self._tool, self._arm_shadows = config.scene.tool, settings.arm_shadows
-        self.robot, robot_endpoint = robot.build(self.reactor, settings.robot)
+        tell = _told if config.tells_refusals else untold
+        self.robot, robot_endpoint = robot.build(self.reactor, settings.robot, tell)
         self.camera, camera_endpoint = self._build_camera(config.camera, folder)
         self.box = ledbox_stand_in.build(
             self.reactor,
@@ -269,6 +271,11 @@ class OneFault(BaseModel):
     """One fault, for the control connection."""
 
     fault: script.Fault
+
+
+def _told(message: str) -> None:
+    """To the terminal of whoever serves this world; standard output is for the endpoints."""
+    print(message, file=sys.stderr, flush=True)
 
 
 def main() -> int:

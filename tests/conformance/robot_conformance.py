@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import socket
+import sys
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -122,6 +124,8 @@ class KukaCell(RobotCell):
         arm = KukaController(reactor, ControllerSettings.model_validate(theirs | delay | controller))
         ours = {"listen": self.address, "cycle_ms": cycle_ms, "link_timeout_s": 0.5, "connect_timeout_s": 20.0}
         alike = {name: value for name, value in controller.items() if name in ALIKE}
+        if lock_step:
+            ours["declared_cycle_ms"] = cycle_ms
         self.settings = Settings.model_validate({"arm_model": KR10_R1100_SIXX} | ours | delay | alike)
         super().__init__(folder / "clock", reactor, arm, cycle_ms)
 
@@ -206,6 +210,57 @@ class RobotConformance:
             cell.clock.sleep(random.uniform(0.05, 0.9))
             called_deg = _stop_while_the_world_waits(cell, robot)
             assert np.all(np.abs(cell.joints_deg() - called_deg) <= allowed_deg + 1e-3)
+
+    def test_a_stop_forgets_the_next_target_too(self, cell: RobotCell, robot: Robot) -> None:
+        """A target given in motion waits until the arm is at rest; a stop must not bring it to rest for that."""
+        robot.move_to(AWAY_DEG)
+        cell.wait_until_under_way()
+        robot.move_to(HOME_DEG - 20.0)
+        cell.clock.sleep(0.05)  # so that this target is waiting when the stop comes
+        robot.stop()
+        stood_deg = cell.joints_deg()
+        cell.assert_stands()
+        cell.clock.sleep(1.0)
+        assert np.abs(cell.joints_deg() - stood_deg).max() < 1e-3
+        assert np.abs(stood_deg - (HOME_DEG - 20.0)).max() > 5.0
+        cell.assert_smooth()
+
+    def test_a_motion_that_another_thread_stops_before_it_begins_does_not_begin(
+        self, cell: RobotCell, robot: Robot, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        driver = sys.modules[type(robot).__module__]
+        entered, stopped = threading.Event(), threading.Event()
+        checked_target = driver.checked_target
+
+        def checked_slowly(*arguments: Any) -> Any:
+            entered.set()
+            assert stopped.wait(30.0)
+            return checked_target(*arguments)
+
+        monkeypatch.setattr(driver, "checked_target", checked_slowly)
+        with ThreadPoolExecutor(1) as other:
+            motion = other.submit(robot.move_to, AWAY_DEG)
+            assert entered.wait(30.0)
+            robot.stop()
+            stopped.set()
+            with pytest.raises(DeviceRefused, match="another command"):
+                motion.result(30.0)
+        cell.assert_stands()
+        assert np.abs(cell.joints_deg() - HOME_DEG).max() < 1e-3
+
+    def test_stops_of_other_threads_end_a_wait_in_progress(self, cell: RobotCell, robot: Robot) -> None:
+        robot.move_to(AWAY_DEG)
+        with ThreadPoolExecutor(4) as others:
+            wait = others.submit(robot.wait_settled)
+            cell.wait_until_under_way()
+            for stop in [others.submit(robot.stop) for _ in range(3)]:
+                stop.result(30.0)
+            with pytest.raises(DeviceRefused, match="another command"):
+                wait.result(30.0)
+        assert not robot.measured().moving
+        cell.assert_stands()
+        assert np.max(np.abs(cell.joints_deg() - AWAY_DEG)) > 1.0
+        cell.assert_smooth()
 
     def test_it_moves_again_after_a_stop(self, cell: RobotCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
@@ -353,3 +355,40 @@ def test_the_arm_moves_at_the_whole_percents_that_the_controller_is_given() -> N
     settings = Settings(arm_model=KR10_R1100_SIXX, speed_fraction=0.299, acceleration_deg_s2=305.0)
     assert settings.arm().velocity_deg_s[0] == pytest.approx(0.29 * 300.0)
     assert settings.arm().acceleration_deg_s2[0] == pytest.approx(300.0)
+
+
+def knock(host: str, port: int, over: threading.Event) -> None:
+    """Connect from 127.0.0.3 again and again."""
+    while not over.wait(0.02):
+        with contextlib.suppress(OSError), socket.create_connection((host, port), 1.0, ("127.0.0.3", 0)) as link:
+            link.settimeout(1.0)
+            link.recv(1)
+
+
+@contextmanager
+def a_stranger_knocks(address: str) -> Iterator[None]:
+    host, port = address.rsplit(":", 1)
+    over = threading.Event()
+    thread = threading.Thread(target=knock, args=(host, int(port), over))
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_a_controller_named_in_the_rig_is_the_only_client_let_in(tmp_path: Path) -> None:
+    with closing(EkiCell(tmp_path, controller_is="client")) as cell:
+        with a_stranger_knocks(cell.settings.address), pytest.raises(DeviceLost) as raised:
+            cell.open(controller=IPv4Address("127.0.0.2"), connect_timeout_s=0.5)
+        assert "connections of other addresses than 127.0.0.2 were turned away" in raised.value.happened
+        with a_stranger_knocks(cell.settings.address):
+            robot = cell.open(controller=IPv4Address("127.0.0.1"))
+        robot.move_to(AWAY_DEG)
+        assert np.allclose(robot.wait_settled().joints_deg, AWAY_DEG, atol=1e-3)
+
+
+def test_a_controller_that_is_the_server_is_named_by_its_address_alone() -> None:
+    with pytest.raises(ValidationError, match="a server is reached at `address`"):
+        Settings.model_validate({"arm_model": KR10_R1100_SIXX, "controller": "127.0.0.1"})

@@ -23,10 +23,13 @@ from sim.devices.kuka_corrections import Corrections
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
 CONFIG = Config(
     cycle_s=0.004,
+    declared_cycle_s=0.004,
+    controller="",
     sen_type="ImFree",
     measured_tag="AIPos",
     delay_tag="Delay",
     correction_tag="AKorr",
+    stop_tag="",
     corrects="axes",
     mode="absolute",
     geometry=Geometry(*(getattr(structure_of(KR10_R1100_SIXX), name) for name in Geometry._fields)),
@@ -47,7 +50,7 @@ parse = packet_parser("AIPos", "Delay")
 def packet(ipoc: int, joints_deg: tuple[float, ...] = HOME_DEG, delay: int | None = 0) -> bytes:
     axes = " ".join(f'A{i}="{angle:.4f}"' for i, angle in enumerate(joints_deg, start=1))
     late = "" if delay is None else f'<Delay D="{delay}"/>'
-    return f'<Rob Type="KUKA"><AIPos {axes}/>{late}<IPOC>{ipoc}</IPOC></Rob>'.encode()
+    return f'<Rob Type="KUKA simulated"><AIPos {axes}/>{late}<IPOC>{ipoc}</IPOC></Rob>'.encode()
 
 
 def values_of(answer: bytes | None) -> tuple[float, ...]:
@@ -97,6 +100,12 @@ def test_a_packet_is_read_in_any_order(
         packet(1).replace(b"A4", b"B4"),
         packet(1).replace(b"90.0000", b"ninety"),
         packet(1).replace(b"90.0000", b"nan"),
+        packet(1).replace(b"90.0000", b"1e300"),
+        packet(1, delay=2**64),
+        packet(1, delay=2**31),
+        packet(1, delay=-1),
+        packet(1).replace(b'D="0"', b'D="none"'),
+        packet(2**63),
     ],
 )
 def test_a_packet_without_ipoc_or_axes_is_not_answered(data: bytes) -> None:
@@ -131,37 +140,40 @@ def test_a_packet_that_comes_twice_gets_the_same_answer_twice() -> None:
     assert session.answer(packet(104), 1) == session.answer(packet(104), 2)
 
 
-def test_a_session_begun_anew_is_rebased_on_the_measured_axes() -> None:
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_session_begun_anew_is_a_fault_and_gets_no_answer(moves: bool) -> None:
     session = RsiSession(CONFIG)
     for ipoc in (10_000, 10_004):
         session.answer(packet(ipoc), 0)
+    if moves:
+        session.obey(turn_a1(20.0))
+        session.answer(packet(10_008), 0)
     elsewhere = (30.0, -80.0, 90.0, 0.0, 90.0, 0.0)
-    answer = session.answer(packet(200, elsewhere), 0)
-    assert answer is not None
-    assert b'A1="0.000000" A2="0.000000"' in answer
-    assert session.fault == shared_state.NO_FAULT
-
-
-def test_a_session_begun_anew_in_mid_motion_is_a_fault() -> None:
-    session = RsiSession(CONFIG)
-    for ipoc in (10_000, 10_004):
-        session.answer(packet(ipoc), 0)
-    session.obey(shared_state.Command(1, shared_state.MOVE, (20.0, -90.0, 90.0, 0.0, 90.0, 0.0)))
-    session.answer(packet(10_008), 0)
-    answers = [session.answer(packet(ipoc), 0) for ipoc in range(200, 240, 4)]
+    assert [session.answer(packet(ipoc, elsewhere), 0) for ipoc in range(200, 240, 4)] == [None] * 10
     assert session.fault == shared_state.RESTARTED
-    assert answers[0] is not None
-    assert b'A1="0.000000" A2="0.000000"' in answers[0]
-    assert answers[-1] is None
+    assert session.answer(packet(10_012), 0) is None
+
+
+@pytest.mark.parametrize("stray", [400, 9_000, 2**40, 10_007])
+def test_one_packet_that_does_not_continue_the_session_changes_nothing(stray: int) -> None:
+    """At rest a re-based session would let the next correction jump by as much as the arm has moved."""
+    session = RsiSession(CONFIG)
+    for ipoc in range(8_000, 10_000, 4):
+        session.answer(packet(ipoc, delay=0), 0)
+    before = session.answer(packet(10_000), 0)
+    assert session.answer(packet(stray, (5.0, *HOME_DEG[1:])), 0) is None
+    assert values_of(session.answer(packet(10_004), 0)) == values_of(before)
+    assert session.astray == 1
+    assert session.fault == shared_state.NO_FAULT
 
 
 def test_after_a_gap_nothing_is_answered_any_more() -> None:
     session = RsiSession(CONFIG)
     for ipoc in (100, 104, 108):
         session.answer(packet(ipoc), 0)
-    assert session.answer(packet(1108), 0) is None
+    assert [session.answer(packet(ipoc), 0) for ipoc in range(1108, 1140, 4)] == [None] * 8
     assert session.fault == shared_state.LINK_LOST
-    assert session.answer(packet(1112), 0) is None
+    assert session.fault_text == b"249 packets are missing"
 
 
 def test_a_fault_is_latched_against_new_targets() -> None:

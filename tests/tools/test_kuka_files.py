@@ -16,7 +16,7 @@ from drivers.kuka import eki as kuka_eki
 from drivers.kuka import rsi as kuka_rsi
 from drivers.kuka.eki import wire
 from drivers.kuka.rsi.corrections import NAMES
-from drivers.kuka.rsi.wire import answer_template
+from drivers.kuka.rsi.wire import answer_template, stop_element
 from sim.devices.kuka_settings import Limits
 
 ROOT = REPO
@@ -68,14 +68,23 @@ def test_rsi_receives_what_the_driver_sends_and_holds_what_may_be_held(
     tool: dict[str, Any], corrects: str, mode: str, hold_on: str
 ) -> None:
     settings = kuka_rsi.Settings.model_validate({"arm_model": KR10_R1100_SIXX, "corrects": corrects, "mode": mode})
-    template = answer_template(settings.sen_type, settings.tag, NAMES[corrects])
+    template = answer_template(settings.sen_type, settings.tag, NAMES[corrects], stop_element("Stop", stops=True))
     sent = ElementTree.fromstring(template % (*(0.0,) * 6, b"1"))
     corrections = [f"{child.tag}.{name}" for child in sent for name in child.attrib]
+    assert sent.findtext("Stop") == "1"
     configuration = ElementTree.fromstring(tool["rsi_xml"](settings, "192.168.1.10"))
     outputs = [e for e in configuration.iterfind("RECEIVE/ELEMENTS/ELEMENT") if e.get("INDX") != "INTERNAL"]
-    assert [e.get("TAG") for e in outputs] == corrections
-    assert [e.get("INDX") for e in outputs] == ["1", "2", "3", "4", "5", "6"]
-    assert {e.get("HOLDON") for e in outputs} == {hold_on}
+    assert [e.get("TAG") for e in outputs] == [*corrections, "Stop"]
+    assert [e.get("INDX") for e in outputs] == ["1", "2", "3", "4", "5", "6", "7"]
+    assert {e.get("HOLDON") for e in outputs[:6]} == {hold_on}
+    assert (outputs[6].get("TYPE"), outputs[6].get("HOLDON")) == ("BOOL", "0")
+
+
+def test_without_a_stop_tag_neither_configuration_nor_context_stops(tool: dict[str, Any], tmp_path: Path) -> None:
+    tool["main"](["--output", str(tmp_path), "--rsi", '{"stop_tag": ""}'])
+    for name, word in (("coupole_rsi_ethernet.xml", '"Stop"'), ("context.md", "STOP1")):
+        assert word in (KUKA / "rsi" / name).read_text()
+        assert word not in (tmp_path / "rsi" / name).read_text()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,9 @@ in `configs/kuka/eki/`; in the cell, start them before this driver is opened.
 from __future__ import annotations
 
 import secrets
+import threading
 from collections.abc import Callable, Mapping
+from ipaddress import IPv4Address
 from typing import Literal, Self
 
 import numpy as np
@@ -42,6 +44,9 @@ class Settings(BaseModel):
     """host:port of the controller, or of this machine where the controller is the client."""
     controller_is: Literal["server", "client"] = "server"
     """Which side listens for the connection; EKI's own configuration (EXTERNAL/TYPE) names the opposite side."""
+    controller: Literal[""] | IPv4Address = ""
+    """The controller's address, where it is the client: connections of any other are turned away and counted. (A
+    controller that is the server is reached at `address`.)"""
     status_ms: int = Field(default=20, ge=4)
     """Period of the controller's status messages, in controller time."""
     link_timeout_s: float = Field(default=2.0, gt=0)
@@ -64,6 +69,12 @@ class Settings(BaseModel):
     follow_cycles: int = Field(default=3, ge=1)
     """The arm does not follow: motion done, but farther than `follow_deg` from the target for this many
     statuses."""
+
+    @model_validator(mode="after")
+    def _controller_can_be_checked(self) -> Self:
+        if self.controller and self.controller_is == "server":
+            raise ValueError("`controller` is for `controller_is: client`; a server is reached at `address`")
+        return self
 
     @model_validator(mode="after")
     def _percents_exist(self) -> Self:
@@ -104,13 +115,18 @@ class KukaEki:
         self._clock = clock
         self._message_time = MessageTime(clock)
         self._number = 0
+        self._sending = threading.Lock()
+        """Held while a command is numbered and sent: `stop` may come from any thread."""
+        self._stops = 0
         self._motion_s = 0.0
         self._watch = Watch(
             1 + secrets.randbelow(2**31 - 2),
             Tolerances(settings.settle_deg, settings.settle_deg_s, settings.follow_deg, settings.follow_cycles),
         )
         try:
-            link = connect(settings.address, settings.controller_is, settings.connect_timeout_s)
+            link, self._strangers = connect(
+                settings.address, settings.controller_is, str(settings.controller), settings.connect_timeout_s
+            )
         except OSError as error:
             raise DeviceLost(
                 "robot",
@@ -147,6 +163,7 @@ class KukaEki:
         }
 
     def move_to(self, joints_deg: NDArray[np.float64]) -> None:
+        stops = self._stops
         target_deg = checked_target(joints_deg, self.arm.limits_deg)
         self._raise_fault()
         status = self._status()
@@ -154,15 +171,19 @@ class KukaEki:
             raise refused("an override above 0 %", "the controller's program override is at 0 %")
         # If the arm is moving it brakes first, which lengthens the motion by up to twice the braking time.
         move_s = move_duration_s(self.arm, status.joints_deg, target_deg) + self._stop_s()
-        self._motion_s = move_s * _slower(status)
-        self._order(wire.MOVE, target_deg)
+        with self._sending:
+            if self._stops != stops:  # by another thread, since this call began
+                raise overtaken()
+            self._motion_s = move_s * _slower(status)
+            self._order(wire.MOVE, target_deg)
 
     def wait_settled(self) -> ArmState:
         settings, watch = self.settings, self._watch
         order = watch.order
-        with self._link.changed:  # only statuses sent after the controller has taken ASK count
-            watch.asked(self._number + 1)
-        self._send(wire.ASK)
+        with self._sending:
+            with self._link.changed:  # only statuses sent after the controller has taken ASK count
+                watch.asked(self._number + 1)
+            self._send(wire.ASK)
         self._wait_taken()
         settle_s = settings.settle_cycles * settings.status_ms / 1e3
         limit_s = 1.5 * self._motion_s + settle_s + settings.dwell_s + 1.0
@@ -201,7 +222,9 @@ class KukaEki:
         watch = self._watch
         if watch.link_lost:
             return
-        self._order(wire.STOP, None)
+        with self._sending:
+            self._stops += 1
+            self._order(wire.STOP, None)
         self._wait_taken()
         self._wait(lambda: not watch.moving, 2.0 * self._stop_s() + 1.0, "the arm at rest", faults=False)
 
@@ -217,6 +240,7 @@ class KukaEki:
         return {
             "statuses": watch.statuses,
             "foreign_statuses": watch.foreign,
+            "strangers": self._strangers,
             "malformed_statuses": self._link.reader.malformed,
             "max_gap_ms": watch.max_gap_ms,
         }
@@ -233,7 +257,8 @@ class KukaEki:
 
     def _begin_session(self) -> None:
         """Send a first STOP; its answers carry this session's number, so older statuses are recognised."""
-        self._order(wire.STOP, None)
+        with self._sending:
+            self._order(wire.STOP, None)
         watch = self._watch
         self._link.wait_for(
             lambda: watch.fault or (watch.status and not watch.moving), self.settings.connect_timeout_s
@@ -249,6 +274,7 @@ class KukaEki:
             )
 
     def _order(self, verb: int, target_deg: Six | None) -> None:
+        """Send a STOP or a MOVE; `_sending` must be held."""
         with self._link.changed:
             self._watch.ordered(self._number + 1, target_deg)
         self._send(verb, target_deg)

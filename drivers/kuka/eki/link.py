@@ -23,15 +23,36 @@ _UNREAD_BYTES = 16384
 faster than it is read (a simulated world that runs faster than real time) is slowed down by TCP flow control."""
 
 
-def connect(address: str, controller_is: Literal["server", "client"], timeout_s: float) -> socket.socket:
-    """An open connection; retries for `timeout_s` of machine time. Raises OSError."""
+def connect(
+    address: str, controller_is: Literal["server", "client"], controller: str, timeout_s: float
+) -> tuple[socket.socket, int]:
+    """An open connection, and the number of strangers who were turned away; retries for `timeout_s` of machine
+    time.
+
+    Where the controller is the client, only one from the address `controller` is let in, if that is not empty.
+    Raises OSError.
+    """
     host, port = address.rsplit(":", 1)
     give_up = time.monotonic() + timeout_s
+    strangers: list[str] = []
     if controller_is == "client":
         with socket.create_server((host, int(port)), backlog=1) as listener:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNREAD_BYTES)  # inherited by the link
-            listener.settimeout(timeout_s)
-            link, _ = listener.accept()
+            while True:
+                listener.settimeout(max(_LOOK_S, give_up - time.monotonic()))
+                try:
+                    link, (caller, _) = listener.accept()
+                except TimeoutError:
+                    if not strangers:
+                        raise
+                    raise TimeoutError(
+                        f"{len(strangers)} connections of other addresses than {controller} were turned away, the "
+                        f"last of {strangers[-1]}"
+                    ) from None
+                if controller in ("", caller):
+                    break
+                link.close()
+                strangers.append(caller)
     else:
         while True:
             link = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -46,7 +67,7 @@ def connect(address: str, controller_is: Literal["server", "client"], timeout_s:
                     raise
                 time.sleep(_LOOK_S)
     link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    return link
+    return link, len(strangers)
 
 
 class Link:

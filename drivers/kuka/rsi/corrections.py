@@ -38,10 +38,12 @@ class Corrections:
         """The place from which the next correction counts."""
         self._last = self._applied = _NOTHING
         """The last correction sent, and the last that the controller is known to have applied."""
+        self._led_to: Any = None
+        """The place to which the last absolute correction leads."""
 
     def begin(self, start_deg: Six) -> None:
         """Begin a session with the axes at `start_deg`."""
-        self._from = self._place(start_deg)
+        self._from = self._led_to = self._place(start_deg)
         self._last = self._applied = _NOTHING
 
     def taken(self) -> None:
@@ -61,6 +63,13 @@ class Corrections:
         """The correction that causes no further motion."""
         self._last = _NOTHING if self._relative else self._applied
         return self._last
+
+    def step(self, values: Six) -> Six:
+        """From the place to which the answer before led to that of an answer with these corrections."""
+        if self._relative:
+            return values
+        before, self._led_to = self._led_to, self._moved(self._from, values)
+        return self._between(before, self._led_to)
 
 
 def _axes_between(before_deg: Six, after_deg: Six) -> Six:

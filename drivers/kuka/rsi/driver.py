@@ -13,6 +13,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -36,6 +37,10 @@ __all__ = ["KukaRsi", "Settings"]
 _SESSION_ANSWERS = 10
 """Number of answers after which a session counts as established."""
 _POLL_S = 0.004
+_LOST = (shared_state.LINK_LOST, shared_state.RESTARTED)
+"""Faults after which the controller has no session with this driver any more."""
+_LEAVE_S = 2.0
+"""Longest time that the loop needs to end once the arm is at rest."""
 
 
 class KukaRsi:
@@ -50,6 +55,9 @@ class KukaRsi:
         self.arm = settings.arm()
         self._clock = clock
         self._command = shared_state.Command()
+        self._sending = threading.Lock()
+        """Held while a command is numbered and written: `stop` may come from any thread."""
+        self._stops = 0
         self._motion_s = 0.0
         self._target_deg: shared_state.Six = (0.0,) * 6
         """Target of the last motion."""
@@ -82,6 +90,7 @@ class KukaRsi:
         }
 
     def move_to(self, joints_deg: NDArray[np.float64]) -> None:
+        stops = self._stops
         target_deg = checked_target(joints_deg, self.arm.limits_deg)
         state = self._state()
         self._raise_fault(state)
@@ -91,10 +100,13 @@ class KukaRsi:
             self.settings, self.arm, state.start_deg, on_the_way_deg, target_deg
         ):
             raise refused("a motion within the limits of corrections", violations)
-        self._target_deg = target_deg
         # If the arm is moving it brakes first, which lengthens the motion by up to twice the braking time.
-        self._motion_s = move_duration_s(self.arm, state.measured_deg, target_deg) + self._stop_s()
-        self._send(shared_state.MOVE, self._target_deg)
+        motion_s = move_duration_s(self.arm, state.measured_deg, target_deg) + self._stop_s()
+        with self._sending:
+            if self._stops != stops:  # by another thread, since this call began
+                raise overtaken()
+            self._target_deg, self._motion_s = target_deg, motion_s
+            self._send(shared_state.MOVE, target_deg)
 
     def wait_settled(self) -> ArmState:
         command = self._command
@@ -124,8 +136,10 @@ class KukaRsi:
         """
         if self._process.poll() is not None:
             return
-        self._send(shared_state.STOP)
-        number = self._command.number
+        with self._sending:
+            self._stops += 1
+            self._send(shared_state.STOP)
+            number = self._command.number
         deadline = Deadline(self._clock, 2.0 * self._stop_s() + 1.0)
 
         def stands(state: shared_state.State) -> bool:
@@ -146,6 +160,9 @@ class KukaRsi:
             "late_answers": state.late,
             "malformed_packets": state.malformed,
             "foreign_packets": state.foreign,
+            "astray_packets": state.astray,
+            "cycle_ms": state.cycle_ns / 1e6,
+            "program_ended": state.program_ended,
             "max_gap_ms": state.max_gap_ns / 1e6,
             "delay_counter": state.delay,
             "realtime": state.realtime,
@@ -156,21 +173,26 @@ class KukaRsi:
         if self._process.poll() is None:
             with contextlib.suppress(DeviceError):
                 self.stop()
-            self._send(shared_state.LEAVE)
+            with self._sending:
+                self._stops += 1
+                self._send(shared_state.LEAVE)
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(timeout=1.0)
+                self._process.wait(timeout=_LEAVE_S)
             self._process.kill()
         self._process.wait()
 
     def _wait_for_session(self) -> None:
         give_up = time.monotonic() + self.settings.connect_timeout_s
-        while (state := self._state()).answers < _SESSION_ANSWERS:
+        while (state := self._state()).answers < _SESSION_ANSWERS or not state.cycle_ns:
+            self._raise_fault(state)
             if time.monotonic() > give_up:
                 raise DeviceTimeout(
                     "robot",
-                    expected=f"RSI packets at {self.settings.listen}",
+                    expected=f"RSI packets at {self.settings.listen}"
+                    + (f" from {self.settings.controller}" if self.settings.controller else ""),
                     happened=_no_session_reason(state),
-                    remedy="Restart the RSI program on the controller, and check its IP_NUMBER and PORT",
+                    remedy="Restart the RSI program on the controller, and check its IP_NUMBER and PORT"
+                    + ("; set `controller` to the controller's address" if state.foreign else ""),
                 )
             time.sleep(_POLL_S)
         self._raise_fault(state)
@@ -231,7 +253,15 @@ class KukaRsi:
     def _raise_fault(self, state: shared_state.State) -> None:
         if state.fault == shared_state.NO_FAULT:
             return
-        kind = DeviceLost if state.fault == shared_state.LINK_LOST else DeviceFault
+        if state.fault == shared_state.WRONG_CYCLE:
+            raise DeviceFault(
+                "robot",
+                expected=f"a controller with a cycle of {self.settings.cycle_ms} ms",
+                happened=state.fault_text.decode(errors="replace"),
+                remedy="Set `cycle_ms` to the controller's cycle, or start RSI with the other one "
+                "(#IPO_FAST: 4 ms, #IPO: 12 ms); before that, nothing is moved",
+            )
+        kind = DeviceLost if state.fault in _LOST else DeviceFault
         raise kind(
             "robot",
             expected="an arm that follows its RSI corrections",
@@ -241,6 +271,12 @@ class KukaRsi:
 
 
 def _no_session_reason(state: shared_state.State) -> str:
+    if state.foreign:
+        other, heard = state.other_sender.decode(), state.sender.decode()
+        listened = f"the driver listens to {heard}, of which {state.packets} came" if heard else "no others came"
+        return f"{state.foreign} packets of other senders were ignored, the last of {other}; {listened}"
+    if state.astray:
+        return f"{state.astray} packets came that do not continue the session, and {state.packets} that do"
     if state.refused:
         return f"{state.refused} packets belong to a running RSI session that another program may have begun"
     if state.malformed:
@@ -256,6 +292,8 @@ def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], share
     host, port = settings.listen.rsplit(":", 1)
     derived: dict[str, Any] = {
         "cycle_s": settings.cycle_ms / 1e3,
+        "declared_cycle_s": settings.declared_cycle_ms and settings.declared_cycle_ms / 1e3,
+        "controller": str(settings.controller),
         "correction_tag": settings.tag,
         "geometry": Geometry(*(getattr(settings.wrist, name) for name in Geometry._fields)),
         "velocity_deg_s": arm.velocity_deg_s,

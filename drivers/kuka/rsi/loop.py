@@ -23,22 +23,27 @@ from drivers.kuka.rsi.rsi_session import Config, RsiSession
 
 _TICK_S = 0.05
 """Interval at which the loop checks its parent process, and the link while no packet comes."""
-_ORPHAN_S = 0.8
-"""Longest time for which the loop continues after its parent's death: the time to brake."""
+_END_PROGRAM_S = 0.5
+"""Once the axes are at rest, longest wait for the packet that is answered with the end of the program."""
+_ENDED_S = 0.1
+"""A controller that is silent for this long after that answer has ended its program."""
+_MOST_STOP_ANSWERS = 50
+"""A controller that goes on after so many has no stop element in its configuration."""
 _REALTIME_PRIORITY = 20
 
 
 def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, config: Config) -> None:
-    """Answer packets until the command LEAVE or the parent's death; before returning, bring the arm to rest."""
+    """Answer packets until the command LEAVE or the parent's death; before returning, bring the arm to rest and
+    end the controller's program."""
     # SO_RCVTIMEO costs nothing per packet; a Python socket time-out costs a poll() before every call.
     link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@qq", 0, int(_TICK_S * 1e6)))
     realtime = _become_realtime()
     session = RsiSession(config, time.monotonic_ns())
     shared.write_state(session.state(realtime))
     _drop_backlog(link)
-    leaving, orphan_ns, look_ns = False, 0, 0
+    leaving, look_ns = Leaving(session, config), 0
     controller = None
-    while not (leaving and session.motion.phase == shared_state.STANDING):
+    while not leaving.done:
         try:
             data, address = link.recvfrom(4096)
             idle = False
@@ -48,28 +53,79 @@ def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, conf
         if shared.command_number() != session.command:
             command = shared.read_command()
             session.obey(command)
-            leaving |= command.verb == shared_state.LEAVE
+            if command.verb == shared_state.LEAVE:
+                leaving.begin()
         late, answer = session.late, None
-        if not idle and controller not in (None, address):
+        if not idle and (controller not in (None, address) or config.controller not in ("", address[0])):
             session.foreign += 1  # another controller's axes must not be taken for this arm's
+            session.other_sender = _name(address)
         elif not idle:
             answer = session.answer(data, now_ns)
         if answer is None:
             session.check_link(now_ns)
         else:
-            controller = address
+            if controller is None:
+                controller, session.sender = address, _name(address)
             with contextlib.suppress(OSError):  # a controller that has gone is detected by its silence
                 link.sendto(answer, address)
         if session.late > late:
             _drop_backlog(link)  # answers to packets that are queued here would be late too
-        shared.write_state(session.state(realtime))
         if now_ns > look_ns:
             look_ns = now_ns + int(_TICK_S * 1e9)
-            if os.getppid() != parent_pid and not leaving:
-                leaving, orphan_ns = True, now_ns
-                session.motion.stop()
-        if orphan_ns and now_ns - orphan_ns > _ORPHAN_S * 1e9:
-            break
+            if os.getppid() != parent_pid and not leaving.begun:
+                session.leave()
+                leaving.begin()
+        leaving.look(now_ns)
+        shared.write_state(session.state(realtime))
+
+
+class Leaving:
+    """The end of a session: the axes brake on their path, then the controller's program is ended. While packets
+    come, braking takes the time that the limits demand, however the parent ended; it is counted in packets, since
+    the controller's cycles are the time of the motion."""
+
+    def __init__(self, session: RsiSession, config: Config) -> None:
+        self.begun = self.done = False
+        self._session, self._config = session, config
+        longest_s = max(
+            speed / acceleration + 2.0 * acceleration / jerk
+            for speed, acceleration, jerk in zip(
+                config.velocity_deg_s, config.acceleration_deg_s2, config.jerk_deg_s3, strict=True
+            )
+        )
+        # With answers that are late the axes wait, so twice the time; beyond it they will not come to rest here.
+        self._most_packets = round(2.0 * longest_s / config.cycle_s) + _MOST_STOP_ANSWERS
+        self._first_packet = self._packets = self._heard_ns = 0
+        self._rested_ns: int | None = None
+
+    def begin(self) -> None:
+        self.begun, self._first_packet = True, self._session.packets
+
+    def look(self, now_ns: int) -> None:
+        """Determine whether the end is reached; called after every packet, and at times without one."""
+        session = self._session
+        if session.packets != self._packets:
+            self._packets, self._heard_ns = session.packets, now_ns
+        if not self.begun:
+            return
+        if session.motion.phase != shared_state.STANDING:
+            self.done = session.packets - self._first_packet > self._most_packets
+            return
+        if self._rested_ns is None:
+            self._rested_ns = now_ns
+        if session.fault != shared_state.NO_FAULT or not self._config.stop_tag:
+            self.done = True
+        elif not session.stop_answers:
+            self.done = now_ns - max(self._rested_ns, self._heard_ns) > _END_PROGRAM_S * 1e9
+        elif now_ns - self._heard_ns > _ENDED_S * 1e9:
+            session.program_ended = 1
+            self.done = True
+        else:
+            self.done = session.stop_answers > _MOST_STOP_ANSWERS
+
+
+def _name(address: tuple[str, int]) -> bytes:
+    return f"{address[0]}:{address[1]}".encode()
 
 
 def _become_realtime() -> int:

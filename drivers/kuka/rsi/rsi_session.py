@@ -5,6 +5,9 @@ corrections. So the motion follows the controller's cycles, also in a simulated 
 
 Corrections count from where RSI was started (`drivers.kuka.rsi.corrections`). Therefore only a program that saw
 the session begin may answer: in a session in progress, a first answer of zero would be a jump back to its start.
+For the same reason a session keeps its start for as long as this program runs: a packet that does not continue it
+is not answered, and when RSI was restarted, the driver has to be opened again. `drivers.kuka.rsi.bounds` states
+what holds for every answer.
 """
 
 from __future__ import annotations
@@ -12,13 +15,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drivers.kuka.rsi import shared_state
+from drivers.kuka.rsi.bounds import StepBounds
 from drivers.kuka.rsi.corrections import NAMES, Corrections
+from drivers.kuka.rsi.cycle import CycleMeter
 from drivers.kuka.rsi.pose import Geometry
 from drivers.kuka.rsi.trajectory import Motion
-from drivers.kuka.rsi.wire import Packet, answer_template, controller_type, packet_parser
+from drivers.kuka.rsi.wire import Packet, answer_template, controller_type, packet_parser, stop_element
 
 _GAP_STEPS = 25
-"""A jump of the IPOC by more than this many steps is a new session, or an outage long enough for one."""
+"""A jump of the IPOC by more than this many steps does not continue the session: it comes from an old packet, from
+a new session, or after an outage long enough for one."""
+_LONGEST_STEP = 12
+"""Largest step of the IPOC that is believed before it is known: the longest cycle in ms."""
+_ANOTHER_RUN = 5
+"""After this many packets in a row that continue one another, but not the session, the session is over."""
 _LAST_WORDS = 5
 """Packets that are still answered once the commanded axes are at rest after a fault."""
 _HALTED_PACKETS = 5
@@ -26,16 +36,23 @@ _HALTED_PACKETS = 5
 _QUIET_NS = 500_000_000
 """Without delay counter, a packet after a silence this long counts as the first of a session."""
 
+_SESSION_ENDS = (shared_state.LINK_LOST, shared_state.RESTARTED, shared_state.OUT_OF_BOUNDS)
+"""Faults after which nothing is answered, since the controller may have begun a new session, or no answer is
+right."""
+
 
 @dataclass(frozen=True)
 class Config:
     """What the driver passes to the loop; the fields are described in `drivers.kuka.rsi.settings.Settings`."""
 
     cycle_s: float
+    declared_cycle_s: float | None
+    controller: str
     sen_type: str
     measured_tag: str
     delay_tag: str
     correction_tag: str
+    stop_tag: str
     corrects: str
     mode: str
     geometry: Geometry
@@ -56,24 +73,39 @@ class RsiSession:
 
     def __init__(self, config: Config, opened_ns: int = 0) -> None:
         self.fault, self.fault_text = shared_state.NO_FAULT, b""
-        self.packets = self.answers = self.malformed = self.refused = self.foreign = 0
+        self.packets = self.answers = self.malformed = self.refused = self.foreign = self.astray = 0
         self.late = self.delay = self.max_gap_ns = self.command = 0
+        self.sender = self.other_sender = b""
+        self.stop_answers = self.program_ended = 0
+        """Answers that end the controller's program; 1 once it has ended on one of them."""
         self.settled_cycles = self._astray_cycles = self._late_in_row = 0
         limits = config.velocity_deg_s, config.acceleration_deg_s2, config.jerk_deg_s3
         self.motion = Motion(config.cycle_s, limits)
         self._config = config
         self._parse = packet_parser(config.measured_tag, config.delay_tag)
-        self._template = answer_template(config.sen_type, config.correction_tag, NAMES[config.corrects])
+        names = NAMES[config.corrects]
+        self._template, self._stop_template = (
+            answer_template(
+                config.sen_type, config.correction_tag, names, stop_element(config.stop_tag, stops=stops)
+            )
+            for stops in (False, True)
+        )
         self._corrections = Corrections(config.corrects, config.mode, config.geometry)
+        self._bounds = StepBounds(
+            config.corrects, config.cycle_s, config.velocity_deg_s, config.acceleration_deg_s2, config.geometry
+        )
+        self._cycle = CycleMeter(config.cycle_s, None)
+        self._counts_delay = False
+        """Whether the session's first packet had a delay counter."""
         self._controller = b""
         self._start_deg: tuple[float, ...] | None = None
         """The measured axes at the start of the session, to which corrections refer; None before it."""
         self._measured_deg: tuple[float, ...] = (0.0,) * 6
         self._velocity_deg_s: tuple[float, ...] = (0.0,) * 6
-        self._ipoc = self._ipoc_step = 0
+        self._ipoc = self._ipoc_step = self._astray_ipoc = self._astray_run = 0
         self._packet_ns = opened_ns
         """Time of the last packet, including those of a session that another program began."""
-        self._session_over = False
+        self._session_over = self._leaves = False
         self._last_words = _LAST_WORDS
         self._last_answer: bytes | None = None
 
@@ -83,50 +115,70 @@ class RsiSession:
         self.settled_cycles = 0
         if command.verb == shared_state.MOVE and self.fault == shared_state.NO_FAULT:
             self.motion.move_to(command.target_deg)
-        elif command.verb in (shared_state.STOP, shared_state.LEAVE):
+        elif command.verb == shared_state.STOP:
             self.motion.stop()
+        elif command.verb == shared_state.LEAVE:
+            self.leave()
+
+    def leave(self) -> None:
+        """Bring the commanded axes to rest, then end the controller's program."""
+        self._leaves = True
+        self.motion.stop()
 
     def answer(self, data: bytes, now_ns: int) -> bytes | None:
         """The answer to a packet, or None if it must not be answered."""
         packet = self._parse(data)
-        if packet is None or (packet.delay is None and self._config.mode == "relative"):
+        if packet is None or (packet.delay is None and (self._config.mode == "relative" or self._counts_delay)):
             self.malformed += 1
             return None
-        advance, rose = int(packet.ipoc) - self._ipoc, 0
+        advance, cycles, rose = int(packet.ipoc) - self._ipoc, 1, 0
         if self._start_deg is None:
             if not self._may_begin(packet, now_ns):
                 self.refused += 1
                 return None
-            self._controller = controller_type(data)
-            self._begin_session(packet)
+            self._begin_session(packet, controller_type(data))
         else:
-            self.max_gap_ns = max(self.max_gap_ns, now_ns - self._packet_ns)
-            if not self._in_sequence(packet, advance):
+            if not self._in_sequence(int(packet.ipoc), advance):
                 return self._last_answer if advance == 0 else None
-            rose = max(0, (packet.delay or 0) - self.delay) if advance > 0 else 0
+            self.max_gap_ns = max(self.max_gap_ns, now_ns - self._packet_ns)
+            rose = max(0, (packet.delay or 0) - self.delay)
+            cycles = advance // self._ipoc_step
         self._ipoc, self._packet_ns, self.delay = int(packet.ipoc), now_ns, packet.delay or 0
+        if mismatch := self._cycle.packet(now_ns, advance, cycles):
+            self.fail(shared_state.WRONG_CYCLE, mismatch)
+        self._ipoc_step = self._cycle.ipoc_step or self._ipoc_step
         self.packets += 1
         self.late += rose
         # Packets lost on the network also raise the delay counter, but do not concern the answer before them.
-        applied = rose == 0 or rose < advance // self._ipoc_step
+        applied = rose == 0 or rose < cycles
         if applied:
             self._corrections.taken()
         self._watch(packet)
         self._late_in_row = self._late_in_row + 1 if rose else 0
+        rested = self.motion.phase == shared_state.STANDING
         if not applied:  # repeat the last answer instead of advancing ahead of the arm
             if self._late_in_row >= _HALTED_PACKETS:
                 self.motion.halted()
+                self._bounds.at_rest()
         elif not self.motion.step():
+            self._bounds.at_rest()
             self.fail(shared_state.NO_TRAJECTORY, "no trajectory within the limits leads to the target")
-        self._last_answer = None if self._silent() else self._template % (*self._values(), packet.ipoc)
+        self._last_answer = None if self._silent() else self._formed(packet.ipoc, applied, rested)
         self.answers += self._last_answer is not None
         return self._last_answer
 
-    def _values(self) -> shared_state.Six:
-        """The six corrections. Once the arm is at rest after a fault they cause no further motion."""
-        if self.fault != shared_state.NO_FAULT and self.motion.phase == shared_state.STANDING:
-            return self._corrections.hold()
-        return self._corrections.to(self.motion.commanded_deg)
+    def _formed(self, ipoc: bytes, advances: bool, rested: bool) -> bytes | None:
+        """The answer, or None if it would break the bounds: the controller then ends the session by itself. Once
+        the arm is at rest after a fault, its corrections cause no further motion. `rested`: the axes were at rest
+        in the answer before."""
+        holds = self.motion.phase == shared_state.STANDING and self.fault != shared_state.NO_FAULT
+        values = self._corrections.hold() if holds else self._corrections.to(self.motion.commanded_deg)
+        if violation := self._bounds.violation(self._corrections.step(values), advances=advances and not holds):
+            self.fail(shared_state.OUT_OF_BOUNDS, f"an answer was withheld: {violation}")
+            return None
+        ends = self._leaves and rested and self.fault == shared_state.NO_FAULT and bool(self._config.stop_tag)
+        self.stop_answers += ends
+        return (self._stop_template if ends else self._template) % (*values, ipoc)
 
     def _silent(self) -> bool:
         """After a fault the driver ends the session by not answering, so that no old correction reaches a new
@@ -148,9 +200,10 @@ class RsiSession:
         them, else at once where they are, so that the arm is not pushed further."""
         if self.fault == shared_state.NO_FAULT:
             self.fault, self.fault_text = fault, text.encode()
-        self._session_over |= fault == shared_state.LINK_LOST
-        if fault in (shared_state.LINK_LOST, shared_state.NOT_FOLLOWING):
+        self._session_over |= fault in _SESSION_ENDS
+        if fault in _SESSION_ENDS or fault == shared_state.NOT_FOLLOWING:
             self.motion.stand_at(self.motion.commanded_deg)
+            self._bounds.at_rest()
         else:
             self.motion.stop()
 
@@ -161,9 +214,12 @@ class RsiSession:
             malformed=self.malformed,
             refused=self.refused,
             foreign=self.foreign,
+            astray=self.astray,
             late=self.late,
             delay=self.delay,
             max_gap_ns=self.max_gap_ns,
+            cycle_ns=self._cycle.measured_ns,
+            program_ended=self.program_ended,
             realtime=realtime,
             command=self.command,
             phase=self.motion.phase,
@@ -174,6 +230,8 @@ class RsiSession:
             commanded_deg=self.motion.commanded_deg,
             start_deg=self._start_deg or (0.0,) * 6,
             controller=self._controller,
+            sender=self.sender,
+            other_sender=self.other_sender,
             fault_text=self.fault_text,
         )
 
@@ -182,24 +240,45 @@ class RsiSession:
         quiet_ns, self._packet_ns = now_ns - self._packet_ns, now_ns
         return packet.delay == 0 if packet.delay is not None else quiet_ns > _QUIET_NS
 
-    def _begin_session(self, packet: Packet) -> None:
+    def _begin_session(self, packet: Packet, controller: bytes) -> None:
+        """Once in the life of this object."""
+        config = self._config
+        self._controller, self._counts_delay = controller, packet.delay is not None
+        # Only a simulated controller may say how long its cycle is.
+        declared_s = config.declared_cycle_s if b"simulated" in controller else None
+        self._cycle = CycleMeter(config.cycle_s, declared_s)
         self._start_deg = self._measured_deg = packet.joints_deg
-        self._ipoc_step = self._astray_cycles = 0
         self._corrections.begin(packet.joints_deg)
         self.motion.stand_at(packet.joints_deg)
 
-    def _in_sequence(self, packet: Packet, advance: int) -> bool:
-        """False for a packet that came twice or out of order. Detects restarted sessions."""
-        step = self._ipoc_step or 1
-        if advance > 0 and not 0 < self._ipoc_step <= advance:
-            self._ipoc_step = advance  # the smallest so far: a packet may have been lost on the network
-        elif advance > _GAP_STEPS * step:
-            self.fail(shared_state.LINK_LOST, f"{advance // step - 1} packets are missing")
-        elif advance < -_GAP_STEPS * step:
-            if self.motion.phase != shared_state.STANDING:
-                self.fail(shared_state.RESTARTED, "RSI was restarted while the arm was moving")
-            self._begin_session(packet)
-        return advance > 0 or advance < -_GAP_STEPS * step
+    def _in_sequence(self, ipoc: int, advance: int) -> bool:
+        """True for a packet that continues the session. Others, twice, old or of another session, change nothing;
+        a run of others ends the session."""
+        step = self._cycle.ipoc_step
+        if step:
+            continues = 0 < advance <= _GAP_STEPS * step and advance % step == 0
+        else:
+            continues = 0 < advance <= _GAP_STEPS * _LONGEST_STEP
+        if continues:
+            if not 0 < self._ipoc_step <= advance:
+                self._ipoc_step = advance  # the smallest so far: a packet may have been lost on the network
+            self._astray_run = 0
+        elif advance != 0:
+            self._astray(ipoc, advance, self._ipoc_step or 1)
+        return continues
+
+    def _astray(self, ipoc: int, advance: int, step: int) -> None:
+        """A packet with an IPOC of the past, or too far ahead: perhaps one old packet, perhaps a new session."""
+        self.astray += 1
+        follows = 0 < ipoc - self._astray_ipoc <= _GAP_STEPS * step
+        self._astray_run = self._astray_run + 1 if follows else 1
+        self._astray_ipoc = ipoc
+        if self._astray_run < _ANOTHER_RUN:
+            return
+        if advance > 0:
+            self.fail(shared_state.LINK_LOST, f"{advance // step - self._astray_run} packets are missing")
+        else:
+            self.fail(shared_state.RESTARTED, "RSI was restarted: its packets begin to count anew")
 
     def _watch(self, packet: Packet) -> None:
         """Compare the measured axes with those commanded in the last answer."""

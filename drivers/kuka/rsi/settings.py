@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ipaddress import IPv4Address
 from typing import Literal, Self
 
 import numpy as np
@@ -24,14 +25,24 @@ class Settings(BaseModel):
     """The arm that the controller moves; filled in from the rig."""
     listen: str = Field(default="0.0.0.0:49152", pattern=r"^[^:]+:\d+$")
     """host:port to bind; the controller's RSI configuration names it (IP_NUMBER, PORT)."""
+    controller: Literal[""] | IPv4Address = ""
+    """The controller's address in the RSI network. Packets of any other are ignored and counted. Without it the
+    first sender of an answerable packet counts as the controller, until the driver is closed."""
     cycle_ms: Literal[4, 12] = 4
-    """4 for #IPO_FAST, 12 for #IPO."""
+    """4 for #IPO_FAST, 12 for #IPO. It is compared with the arrival of the packets before the first motion."""
+    declared_cycle_ms: float | None = Field(default=None, gt=0)
+    """Cycle of a simulated controller whose world waits for answers or runs at another pace than the machine's
+    clock; compared instead of the arrival. From the world; a controller that does not call itself simulated is
+    measured."""
     sen_type: str = Field(default="ImFree", pattern=r"^[\w.-]+$")
     """SENTYPE of the controller's RSI configuration."""
     measured_tag: str = Field(default="AIPos", pattern=_TAG)
     delay_tag: str = Field(default="Delay", pattern=_TAG)
     correction_tag: str = Field(default="", pattern=_TAG + "|^$")
     """Empty: AKorr for axes, RKorr for the pose."""
+    stop_tag: str = Field(default="Stop", pattern=_TAG + "|^$")
+    """The element that ends the controller's program when the driver is closed; empty for none: the controller
+    then ends it with an error when no more answers come."""
     corrects: Literal["axes", "pose"] = "axes"
     """What the controller corrects: axes (AXISCORR) or the flange's pose (POSCORR). In both cases motions are
     straight in joint space; those on which the pose does not determine the axes are refused."""

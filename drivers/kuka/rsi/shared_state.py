@@ -16,14 +16,16 @@ BLOCK_BYTES = 4096
 _COMMAND_AT, _STATE_AT = 0, 1024
 _SEQUENCE = struct.Struct("=Q")
 _COMMAND = struct.Struct("=QQ6d")
-_STATE = struct.Struct("=13Q24d32s200s")
+_STATE = struct.Struct("=16Q24d32s32s32s200s")
+_WORDS = 16
+"""Integers of a state."""
 _TORN_S = 1.0
 
 HOLD, MOVE, STOP, LEAVE = range(4)
 """Verbs of a command: nothing yet, move to the target, come to rest, come to rest and end the process."""
 STANDING, MOVING, STOPPING = range(3)
 """Phase of the commanded axes."""
-NO_FAULT, LINK_LOST, LATE, NOT_FOLLOWING, RESTARTED, NO_TRAJECTORY = range(6)
+NO_FAULT, LINK_LOST, LATE, NOT_FOLLOWING, RESTARTED, NO_TRAJECTORY, WRONG_CYCLE, OUT_OF_BOUNDS = range(8)
 """Faults, latched."""
 
 Six = tuple[float, ...]
@@ -46,13 +48,19 @@ class State(NamedTuple):
     refused: int = 0
     """Packets left unanswered because they belong to an RSI session that another program began."""
     foreign: int = 0
-    """Packets from other senders than the session's; they are ignored."""
+    """Packets from other senders than the session's, or than the controller set in the rig; they are ignored."""
+    astray: int = 0
+    """Packets of the controller's address that do not continue the session; they are not answered."""
     late: int = 0
     """Total rise of the controller's delay counter: answers that came too late or not at all."""
     delay: int = 0
     """The controller's delay counter in the last packet."""
     max_gap_ns: int = 0
     """Longest time between two packets."""
+    cycle_ns: int = 0
+    """The controller's cycle, as measured, or as a simulated world declares it; 0 before it is known."""
+    program_ended: int = 0
+    """1 if the controller ended its program on the stop element of an answer."""
     realtime: int = 0
     """1 if the loop runs under SCHED_FIFO."""
     command: int = 0
@@ -69,6 +77,10 @@ class State(NamedTuple):
     """Axes at the start of the session, from which the correction limits count."""
     controller: bytes = b""
     """The `Type` attribute of the controller's packets."""
+    sender: bytes = b""
+    """Address of the session's controller."""
+    other_sender: bytes = b""
+    """Address of the last foreign packet."""
     fault_text: bytes = b""
 
 
@@ -94,21 +106,24 @@ class Block:
         self._write(
             _STATE_AT,
             _STATE.pack(
-                *state[:13],
+                *state[:_WORDS],
                 *state.measured_deg,
                 *state.velocity_deg_s,
                 *state.commanded_deg,
                 *state.start_deg,
                 state.controller[:32],
+                state.sender,
+                state.other_sender,
                 state.fault_text[:200],
             ),
         )
 
     def read_state(self) -> State:
         fields = self._read(_STATE_AT, _STATE)
-        controller, fault_text = (text.rstrip(b"\0") for text in fields[37:])
-        joints = (fields[13:19], fields[19:25], fields[25:31], fields[31:37])
-        return State._make((*fields[:13], *joints, controller, fault_text))
+        joints_end = _WORDS + 24
+        joints = (fields[at : at + 6] for at in range(_WORDS, joints_end, 6))
+        texts = (text.rstrip(b"\0") for text in fields[joints_end:])
+        return State._make((*fields[:_WORDS], *joints, *texts))
 
     def close(self) -> None:
         self._memory.close()

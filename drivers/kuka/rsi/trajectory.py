@@ -9,6 +9,9 @@ import ruckig
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.shared_state import Six
 
+_LEAST_MOTION_DEG = 1e-6
+"""Shorter motions, below the resolution of the wire, are not made: along them the limits would be endless."""
+
 
 class Motion:
     """The commanded axes: at rest, moving to a target or braking, always within the limits.
@@ -48,7 +51,8 @@ class Motion:
             self._next_target_deg = target_deg
             return
         line_deg = tuple(map(float.__sub__, target_deg, self.commanded_deg))
-        if not any(line_deg):
+        if max(map(abs, line_deg)) < _LEAST_MOTION_DEG:
+            self.commanded_deg = target_deg
             return
         self._start_deg, self._line_deg = self.commanded_deg, line_deg
         highest = [
@@ -74,7 +78,10 @@ class Motion:
         """Advance one cycle; False if the trajectory could not be computed: the axes are then at rest."""
         if self.phase == shared_state.STANDING:
             return True
-        result = self._run.update(self._input, self._output)
+        try:
+            result = self._run.update(self._input, self._output)
+        except ruckig.RuckigError:
+            result = None
         if result not in (ruckig.Result.Working, ruckig.Result.Finished):
             self.stand_at(self.commanded_deg)
             return False

@@ -5,7 +5,6 @@ The names of elements are set in the controller's RSI configuration, so they are
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable
 from typing import NamedTuple
@@ -19,6 +18,12 @@ class Packet(NamedTuple):
     """The counter of late answers; None where the controller does not send it."""
 
 
+_LARGEST_DELAY, _LARGEST_IPOC = 2**31 - 1, 2**63 - 1
+"""Largest numbers of the controller's types; a larger one is no number of a controller."""
+_LARGEST_DEG = 1e4
+"""No axis turns 27 times."""
+
+
 _ATTRIBUTE = re.compile(rb"""([A-Za-z_]\w*)\s*=\s*["']\s*([^"']*?)\s*["']""")
 _TYPE = re.compile(rb"""<Rob\b[^>]*?\bTYPE\s*=\s*["']([^"']*)["']""", re.IGNORECASE)
 
@@ -26,7 +31,8 @@ _TYPE = re.compile(rb"""<Rob\b[^>]*?\bTYPE\s*=\s*["']([^"']*)["']""", re.IGNOREC
 def packet_parser(measured_tag: str, delay_tag: str) -> Callable[[bytes], Packet | None]:
     """A parser of the controller's packets: elements and attributes in any order, unknown ones ignored.
 
-    It returns None if IPOC or an axis is missing or not a number.
+    It returns None if IPOC or an axis is missing, or if one of them, or the delay counter, is not a possible
+    number.
     """
     measured, delay = re.escape(measured_tag).encode(), re.escape(delay_tag).encode()
     usual_axes = re.compile(
@@ -34,7 +40,7 @@ def packet_parser(measured_tag: str, delay_tag: str) -> Callable[[bytes], Packet
     )
     any_axes = re.compile(rb"<%s\b([^>]*)>" % measured)
     usual_tail = re.compile(rb'<%s D="(\d+)"\s*/>\s*<IPOC>(\d+)</IPOC>' % delay)
-    any_delay = re.compile(rb"""<%s\b[^>]*?\bD\s*=\s*["']\s*(\d+)\s*["']""" % delay)
+    any_delay = re.compile(rb"""<%s\b(?:[^>]*?\bD\s*=\s*["']\s*(\d+)\s*["'])?""" % delay)
     any_ipoc = re.compile(rb"<IPOC>\s*(\d+)\s*</IPOC>")
     names = [b"A%d" % axis for axis in range(1, 7)]
 
@@ -49,13 +55,19 @@ def packet_parser(measured_tag: str, delay_tag: str) -> Callable[[bytes], Packet
                 return None
         except (KeyError, ValueError):
             return None
-        if not math.isfinite(sum(joints_deg)):
+        if not all(abs(angle) <= _LARGEST_DEG for angle in joints_deg):  # also false for a NaN
             return None
         if match := usual_tail.search(packet):
-            return Packet(match[2], joints_deg, int(match[1]))
-        ipoc = any_ipoc.search(packet)
-        late = any_delay.search(packet)
-        return Packet(ipoc[1], joints_deg, int(late[1]) if late else None) if ipoc else None
+            late, ipoc = match[1], match[2]
+        else:
+            found = any_ipoc.search(packet)
+            counted = any_delay.search(packet)
+            if found is None or (counted and counted[1] is None):
+                return None
+            late, ipoc = counted[1] if counted else None, found[1]
+        if int(ipoc) > _LARGEST_IPOC or (late is not None and int(late) > _LARGEST_DELAY):
+            return None
+        return Packet(ipoc, joints_deg, None if late is None else int(late))
 
     return parse
 
@@ -66,7 +78,13 @@ def controller_type(packet: bytes) -> bytes:
     return match[1] if match else b""
 
 
-def answer_template(sen_type: str, correction_tag: str, names: tuple[str, ...]) -> bytes:
-    """An answer with places for six corrections (floats) and the IPOC (bytes), for `%`."""
+def answer_template(sen_type: str, correction_tag: str, names: tuple[str, ...], stop: str = "") -> bytes:
+    """An answer with places for six corrections (floats) and the IPOC (bytes), for `%`; `stop` is the element that
+    ends the program, or not."""
     values = " ".join(f'{name}="%.6f"' for name in names)
-    return f'<Sen Type="{sen_type}"><EStr></EStr><{correction_tag} {values}/><IPOC>%b</IPOC></Sen>'.encode()
+    return f'<Sen Type="{sen_type}"><EStr></EStr><{correction_tag} {values}/>{stop}<IPOC>%b</IPOC></Sen>'.encode()
+
+
+def stop_element(stop_tag: str, *, stops: bool) -> str:
+    """The element that ends the RSI program, if it is 1; "" without a tag."""
+    return f"<{stop_tag}>{int(stops)}</{stop_tag}>" if stop_tag else ""

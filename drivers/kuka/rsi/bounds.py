@@ -1,0 +1,66 @@
+"""The invariant of every answer, whatever packets came in:
+
+    From one answer to the next, the place to which the corrections lead moves by no more than the highest speed
+    times the cycle. Where the commanded axes advance, this step differs from the one before by no more than the
+    highest acceleration times the cycle squared; the only other change is to no step at all.
+
+A place is the axes, or the flange's pose. The trajectory obeys this by construction; here it is checked on what is
+about to be sent, from the sent numbers alone, so that no mistake before it can reach the arm. Limits of the pose
+follow from those of the axes: no point of the arm moves faster than its reach times the sum of all axis speeds.
+"""
+
+from __future__ import annotations
+
+from math import degrees, hypot, radians
+
+from drivers.kuka.rsi.pose import Geometry
+
+Six = tuple[float, ...]
+
+_ROUNDING = 1e-5
+"""Numbers on the wire have six decimals; a step and its change take up to four of them."""
+_SLACK = 1.001
+_POSE_SLACK = 2.0
+"""For the change of a pose's step: angles A, B, C of a turn differ from its rotation vector in second order."""
+
+
+class StepBounds:
+    """See the module; `step` is six numbers, degrees of the axes, or mm and degrees of the flange."""
+
+    def __init__(
+        self, corrects: str, cycle_s: float, velocity_deg_s: Six, acceleration_deg_s2: Six, geometry: Geometry
+    ) -> None:
+        if corrects == "axes":
+            self._farthest: Six = tuple(_SLACK * speed * cycle_s + _ROUNDING for speed in velocity_deg_s)
+            self._change: Six = tuple(_SLACK * a * cycle_s**2 + 2 * _ROUNDING for a in acceleration_deg_s2)
+        else:
+            turn = sum(map(radians, velocity_deg_s)) * cycle_s
+            change = sum(map(radians, acceleration_deg_s2)) * cycle_s**2 + turn**2
+            self._farthest = _pose_bounds(_SLACK * turn, geometry)
+            self._change = _pose_bounds(_POSE_SLACK * change, geometry)
+        self._last: Six = (0.0,) * 6
+        """The step of the last cycle in which the axes advanced."""
+
+    def at_rest(self) -> None:
+        """The arm has halted: the next advance begins from rest."""
+        self._last = (0.0,) * 6
+
+    def violation(self, step: Six, *, advances: bool) -> str:
+        """Why an answer that makes this step must not be sent, or ""."""
+        for number, (length, farthest) in enumerate(zip(step, self._farthest, strict=True), start=1):
+            if not abs(length) <= farthest:
+                return f"correction {number} would step by {length:.4f} in one cycle, {farthest:.4f} is the limit"
+        if not advances:
+            return ""
+        last, self._last = self._last, step
+        for number, (length, before, most) in enumerate(zip(step, last, self._change, strict=True), start=1):
+            if not abs(length - before) <= most:
+                change = length - before
+                return f"the step of correction {number} would change by {change:.4f}, {most:.4f} is the limit"
+        return ""
+
+
+def _pose_bounds(turn: float, geometry: Geometry) -> Six:
+    """Largest step of a pose while all axes together turn by `turn` radians."""
+    reach_mm = geometry.a1_mm + abs(geometry.b_mm) + geometry.c2_mm + hypot(geometry.a2_mm, geometry.c3_mm)
+    return ((reach_mm + geometry.c4_mm) * turn + _ROUNDING,) * 3 + (degrees(turn) + _ROUNDING,) * 3

@@ -1,0 +1,37 @@
+"""What a stand-in refuses, told to a person: an outside client would otherwise see silence only.
+
+A client that is wrong is wrong in every cycle, so the same reason is told again only after a while, with its
+count.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+_AGAIN_S = 2.0
+"""Machine time between two messages with the same reason."""
+
+
+def untold(message: str) -> None:
+    """For stand-ins whose client is Coupole itself."""
+
+
+class Refusals:
+    """Counts refusals by reason, and tells them."""
+
+    def __init__(self, device: str, tell: Callable[[str], None]) -> None:
+        self._device, self._tell = device, tell
+        self._since: dict[str, tuple[float, int]] = {}
+        """For each reason, when it was last told, and how often it has occurred since."""
+
+    def refused(self, reason: str, details: str = "") -> None:
+        """`reason` is equal for equal mistakes; `details` are those of this occurrence."""
+        now_s = time.monotonic()
+        told_s, count = self._since.get(reason, (-_AGAIN_S, 0))
+        if now_s - told_s < _AGAIN_S:
+            self._since[reason] = told_s, count + 1
+            return
+        self._since[reason] = now_s, 0
+        again = f" ({count + 1} times since the last message)" if count else ""
+        self._tell(f"{self._device}: {reason}{': ' if details else ''}{details}{again}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +35,11 @@ def _paths(value: Any, at: KeyPath) -> Iterator[tuple[KeyPath, Path]]:
             yield from _paths(inner, (*at, index))
 
 
-def differences(before: BaseModel, now: BaseModel) -> list[str]:
-    """Keys whose values differ, with both values; paths count as equal: what they lead to is compared apart."""
-    return list(_differences(_without_paths(before), _without_paths(now), ""))
+def differences(before: BaseModel, now: BaseModel, apart: Set[str] = frozenset()) -> list[str]:
+    """Keys whose values differ, with both values; paths count as equal: what they lead to is
+    compared apart, as are these top-level keys."""
+    then, here = ({k: v for k, v in _without_paths(model).items() if k not in apart} for model in (before, now))
+    return list(_differences(then, here, ""))
 
 
 def _without_paths(model: BaseModel) -> Any:

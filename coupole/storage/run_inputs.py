@@ -18,7 +18,7 @@ import hashlib
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -229,9 +229,10 @@ def changes_since(about: Mapping[str, Any], run: Path, now: Inputs) -> list[str]
 
     Comments, the order of keys, and the place of a file are no change; any other byte of a mesh or a record is.
     """
+    arm_known = now.arm is not None and "arm_sha256" in about
     found = [
         *_changes_of(about["plan"], now.plan, Plan, "plan"),
-        *_changes_of(about["rig"], now.rig, Rig, "rig"),
+        *_changes_of(about["rig"], now.rig, Rig, "rig", {"arm"} if arm_known else set()),
     ]
     before = Counter(entry["sha256"] for entry in about["files"])
     kept = [run / entry["stored"] for entry in about["files"] if entry.get("stored")]
@@ -239,12 +240,18 @@ def changes_since(about: Mapping[str, Any], run: Path, now: Inputs) -> list[str]
     found += [
         f"{path} is another file" for path in now.others if not (before[sha256(path)] or before[_meaning(path)])
     ]
-    if now.arm is not None and about.get("arm_sha256", _arm_sha256(now.arm)) != _arm_sha256(now.arm):
+    if now.arm is not None and arm_known and about["arm_sha256"] != _arm_sha256(now.arm):
         found.append("the description of the arm")
     return found
 
 
-def _changes_of(before: Mapping[str, str], path: Path, model: type[Plan] | type[Rig], what: str) -> Iterator[str]:
+def _changes_of(
+    before: Mapping[str, str],
+    path: Path,
+    model: type[Plan] | type[Rig],
+    what: str,
+    apart: Set[str] = frozenset(),
+) -> Iterator[str]:
     if sha256(path) == before["sha256"]:
         return
     try:
@@ -253,7 +260,7 @@ def _changes_of(before: Mapping[str, str], path: Path, model: type[Plan] | type[
         yield f"the {what} {path} is another file, and the old one is not understood any more"
         return
     now = yamlfile.read(path).validate(model)
-    if found := differences(then, now):
+    if found := differences(then, now, apart):
         yield f"the {what} {path}: {'; '.join(found)}"
 
 

@@ -1,4 +1,4 @@
-"""Two sessions of a run and its archive, without devices: what the test of `write_cuts` records.
+"""Three sessions of a run and its archive, without devices: what the test of `write_cuts` records.
 
     python recorded_session.py FOLDER
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import mmap
 import sys
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -67,22 +68,28 @@ def main(folder: Path) -> None:
         first.commit(now=True)
     take(first, f"top/{LABELS[2]}")  # and then it is killed
 
-    open_for_session(run)
-    second = RunRecorder(run, METADATA)
-    second.note(SessionResumed(simulated=True))
-    for view in VIEWS:
-        second.note(ViewBegun(view=view))
-        begin_view(second, view)
-        for label in LABELS:
-            if ShotId.parse(f"{view}/{label}") not in second.proven():
-                take(second, f"{view}/{label}")
-                second.commit(now=True)
-        second.end_view()
-    second.note(SessionStopped(outcome="done"))
-    second.close_quietly()
-    second.close()
-    conclude(run, make_console(quiet=True))
+    go_on(run, LABELS[:4], "interrupted")
+    go_on(run, LABELS, "done")
     archive_run(run, codec_of("lz4"), keep=True)
+
+
+def go_on(run: Run, labels: tuple[str, ...], outcome: Literal["interrupted", "done"]) -> None:
+    """A later session, which takes these shots of each view and ends in order."""
+    open_for_session(run)
+    recorder = RunRecorder(run, METADATA)
+    recorder.note(SessionResumed(simulated=True))
+    for view in VIEWS:
+        recorder.note(ViewBegun(view=view))
+        begin_view(recorder, view)
+        for label in labels:
+            if ShotId.parse(f"{view}/{label}") not in recorder.proven():
+                take(recorder, f"{view}/{label}")
+                recorder.commit(now=True)
+        recorder.end_view()
+    recorder.note(SessionStopped(outcome=outcome))
+    recorder.close_quietly()
+    recorder.close()
+    conclude(run, make_console(quiet=True))
 
 
 if __name__ == "__main__":

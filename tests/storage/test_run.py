@@ -82,6 +82,17 @@ def test_verify_finds_a_shot_that_stands_in_two_slots(finished: Run) -> None:
     assert verify(finished).bad == ["views/top.h5: top/led0001/e0 is in 2 slots"]
 
 
+def test_what_a_crash_left_in_the_frame_table_alone_is_missing_and_not_bad(finished: Run) -> None:
+    """Twice synced as proven, and twice the journal's line was lost: only the journal counts."""
+    lines = finished.journal_path.read_text().splitlines(keepends=True)
+    finished.journal_path.write_text("".join(line for line in lines if "led0001" not in line))
+    writer = ViewWriter(finished.view_path("top"), {f"top/led{k:04d}/e0": k for k in range(3)})
+    writer.prove(writer.put(frame(9), frame_id=200, camera_ns=9, exposure_us=8000), "top/led0001/e0")
+    writer.close()
+    found = verify(finished)
+    assert (found.bad, found.missing) == ([], ["top/led0001/e0"])
+
+
 def test_verify_finds_a_shot_that_was_proven_twice(finished: Run) -> None:
     diary = Journal(finished.journal_path)
     proven = finished.proven()[ShotId.parse("top/led0001/e0")]

@@ -35,7 +35,7 @@ def renew_report(run: Run) -> Path:
         return report.write(run)
     with run.locked():
         manifest.forget(run.folder, [report.NAME])
-        path = report.write(run)
+        path = report.write(run, in_use=False)
         manifest.enter(run.folder, [report.NAME])
     return path
 
@@ -43,7 +43,7 @@ def renew_report(run: Run) -> Path:
 def conclude(run: Run, console: Console) -> None:
     """Write the report and enter in the manifest what is complete. Never raises: the run itself has ended."""
     try:
-        report.write(run)
+        report.write(run, in_use=False)
         changed = {name for name in manifest.unlisted(run.folder) if not name.startswith(f"{manifest.VIEWS}/")}
         manifest.enter(run.folder, sorted(changed))
         listed = manifest.read(run.folder)

@@ -96,13 +96,13 @@ class Status:
         return {**vars(self), "sessions": sessions, "missing": self.missing, "frames_left": self.frames_left}
 
 
-def status(run: Run) -> Status:
-    """Progress of a run, also of one that is running."""
+def status(run: Run, *, in_use: bool | None = None) -> Status:
+    """Progress of a run, also of one that is running. Whoever holds its lock says whether it is `in_use`."""
     found = Status(proof=run.proof)
     expected = list(run.expected_shots())
     found.shots = sum(shot.is_shot for shot in expected)
     per_view = Counter(shot.view for shot in expected)
-    in_use = run.in_use
+    in_use = run.in_use if in_use is None else in_use
     proven = set()
     for event in journal.read(run.journal_path):
         if isinstance(event, FrameProven):

@@ -35,10 +35,11 @@ img{display:block;background:#000}.bad{color:#b00}.ok{color:#070}.stopped{color:
 """
 
 
-def write(run: Run, path: Path | None = None) -> Path:
-    """Write the run's report into its folder, or to another file; also of an incomplete run."""
+def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> Path:
+    """Write the run's report into its folder, or to another file; also of an incomplete run. Whoever holds the
+    run's lock says whether it is `in_use`."""
     path = path or run.folder / NAME
-    page = _page(run)
+    page = _page(run, status(run, in_use=in_use))
     try:
         write_synced(path, page)
     except OSError as error:
@@ -46,8 +47,7 @@ def write(run: Run, path: Path | None = None) -> Path:
     return path
 
 
-def _page(run: Run) -> str:
-    found = status(run)
+def _page(run: Run, found: Status) -> str:
     events = list(journal.read(run.journal_path))
     proven = [event for event in events if isinstance(event, FrameProven)]
     views = [

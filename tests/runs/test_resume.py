@@ -258,7 +258,9 @@ def test_a_stopped_run_ends_with_its_signals_code_leaves_the_cell_safe_and_is_re
     told = cells.here("status", run).err
     assert "fault" not in told
     assert f"coupole acquire --resume {run}" in told
-    assert "class=bad" not in (run / "report.html").read_text()
+    page = (run / "report.html").read_text()
+    assert "class=bad" not in page
+    assert f"<code>coupole acquire --resume {run}</code>" in page
     assert cell.acquire("--resume", run).code == 0
     cells.assert_each_shot_proven_once(run)
 

@@ -13,7 +13,8 @@ from coupole.devices import ArmState, FrameFormat
 from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
-from coupole.storage.run import Inputs, Run
+from coupole.storage.run import Run
+from coupole.storage.run_inputs import Inputs
 from coupole.storage.view_writer import ViewWriter
 
 FORMAT = FrameFormat(height_px=96, width_px=128, bit_depth=12, bayer_pattern="GBRG", black_dn=64, white_dn=4095)

@@ -78,10 +78,19 @@ class Recorder(Protocol):
 class RunRecorder:
     """Into a run folder."""
 
-    def __init__(self, run: Run, metadata: Mapping[str, Any], *, packed: bool = False) -> None:
-        """Frames may be stored `packed`, two pixels in three bytes."""
+    def __init__(
+        self,
+        run: Run,
+        metadata: Mapping[str, Any],
+        described: Collections | None = None,
+        *,
+        packed: bool = False,
+    ) -> None:
+        """`described` is stored in each view's file, beside the view's own collections. Frames may be stored
+        `packed`, two pixels in three bytes."""
         self._run, self._metadata, self._packed = run, dict(metadata), packed
         self.name = run.folder.name
+        self._described = dict(described or {})
         self._journal = Journal(run.journal_path)
         self._proven = {shot: frame.index for shot, frame in run.proven().items()}
         self._writer: ViewWriter | None = None
@@ -114,7 +123,14 @@ class RunRecorder:
                 if own:
                     raise StorageError(f"{path}: the journal lists proven frames of it, but the file is missing")
                 metadata = {**self._metadata, "title": view}
-                create(path, frames + SPARE_SLOTS, frame_format, metadata, collections, packed=self._packed)
+                create(
+                    path,
+                    frames + SPARE_SLOTS,
+                    frame_format,
+                    metadata,
+                    {**self._described, **collections},
+                    packed=self._packed,
+                )
             self._writer = ViewWriter(path, own)
         self._pose = self._writer.add_pose(arm, base_from_camera)
 
@@ -233,12 +249,7 @@ class DryRecorder:
         self._proven.add(shot)
         judged = self._slots[slot]
         if judged is not None and shot.is_shot:
-            seen = self.exposures.setdefault(self._view, ViewExposure())
-            seen.pictures += 1
-            seen.quantiles.append(judged[0])
-            seen.brightest = max(seen.brightest, judged[0])
-            seen.median_bright = float(np.median(seen.quantiles))
-            seen.saturated = max(seen.saturated, judged[1])
+            self.exposures.setdefault(self._view, ViewExposure()).add_figures(*judged)
 
     def free(self, slot: int) -> None:
         self._slots[slot] = None

@@ -6,12 +6,14 @@ import contextlib
 import os
 import time
 import traceback
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
 
+from coupole.acquisition.conclusion import conclude, open_for_session
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell, open_cell
 from coupole.acquisition.operator import (
@@ -21,6 +23,7 @@ from coupole.acquisition.operator import (
     refuse,
 )
 from coupole.acquisition.recorder import DryRecorder, RunRecorder
+from coupole.acquisition.run_description import described_cell
 from coupole.acquisition.sequencer import Sequencer
 from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.verdict import PROOF_BY
@@ -39,7 +42,6 @@ from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
-from coupole.viewing import report
 from coupole.viewing.progress import Outcome
 from coupole.viewing.terminal import RunObserver, alarm, show_dry_run, show_preflight
 
@@ -58,8 +60,12 @@ def acquire_plan(
     resume: Path | None,
     confirm: bool,
     found: dict[str, Any],
+    with_mesh: bool = False,
 ) -> None:
-    """Run a plan into a run folder; `found` is filled with the figures of `--json`, also when this raises."""
+    """Run a plan into a run folder; `found` is filled with the figures of `--json`, also when this raises.
+
+    A mesh of more than 100 MB is copied into the folder only `with_mesh`.
+    """
     with contextlib.ExitStack() as held:
         run = Run(resume) if resume else None
         if run is not None:
@@ -67,7 +73,9 @@ def acquire_plan(
             run.refuse_old_journal()
             run.refuse_changes(job.inputs)
         job = without_hidden(job, run.hidden_leds if run else None)
-        _acquire_into(run, job, console, parent=parent, confirm=confirm, found=found, held=held)
+        _acquire_into(
+            run, job, console, parent=parent, confirm=confirm, found=found, held=held, with_mesh=with_mesh
+        )
 
 
 def _acquire_into(
@@ -79,6 +87,7 @@ def _acquire_into(
     confirm: bool,
     found: dict[str, Any],
     held: contextlib.ExitStack,
+    with_mesh: bool,
 ) -> None:
     resumed = run is not None
     folder = (run.folder if run else parent or job.cell.storage_folder).resolve()
@@ -97,22 +106,19 @@ def _acquire_into(
     with open_cell(job.cell, job=job, on_opened=identity_printer(console)) as cell:
         room_c = _refuse_other_calibrations(job, cell)
         if run is None:
-            run = Run.create(folder, job.plan.name, job.inputs, about_run(job, cell))
+            inputs = replace(job.inputs, copy_large=with_mesh)
+            run = Run.create(folder, job.plan.name, inputs, about_run(job, cell))
             held.callback(os.close, run.lock())
+        open_for_session(run)
+        held.callback(conclude, run, console)  # when the devices are closed
         console.print(f"run {run.folder}")
         packed = job.cell.rig.storage.pixels == "packed12"
-        recorder = RunRecorder(run, metadata_of_views(job, cell), packed=packed)
+        recorder = RunRecorder(run, metadata_of_views(job, cell), described_cell(job), packed=packed)
         try:
             begun = SessionResumed if resumed else SessionStarted
             acknowledged = faults.begin_session(run.folder.name)
             recorder.note(begun(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledged))
             _acquire(job, cell, run, recorder, console, faults, found=found)
-        except BaseException:
-            with contextlib.suppress(Exception):  # it must not hide the error that ended the run
-                report.write(run)
-            raise
-        else:
-            report.write(run)
         finally:
             recorder.close()
 
@@ -141,6 +147,8 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
     return {
         "simulated": cell.simulated,
         "proof": _proof(job),
+        "licence": job.plan.licence or job.cell.rig.licence,
+        "contact": job.plan.contact or job.cell.rig.contact,
         "object": job.plan.object.id if job.plan.object else None,
         "calibrations": {item.record.kind: item.record.sha256 for item in job.calibrations or ()} or "none",
         "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
@@ -221,7 +229,14 @@ def _acquire(
         for trouble in cell.trouble:
             recorder.note(FaultNoted(kind="unsafe", message=trouble))
             alarm(trouble)
-        recorder.note(SessionStopped(outcome=ended, robot=_statistics(cell)))
+        recorder.note(
+            SessionStopped(
+                outcome=ended,
+                reason=str(failure or ""),
+                dose_lux_h=outcome.dose_lux_h,
+                robot=_statistics(cell),
+            )
+        )
         recorder.close_quietly()
         found.update({**_figures(run, job, outcome), "unsafe": cell.trouble})
         _say_outcome(console, run, outcome, ended)
@@ -256,7 +271,7 @@ def _note_failure(error: BaseException, cell: OpenedCell, run: Run, recorder: Ru
     with contextlib.suppress(OSError):
         path.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
     safe = "; ".join(cell.trouble) or "lights are off, the arm is at rest, the camera is disarmed"
-    error.add_note(f"{safe}; the trace is in {path}; go on with --resume {run.folder}")
+    error.add_note(f"{safe}; the trace is in {path}; go on with `{run.go_on_command}`")
 
 
 def _note_faults_of_the_arm(failure: BaseException | None, cell: OpenedCell, run: Run, faults: ArmFaults) -> None:
@@ -297,7 +312,7 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> No
     )
     console.print(f"  frames  {run.folder / 'views'}\n  report  {run.folder / 'report.html'}")
     if ended != "done":
-        console.print(f"  go on with --resume {run.folder}")
+        console.print(f"  go on   {run.go_on_command}")
 
 
 # -- the dry run ------------------------------------------------------------------------------------------

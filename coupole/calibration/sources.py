@@ -25,8 +25,9 @@ from coupole.calibration.poses import PoseFile, ReportedPoses, read_poses, repor
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError, StorageError
 from coupole.storage import frame_file
+from coupole.storage.durable import sha256
 from coupole.storage.journal_events import FrameProven
-from coupole.storage.run import Run, sha256
+from coupole.storage.run import Run
 from coupole.storage.step_fields import temperature_range_c
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")

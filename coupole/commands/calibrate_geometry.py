@@ -11,7 +11,7 @@ import typer
 
 from coupole.calibration.leds.acceptance import LEDS
 from coupole.calibration.stickers.acceptance import MESH
-from coupole.commands.calibrating import Work, bar, calibration
+from coupole.commands.calibrating import Work, bar, calibration, rig_of
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def leds(
     from coupole.calibration.leds.workflow import leds_from
     from coupole.calibration.posed_camera import read_posed_camera
     from coupole.calibration.report import Outcome
-    from coupole.storage.run import sha256
+    from coupole.storage.durable import sha256
 
     def work(console: Console, request: Request) -> Outcome:
         cell = _cell(rig, runs)
@@ -157,14 +157,7 @@ def _arm(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
 
 
 def _cell(rig: Path | None, runs: list[Path]) -> Cell:
-    """The rig that is named, or that of the first run if its file is unchanged."""
+    """The rig that is named, or the first run's."""
     from coupole.plan.cell import read_cell
-    from coupole.storage.run import Run, sha256
 
-    if rig is not None:
-        return read_cell(rig)
-    about = Run(runs[0]).about["rig"]
-    path = Path(about["path"])
-    if not path.is_file() or sha256(path) != about["sha256"]:
-        raise InputError(f"{runs[0]}: its rig {path} is gone or was changed since; name one with --rig")
-    return read_cell(path)
+    return read_cell(rig or rig_of(runs[0]))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coupole.calibration.light.acceptance import DARK, DRIFT, LED_POWER, RESPONSE
-from coupole.commands.calibrating import EmissionOption, Work, bar, calibration, emission_of
+from coupole.commands.calibrating import EmissionOption, Work, bar, calibration, emission_of, rig_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,7 +30,9 @@ CameraOption = Annotated[
     Path | None, typer.Option("--camera", help="A camera's record; the rig's lens if not given.")
 ]
 TileOption = Annotated[Path, typer.Option("--tile", help="The tile's description (YAML).", show_default=False)]
-RigOption = Annotated[Path, typer.Option("--rig", help="The rig, for its LEDs and support.", show_default=False)]
+RigOption = Annotated[
+    Path | None, typer.Option("--rig", help="The rig, for its LEDs and support; the first run's if not given.")
+]
 HandEyeOption = Annotated[
     Path | None, typer.Option("--hand-eye", help="A record of `calibrate hand-eye`; the rig's if not given.")
 ]
@@ -95,7 +97,7 @@ def flat_field(
 def led_power(
     runs: Runs,
     tile: TileOption,
-    rig: RigOption,
+    rig: RigOption = None,
     leds: LedsOption = None,
     hand_eye: HandEyeOption = None,
     camera: CameraOption = None,
@@ -110,7 +112,10 @@ def led_power(
 
     def work(console: Console, request: Request) -> Outcome:
         frames = _posed(open_light_frames(runs), hand_eye)
-        setting = _setting(frames, tile, rig, leds, hand_eye, camera, dark_record, response_record, flat, emission)
+        used = rig or rig_of(runs[0])
+        setting = _setting(
+            frames, tile, used, leds, hand_eye, camera, dark_record, response_record, flat, emission
+        )
         with bar(console, "frames of the tile") as progress:
             return led_power_outcome(frames, setting, request, progress)
 
@@ -124,7 +129,7 @@ def drift(
         Path, typer.Option("--led-power", help="A record of `calibrate led-power`.", show_default=False)
     ],
     tile: TileOption,
-    rig: RigOption,
+    rig: RigOption = None,
     leds: LedsOption = None,
     hand_eye: HandEyeOption = None,
     camera: CameraOption = None,
@@ -142,7 +147,10 @@ def drift(
 
     def work(console: Console, request: Request) -> Outcome:
         frames = _posed(open_light_frames(runs), hand_eye)
-        setting = _setting(frames, tile, rig, leds, hand_eye, camera, dark_record, response_record, flat, emission)
+        used = rig or rig_of(runs[0])
+        setting = _setting(
+            frames, tile, used, leds, hand_eye, camera, dark_record, response_record, flat, emission
+        )
         with bar(console, "frames with the tile") as progress:
             return drift_outcome(frames, setting, led_power_record, request, progress)
 

@@ -52,6 +52,19 @@ def emission_of(name: str) -> Emission:
     raise InputError(f"--emission: expected lambertian or paper, found {name}")
 
 
+def rig_of(run: Path) -> Path:
+    """A run's rig: its own copy, or in runs without copies the file that it names, if it is unchanged."""
+    from coupole.storage.durable import sha256
+    from coupole.storage.run import Run
+
+    opened = Run(run)
+    path, described = opened.rig_path, opened.about["rig"]
+    unchanged = path.is_file() and ("stored" in described or sha256(path) == described["sha256"])
+    if not unchanged:
+        raise InputError(f"{run}: its rig {path} is gone or was changed since; name one with --rig")
+    return path
+
+
 def calibration(
     kind: str, *, limits: Sequence[Allowed] = (), valid_days: int = 180, lens: bool = True
 ) -> Callable[[Callable[..., Work]], Callable[..., None]]:

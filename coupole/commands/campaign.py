@@ -141,7 +141,9 @@ class Campaign:
         """The step's run, complete."""
         from coupole.acquisition.session import acquire_plan
         from coupole.preflight.job import read_job
-        from coupole.storage.run import Run, sha256, status
+        from coupole.storage.durable import sha256
+        from coupole.storage.run import Run
+        from coupole.storage.run_status import status
 
         plan = self._plan(step)
         begun = sorted((self._out / "runs").glob(f"*-{step.name}"))

@@ -34,6 +34,7 @@ for command in (
     running.confirm,
     running.sim,
     keeping.status,
+    keeping.report,
     keeping.verify,
     keeping.archive,
     keeping.export,

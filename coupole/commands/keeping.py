@@ -1,56 +1,106 @@
-"""Commands on stored data: status, verify, archive, export, scan."""
+"""Commands on stored data: status, report, verify, archive, export, scan."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from coupole.commands.common import JsonOption, RunPath, fail
-from coupole.errors import CoupoleError, InputError
+from coupole.errors import ChecksumMismatch, CoupoleError, InputError, UnprovenError
 from coupole.exchange import FORMATS
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.storage.run import Run
+    from coupole.storage.verification import Verification
 
 
 def status(run: RunPath, as_json: JsonOption = False) -> None:
-    """Progress of a run, also while it is running."""
+    """Progress of a run, also while it is running, and the command line that takes what is left."""
     from coupole.storage.run import Run
-    from coupole.storage.run import status as status_of
+    from coupole.storage.run_status import status as status_of
     from coupole.viewing.terminal import make_console, show_status
 
     found = status_of(Run(run))
     show_status(make_console(quiet=as_json), found)
     if as_json:
-        print(json.dumps({**vars(found), "missing": found.missing}))
+        print(json.dumps(found.figures()))
 
 
-def verify(run: RunPath, as_json: JsonOption = False) -> None:
-    """Read every frame of a run back: completeness and every checksum."""
+def report(
+    run: RunPath,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Another file than RUN/report.html.", show_default=False)
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a run's report from its folder: at any time, also while it is running, and after a crash."""
+    from coupole.acquisition.conclusion import renew_report
+    from coupole.storage.run import Run
+    from coupole.viewing import report as page
+    from coupole.viewing.terminal import make_console
+
+    written = page.write(Run(run), out) if out else renew_report(Run(run))
+    make_console(quiet=as_json).print(f"report {written}")
+    if as_json:
+        print(json.dumps({"report": str(written.resolve())}))
+
+
+def verify(
+    run: RunPath,
+    with_manifest: Annotated[
+        bool, typer.Option("--manifest", help="Enter in manifest.sha256 what it does not list yet.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Read a run back: every frame, its completeness and checksums, and every file that the manifest lists."""
     from rich.progress import Progress
 
-    from coupole.errors import ChecksumMismatch, UnprovenError
+    from coupole.storage import manifest
     from coupole.storage.run import Run
-    from coupole.storage.run import verify as verify_run
+    from coupole.storage.verification import verify as verify_run
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     opened = Run(run)
     with Progress(console=console, disable=not console.is_terminal) as bars:
         bar = bars.add_task("reading back")
-        found = verify_run(opened, lambda done, total: bars.update(bar, completed=done, total=total))
-    for problem in found.bad:
-        console.print(f"[red]bad:[/] {problem}")
-    if found.missing:
-        console.print(f"[red]missing:[/] {len(found.missing)} frames, the first {found.missing[0]}")
+
+        def show(done: int, total: int) -> None:
+            bars.update(bar, completed=done, total=total)
+
+        found = verify_run(opened, show)
+        if with_manifest and not found.bad:
+            with opened.locked():
+                manifest.enter(opened.folder, manifest.unlisted(opened.folder), show)
+            found.unlisted = []
+    _show_verified(console, opened, found)
     if as_json:
-        document = {"ok": found.ok, "proof": opened.proof, "frames": found.frames}
-        print(json.dumps({**document, "bad": found.bad, "missing": found.missing}))
+        document = {"ok": found.ok, "proof": opened.proof, "frames": found.frames, "listed": found.listed}
+        print(json.dumps({**document, **{key: getattr(found, key) for key in ("bad", "missing", "unlisted")}}))
     if found.bad:
-        raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames differ from what was written")
+        raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames and {found.listed} files are not right")
     if found.missing:
-        raise UnprovenError(f"{len(found.missing)} frames of the plan are missing; resume the run")
-    console.print(f"ok: {found.frames} frames, each exactly once, all checksums right; proof: {opened.proof}")
+        raise UnprovenError(
+            f"{len(found.missing)} frames of the plan are missing; go on with `{opened.go_on_command}`"
+        )
+
+
+def _show_verified(console: Console, run: Run, found: Verification) -> None:
+    for problem in found.bad:
+        console.print("[red]bad:[/]", problem)
+    if found.missing:
+        console.print(f"[yellow]missing:[/] {len(found.missing)} frames, the first {found.missing[0]}")
+    if found.ok:
+        console.print(f"ok: {found.frames} frames, each exactly once, all checksums right; proof: {run.proof}")
+    if found.listed and not found.bad:
+        console.print(f"{found.listed} files are as manifest.sha256 lists them")
+    if found.unlisted:
+        console.print(f"not listed there: {', '.join(found.unlisted[:5])}{' ...' if found.unlisted[5:] else ''}")
 
 
 def archive(

@@ -14,19 +14,25 @@ from coupole.errors import CoupoleError
 
 
 def acquire(
-    plan: PlanPath,
+    plan: Annotated[
+        Path | None, typer.Argument(help="The plan (YAML); not needed with --resume.", show_default=False)
+    ] = None,
     rig: RigOption = None,
     output: Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")] = None,
     resume: Annotated[Path | None, typer.Option("--resume", help="Resume this run.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Rehearse on the rig's twin.")] = False,
     speed: Annotated[float, typer.Option("--speed", min=0.1, max=1000, help="Pace of a dry run.")] = 20.0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell moves.")] = False,
+    with_mesh: Annotated[
+        bool, typer.Option("--with-mesh", help="Copy the mesh into the run even if it has more than 100 MB.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run a plan: check it, move, trigger, prove the frames, store them.
 
-    Ctrl-C stops safely (lights off, arm still) and the run can be resumed. SIGUSR1 pauses between bursts, and
-    continues when sent again.
+    Ctrl-C stops safely (lights off, arm still) and the run can be resumed: `acquire --resume RUN`, with the run's
+    own copies of plan and rig, or with the plan again, whose comments alone may have changed. SIGUSR1 pauses
+    between bursts, and continues when sent again.
     """
     from coupole.acquisition.session import acquire_plan, rehearse
     from coupole.preflight.job import read_job
@@ -39,16 +45,27 @@ def acquire(
     console = make_console(quiet=as_json)
     found: dict[str, Any] = {}
     try:
-        job = read_job(plan, rig)
+        job = read_job(plan or _plan_of(resume), rig)
         if dry_run:
             rehearse(job, console, speed=speed, found=found)
         else:
-            acquire_plan(job, console, parent=output, resume=resume, confirm=not yes, found=found)
+            acquire_plan(
+                job, console, parent=output, resume=resume, confirm=not yes, found=found, with_mesh=with_mesh
+            )
     except CoupoleError as error:
         fail(error, as_json=as_json, found=found)
         raise
     if as_json:
         print(json.dumps(found))
+
+
+def _plan_of(resumed: Path | None) -> Path:
+    """The plan of a run that is resumed without naming it."""
+    from coupole.storage.run import Run
+
+    if resumed is None:
+        raise typer.BadParameter("expected the plan (YAML), or --resume with a run's folder")
+    return Run(resumed).plan_path
 
 
 def devices(

@@ -17,6 +17,7 @@ from coupole.geometry import Transform, transform
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 """Letters, digits, dot, underscore, hyphen: it becomes part of file names and shot ids."""
 Vector = tuple[float, float, float]
+Words = Annotated[str, Field(min_length=1, max_length=500)]
 Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
 ExposureUs = Annotated[int, Field(ge=10, le=2_000_000)]
 LedId = Annotated[int, Field(ge=0, le=65534)]
@@ -202,6 +203,10 @@ class Plan(Model):
     darks_per_view: Annotated[int, Field(ge=0, le=1000)] = 2
     trigger: Literal["hardware", "software"] = "hardware"
     reshoot_limit: Annotated[int, Field(ge=0, le=20)] = 3
+    licence: Words | None = None
+    """Terms under which the run's data may be used; None: the rig's. For the run's README.txt."""
+    contact: Words | None = None
+    """Whom to ask about the data; None: the rig's."""
 
     @model_validator(mode="after")
     def _something_to_shoot(self) -> Plan:

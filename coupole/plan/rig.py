@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from coupole.plan.arm_description import ArmDescription
-from coupole.plan.plan import Model, Name, Pose, Vector
+from coupole.plan.plan import Model, Name, Pose, Vector, Words
 from coupole.plan.registry import WORLD, current_name
 
 DriverName = Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"), AfterValidator(current_name)]
@@ -201,6 +201,10 @@ class Rig(Model):
     calibrations: Literal["none"] | tuple[Path, ...] = "none"
     """Records that must be in force for plans without a list of their own."""
     world: WorldSection | None = None
+    licence: Words | None = None
+    """Terms under which the data of its runs may be used, where the plan has none."""
+    contact: Words | None = None
+    """Whom to ask about them."""
 
     @property
     def frame_bytes(self) -> int:

@@ -126,7 +126,11 @@ def read(path: Path) -> Document:
     Raises InputError: no file, not UTF-8, tabs as indentation, YAML syntax, duplicate keys, unknown
     tags, empty file, root not a mapping.
     """
-    text = _text(path)
+    return parse(path, text_of(path))
+
+
+def parse(path: Path, text: str) -> Document:
+    """The same of a file's text; `path` is where it is, or was."""
     tabs = [
         Problem(str(path), number, len(line) - len(line.lstrip(" ")) + 1, "", "a tab; indent with spaces")
         for number, line in enumerate(text.split("\n"), start=1)
@@ -134,7 +138,7 @@ def read(path: Path) -> Document:
     ]
     if tabs:
         raise InputError(tabs)
-    root = _compose(path, text)
+    root = compose(path, text)
     if root is None:
         raise InputError([Problem(str(path), 0, 0, "", "the file is empty; expected a mapping of keys to values")])
     builder = _Builder(path)
@@ -146,7 +150,7 @@ def read(path: Path) -> Document:
     return Document(path, data, builder.value_places, builder.key_places)
 
 
-def _text(path: Path) -> str:
+def text_of(path: Path) -> str:
     """The file as text, without byte order mark, with LF line ends."""
     try:
         if not path.exists():
@@ -167,7 +171,7 @@ def _text(path: Path) -> str:
         raise InputError([_problem_after(path, before, message)]) from error
 
 
-def _compose(path: Path, text: str) -> Node | None:
+def compose(path: Path, text: str) -> Node | None:
     """The graph of YAML nodes, None when the file has no content."""
     yaml = YAML(typ="safe", pure=True)
     yaml.composer.warn_double_anchors = False  # YAML 1.2 (3.2.2.2): a later anchor may replace an earlier one

@@ -20,11 +20,11 @@ from coupole.plan.bursts import FASTEST, Pace
 from coupole.plan.cell import Cell
 from coupole.plan.plan import Plan
 from coupole.plan.reading import read_plan
-from coupole.plan.rig_devices import runs_tables
+from coupole.plan.rig_devices import described_arm, runs_tables
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.yamlfile import Document
 from coupole.preflight.object_shape import ObjectShape, read_object
-from coupole.storage.run import Inputs
+from coupole.storage.run_inputs import Inputs
 
 if TYPE_CHECKING:
     from coupole.calibration.in_force import InForce
@@ -52,7 +52,7 @@ class Job:
         """Files that a run of this job depends on."""
         others = [self.cell.leds_path] + ([self.shape.mesh_path] if self.shape.mesh_path else [])
         others += [item.path for item in self.calibrations or ()]
-        return Inputs(self.document.path, self.cell.document.path, tuple(others))
+        return Inputs(self.document.path, self.cell.document.path, tuple(others), described_arm(self.cell.rig))
 
 
 def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:

@@ -7,13 +7,12 @@ the journal records how frames were taken, and is not changed.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from coupole.errors import UnprovenError
-from coupole.storage import frame_file
+from coupole.storage import frame_file, manifest
 from coupole.storage.archive_view import ArchivedView, Progress, archive_view
 from coupole.storage.bitshuffle import Codec
 from coupole.storage.run import Run
@@ -68,8 +67,7 @@ def archive_run(
     `partial`), ChecksumMismatch if a frame is not what was proven, before or after, and DiskFull; the current view
     is then unchanged.
     """
-    held = run.lock()
-    try:
+    with run.locked():
         proven = run.proven()
         missing = [shot for shot in run.expected_shots() if shot not in proven]
         if missing and not partial:
@@ -85,10 +83,11 @@ def archive_run(
             if frame_file.read_layout(path).archived:
                 result.already.append(view)
                 continue
+            name, kept = str(path.relative_to(run.folder)), f"{KEPT_FOLDER}/{path.name}"
+            manifest.forget(run.folder, [name])
             frames = [frame for frame in proven.values() if run.folder / frame.file == path]
             done = archive_view(path, frames, codec, progress, keep_in=run.folder / KEPT_FOLDER if keep else None)
+            manifest.enter(run.folder, [name, kept] if keep else [name])
             result.views.append(done)
             on_view(done)
-    finally:
-        os.close(held)
     return result

@@ -30,6 +30,7 @@ import coupole
 from coupole.errors import ChecksumMismatch, DiskFull, StorageError
 from coupole.storage import bitshuffle, frame_file
 from coupole.storage.bitshuffle import Codec
+from coupole.storage.durable import sync_folder
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.line_file import utc_now
 
@@ -317,15 +318,7 @@ def _replace(path: Path, partial: Path, keep_in: Path | None) -> None:
         linked = kept.exists() and kept.samefile(path)  # by an interrupted call
         if not linked:
             os.link(path, kept)
-        _sync_folder(keep_in)
-        _sync_folder(keep_in.parent)
+        sync_folder(keep_in)
+        sync_folder(keep_in.parent)
     partial.rename(path)
-    _sync_folder(path.parent)
-
-
-def _sync_folder(folder: Path) -> None:
-    fd = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+    sync_folder(path.parent)

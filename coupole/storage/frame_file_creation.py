@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,46 @@ from numpy.typing import NDArray
 
 from coupole.devices import FrameFormat
 from coupole.storage.disk_errors import disk_error
+from coupole.storage.durable import sync_folder
 from coupole.storage.frame_file import DATA, FRAME_DTYPE, MAX_POSES, PAGE, POSE_DTYPE
+from coupole.storage.line_file import utc_now
 
-Collections = Mapping[str, Mapping[str, NDArray[np.generic]]]
-"""Arrays by name, by name of their group in the entry (NXcollection)."""
+
+@dataclass(frozen=True)
+class Quantity:
+    """An array, or one value, with what its attributes say."""
+
+    values: NDArray[np.generic] | float | str
+    units: str = ""
+    frame: str = ""
+    """The frame of reference of positions and directions."""
+
+
+Collections = Mapping[str, Mapping[str, Quantity | NDArray[np.generic]]]
+"""Arrays by name, by the path of their group in the entry (NXcollection)."""
+
+_MAPS_CAMERA = "base_from_camera maps camera coordinates (x right, y down, z forward) to the robot's base"
+_MAPS_FLANGE = "base_from_flange maps coordinates of the flange to the robot's base"
+_POSES_ATTRIBUTES = {
+    "t_ns_units": "ns",
+    "joints_deg_units": "degree",
+    "base_from_flange_units": "mm",
+    "base_from_camera_units": "mm",
+    "frames_of_reference": f"{_MAPS_CAMERA}; {_MAPS_FLANGE}; 4x4, p_base = matrix @ (x, y, z, 1)",
+}
+_FRAMES_ATTRIBUTES = {
+    "state_values": "0 free, 1 a frame that is not proven, 2 the proven frame of `shot`",
+    "led_none": 65535,
+    "exposure_us_units": "us",
+    "t_trigger_ns_units": "ns",
+    "t_trigger_ns_clock": "the LED box's; the host's where the box has none",
+    "camera_ns_units": "ns",
+    "camera_ns_clock": "the camera's",
+    "board_temperature_dc_units": "0.1 degC",
+    "led_current_ma_units": "mA",
+    "xxh3": "xxh3-64 of the pixels as little-endian uint16",
+    "pose": "row of /entry/instrument/robot/poses",
+}
 
 
 def create(
@@ -43,14 +80,12 @@ def create(
             for name, arrays in (collections or {}).items():
                 collection = _group(file["entry"], name, "NXcollection")
                 for key, values in arrays.items():
-                    collection[key] = values
+                    _store(collection, key, values)
         with partial.open("r+b") as file_on_disk:
             os.posix_fallocate(file_on_disk.fileno(), 0, partial.stat().st_size)
             os.fsync(file_on_disk.fileno())
         partial.rename(path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        os.fsync(folder)
-        os.close(folder)
+        sync_folder(path.parent)
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise disk_error(path, error) from error
@@ -61,9 +96,13 @@ def _describe(
 ) -> None:
     file.attrs["default"] = "entry"
     entry = _group(file, "entry", "NXentry", default="data")
+    entry["definition"] = "NXentry"  # base classes only: there is no application definition of a dome
     entry["title"] = metadata["title"]
+    entry["start_time"] = utc_now()
     for key, value in metadata.items():
         entry.attrs[key] = value
+    if "base_from_support" in metadata:
+        entry.attrs["base_from_support_units"] = "mm"
     instrument = _group(entry, "instrument", "NXinstrument")
     instrument["name"] = "La Coupole"
     detector = _group(instrument, "detector", "NXdetector")
@@ -74,7 +113,8 @@ def _describe(
         data.attrs["packing"] = "three bytes hold two pixels a, b: a[7:0], b[3:0] a[11:8], b[11:4] (GenICam 12p)"
     data.attrs["units"] = "DN"
     data.attrs["long_name"] = "raw frames, one a slot; `frames` says what each slot holds"
-    _contiguous(detector, "frames", (slots,), FRAME_DTYPE, fill=True)
+    frames = _contiguous(detector, "frames", (slots,), FRAME_DTYPE, fill=True)
+    frames.attrs.update(_FRAMES_ATTRIBUTES)
     detector["bit_depth_readout"] = frame_format.bit_depth
     detector["saturation_value"] = frame_format.white_dn
     detector["black_level"] = frame_format.black_dn
@@ -83,7 +123,8 @@ def _describe(
         detector[axis] = float(metadata["pixel_pitch_um"])
         detector[axis].attrs["units"] = "um"
     robot = _group(instrument, "robot", "NXpositioner")
-    _contiguous(robot, "poses", (MAX_POSES,), POSE_DTYPE, fill=True)
+    poses = _contiguous(robot, "poses", (MAX_POSES,), POSE_DTYPE, fill=True)
+    poses.attrs.update(_POSES_ATTRIBUTES)
     sample = _group(entry, "sample", "NXsample")
     sample["name"] = metadata["sample"]
     shown = _group(entry, "data", "NXdata", signal="data")
@@ -96,6 +137,14 @@ def _group(parent: h5py.Group, name: str, nx_class: str, **attributes: str) -> h
     for key, value in attributes.items():
         group.attrs[key] = value
     return group
+
+
+def _store(group: h5py.Group, name: str, value: Quantity | NDArray[np.generic]) -> None:
+    given = value if isinstance(value, Quantity) else Quantity(value)
+    group[name] = given.values
+    for key in ("units", "frame"):
+        if text := getattr(given, key):
+            group[name].attrs[key] = text
 
 
 def _contiguous(

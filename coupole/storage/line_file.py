@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from coupole.storage.disk_errors import disk_error
+from coupole.storage.durable import sync_folder
 
 
 def utc_now() -> str:
@@ -24,6 +25,8 @@ class LineFile:
         try:
             self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
             self.was_empty = os.fstat(self._fd).st_size == 0
+            if self.was_empty:  # perhaps made just now
+                sync_folder(path.parent)
             self._end_torn_line()
         except OSError as error:
             raise disk_error(path, error) from error

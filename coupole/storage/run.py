@@ -1,81 +1,51 @@
-"""A run folder: create, open, status, verify.
+"""A run folder: create, open, lock.
 
 ::
 
     RUN/
-      run.json        the request, operator and software; plan, rig and other files with their SHA-256
-      journal.jsonl   one line per event; a `frame` line for each proven shot
-      views/NAME.h5   frames
-      report.html     report with pictures
+      run.json          the request, operator and software; plan, rig and other files with their SHA-256
+      inputs/           copies of these files
+      journal.jsonl     one line per event; a `frame` line for each proven shot
+      views/NAME.h5     frames
+      report.html       report with pictures
+      README.txt        what this folder is, for readers without Coupole
+      manifest.sha256   checksums of the files
 """
 
 from __future__ import annotations
 
 import fcntl
 import getpass
-import hashlib
 import json
 import os
 import platform
-from collections import Counter
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+import shlex
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, assert_never
+from typing import Any
 
 import coupole
 from coupole.errors import InputError, StorageError
 from coupole.plan.shot_id import Led, ShotId, ShotLabel
-from coupole.storage import frame_file, journal, run_dose
+from coupole.storage import frame_file, journal, manifest
+from coupole.storage.durable import make_folder, sync_folder, write_synced
 from coupole.storage.journal_events import (
     JOURNAL_VERSION,
-    ArmSettled,
-    BurstBegun,
-    BurstEnded,
-    Continued,
-    Event,
     FaultNoted,
     FrameProven,
-    GapFound,
-    JournalBegun,
-    MoveBegun,
-    Paused,
-    ReshootBegun,
     SessionResumed,
     SessionStarted,
-    SessionStopped,
-    ViewBegun,
-    ViewSealed,
 )
 from coupole.storage.line_file import utc_now
+from coupole.storage.run_inputs import Inputs, changes_since, keep
+from coupole.storage.run_readme import readme
 
 SCHEMA_VERSION = 1
-
-
-def sha256(path: Path) -> str:
-    """Hex digest of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """Files that a run depends on; a run can be resumed only with unchanged ones."""
-
-    plan: Path
-    rig: Path
-    others: tuple[Path, ...]
-
-    def describe(self) -> dict[str, Any]:
-        def one(path: Path) -> dict[str, str]:
-            return {"path": str(path), "sha256": sha256(path)}
-
-        return {
-            "plan": {**one(self.plan), "text": self.plan.read_text(encoding="utf-8")},
-            "rig": {**one(self.rig), "text": self.rig.read_text(encoding="utf-8")},
-            "files": [one(path) for path in self.others],
-        }
+RUN_JSON = "run.json"
+_LOCK_TRIALS, _LOCK_NAP_S = 20, 0.01
 
 
 class Run:
@@ -85,7 +55,7 @@ class Run:
         """Open an existing run. Raises InputError if there is none."""
         self.folder = folder.resolve()
         try:
-            self.about: dict[str, Any] = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+            self.about: dict[str, Any] = json.loads((folder / RUN_JSON).read_text(encoding="utf-8"))
         except (OSError, json.JSONDecodeError) as error:
             raise InputError(f"{folder}: not a run folder: {error}") from error
         if self.about.get("schema_version") != SCHEMA_VERSION:
@@ -96,10 +66,10 @@ class Run:
 
     @staticmethod
     def create(parent: Path, name: str, inputs: Inputs, about: dict[str, Any]) -> Run:
-        """Make `<UTC time>-<name>` under `parent`."""
+        """Make `<UTC time>-<name>` under `parent`, with copies of the inputs; on the disk when this returns."""
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         try:
-            parent.mkdir(parents=True, exist_ok=True)
+            make_folder(parent)
             folder = _new_folder(parent, f"{stamp}-{name}")
             (folder / "views").mkdir()
             described = {
@@ -109,10 +79,12 @@ class Run:
                 "host": platform.node(),
                 "operator": _user(),
                 **about,
-                **inputs.describe(),
+                **keep(inputs, folder),
             }
-            text = json.dumps(described, indent=2, ensure_ascii=False)
-            _write_synced(folder / "run.json", text)
+            write_synced(folder / "README.txt", readme(folder.name, described))
+            write_synced(folder / RUN_JSON, json.dumps(described, indent=2, ensure_ascii=False))
+            sync_folder(parent)
+            manifest.begin(folder)
         except OSError as error:
             raise StorageError(f"{parent}: cannot make a run folder: {error.strerror}") from error
         return Run(folder)
@@ -170,13 +142,58 @@ class Run:
 
     def lock(self) -> int:
         """Lock the run for this process. Raises InputError if another process acquires into it."""
-        fd = os.open(self.folder / "run.json", os.O_RDONLY)
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(fd)
-            raise InputError(f"{self.folder}: another process is acquiring into this run") from error
+        fd = os.open(self.folder / RUN_JSON, os.O_RDONLY)
+        for last in (*[False] * _LOCK_TRIALS, True):
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except OSError as error:
+                if last:
+                    os.close(fd)
+                    raise InputError(f"{self.folder}: another process is acquiring into this run") from error
+                time.sleep(_LOCK_NAP_S)  # `in_use` holds it for a moment
         return fd
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """The lock while the context lasts."""
+        held = self.lock()
+        try:
+            yield
+        finally:
+            os.close(held)
+
+    @property
+    def in_use(self) -> bool:
+        """True while a process acquires into the run, or archives it."""
+        fd = os.open(self.folder / RUN_JSON, os.O_RDONLY)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            return True
+        finally:
+            os.close(fd)
+        return False
+
+    @property
+    def plan_path(self) -> Path:
+        """The plan to go on with: the run's own copy, or in runs without copies the file that was named."""
+        return self._input("plan")
+
+    @property
+    def rig_path(self) -> Path:
+        """The rig, likewise."""
+        return self._input("rig")
+
+    def _input(self, what: str) -> Path:
+        described = self.about[what]
+        return self.folder / described["stored"] if "stored" in described else Path(described["path"])
+
+    @property
+    def go_on_command(self) -> str:
+        """The whole command line that resumes the run."""
+        plan = "" if "stored" in self.about["plan"] else f"{shlex.quote(self.about['plan']['path'])} "
+        return f"coupole acquire {plan}--resume {shlex.quote(str(self.folder))}"
 
     def refuse_old_journal(self) -> None:
         """Raise InputError if the journal has an old version, which can be read but not continued."""
@@ -188,19 +205,13 @@ class Run:
             )
 
     def refuse_changes(self, inputs: Inputs) -> None:
-        """Raise InputError unless plan, rig and the files they name are those that the run began with."""
-        now = inputs.describe()
-        changed = [
-            f"{what} ({now[what]['path']})"
-            for what in ("plan", "rig")
-            if now[what]["sha256"] != self.about[what]["sha256"]
-        ]
-        before = Counter(entry["sha256"] for entry in self.about["files"])
-        changed += [entry["path"] for entry in now["files"] if not before[entry["sha256"]]]
-        if changed:
+        """Raise InputError unless plan, rig and the files they name mean what those meant that the run began
+        with."""
+        if changed := changes_since(self.about, self.folder, inputs):
             raise InputError(
-                f"{self.folder}: cannot be resumed: {', '.join(changed)} changed since the run began. "
-                "Put the old file back, or start a new run."
+                f"{self.folder}: cannot be resumed, because this changed since the run began: "
+                f"{'; '.join(changed)}. Put the old value or file back, go on with the run's own copies by "
+                f"`{self.go_on_command}`, or start a new run."
             )
 
 
@@ -225,129 +236,3 @@ def _user() -> str:
         return getpass.getuser()
     except (OSError, KeyError):
         return "unknown"
-
-
-def _write_synced(path: Path, text: str) -> None:
-    with path.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-@dataclass
-class Status:
-    """Progress of a run, by its journal alone."""
-
-    state: str = "created"
-    proof: str = ""
-    """What the identity of its frames rests on."""
-    shots: int = 0
-    proven: int = 0
-    darks_proven: int = 0
-    reshot: int = 0
-    faults: list[str] = field(default_factory=list)
-    views: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Proven and expected frames of each view."""
-    last_event: str = ""
-    dose_lux_h: float = 0.0
-    """Light on the object in all sessions."""
-
-    @property
-    def missing(self) -> int:
-        return self.shots - self.proven
-
-
-def status(run: Run) -> Status:
-    """Progress of a run, also of one that is running."""
-    found = Status(proof=run.proof)
-    expected = list(run.expected_shots())
-    found.shots = sum(shot.is_shot for shot in expected)
-    per_view = Counter(shot.view for shot in expected)
-    proven = set(run.proven())
-    found.proven = sum(shot.is_shot for shot in proven)
-    found.darks_proven = len(proven) - found.proven
-    proven_per_view = Counter(shot.view for shot in proven)
-    found.views = {view: (proven_per_view[view], count) for view, count in per_view.items()}
-    for event in journal.read(run.journal_path):
-        _note_event(found, event)
-    found.dose_lux_h = run_dose.highest_lux_h(journal.read(run.journal_path))
-    return found
-
-
-def _note_event(found: Status, event: Event) -> None:
-    found.last_event = event.t
-    match event:
-        case SessionStarted() | SessionResumed() | Continued():
-            found.state = "running or interrupted"
-        case Paused():
-            found.state = "paused"
-        case SessionStopped():
-            found.state = event.outcome
-        case ReshootBegun():
-            found.reshot += len(event.shots)
-        case FaultNoted():
-            found.faults.append(event.message)
-        case JournalBegun() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
-            pass
-        case BurstBegun() | BurstEnded() | GapFound() | ViewSealed():
-            pass
-        case _:
-            assert_never(event)
-
-
-@dataclass
-class Verification:
-    """Result of `verify`."""
-
-    frames: int = 0
-    bad: list[str] = field(default_factory=list)
-    """One line for each error."""
-    missing: list[str] = field(default_factory=list)
-
-    @property
-    def ok(self) -> bool:
-        return not self.bad and not self.missing
-
-
-def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Verification:
-    """Read every proven frame back: each shot of the plan exactly once, each record and checksum right."""
-    result = Verification()
-    proven = run.proven()
-    result.missing = [str(shot) for shot in run.expected_shots() if shot not in proven]
-    by_file: dict[str, list[FrameProven]] = {}
-    for frame in proven.values():
-        by_file.setdefault(frame.file, []).append(frame)
-    lines = Counter(event.shot for event in journal.read(run.journal_path) if isinstance(event, FrameProven))
-    result.bad += [f"{shot}: proven {n} times in the journal" for shot, n in lines.items() if n > 1]
-    done = 0
-    for name, frames in sorted(by_file.items()):
-        path = run.folder / name
-        try:
-            layout, table = frame_file.read_layout(path), frame_file.read_frames(path)
-        except StorageError as error:
-            result.bad.append(str(error))
-            continue
-        claimed = Counter(record["shot"] for record in table if record["state"] == frame_file.PROVEN)
-        result.bad += [f"{name}: {shot.decode()} is in {n} slots" for shot, n in claimed.items() if n > 1]
-        for frame in sorted(frames, key=lambda f: f.index):
-            if problem := _frame_problem(path, layout, table, frame):
-                result.bad.append(problem)
-            result.frames += 1
-            done += 1
-            progress(done, len(proven))
-    return result
-
-
-def _frame_problem(path: Path, layout: frame_file.Layout, table: Any, frame: FrameProven) -> str:
-    if not 0 <= frame.index < layout.frames:
-        return f"{frame.shot}: slot {frame.index} is not in {path.name}"
-    record = table[frame.index]
-    if record["state"] != frame_file.PROVEN or record["shot"].decode() != str(frame.shot):
-        return f"{frame.shot}: slot {frame.index} of {path.name} is recorded as `{record['shot'].decode()}`"
-    try:
-        found = frame_file.checksum(frame_file.read_frame(path, layout, frame.index))
-    except StorageError as error:
-        return f"{frame.shot}: {error}"
-    if not f"{found:016x}" == f"{int(record['xxh3']):016x}" == frame.xxh3:
-        return f"{frame.shot}: slot {frame.index} of {path.name} has checksum {found:016x}, not {frame.xxh3}"
-    return ""

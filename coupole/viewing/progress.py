@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from coupole.plan.shot_id import ShotId
 
 
@@ -51,6 +54,19 @@ class ViewExposure:
     median_bright: float = 0.0
     """Median over the sampled frames of that quantile."""
     quantiles: list[float] = field(default_factory=list)
+
+    def add(self, raw: NDArray[np.uint16], *, black_dn: int, white_dn: int) -> None:
+        """Count one more frame of the sample, [H, W] in DN."""
+        brightest = (float(np.quantile(raw, 0.999)) - black_dn) / (white_dn - black_dn)
+        self.add_figures(brightest, float(np.mean(raw >= white_dn)))
+
+    def add_figures(self, brightest: float, saturated: float) -> None:
+        """The same of a frame whose quantile (share of full scale) and share of saturated pixels are known."""
+        self.pictures += 1
+        self.quantiles.append(brightest)
+        self.brightest = max(self.brightest, brightest)
+        self.median_bright = float(np.median(self.quantiles))
+        self.saturated = max(self.saturated, saturated)
 
     def verdict(self) -> str:
         """`over-exposed`, `under-exposed` or `well exposed`."""

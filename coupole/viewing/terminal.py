@@ -14,10 +14,11 @@ from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from coupole.plan.bursts import BurstTiming
 from coupole.preflight.preflight import Report
-from coupole.storage.run import Status
+from coupole.storage.run_status import Status
 from coupole.viewing.progress import Outcome, ViewExposure
 from coupole.viewing.progress import Progress as RunProgress
 
@@ -176,17 +177,23 @@ def show_views(console: Console, report: Report) -> None:
 
 
 def show_status(console: Console, status: Status) -> None:
-    """Progress of a run."""
+    """Progress of a run; only what failed is red."""
+    colour = {"done": "green", "failed": "red"}.get(status.state, "yellow")
     console.print(
-        f"{status.state}: {status.proven} of {status.shots} shots proven, {status.darks_proven} dark frames, "
-        f"{status.reshot} re-shot; last event {status.last_event or 'none'}"
+        f"[{colour}]{status.state}[/]: {status.proven} of {status.shots} shots proven, {status.darks_proven} dark "
+        f"frames, {status.reshot} re-shot; last event {status.last_event or 'none'}"
     )
+    if status.reason and status.reason not in status.faults:
+        console.print(f"  {status.reason}", markup=False)
     console.print(f"  proof: {status.proof}")
     console.print(f"  light on the object: {status.dose_lux_h:.3f} lux.h")
     for view, (proven, expected) in status.views.items():
         console.print(f"  {view}: {proven} of {expected} frames")
     for fault in status.faults:
-        console.print(f"  [red]fault:[/] {fault}")
+        console.print("  [red]fault:[/]", Text(fault))
+    if status.go_on:
+        console.print(f"  {status.frames_left} frames are left; go on with")
+        console.print(f"  {status.go_on}", markup=False, soft_wrap=True)
 
 
 def show_dry_run(

@@ -28,7 +28,8 @@ from coupole.plan.plan import Pose
 from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
-from coupole.storage.run import Inputs, Run
+from coupole.storage.run import Run
+from coupole.storage.run_inputs import Inputs
 from coupole.storage.view_writer import ViewWriter
 
 FLANGE_FROM_CAMERA = frame(np.array([31.0, -42.0, 118.0]), np.array([4.0, -3.0, 60.0]))

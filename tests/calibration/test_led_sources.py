@@ -18,7 +18,8 @@ from coupole.plan.led_table import LedTable
 from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped
-from coupole.storage.run import Inputs, Run
+from coupole.storage.run import Run
+from coupole.storage.run_inputs import Inputs
 from coupole.storage.view_writer import ViewWriter
 
 SHAPE = (96, 128)

@@ -16,6 +16,8 @@ import cells
 import pytest
 from cells import SIDE, TOP, CellFolder, Ended, Stored
 
+from coupole.preflight.job import read_job
+from coupole.storage.run import Run
 from sim.world.client import World
 
 MANY_LIGHTS = {"kind": "every", "every": 4}
@@ -78,7 +80,11 @@ def _pixels_of(run: Path, shots: Any) -> dict[str, bytes]:
 def test_a_killed_run_has_kept_part_of_a_burst(killed: Killed) -> None:
     assert 20 < len(_proven(killed.run)) < len(cells.labels(killed.run))
     assert cells.events(killed.run, "stop") == []
-    assert cells.here("status", killed.run, "--json").document["state"] == "running or interrupted"
+    found = cells.here("status", killed.run, "--json").document
+    assert (found["state"], found["faults"]) == ("interrupted", [])
+    assert "it was killed, or the power failed" in found["reason"]
+    assert found["go_on"] == f"coupole acquire --resume {killed.run}"
+    assert found["frames_left"] == 2 * len(cells.labels(killed.run)) - len(_proven(killed.run))
 
 
 def test_verify_says_five_of_a_run_that_is_not_complete(killed: Killed) -> None:
@@ -170,9 +176,11 @@ def test_a_run_is_not_resumed_with_a_changed_file(killed: Killed, tmp_path: Path
     changed = tmp_path / name
     match changed.suffix:
         case ".yaml":
-            changed.write_text(changed.read_text() + "\n")
+            data = json.loads(changed.read_text())
+            data |= {"gain_db": 3} if name == "plan.yaml" else {"sensor": {**data["sensor"], "black_dn": 65}}
+            changed.write_text(json.dumps(data))
         case ".csv":
-            changed.write_text("# another dome\n" + changed.read_text())
+            changed.write_text(changed.read_text().replace("0,0,", "0,1,", 1))
         case _:
             data = bytearray(changed.read_bytes())
             data[1000] ^= 1
@@ -181,6 +189,24 @@ def test_a_run_is_not_resumed_with_a_changed_file(killed: Killed, tmp_path: Path
     assert ended.code == 2
     assert name in ended.err
     assert (run / "journal.jsonl").read_bytes() == before
+
+
+def test_a_refused_change_is_named_with_both_values(killed: Killed, tmp_path: Path) -> None:
+    cell, run = killed.copy(tmp_path)
+    cell.plan.write_text(cell.plan.read_text().replace('"exposure_us": 8000', '"exposure_us": 9000'))
+    assert "exposure.exposure_us was 8000, is 9000" in cell.acquire("--resume", run).err
+
+
+def test_comments_another_order_and_another_place_of_a_file_are_no_change(killed: Killed, tmp_path: Path) -> None:
+    cell, run = killed.copy(tmp_path)
+    (tmp_path / "mesh").mkdir()
+    shutil.move(tmp_path / "relief.ply", tmp_path / "mesh/other.ply")
+    data = json.loads(cell.plan.read_text())
+    data["object"]["mesh"] = "mesh/other.ply"
+    again = json.dumps(dict(reversed(data.items())), indent=3)
+    cell.plan.write_text(f"# the same, said again\n{again}\n")
+    (tmp_path / "coupole.csv").write_text("# checked in May\n" + (tmp_path / "coupole.csv").read_text())
+    Run(run).refuse_changes(read_job(cell.plan).inputs)
 
 
 def test_a_folder_that_is_no_run_is_not_resumed(cell: CellFolder) -> None:
@@ -226,7 +252,15 @@ def test_a_stopped_run_ends_with_its_signal_leaves_the_cell_safe_and_is_resumed(
     assert ended.code == code
     assert ended.document["exit_code"] == code
     assert cells.events(run, "stop")[-1]["outcome"] == "interrupted"
-    assert cells.here("status", run, "--json").document["state"] == "interrupted"
+    found = cells.here("status", run, "--json").document
+    assert (found["state"], found["faults"]) == ("interrupted", [])
+    assert f"({number.name})" in found["reason"]
+    told = cells.here("status", run).err
+    assert "fault" not in told
+    assert f"coupole acquire --resume {run}" in told
+    page = (run / "report.html").read_text()
+    assert "class=bad" not in page
+    assert f"<code>coupole acquire --resume {run}</code>" in page
     assert cell.acquire("--resume", run).code == 0
     cells.assert_each_shot_proven_once(run)
 

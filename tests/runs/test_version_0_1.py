@@ -15,7 +15,8 @@ from places import REPO
 from coupole.calibration.record import read_record
 from coupole.plan.cell import read_cell
 from coupole.storage import journal
-from coupole.storage.run import Run, status
+from coupole.storage.run import Run
+from coupole.storage.run_status import status
 
 WITNESS = REPO / "tests/data/version-0.1"
 RIGS = sorted(path.name for path in (WITNESS / "rigs").glob("*.yaml"))

@@ -23,10 +23,10 @@ from coupole.devices import FrameFormat
 from coupole.errors import ChecksumMismatch, InputError, StorageError, UnprovenError
 from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file
-from coupole.storage import run as run_module
 from coupole.storage.archive import KEPT_FOLDER, Archived, archive_run
 from coupole.storage.bitshuffle import CODECS, FILL_DN, codec_of, compressed_tiles, tile_shape
 from coupole.storage.run import Run
+from coupole.storage.verification import verify
 from coupole.storage.view_writer import ViewWriter
 
 LZ4 = CODECS["lz4"]
@@ -171,7 +171,7 @@ def test_slots_without_a_proven_frame_are_free_and_read_as_65535(archived: MadeR
 
 
 def test_an_archived_run_verifies(archived: MadeRun) -> None:
-    found = run_module.verify(archived.run)
+    found = verify(archived.run)
     assert (found.ok, found.frames) == (True, 8)
 
 
@@ -182,7 +182,7 @@ def test_verify_finds_a_flipped_byte_of_an_archive(made: MadeRun, codec: str) ->
     with h5py.File(path) as file:
         chunk = file[DATA].id.get_chunk_info_by_coord((frame.index, 0, 0))
     flip_byte(path, chunk.byte_offset + chunk.size // 2)
-    found = run_module.verify(made.run)
+    found = verify(made.run)
     assert len(found.bad) == 1
     assert found.bad[0].startswith("top/led0001/e0: ")
 
@@ -199,7 +199,7 @@ def test_frames_of_an_odd_size_are_archived_too(tmp_path: Path) -> None:
     odd = FrameFormat(height_px=301, width_px=523, bit_depth=12, bayer_pattern="MONO", black_dn=64, white_dn=4095)
     made = make_run(tmp_path, views=("odd",), shots=2, of=odd)
     archive_run(made.run, LZ4)
-    assert run_module.verify(made.run).ok
+    assert verify(made.run).ok
 
 
 # -- figures ----------------------------------------------------------------------------------------------
@@ -239,7 +239,7 @@ def test_files_are_kept_as_they_were_where_that_is_asked(made: MadeRun) -> None:
     kept = made.run.folder / KEPT_FOLDER
     assert {path.name: path.read_bytes() for path in kept.iterdir()} == before
     assert found.figures()["freed_bytes"] < 0
-    assert run_module.verify(made.run).ok
+    assert verify(made.run).ok
 
 
 def test_a_call_that_ended_after_keeping_a_file_is_gone_on_with(made: MadeRun) -> None:
@@ -253,7 +253,7 @@ def test_what_a_killed_call_left_is_written_over(made: MadeRun) -> None:
     (made.run.folder / "views" / "top.archive").write_bytes(b"\x89HDF torn")
     archive_run(made.run, LZ4)
     assert sorted(views_bytes(made.run)) == ["side.h5", "top.h5"]
-    assert run_module.verify(made.run).ok
+    assert verify(made.run).ok
 
 
 def test_a_run_that_is_not_complete_is_refused(tmp_path: Path) -> None:

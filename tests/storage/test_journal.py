@@ -105,6 +105,30 @@ def test_a_torn_last_line_is_closed_on_reopening_and_the_next_is_whole(tmp_path:
     assert tags(path) == ["journal", "start", "resume"]
 
 
+@pytest.mark.parametrize("hole", [b"\x00", b"\xff", b"\xff\xfe", b"\x00\x00\x00{", b"\n\x00"], ids=repr)
+@pytest.mark.parametrize("count", [1, 7, 512, 4096])
+def test_a_tail_of_what_a_disk_gives_for_lost_sectors_is_passed_over(
+    tmp_path: Path, hole: bytes, count: int
+) -> None:
+    """A file system may have made the file longer before the bytes came: zeros, or 0xff on flash."""
+    path = tmp_path / "journal.jsonl"
+    written(path, [SessionStarted(), FRAME])
+    with path.open("ab") as file:
+        file.write(hole * count)
+    assert tags(path) == ["journal", "start", "frame"]
+    written(path, [SessionResumed(), FRAME])
+    assert tags(path) == ["journal", "start", "frame", "resume", "frame"]
+    assert journal.tail(path, 10**6) == list(journal.read(path))
+
+
+def test_a_line_whose_first_sectors_are_lost_is_passed_over_and_the_next_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "journal.jsonl"
+    written(path, [SessionStarted(), FRAME, SessionStopped(outcome="done")])
+    first, start, frame, stop = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(first + start + bytes(len(frame) - 9) + frame[-9:] + stop)
+    assert tags(path) == ["journal", "start", "stop"]
+
+
 @pytest.mark.parametrize(
     "line",
     [

@@ -10,10 +10,13 @@ from view_files import frame, write_view
 
 from coupole.errors import InputError
 from coupole.plan.shot_id import ShotId
-from coupole.storage import frame_file, run
+from coupole.storage import frame_file
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted
-from coupole.storage.run import Inputs, Run
+from coupole.storage.run import Run
+from coupole.storage.run_inputs import Inputs
+from coupole.storage.run_status import status
+from coupole.storage.verification import verify
 from coupole.storage.view_writer import ViewWriter
 
 
@@ -44,7 +47,7 @@ def prove_in(diary: Journal, shot: str, slot: int, checksum: str) -> None:
 
 
 def test_a_whole_run_verifies(finished: Run) -> None:
-    found = run.verify(finished)
+    found = verify(finished)
     assert found.ok
     assert found.frames == 3
 
@@ -57,7 +60,7 @@ def test_verify_finds_a_flipped_byte(finished: Run) -> None:
         byte = file.read(1)
         file.seek(-1, os.SEEK_CUR)
         file.write(bytes([byte[0] ^ 1]))
-    found = run.verify(finished)
+    found = verify(finished)
     assert not found.ok
     assert len(found.bad) == 1
     assert found.bad[0].startswith("top/led0001/e0: slot 1 of top.h5 has checksum ")
@@ -66,7 +69,7 @@ def test_verify_finds_a_flipped_byte(finished: Run) -> None:
 def test_verify_finds_a_missing_shot(finished: Run) -> None:
     lines = finished.journal_path.read_text().splitlines(keepends=True)
     finished.journal_path.write_text("".join(line for line in lines if "led0002" not in line))
-    found = run.verify(finished)
+    found = verify(finished)
     assert found.missing == ["top/led0002/e0"]
     assert not found.ok
 
@@ -76,7 +79,18 @@ def test_verify_finds_a_shot_that_stands_in_two_slots(finished: Run) -> None:
     slot = writer.put(frame(9), frame_id=200, camera_ns=9, exposure_us=8000)
     writer.prove(slot, "top/led0001/e0")
     writer.close()
-    assert run.verify(finished).bad == ["views/top.h5: top/led0001/e0 is in 2 slots"]
+    assert verify(finished).bad == ["views/top.h5: top/led0001/e0 is in 2 slots"]
+
+
+def test_what_a_crash_left_in_the_frame_table_alone_is_missing_and_not_bad(finished: Run) -> None:
+    """Twice synced as proven, and twice the journal's line was lost: only the journal counts."""
+    lines = finished.journal_path.read_text().splitlines(keepends=True)
+    finished.journal_path.write_text("".join(line for line in lines if "led0001" not in line))
+    writer = ViewWriter(finished.view_path("top"), {f"top/led{k:04d}/e0": k for k in range(3)})
+    writer.prove(writer.put(frame(9), frame_id=200, camera_ns=9, exposure_us=8000), "top/led0001/e0")
+    writer.close()
+    found = verify(finished)
+    assert (found.bad, found.missing) == ([], ["top/led0001/e0"])
 
 
 def test_verify_finds_a_shot_that_was_proven_twice(finished: Run) -> None:
@@ -85,7 +99,7 @@ def test_verify_finds_a_shot_that_was_proven_twice(finished: Run) -> None:
     prove_in(diary, proven.shot, proven.index, proven.xxh3)
     diary.commit()
     diary.close()
-    assert run.verify(finished).bad == ["top/led0001/e0: proven 2 times in the journal"]
+    assert verify(finished).bad == ["top/led0001/e0: proven 2 times in the journal"]
 
 
 def test_verify_finds_a_record_that_names_another_shot(finished: Run) -> None:
@@ -94,12 +108,12 @@ def test_verify_finds_a_record_that_names_another_shot(finished: Run) -> None:
     with path.open("r+b") as file:
         file.seek(layout.table_offset + frame_file.FRAME_DTYPE.fields["shot"][1])  # type: ignore[index]
         file.write(b"top/led0007/e0")
-    assert run.verify(finished).bad == ["top/led0000/e0: slot 0 of top.h5 is recorded as `top/led0007/e0`"]
+    assert verify(finished).bad == ["top/led0000/e0: slot 0 of top.h5 is recorded as `top/led0007/e0`"]
 
 
 def test_verify_finds_a_view_that_is_gone(finished: Run) -> None:
     finished.view_path("top").unlink()
-    found = run.verify(finished)
+    found = verify(finished)
     assert len(found.bad) == 1
     assert "top.h5" in found.bad[0]
 
@@ -107,7 +121,7 @@ def test_verify_finds_a_view_that_is_gone(finished: Run) -> None:
 def test_status_counts_proven_and_missing_shots(finished: Run) -> None:
     lines = finished.journal_path.read_text().splitlines(keepends=True)
     finished.journal_path.write_text("".join(lines[:-1]))
-    found = run.status(finished)
+    found = status(finished)
     assert (found.shots, found.proven, found.missing) == (3, 2, 1)
 
 

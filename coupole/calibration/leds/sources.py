@@ -17,9 +17,10 @@ from coupole.calibration.sources import About, about_of, frames_sha256, poses_an
 from coupole.errors import InputError
 from coupole.plan.led_table import LedTable
 from coupole.plan.shot_id import Led, ShotId
+from coupole.storage.durable import sha256
 from coupole.storage.frame_file import Layout, read_facts, read_frame, read_frames, read_layout
 from coupole.storage.journal_events import FrameProven
-from coupole.storage.run import Run, sha256
+from coupole.storage.run import Run
 from coupole.storage.step_fields import temperature_range_c
 
 

@@ -19,8 +19,9 @@ from coupole.calibration.sources import About, about_of, frames_sha256, poses_an
 from coupole.errors import InputError
 from coupole.plan.shot_id import Led, PanelMark, ShotId
 from coupole.storage import frame_file
+from coupole.storage.durable import sha256
 from coupole.storage.journal_events import FrameProven
-from coupole.storage.run import Run, sha256
+from coupole.storage.run import Run
 
 CHANNELS = ("R", "G", "B")
 

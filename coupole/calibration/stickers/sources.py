@@ -14,7 +14,7 @@ from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import Sources
 from coupole.calibration.stickers.detection import Sticker, find_stickers
 from coupole.errors import InputError
-from coupole.storage.run import sha256
+from coupole.storage.durable import sha256
 
 TARGETS, MESH = "targets.csv", "mesh.ply"
 _COORDINATES = ("x_mm", "y_mm", "z_mm")

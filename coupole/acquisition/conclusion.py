@@ -1,0 +1,62 @@
+"""Begin and end of a session for the run's folder: its manifest and its report. No device is open when it ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from coupole.storage import manifest
+from coupole.storage.run import Run
+from coupole.viewing import report
+from coupole.viewing.terminal import bytes_text
+
+MOST_HASHED_BYTES = 2_000_000_000
+"""Views of more bytes together are left to `verify --manifest` and to `archive`, so that a session ends soon."""
+
+
+def open_for_session(run: Run) -> None:
+    """Take out of the manifest what the session may write."""
+    manifest.open_for_session(run.folder, complete_views(run))
+
+
+def complete_views(run: Run) -> list[str]:
+    """Files of the views whose frames are all proven, relative to the run: nothing writes into them any more."""
+    proven = run.proven()
+    left = {shot.view for shot in run.expected_shots() if shot not in proven}
+    files = (run.view_path(view) for view in run.about["views"] if view not in left)
+    return [str(path.relative_to(run.folder)) for path in files if path.is_file()]
+
+
+def renew_report(run: Run) -> Path:
+    """Write the report again, and enter it in the manifest unless a session is writing the run. Raises
+    StorageError."""
+    if run.in_use:
+        return report.write(run)
+    with run.locked():
+        manifest.forget(run.folder, [report.NAME])
+        path = report.write(run, in_use=False)
+        manifest.enter(run.folder, [report.NAME])
+    return path
+
+
+def conclude(run: Run, console: Console) -> None:
+    """Write the report and enter in the manifest what is complete. Never raises: the run itself has ended."""
+    try:
+        report.write(run, in_use=False)
+        changed = {name for name in manifest.unlisted(run.folder) if not name.startswith(f"{manifest.VIEWS}/")}
+        manifest.enter(run.folder, sorted(changed))
+        listed = manifest.read(run.folder)
+        views = [name for name in complete_views(run) if name not in listed]
+        size = sum((run.folder / name).stat().st_size for name in views)
+        if size > MOST_HASHED_BYTES:
+            console.print(
+                f"  {bytes_text(size)} of frames are not in {manifest.NAME} yet: "
+                f"`coupole verify {run.folder} --manifest` enters them"
+            )
+        elif views:
+            manifest.enter(run.folder, views)
+    except KeyboardInterrupt:
+        console.print(f"  {manifest.NAME} is not complete: `coupole verify {run.folder} --manifest` completes it")
+    except Exception as error:  # noqa: BLE001  it must not hide what ended the run
+        console.print(f"  [yellow]the report or {manifest.NAME} could not be written:[/] {error}")

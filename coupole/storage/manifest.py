@@ -1,0 +1,139 @@
+"""`manifest.sha256`: SHA-256 of a run's files; in the run's folder `sha256sum -c manifest.sha256` checks it.
+
+At every moment, also after a crash, all that it lists is on the disk and unchanged: files that a session writes
+(journal, views, report) are taken out of the list before the session begins, and entered when they are complete.
+What is not listed yet, `verify --manifest` enters.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import threading
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from coupole.errors import StorageError
+from coupole.storage.disk_errors import disk_error
+from coupole.storage.durable import sha256, write_synced
+
+NAME = "manifest.sha256"
+VIEWS = "views"
+_CHANGING = ("journal.jsonl", "report.html")
+_UNFINISHED = (".part", ".archive")
+_CHUNK_BYTES = 4 * 2**20
+
+Progress = Callable[[int, int], None]
+"""Files hashed so far, and all."""
+
+
+def read(run: Path) -> dict[str, str]:
+    """SHA-256 by path in the run; empty without a manifest. Raises StorageError for a line that is none."""
+    path = run / NAME
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return {}
+    except (OSError, UnicodeDecodeError) as error:
+        raise StorageError(f"{path}: cannot be read: {error}") from error
+    found = {}
+    for number, line in enumerate(lines, 1):
+        digest, _, name = line.partition("  ")
+        if len(digest) != 64 or not name:
+            raise StorageError(f"{path}: line {number} is not a SHA-256, two spaces, and a file")
+        found[name] = digest
+    return found
+
+
+def files(run: Path) -> list[str]:
+    """Every file that a manifest can list, sorted; unfinished ones and the manifest itself are left out."""
+    found = [str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()]
+    return sorted(name for name in found if name != NAME and not name.endswith(_UNFINISHED))
+
+
+def begin(run: Path) -> None:
+    """List the files of a new run, which its sessions will not change."""
+    _write(run, {name: sha256(run / name) for name in files(run)})
+
+
+def open_for_session(run: Path, complete_views: Iterable[str]) -> None:
+    """Before a session: take out what it may write. `complete_views` are files of views that it will not open."""
+    kept = set(complete_views)
+    forget(run, [name for name in read(run) if _written_by_sessions(name) and name not in kept])
+
+
+def forget(run: Path, names: Iterable[str]) -> None:
+    """Take files out of the list before they change. Nothing happens without a manifest."""
+    listed, gone = read(run), set(names)
+    if gone & listed.keys():
+        _write(run, {name: digest for name, digest in listed.items() if name not in gone})
+
+
+def _written_by_sessions(name: str) -> bool:
+    return name in _CHANGING or name.startswith(f"{VIEWS}/")
+
+
+def enter(run: Path, names: Iterable[str], progress: Progress = lambda done, total: None) -> None:
+    """Hash these files at low priority and list them; take out those that are `gone`. Raises StorageError."""
+    wanted = list(names)
+    listed = read(run)
+    stop = threading.Event()
+    with ThreadPoolExecutor(1, "manifest", initializer=_yield_to_others) as hashing:
+        try:
+            for done, name in enumerate(wanted):
+                progress(done, len(wanted))
+                listed[name] = hashing.submit(_synced_sha256, run / name, stop).result()
+        finally:
+            stop.set()
+    _write(run, listed)
+    progress(len(wanted), len(wanted))
+
+
+def _yield_to_others() -> None:
+    """Lowest priority, for the calling thread only, as Linux has it."""
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
+
+
+def _synced_sha256(path: Path, stop: threading.Event) -> str:
+    """Of a file that is on the disk first: the manifest must not know of more than the disk."""
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+            while (chunk := file.read(_CHUNK_BYTES)) and not stop.is_set():
+                digest.update(chunk)
+    except OSError as error:
+        raise disk_error(path, error) from error
+    return digest.hexdigest()
+
+
+def problems(run: Path, progress: Progress = lambda done, total: None) -> dict[str, str]:
+    """What is wrong with each listed file that is missing or has changed, by its name."""
+    listed, found = read(run), {}
+    for done, (name, digest) in enumerate(listed.items()):
+        progress(done, len(listed))
+        try:
+            same = sha256(run / name) == digest
+        except OSError as error:
+            found[name] = f"{name}: is in {NAME}, but cannot be read: {error.strerror}"
+        else:
+            if not same:
+                found[name] = f"{name}: is not what {NAME} lists: it was changed, or the disk failed"
+    return found
+
+
+def unlisted(run: Path) -> list[str]:
+    """Files that the manifest does not cover (yet)."""
+    listed = read(run)
+    return [name for name in files(run) if name not in listed]
+
+
+def _write(run: Path, listed: dict[str, str]) -> None:
+    text = "".join(f"{digest}  {name}\n" for name, digest in sorted(listed.items()))
+    try:
+        write_synced(run / NAME, text)
+    except OSError as error:
+        raise disk_error(run / NAME, error) from error

@@ -1,0 +1,276 @@
+"""What a run depends on: plan, rig and the files that they name, kept in the run's folder `inputs/`.
+
+::
+
+    inputs/plan.yaml  rig.yaml      as they were, but with the paths of the copies
+           dome/                    LED table
+           object/                  mesh
+           arm/                     description of the arm, meshes of its links
+           calibrations/NAME/       a record and its files
+
+Paths that are no files to be read (the storage folder, a joined world) become absolute. `run.json` has hash and
+unchanged text of plan and rig, and the hash of every other file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Set
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from coupole.errors import InputError
+from coupole.plan import yamlfile
+from coupole.plan.arm_description import ArmDescription
+from coupole.plan.link_meshes import LINKS, link_mesh_path
+from coupole.plan.plan import Plan
+from coupole.plan.rewriting import differences, named_paths, rewritten
+from coupole.plan.rig import Rig
+from coupole.plan.validation_messages import KeyPath
+from coupole.plan.yamlfile import Document
+from coupole.storage.durable import make_folder, sha256, sync_folder, write_synced
+
+FOLDER = "inputs"
+PLAN, RIG = f"{FOLDER}/plan.yaml", f"{FOLDER}/rig.yaml"
+MOST_COPIED_BYTES = 100_000_000
+"""A larger file is named by its hash, and copied on request."""
+_CHUNK_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Files that a run depends on; a run can be resumed only with files that mean the same."""
+
+    plan: Path
+    rig: Path
+    others: tuple[Path, ...]
+    """LED table, mesh, calibration records."""
+    arm: ArmDescription | None = None
+    """The arm in force, whatever names it."""
+    copy_large: bool = False
+    """Copy files of more than MOST_COPIED_BYTES, too."""
+
+
+def keep(inputs: Inputs, run: Path) -> dict[str, Any]:
+    """Copy the inputs into a run's folder; returns what `run.json` says of them. All is on the disk afterwards."""
+    keeper = _Keeper(run, inputs.copy_large)
+    make_folder(run / FOLDER)
+    described = {
+        "plan": {**_described(inputs.plan), "text": _text(inputs.plan), "stored": PLAN},
+        "rig": {**_described(inputs.rig), "text": _text(inputs.rig), "stored": RIG},
+    }
+    write_synced(run / PLAN, keeper.plan_text(inputs))
+    write_synced(run / RIG, keeper.rig_text(inputs))
+    others = {path.resolve() for path in inputs.others}
+    files = [{**_described(path), "stored": keeper.file(path, "others")} for path in inputs.others]
+    files += [
+        {**_described(path), "stored": stored}
+        for path, stored in keeper.stored.items()
+        if path not in others and path.is_file()
+    ]
+    for folder in {run / FOLDER, *((run / stored).parent for stored in keeper.stored.values() if stored)}:
+        sync_folder(folder)
+    arm = {} if inputs.arm is None else {"arm_sha256": _arm_sha256(inputs.arm)}
+    return {**described, **arm, "files": files}
+
+
+def _arm_sha256(arm: ArmDescription) -> str:
+    """Of all that the description says; the meshes of its links are compared as files."""
+    return hashlib.sha256(arm.model_dump_json(exclude={"link_meshes"}).encode()).hexdigest()
+
+
+def _described(path: Path) -> dict[str, str]:
+    return {"path": str(path), "sha256": sha256(path)}
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def _read(path: Path, model: type[Plan] | type[Rig]) -> tuple[Document, BaseModel] | None:
+    """A plan or rig and its model; None if it is none."""
+    try:
+        document = yamlfile.read(path)
+        return document, document.validate(model)
+    except InputError:
+        return None
+
+
+@dataclass
+class _Keeper:
+    """Copies files into a run, each once."""
+
+    run: Path
+    copy_large: bool
+    stored: dict[Path, str | None] = field(default_factory=dict)
+    """Place in the run, by resolved path; None for a file that is too large."""
+
+    def plan_text(self, inputs: Inputs) -> str:
+        read = _read(inputs.plan, Plan)
+        if read is None:
+            return _text(inputs.plan)
+        return self._with_copies(*read, {("rig",): Path(RIG).name})
+
+    def rig_text(self, inputs: Inputs) -> str:
+        read = _read(inputs.rig, Rig)
+        if read is None:
+            return _text(inputs.rig)
+        changes: dict[KeyPath, str] = {}
+        document, rig = read
+        if inputs.arm is not None and not isinstance(document.data.get("arm"), dict):
+            changes[("arm",)] = self._arm(document, inputs.arm)
+        return self._with_copies(document, rig, changes)
+
+    def _with_copies(self, document: Document, model: BaseModel, changes: dict[KeyPath, str]) -> str:
+        for at, written in named_paths(model):
+            if at not in changes:
+                path = document.resolve(written)
+                stored = self._copy(at, path)
+                changes[at] = str(path) if stored is None else str(Path(stored).relative_to(FOLDER))
+        return rewritten(document, yamlfile.text_of(document.path), changes)
+
+    def _copy(self, at: KeyPath, path: Path) -> str | None:
+        """Place of the copy of what stands at this key path; None if it is not copied."""
+        match at:
+            case ("dome", _):
+                return self.file(path, "dome")
+            case ("object", "mesh"):
+                return self.file(path, "object")
+            case ("calibrations", _):
+                return self._record(path)
+            case ("link_meshes",) | ("arm", "link_meshes"):
+                return self._link_meshes(path)
+        return None
+
+    def file(self, path: Path, folder: str) -> str | None:
+        """Copy a file into a folder of `inputs`; None if it is too large, or not there."""
+        path = path.resolve()
+        if path not in self.stored:
+            if not path.is_file() or (path.stat().st_size > MOST_COPIED_BYTES and not self.copy_large):
+                self.stored[path] = None
+            else:
+                name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)
+                self.stored[path] = self._new_place(f"{FOLDER}/{folder}", name)
+                _copy_synced(path, self.run / str(self.stored[path]))
+        return self.stored[path]
+
+    def _new_place(self, folder: str, name: str) -> str:
+        taken = set(self.stored.values())
+        places = (f"{folder}/{name}" if n == 1 else f"{folder}/{n}/{name}" for n in range(1, len(taken) + 2))
+        return next(place for place in places if place not in taken)
+
+    def _record(self, path: Path) -> str | None:
+        """A calibration record, and beside it the files that it names."""
+        folder = f"calibrations/{re.sub(r'[^A-Za-z0-9._-]', '_', path.stem)}"
+        stored = self.file(path, folder)
+        if stored is not None:
+            for name in _files_of_record(path):
+                beside = self.run / Path(stored).with_name(name)
+                if not beside.exists():
+                    self.stored[(path.parent / name).resolve()] = str(Path(stored).with_name(name))
+                    _copy_synced(path.parent / name, beside)
+        return stored
+
+    def _link_meshes(self, folder: Path) -> str | None:
+        places = [self.file(link_mesh_path(folder, link), "arm/link_meshes") for link in range(LINKS)]
+        return str(Path(places[0]).parent) if all(places) and places[0] else None
+
+    def _arm(self, document: Document, arm: ArmDescription) -> str:
+        """The arm's file, or a new one for the arm that comes with Coupole for the robot's driver."""
+        named = document.data.get("arm")
+        place = f"{FOLDER}/arm/{Path(named).name if named else 'arm.yaml'}"
+        meshes = self._link_meshes(arm.link_meshes) if arm.link_meshes else None
+        beside = None if meshes is None else str(Path(meshes).relative_to(f"{FOLDER}/arm"))
+        make_folder(self.run / FOLDER / "arm")
+        if named:
+            source = yamlfile.read(document.resolve(Path(named)))
+            link_meshes = beside or (str(arm.link_meshes) if arm.link_meshes else None)
+            changes: dict[KeyPath, str] = {("link_meshes",): link_meshes} if link_meshes else {}
+            text = rewritten(source, yamlfile.text_of(source.path), changes)
+            self.stored[source.path.resolve()] = place
+        else:
+            shipped = arm.model_copy(update={"link_meshes": Path(beside) if beside else arm.link_meshes})
+            text = shipped.model_dump_json(indent=1, exclude_none=True) + "\n"
+        write_synced(self.run / place, text)
+        return str(Path(place).relative_to(FOLDER))
+
+
+def _files_of_record(path: Path) -> Iterator[str]:
+    try:
+        listed = yamlfile.read(path).data.get("files", [])
+    except InputError:
+        return
+    for entry in listed if isinstance(listed, list) else []:
+        name = entry.get("name") if isinstance(entry, dict) else None
+        if isinstance(name, str) and Path(name).name == name and (path.parent / name).is_file():
+            yield name
+
+
+def _copy_synced(path: Path, to: Path) -> None:
+    make_folder(to.parent)
+    with path.open("rb") as source, to.open("wb") as copy:
+        while chunk := source.read(_CHUNK_BYTES):
+            copy.write(chunk)
+        copy.flush()
+        os.fsync(copy.fileno())
+
+
+# -- what may not change --------------------------------------------------------------------------------------
+
+
+def changes_since(about: Mapping[str, Any], run: Path, now: Inputs) -> list[str]:
+    """How plan, rig and the files that they name differ in meaning from those that a run began with.
+
+    Comments, the order of keys, and the place of a file are no change; any other byte of a mesh or a record is.
+    """
+    arm_known = now.arm is not None and "arm_sha256" in about
+    found = [
+        *_changes_of(about["plan"], now.plan, Plan, "plan"),
+        *_changes_of(about["rig"], now.rig, Rig, "rig", {"arm"} if arm_known else set()),
+    ]
+    before = Counter(entry["sha256"] for entry in about["files"])
+    kept = [run / entry["stored"] for entry in about["files"] if entry.get("stored")]
+    before.update(_meaning(path) for path in kept if path.is_file())
+    found += [
+        f"{path} is another file" for path in now.others if not (before[sha256(path)] or before[_meaning(path)])
+    ]
+    if now.arm is not None and arm_known and about["arm_sha256"] != _arm_sha256(now.arm):
+        found.append("the description of the arm")
+    return found
+
+
+def _changes_of(
+    before: Mapping[str, str],
+    path: Path,
+    model: type[Plan] | type[Rig],
+    what: str,
+    apart: Set[str] = frozenset(),
+) -> Iterator[str]:
+    if sha256(path) == before["sha256"]:
+        return
+    try:
+        then = yamlfile.parse(Path(before["path"]), _plain(before["text"])).validate(model)
+    except InputError:
+        yield f"the {what} {path} is another file, and the old one is not understood any more"
+        return
+    now = yamlfile.read(path).validate(model)
+    if found := differences(then, now, apart):
+        yield f"the {what} {path}: {'; '.join(found)}"
+
+
+def _plain(text: str) -> str:
+    return text.removeprefix("\ufeff").replace("\r\n", "\n")
+
+
+def _meaning(path: Path) -> str:
+    """Hash of what counts in a file: of a table's lines without comments, and of all bytes of another file."""
+    if path.suffix.lower() != ".csv":
+        return sha256(path)
+    lines = [line.strip() for line in path.read_bytes().splitlines()]
+    return hashlib.sha256(b"\n".join(line for line in lines if line and not line.startswith(b"#"))).hexdigest()

@@ -1,0 +1,166 @@
+"""Progress of a run and the story of its sessions, by its journal and its lock."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, assert_never
+
+from coupole.storage import journal, run_dose
+from coupole.storage.journal_events import (
+    ArmSettled,
+    BurstBegun,
+    BurstEnded,
+    Continued,
+    Event,
+    FaultNoted,
+    FrameProven,
+    GapFound,
+    JournalBegun,
+    MoveBegun,
+    Paused,
+    ReshootBegun,
+    SessionResumed,
+    SessionStarted,
+    SessionStopped,
+    ViewBegun,
+    ViewSealed,
+)
+from coupole.storage.run import Run
+
+RUNNING, PAUSED, CREATED = "running", "paused", "created"
+KILLED = "its last session has no end: it was killed, or the power failed"
+_STOPPED_IN_0_1 = "Interrupted"
+"""Kind of fault as which version 0.1 noted that the operator had stopped the session."""
+
+
+@dataclass
+class Session:
+    """One session of a run. Times are UTC, ISO 8601."""
+
+    begun: str
+    ended: str = ""
+    """Time of its last event so far."""
+    outcome: str = ""
+    """`done`, `interrupted` or `failed`; empty while it runs, and for one that was killed."""
+    reason: str = ""
+    """Why it ended, if not because all was done."""
+    pauses: int = 0
+    paused_s: float = 0.0
+    light_s: float = 0.0
+    """Sum of the on-times of its LEDs."""
+    dose_lux_h: float | None = None
+    """None for one that was killed, or by a version that did not note it."""
+
+    @property
+    def duration_s(self) -> float:
+        """From its begin to its last event, pauses included, by this machine's clock."""
+        return _seconds(self.begun, self.ended)
+
+
+@dataclass
+class Status:
+    """Progress of a run."""
+
+    state: str = CREATED
+    """`created`, `running`, `paused`, `done`, `interrupted` (by a person, a signal, a crash) or `failed`."""
+    reason: str = ""
+    """Why it is interrupted or failed."""
+    proof: str = ""
+    """What the identity of its frames rests on."""
+    shots: int = 0
+    proven: int = 0
+    darks_proven: int = 0
+    reshot: int = 0
+    faults: list[str] = field(default_factory=list)
+    """What failed. That somebody stopped the run is none."""
+    sessions: list[Session] = field(default_factory=list)
+    views: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Proven and expected frames of each view."""
+    last_event: str = ""
+    dose_lux_h: float = 0.0
+    """Light on the object in all sessions."""
+    go_on: str = ""
+    """The command line that takes what is left; empty if nothing is, or while the run is in use."""
+
+    @property
+    def missing(self) -> int:
+        return self.shots - self.proven
+
+    @property
+    def frames_left(self) -> int:
+        """Shots and dark frames that are not proven."""
+        return sum(expected - proven for proven, expected in self.views.values())
+
+    def figures(self) -> dict[str, Any]:
+        """Content of `--json`."""
+        sessions = [{**vars(one), "duration_s": round(one.duration_s, 3)} for one in self.sessions]
+        return {**vars(self), "sessions": sessions, "missing": self.missing, "frames_left": self.frames_left}
+
+
+def status(run: Run, *, in_use: bool | None = None) -> Status:
+    """Progress of a run, also of one that is running. Whoever holds its lock says whether it is `in_use`."""
+    found = Status(proof=run.proof)
+    expected = list(run.expected_shots())
+    found.shots = sum(shot.is_shot for shot in expected)
+    per_view = Counter(shot.view for shot in expected)
+    in_use = run.in_use if in_use is None else in_use
+    proven = set()
+    events = list(journal.read(run.journal_path))
+    found.dose_lux_h = run_dose.highest_lux_h(events)
+    for event in events:
+        if isinstance(event, FrameProven):
+            proven.add(event.shot)
+        _note_event(found, event)
+    found.proven = sum(shot.is_shot for shot in proven)
+    found.darks_proven = len(proven) - found.proven
+    proven_per_view = Counter(shot.view for shot in proven)
+    found.views = {view: (proven_per_view[view], count) for view, count in per_view.items()}
+    if in_use and found.state == CREATED:
+        found.state = RUNNING
+    if not in_use and found.state in (RUNNING, PAUSED):
+        found.state, found.reason = "interrupted", KILLED
+    if found.frames_left and not in_use:
+        found.go_on = run.go_on_command
+    return found
+
+
+def _note_event(found: Status, event: Event) -> None:
+    before, found.last_event = found.last_event, event.t
+    session = found.sessions[-1] if found.sessions else Session(begun=event.t)
+    match event:
+        case SessionStarted() | SessionResumed():
+            found.state, found.reason = RUNNING, ""
+            session = Session(begun=event.t)
+            found.sessions.append(session)
+        case Continued():
+            found.state = RUNNING
+            session.paused_s += _seconds(before, event.t)
+        case Paused():
+            found.state = PAUSED
+            session.pauses += 1
+        case SessionStopped():
+            found.state, found.reason = event.outcome, event.reason or found.reason
+            session.outcome, session.reason, session.dose_lux_h = event.outcome, found.reason, event.dose_lux_h
+        case ReshootBegun():
+            found.reshot += len(event.shots)
+        case FaultNoted():
+            found.reason = event.message
+            if event.kind != _STOPPED_IN_0_1:
+                found.faults.append(event.message)
+        case BurstEnded():
+            session.light_s += event.on_s
+        case JournalBegun() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
+            pass
+        case BurstBegun() | GapFound() | ViewSealed():
+            pass
+        case _:
+            assert_never(event)
+    session.ended = event.t
+
+
+def _seconds(begun: str, ended: str) -> float:
+    if not begun or not ended:
+        return 0.0
+    return (datetime.fromisoformat(ended) - datetime.fromisoformat(begun)).total_seconds()

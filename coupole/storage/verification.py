@@ -1,0 +1,84 @@
+"""Reads a run back: every proven frame, and every file that its manifest lists."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from coupole.errors import StorageError
+from coupole.storage import frame_file, journal, manifest
+from coupole.storage.journal_events import FrameProven
+from coupole.storage.run import Run
+
+
+@dataclass
+class Verification:
+    """Result of `verify`."""
+
+    frames: int = 0
+    bad: list[str] = field(default_factory=list)
+    """One line for each error."""
+    missing: list[str] = field(default_factory=list)
+    listed: int = 0
+    """Files of the manifest, each read and compared."""
+    unlisted: list[str] = field(default_factory=list)
+    """Files that the manifest does not cover yet."""
+
+    @property
+    def ok(self) -> bool:
+        return not self.bad and not self.missing
+
+
+def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Verification:
+    """Read every proven frame back: each shot of the plan exactly once, each record and checksum right. Compare
+    every file that the manifest lists."""
+    result = Verification()
+    proven = run.proven()
+    result.missing = [str(shot) for shot in run.expected_shots() if shot not in proven]
+    by_file: dict[str, list[FrameProven]] = {}
+    for frame in proven.values():
+        by_file.setdefault(frame.file, []).append(frame)
+    lines = Counter(event.shot for event in journal.read(run.journal_path) if isinstance(event, FrameProven))
+    result.bad += [f"{shot}: proven {n} times in the journal" for shot, n in lines.items() if n > 1]
+    done = 0
+    for name, frames in sorted(by_file.items()):
+        path = run.folder / name
+        try:
+            layout, table = frame_file.read_layout(path), frame_file.read_frames(path)
+        except StorageError as error:
+            result.bad.append(str(error))
+            continue
+        claimed = Counter(record["shot"] for record in table if record["state"] == frame_file.PROVEN)
+        shots = {str(frame.shot).encode() for frame in frames}  # what the journal does not know, a crash left
+        twice = [shot for shot in sorted(shots) if claimed[shot] > 1]
+        result.bad += [f"{name}: {shot.decode()} is in {claimed[shot]} slots" for shot in twice]
+        for frame in sorted(frames, key=lambda f: f.index):
+            if problem := _frame_problem(path, layout, table, frame):
+                result.bad.append(problem)
+            result.frames += 1
+            done += 1
+            progress(done, len(proven))
+    told = {name for name in by_file if any(Path(name).name in problem for problem in result.bad)}
+    result.bad += [problem for name, problem in manifest.problems(run.folder).items() if name not in told]
+    result.listed = len(manifest.read(run.folder))
+    result.unlisted = manifest.unlisted(run.folder)
+    return result
+
+
+def _frame_problem(path: Path, layout: frame_file.Layout, table: Any, frame: FrameProven) -> str:
+    if not 0 <= frame.index < layout.frames:
+        return f"{frame.shot}: slot {frame.index} is not in {path.name}"
+    record = table[frame.index]
+    if record["state"] != frame_file.PROVEN or record["shot"] != str(frame.shot).encode():
+        shown = record["shot"].decode(errors="replace")
+        return f"{frame.shot}: slot {frame.index} of {path.name} is recorded as `{shown}`"
+    try:
+        found = frame_file.checksum(frame_file.read_frame(path, layout, frame.index))
+    except StorageError as error:
+        return f"{frame.shot}: {error}"
+    if not f"{found:016x}" == f"{int(record['xxh3']):016x}" == frame.xxh3:
+        return f"{frame.shot}: slot {frame.index} of {path.name} has checksum {found:016x}, not {frame.xxh3}"
+    return ""

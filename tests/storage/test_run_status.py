@@ -1,0 +1,110 @@
+"""The story of a run's sessions: what stopped it, what failed, what is left, and how to go on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import cells
+import pytest
+from archives import make_run
+
+from coupole.storage.journal import event_line
+from coupole.storage.journal_events import (
+    BurstEnded,
+    Continued,
+    Event,
+    FaultNoted,
+    Paused,
+    SessionResumed,
+    SessionStarted,
+    SessionStopped,
+)
+from coupole.storage.run import Run
+from coupole.storage.run_status import Status, status
+from coupole.viewing import report
+
+T = "2026-01-01T00:00:{:06.3f}Z"
+
+
+def told(run: Run, events: Sequence[Event]) -> Status:
+    """Status of a run whose journal has these events, a second apart, before its frames."""
+    lines = [line for line in run.journal_path.read_text().splitlines(keepends=True) if '"frame"' in line]
+    lines += [event_line(event.model_copy(update={"t": T.format(n)})) for n, event in enumerate(events)]
+    run.journal_path.write_text("".join(lines))
+    return status(run)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return make_run(tmp_path, shots=2, missing=("side/led0001/e0",)).run
+
+
+STOPPED = SessionStopped(outcome="interrupted", reason="stopped by the operator (SIGINT)", dose_lux_h=0.25)
+FAULT = FaultNoted(kind="DeviceLost", message="the box is gone", device="ledbox")
+
+
+def test_an_operators_stop_is_a_reason_and_no_fault(run: Run) -> None:
+    found = told(run, [SessionStarted(), STOPPED])
+    assert (found.state, found.reason, found.faults) == ("interrupted", "stopped by the operator (SIGINT)", [])
+
+
+def test_a_stop_that_version_0_1_noted_as_a_fault_is_none(run: Run) -> None:
+    by_operator = FaultNoted(kind="Interrupted", message="stopped by the operator")
+    found = told(run, [SessionStarted(), by_operator, SessionStopped(outcome="interrupted")])
+    assert (found.reason, found.faults) == ("stopped by the operator", [])
+    assert "Nothing went wrong" in report.write(run).read_text()
+
+
+def test_a_failure_is_a_fault_and_the_reason(run: Run) -> None:
+    found = told(run, [SessionStarted(), FAULT, SessionStopped(outcome="failed")])
+    assert (found.state, found.reason, found.faults) == ("failed", "the box is gone", ["the box is gone"])
+    assert "<li class=bad>" in report.write(run).read_text()
+
+
+def test_the_lock_tells_a_session_that_runs_from_one_that_was_killed(run: Run) -> None:
+    assert told(run, [SessionStarted()]).state == "interrupted"
+    with run.locked():
+        assert (status(run).state, status(run).go_on) == ("running", "")
+        assert told(run, [SessionStarted(), Paused()]).state == "paused"
+    assert "it was killed, or the power failed" in status(run).reason
+    assert status(run).go_on == f"coupole acquire --resume {run.folder}"
+
+
+def test_a_look_at_the_lock_does_not_keep_a_session_out(run: Run) -> None:
+    assert not run.in_use
+    with run.locked():
+        assert run.in_use
+    assert not run.in_use
+
+
+def test_sessions_have_durations_pauses_light_and_dose(run: Run) -> None:
+    burst = BurstEnded(view="top", steps=3, on_s=0.5, frames=3)
+    events = [SessionStarted(), burst, Paused(), Continued(), STOPPED, SessionResumed(), burst, burst]
+    first, second = told(run, events).sessions
+    assert (first.duration_s, first.pauses, first.paused_s, first.light_s) == (4.0, 1, 1.0, 0.5)
+    assert (first.outcome, first.dose_lux_h) == ("interrupted", 0.25)
+    assert (second.duration_s, second.light_s, second.outcome, second.dose_lux_h) == (2.0, 1.0, "", None)
+
+
+def test_a_report_can_be_made_after_a_crash(run: Run) -> None:
+    """Also of a view whose file is damaged; a killed session's dose is not guessed."""
+    told(run, [SessionStarted(), STOPPED, SessionResumed()])
+    run.view_path("top").write_bytes(b"damaged")
+    ended = cells.here("report", run.folder, "--json")
+    assert ended.code == 0, ended.err
+    page = Path(ended.document["report"]).read_text()
+    assert "<b class=stopped>interrupted</b>: its last session has no end" in page
+    assert "at least 0.250 lux h" in page
+    assert "not a view file of a run" in page
+    assert f"<code>coupole acquire --resume {run.folder}</code> (1 frames are left)" in page
+
+
+def test_a_run_without_copies_is_resumed_with_its_plan_named(run: Run) -> None:
+    path = run.folder / "run.json"
+    about = json.loads(path.read_text())
+    for what in ("plan", "rig"):
+        del about[what]["stored"]
+    path.write_text(json.dumps(about))
+    assert Run(run.folder).go_on_command == f"coupole acquire {about['plan']['path']} --resume {run.folder}"

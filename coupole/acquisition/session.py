@@ -87,7 +87,7 @@ def _acquire_into(
         job,
         folder,
         allocated_bytes=run.allocated_bytes() if run else 0,
-        share_left=1.0 - len(run.proven()) / job.schedule.frames if run else 1.0,
+        proven=run.proven() if run else (),
     )
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     refuse(preflight)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import assert_never
 
@@ -12,7 +12,7 @@ from coupole.plan.led_table import LedTable
 from coupole.plan.light_selection import lit_in_bursts
 from coupole.plan.marks import MARKS, Marks
 from coupole.plan.plan import Grid, Joints, Lights, LookAt, Plan, View
-from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotLabel
+from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotId, ShotLabel
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,26 @@ class Schedule:
             ),
             self.labels,
         )
+
+    def left(self, proven: Collection[ShotId]) -> Schedule:
+        """What is still to be taken: views with unproven frames, with their bursts reduced to these."""
+        left = [bursts_left(bursts, proven) for bursts in self.bursts]
+        numbers = [n for n, bursts in enumerate(left) if bursts]
+        return Schedule(
+            tuple(self.views[n] for n in numbers),
+            tuple(tuple(left[n]) for n in numbers),
+            tuple(self.labels[n] for n in numbers),
+        )
+
+
+def bursts_left(bursts: Sequence[Burst], proven: Collection[ShotId]) -> list[Burst]:
+    """Bursts with unproven frames, reduced to these."""
+    left = []
+    for burst in bursts:
+        wanted = {shot.label for shot in burst.shots if shot and shot not in proven}
+        if wanted:
+            left.append(burst if len(wanted) == len(burst.labels) else burst.only(wanted))
+    return left
 
 
 def expand_view(view: View) -> list[ViewPose]:

@@ -41,8 +41,9 @@ from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionSt
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
 from coupole.viewing import report
+from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Outcome
-from coupole.viewing.terminal import RunObserver, alarm, show_dry_run, show_preflight
+from coupole.viewing.terminal import RunObserver, alarm, show_dry_run
 
 _ASKED_BOARDS = 12
 """Number of boards, spread over the dome, whose temperature is read."""
@@ -324,12 +325,13 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
                     "speed": round(outcome.duration_s / machine_s, 2),
                     "speed_asked": speed,
                     "over_triggers": outcome.over_triggers,
+                    "exposure_scale": preflight.exposure_scale,
                     "exposure": {
                         view: {
                             "pictures": seen.pictures,
-                            "brightest": round(seen.brightest, 4),
-                            "saturated": round(seen.saturated, 6),
-                            "verdict": seen.verdict(),
+                            "brightest": round(seen.brightest, 4) if preflight.exposure_scale else None,
+                            "saturated": round(seen.saturated, 6) if preflight.exposure_scale else None,
+                            "verdict": seen.verdict() if preflight.exposure_scale else "not known",
                         }
                         for view, seen in recorder.exposures.items()
                     },

@@ -73,6 +73,15 @@ class Lens(Model):
         return self
 
 
+class WhiteResponse(Model):
+    """What a white diffuser that faces the light gives in the camera's pictures, measured with a lux meter."""
+
+    dn_per_lux_s: Annotated[float, Field(gt=0, le=1e9)]
+    """Above black, per lux and second of exposure, in the most sensitive channel, at gain 0 dB."""
+    f_number: Annotated[float, Field(gt=0, le=1000)]
+    """With which it was measured; at another one it does not hold."""
+
+
 class Dome(Model):
     """The LEDs: a CSV with columns id, board, x_mm, y_mm, z_mm, nx, ny, nz (base frame), flux_lm."""
 
@@ -213,6 +222,8 @@ class Rig(Model):
     """The file that describes the arm, or the description itself. Default: the arm of the robot's driver."""
     sensor: Sensor
     lens: Lens
+    white_response: WhiteResponse | None = None
+    """Without it, and without a record of the LEDs' power, exposures cannot be judged without the camera."""
     flange_from_camera: Pose
     dome: Dome
     support: Support

@@ -14,6 +14,9 @@ from coupole.plan.marks import MARKS, Marks
 from coupole.plan.plan import Grid, Joints, Lights, LookAt, Plan, View
 from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotId, ShotLabel
 
+MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000
+"""Of one plan, as many as fit into memory."""
+
 
 @dataclass(frozen=True)
 class ViewPose:
@@ -148,6 +151,21 @@ def build_schedule(
             bursts.append([replace(burst, view=pose.name) for burst in bursts_of[lights]])
     labels = tuple(tuple(label for burst in own for label in burst.labels if label) for own in bursts)
     return Schedule(tuple(views), tuple(map(tuple, bursts)), labels)
+
+
+def too_large(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
+    """Key path and message if a plan has more views or frames than can be planned for."""
+    sizes = [
+        len(view.azimuths_deg) * len(view.elevations_deg) if isinstance(view, Grid) else 1 for view in plan.views
+    ]
+    if sum(sizes) > MOST_VIEWS:
+        return [(("views",), f"expected at most {MOST_VIEWS} views in one plan, found {sum(sizes)}; split it")]
+    exposures = plan.repeats * len(plan.exposure.exposures_us)
+    frames = sum(sizes) * (exposures * len(leds.ids) + plan.darks_per_view)
+    if frames > MOST_FRAMES:
+        message = f"expected at most {MOST_FRAMES} frames in one plan, found up to {frames}; split it"
+        return [(("repeats",) if plan.repeats > 1 else ("views",), message)]
+    return []
 
 
 def names_too_long(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:

@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 import shutil
 from bisect import bisect_left
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
 from coupole.errors import StorageError
+from coupole.motion.itinerary import Itinerary
 from coupole.plan.bursts import Pace
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import in_world, runs_tables
 from coupole.plan.shot_id import ShotId
 from coupole.preflight import ledger
+from coupole.preflight.exposure_scale import ExposedWhite, exposed_white, exposure_scale
+from coupole.preflight.framing import ObjectCheck, check_object
 from coupole.preflight.job import Job, at_pace
 from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, Whole, check
 from coupole.storage.write_speed import measure_write_speed
@@ -106,12 +109,39 @@ def check_job(
         return paced, left
 
     job, report = _cooled(*checked(Pace(disk_us=_disk_us(rig, storage))), checked)
+    report.object_check = _object_check(job, itinerary, proven)
+    if report.object_check is not None:
+        report.refusals += report.object_check.refusals
+        report.warnings += report.object_check.warnings
+    report.warnings += job.shape.remarks
+    if (scale := exposure_scale(job)) is not None:
+        report.exposure_scale, report.white = scale.source, tuple(exposed_white(job, scale))
+        report.warnings += _badly_exposed(report.white)
     report.refusals += calibration_refusals(job)
     if job.plan.trigger == "hardware" and not runs_tables(rig):
         why = "cannot trigger the camera: it runs no tables. Set `trigger: software` in the plan"
         report.refusals.insert(0, f"led box {rig.ledbox.driver}: {why}")
     report.warnings += job.cell.remarks
     return job, report
+
+
+def _object_check(job: Job, itinerary: Itinerary, proven: Collection[ShotId]) -> ObjectCheck | None:
+    """The object in its views, as far as they are still to be taken; None without a mesh."""
+    if job.plan.object is None:
+        return None
+    schedule = job.schedule.left(proven) if proven else job.schedule
+    return check_object(job.plan.object.id, job.shape.corners_mm, job.cell.rig, schedule, itinerary)
+
+
+def _badly_exposed(white: Sequence[ExposedWhite]) -> list[str]:
+    """Warnings if even the shortest exposure saturates white, or even the longest leaves it dark."""
+    ends = [(white[0], "over-exposed"), (white[-1], "under-exposed")] if white else []
+    return [
+        f"{end.exposure_us} us: {verdict}: white reaches {end.brightest:.0%} of full scale under the brightest "
+        f"LED, {end.median:.0%} under the median one"
+        for end, verdict in ends
+        if end.verdict() == verdict
+    ]
 
 
 def calibration_refusals(job: Job, *, camera: str | None = None, temperature_c: float | None = None) -> list[str]:

@@ -21,6 +21,8 @@ from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import upload_s
 from coupole.plan.schedule import Schedule
+from coupole.preflight.exposure_scale import ExposedWhite
+from coupole.preflight.framing import ObjectCheck
 from coupole.preflight.led_limits import heat_of, refuse_on_times
 
 BURST_OVERHEAD_S = 0.14
@@ -95,6 +97,12 @@ class Report:
     """Timing of each exposure, with the limit that determines its period."""
     asked_bytes_s: float = 0.0
     disk_bytes_s: float = 0.0
+    exposure_scale: str | None = None
+    """From which it is known how bright white will be; None: it is not known."""
+    white: tuple[ExposedWhite, ...] = ()
+    """Of each exposure, if that is known."""
+    object_check: ObjectCheck | None = None
+    """None without a mesh."""
     refusals: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 

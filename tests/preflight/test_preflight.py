@@ -176,7 +176,7 @@ def board(**changes: float) -> dict[str, Any]:
 def test_an_on_time_over_the_limit_is_refused_naming_shot_led_and_limit() -> None:
     rig = rig_of(led_limits=limits(on_us=(1000, 9000)))
     refusal = only_refusal(checked(plan_of(lights={"kind": "ids", "ids": [417]}), rig))
-    assert refusal == "shot led0417/e0: LED 417 would be on for 9200 us; the limits are 1000 to 9000 us"
+    assert refusal == "shot top/led0417/e0: LED 417 would be on for 9200 us; the limits are 1000 to 9000 us"
 
 
 def test_an_on_time_under_the_limit_is_refused() -> None:

@@ -30,6 +30,9 @@ _COLUMNS = 64
 """Rays through the picture, per row."""
 _SAMPLES = 2000
 """Points on the object's surface."""
+_R2 = (0.7548776662466927, 0.5698402909980532)
+"""Steps of an even sequence in the unit square (Roberts, The unreasonable effectiveness of quasirandom sequences,
+2018)."""
 _NO_HIT_MM = 1e30
 _ALL, _MOST = 0.995, 0.9
 """Shares of the object in the field, and of what is seen in focus, below which views are warned of."""
@@ -131,8 +134,8 @@ def surface_samples(corners_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(corners_mm.mean(axis=1)[:_SAMPLES])
     at = np.cumsum(areas) / areas.sum()
     chosen = np.minimum(np.searchsorted(at, (np.arange(_SAMPLES) + 0.5) / _SAMPLES), len(at) - 1)
-    random = np.random.default_rng(1)
-    u, v = np.sqrt(random.random(_SAMPLES)), random.random(_SAMPLES)
+    number = np.arange(_SAMPLES) + 0.5
+    u, v = np.sqrt(number * _R2[0] % 1.0), number * _R2[1] % 1.0
     weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
     points: NDArray[np.float64] = np.einsum("nk,nkj->nj", weights, corners_mm[chosen])
     return points
@@ -143,14 +146,17 @@ def framing_of(
 ) -> Framing:
     """What a camera sees of an object: a `ray_mesh`, and points [n, 3] on its surface."""
     depth_mm = seen_depths_mm(sight, mesh)
+    in_field, depth_of_points_mm = _in_field(sight, mesh, points_mm)
     near_mm, far_mm = sharp_mm
     shown = depth_mm[np.isfinite(depth_mm)]
+    if len(shown) == 0:  # too small for the raster, or nothing
+        shown = depth_of_points_mm
     nothing = len(shown) == 0
     nearest, farthest = (np.nan, np.nan) if nothing else (float(shown.min()), float(shown.max()))
     return Framing(
         view,
-        _share_in_field(sight, mesh, points_mm),
-        len(shown) / depth_mm.size,
+        in_field,
+        float(np.isfinite(depth_mm).mean()),
         nearest,
         farthest,
         0.0 if nothing else float(np.mean((shown >= near_mm) & (shown <= far_mm))),
@@ -173,17 +179,16 @@ def seen_depths_mm(sight: Sight, mesh: Any) -> NDArray[np.float64]:
     return found
 
 
-def _share_in_field(sight: Sight, mesh: Any, points_mm: NDArray[np.float64]) -> float:
-    """Share inside the picture of the points that nothing hides from the camera, weighted by the inverse square
-    of their distance."""
+def _in_field(sight: Sight, mesh: Any, points_mm: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """Of the points [n, 3] that nothing hides from the camera, the share inside the picture, and their depths."""
     eye_mm = sight.support_from_camera[:3, 3]
     away_mm = np.linalg.norm(eye_mm - points_mm, axis=1)
     starts_mm = points_mm + (eye_mm - points_mm) * (RAY_START_MM / np.maximum(away_mm, RAY_START_MM))[:, None]
-    weights = np.where(blocked(mesh, starts_mm, np.tile(eye_mm, (len(starts_mm), 1))), 0.0, 1 / away_mm**2)
+    visible = ~blocked(mesh, starts_mm, np.tile(eye_mm, (len(starts_mm), 1)))
     pixels, depth_mm = sight.project(points_mm)
     inside = (pixels >= -0.5) & (pixels <= np.array((sight.width_px, sight.height_px)) - 0.5)
-    inside_too = inside.all(axis=1) & (depth_mm > 0)
-    return float(weights[inside_too].sum() / weights.sum()) if weights.sum() > 0 else 0.0
+    shown = inside.all(axis=1) & (depth_mm > 0) & visible
+    return float(shown.sum() / max(1, visible.sum())), depth_mm[shown]
 
 
 def _camera_pose(view: ViewPose, number: int, rig: Rig, itinerary: Itinerary) -> Transform:

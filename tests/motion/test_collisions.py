@@ -116,8 +116,8 @@ def test_a_keep_out_box_that_only_link_1_enters_is_named_with_it() -> None:
     bodies = CellBodies(KR10, around, TOOL, Clearances())
     touching = [contact.body for contact in bodies.contacts(home_deg) if contact.other == "keep-out `shelf`"]
     assert touching == ["link 1"]
-    away_deg, back_deg = np.array(home_deg) - (60, 0, 0, 0, 0, 0), np.array(home_deg) + (60, 0, 0, 0, 0, 0)
-    swept = bodies.contact_on_the_way(away_deg, back_deg)
+    turned_deg = np.array((60.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    swept = bodies.contact_on_the_way(np.array(home_deg) - turned_deg, np.array(home_deg) + turned_deg)
     assert swept is not None
     assert swept.body == "link 1"
 

@@ -420,7 +420,9 @@ def test_a_disk_that_cannot_be_written_is_refused_and_not_taken_for_one_without_
     )
 
 
-def test_a_disk_whose_test_fails_is_refused_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_whose_test_fails_is_refused_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def failing(fd: int, data: object, offset: int) -> int:
         raise OSError(errno.EIO, "Input/output error")
 

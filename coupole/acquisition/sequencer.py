@@ -23,7 +23,7 @@ from coupole.devices import FrameFormat
 from coupole.errors import DeviceError, UnprovenError
 from coupole.motion.itinerary import Visit
 from coupole.plan.bursts import Burst
-from coupole.plan.schedule import ViewPose
+from coupole.plan.schedule import ViewPose, bursts_left
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.job import Job
 from coupole.storage.journal_events import (
@@ -85,7 +85,8 @@ class Sequencer:
         """Take all shots that are not proven yet. Raises UnprovenError if shots remain missing, or a
         CoupoleError."""
         schedule = self._job.schedule
-        left = {n: found for n, bursts in enumerate(schedule.bursts) if (found := self._left_of(bursts))}
+        proven = self._recorder.proven()
+        left = {n: found for n, bursts in enumerate(schedule.bursts) if (found := bursts_left(bursts, proven))}
         numbers = list(left)
         itinerary = self._arm.itinerary([schedule.views[n] for n in numbers])
         start_ns = self._cell.clock.now_ns()
@@ -109,16 +110,6 @@ class Sequencer:
         if self.outcome.missing:
             raise UnprovenError(self._say_missing())
         return self.outcome
-
-    def _left_of(self, bursts: Sequence[Burst]) -> list[Burst]:
-        """Bursts with unproven shots, reduced to these."""
-        done = self._recorder.proven()
-        left = []
-        for burst in bursts:
-            wanted = {shot.label for shot in burst.shots if shot and shot not in done}
-            if wanted:
-                left.append(burst if len(wanted) == len(burst.labels) else burst.only(wanted))
-        return left
 
     def _acquire_view(self, view: ViewPose, visit: Visit, left: list[Burst], all_bursts: Sequence[Burst]) -> None:
         occlusion = self._job.motion.occlusions.at(visit.joints_deg)

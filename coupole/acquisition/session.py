@@ -42,8 +42,9 @@ from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
+from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Outcome
-from coupole.viewing.terminal import RunObserver, alarm, show_dry_run, show_preflight
+from coupole.viewing.terminal import RunObserver, alarm, show_dry_run
 
 _ASKED_BOARDS = 12
 """Number of boards, spread over the dome, whose temperature is read."""
@@ -95,7 +96,7 @@ def _acquire_into(
         job,
         folder,
         allocated_bytes=run.allocated_bytes() if run else 0,
-        share_left=1.0 - len(run.proven()) / job.schedule.frames if run else 1.0,
+        proven=run.proven() if run else (),
     )
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     refuse(preflight)
@@ -349,12 +350,13 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
                     "speed": round(outcome.duration_s / machine_s, 2),
                     "speed_asked": speed,
                     "over_triggers": outcome.over_triggers,
+                    "exposure_scale": preflight.exposure_scale,
                     "exposure": {
                         view: {
                             "pictures": seen.pictures,
-                            "brightest": round(seen.brightest, 4),
-                            "saturated": round(seen.saturated, 6),
-                            "verdict": seen.verdict(),
+                            "brightest": round(seen.brightest, 4) if preflight.exposure_scale else None,
+                            "saturated": round(seen.saturated, 6) if preflight.exposure_scale else None,
+                            "verdict": seen.verdict() if preflight.exposure_scale else "not known",
                         }
                         for view, seen in recorder.exposures.items()
                     },

@@ -24,7 +24,8 @@ def check(
     """Check everything about a plan that can be checked without devices."""
     from coupole.preflight.checking import preflight_of
     from coupole.preflight.job import read_job, without_hidden
-    from coupole.viewing.terminal import make_console, show_preflight, show_views
+    from coupole.viewing.preflight_table import document_of, show_preflight, show_views
+    from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     try:
@@ -41,18 +42,7 @@ def check(
         print(
             json.dumps(
                 {
-                    "ok": not report.refusals,
-                    "refusals": report.refusals,
-                    "warnings": report.warnings,
-                    "views": len(report.views),
-                    "shots": report.shots,
-                    "frames": report.frames,
-                    "bytes": report.bytes,
-                    "duration_s": report.duration_s,
-                    "ideal_s": report.ideal_s,
-                    "dose_lux_h": report.dose_lux_h,
-                    "peak_board_c": report.peak_board_c,
-                    "exposures": [asdict(timing) for timing in report.timings],
+                    **document_of(report),
                     "hidden_lights": sum(map(len, job.hidden_leds.values())),
                     "paths_checked": not no_paths,
                 }

@@ -23,6 +23,8 @@ LINK_MESH_STEP_MM = 12.0
 _METRES_BELOW = 10.0
 """A link mesh no larger than this is taken as metres (the ROS convention), otherwise as mm."""
 
+_LARGEST_MM = 5000.0
+
 
 @dataclass(frozen=True)
 class Capsule:
@@ -88,7 +90,13 @@ def link_corners(folder: Path, link: int) -> Floats:
     corners: Floats = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]
     if len(corners) == 0 or not np.isfinite(corners).all():
         raise InputError(f"{path}: expected the mesh of link {link}; it has no triangles, or no finite ones")
-    return corners * (1000.0 if np.ptp(corners) < _METRES_BELOW else 1.0)
+    corners = corners * (1000.0 if np.ptp(corners) < _METRES_BELOW else 1.0)
+    if np.abs(corners).max() > _LARGEST_MM:
+        far_mm = np.abs(corners).max()
+        raise InputError(
+            f"{path}: expected the mesh of link {link} in its own frame, metres or mm; it reaches {far_mm:.3g} mm"
+        )
+    return corners
 
 
 def reach_mm(arm: Arm, body: Body, from_link: int = 0) -> Floats:

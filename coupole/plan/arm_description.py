@@ -9,16 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache, cached_property
+from math import prod
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from coupole.errors import InputError, Problem
 from coupole.joint_chain import Axis, JointChain
 from coupole.kinematics import Arm, structure_of
 from coupole.plan import yamlfile
-from coupole.plan.plan import Model, Pose, Vector
+from coupole.plan.plan import Degrees, FilePath, Length, Model, Pose, Vector
 from coupole.plan.registry import ARMS_OF_DRIVERS, UR
 from coupole.plan.validation_messages import KeyPath
 from coupole.plan.yamlfile import Document
@@ -31,8 +32,10 @@ FOLDERS = (_PACKAGE / "robots", _PACKAGE.parent / "configs" / "robots")
 UR_MODEL = "ur10e"
 """The default arm of a UR's driver."""
 
+_MOST_POSTURES = 10_000
+
 BodyName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}$")]
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(ge=0.001, le=10_000_000)]
 Range = tuple[Annotated[float, Field(ge=-720, le=720)], Annotated[float, Field(ge=-720, le=720)]]
 
 
@@ -56,7 +59,7 @@ class CapsuleDescription(Model):
 
     from_mm: Vector
     to_mm: Vector
-    radius_mm: Positive
+    radius_mm: Length
 
 
 class LinkDescription(Model):
@@ -65,7 +68,7 @@ class LinkDescription(Model):
     name: BodyName
     link: Annotated[int, Field(ge=0, le=6)]
     """0 is the base, which is fixed; link k turns with joint k."""
-    capsules: Annotated[tuple[CapsuleDescription, ...], Field(min_length=1)]
+    capsules: Annotated[tuple[CapsuleDescription, ...], Field(min_length=1, max_length=100)]
 
 
 class KeptApart(Model):
@@ -75,10 +78,18 @@ class KeptApart(Model):
     other: BodyName
     """Nearer to the base than `body`."""
     near_by_design_deg: Annotated[
-        tuple[Annotated[tuple[float, ...], Field(min_length=1)], ...] | None, Field(min_length=6, max_length=6)
+        tuple[Annotated[tuple[Degrees, ...], Field(min_length=1, max_length=360)], ...] | None,
+        Field(min_length=6, max_length=6),
     ] = None
     """Angles of each joint. Parts of `body` that are near `other` in all their combinations are always near
     because of the joint between the two, or because their capsules are too large; they are not checked."""
+
+    @model_validator(mode="after")
+    def _few_combinations(self) -> KeptApart:
+        combinations = prod(map(len, self.near_by_design_deg or ()))
+        if combinations > _MOST_POSTURES:
+            raise ValueError(f"at most {_MOST_POSTURES} combinations of angles, found {combinations}")
+        return self
 
 
 class ArmDescription(Model):
@@ -89,9 +100,9 @@ class ArmDescription(Model):
     name: Annotated[str, Field(min_length=1, max_length=64)]
     joints: Annotated[tuple[JointDescription, ...], Field(min_length=6, max_length=6)]
     link_6_from_flange: Pose
-    links: Annotated[tuple[LinkDescription, ...], Field(min_length=1)]
-    kept_apart: tuple[KeptApart, ...] = ()
-    link_meshes: Path | None = None
+    links: Annotated[tuple[LinkDescription, ...], Field(min_length=1, max_length=100)]
+    kept_apart: Annotated[tuple[KeptApart, ...], Field(max_length=1000)] = ()
+    link_meshes: FilePath | None = None
     """Folder of meshes that replace the links' capsules; relative to the file."""
 
     @cached_property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from coupole.errors import InputError, Problem
 
 COLUMNS = ("id", "board", "x_mm", "y_mm", "z_mm", "nx", "ny", "nz", "flux_lm")
+
+_FARTHEST_MM, _BRIGHTEST_LM = 20_000.0, 1e6
+_MOST_BYTES = 16 * 1024**2
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,8 @@ def read_led_table(path: Path) -> LedTable:
         problems.append(Problem(str(path), line, 1 if line else 0, key, message))
 
     try:
+        if (size_bytes := path.stat().st_size) > _MOST_BYTES:
+            raise InputError(f"{path}: expected an LED table of at most {_MOST_BYTES} bytes, found {size_bytes}")
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError([Problem(str(path), 0, 0, "", f"cannot read the LED table: {error}")]) from error
@@ -72,15 +78,11 @@ def read_led_table(path: Path) -> LedTable:
         if len(values) != len(COLUMNS) or not np.all(np.isfinite(values)):
             wrong(line, f"expected {len(COLUMNS)} finite numbers, found {len(values)} fields")
             continue
-        led, norm = int(values[0]), float(np.linalg.norm(values[5:8]))
+        led = int(values[0])
         if led in first_line_of_id:
             wrong(line, f"LED {led} is already defined in line {first_line_of_id[led]}", "id")
-        if values[0] != led or not 0 <= led < 65535:
-            wrong(line, f"expected an integer from 0 to 65534, found {values[0]:g}", "id")
-        if abs(norm - 1.0) > 1e-3:
-            wrong(line, f"expected a unit normal, found one of length {norm:.4f}", "nx, ny, nz")
-        if values[8] <= 0:
-            wrong(line, f"expected a positive flux in lm, found {values[8]:g}", "flux_lm")
+        for key, message in _mistakes(values):
+            wrong(line, message, key)
         first_line_of_id.setdefault(led, line)
         rows.append(values)
     if not rows and not problems:
@@ -90,3 +92,18 @@ def read_led_table(path: Path) -> LedTable:
     table = np.array(rows)
     normals = table[:, 5:8] / np.linalg.norm(table[:, 5:8], axis=1, keepdims=True)
     return LedTable(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:5], normals, table[:, 8])
+
+
+def _mistakes(values: list[float]) -> Iterator[tuple[str, str]]:
+    """Columns and messages of the values of one LED that cannot be."""
+    for key, value, most in (("id", values[0], 65534), ("board", values[1], 65535)):
+        if value != int(value) or not 0 <= value <= most:
+            yield key, f"expected an integer from 0 to {most}, found {value:g}"
+    if max(map(abs, values[2:5])) > _FARTHEST_MM:
+        place = ", ".join(f"{value:g}" for value in values[2:5])
+        yield "x_mm, y_mm, z_mm", f"expected mm, at most {_FARTHEST_MM:g} on each axis, found {place}"
+    norm = float(np.linalg.norm(values[5:8]))
+    if abs(norm - 1.0) > 1e-3:
+        yield "nx, ny, nz", f"expected a unit normal, found one of length {norm:.4f}"
+    if not 0 < values[8] <= _BRIGHTEST_LM:
+        yield "flux_lm", f"expected a flux in lm, above 0 and at most {_BRIGHTEST_LM:g}, found {values[8]:g}"

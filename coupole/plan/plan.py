@@ -10,17 +10,39 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from coupole.geometry import Transform, transform
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 """Letters, digits, dot, underscore, hyphen: it becomes part of file names and shot ids."""
-Vector = tuple[float, float, float]
 Words = Annotated[str, Field(min_length=1, max_length=500)]
+Millimetres = Annotated[float, Field(ge=-20_000, le=20_000)]
+"""A coordinate in a cell: 20 m are more than any has."""
+Vector = tuple[Millimetres, Millimetres, Millimetres]
+Length = Annotated[float, Field(gt=0, le=20_000)]
+"""mm."""
 Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
+Angles = tuple[Degrees, Degrees, Degrees]
 ExposureUs = Annotated[int, Field(ge=10, le=2_000_000)]
 LedId = Annotated[int, Field(ge=0, le=65534)]
+
+
+def possible_path(path: Path) -> Path:
+    """The path itself. Raises ValueError if no file can have it."""
+    if any(len(part.encode("utf-8", "replace")) > 255 for part in path.parts) or len(str(path)) > 2000:
+        raise ValueError("a path of at most 2000 characters, each of its names of at most 255 bytes")
+    if "\0" in str(path):
+        raise ValueError("a path without NUL characters")
+    if str(path).startswith("~"):
+        try:
+            path.expanduser()
+        except RuntimeError as error:
+            raise ValueError(f"a path in the home folder of a known user: {error}") from error
+    return path
+
+
+FilePath = Annotated[Path, AfterValidator(possible_path)]
 
 
 class Model(BaseModel):
@@ -33,7 +55,7 @@ class Pose(Model):
     """A rigid transform in a file: translation in mm, KUKA's A, B, C in degrees."""
 
     translation_mm: Vector = (0.0, 0.0, 0.0)
-    abc_deg: Vector = (0.0, 0.0, 0.0)
+    abc_deg: Angles = (0.0, 0.0, 0.0)
 
     def matrix(self) -> Transform:
         return transform(self.translation_mm, self.abc_deg)
@@ -59,15 +81,15 @@ class LightBoards(Model):
     """All LEDs of some boards."""
 
     kind: Literal["boards"]
-    boards: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+    boards: Annotated[tuple[Annotated[int, Field(ge=0, le=65535)], ...], Field(min_length=1)]
 
 
 class EveryLight(Model):
     """Every n-th LED of the table, from `offset` on."""
 
     kind: Literal["every"]
-    every: Annotated[int, Field(ge=1)]
-    offset: Annotated[int, Field(ge=0)] = 0
+    every: Annotated[int, Field(ge=1, le=65535)]
+    offset: Annotated[int, Field(ge=0, le=65535)] = 0
 
 
 class LightCone(Model):
@@ -168,17 +190,17 @@ class MeasuredObject(Model):
     """The object on the support: its id, mesh, pose and dose budget."""
 
     id: Name
-    mesh: Path | None = None
+    mesh: FilePath | None = None
     mesh_unit: Literal["mm", "m", "um"] = "mm"
     support_from_object: Pose = Pose()
-    dose_budget_lux_h: Annotated[float, Field(gt=0)] | None = None
+    dose_budget_lux_h: Annotated[float, Field(gt=0, le=1e9)] | None = None
 
 
 class Optics(Model):
     """The intended lens settings; preflight compares them with the rig."""
 
-    focus_distance_mm: Annotated[float, Field(gt=0)] | None = None
-    f_number: Annotated[float, Field(gt=0)] | None = None
+    focus_distance_mm: Length | None = None
+    f_number: Annotated[float, Field(gt=0, le=1000)] | None = None
 
 
 class Plan(Model):
@@ -186,10 +208,10 @@ class Plan(Model):
 
     schema_version: Literal[1]
     name: Name
-    rig: Path
+    rig: FilePath
     object: MeasuredObject | None = None
     optics: Optics = Optics()
-    calibrations: Literal["none"] | tuple[Path, ...] | None = None
+    calibrations: Literal["none"] | tuple[FilePath, ...] | None = None
     """Records that must be in force; None: those that the rig names."""
     views: Annotated[tuple[View, ...], Field(min_length=1)]
     order: Literal["fastest", "as_written"] = "fastest"

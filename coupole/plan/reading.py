@@ -9,9 +9,9 @@ from coupole.errors import InputError, Problem
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell, read_cell
 from coupole.plan.light_selection import missing_lights
-from coupole.plan.plan import Plan
+from coupole.plan.plan import Plan, possible_path
 from coupole.plan.rig import Rig
-from coupole.plan.schedule import names_too_long
+from coupole.plan.schedule import names_too_long, too_large
 from coupole.plan.yamlfile import Document
 
 
@@ -50,6 +50,7 @@ def read_plan(plan_path: Path, rig_path: Path | None = None) -> PlanFiles:
         problems.append(cell.document.problem(("arm",), message))
     wrong = missing_lights(plan, cell.leds, cell.rig.support.base_from_support.matrix())
     wrong += names_too_long(plan, cell.leds)
+    wrong += too_large(plan, cell.leds)
     problems += [document.problem(key, message) for key, message in wrong]
     mesh_path = document.resolve(plan.object.mesh) if plan.object and plan.object.mesh else None
     if mesh_path is not None and not mesh_path.is_file():
@@ -65,7 +66,10 @@ def read_plan(plan_path: Path, rig_path: Path | None = None) -> PlanFiles:
 
 def _named_rig(document: Document) -> Path | None:
     named = document.data.get("rig")
-    return document.resolve(Path(named)) if isinstance(named, str) else None
+    try:
+        return document.resolve(possible_path(Path(named))) if isinstance(named, str) else None
+    except ValueError:  # the plan's own problems say so
+        return None
 
 
 def _named_records(document: Document, plan: Plan, cell: Cell) -> tuple[tuple[Path, ...] | None, list[Problem]]:

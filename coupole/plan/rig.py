@@ -5,17 +5,20 @@ Lengths are in mm, angles in degrees; poses are in the robot's base frame unless
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from coupole.plan.arm_description import ArmDescription
-from coupole.plan.plan import Model, Name, Pose, Vector, Words
+from coupole.plan.plan import Degrees, FilePath, Length, Model, Name, Pose, Vector, Words
 from coupole.plan.registry import WORLD, current_name
 
 DriverName = Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"), AfterValidator(current_name)]
 """`package.module:Class`; names of version 0.1 are understood."""
+
+
+Posture = tuple[Degrees, Degrees, Degrees, Degrees, Degrees, Degrees]
+OnTimeUs = Annotated[int, Field(ge=1, le=60_000_000)]
 
 
 class Twin(Model):
@@ -38,13 +41,19 @@ class Sensor(Model):
 
     width_px: Annotated[int, Field(ge=8, le=65536)]
     height_px: Annotated[int, Field(ge=8, le=65536)]
-    pixel_pitch_um: Annotated[float, Field(gt=0)]
+    pixel_pitch_um: Annotated[float, Field(gt=0, le=1000)]
     bit_depth: Annotated[int, Field(ge=8, le=16)] = 12
     bayer_pattern: Literal["GBRG", "GRBG", "RGGB", "BGGR", "MONO"] = "GBRG"
-    black_dn: Annotated[int, Field(ge=0)] = 64
-    max_frames_per_s: Annotated[float, Field(gt=0)] = 100.0
-    exposure_gap_us: Annotated[int, Field(ge=0)] = 100
+    black_dn: Annotated[int, Field(ge=0, le=65535)] = 64
+    max_frames_per_s: Annotated[float, Field(ge=0.001, le=100_000)] = 100.0
+    exposure_gap_us: Annotated[int, Field(ge=0, le=10_000_000)] = 100
     """Least time between the end of one exposure and the start of the next."""
+
+    @model_validator(mode="after")
+    def _black_below_white(self) -> Sensor:
+        if self.black_dn >= self.white_dn:
+            raise ValueError(f"a black level below the highest value of {self.bit_depth} bits, {self.white_dn}")
+        return self
 
     @property
     def white_dn(self) -> int:
@@ -52,56 +61,84 @@ class Sensor(Model):
 
 
 class Lens(Model):
-    focal_length_mm: Annotated[float, Field(gt=0)]
-    f_number: Annotated[float, Field(gt=0)]
-    focus_distance_mm: Annotated[float, Field(gt=0)]
+    focal_length_mm: Annotated[float, Field(gt=0, le=5000)]
+    f_number: Annotated[float, Field(gt=0, le=1000)]
+    focus_distance_mm: Length
     """From the projection centre to the plane of best focus."""
+
+    @model_validator(mode="after")
+    def _makes_an_image(self) -> Lens:
+        if self.focus_distance_mm <= self.focal_length_mm:
+            raise ValueError("a focus distance longer than the focal length, or there is no image")
+        return self
+
+
+class WhiteResponse(Model):
+    """What a white diffuser that faces the light gives in the camera's pictures, measured with a lux meter."""
+
+    dn_per_lux_s: Annotated[float, Field(gt=0, le=1e9)]
+    """Above black, per lux and second of exposure, in the most sensitive channel, at gain 0 dB."""
+    f_number: Annotated[float, Field(gt=0, le=1000)]
+    """With which it was measured; at another one it does not hold."""
 
 
 class Dome(Model):
     """The LEDs: a CSV with columns id, board, x_mm, y_mm, z_mm, nx, ny, nz (base frame), flux_lm."""
 
-    leds: Path
+    leds: FilePath
     emission: Literal["lambertian", "paper"] = "lambertian"
-    panel_lux: Annotated[float, Field(ge=0)] = 0.0
+    panel_lux: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     """Illuminance at the support's centre with one flat panel on, for the light dose."""
-    spectrum: Path | None = None
+    spectrum: FilePath | None = None
     """Relative spectral power of the LEDs (CSV: nm, power), for the radiant exposure weighted by damage."""
-    panel_spectrum: Path | None = None
+    panel_spectrum: FilePath | None = None
     """The same of the panels."""
 
 
 class BoardThermal(Model):
     """First-order thermal model of an LED board: heated by each joule, cooling with one time constant."""
 
-    led_power_w: Annotated[float, Field(gt=0)] = 15.0
-    rise_c_per_j: Annotated[float, Field(gt=0)] = 0.02
-    time_constant_s: Annotated[float, Field(gt=0)] = 240.0
-    ambient_c: float = 22.0
-    limit_c: float = 70.0
+    led_power_w: Annotated[float, Field(gt=0, le=10_000)] = 15.0
+    rise_c_per_j: Annotated[float, Field(gt=0, le=1000)] = 0.02
+    time_constant_s: Annotated[float, Field(ge=0.001, le=1e6)] = 240.0
+    ambient_c: Annotated[float, Field(ge=-50, le=100)] = 22.0
+    limit_c: Annotated[float, Field(ge=-50, le=1000)] = 70.0
 
 
 class LedLimits(Model):
     """Limits of LEDs and boards; the box also enforces its own."""
 
-    on_us: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (1_000, 2_000_000)
-    rise_us: Annotated[int, Field(ge=0)] = 1_000
+    on_us: tuple[OnTimeUs, OnTimeUs] = (1_000, 2_000_000)
+    rise_us: Annotated[int, Field(ge=0, le=10_000_000)] = 1_000
     """From switching on to full current: the trigger waits for it."""
-    cooldown_ratio: Annotated[float, Field(ge=0)] = 2.0
+    cooldown_ratio: Annotated[float, Field(ge=0, le=100_000)] = 2.0
     """An LED that was lit for t stays dark for at least `cooldown_ratio` * t."""
     board: BoardThermal = BoardThermal()
+
+    @model_validator(mode="after")
+    def _shortest_first(self) -> LedLimits:
+        if self.on_us[0] > self.on_us[1]:
+            raise ValueError("the shortest on-time first")
+        return self
 
 
 class Motion(Model):
     """Motion between views: share of the joint speeds, acceleration, jerk, and settling."""
 
-    speed_fraction: Annotated[float, Field(gt=0, le=1)] = 0.3
-    acceleration_deg_s2: Annotated[float, Field(gt=0)] = 300.0
-    jerk_deg_s3: Annotated[float, Field(gt=0)] = 3000.0
-    settle_dwell_s: Annotated[float, Field(ge=0)] = 0.3
-    still_deg: Annotated[float, Field(gt=0)] = 0.01
+    speed_fraction: Annotated[float, Field(ge=0.001, le=1)] = 0.3
+    acceleration_deg_s2: Annotated[float, Field(ge=0.01, le=100_000)] = 300.0
+    jerk_deg_s3: Annotated[float, Field(ge=0.01, le=10_000_000)] = 3000.0
+    settle_dwell_s: Annotated[float, Field(ge=0, le=3600)] = 0.3
+    still_deg: Annotated[float, Field(gt=0, le=10)] = 0.01
     """Largest change of an axis during a burst. Beyond it, shots that were not proven before are taken again."""
-    home_joints_deg: tuple[float, float, float, float, float, float] = (0.0, -170.0, 150.0, 0.0, -70.0, 0.0)
+    home_joints_deg: Posture = (
+        0.0,
+        -170.0,
+        150.0,
+        0.0,
+        -70.0,
+        0.0,
+    )
     """Assumed start posture when a plan is checked without the arm."""
 
 
@@ -109,7 +146,7 @@ class Support(Model):
     """The disk that carries the object, and the origin of the support frame."""
 
     base_from_support: Pose
-    diameter_mm: Annotated[float, Field(gt=0)] = 1480.0
+    diameter_mm: Length = 1480.0
 
 
 class KeepOutSphere(Model):
@@ -118,7 +155,7 @@ class KeepOutSphere(Model):
     kind: Literal["sphere"]
     name: Name
     center_mm: Vector
-    radius_mm: Annotated[float, Field(gt=0)]
+    radius_mm: Length
 
 
 class KeepOutBox(Model):
@@ -126,6 +163,12 @@ class KeepOutBox(Model):
     name: Name
     min_mm: Vector
     max_mm: Vector
+
+    @model_validator(mode="after")
+    def _has_a_volume(self) -> KeepOutBox:
+        if not all(low < high for low, high in zip(self.min_mm, self.max_mm, strict=True)):
+            raise ValueError("`min_mm` below `max_mm` on each axis")
+        return self
 
 
 KeepOut = Annotated[KeepOutSphere | KeepOutBox, Field(discriminator="kind")]
@@ -137,26 +180,26 @@ class ToolBody(Model):
     name: Name
     from_mm: Vector
     to_mm: Vector
-    radius_mm: Annotated[float, Field(gt=0)]
+    radius_mm: Length
 
 
 class Clearances(Model):
     """Clearances of the arm, mm."""
 
-    object_mm: Annotated[float, Field(ge=0)] = 50.0
-    support_mm: Annotated[float, Field(ge=0)] = 10.0
-    dome_mm: Annotated[float, Field(ge=0)] = 20.0
-    self_mm: Annotated[float, Field(ge=0)] = 0.0
-    keep_out_mm: Annotated[float, Field(ge=0)] = 0.0
+    object_mm: Annotated[float, Field(ge=0, le=5000)] = 50.0
+    support_mm: Annotated[float, Field(ge=0, le=5000)] = 10.0
+    dome_mm: Annotated[float, Field(ge=0, le=5000)] = 20.0
+    self_mm: Annotated[float, Field(ge=0, le=5000)] = 0.0
+    keep_out_mm: Annotated[float, Field(ge=0, le=5000)] = 0.0
 
 
 class Storage(Model):
-    folder: Path
-    reserve_bytes: Annotated[int, Field(ge=0)] = 256 * 1024**2
+    folder: FilePath
+    reserve_bytes: Annotated[int, Field(ge=0, le=2**60)] = 256 * 1024**2
     """Free space that a run leaves on the disk."""
     pixels: Literal["uint16", "packed12"] = "uint16"
     """Storage of pixels: two bytes each, or two pixels of at most 12 bits in three bytes."""
-    state: Path | None = None
+    state: FilePath | None = None
     """Folder for what is true of the cell whatever is acquired, such as faults of the arm; the same for all who
     use the cell. `state` in `folder` if not given."""
 
@@ -165,7 +208,7 @@ class WorldSection(Model):
     """The stand-ins: started with the rig (or for dry runs only), or joined if they already run."""
 
     serves: Literal["always", "dry_run"] = "always"
-    join: Path | None = None
+    join: FilePath | None = None
     """File with the JSON line of a running `coupole sim`."""
     driver: DriverName = WORLD
     settings: dict[str, Any] = Field(default_factory=dict)
@@ -179,26 +222,28 @@ class Rig(Model):
     ledbox: Device
     camera: Device
     robot: Device
-    arm: Path | ArmDescription | None = None
+    arm: FilePath | ArmDescription | None = None
     """The file that describes the arm, or the description itself. Default: the arm of the robot's driver."""
     sensor: Sensor
     lens: Lens
+    white_response: WhiteResponse | None = None
+    """Without it, and without a record of the LEDs' power, exposures cannot be judged without the camera."""
     flange_from_camera: Pose
     dome: Dome
     support: Support
-    tool: tuple[ToolBody, ...]
-    link_meshes: Path | None = None
+    tool: Annotated[tuple[ToolBody, ...], Field(max_length=100)]
+    link_meshes: FilePath | None = None
     """Folder of meshes (`base_link.stl`, `link_1.stl` to `link_6.stl`) that replace the capsules of the arm's
     links."""
     clearances: Clearances = Clearances()
-    keep_out: tuple[KeepOut, ...] = ()
+    keep_out: Annotated[tuple[KeepOut, ...], Field(max_length=1000)] = ()
     led_limits: LedLimits = LedLimits()
     motion: Motion = Motion()
     storage: Storage
-    ledger: Path | None = None
+    ledger: FilePath | None = None
     """Folder of the objects' dose ledgers, the same for all rigs under which they lie. `coupole/ledger` in the
     user's data folder (XDG) if not given."""
-    calibrations: Literal["none"] | tuple[Path, ...] = "none"
+    calibrations: Literal["none"] | tuple[FilePath, ...] = "none"
     """Records that must be in force for plans without a list of their own."""
     world: WorldSection | None = None
     licence: Words | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import assert_never
 
@@ -12,7 +12,10 @@ from coupole.plan.led_table import LedTable
 from coupole.plan.light_selection import lit_in_bursts
 from coupole.plan.marks import MARKS, Marks
 from coupole.plan.plan import Grid, Joints, Lights, LookAt, Plan, View
-from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotLabel
+from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotId, ShotLabel
+
+MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000
+"""Of one plan, as many as fit into memory."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,26 @@ class Schedule:
             ),
             self.labels,
         )
+
+    def left(self, proven: Collection[ShotId]) -> Schedule:
+        """What is still to be taken: views with unproven frames, with their bursts reduced to these."""
+        left = [bursts_left(bursts, proven) for bursts in self.bursts]
+        numbers = [n for n, bursts in enumerate(left) if bursts]
+        return Schedule(
+            tuple(self.views[n] for n in numbers),
+            tuple(tuple(left[n]) for n in numbers),
+            tuple(self.labels[n] for n in numbers),
+        )
+
+
+def bursts_left(bursts: Sequence[Burst], proven: Collection[ShotId]) -> list[Burst]:
+    """Bursts with unproven frames, reduced to these."""
+    left = []
+    for burst in bursts:
+        wanted = {shot.label for shot in burst.shots if shot and shot not in proven}
+        if wanted:
+            left.append(burst if len(wanted) == len(burst.labels) else burst.only(wanted))
+    return left
 
 
 def expand_view(view: View) -> list[ViewPose]:
@@ -128,6 +151,21 @@ def build_schedule(
             bursts.append([replace(burst, view=pose.name) for burst in bursts_of[lights]])
     labels = tuple(tuple(label for burst in own for label in burst.labels if label) for own in bursts)
     return Schedule(tuple(views), tuple(map(tuple, bursts)), labels)
+
+
+def too_large(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
+    """Key path and message if a plan has more views or frames than can be planned for."""
+    sizes = [
+        len(view.azimuths_deg) * len(view.elevations_deg) if isinstance(view, Grid) else 1 for view in plan.views
+    ]
+    if sum(sizes) > MOST_VIEWS:
+        return [(("views",), f"expected at most {MOST_VIEWS} views in one plan, found {sum(sizes)}; split it")]
+    exposures = plan.repeats * len(plan.exposure.exposures_us)
+    frames = sum(sizes) * (exposures * len(leds.ids) + plan.darks_per_view)
+    if frames > MOST_FRAMES:
+        message = f"expected at most {MOST_FRAMES} frames in one plan, found up to {frames}; split it"
+        return [(("repeats",) if plan.repeats > 1 else ("views",), message)]
+    return []
 
 
 def names_too_long(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:

@@ -5,17 +5,22 @@ from __future__ import annotations
 import math
 import shutil
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 from coupole.errors import StorageError
+from coupole.motion.itinerary import Itinerary
 from coupole.plan.bursts import Pace
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import in_world, runs_tables
+from coupole.plan.shot_id import ShotId
+from coupole.preflight.exposure_scale import ExposedWhite, exposed_white, exposure_scale
+from coupole.preflight.framing import ObjectCheck, check_object
 from coupole.preflight.job import Job, at_pace
-from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, check
+from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, Whole, check
 from coupole.storage.ledger import History, ledger_of, similar_ids
 from coupole.storage.write_speed import measure_write_speed
 
@@ -25,53 +30,94 @@ _LED_DUTIES = tuple(0.9**k for k in range(1, 33))
 
 
 def preflight_of(
-    job: Job, folder: Path, *, paths: bool = True, allocated_bytes: int = 0, share_left: float = 1.0
+    job: Job,
+    folder: Path,
+    *,
+    paths: bool = True,
+    allocated_bytes: int = 0,
+    proven: Collection[ShotId] = (),
 ) -> tuple[Job, Report]:
     """Preflight's report on a job whose run would be in `folder`, and the job at the pace that LEDs and the
     measured speed of that disk allow.
 
     Without `paths` collisions are not checked. For a resumed run, `allocated_bytes` are already on the disk
-    and `share_left` of its frames are still to be taken.
+    and the `proven` frames are not taken again.
     """
+    storage = storage_of(folder, job.cell.rig, allocated_bytes)
+    job, report = check_job(job, storage, paths=paths, proven=proven)
+    if not storage.write_bytes_s and not storage.trouble:
+        report.warnings.append(f"storage {folder}: too little room to measure the disk's speed; none is assumed")
+    return job, report
+
+
+def storage_of(folder: Path, rig: Rig, allocated_bytes: int = 0) -> StorageFacts:
+    """State of the disk on which `folder` is, or would be."""
     existing = folder
     while not existing.exists():
         existing = existing.parent
-    try:
-        write_bytes_s = measure_write_speed(existing, frame_bytes=job.cell.rig.frame_bytes)
-    except StorageError:
-        write_bytes_s = 0.0
-    free_bytes = shutil.disk_usage(existing).free + allocated_bytes
-    return check_job(job, StorageFacts(free_bytes, write_bytes_s), paths=paths, share_left=share_left)
+    write_bytes_s, trouble = 0.0, "" if existing.is_dir() else f"{existing} is a file"
+    free_bytes = shutil.disk_usage(existing).free
+    if not trouble:
+        try:
+            write_bytes_s = measure_write_speed(
+                existing, frame_bytes=rig.frame_bytes, room_bytes=free_bytes - rig.storage.reserve_bytes
+            )
+        except StorageError as error:
+            trouble = str(error)
+    return StorageFacts(free_bytes, write_bytes_s, folder, allocated_bytes, trouble)
 
 
 def check_job(
-    job: Job, storage: StorageFacts, *, paths: bool = True, share_left: float = 1.0
+    job: Job, storage: StorageFacts, *, paths: bool = True, proven: Collection[ShotId] = ()
 ) -> tuple[Job, Report]:
-    """Preflight's report on a job, given the disk's state; and the job at the pace that LEDs and disk allow."""
+    """Preflight's report on a job, or on what the `proven` frames of its run leave of it, given the disk's state;
+    and the job at the pace that LEDs and disk allow."""
     rig = job.cell.rig
     home_deg = rig.motion.home_joints_deg
-    if paths:
-        itinerary = job.motion.itinerary(job.schedule.views, home_deg)
-    else:
-        itinerary = job.motion.unchecked_itinerary(job.schedule.views, home_deg)
+    views = job.schedule.left(proven).views if proven else job.schedule.views
+    planned = job.motion.itinerary if paths else job.motion.unchecked_itinerary
+    itinerary = planned(views, home_deg)
+    all_views = job.motion.unchecked_itinerary(job.schedule.views, home_deg) if proven else None
     history = ledger_of(job.cell, job.plan.object.id).read() if job.plan.object else History()
+    before = history.total_lux_h
 
     def checked(pace: Pace) -> tuple[Job, Report]:
         paced = at_pace(job, pace)
-        report = check(
+        checking = partial(
+            check,
             job.plan,
             rig,
-            paced.schedule,
-            job.cell.leds,
-            storage,
-            itinerary,
+            leds=job.cell.leds,
+            storage=storage,
             object_points_support_mm=job.shape.dose_points_mm,
-            dose_before_lux_h=history.total_lux_h,
-            share_left=share_left,
         )
-        return paced, report
+        if all_views is None:
+            return paced, checking(paced.schedule, itinerary=itinerary, dose_before_lux_h=before)
+        of_all = checking(paced.schedule, itinerary=all_views)
+        left = checking(
+            paced.schedule.left(proven),
+            itinerary=itinerary,
+            dose_before_lux_h=before,
+            whole=Whole(
+                len(of_all.views),
+                of_all.shots,
+                of_all.frames,
+                of_all.bytes,
+                of_all.duration_s,
+                of_all.dose_lux_h,
+            ),
+        )
+        return paced, left
 
     job, report = _cooled(*checked(Pace(disk_us=_disk_us(rig, storage))), checked)
+    report.object_check = _object_check(job, itinerary, proven)
+    if report.object_check is not None:
+        report.refusals += report.object_check.refusals
+        report.warnings += report.object_check.warnings
+    report.warnings += job.shape.remarks
+    if (scale := exposure_scale(job)) is not None:
+        report.exposure_scale, report.white = scale.source, tuple(exposed_white(job, scale))
+        report.warnings += _badly_exposed(report.white)
     report.refusals += calibration_refusals(job)
     if job.plan.trigger == "hardware" and not runs_tables(rig):
         why = "cannot trigger the camera: it runs no tables. Set `trigger: software` in the plan"
@@ -111,6 +157,25 @@ def ledger_warnings(job: Job, history: History, more_lux_h: float) -> list[str]:
     if history.unreadable:
         warnings.append(f"object {name}: {history.unreadable} lines of its ledger cannot be read")
     return warnings
+
+
+def _object_check(job: Job, itinerary: Itinerary, proven: Collection[ShotId]) -> ObjectCheck | None:
+    """The object in its views, as far as they are still to be taken; None without a mesh."""
+    if job.plan.object is None:
+        return None
+    schedule = job.schedule.left(proven) if proven else job.schedule
+    return check_object(job.plan.object.id, job.shape.corners_mm, job.cell.rig, schedule, itinerary)
+
+
+def _badly_exposed(white: Sequence[ExposedWhite]) -> list[str]:
+    """Warnings if even the shortest exposure saturates white, or even the longest leaves it dark."""
+    ends = [(white[0], "over-exposed"), (white[-1], "under-exposed")] if white else []
+    return [
+        f"{end.exposure_us} us: {verdict}: white reaches {end.brightest:.0%} of full scale under the brightest "
+        f"LED, {end.median:.0%} under the median one"
+        for end, verdict in ends
+        if end.verdict() == verdict
+    ]
 
 
 def calibration_refusals(job: Job, *, camera: str | None = None, temperature_c: float | None = None) -> list[str]:

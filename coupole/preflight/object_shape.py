@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +12,16 @@ from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.plan.plan import MeasuredObject
 from coupole.plan.reading import PlanFiles
+from coupole.scan.mesh_files import read_mesh
 
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
+_LARGEST = 2.0
+"""Largest side of an object, in diameters of the support."""
+_SMALLEST_MM = 1.0
+_DOUBTFUL_MM = 10.0
+"""Objects below it are measured, but wrong units are likelier."""
+_LARGEST_AREA_MM2 = 1e8
+"""Of all triangles together: beyond it they are no surface of an object."""
 
 
 @dataclass(frozen=True)
@@ -26,36 +33,67 @@ class ObjectShape:
     """[triangles, 3, 3]; none of them without a mesh."""
     dose_points_mm: NDArray[np.float64]
     """[n, 3] corners and centre of the bounding box; without a mesh, the views' targets."""
+    remarks: tuple[str, ...] = ()
+    """Warnings about a valid mesh."""
 
 
 def read_object(files: PlanFiles) -> ObjectShape:
-    """Raises InputError with the line in the plan if its mesh cannot be read."""
-    corners = np.zeros((0, 3, 3))
+    """Raises InputError with the line in the plan if its mesh cannot be read, or if its size cannot be that of an
+    object on this support."""
+    corners, remarks = np.zeros((0, 3, 3)), []
     if files.mesh_path is not None:
         assert files.plan.object is not None
         try:
             corners = load_corners(files.mesh_path, files.plan.object)
-        except Exception as error:  # any exception of trimesh means that the file is not a readable mesh
-            message = f"cannot read the mesh {files.mesh_path}: {error}"
+        except InputError as error:
+            message = f"cannot read the mesh {error}"
             raise InputError([files.document.problem(("object", "mesh"), message)]) from error
+        size_mm = float(np.ptp(corners, axis=(0, 1)).max())
+        unit, diameter_mm = files.plan.object.mesh_unit, files.cell.rig.support.diameter_mm
+        if problem := _impossible_size(corners, size_mm, unit, diameter_mm):
+            raise InputError([files.document.problem(("object", "mesh_unit"), problem)])
+        if size_mm < _DOUBTFUL_MM and (better := _other_unit(size_mm, unit, diameter_mm)):
+            remarks.append(f"object {files.plan.object.id}: it is {size_mm:.3g} mm large. {better}")
     targets = [view.target_mm for view in files.plan.views if hasattr(view, "target_mm")]
-    return ObjectShape(files.mesh_path, corners, _dose_points(corners, targets))
+    return ObjectShape(files.mesh_path, corners, _dose_points(corners, targets), tuple(remarks))
 
 
 def load_corners(mesh_path: Path, measured: MeasuredObject) -> NDArray[np.float64]:
-    """Triangles [n, 3, 3] of a mesh file in the support frame, mm. Raises trimesh's exceptions."""
-    import trimesh
-
-    loaded: Any = trimesh.load(mesh_path, process=False, force="mesh")
-    if len(loaded.faces) == 0:
-        raise ValueError("it has no triangles")
-    corners = np.asarray(loaded.vertices)[np.asarray(loaded.faces)] * MM_PER_UNIT[measured.mesh_unit]
-    if not np.isfinite(corners).all():
-        raise ValueError("it has vertices that are no finite numbers")
+    """Triangles [n, 3, 3] of a mesh file in the support frame, mm. Raises InputError with the place in it."""
+    mesh = read_mesh(mesh_path)
+    corners = mesh.vertices.astype(np.float64)[mesh.triangles] * MM_PER_UNIT[measured.mesh_unit]
     return apply(measured.support_from_object.matrix(), corners)
 
 
-def _dose_points(corners: NDArray[np.float64], targets_mm: list[Any]) -> NDArray[np.float64]:
+def _impossible_size(corners: NDArray[np.float64], size_mm: float, unit: str, diameter_mm: float) -> str:
+    """Why a mesh cannot be an object on a support of this diameter; empty if it can."""
+    if not _SMALLEST_MM <= size_mm <= _LARGEST * diameter_mm:
+        return (
+            f"read in {unit} the object is {size_mm:.3g} mm large; expected {_SMALLEST_MM:g} to "
+            f"{_LARGEST * diameter_mm:g} mm. {_other_unit(size_mm, unit, diameter_mm)}".rstrip()
+        )
+    edges = corners[:, 1:] - corners[:, :1]
+    area_mm2 = float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum()) / 2.0
+    if area_mm2 > _LARGEST_AREA_MM2:
+        return f"its triangles have {area_mm2 / 1e6:.3g} m2 together; expected the surface of one object"
+    return ""
+
+
+def _other_unit(size_mm: float, unit: str, diameter_mm: float) -> str:
+    """The units in which the object would have an ordinary size, as a sentence; empty if there is none."""
+    raw = size_mm / MM_PER_UNIT[unit]
+    fitting = {
+        other: raw * mm
+        for other, mm in MM_PER_UNIT.items()
+        if other != unit and _DOUBTFUL_MM <= raw * mm <= diameter_mm
+    }
+    choices = [f"`mesh_unit: {other}` makes it {other_mm:.4g} mm" for other, other_mm in fitting.items()]
+    return f"Is its unit right? {'; '.join(choices)}." if choices else ""
+
+
+def _dose_points(
+    corners: NDArray[np.float64], targets_mm: list[tuple[float, float, float]]
+) -> NDArray[np.float64]:
     if len(corners) == 0:
         return np.array(targets_mm or [(0.0, 0.0, 0.0)])
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))

@@ -6,8 +6,8 @@ LED, the limit and the value.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 from coupole.devices import NO_LED
 from coupole.geometry import apply
 from coupole.motion.itinerary import Itinerary
-from coupole.plan.bursts import Burst, BurstTiming
+from coupole.plan.bursts import BurstTiming
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
-from coupole.plan.rig import BoardThermal, LedLimits, Rig
+from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import upload_s
 from coupole.plan.schedule import Schedule
+from coupole.preflight.exposure_scale import ExposedWhite
+from coupole.preflight.framing import ObjectCheck
+from coupole.preflight.led_limits import heat_of, refuse_on_times
 
 BURST_OVERHEAD_S = 0.14
 """Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""
@@ -33,10 +36,17 @@ PAGE_BYTES = 4096
 
 @dataclass(frozen=True)
 class StorageFacts:
-    """State of the disk: free bytes, and its measured speed (0: not measured)."""
+    """State of the disk that the run would be on."""
 
     free_bytes: int
     write_bytes_s: float = 0.0
+    """Measured; 0: not measured."""
+    folder: Path | None = None
+    """In which the run would be, or is; None: the rig's."""
+    allocated_bytes: int = 0
+    """What a resumed run already occupies: its views' files are allocated as a whole."""
+    trouble: str = ""
+    """Why nothing can be written there."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +60,25 @@ class ViewReport:
     dose_lux_h: float
 
 
+@dataclass(frozen=True)
+class Whole:
+    """The same figures for a whole run, of which a part is done."""
+
+    views: int
+    shots: int
+    frames: int
+    bytes: int
+    duration_s: float
+    """Without regard to collisions."""
+    dose_lux_h: float
+
+
 @dataclass
 class Report:
-    """The expected course of a plan, and the refusals."""
+    """The expected course of a plan, or of what is left of a run, and the refusals."""
 
+    whole: Whole | None = None
+    """Of a resumed run; None otherwise."""
     views: list[ViewReport] = field(default_factory=list)
     """In the order of the visits; unreachable ones last."""
     shots: int = 0
@@ -72,6 +97,12 @@ class Report:
     """Timing of each exposure, with the limit that determines its period."""
     asked_bytes_s: float = 0.0
     disk_bytes_s: float = 0.0
+    exposure_scale: str | None = None
+    """From which it is known how bright white will be; None: it is not known."""
+    white: tuple[ExposedWhite, ...] = ()
+    """Of each exposure, if that is known."""
+    object_check: ObjectCheck | None = None
+    """None without a mesh."""
     refusals: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -86,22 +117,23 @@ def check(
     *,
     object_points_support_mm: NDArray[np.float64],
     dose_before_lux_h: float = 0.0,
-    share_left: float = 1.0,
+    whole: Whole | None = None,
 ) -> Report:
-    """Check a whole plan. The dose is computed at `object_points_support_mm` [n, 3]; the highest counts.
-
-    For a resumed plan, `share_left` of its light is still to come.
-    """
-    report = Report(shots=schedule.shots, frames=schedule.frames)
-    report.timings = tuple(dict.fromkeys(burst.timing for burst in schedule.bursts[0]))
+    """Check a whole plan, or what is left of the run `whole`. The dose is computed at `object_points_support_mm`
+    [n, 3]; the highest counts."""
+    report = Report(whole, shots=schedule.shots, frames=schedule.frames)
+    report.timings = tuple(dict.fromkeys(burst.timing for bursts in schedule.bursts for burst in bursts))
     report.dose_before_lux_h = dose_before_lux_h
     report.dose_budget_lux_h = plan.object.dose_budget_lux_h if plan.object else None
     report.refusals += itinerary.refusals
     report.refusals += _refuse_names(schedule)
     report.refusals += _refuse_optics(plan, rig)
-    report.refusals += _refuse_on_times(schedule.bursts[0], rig.led_limits)
-    _time_and_dose(report, plan, rig, schedule, itinerary, leds, object_points_support_mm, share_left)
-    _thermal(report, rig.led_limits, [schedule.bursts[index] for index in _order(itinerary)], leds)
+    report.refusals += refuse_on_times(schedule.bursts, rig.led_limits)
+    _time_and_dose(report, plan, rig, schedule, itinerary, leds, object_points_support_mm)
+    bursts = [schedule.bursts[index] for index in _order(itinerary)]
+    heat = heat_of(bursts, [view.move_s for view in report.views], rig.led_limits, leds)
+    report.peak_board_c, report.too_hot = heat.peak_c, heat.too_hot
+    report.refusals += heat.refusals
     _storage(report, rig, schedule, storage)
     return report
 
@@ -123,21 +155,6 @@ def _refuse_optics(plan: Plan, rig: Rig) -> list[str]:
     return refusals
 
 
-def _refuse_on_times(bursts: Sequence[Burst], limits: LedLimits) -> list[str]:
-    low_us, high_us = limits.on_us
-    refusals = []
-    for burst in bursts:
-        lit = burst.table["led"] != NO_LED
-        wrong = lit & ((burst.table["on_us"] < low_us) | (burst.table["on_us"] > high_us))
-        if wrong.any():
-            first = int(np.flatnonzero(wrong)[0])
-            refusals.append(
-                f"shot {burst.labels[first]}: LED {burst.table['led'][first]} would be on for "
-                f"{burst.table['on_us'][first]} us; the limits are {low_us} to {high_us} us"
-            )
-    return refusals
-
-
 def _order(itinerary: Itinerary) -> list[int]:
     """Views in the order of the visits, then unreachable ones."""
     return [*itinerary.order, *sorted(set(range(len(itinerary.visits))) - set(itinerary.order))]
@@ -151,7 +168,6 @@ def _time_and_dose(
     itinerary: Itinerary,
     leds: LedTable,
     points_support_mm: NDArray[np.float64],
-    share_left: float,
 ) -> None:
     points_base = apply(rig.support.base_from_support.matrix(), points_support_mm)
     lux = leds.illuminance_lux(points_base, emission=rig.dome.emission)
@@ -184,7 +200,7 @@ def _time_and_dose(
                 float(dose.max()),
             )
         )
-    report.dose_lux_h = float(total.max()) * share_left
+    report.dose_lux_h = float(total.max())
     budget = report.dose_budget_lux_h
     if budget is not None and report.dose_lux_h + report.dose_before_lux_h > budget:
         assert plan.object is not None
@@ -194,82 +210,19 @@ def _time_and_dose(
         )
 
 
-def _thermal(
-    report: Report, limits: LedLimits, bursts_of_views: Sequence[Sequence[Burst]], leds: LedTable
-) -> None:
-    """Board temperatures (first order) and dark times of each LED, over the bursts of the report's views."""
-    model = limits.board
-    board_of_led = dict(zip(leds.ids.tolist(), leds.boards.tolist(), strict=True))
-    n_boards = int(leds.boards.max()) + 1
-    rise = np.zeros(n_boards)
-    off_since = np.full(int(leds.ids.max()) + 1, -np.inf)
-    peak = 0.0
-    t_s = 0.0
-    for bursts, view in zip(bursts_of_views, report.views, strict=True):
-        rise *= np.exp(-view.move_s / model.time_constant_s)
-        t_s += view.move_s
-        for burst in bursts:
-            starts_s = np.concatenate([[0.0], np.cumsum(burst.table["period_us"][:-1], dtype=np.int64)]) / 1e6
-            lit = np.flatnonzero(burst.table["led"] != NO_LED)
-            led = burst.table["led"][lit]
-            on_s = burst.table["on_us"][lit] / 1e6
-            rest_s = t_s + starts_s[lit] - off_since[led]
-            short = rest_s < limits.cooldown_ratio * on_s
-            if short.any() and not report.too_hot:
-                report.too_hot = True
-                k = int(np.flatnonzero(short)[0])
-                report.refusals.append(
-                    f"shot {burst.view}/{burst.labels[lit[k]]}: LED {led[k]} rests {rest_s[k]:.3f} s before it is "
-                    f"lit for {on_s[k]:.3f} s; it needs {limits.cooldown_ratio * on_s[k]:.3f} s"
-                )
-            off_since[led] = t_s + starts_s[lit] + on_s
-            boards = np.array([board_of_led[int(n)] for n in led], np.int64)
-            last_s = np.zeros(n_boards)
-            peak = max(peak, _heat(rise, last_s, boards, starts_s[lit] + on_s, on_s, model))
-            rise *= np.exp(-(burst.duration_s - last_s) / model.time_constant_s)
-            t_s += burst.duration_s
-    report.peak_board_c = model.ambient_c + peak
-    if report.peak_board_c > model.limit_c:
-        report.too_hot = True
-        report.refusals.append(
-            f"LED boards: the hottest would reach {report.peak_board_c:.1f} C; the limit is {model.limit_c:g} C"
-        )
-
-
-def _heat(
-    rise: NDArray[np.float64],
-    last_s: NDArray[np.float64],
-    boards: NDArray[np.int64],
-    ends_s: NDArray[np.float64],
-    on_s: NDArray[np.float64],
-    model: BoardThermal,
-) -> float:
-    """Warm `rise` [boards] by lit LEDs in order of time, all boards at once; returns the highest rise."""
-    peak = 0.0
-    turn = np.zeros(len(boards), np.int64)
-    order = np.argsort(boards, kind="stable")
-    sorted_boards = boards[order]
-    first = np.searchsorted(sorted_boards, sorted_boards, side="left")
-    turn[order] = np.arange(len(boards)) - first
-    for k in range(int(turn.max()) + 1 if len(turn) else 0):
-        now = turn == k
-        b = boards[now]
-        rise[b] *= np.exp(-(ends_s[now] - last_s[b]) / model.time_constant_s)
-        rise[b] += model.rise_c_per_j * model.led_power_w * on_s[now]
-        last_s[b] = ends_s[now]
-        peak = max(peak, float(rise[b].max()))
-    return peak
-
-
 def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts) -> None:
     frame_bytes = rig.frame_bytes
+    folder = storage.folder or rig.storage.folder
     report.bytes = report.frames * frame_bytes
-    shortest_us = min(int(b.table["period_us"].min()) for b in schedule.bursts[0])
-    report.asked_bytes_s = frame_bytes / (shortest_us * 1e-6)
+    periods_us = [int(b.table["period_us"].min()) for bursts in schedule.bursts for b in bursts]
+    report.asked_bytes_s = frame_bytes / (min(periods_us) * 1e-6) if periods_us else 0.0
     report.disk_bytes_s = storage.write_bytes_s
-    if report.bytes + rig.storage.reserve_bytes > storage.free_bytes:
+    needed_bytes = max(0, (report.whole.bytes if report.whole else report.bytes) - storage.allocated_bytes)
+    if storage.trouble:
+        report.refusals.append(f"storage {folder}: expected a folder that can be written; {storage.trouble}")
+    if needed_bytes + rig.storage.reserve_bytes > storage.free_bytes:
         report.refusals.append(
-            f"storage {rig.storage.folder}: the run needs {report.bytes / 1e9:.2f} GB and "
+            f"storage {folder}: the run needs {needed_bytes / 1e9:.2f} GB and "
             f"{rig.storage.reserve_bytes / 1e9:.2f} GB must stay free; {storage.free_bytes / 1e9:.2f} GB are free"
         )
     if frame_bytes % PAGE_BYTES:

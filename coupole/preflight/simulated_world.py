@@ -9,6 +9,7 @@ from coupole.errors import InputError
 from coupole.plan.cell import Cell
 from coupole.plan.rig import Rig, Sensor
 from coupole.plan.rig_devices import camera_kind, device_for, ledbox_stand_in, stand_in_for, world_problems
+from coupole.preflight.exposure_scale import exposure_scale, white_share
 from coupole.preflight.job import Job
 
 DRY_RUN_WIDTH_PX = 128
@@ -43,6 +44,8 @@ def world_config(
     if problems := world_problems(cell.document, rig, settings):
         raise InputError(problems)
     exposures_us = job.plan.exposure.exposures_us if job else (8000,)
+    nominal_us = exposures_us[len(exposures_us) // 2]
+    scale = exposure_scale(job) if job is not None and dry_run else None
     return {
         "settings": settings,
         "scene": {
@@ -70,7 +73,8 @@ def world_config(
             "focus_distance_mm": rig.lens.focus_distance_mm,
             "f_number": rig.lens.f_number,
             "flange_from_camera": rig.flange_from_camera.matrix().tolist(),
-            "nominal_exposure_us": exposures_us[len(exposures_us) // 2],
+            "nominal_exposure_us": nominal_us,
+            **({"white_share": white_share(job, scale, nominal_us)} if job is not None and scale else {}),
         },
     }
 

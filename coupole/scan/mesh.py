@@ -33,6 +33,15 @@ def expect_records(path: Path, what: str, count: int, read: int, wanted: int | N
         raise InputError(f"{path}: the file ends in {what} {read} of {count}: it was cut off")
 
 
+def expect_room(path: Path, what: str, count: int, least_bytes: int, size_bytes: int) -> None:
+    """Raise InputError if a file of this size cannot hold as many records as it says, before they get memory."""
+    if count * least_bytes > size_bytes:
+        raise InputError(
+            f"{path}: expected {count} of {what}, as its header says, of {least_bytes} bytes or more each; the "
+            f"file has {size_bytes} bytes: it was cut off, or its header is wrong"
+        )
+
+
 def expect_finite(path: Path, points: NDArray[np.float32], where: str) -> None:
     """Raise InputError if a coordinate is not finite; `where` is a format string for the number of the point."""
     bad = _first_not_finite(points.reshape(-1, 3))

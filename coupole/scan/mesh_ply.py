@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.scan import mesh_text
-from coupole.scan.mesh import CHUNK, Mesh, expect_corners, expect_finite, expect_records, expect_text
+from coupole.scan.mesh import CHUNK, Mesh, expect_corners, expect_finite, expect_records, expect_room, expect_text
 from coupole.scan.mesh_text import BAD_CORNER, NOT_A_NUMBER, OK, TOO_FEW
 
 _PLY_TYPES = {
@@ -38,6 +38,8 @@ class _Element:
 def read_ply(path: Path) -> Mesh:
     """Read a PLY. Raises InputError with the place of the error."""
     file_format, elements, at, line = _ply_header(path)
+    for element in elements:
+        _expect_possible(path, element, ascii_text=file_format == "ascii")
     if file_format == "ascii":
         return _read_ascii_ply(path, elements, at, line)
     order = "<" if file_format == "binary_little_endian" else ">"
@@ -53,6 +55,18 @@ def read_ply(path: Path) -> Mesh:
             else:
                 file.seek(element.count * _plain_record(path, element, order).itemsize, 1)
     return Mesh(vertices, triangles)
+
+
+def _expect_possible(path: Path, element: _Element, *, ascii_text: bool) -> None:
+    """Raise InputError if the file is too short for an element, or a property stands twice."""
+    names = [described[0] for described in element.properties]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(
+            f"{path}: element `{element.name}` has property `{twice[0]}` twice; expected each name once"
+        )
+    kinds = [_PLY_TYPES.get(described[1], "u1") for described in element.properties]  # of a list, its count
+    least_bytes = 2 * len(kinds) if ascii_text else sum(np.dtype(kind).itemsize for kind in kinds)
+    expect_room(path, f"`{element.name}`", element.count, max(1, least_bytes), path.stat().st_size + 1)
 
 
 def _ply_header(path: Path) -> tuple[str, list[_Element], int, int]:
@@ -109,7 +123,8 @@ def _binary_vertices(path: Path, file, element: _Element, order: str) -> NDArray
                 path, "vertex", element.count, first + len(part), min(CHUNK, element.count - first) + first
             )
             for k, axis in enumerate("xyz"):
-                vertices[first : first + len(part), k] = part[axis]
+                with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused below
+                    vertices[first : first + len(part), k] = part[axis]
     expect_finite(path, vertices, "vertex {}")
     return vertices
 
@@ -156,6 +171,7 @@ def _read_ascii_ply(path: Path, elements: list[_Element], at: int, line: int) ->
     for element in elements:
         names = [described[0] for described in element.properties]
         if element.name == "vertex":
+            _plain_record(path, element, "<")
             if not {"x", "y", "z"} <= set(names):
                 raise InputError(f"{path}: expected vertices with x, y and z, found {', '.join(names)}")
             vertices = np.empty((element.count, 3), np.float32)
@@ -168,7 +184,8 @@ def _read_ascii_ply(path: Path, elements: list[_Element], at: int, line: int) ->
             state, at, line = _fill_faces(data, at, line, triangles, len(vertices))
             expect_text(path, state, line, f"3 and three vertices of 0 to {len(vertices) - 1}")
         else:
-            for _ in range(element.count):
+            for number in range(element.count):
+                expect_records(path, element.name, element.count, number if at >= len(data) else element.count)
                 at, line = mesh_text.line_end(data, at) + 1, line + 1
     return Mesh(vertices, triangles)
 

@@ -13,14 +13,20 @@ from coupole.storage.disk_errors import disk_error
 from coupole.storage.view_writer import WRITERS
 
 _BLOCK_BYTES = 8 * 2**20
-_LEAST_BLOCKS, _MOST_BLOCKS, _FRAMES = 8, 64, 20
+_LEAST_BLOCKS, _MOST_BLOCKS, _FRAMES = 8, 16, 20
 
 
-def measure_write_speed(folder: Path, *, frame_bytes: int = 0) -> float:
+def measure_write_speed(folder: Path, *, frame_bytes: int = 0, room_bytes: int) -> float:
     """Write speed of a folder's disk, bytes per second, measured as frames are written: O_DIRECT if possible,
-    several at a time, into allocated space, synced. The measurement takes longer for large frames."""
+    several at a time, into allocated space, synced.
+
+    It writes 64 MiB, or 128 MiB for large frames, into a file without a name, which does not outlast this
+    process. Returns 0 if that is more than the room there is. Raises StorageError if nothing can be written.
+    """
     blocks = min(max(_LEAST_BLOCKS, _FRAMES * frame_bytes // _BLOCK_BYTES), _MOST_BLOCKS)
     total_bytes = blocks * _BLOCK_BYTES
+    if total_bytes > room_bytes:
+        return 0.0
     path = folder / f".speed-{os.getpid()}"
     block = mmap.mmap(-1, _BLOCK_BYTES)
     block.write(os.urandom(_BLOCK_BYTES))
@@ -29,6 +35,7 @@ def measure_write_speed(folder: Path, *, frame_bytes: int = 0) -> float:
             fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_DIRECT, 0o600)
         except OSError:
             fd = os.open(path, os.O_WRONLY | os.O_CREAT, 0o600)
+        path.unlink()
         try:
             os.posix_fallocate(fd, 0, total_bytes)
             with ThreadPoolExecutor(WRITERS) as pool:
@@ -42,6 +49,5 @@ def measure_write_speed(folder: Path, *, frame_bytes: int = 0) -> float:
                 return total_bytes / (time.perf_counter() - start)
         finally:
             os.close(fd)
-            path.unlink()
     except OSError as error:
         raise disk_error(folder, error) from error

@@ -16,8 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from rich.table import Table
 from rich.text import Text
 
-from coupole.plan.bursts import BurstTiming
-from coupole.preflight.preflight import Report
+from coupole.preflight.exposure_scale import HOW_TO_KNOW
 from coupole.storage.run_status import Status
 from coupole.viewing.progress import Outcome, ViewExposure
 from coupole.viewing.progress import Progress as RunProgress
@@ -138,44 +137,6 @@ class RunObserver:
         self._console.print(message)
 
 
-def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> None:
-    """Print the summary of a preflight."""
-    table = Table(title=f"{name} on {rig}", title_justify="left", box=None, show_header=False)
-    table.add_row("views, shots, frames", f"{len(report.views)}, {report.shots}, {report.frames}")
-    table.add_row("on disk", f"{bytes_text(report.bytes)} at {bytes_text(report.asked_bytes_s)}/s" + _disk(report))
-    table.add_row("a frame every", "; ".join(map(_pace, report.timings)))
-    table.add_row("duration", f"{duration_text(report.duration_s)} (at best {duration_text(report.ideal_s)})")
-    budget = "" if report.dose_budget_lux_h is None else f" of {report.dose_budget_lux_h:g} allowed"
-    before = f" after {report.dose_before_lux_h:.3f} before" if report.dose_before_lux_h else ""
-    table.add_row("light on the object", f"{report.dose_lux_h:.3f} lux.h{before}{budget}")
-    table.add_row("hottest LED board", f"{report.peak_board_c:.1f} C")
-    console.print(table)
-    for warning in report.warnings:
-        console.print(f"[yellow]note:[/] {warning}")
-
-
-def _pace(timing: BurstTiming) -> str:
-    bounds = {"LED": "the LED's on-time", "heat": "the LEDs' heat", "disk": "the disk", "camera": "the camera"}
-    return (
-        f"{timing.period_us / 1e3:g} ms, as {bounds[timing.bound]} asks ({timing.exposure_us / 1e3:g} ms exposed)"
-    )
-
-
-def _disk(report: Report) -> str:
-    return f"; the disk takes {bytes_text(report.disk_bytes_s)}/s" if report.disk_bytes_s else ""
-
-
-def show_views(console: Console, report: Report) -> None:
-    """One line for each view."""
-    table = Table("view", "joints (deg)", "move", "bursts", "lux.h", box=None)
-    for view in report.views:
-        joints = "-" if view.joints_deg is None else " ".join(f"{j:.1f}" for j in view.joints_deg)
-        table.add_row(
-            view.name, joints, duration_text(view.move_s), duration_text(view.burst_s), f"{view.dose_lux_h:.3f}"
-        )
-    console.print(table)
-
-
 def show_status(console: Console, status: Status) -> None:
     """Progress of a run; only what failed is red."""
     colour = {"done": "green", "failed": "red"}.get(status.state, "yellow")
@@ -204,10 +165,16 @@ def show_dry_run(
         f"dry run: {duration_text(found['duration_s'])} of the cell's time in {duration_text(found['machine_s'])} "
         f"({found['speed']:.1f} times faster); preflight said {duration_text(found['preflight_s'])}"
     )
-    table = Table("view", "pictures", "brightest", "saturated", "exposure", box=None)
-    for view, seen in exposures.items():
-        table.add_row(view, str(seen.pictures), f"{seen.brightest:.0%}", f"{seen.saturated:.2%}", seen.verdict())
-    console.print(table)
+    if found["exposure_scale"] is None:
+        console.print(f"exposure: not known; {HOW_TO_KNOW}")
+    else:
+        table = Table("view", "pictures", "brightest", "saturated", "exposure", box=None)
+        for view, seen in exposures.items():
+            table.add_row(
+                view, str(seen.pictures), f"{seen.brightest:.0%}", f"{seen.saturated:.2%}", seen.verdict()
+            )
+        console.print(table)
+        console.print(f"exposure judged by {found['exposure_scale']}", markup=False)
     if outcome.reshot or outcome.over_triggers or outcome.lost_transfers:
         console.print(
             f"{outcome.reshot} shots re-shot, {outcome.over_triggers} edges came while the camera was busy, "

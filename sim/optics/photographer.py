@@ -32,7 +32,7 @@ from sim.render.shadows import Shadows
 from sim.scene.scene import Scene, build_scene, load_surface, support_disk
 from sim.scene.surface import Material, Surface
 from sim.scene.things import placed
-from sim.world.config import WHITE_SHARE, CameraConfig, MeshConfig, SceneConfig, Settings
+from sim.world.config import CameraConfig, MeshConfig, SceneConfig, Settings
 
 if TYPE_CHECKING:
     from sim.render.interreflection import Prepared
@@ -120,7 +120,7 @@ class Photographer:
         self.sensor = camera.true_sensor(settings.seed)
         self.flange_from_camera: Transform = np.array(camera.flange_from_camera)
         self.reference_lux = _reference_lux(_emitters(table), base_from_support)
-        white_e = WHITE_SHARE * self.sensor.full_scale_e
+        white_e = camera.white_share * self.sensor.full_scale_e
         self._electrons = white_e * np.pi / (self.reference_lux * camera.nominal_exposure_us * 1e-6)
         self._panels = [
             (panels.whole(panel, base_from_support, self.reference_lux), panel.unevenness)

@@ -109,7 +109,8 @@ class CameraConfig(_Model):
     """The settings from `blur` on are as in `sim.devices.camera_body.Settings`."""
     flange_from_camera: list[list[float]]
     nominal_exposure_us: int
-    """The exposure at which white reaches `WHITE_SHARE` of full scale."""
+    """The exposure at which white reaches `white_share` of full scale."""
+    white_share: Annotated[float, Field(gt=0)] = WHITE_SHARE
 
     def true_sensor(self, seed: int) -> SensorModel:
         """The sensor with the rig's pattern, bit depth and black level; its seed depends on the world's."""

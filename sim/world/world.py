@@ -78,8 +78,8 @@ class World:
             "camera": {
                 "kind": settings.camera.kind,
                 **camera_endpoint,
-                "scaling": f"white at the support's centre reaches 60 % of full scale in "
-                f"{config.camera.nominal_exposure_us} us under the median LED",
+                "scaling": f"white at the support's centre reaches {config.camera.white_share:.0%} of full scale "
+                f"in {config.camera.nominal_exposure_us} us under the median LED",
             },
             "clock": {"path": str(folder / "clock"), "speed": settings.speed},
             "control": {"address": str(folder / "control")},

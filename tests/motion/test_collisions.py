@@ -103,6 +103,25 @@ def test_an_arm_through_the_support_is_named() -> None:
     assert any(contact.other == "the support" and contact.distance_mm < 0 for contact in contacts)
 
 
+def test_a_keep_out_box_that_only_link_1_enters_is_named_with_it() -> None:
+    """Link 1 turns with axis 1: its capsule sweeps a ring round the axis that no other link comes near."""
+    home_deg = (0.0, -170.0, 150.0, 0.0, -70.0, 0.0)
+    (capsule,) = (c for c in capsules_of(KR10) if c.link == 1 and c.start_mm[1] < -50)
+    middle = apply(link_frames(KR10_R1100_SIXX, home_deg)[1], capsule.start_mm)
+    outwards = middle - link_frames(KR10_R1100_SIXX, home_deg)[1][:3, 3]
+    middle = middle + outwards / np.linalg.norm(outwards) * (capsule.radius_mm - 15.0)
+    at_mm = apply(inverse(BASE_FROM_SUPPORT), middle)
+    box = ("shelf", tuple(at_mm - 10.0), tuple(at_mm + 10.0))
+    around = Surroundings(BASE_FROM_SUPPORT, 740.0, 1500.0, 74.0, np.zeros((0, 3)), (), (box,))
+    bodies = CellBodies(KR10, around, TOOL, Clearances())
+    touching = [contact.body for contact in bodies.contacts(home_deg) if contact.other == "keep-out `shelf`"]
+    assert touching == ["link 1"]
+    turned_deg = np.array((60.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    swept = bodies.contact_on_the_way(np.array(home_deg) - turned_deg, np.array(home_deg) + turned_deg)
+    assert swept is not None
+    assert swept.body == "link 1"
+
+
 def test_an_arm_through_the_dome_is_named() -> None:
     contacts = cell().contacts(STRETCHED)
     around = apply(inverse(BASE_FROM_SUPPORT), link_frames(KR10_R1100_SIXX, STRETCHED)[7][:3, 3])

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -22,8 +25,10 @@ from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import upload_s
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.yamlfile import read
+from coupole.preflight.checking import storage_of
 from coupole.preflight.preflight import BURST_OVERHEAD_S, SETTLE_CHECK_S, Report, StorageFacts, check
 from coupole.storage.ledger import Ledger
+from coupole.storage.write_speed import measure_write_speed
 
 ROOT = REPO
 RIG, _ = read(ROOT / "configs/rigs/sim.yaml").problems(Rig)
@@ -177,7 +182,7 @@ def board(**changes: float) -> dict[str, Any]:
 def test_an_on_time_over_the_limit_is_refused_naming_shot_led_and_limit() -> None:
     rig = rig_of(led_limits=limits(on_us=(1000, 9000)))
     refusal = only_refusal(checked(plan_of(lights={"kind": "ids", "ids": [417]}), rig))
-    assert refusal == "shot led0417/e0: LED 417 would be on for 9200 us; the limits are 1000 to 9000 us"
+    assert refusal == "shot top/led0417/e0: LED 417 would be on for 9200 us; the limits are 1000 to 9000 us"
 
 
 def test_an_on_time_under_the_limit_is_refused() -> None:
@@ -190,6 +195,29 @@ def test_each_exposure_of_a_bracket_that_is_too_long_is_refused() -> None:
     bracket = {"kind": "bracket", "exposures_us": [2000, 8000, 16000]}
     refusals = checked(plan_of(exposure=bracket), rig).refusals
     assert [refusal.split(":")[0].rpartition("/")[2] for refusal in refusals] == ["e1", "e2"]
+
+
+def test_on_times_are_checked_in_every_view_not_in_the_first_alone() -> None:
+    rig = rig_of(led_limits=limits(on_us=(1000, 9000)))
+    views = [{**PARK, "lights": {"kind": "none"}}, {**PARK, "name": "lit"}, {**PARK, "name": "too"}]
+    refusal = only_refusal(checked(plan_of(views=views, lights={"kind": "ids", "ids": [417]}), rig))
+    assert refusal.startswith("shot lit/led0417/e0 (and in 1 more views): LED 417 would be on for 9200 us")
+
+
+def test_boards_are_heated_by_the_lights_of_each_view_not_by_those_of_the_first() -> None:
+    rig = rig_of(led_limits=board(rise_c_per_j=2.0, limit_c=60.0, ambient_c=25.0))
+    hot = {"kind": "boards", "boards": [3]}
+    views = [{**PARK, "lights": {"kind": "none"}}, {**PARK, "name": "lit", "lights": hot}]
+    plan = plan_of(views=views, order="as_written", exposure={"kind": "fixed", "exposure_us": 1_000_000})
+    report = checked(plan, rig)
+    assert only_refusal(report).startswith("LED boards: the hottest would reach ")
+    alone = checked(plan.model_copy(update={"views": plan.views[1:]}), rig)
+    assert report.peak_board_c == pytest.approx(alone.peak_board_c)
+
+
+def test_a_board_of_any_number_takes_no_memory_of_its_own() -> None:
+    leds = replace(sphere(count=12), boards=np.repeat([0, 2**31], 6))
+    assert checked(plan_of(), leds=leds).peak_board_c > 25.0
 
 
 def integrated_peak_c(
@@ -367,6 +395,60 @@ def test_a_run_that_does_not_fit_on_the_disk_is_refused() -> None:
     assert checked(plan_of(), storage=StorageFacts(free_bytes=need)).refusals == []
     refusal = only_refusal(checked(plan_of(), storage=StorageFacts(free_bytes=need - 1)))
     assert "must stay free" in refusal
+
+
+def test_the_folder_of_the_run_is_named_not_that_of_the_rig() -> None:
+    refusal = only_refusal(checked(plan_of(), storage=StorageFacts(0, folder=Path("/elsewhere/runs"))))
+    assert refusal.startswith("storage /elsewhere/runs: the run needs ")
+
+
+def test_what_a_resumed_run_has_allocated_is_not_asked_for_again() -> None:
+    assert RIG is not None
+    need = (1080 + 2 + MARKS) * RIG.frame_bytes + RIG.storage.reserve_bytes
+    facts = StorageFacts(need - 10**6, allocated_bytes=10**6)
+    assert checked(plan_of(), storage=facts).refusals == []
+    assert len(checked(plan_of(), storage=replace(facts, allocated_bytes=10**6 - 1)).refusals) == 1
+
+
+def test_a_disk_that_cannot_be_written_is_refused_and_not_taken_for_one_without_limit(tmp_path: Path) -> None:
+    occupied = tmp_path / "runs"
+    occupied.write_text("a file where the folder of the runs should be")
+    facts = storage_of(occupied / "below", rig_of())
+    assert facts.write_bytes_s == 0.0
+    refusal = only_refusal(checked(plan_of(), storage=replace(facts, free_bytes=10**15)))
+    assert refusal == (
+        f"storage {occupied / 'below'}: expected a folder that can be written; {occupied} is a file"
+    )
+
+
+def test_a_disk_whose_test_fails_is_refused_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(fd: int, data: object, offset: int) -> int:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "pwrite", failing)
+    facts = storage_of(tmp_path, rig_of())
+    assert "Input/output error" in only_refusal(checked(plan_of(), storage=replace(facts, free_bytes=10**15)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_test_of_a_disk_leaves_nothing_and_never_writes_into_the_reserve(tmp_path: Path) -> None:
+    seen: list[int] = []
+    original = os.pwrite
+
+    def counted(fd: int, data: Any, offset: int) -> int:
+        seen.append(len(data))
+        assert list(tmp_path.iterdir()) == []  # a file without a name: kill -9 leaves nothing
+        return original(fd, data, offset)
+
+    with mock.patch("os.pwrite", counted):
+        assert measure_write_speed(tmp_path, frame_bytes=25_000_000, room_bytes=2**40) > 0.0
+        assert sum(seen) <= 128 * 2**20
+        seen.clear()
+        assert measure_write_speed(tmp_path, room_bytes=63 * 2**20) == 0.0
+    assert seen == []
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_frame_that_is_no_multiple_of_a_page_is_warned_of() -> None:

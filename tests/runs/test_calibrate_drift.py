@@ -16,6 +16,8 @@ from ruamel.yaml import YAML
 
 from coupole.calibration.light.frames import LightFrame, open_light_frames
 from coupole.calibration.record import Record, read_record
+from coupole.preflight.exposure_scale import exposure_scale
+from coupole.preflight.job import read_job
 from sim.optics.led_light import LedModel, led_flux_factor
 
 LEDS = {"kind": "every", "every": 24}
@@ -101,6 +103,20 @@ def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = acquire(folder, x_mm, y_mm)
     run.rename(folder / "run")
     return folder
+
+
+def test_the_leds_powers_tell_how_bright_white_will_be(calibrated: Path) -> None:
+    """The world's word: white reaches 60 % of full scale in the plan's middle exposure under the median LED."""
+    content = json.loads((calibrated / "plan.yaml").read_text())
+    content |= {"calibrations": ["led-power.yaml"]}
+    (calibrated / "known.yaml").write_text(json.dumps(content))
+    job = read_job(calibrated / "known.yaml")
+    scale = exposure_scale(job)
+    assert scale is not None
+    known = scale.dn_per_s > 0
+    shares = scale.dn_per_s[known] * 6000e-6 / (job.cell.rig.sensor.white_dn - job.cell.rig.sensor.black_dn)
+    assert known.sum() == 45
+    assert np.median(shares) == pytest.approx(0.6, rel=0.15)  # 45 of 1080 LEDs, each with a flux of its own
 
 
 def drift(calibrated: Path, later: Path, out: Path, x_mm: float, y_mm: float) -> Ended:

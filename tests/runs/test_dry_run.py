@@ -9,6 +9,9 @@ import cells
 import pytest
 from cells import LOW, SIDE, TOP, CellFolder, Ended
 
+WHITE_RESPONSE = {"dn_per_lux_s": 2270.0, "f_number": 8.0}
+"""White reaches about 60 % of full scale in 8 ms under the median LED of the dome (133 lux)."""
+
 
 @pytest.fixture(scope="module")
 def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellFolder, Ended]:
@@ -18,6 +21,7 @@ def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellFolder, End
     cell.rig_data["camera"]["settings"] = {"address": "/nowhere"}
     cell.rig_data["robot"] = {"driver": "drivers.kuka.rsi:KukaRsi", "settings": {"listen": "192.0.2.1:49152"}}
     cell.rig_data["world"] = {"serves": "dry_run"}
+    cell.rig_data["white_response"] = WHITE_RESPONSE
     cell.write(views=[TOP, SIDE, LOW], lights={"kind": "all"})
     return cell, cell.acquire("--dry-run", "--speed", "10")
 
@@ -65,18 +69,28 @@ def test_a_dry_run_leaves_the_ledger_alone(cell: CellFolder) -> None:
 
 
 @pytest.mark.parametrize(
-    ("exposures_us", "verdict"),
-    [((1000, 2000, 16000), "over-exposed"), ((1000, 30000, 31000), "well exposed")],
-    ids=["too-long", "right"],
+    ("exposure_us", "verdict"),
+    [(200, "under-exposed"), (8000, "well exposed"), (80_000, "over-exposed")],
+    ids=["too-short", "right", "too-long"],
 )
-def test_a_dry_run_tells_an_exposure_that_is_too_long_from_a_right_one(
-    cell: CellFolder, exposures_us: tuple[int, ...], verdict: str
+def test_a_dry_run_judges_an_exposure_by_the_rigs_own_light(
+    cell: CellFolder, exposure_us: int, verdict: str
 ) -> None:
-    """The world's light is such that the middle exposure of a bracket is right."""
-    cell.write(exposure={"kind": "bracket", "exposures_us": exposures_us})
+    cell.rig_data["white_response"] = WHITE_RESPONSE
+    cell.write(exposure={"kind": "fixed", "exposure_us": exposure_us}, lights={"kind": "every", "every": 60})
     ended = cell.acquire("--dry-run")
     assert ended.code == 0, ended.err
     assert ended.document["exposure"]["top"]["verdict"] == verdict
+
+
+def test_a_dry_run_does_not_judge_what_it_does_not_know(cell: CellFolder) -> None:
+    """The world scales its light to the plan: without a figure of the rig's own, its brightness says nothing."""
+    cell.write(lights={"kind": "every", "every": 120})
+    ended = cell.acquire("--dry-run")
+    assert ended.code == 0, ended.err
+    seen = ended.document["exposure"]["top"]
+    assert (seen["verdict"], seen["brightest"], seen["saturated"]) == ("not known", None, None)
+    assert ended.document["exposure_scale"] is None
 
 
 def test_a_dry_run_of_a_refused_plan_ends_with_three(cell: CellFolder) -> None:

@@ -67,6 +67,8 @@ class LightFrames:
     """Image distance over pixel pitch, f (1 + m): length on the sensor, px, of a tangent of 1."""
     inputs: tuple[tuple[str, str], ...]
     """Name and SHA-256 of every file that was or will be read."""
+    gain_db: float = 0.0
+    """The camera's gain."""
 
     @property
     def lit(self) -> tuple[LightFrame, ...]:
@@ -111,9 +113,9 @@ def open_light_frames(paths: Sequence[Path]) -> LightFrames:
             inputs.append((f"{run.folder.name}/views/{view_path.name}", frames_sha256(proven)))
     if common is None or not frames:
         raise InputError(f"{', '.join(map(str, paths))}: no proven frame; acquire the plan first")
-    pattern, black_dn, white_dn, _gain_db, focal_px, about = common
+    pattern, black_dn, white_dn, gain_db, focal_px, about = common
     about = replace(about, begun=max(Run(path).created for path in paths))
-    return LightFrames(tuple(frames), pattern, black_dn, white_dn, about, focal_px, tuple(inputs))
+    return LightFrames(tuple(frames), pattern, black_dn, white_dn, about, focal_px, tuple(inputs), gain_db)
 
 
 def channel_mask(shape: tuple[int, int], pattern: str, channel: str) -> NDArray[np.bool_]:

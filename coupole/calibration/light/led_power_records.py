@@ -63,7 +63,11 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
         partial(pictures.draw_led_power, powers, setting.positions),
         limits=against_limits(LED_POWER, request.limits, {"power": typical, "unusable": unusable}),
         files={f"{request.name}.csv": power_table(powers, warm).encode()},
-        fixed={"tile.reflectance": setting.tile.reflectance, "tile.minnaert": setting.tile.minnaert},
+        fixed={
+            "tile.reflectance": setting.tile.reflectance,
+            "tile.minnaert": setting.tile.minnaert,
+            "gain_db": frames.gain_db,
+        },
         remarks=(f"emission profile `{setting.emission}`", *remarks),
         more_inputs=setting.inputs,
     )

@@ -1,0 +1,147 @@
+"""Preflight's report for the operator: a summary, the object on its support, a line for each view."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from coupole.plan.bursts import BurstTiming
+from coupole.preflight.exposure_scale import HOW_TO_KNOW
+from coupole.preflight.framing import SHARP_PX, Framing, Placement
+from coupole.preflight.preflight import Report
+from coupole.viewing.terminal import bytes_text, duration_text
+
+
+def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> None:
+    """Print the summary of a preflight. For a resumed run figures are what is left, beside the whole."""
+    whole = report.whole
+    table = Table(title=f"{name} on {rig}", title_justify="left", box=None, show_header=False)
+    counts = f"{len(report.views)}, {report.shots}, {report.frames}"
+    size, duration = bytes_text(report.bytes), duration_text(report.duration_s)
+    if whole is not None:
+        counts += f" left of {whole.views}, {whole.shots}, {whole.frames}"
+        size += f" left of {bytes_text(whole.bytes)}"
+        duration += f" left of {duration_text(whole.duration_s)}"
+    table.add_row("views, shots, frames", counts)
+    table.add_row("on disk", f"{size} at {bytes_text(report.asked_bytes_s)}/s" + _disk(report))
+    table.add_row("a frame every", "; ".join(map(_pace, report.timings)))
+    table.add_row("duration", f"{duration} (at best {duration_text(report.ideal_s)})")
+    table.add_row("light on the object", _dose(report))
+    table.add_row("hottest LED board", f"{report.peak_board_c:.1f} C")
+    table.add_row("white is exposed to", _white(report))
+    if report.object_check is not None:
+        table.add_row("object", _placed(report.object_check.placement))
+    console.print(table)
+    for warning in report.warnings:
+        console.print(f"[yellow]note:[/] {warning}")
+
+
+def show_views(console: Console, report: Report) -> None:
+    """A line for each view: motion, time and light; and one for what it sees of the object."""
+    table = Table("view", "joints (deg)", "move", "bursts", "lux.h", box=None)
+    for view in report.views:
+        joints = "-" if view.joints_deg is None else " ".join(f"{j:.0f}" for j in view.joints_deg)
+        times = duration_text(view.move_s), duration_text(view.burst_s)
+        table.add_row(view.name, joints, *times, f"{view.dose_lux_h:.3f}")
+    console.print(table)
+    if report.object_check is None:
+        return
+    framed = {seen.view: seen for seen in report.object_check.views}
+    table = Table("view", "object in field", "of the field", "mm away", "sharp", "px per mm", box=None)
+    for view in report.views:
+        table.add_row(view.name, *_framed(framed[view.name]))
+    console.print(table)
+    nearest, farthest = (_distance(mm) for mm in report.object_check.sharp_mm)
+    console.print(f"sharp (blurred over at most {SHARP_PX:g} pixels) is {nearest} to {farthest}")
+
+
+def document_of(report: Report) -> dict[str, Any]:
+    """The figures of `coupole check --json`."""
+    return {
+        "ok": not report.refusals,
+        "refusals": report.refusals,
+        "warnings": report.warnings,
+        "views": len(report.views),
+        "shots": report.shots,
+        "frames": report.frames,
+        "bytes": report.bytes,
+        "duration_s": report.duration_s,
+        "ideal_s": report.ideal_s,
+        "dose_lux_h": report.dose_lux_h,
+        "dose_before_lux_h": report.dose_before_lux_h,
+        "peak_board_c": report.peak_board_c,
+        "exposures": [asdict(timing) for timing in report.timings],
+        "exposure_scale": report.exposure_scale,
+        "white": [{**asdict(white), "verdict": white.verdict()} for white in report.white],
+        "object": _object_figures(report),
+    }
+
+
+def _object_figures(report: Report) -> dict[str, Any] | None:
+    found = report.object_check
+    if found is None:
+        return None
+    views = [{name: _finite(value) for name, value in asdict(seen).items()} for seen in found.views]
+    return {**asdict(found.placement), "sharp_mm": _finite(found.sharp_mm), "views": views}
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN and no infinity: both become null."""
+    if isinstance(value, tuple):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _dose(report: Report) -> str:
+    given = f"{report.dose_lux_h:.3f} lux.h"
+    given += f" left of {report.whole.dose_lux_h:.3f}" if report.whole else ""
+    given += f" after {report.dose_before_lux_h:.3f} before" if report.dose_before_lux_h else ""
+    return given + ("" if report.dose_budget_lux_h is None else f" of {report.dose_budget_lux_h:g} allowed")
+
+
+def _pace(timing: BurstTiming) -> str:
+    bounds = {"LED": "the LED's on-time", "heat": "the LEDs' heat", "disk": "the disk", "camera": "the camera"}
+    return (
+        f"{timing.period_us / 1e3:g} ms, as {bounds[timing.bound]} asks ({timing.exposure_us / 1e3:g} ms exposed)"
+    )
+
+
+def _disk(report: Report) -> str:
+    return f"; the disk takes {bytes_text(report.disk_bytes_s)}/s" if report.disk_bytes_s else ""
+
+
+def _white(report: Report) -> str:
+    if report.exposure_scale is None:
+        return f"not known; {HOW_TO_KNOW}"
+    return "; ".join(
+        f"{white.brightest:.0%} of full scale at {white.exposure_us / 1e3:g} ms ({white.verdict()})"
+        for white in report.white
+    )
+
+
+def _placed(placed: Placement) -> str:
+    size = " x ".join(f"{high - low:.0f}" for low, high in zip(placed.low_mm, placed.high_mm, strict=True))
+    lowest = placed.lowest_over_disk_mm
+    where = "beside the disk" if lowest is None else f"lowest point {lowest:.1f} mm above the disk"
+    return f"{size} mm, {where}, up to {placed.reach_mm:.0f} mm from its centre"
+
+
+def _framed(seen: Framing) -> list[str]:
+    if not seen.fills:
+        return [f"{seen.in_field:.0%}", "0%", "-", "-", "-"]
+    least, most = seen.px_per_mm
+    return [
+        f"{seen.in_field:.0%}",
+        f"{seen.fills:.0%}",
+        f"{seen.nearest_mm:.0f} to {seen.farthest_mm:.0f}",
+        f"{seen.in_focus:.0%}",
+        f"{least:.1f} to {most:.1f}",
+    ]
+
+
+def _distance(distance_mm: float) -> str:
+    return f"{distance_mm:.0f} mm" if math.isfinite(distance_mm) else "infinity"

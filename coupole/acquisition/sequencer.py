@@ -82,7 +82,7 @@ class Sequencer:
     # -- the run ------------------------------------------------------------------------------------------
 
     def acquire(self) -> Outcome:
-        """Take all shots that are not proven yet. Raises UnprovenError if shots remain missing, or a
+        """Take all frames that are not proven yet. Raises UnprovenError if some remain missing, or a
         CoupoleError."""
         schedule = self._job.schedule
         proven = self._recorder.proven()
@@ -107,7 +107,8 @@ class Sequencer:
             self.outcome.proven = sum(shot.is_shot for shot in done)
             expected = [shot for bursts in schedule.bursts for burst in bursts for shot in burst.shots if shot]
             self.outcome.missing = [shot for shot in expected if shot.is_shot and shot not in done]
-        if self.outcome.missing:
+            self.outcome.missing_darks = [shot for shot in expected if not shot.is_shot and shot not in done]
+        if self.outcome.missing or self.outcome.missing_darks:
             raise UnprovenError(self._say_missing())
         return self.outcome
 
@@ -214,8 +215,8 @@ class Sequencer:
         self._observer.note(f"{burst.view}: {len(left)} frames not proven ({'; '.join(why) or 'aborted'})")
 
     def _say_missing(self) -> str:
-        missing, bad = self.outcome.missing, self.outcome.bad
-        text = f"{len(missing)} shots are not proven after {self._job.plan.reshoot_limit} re-shoots: "
+        missing, bad = self.outcome.missing + self.outcome.missing_darks, self.outcome.bad
+        text = f"{len(missing)} frames are not proven after {self._job.plan.reshoot_limit} re-shoots: "
         text += ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
         if bad:
             text += f". In {len(bad)} of them the LED drew no current: repair it or leave it out of `lights:`"

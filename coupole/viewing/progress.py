@@ -34,6 +34,8 @@ class Outcome:
     bad: set[ShotId] = field(default_factory=set)
     """Shots whose LED drew no current: proven to be dark, so not stored as shots."""
     missing: list[ShotId] = field(default_factory=list)
+    missing_darks: list[ShotId] = field(default_factory=list)
+    """Dark frames and marks that are not proven."""
     duration_s: float = 0.0
     ideal_s: float = 0.0
     """Time of this session's motions and settling at the arm's limits, plus that of its burst tables."""

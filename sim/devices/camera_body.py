@@ -121,6 +121,8 @@ class Surroundings:
     render: Render
     arm: Callable[[], Capsules] = lambda: NONE
     """Parts of the arm that block light at present."""
+    on_exposed: Callable[[int, int, int, int, int], None] = lambda *_: None
+    """Told of each exposure that has ended: number, frame id, timestamp ns, world times ns of start and end."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,7 @@ class CameraBody:
         self._reactor, self._settings, self._wire = reactor, settings, wire
         self._lighting, self._pose = surroundings.lighting, surroundings.pose
         self._render, self._arm = surroundings.render, surroundings.arm
+        self._on_exposed = surroundings.on_exposed
         self.readout_ns = round(surroundings.readout_us * 1e3)
         self.gap_ns = round(surroundings.exposure_gap_us * 1e3)
         self._random = random.Random(settings.seed)
@@ -249,6 +252,7 @@ class CameraBody:
     ) -> None:
         if session != self._session or not self.armed:
             return
+        self._on_exposed(number, frame_id, stamp_ns, start_ns, end_ns)
         if number in self.lose_frames:
             self.counters["lost_transfers"] += 1
             return

@@ -120,10 +120,11 @@ class LedBoxFirmware:
         self._edge_count = 0
         self._dropped_edges: set[int] = set()
         self._doubled_edges: dict[int, int] = {}
-        self._dead_leds: set[int] = set()
+        self.dead_leds: set[int] = set()
+        """LEDs that from their next step on draw no current and give no light."""
         self._panels = dict.fromkeys(_PANELS, False)
         self._burst: Burst | None = None
-        self._heard_ns = reactor.now_ns
+        self._heard_ns = self._deaf_until_ns = reactor.now_ns
         self._watchdog_timer: Timer | None = None
         self._block_timer: Timer | None = None
         self._reset()
@@ -147,9 +148,12 @@ class LedBoxFirmware:
         """A second pulse, neither logged nor counted, follows edge number `n` after `delay_us`."""
         self._doubled_edges[n] = delay_us
 
-    def mute(self) -> None:
-        """The box neither receives nor answers any more; a burst continues until the watchdog ends it."""
-        self._link.mute()
+    def mute(self, seconds: float | None = None) -> None:
+        """The box neither receives nor answers, for ever or for `seconds`; a burst continues."""
+        if seconds is None:
+            self._link.mute()
+        else:
+            self._deaf_until_ns = self._reactor.now_ns + round(seconds * 1e9)
 
     def unplug(self) -> None:
         """Unplug the cable to the host."""
@@ -158,10 +162,6 @@ class LedBoxFirmware:
     def close(self) -> None:
         """Release the line; a second call does nothing."""
         self._link.close()
-
-    def kill_led(self, led: int) -> None:
-        """From its next step on, the LED draws no current and gives no light."""
-        self._dead_leds.add(led)
 
     def temperature_of_led_c(self, led: int) -> float:
         """Present temperature of the LED's board."""
@@ -174,7 +174,9 @@ class LedBoxFirmware:
     # Bytes in, bytes out.
 
     def _receive(self, data: bytes) -> None:
-        self._heard_ns = self._reactor.now_ns
+        if (now_ns := self._reactor.now_ns) < self._deaf_until_ns:
+            return
+        self._heard_ns = now_ns
         for reply in self._scpi.replies(data):
             if reply and not self._link.send(reply):
                 self._scpi.report(ScpiError(-430, "responses were not read"))
@@ -279,7 +281,7 @@ class LedBoxFirmware:
             self._boards,
             table,
             wiring,
-            dead_leds=self._dead_leds,
+            dead_leds=self.dead_leds,
             led_current_ma=self._settings.led_current_ma,
             jitter_ns=self._quartz.edge_lateness_ns,
         )

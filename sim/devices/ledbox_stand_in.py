@@ -30,19 +30,17 @@ class LedBoxStandIn(Protocol):
 
     port: str
     """The port that a client opens."""
+    dead_leds: set[int]
+    """LEDs that give no light from now on."""
 
     def temperature_of_led_c(self, led: int) -> float: ...
 
-    def mute(self) -> None:
-        """The box neither receives nor answers any more."""
+    def mute(self, seconds: float | None = None) -> None:
+        """The box neither receives nor answers, for ever or for `seconds`."""
         ...
 
     def unplug(self) -> None:
         """Unplug its cable to the host."""
-        ...
-
-    def kill_led(self, led: int) -> None:
-        """From now on the LED gives no light."""
         ...
 
     def close(self) -> None: ...

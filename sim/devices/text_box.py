@@ -55,7 +55,9 @@ class TextBox:
         self._on_light, self._on_dark = on_light, on_dark
         self._lit: dict[int, Timer | None] = {}
         """LEDs that are lit, with the timer that will end them."""
-        self._dead_leds: set[int] = set()
+        self.dead_leds: set[int] = set()
+        """LEDs that from their next flash on give no light."""
+        self._deaf_until_ns = 0
         self._stuck_leds: set[int] = set()
         self._line = bytearray()
         self._link = PtyPort(reactor, settings.baud)
@@ -64,17 +66,17 @@ class TextBox:
 
     # Faults for the fault script.
 
-    def mute(self) -> None:
-        """The box neither receives nor answers any more; lit LEDs stay lit."""
-        self._link.mute()
+    def mute(self, seconds: float | None = None) -> None:
+        """The box neither receives nor answers, for ever or for `seconds`; lit LEDs stay lit until they are due.
+        What comes meanwhile is lost."""
+        if seconds is None:
+            self._link.mute()
+            return
+        self._deaf_until_ns = self._reactor.now_ns + round(seconds * 1e9)
 
     def unplug(self) -> None:
         """Unplug the cable to the host; lit LEDs stay lit."""
         self._link.close()
-
-    def kill_led(self, led: int) -> None:
-        """From its next flash on, the LED gives no light."""
-        self._dead_leds.add(led)
 
     def stick_led(self, led: int) -> None:
         """From now on the LED cannot be switched off once it is lit: its transistor has failed short."""
@@ -90,6 +92,8 @@ class TextBox:
     # Lines in, lines out.
 
     def _receive(self, data: bytes) -> None:
+        if self._reactor.now_ns < self._deaf_until_ns:
+            return
         for byte in data:
             if byte != ord("\n"):
                 if len(self._line) <= _LONGEST_LINE:
@@ -132,7 +136,7 @@ class TextBox:
     # Light.
 
     def _lighten(self, led: int, on_ms: int | None) -> None:
-        if led in self._dead_leds:
+        if led in self.dead_leds:
             return
         self._darken(led)
         now_ns = self._reactor.now_ns

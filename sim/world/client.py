@@ -62,7 +62,8 @@ class World:
             ) from error
 
     def ask(self, do: str, **arguments: Any) -> dict[str, Any]:
-        """Send a command on the control connection: `state`, `light`, `fault`, `reset_robot`, `stop`."""
+        """Send a command on the control connection: `state`, `light`, `fault`, `exposures`, `edges`, `reset_robot`
+        or `stop`."""
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
             link.settimeout(_START_TIMEOUT_S)
             try:

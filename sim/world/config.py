@@ -148,6 +148,8 @@ class Settings(_Model):
     """`{}`: realistic LEDs, each with its own flux and colour, temperature dependence and flicker."""
     dome: DomeErrors = DomeErrors()
     """Deviations of the dome from its table."""
+    exposures_remembered: Annotated[int, Field(ge=0)] = 0
+    """Number of last exposures whose true light the world tells on its control connection."""
     panels: tuple[Panel, ...] = ()
     """The flat white panels 1 to 4, visible to the camera; without them a panel is uniform ambient light."""
 

@@ -57,9 +57,10 @@ class LostTransfer(_Model):
 
 
 class MuteBox(When):
-    """The box continues its burst but neither answers nor receives."""
+    """The box continues its burst but neither answers nor receives, for `seconds` (None: for ever)."""
 
     kind: Literal["mute_box"]
+    seconds: Annotated[float, Field(gt=0)] | None = None
 
 
 class CutWire(When):
@@ -87,11 +88,12 @@ class OverTemperature(When):
     board: Count
 
 
-class DeadLed(_Model):
-    """An LED that draws no current and gives no light."""
+class DeadLed(When):
+    """An LED that draws no current and gives no light, for `seconds` (None: for ever), as at a loose contact."""
 
     kind: Literal["dead_led"]
     led: Count
+    seconds: Annotated[float, Field(gt=0)] | None = None
 
 
 class StuckLed(When):

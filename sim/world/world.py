@@ -30,6 +30,7 @@ from sim.optics.photographer import Photographer
 from sim.world import faults as script
 from sim.world.clock import ClockWriter
 from sim.world.config import CameraConfig, Config
+from sim.world.exposure_log import ExposureLog
 from sim.world.lighting import Lighting
 from sim.world.reactor import Reactor
 from sim.world.scratch import world_folder
@@ -47,6 +48,7 @@ class World:
         )
         self.reactor = Reactor(self.clock)
         self.lighting = Lighting()
+        self._exposures = ExposureLog(self.lighting, settings.exposures_remembered)
         self._photographer = Photographer(config.scene, config.photographed, settings)
         self._flashes = Flashes(settings.leds)
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
@@ -103,6 +105,7 @@ class World:
                 pose=self.robot.true_base_from_flange,
                 render=self._photographer.render,
                 arm=self._arm,
+                on_exposed=self._exposures.note,
             ),
         )
 
@@ -157,7 +160,7 @@ class World:
             case script.LostTransfer():
                 self.camera.lose_frames.add(fault.frame)
             case script.MuteBox():
-                self.box.mute()
+                self.box.mute(fault.seconds)
             case script.CutWire():
                 self.box.unplug()
             case script.UnplugCamera():
@@ -168,7 +171,9 @@ class World:
             case script.OverTemperature():
                 self._scpi_box.over_temperature(fault.board)
             case script.DeadLed():
-                self.box.kill_led(fault.led)
+                self.box.dead_leds.add(fault.led)
+                if fault.seconds is not None:
+                    self.reactor.after(fault.seconds, lambda: self.box.dead_leds.discard(fault.led))
             case script.StuckLed():
                 assert isinstance(self.box, TextBox)  # `impossible` refuses the fault for others
                 self.box.stick_led(fault.led)
@@ -251,6 +256,11 @@ class World:
                     return {"error": why}
                 self._schedule(fault)
                 return {}
+            case "exposures":
+                exposures = self._exposures.since(command["first"], command["count"])
+                return {"next": self._exposures.next_number, "exposures": exposures}
+            case "edges" if isinstance(self.box, LedBoxFirmware):
+                return {"next": self.box.edge_count}
             case "reset_robot":
                 self.robot.reset()
                 return {}

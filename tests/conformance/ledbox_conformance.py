@@ -91,7 +91,7 @@ class LedBoxConformance:
         assert world.lights == []
 
     def test_a_dead_led_gives_no_light(self, box: LedBox, world: LedBoxWorld) -> None:
-        world.do(lambda: world.box.kill_led(4))
+        world.do(lambda: world.box.dead_leds.add(4))
         box.flash(4, FLASH_US)
         box.end_flash()
         assert world.lights == []
@@ -187,6 +187,18 @@ class LedBoxConformance:
         world.do(world.box.mute)
         with pytest.raises(DeviceTimeout, match="led box: expected an answer to"):
             box.flash(5, FLASH_US)
+
+    def test_a_box_that_was_mute_for_a_while_missed_what_came_and_obeys_again(
+        self, box: LedBox, world: LedBoxWorld
+    ) -> None:
+        world.do(lambda: world.box.mute(3.0))
+        with pytest.raises(DeviceTimeout):
+            box.flash(4, FLASH_US)
+        world.clock.sleep(3.0)
+        box.lights_off()
+        box.flash(5, FLASH_US)
+        box.end_flash()
+        assert [led for led, _, _ in world.lights] == [5]
 
     def test_a_box_that_falls_mute_in_a_flash_is_not_believed(self, box: LedBox, world: LedBoxWorld) -> None:
         box.flash(5, self.long_us)

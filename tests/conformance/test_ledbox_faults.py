@@ -43,7 +43,7 @@ def send_behind_its_back(world: LedBoxWorld, message: bytes) -> None:
 
 
 def test_a_dead_led_draws_no_current_and_gives_no_light(box: LedBox, world: LedBoxWorld) -> None:
-    world.do(lambda: world.box.kill_led(4))
+    world.do(lambda: world.box.dead_leds.add(4))
     steps = table(8)
     box.load(steps)
     box.start(steps)

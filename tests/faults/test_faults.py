@@ -195,6 +195,27 @@ def test_a_flickering_led_changes_no_label(joining: CellFolder) -> None:
     assert cells.mislabelled(joining, joining.run_folder) == []
 
 
+def test_an_led_that_was_dead_for_a_while_is_proven_when_it_is_taken_again(joining: CellFolder) -> None:
+    """It is lit in the middle of the burst, and its contact is loose until just before the burst's end."""
+    ended = _acquire_with(joining, {"kind": "dead_led", "led": 400, "at_edge": 0, "seconds": 0.6})
+    assert ended.code == 0, ended.err
+    assert cells.reshot(joining.run_folder) == ["top/led0400/e0"]
+    assert cells.mislabelled(joining, joining.run_folder) == []
+
+
+def test_a_dark_frame_that_stays_unproven_ends_the_run_with_five_and_is_named(joining: CellFolder) -> None:
+    """Its edge is lost in the burst, and in each of the three bursts of eleven edges that take it again."""
+    faults = [{"kind": "drop_trigger", "edge": edge} for edge in (5, 71, 82, 93)]
+    ended = _acquire_with(joining, *faults)
+    assert ended.code == 5
+    assert "1 frames are not proven after 3 re-shoots: top/dark10/e0" in ended.err
+    assert (ended.document["missing"], ended.document["missing_darks"]) == (0, 1)
+    assert cells.events(joining.run_folder, "stop")[-1]["outcome"] == "failed"
+    with joining.world():
+        assert joining.acquire("--resume", joining.run_folder).code == 0
+    cells.assert_each_shot_proven_once(joining.run_folder)
+
+
 # -- devices that fail ----------------------------------------------------------------------------------------
 
 

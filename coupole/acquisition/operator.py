@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
@@ -14,6 +15,7 @@ from coupole.plan.cell import Cell
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import in_world
 from coupole.preflight import ledger
+from coupole.preflight.commissioned import commissioning_refusals
 from coupole.preflight.job import Job
 from coupole.preflight.preflight import Report
 from coupole.viewing.terminal import ask
@@ -25,6 +27,13 @@ UNLIMITED_BYTES = 2**62
 def refuse(found: Report) -> None:
     if found.refusals:
         raise PreflightRefused(found.refusals)
+
+
+def refuse_uncommissioned(cell: Cell, identities: Mapping[str, Identity] | None = None) -> None:
+    """Raise PreflightRefused if a real cell (or one of its opened devices) is not the one that was
+    commissioned."""
+    if reasons := commissioning_refusals(cell, identities):
+        raise PreflightRefused(reasons)
 
 
 def ask_to_begin(cell: Cell, *, confirm: bool) -> None:

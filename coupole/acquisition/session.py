@@ -20,6 +20,7 @@ from coupole.acquisition.operator import (
     enter_dose,
     identity_printer,
     refuse,
+    refuse_uncommissioned,
 )
 from coupole.acquisition.recorder import DryRecorder, RunRecorder
 from coupole.acquisition.sequencer import Sequencer
@@ -96,6 +97,7 @@ def _acquire_into(
     ask_to_begin(job.cell, confirm=confirm)
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=identity_printer(console)) as cell:
+        refuse_uncommissioned(job.cell, cell.identities)
         room_c = _refuse_other_calibrations(job, cell)
         if run is None:
             run = Run.create(folder, job.plan.name, job.inputs, about_run(job, cell))

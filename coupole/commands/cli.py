@@ -11,6 +11,7 @@ import typer
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
 from coupole.commands import keeping, planning, running
 from coupole.commands.calibrate import calibrate_app
+from coupole.commands.commissioning import commission
 from coupole.commands.render_scene import render
 from coupole.commands.uncertainty import budget
 from coupole.errors import CoupoleError, InputError, Interrupted
@@ -31,6 +32,7 @@ for command in (
     running.live,
     running.devices,
     running.confirm,
+    commission,
     running.sim,
     keeping.status,
     keeping.verify,

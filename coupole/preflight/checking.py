@@ -15,6 +15,7 @@ from coupole.plan.bursts import Pace
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import in_world, runs_tables
 from coupole.preflight import ledger
+from coupole.preflight.commissioned import commissioning_refusals
 from coupole.preflight.job import Job, at_pace
 from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, check
 from coupole.storage.write_speed import measure_write_speed
@@ -41,7 +42,9 @@ def preflight_of(
     except StorageError:
         write_bytes_s = 0.0
     free_bytes = shutil.disk_usage(existing).free + allocated_bytes
-    return check_job(job, StorageFacts(free_bytes, write_bytes_s), paths=paths, share_left=share_left)
+    job, report = check_job(job, StorageFacts(free_bytes, write_bytes_s), paths=paths, share_left=share_left)
+    report.refusals += commissioning_refusals(job.cell)
+    return job, report
 
 
 def check_job(

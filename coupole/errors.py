@@ -7,6 +7,7 @@
     ├── PreflightRefused      3  the plan is well formed but must not be run
     ├── DoseBudgetReached     3  more light would exceed the object's budget
     ├── CalibrationRefused    3  the calibration misses its limits: written, but not to be used
+    ├── CommissioningFailed   3  a step of a cell's commissioning did not pass
     ├── DeviceError           4  a device failed
     │   ├── DeviceTimeout     4  ... did not answer in time
     │   ├── DeviceLost        4  ... its link is gone
@@ -86,6 +87,16 @@ class CalibrationRefused(CoupoleError):
     def __init__(self, refusals: Sequence[str]) -> None:
         self.refusals = tuple(refusals)
         super().__init__("\n".join(refusals))
+
+
+class CommissioningFailed(CoupoleError):
+    """A step of a cell's commissioning did not pass; `reasons` holds what was wrong and what to do."""
+
+    exit_code = 3
+
+    def __init__(self, step: str, reasons: Sequence[str]) -> None:
+        self.step, self.reasons = step, tuple(reasons)
+        super().__init__("\n".join([f"the step {step} did not pass", *reasons]))
 
 
 class DeviceError(CoupoleError):

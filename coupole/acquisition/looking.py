@@ -19,6 +19,7 @@ from coupole.acquisition.operator import (
     identity_printer,
     longest_exposure_us,
     refuse,
+    refuse_uncommissioned,
 )
 from coupole.acquisition.sequencer import Sequencer
 from coupole.acquisition.signals import obeyed_by
@@ -52,10 +53,12 @@ def meter(
     small = replace(job, plan=few, schedule=schedule_of(few, job.cell))
     small, preflight = check_job(small, StorageFacts(UNLIMITED_BYTES))
     refuse(preflight)
+    refuse_uncommissioned(job.cell)
     ArmFaults(job.cell.state_folder).refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)
     recorder, control = exposure_advice.MeterRecorder(), Control()
     with open_cell(job.cell, job=small, on_opened=identity_printer(console)) as cell:
+        refuse_uncommissioned(job.cell, cell.identities)
         observer = RunObserver(console, job.cell.rig.frame_bytes, 0)
         sequencer = Sequencer(small, cell, recorder, observer=observer, control=control)
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
@@ -12,6 +13,7 @@ from coupole.plan.bursts import EXPOSURE_MARGIN_US
 from coupole.plan.cell import Cell
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import in_world
+from coupole.preflight.commissioned import commissioning_refusals
 from coupole.preflight.preflight import Report
 from coupole.viewing.terminal import ask
 
@@ -22,6 +24,13 @@ UNLIMITED_BYTES = 2**62
 def refuse(found: Report) -> None:
     if found.refusals:
         raise PreflightRefused(found.refusals)
+
+
+def refuse_uncommissioned(cell: Cell, identities: Mapping[str, Identity] | None = None) -> None:
+    """Raise PreflightRefused if a real cell (or one of its opened devices) is not the one that was
+    commissioned."""
+    if reasons := commissioning_refusals(cell, identities):
+        raise PreflightRefused(reasons)
 
 
 def ask_to_begin(cell: Cell, *, confirm: bool) -> None:

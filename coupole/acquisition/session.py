@@ -21,6 +21,7 @@ from coupole.acquisition.operator import (
     ask_to_begin,
     identity_printer,
     refuse,
+    refuse_uncommissioned,
 )
 from coupole.acquisition.recorder import DryRecorder, RunRecorder
 from coupole.acquisition.run_description import described_cell
@@ -105,6 +106,7 @@ def _acquire_into(
     ask_to_begin(job.cell, confirm=confirm)
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=identity_printer(console)) as cell:
+        refuse_uncommissioned(job.cell, cell.identities)
         room_c = _refuse_other_calibrations(job, cell)
         if run is None:
             inputs = replace(job.inputs, copy_large=with_mesh)

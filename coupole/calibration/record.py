@@ -175,12 +175,19 @@ def content_sha256(plain: dict[str, Any]) -> str:
 
 def write_record(path: Path, record: Record) -> None:
     """Write a record atomically. Raises StorageError."""
-    plain = json.loads(record.model_dump_json())
-    text = f"{SEAL}. It carries its own checksum: do not edit it, calibrate anew.\n"
+    write_sealed(
+        path,
+        json.loads(record.model_dump_json()),
+        f"{SEAL}. It carries its own checksum: do not edit it, calibrate anew.",
+    )
+
+
+def write_sealed(path: Path, plain: dict[str, Any], head: str) -> None:
+    """Write a record's content as YAML, atomically, below a comment `head`. Raises StorageError."""
     partial = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text + "".join(_lines(plain)), encoding="utf-8")
+        partial.write_text(f"{head}\n" + "".join(_lines(plain)), encoding="utf-8")
         partial.replace(path)
     except OSError as error:
         raise StorageError(

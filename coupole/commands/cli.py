@@ -11,6 +11,7 @@ import typer
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
 from coupole.commands import keeping, planning, running
 from coupole.commands.calibrate import calibrate_app
+from coupole.commands.commissioning import commission
 from coupole.commands.dose_ledger import dose
 from coupole.commands.render_scene import render
 from coupole.commands.uncertainty import budget
@@ -32,6 +33,7 @@ for command in (
     running.live,
     running.devices,
     running.confirm,
+    commission,
     running.sim,
     keeping.status,
     keeping.report,

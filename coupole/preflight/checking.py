@@ -17,6 +17,7 @@ from coupole.plan.bursts import Pace
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import in_world, runs_tables
 from coupole.plan.shot_id import ShotId
+from coupole.preflight.commissioned import commissioning_refusals
 from coupole.preflight.exposure_scale import ExposedWhite, exposed_white, exposure_scale
 from coupole.preflight.framing import ObjectCheck, check_object
 from coupole.preflight.job import Job, at_pace
@@ -47,6 +48,7 @@ def preflight_of(
     job, report = check_job(job, storage, paths=paths, proven=proven)
     if not storage.write_bytes_s and not storage.trouble:
         report.warnings.append(f"storage {folder}: too little room to measure the disk's speed; none is assumed")
+    report.refusals += commissioning_refusals(job.cell)
     return job, report
 
 

@@ -1,0 +1,135 @@
+"""What every step of a commissioning works with: the opened cell, the person, and the result that grows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.acquisition.observer import Control
+from coupole.acquisition.opened_cell import OpenedCell
+from coupole.calibration.record import Limit
+from coupole.errors import Interrupted
+from coupole.motion.collisions import CellBodies
+from coupole.plan.cell import Cell
+from coupole.preflight.commissioned import Answer
+
+
+class Person(Protocol):
+    """Who stands at the cell."""
+
+    def is_ready(self, announcement: str) -> bool:
+        """The word before something moves or is lit."""
+        ...
+
+    def confirms(self, question: str) -> bool:
+        """Whether what was seen is what is described."""
+        ...
+
+    def told(self, message: str) -> None:
+        """A message without an answer."""
+        ...
+
+    def press_emergency_stop(self) -> None:
+        """Asks for the emergency stop to be pressed; returns at once."""
+        ...
+
+
+class StepFailedError(Exception):
+    """A step cannot be brought to an end; the text says what was wrong and what to do."""
+
+
+@dataclass
+class Findings:
+    """What a step has found so far."""
+
+    limits: list[Limit] = field(default_factory=list)
+    answers: list[Answer] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    remedy: str = ""
+    """What to do if a limit is missed or an answer is no."""
+
+    def at_most(self, what: str, found: float, limit: float, unit: str) -> bool:
+        """Note a figure and its limit; returns whether it is met. A figure that is not finite misses it."""
+        known = float(found) if np.isfinite(found) else 1e9
+        self.limits.append(Limit(what=what, found=round(known, 6), limit=round(float(limit), 6), unit=unit))
+        return self.limits[-1].passed
+
+
+@dataclass
+class Bench:
+    """One session of commissioning."""
+
+    cell: Cell
+    """With the rig at reduced speed."""
+    opened: OpenedCell
+    bodies: CellBodies
+    """Of an empty cell: no object lies on the support."""
+    velocity_deg_s: NDArray[np.float64]
+    """[6] greatest speeds of the axes in this session."""
+    person: Person
+    control: Control
+    findings: Findings = field(default_factory=Findings)
+
+    def ask_before(self, announcement: str) -> None:
+        """Raises Interrupted unless the person agrees."""
+        self.control.go_on()
+        if not self.person.is_ready(announcement):
+            raise Interrupted("not gone on with; the steps that were done are kept")
+        self.control.go_on()
+
+    def ask_whether(self, question: str) -> bool:
+        """Ask the person what was seen; the answer is noted."""
+        self.control.go_on()
+        yes = self.person.confirms(question)
+        self.findings.answers.append(Answer(question=question, yes=yes))
+        return yes
+
+    def pause(self, seconds: float) -> None:
+        """Wait on the rig's clock. Raises Interrupted after the operator's stop."""
+        self.control.go_on()
+        self.opened.clock.sleep(seconds)
+        self.control.go_on()
+
+    def joints_deg(self) -> NDArray[np.float64]:
+        """The axes [6] as measured now."""
+        return np.array(self.opened.robot.measured().joints_deg)
+
+    def go_to(self, joints_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Move straight to joint angles [6], wait until settled; returns the measured ones. Raises StepFailedError
+        if something would be touched on the way."""
+        self.control.go_on()
+        if contact := self.bodies.contact_on_the_way(self.joints_deg(), joints_deg):
+            raise StepFailedError(
+                f"{contact}: jog the arm to where it has room on all sides, then repeat the step"
+            )
+        self.opened.robot.move_to(joints_deg)
+        measured = np.array(self.opened.robot.wait_settled().joints_deg)
+        self.control.go_on()
+        return measured
+
+    def clear_change(self, change_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The change [6] of the axes, or its opposite, whichever touches nothing and stays within the axes'
+        limits.
+
+        Raises StepFailedError if neither does.
+        """
+        here_deg = self.joints_deg()
+        low, high = np.array(self.arm_limits_deg).T
+        for sign in (1.0, -1.0):
+            there_deg = here_deg + sign * change_deg
+            if np.all((there_deg >= low) & (there_deg <= high)) and self.bodies.is_clear(here_deg, there_deg):
+                return sign * change_deg
+        raise StepFailedError(
+            "the arm has no room for a motion of a few degrees either way: jog it to where it has room on all "
+            "sides, "
+            "then repeat the step"
+        )
+
+    @property
+    def arm_limits_deg(self) -> tuple[tuple[float, float], ...]:
+        from coupole.motion.itinerary import arm_of
+
+        return arm_of(self.cell.rig).limits_deg

@@ -1,0 +1,48 @@
+"""Who answers in a commissioning: a person at the terminal; for a simulated cell, the simulation itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+
+from coupole.plan.registry import WORLD, load_class
+from coupole.viewing.terminal import alarm, ask
+
+
+class PersonAtTerminal:
+    """A `Person` who reads and types here."""
+
+    def is_ready(self, announcement: str) -> bool:
+        return ask(f"\n{announcement}\nGo on?")
+
+    def confirms(self, question: str) -> bool:
+        return ask(question)
+
+    def told(self, message: str) -> None:
+        alarm(message)
+
+    def press_emergency_stop(self) -> None:
+        alarm("PRESS THE EMERGENCY STOP NOW, while the arm moves.")
+
+
+class SimulatedPerson:
+    """A `Person` for `--yes` with a simulated cell: agrees to everything, and presses its emergency stop."""
+
+    def __init__(self, console: Console, world_endpoints: Mapping[str, Any]) -> None:
+        self._console, self._endpoints = console, world_endpoints
+
+    def is_ready(self, announcement: str) -> bool:
+        self._console.print(announcement, markup=False)
+        return True
+
+    def confirms(self, question: str) -> bool:
+        self._console.print(f"{question} (not asked: simulated)", markup=False)
+        return True
+
+    def told(self, message: str) -> None:
+        self._console.print(message, markup=False)
+
+    def press_emergency_stop(self) -> None:
+        load_class(WORLD)(self._endpoints).ask("fault", fault={"kind": "emergency_stop"})

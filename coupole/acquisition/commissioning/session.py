@@ -1,0 +1,174 @@
+"""One `coupole commission`: the steps that are due, each kept in the cell's record as soon as it has ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+from rich.console import Console
+
+from coupole.acquisition.commissioning import arm_steps, emergency_stop, lamp_step, light_timing
+from coupole.acquisition.commissioning.bench import Bench, Findings, Person, StepFailedError
+from coupole.acquisition.commissioning.reduced_speed import REDUCED_MM_S, at_reduced_speed, greatest_speeds_deg_s
+from coupole.acquisition.observer import Control
+from coupole.acquisition.opened_cell import OpenedCell, open_cell
+from coupole.acquisition.operator import identity_printer
+from coupole.acquisition.signals import obeyed_by
+from coupole.errors import CommissioningFailed, DeviceError, InputError
+from coupole.motion.collisions import CellBodies
+from coupole.motion.itinerary import bodies_of
+from coupole.plan.cell import Cell
+from coupole.plan.rig_devices import in_world
+from coupole.preflight.commissioned import (
+    STEPS,
+    CommissioningRecord,
+    Step,
+    StepResult,
+    devices_of,
+    empty_record,
+    outdated,
+    read_commissioning,
+    record_path,
+    settings_of,
+    write_commissioning,
+)
+from coupole.storage.arm_faults import ArmFaults
+from coupole.viewing import commissioning_page
+from coupole.viewing.terminal import alarm
+
+ACTS: Mapping[Step, Callable[[Bench], None]] = {
+    "cycle": arm_steps.cycle,
+    "axes": arm_steps.axes,
+    "stopping": arm_steps.stopping,
+    "lamps": lamp_step.lamps,
+    "trigger": light_timing.trigger,
+    "watchdog": light_timing.watchdog,
+    "emergency-stop": emergency_stop.emergency_stop,
+}
+_BEGIN = (
+    "Commissioning. You need: mode T1 at the controller with one hand on the enabling switch; the emergency stop "
+    "in "
+    "reach; nobody in the cell; no object in the dome that light or arm can harm. No point of the arm is faster "
+    "than "
+    f"{REDUCED_MM_S:g} mm/s. The arm moves a few degrees about where it stands: it must have room there, and its "
+    "camera must see a matte ball on the support."
+)
+
+
+def commission(
+    cell: Cell, console: Console, *, name: str, only: Step | None, person_at: Callable[[OpenedCell], Person]
+) -> CommissioningRecord:
+    """Do the steps that are due, or `only` one; returns the record.
+
+    `name` is that of the person, whom `person_at` gives for the opened cell. Due is a step that was not done, did
+    not pass, or does not fit the rig and its devices any more. Raises CommissioningFailed after the first step
+    that does not pass, DeviceError if a device fails, Interrupted if the person does not go on.
+    """
+    ArmFaults(cell.state_folder).refuse(cell.document.path)
+    bodies = bodies_of(cell.rig, cell.leds, np.zeros((0, 3, 3)), cell.link_meshes)
+    slow = replace(cell, rig=at_reduced_speed(cell.rig, bodies))
+    record = _record_so_far(cell, console)
+    control = Control()
+    with open_cell(slow, on_opened=identity_printer(console)) as opened:
+        bench = _bench(slow, opened, bodies, person_at(opened), control)
+        due = [only] if only else _due(cell, record, opened)
+        if not due:
+            console.print("every step has passed and fits this cell; `--only STEP` repeats one")
+        try:
+            with obeyed_by(control, opened.halt):
+                if due:
+                    bench.ask_before(_BEGIN)
+                for step in due:
+                    result, failure = _done(step, bench, cell, name)
+                    record = record.with_result(result)
+                    write_commissioning(cell, record)
+                    commissioning_page.write(record_path(cell), record)
+                    _say(console, result)
+                    if failure is not None:
+                        raise failure
+                    if not result.passed:
+                        raise CommissioningFailed(step, shortcomings(result))
+        except DeviceError as error:
+            if error.device == "robot":
+                ArmFaults(cell.state_folder).note(str(error), "commissioning")
+            raise
+        finally:
+            opened.make_safe()
+            for trouble in opened.trouble:
+                alarm(trouble)
+            if not opened.arm_confirmed:
+                ArmFaults(cell.state_folder).note("; ".join(opened.trouble), "commissioning")
+    return record
+
+
+def shortcomings(result: StepResult) -> list[str]:
+    """What of a step did not pass, in words."""
+    missed = [
+        f"{one.what}: {one.found:.4g} {one.unit}, at most {one.limit:.4g}".replace(" ,", ",")
+        for one in result.limits
+        if not one.passed
+    ]
+    missed += [f"answered with no: {one.question}" for one in result.answers if not one.yes]
+    return [*missed, *([result.failure] if result.failure else [])]
+
+
+def _bench(cell: Cell, opened: OpenedCell, bodies: CellBodies, person: Person, control: Control) -> Bench:
+    return Bench(cell, opened, bodies, greatest_speeds_deg_s(cell.rig), person, control)
+
+
+def _record_so_far(cell: Cell, console: Console) -> CommissioningRecord:
+    found = read_commissioning(cell)
+    simulated = in_world(cell.rig, dry_run=False)
+    if found is None:
+        return empty_record(cell)
+    if (found.rig, found.simulated) != (cell.rig.name, simulated):
+        kind = "simulated" if found.simulated else "real"
+        raise InputError(
+            f"{record_path(cell)}: is of the {kind} cell {found.rig}; expected that of {cell.rig.name}. Give each "
+            "cell "
+            "its own `storage: state:`, or move the file away"
+        )
+    return found
+
+
+def _due(cell: Cell, record: CommissioningRecord, opened: OpenedCell) -> list[Step]:
+    results = {step: record.result(step) for step in STEPS}
+    return [
+        step
+        for step, result in results.items()
+        if result is None or not result.passed or outdated(cell, result, opened.identities)
+    ]
+
+
+def _done(step: Step, bench: Bench, cell: Cell, name: str) -> tuple[StepResult, DeviceError | None]:
+    """Do one step; returns its result, and the error of a device that ended it."""
+    findings = bench.findings = Findings()
+    failure, error = "", None
+    try:
+        ACTS[step](bench)
+    except StepFailedError as shortcoming:
+        failure = str(shortcoming)
+    except DeviceError as raised:
+        failure, error = str(raised), raised
+    result = StepResult(
+        step=step,
+        person=name,
+        ended=datetime.now(UTC),
+        devices=devices_of(step, bench.opened.identities),
+        settings=settings_of(cell, step),
+        limits=tuple(findings.limits),
+        answers=tuple(findings.answers),
+        remarks=tuple(findings.remarks),
+        failure=failure,
+    )
+    if not result.passed and not failure:
+        result = result.model_copy(update={"failure": findings.remedy})
+    return result, error
+
+
+def _say(console: Console, result: StepResult) -> None:
+    console.print(f"{result.step}: {'passed' if result.passed else 'NOT PASSED'}", markup=False)
+    for line in (*result.remarks, *(shortcomings(result) if not result.passed else ())):
+        console.print(f"  {line}", markup=False)

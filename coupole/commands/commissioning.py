@@ -1,0 +1,84 @@
+"""The command that commissions a cell."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coupole.commands.common import JsonOption, fail
+from coupole.errors import CoupoleError, InputError
+
+if TYPE_CHECKING:
+    from coupole.plan.cell import Cell
+
+
+def commission(
+    rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
+    name: Annotated[str, typer.Option("--name", help="Who stands at the cell.", show_default=False)],
+    only: Annotated[
+        str | None,
+        typer.Option(
+            "--only",
+            help="Do this step, though it has passed: cycle, axes, stopping, lamps, trigger, watchdog or "
+            "emergency-stop.",
+        ),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Simulated cells only: nobody is asked.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure a cell's safety figures at reduced speed, step by step, with a person's word before each.
+
+    The record lies in the cell's state folder; without one that passed and fits, a real cell runs no plan. Steps
+    that passed are not repeated. Code 3: a step did not pass.
+    """
+    from coupole.acquisition.commissioning.persons import PersonAtTerminal, SimulatedPerson
+    from coupole.acquisition.commissioning.session import commission as commission_cell
+    from coupole.plan.cell import read_cell
+    from coupole.plan.rig_devices import in_world
+    from coupole.preflight.commissioned import STEPS, record_path
+    from coupole.viewing.terminal import make_console
+
+    if not name.strip():
+        raise InputError("--name: expected the name of the person at the cell")
+    step = next((one for one in STEPS if one == only), None)
+    if only is not None and step is None:
+        raise InputError(f"--only: expected one of {', '.join(STEPS)}; found {only!r}")
+    console, cell = make_console(quiet=as_json), read_cell(rig)
+    if yes and not in_world(cell.rig, dry_run=False):
+        raise InputError(f"--yes: {rig} is a real cell, where a person must see and answer; leave it out")
+
+    try:
+        record = commission_cell(
+            cell,
+            console,
+            name=name.strip(),
+            only=step,
+            person_at=lambda opened: (
+                SimulatedPerson(console, opened.world_endpoints)
+                if yes and opened.world_endpoints is not None
+                else PersonAtTerminal()
+            ),
+        )
+    except CoupoleError as error:
+        fail(error, as_json=as_json, found=None if isinstance(error, InputError) else _figures(cell))
+        raise
+    left = [one for one in STEPS if (result := record.result(one)) is None or not result.passed]
+    console.print(f"record  {record_path(cell)}", markup=False)
+    console.print(f"still to be done: {', '.join(left)}" if left else "the cell is commissioned", markup=False)
+    if as_json:
+        print(json.dumps(_figures(cell)))
+
+
+def _figures(cell: Cell) -> dict[str, Any]:
+    """The figures of `--json`."""
+    from coupole.preflight.commissioned import read_commissioning, record_path
+
+    record = read_commissioning(cell)
+    return {
+        "record": str(record_path(cell)),
+        "passed": bool(record and record.passed),
+        "steps": {result.step: result.passed for result in (record.steps if record else ())},
+    }

@@ -1,0 +1,214 @@
+"""The record of a cell's commissioning: `commissioning.yaml` in its state folder, and whether it fits the cell.
+
+Each step keeps the settings and the devices with which it was done. So a change of the rig, or another box, asks
+for the steps that it concerns and for no others. The file carries a SHA-256 of its own content, as calibrations
+do.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import AwareDatetime, Field, JsonValue
+
+import coupole
+from coupole.calibration.record import Limit, Sha256, content_sha256, write_sealed
+from coupole.devices import Identity
+from coupole.errors import InputError
+from coupole.plan import yamlfile
+from coupole.plan.cell import Cell
+from coupole.plan.plan import Model, Name
+from coupole.plan.registry import settings_class
+from coupole.plan.rig_devices import NOWHERE, described_arm, device_for, in_world
+
+Step = Literal["cycle", "axes", "stopping", "lamps", "trigger", "watchdog", "emergency-stop"]
+STEPS: tuple[Step, ...] = get_args(Step)
+"""In the order in which they are done."""
+_DEVICES: Mapping[Step, tuple[str, ...]] = {
+    "cycle": ("robot",),
+    "axes": ("robot",),
+    "stopping": ("robot",),
+    "lamps": ("ledbox",),
+    "trigger": ("ledbox", "camera"),
+    "watchdog": ("ledbox",),
+    "emergency-stop": ("robot",),
+}
+"""The devices that a step is about."""
+_HEAD = "# The commissioning of a cell. It carries its own checksum: do not edit it, say `coupole commission`."
+
+
+class Answer(Model):
+    """What the person was asked, and whether the answer was yes."""
+
+    question: str
+    yes: bool
+
+
+class StepResult(Model):
+    """One step, as it ended."""
+
+    step: Step
+    person: Annotated[str, Field(min_length=1)]
+    ended: AwareDatetime
+    devices: dict[str, str]
+    """Vendor, model, serial number and firmware of each device of the step."""
+    settings: dict[str, JsonValue]
+    """Settings of the rig that the result depends on, by their place in it."""
+    limits: tuple[Limit, ...]
+    answers: tuple[Answer, ...]
+    remarks: tuple[str, ...]
+    failure: str = ""
+    """What was wrong and what to do; empty if nothing was."""
+
+    @property
+    def passed(self) -> bool:
+        return not self.failure and all(one.passed for one in self.limits) and all(one.yes for one in self.answers)
+
+
+class CommissioningRecord(Model):
+    """The newest result of each step."""
+
+    schema_version: Literal[1]
+    kind: Literal["commissioning"]
+    rig: Name
+    software: str
+    simulated: bool
+    steps: tuple[StepResult, ...]
+    sha256: Sha256
+
+    def result(self, step: Step) -> StepResult | None:
+        return next((one for one in self.steps if one.step == step), None)
+
+    @property
+    def passed(self) -> bool:
+        """True if every step was done and passed."""
+        return all((found := self.result(step)) is not None and found.passed for step in STEPS)
+
+    def with_result(self, result: StepResult) -> CommissioningRecord:
+        """The same record with a new result in place of an older one of that step."""
+        kept = {one.step: one for one in self.steps} | {result.step: result}
+        return _sealed(self.rig, tuple(kept[step] for step in STEPS if step in kept), simulated=self.simulated)
+
+
+def record_path(cell: Cell) -> Path:
+    return cell.state_folder / "commissioning.yaml"
+
+
+def empty_record(cell: Cell) -> CommissioningRecord:
+    return _sealed(cell.rig.name, (), simulated=in_world(cell.rig, dry_run=False))
+
+
+def read_commissioning(cell: Cell) -> CommissioningRecord | None:
+    """The cell's record; None if there is none. Raises InputError for one that was edited or cannot be read."""
+    path = record_path(cell)
+    if not path.exists():
+        return None
+    document = yamlfile.read(path)
+    record = document.validate(CommissioningRecord)
+    if content_sha256(json.loads(record.model_dump_json())) != record.sha256:
+        message = "the record was edited after it was made: its content has another checksum. Commission anew"
+        raise InputError([document.problem(("sha256",), message)])
+    return record
+
+
+def write_commissioning(cell: Cell, record: CommissioningRecord) -> None:
+    """Raises StorageError."""
+    write_sealed(record_path(cell), json.loads(record.model_dump_json()), _HEAD)
+
+
+def settings_of(cell: Cell, step: Step) -> dict[str, JsonValue]:
+    """The settings of the rig that the result of a step depends on. Addresses are not among them."""
+    rig = cell.rig
+    found: dict[str, Any] = {}
+    for kind in _DEVICES[step]:
+        driver, settings = device_for(rig, kind, dry_run=False)
+        found[f"{kind}.driver"] = driver
+        model = settings_class(driver)
+        places = {name: value for name, value in NOWHERE[kind].items() if name in model.model_fields}
+        complete = model(**{**settings, **places}).model_dump(mode="json", exclude={*places, "arm_model"})
+        found |= {f"{kind}.settings.{name}": value for name, value in complete.items()}
+    if "robot" in _DEVICES[step]:
+        arm = described_arm(rig)
+        found["arm"] = None if arm is None else hashlib.sha256(arm.model_dump_json().encode()).hexdigest()
+    if "camera" in _DEVICES[step]:
+        found["led_limits.rise_us"] = rig.led_limits.rise_us
+    if step == "lamps":
+        found["dome.leds"] = hashlib.sha256(cell.leds_path.read_bytes()).hexdigest()
+    plain: dict[str, JsonValue] = json.loads(json.dumps(found))
+    return plain
+
+
+def devices_of(step: Step, identities: Mapping[str, Identity]) -> dict[str, str]:
+    """The devices of a step, as its result keeps them."""
+    return {
+        kind: " ".join(
+            filter(None, (one.vendor, one.model, one.serial, f"({one.firmware})" if one.firmware else ""))
+        )
+        for kind in _DEVICES[step]
+        for one in (identities[kind],)
+    }
+
+
+def outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identity] | None = None) -> str:
+    """Why a step's result does not fit the rig (and the opened devices) any more; empty if it does."""
+    changes = _changes(result.settings, settings_of(cell, result.step))
+    if identities is not None:
+        changes += _changes(result.devices, devices_of(result.step, identities))
+    return "; ".join(changes)
+
+
+def commissioning_refusals(cell: Cell, identities: Mapping[str, Identity] | None = None) -> list[str]:
+    """Why a cell that is not simulated must not be used: a step of its commissioning is missing, failed or does
+    not fit the rig any more, or the opened devices are others. Empty for a simulated cell."""
+    if in_world(cell.rig, dry_run=False):
+        return []
+    command = f"coupole commission {cell.document.path} --name NAME"
+    try:
+        record = read_commissioning(cell)
+    except InputError as error:
+        return [f"commissioning: {error}; remove the file and say `{command}`"]
+    if record is None:
+        return [f"commissioning: this cell has no record ({record_path(cell)}). At the cell, say `{command}`"]
+    if record.simulated:
+        return [f"commissioning: {record_path(cell)} was made with a simulated cell. Say `{command}`"]
+    refusals = []
+    for step in STEPS:
+        result = record.result(step)
+        if result is None:
+            refusals.append(f"commissioning: the step {step} was not done. Say `{command}`")
+        elif not result.passed:
+            refusals.append(f"commissioning: the step {step} did not pass. Say `{command}`")
+        elif why := outdated(cell, result, identities):
+            refusals.append(f"commissioning: the step {step} does not fit any more: {why}. Say `{command}`")
+    return refusals
+
+
+def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    return [
+        f"{key} is {_short(now.get(key))}, was {_short(before.get(key))}"
+        for key in sorted({*before, *now})
+        if before.get(key) != now.get(key)
+    ]
+
+
+def _short(value: Any) -> str:
+    text = "absent" if value is None else str(value)
+    return text if len(text) <= 60 else f"{text[:12]}..."
+
+
+def _sealed(rig: str, steps: tuple[StepResult, ...], *, simulated: bool) -> CommissioningRecord:
+    unsealed = CommissioningRecord.model_construct(
+        schema_version=1,
+        kind="commissioning",
+        rig=rig,
+        software=f"coupole {coupole.__version__}",
+        simulated=simulated,
+        steps=steps,
+        sha256="",
+    )
+    plain = json.loads(unsealed.model_dump_json())
+    return CommissioningRecord.model_validate_json(json.dumps({**plain, "sha256": content_sha256(plain)}))

@@ -87,11 +87,9 @@ class Clock(Protocol):
 
     def sleep(self, seconds: float) -> None:
         """Wait `seconds` on this clock; returns early only if the clock's source is gone."""
-        ...
 
     def hurry(self, until_ns: int) -> None:
         """Until then the caller only waits, so a simulated clock may run fast; a real clock ignores this."""
-        ...
 
 
 class SystemClock:
@@ -163,7 +161,6 @@ class LedBox(Protocol):
 
     def self_test(self) -> Mapping[str, str]:
         """Self-test report of the box, for `coupole devices`; raises if the box is not usable."""
-        ...
 
     def flash(self, led: int, on_us: int) -> None:
         """Light one LED (NO_LED: none) for `on_us`; returns as soon as the box has confirmed that it is lit.
@@ -171,19 +168,16 @@ class LedBox(Protocol):
         Box or driver switch the light off after that time, independently of the caller. The camera is not
         triggered. Raises DeviceRefused for an LED that the box does not have.
         """
-        ...
 
     def lit(self) -> bool:
         """True only if the light of the last `flash` has been on without interruption since that call returned.
         For a flash without light: while it would be on."""
-        ...
 
     def end_flash(self) -> StepRecord:
         """End the last `flash`, possibly before its time. Returns its record; its LED is then off.
 
         Raises DeviceTimeout if the box does not confirm the end in time.
         """
-        ...
 
     def lights_off(self) -> None:
         """Abort a running burst, switch all LEDs and panels off; returns when the box has confirmed it.
@@ -192,19 +186,15 @@ class LedBox(Protocol):
         that call: a box that knows a device clear is dark within 100 ms even while a table is being uploaded.
         Other calls in progress end with a DeviceError, and light nothing after this one has returned.
         """
-        ...
 
     def panel(self, panel: int, on: bool) -> None:
         """Switch a flat white panel (1 to `panel_count`); raises DeviceRefused for any other number."""
-        ...
 
     def board_temperature_c(self, board: int) -> float | None:
         """Of an LED board, C; None if the box does not measure it."""
-        ...
 
     def close(self) -> None:
         """Lights off if the box still accepts commands; never raises because of a lost link."""
-        ...
 
 
 class TableLedBox(LedBox, Protocol):
@@ -216,26 +206,21 @@ class TableLedBox(LedBox, Protocol):
         May be called while the other bank runs. Raises DeviceRefused, naming the record, for a table out of the
         box's limits.
         """
-        ...
 
     def start(self, table: NDArray[np.void]) -> None:
         """Run a loaded table, after checking that the box still has it unchanged. Returns at once."""
-        ...
 
     def poll_log(self) -> NDArray[np.void]:
         """Records (STEP_RECORD_DTYPE [k]) of all steps that finished since the last poll; may be empty.
 
         Raises DeviceFault if the burst ended by a fault of the box.
         """
-        ...
 
     def running(self) -> bool:
         """True while a table runs."""
-        ...
 
     def edges(self) -> int:
         """Trigger edges sent since the last `start`."""
-        ...
 
 
 def table_box(box: LedBox) -> TableLedBox:
@@ -324,29 +309,23 @@ class Camera(Protocol):
 
     def configure(self, exposure: Exposure) -> FrameFormat:
         """Set exposure, gain and trigger; returns the format of the frames. The camera must be disarmed."""
-        ...
 
     def min_period_us(self, exposure: Exposure) -> int:
         """Shortest time between two edges that this exposure and the sensor's readout allow."""
-        ...
 
     def arm(self, buffers: int) -> None:
         """Queue at least `buffers` buffers and start acquisition: from now on edges trigger frames."""
-        ...
 
     def next_frame(self, timeout_s: float) -> Frame | None:
         """The oldest frame not yet taken, or None if none arrived in time."""
-        ...
 
     def trigger(self) -> None:
         """Software trigger; only with `hardware_trigger=False`."""
-        ...
 
     def statistics(self) -> CameraStatistics: ...
 
     def disarm(self) -> None:
         """Stop acquisition and take all buffers back. Safe to call at any time."""
-        ...
 
     def close(self) -> None: ...
 
@@ -378,7 +357,6 @@ class Robot(Protocol):
         Raises DeviceRefused out of limits, or if another thread called `stop` since this call began: no motion is
         then started.
         """
-        ...
 
     def wait_settled(self) -> ArmState:
         """Wait until the arm is at rest at the target; the time-out is derived from the commanded motion.
@@ -386,7 +364,6 @@ class Robot(Protocol):
         Raises DeviceFault on a latched fault, DeviceLost if the link is gone, DeviceTimeout, and DeviceRefused if
         another thread commands the arm meanwhile.
         """
-        ...
 
     def measured(self) -> ArmState: ...
 
@@ -397,14 +374,11 @@ class Robot(Protocol):
         target that waits until the arm is at rest is forgotten. In any motion started by `move_to`, each axis
         turns by at most `stopping_deg` more.
         """
-        ...
 
     def stopping_deg(self) -> NDArray[np.float64]:
         """Largest further turn of each axis [6] after `stop`, from its speeds, accelerations and delays."""
-        ...
 
     def statistics(self) -> Mapping[str, float]:
         """Figures of the link since it was opened (answers, late answers, ...), for the journal."""
-        ...
 
     def close(self) -> None: ...

@@ -141,7 +141,7 @@ def _normals(
 def _direction(
     picture: NDArray[np.float64], normals: NDArray[np.float64], lit: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    found: NDArray[np.float64] = np.linalg.lstsq(normals[:, lit].T, picture[lit], rcond=None)[0]
+    found: NDArray[np.float64] = np.linalg.lstsq(normals[:, lit].T, picture[lit], rcond=None)[0].astype(np.float64)
     return found
 
 

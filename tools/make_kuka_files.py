@@ -32,8 +32,8 @@ STOP_OUTPUT = 7
 """Output of the ETHERNET object that ends the program; 1 to 6 are the corrections."""
 STOP_NOTE = """\
 - `STOP1` ends RSI_MOVECORR when the driver is closed, with the arm at rest: the program goes on to RSI_OFF and its
-  end, without an error. Whatever else silences the PC still ends in KSS29002. RSI_MOVECORR must be what runs: outside
-  of it the same input is an error.
+  end, without an error. Whatever else silences the PC still ends in KSS29002. RSI_MOVECORR must be what runs:
+  outside of it the same input is an error.
 """
 """About the object that ends the program."""
 PING_S = 1

@@ -9,12 +9,14 @@ from __future__ import annotations
 import json
 import re
 import runpy
+import select
 import socket
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,7 @@ from arms import KR10_R1100_SIXX
 from cells import REPO, CellFolder, wait_until
 
 from coupole.devices import SystemClock
+from coupole.errors import DeviceFault
 from coupole.kinematics import forward
 from drivers.kuka.rsi.driver import KukaRsi, Settings
 
@@ -34,12 +37,15 @@ _UNTOLD = 50
 _CLIENT = """
 import json, sys, time
 from RSIPI import RSIAPI
+from RSIPI.fault_injection import suspended
 
 if __name__ == "__main__":
     config, what, values = sys.argv[1], sys.argv[2], json.loads(sys.argv[3])
     with RSIAPI(config, rsi_mode="absolute", max_cartesian_rate=0.2, max_joint_rate=0.05) as api:
         api.start()
         assert api.wait_for_connection(timeout=30.0)
+        with suspended(api.client.network_process.pid):
+            time.sleep(0.2)
         getattr(api.motion, what)(**values)
         print("told", flush=True)
         sys.stdin.readline()
@@ -49,7 +55,7 @@ _ECHO_SERVER = """
 import sys
 from RSIPI.rsi_echo_server import EchoServer
 
-server = EchoServer(sys.argv[1], delay_ms=4, mode="absolute", timeout_packets=1_000_000)
+server = EchoServer(sys.argv[1], delay_ms=int(sys.argv[2]), mode="absolute", timeout_packets=1_000_000)
 server.start()
 sys.stdin.readline()
 server.stop()
@@ -74,10 +80,11 @@ def configuration(folder: Path, settings: Settings) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("corrects", "what", "values"),
+    ("corrects", "what", "values", "cycle_ms", "host"),
     [
-        ("axes", "update_joints", {"A1": 5.0, "A6": -3.0}),
-        pytest.param("pose", "update_cartesian", {"X": 20.0, "Z": -10.0}, marks=pytest.mark.full),
+        ("axes", "update_joints", {"A1": 5.0, "A6": -3.0}, 12, "127.0.0.2"),
+        pytest.param("axes", "update_joints", {"A1": 5.0, "A6": -3.0}, 4, "127.0.0.1", marks=pytest.mark.full),
+        pytest.param("pose", "update_cartesian", {"X": 20.0, "Z": -10.0}, 4, "127.0.0.1", marks=pytest.mark.full),
     ],
 )
 def test_its_client_moves_our_stand_in(
@@ -86,11 +93,15 @@ def test_its_client_moves_our_stand_in(
     corrects: str,
     what: str,
     values: dict[str, float],
+    cycle_ms: int,
+    host: str,
 ) -> None:
+    """Its cycle and address are the world's own; its process is stopped for 200 ms, meanwhile packets come
+    twice."""
     settings = Settings.model_validate(
-        {"arm_model": KR10_R1100_SIXX, "listen": f"127.0.0.1:{port}", "corrects": corrects}
+        {"arm_model": KR10_R1100_SIXX, "listen": f"{host}:{port}", "corrects": corrects}
     )
-    robot = {"sends_to": settings.listen, "sends_pose": True, "corrects": corrects}
+    robot = {"sends_to": settings.listen, "sends_pose": True, "corrects": corrects, "cycle_ms": cycle_ms}
     config = configuration(tmp_path, settings)
     arguments = [sys.executable, "-c", _CLIENT, str(config), what, json.dumps(values)]
     wanted = forward(KR10_R1100_SIXX, HOME_DEG + [values.get(f"A{axis}", 0.0) for axis in range(1, 7)])
@@ -115,23 +126,75 @@ def test_its_client_moves_our_stand_in(
         assert np.allclose(seen_deg, world.ask("state")["joints_deg"], atol=1e-3)
 
 
-def test_its_echo_server_takes_every_answer_of_our_driver(
-    tmp_path: Path, port: int, scale: Callable[[int, int], int]
-) -> None:
+@contextmanager
+def echo_server(config: Path, cycle_ms: int) -> Iterator[subprocess.Popen[str]]:
+    """RSIPI's stand-in for a controller, ended by a line of input."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(("0.0.0.0", _ECHO_PORT))
         except OSError:
             pytest.skip(f"port {_ECHO_PORT}, the echo server's, is in use")
-    settings = Settings.model_validate(
-        {"arm_model": KR10_R1100_SIXX, "listen": f"127.0.0.1:{port}", "delay_limit": 1_000_000}
-    )
-    config = configuration(tmp_path, settings)
-    arguments = [sys.executable, "-c", _ECHO_SERVER, str(config)]
+    arguments = [sys.executable, "-c", _ECHO_SERVER, str(config), str(cycle_ms)]
+    with subprocess.Popen(
+        arguments, cwd=config.parent, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as server:
+        try:
+            yield server
+        finally:
+            server.kill()
+
+
+@contextmanager
+def bad_network(port: int, driver_port: int) -> Iterator[None]:
+    """Between the controller, which sends to `port` of 127.0.0.1, and the driver: packets are doubled, held back
+    and repeated long after."""
+    over = threading.Event()
+
+    def relay(near: socket.socket, far: socket.socket) -> None:
+        controller, packets = None, []
+        while not over.is_set():
+            for link in select.select([near, far], [], [], 0.05)[0]:
+                data, address = link.recvfrom(65535)
+                if link is far:
+                    if controller is not None:
+                        near.sendto(data, controller)
+                    continue
+                controller = address
+                packets.append(data)
+                if len(packets) % 100 == 50:
+                    time.sleep(0.03)
+                far.sendto(data, ("127.0.0.2", driver_port))
+                if len(packets) % 7 == 0:
+                    far.sendto(data, ("127.0.0.2", driver_port))
+                if len(packets) % 40 == 39:
+                    far.sendto(packets[-30], ("127.0.0.2", driver_port))
+
     with (
-        subprocess.Popen(
-            arguments, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        ) as server,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as near,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as far,
+    ):
+        near.bind(("127.0.0.1", port))
+        far.bind(("127.0.0.2", 0))
+        thread = threading.Thread(target=relay, args=(near, far))
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+
+@pytest.mark.parametrize("cycle_ms", [12, pytest.param(4, marks=pytest.mark.full)])
+def test_its_echo_server_takes_every_answer_of_our_driver(
+    tmp_path: Path, port: int, scale: Callable[[int, int], int], cycle_ms: int
+) -> None:
+    """Through a network that doubles packets, holds some back and repeats others."""
+    arm = {"arm_model": KR10_R1100_SIXX, "delay_limit": 1_000_000, "cycle_ms": cycle_ms}
+    config = configuration(tmp_path, Settings.model_validate(arm | {"listen": f"127.0.0.1:{port}"}))
+    settings = Settings.model_validate(arm | {"listen": f"127.0.0.2:{port}", "controller": "127.0.0.2"})
+    with (
+        bad_network(port, port),
+        echo_server(config, cycle_ms) as server,
         closing(KukaRsi(settings, SystemClock())) as robot,
     ):
         assert not robot.identify().simulated
@@ -150,3 +213,15 @@ def test_its_echo_server_takes_every_answer_of_our_driver(
     late = figures["late_answers"]
     print(f"late: {late:.0f} of {figures['packets']:.0f} packets")
     assert int(faulty[1]) <= late + _UNTOLD, out  # what it counts is lateness alone
+    assert figures["astray_packets"] > 0
+
+
+def test_its_echo_server_with_another_cycle_than_the_drivers_is_refused(tmp_path: Path, port: int) -> None:
+    settings = Settings.model_validate(
+        {"arm_model": KR10_R1100_SIXX, "listen": f"127.0.0.1:{port}", "cycle_ms": 12, "delay_limit": 1_000_000}
+    )
+    with (
+        echo_server(configuration(tmp_path, settings), 4),
+        pytest.raises(DeviceFault, match="its IPOC counts 4 a packet; `cycle_ms` is 12"),
+    ):
+        KukaRsi(settings, SystemClock())

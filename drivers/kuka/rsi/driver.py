@@ -86,6 +86,7 @@ class KukaRsi:
         return {
             "axes": f"{axes} deg",
             "delay counter": f"{state.delay}",
+            "cycle": f"{state.cycle_ns / 1e6:.2f} ms",
             "scheduling": "SCHED_FIFO" if state.realtime else "normal: answers may be late on a busy machine",
         }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import select
 import socket
 import threading
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cells import wait_until
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -29,14 +31,17 @@ parse = packet_parser("AIPos", "Delay")
 
 
 @contextmanager
-def controller_and_client(folder: Path, **settings: object) -> Iterator[tuple[KukaController, socket.socket]]:
-    """A running stand-in, and the socket of a client that has to answer it."""
+def controller_and_client(
+    folder: Path, told: list[str] | None = None, **settings: object
+) -> Iterator[tuple[KukaController, socket.socket]]:
+    """A running stand-in, and the socket of a client that has to answer it; `told` gets its messages."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.bind(("127.0.0.1", 0))
         client.settimeout(10.0)
         reactor = Reactor(ClockWriter(folder / "clock", speed=20.0))
         settings |= {"sends_to": f"127.0.0.1:{client.getsockname()[1]}"}
-        controller = KukaController(reactor, Settings.model_validate(settings))
+        tell = (told if told is not None else []).append
+        controller = KukaController(reactor, Settings.model_validate(settings), tell)
         world = threading.Thread(target=reactor.run)
         world.start()
         try:
@@ -70,6 +75,13 @@ def answer_with(client: socket.socket, correction_a1_deg: float) -> None:
     client.sendto(b'<Sen Type="ImFree"><AKorr %b/><IPOC>%b</IPOC></Sen>' % (axes.encode(), read.ipoc), address)
 
 
+def client_of(client: socket.socket) -> tuple[str, int]:
+    """Where the controller's last packet came from."""
+    _, address = client.recvfrom(4096, socket.MSG_PEEK)
+    found: tuple[str, int] = address
+    return found
+
+
 def answer_until_silent(client: socket.socket, correction_a1_deg: float) -> None:
     client.settimeout(0.3)
     with suppress(TimeoutError):
@@ -93,6 +105,66 @@ def test_a_correction_past_a_software_limit_stops_rsi(tmp_path: Path) -> None:
             answer_with(client, correction_deg)
         answer_until_silent(client, 0.2)
         assert "limit switch of A1" in controller.fault
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ("<AKorr @0@/>", "an answer without IPOC is ignored: <Sen Type"),
+        ("<AKorr @0@/><IPOC>7</IPOC>", "an answer with another IPOC than that of the last packet is ignored: 7"),
+        ('<AKorr A1="a"/><IPOC>@</IPOC>', "an answer with a correction that is no number is ignored"),
+        ('<RKorr X="1"/><IPOC>@</IPOC>', "corrections without A1 A2 A3 A4 A5 A6 in AKorr are taken as 0"),
+        ("<AKorr @9@/><IPOC>@</IPOC>", "RSI stops: command velocity of A1 exceeded: 9.000 deg"),
+        ("<AKorr @999@/><IPOC>@</IPOC>", "a correction is clamped: to [341.0, 0.0"),
+        ("another SENTYPE", "an answer whose SENTYPE is not ImFree is ignored"),
+    ],
+    ids=["ipoc", "old", "number", "element", "speed", "clamp", "sentype"],
+)
+def test_what_is_refused_is_told_with_its_reason(tmp_path: Path, answer: str, message: str) -> None:
+    told: list[str] = []
+    with controller_and_client(tmp_path, told, restart_s=1e6, answer_limit_s=0.3) as (_, client):
+        answer_with(client, 0.0)
+        answer_with(client, 0.0)
+        data, address = client.recvfrom(4096)
+        read = parse(data)
+        assert read is not None
+        assert told == []
+        sen_type = "Other" if answer == "another SENTYPE" else "ImFree"
+        inner = re.sub("@([0-9]+)@", r'A1="\1" A2="0" A3="0" A4="0" A5="0" A6="0"', answer)
+        if sen_type == "Other":
+            inner = "<IPOC>@</IPOC>"
+        sent = f'<Sen Type="{sen_type}">{inner}</Sen>'.encode()
+        client.sendto(sent.replace(b"@", read.ipoc), address)
+        wait_until(lambda: told, "a message")
+    assert told[0].startswith(f"robot: {message}")
+
+
+def test_the_same_refusal_is_not_told_in_every_cycle(tmp_path: Path) -> None:
+    told: list[str] = []
+    with controller_and_client(tmp_path, told, answer_limit_s=0.3) as (_, client):
+        for _ in range(50):
+            answer_with(client, 0.0)
+            client.sendto(b"<Sen/>", client_of(client))
+        answer_with(client, 0.0)
+    assert sum("without IPOC" in message for message in told) == 1
+
+
+def test_a_stop_element_ends_the_program_without_a_fault(tmp_path: Path) -> None:
+    told: list[str] = []
+    with controller_and_client(tmp_path, told, restart_s=1e6) as (controller, client):
+        for correction_deg in (0.0, 0.0, 0.01):
+            answer_with(client, correction_deg)
+        data, address = client.recvfrom(4096)
+        read = parse(data)
+        assert read is not None
+        answer = b'<Sen Type="ImFree"><AKorr A1="0.01" A2="0" A3="0" A4="0" A5="0" A6="0"/><Stop>1</Stop>'
+        client.sendto(answer + b"<IPOC>%b</IPOC></Sen>" % read.ipoc, address)
+        client.settimeout(0.3)
+        with pytest.raises(TimeoutError):
+            client.recv(4096)
+        assert controller.ended_programs == 1
+        assert controller.fault == ""
+        assert told == []
 
 
 def test_late_answers_end_in_the_controllers_own_fault(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell
@@ -18,12 +19,14 @@ from coupole.errors import DeviceFault, DeviceLost, PreflightRefused
 from coupole.geometry import Transform
 from coupole.kinematics import move_duration_s
 from coupole.motion.itinerary import Itinerary, Visit, arm_of
-from coupole.motion.path_deviation import PATH_TOLERANCE_MM, path_deviation_mm
+from coupole.motion.path_deviation import PATH_TOLERANCE_MM, deviation_at_rest_mm
 from coupole.motion.path_planner import Joints
 from coupole.plan.schedule import ViewPose
 from coupole.preflight.job import Job
 
 _POLL_S = 0.01
+_SPEED_OVER_NS = 30_000_000
+"""Least time between two readings for the axes' speeds: some cycles of any controller."""
 _NEWS_S = 1.0
 _SPRING_BACK_S = 2.0
 """Time that a pushed arm has to come back by itself."""
@@ -51,6 +54,12 @@ class ArmSupervisor:
         self._settled: SettledPose | None = None
         self._from_deg = np.zeros(6)
         """Joint angles at which the next leg begins."""
+        speeds_deg_s = np.array(self._arm.velocity_deg_s)
+        self._stopping_s = float((self._robot.stopping_deg() / speeds_deg_s).max())
+        """Within which the arm comes to rest from its highest speed; from lower ones sooner."""
+        self._before: ArmState | None = None
+        """An earlier reading during a motion, for the axes' speeds."""
+        self._latest_deg_s = np.zeros(6)
 
     def itinerary(self, views: Sequence[ViewPose]) -> Itinerary:
         """Paths to views from the arm's actual posture. Raises PreflightRefused if there is none."""
@@ -67,14 +76,16 @@ class ArmSupervisor:
     def go(self, visit: Visit) -> SettledPose:
         """Follow the leg of a visit; returns the measured pose."""
         self._settled = None
+        self._before = None
         path = (self._from_deg, *visit.leg.waypoints)
         self._keep_to(path, self._watched(), "before it started")
         for here_deg, there_deg in pairwise(path):
             self._control.go_on()
+            self._before = None
             self._robot.move_to(there_deg)
             self.hurry(move_duration_s(self._arm, here_deg, there_deg) + self._motion.settle_dwell_s)
             while (arm := self._watched()).moving:
-                self._keep_to(path, arm, "during its motion")
+                self._keep_to((here_deg, there_deg), arm, "during its motion")
                 self._clock.sleep(_POLL_S)
         self._from_deg = path[-1]
         return self._settle()
@@ -145,17 +156,34 @@ class ArmSupervisor:
         return arm
 
     def _keep_to(self, path: Sequence[Joints], arm: ArmState, when: str) -> None:
-        """Stop the arm if it deviates from its path by more than the tolerance."""
-        off_mm = path_deviation_mm(path, np.array(arm.joints_deg), self._job.motion.bodies.reach_mm)
+        """Stop the arm if, stopped now, it would come to rest off its path by more than the tolerance."""
+        off_mm = deviation_at_rest_mm(
+            path,
+            np.array(arm.joints_deg),
+            self._speeds_deg_s(arm),
+            self._job.motion.bodies.reach_mm,
+            self._stopping_s,
+        )
         if off_mm <= PATH_TOLERANCE_MM:
             return
         self._robot.stop()
         raise DeviceFault(
             "robot",
             expected=f"all of the arm within {PATH_TOLERANCE_MM:g} mm of the path that was checked",
-            happened=f"{when} it deviated by up to {off_mm:.1f} mm and was stopped",
+            happened=f"{when} it deviated and was stopped; it comes to rest up to {off_mm:.1f} mm off the path",
             remedy="Check the cell; perhaps the controller does not move on straight lines in joint space.",
         )
+
+    def _speeds_deg_s(self, arm: ArmState) -> NDArray[np.float64]:
+        """[6] between two readings, so far apart that their rounding and the network's delays do not matter; 0
+        before the second one."""
+        before = self._before
+        if before is None:
+            self._before, self._latest_deg_s = arm, np.zeros(6)
+        elif arm.t_ns - before.t_ns >= _SPEED_OVER_NS:
+            moved_deg = np.subtract(arm.joints_deg, before.joints_deg)
+            self._before, self._latest_deg_s = arm, moved_deg / ((arm.t_ns - before.t_ns) * 1e-9)
+        return self._latest_deg_s
 
     def _settle(self) -> SettledPose:
         arm = self._robot.wait_settled()

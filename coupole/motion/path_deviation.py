@@ -1,4 +1,4 @@
-"""Path deviation: distance of the moving arm from its planned path."""
+"""Path deviation: distance of the moving arm from its planned path, now and where it would come to rest."""
 
 from __future__ import annotations
 
@@ -17,10 +17,36 @@ def path_deviation_mm(
     """Upper bound of the distance of any point of arm and tool from the straight motions of `way_deg` ([6] each),
     with the axes at `joints_deg` [6]: for the nearest posture of the path, the sum over the axes of the deviation
     times the greatest distance of any point from that axis, `reach_mm` [6] (`CellBodies.reach_mm`)."""
-    best = np.inf
+    return _nearest(way_deg, joints_deg, reach_mm)[0]
+
+
+def deviation_at_rest_mm(
+    way_deg: Sequence[NDArray[np.float64]],
+    joints_deg: NDArray[np.float64],
+    speeds_deg_s: NDArray[np.float64],
+    reach_mm: NDArray[np.float64],
+    stopping_s: float,
+) -> float:
+    """`path_deviation_mm` of the place where the arm comes to rest if it is stopped now: with the speed across the
+    path that the axes have at `speeds_deg_s` [6], kept for `stopping_s`. An arm that is stopped brakes along its
+    path, so its speed along it does not count."""
+    off_mm, along = _nearest(way_deg, joints_deg, reach_mm)
+    speeds_mm_s = np.radians(speeds_deg_s) * reach_mm
+    length = float(along @ along)
+    across_mm_s = speeds_mm_s - (float(speeds_mm_s @ along) / length if length else 0.0) * along
+    return off_mm + stopping_s * float(np.abs(across_mm_s).sum())
+
+
+def _nearest(
+    way_deg: Sequence[NDArray[np.float64]], joints_deg: NDArray[np.float64], reach_mm: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64]]:
+    """Deviation from the nearest motion of the path, mm, and that motion [6], each axis times its reach."""
+    best, nearest = np.inf, np.zeros(6)
     for a, b in pairwise([*way_deg, way_deg[-1]]):
         along, off = (b - a) * reach_mm, (joints_deg - a) * reach_mm
         length = float(along @ along)
         share = min(1.0, max(0.0, float(off @ along) / length)) if length else 0.0
-        best = min(best, float(np.abs(off - share * along).sum()))
-    return float(np.radians(best))
+        deviation = float(np.abs(off - share * along).sum())
+        if deviation < best:
+            best, nearest = deviation, along
+    return float(np.radians(best)), nearest

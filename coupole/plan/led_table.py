@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,12 +68,10 @@ def read_led_table(path: Path) -> LedTable:
     if tuple(field.strip() for field in header[1].split(",")) != COLUMNS:
         wrong(header[0], f"expected the header `{','.join(COLUMNS)}`, found `{header[1]}`")
         raise InputError(problems)
-    for line, fields in zip(
-        (n for n, _ in numbered[1:]), csv.reader(text for _, text in numbered[1:]), strict=True
-    ):
+    for line, text in numbered[1:]:
         try:
-            values = [float(field) for field in fields]
-        except ValueError as error:
+            values = [float(field) for field in next(csv.reader([text]))]
+        except (ValueError, csv.Error) as error:
             wrong(line, str(error))
             continue
         if len(values) != len(COLUMNS) or not np.all(np.isfinite(values)):
@@ -102,7 +101,7 @@ def _mistakes(values: list[float]) -> Iterator[tuple[str, str]]:
     if max(map(abs, values[2:5])) > _FARTHEST_MM:
         place = ", ".join(f"{value:g}" for value in values[2:5])
         yield "x_mm, y_mm, z_mm", f"expected mm, at most {_FARTHEST_MM:g} on each axis, found {place}"
-    norm = float(np.linalg.norm(values[5:8]))
+    norm = math.hypot(*values[5:8])
     if abs(norm - 1.0) > 1e-3:
         yield "nx, ny, nz", f"expected a unit normal, found one of length {norm:.4f}"
     if not 0 < values[8] <= _BRIGHTEST_LM:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coupole.kinematics import link_frames
 from coupole.motion.bodies import Capsule, capsules_of
 from coupole.motion.collisions import CellBodies, Surroundings
-from coupole.motion.path_deviation import path_deviation_mm
+from coupole.motion.path_deviation import deviation_at_rest_mm, path_deviation_mm
 
 TOOL = Capsule("tool", 7, (0, 0, 0), (0, 0, 120), 1)
 REACH_MM = CellBodies(KR10, Surroundings(np.eye(4), 740.0, 1500.0, 74.0, np.zeros((0, 3))), [TOOL]).reach_mm
@@ -54,3 +54,26 @@ def test_an_arm_that_has_no_way_to_go_is_off_by_where_it_stands() -> None:
     here = np.zeros(6)
     assert path_deviation_mm([here], here, REACH_MM) == 0.0
     assert path_deviation_mm([here], np.array([0.1, 0, 0, 0, 0, 0]), REACH_MM) > 2.0
+
+
+@given(places, places, st.floats(0.0, 1.0), st.floats(0.0, 200.0))
+def test_speed_along_the_path_does_not_count(start: NDArray, goal: NDArray, share: float, speed: float) -> None:  # type: ignore[type-arg]
+    along = (goal - start) / max(1e-9, float(np.abs(goal - start).max()))
+    here = start + share * (goal - start)
+    assert deviation_at_rest_mm([start, goal], here, speed * along, REACH_MM, 0.5) < 1e-6
+
+
+def test_an_arm_that_leaves_its_path_counts_with_the_place_where_it_comes_to_rest() -> None:
+    """Axis 1 turns at 2 deg/s while only axis 3 should: 1376 mm away that is 48 mm/s, for half a second."""
+    start, goal = np.zeros(6), np.array([0.0, 0, 90, 0, 0, 0])
+    here, speeds = np.array([0.1, 0, 30, 0, 0, 0]), np.array([2.0, 0, 60, 0, 0, 0])
+    now_mm = path_deviation_mm([start, goal], here, REACH_MM)
+    assert np.isclose(now_mm, np.radians(0.1) * REACH_MM[0])
+    at_rest_mm = deviation_at_rest_mm([start, goal], here, speeds, REACH_MM, 0.5)
+    assert np.isclose(at_rest_mm, now_mm + 0.5 * np.radians(2.0) * REACH_MM[0])
+
+
+def test_an_arm_that_should_stand_counts_with_all_its_speed() -> None:
+    here, speeds = np.zeros(6), np.array([0.0, 1.0, 0, 0, 0, 0])
+    at_rest_mm = deviation_at_rest_mm([here], here, speeds, REACH_MM, 0.4)
+    assert np.isclose(at_rest_mm, 0.4 * np.radians(1.0) * REACH_MM[1])

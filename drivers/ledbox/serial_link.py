@@ -53,9 +53,9 @@ class SerialLink:
 
     def write(self, data: bytes, deadline: Deadline, clears: int) -> None:
         """Send all of `data`."""
-        self._refuse_closed(clears)
         rest = memoryview(data)
         while rest:
+            self._refuse_closed(clears)
             try:
                 # A non-blocking write of pyserial 3.5 to a full port loops for ever: wait for room first
                 if self._fileno is None or select.select([], [self._fileno], [], _LOOK_S)[1]:

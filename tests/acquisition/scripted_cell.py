@@ -25,8 +25,6 @@ from coupole.plan.bursts import Burst
 from coupole.plan.shot_id import ShotId
 
 FORMAT = FrameFormat(8, 8, 12, "MONO", 64, 4095)
-DELIVERY_S = 0.02
-"""From a frame's edge until it is at the host."""
 MOVED = ArmMovedError("the arm moved by 0.100 deg during a burst")
 
 
@@ -93,6 +91,8 @@ class Box:
 
     def start(self, table: NDArray[np.void]) -> None:
         self._cell.done.append("started")
+        if self._cell.start_fails is not None:
+            raise self._cell.start_fails
         self._cell.started_us, self._told = self._cell.now_us, 0
 
     def poll_log(self) -> NDArray[np.void]:
@@ -125,7 +125,11 @@ class Cell:
     """From then on the arm reports that it has moved."""
     poll_takes_s: float = 0.0
     """Time that passes while the log is read."""
+    delivery_s: float = 0.02
+    """From a frame's edge until it is at the host."""
     on_load: Callable[[NDArray[np.void]], None] | None = None
+    start_fails: Exception | None = None
+    """What the box raises when the burst is to begin."""
     done: list[str] = field(default_factory=list)
     proven: dict[ShotId, Mapping[str, int]] = field(default_factory=dict)
     slots: list[int] = field(default_factory=list)
@@ -180,6 +184,7 @@ class Cell:
         return round(self.now_us * 1e3)
 
     def sleep(self, seconds: float) -> None:
+        assert self.burst_us < 60e6, "the loop does not end"
         self.pass_time(seconds)
 
     @property
@@ -188,7 +193,7 @@ class Cell:
         return self.now_us - self.started_us
 
     def arrives_us(self, frame: int) -> float:
-        return float(self.what.frames_us[frame]) + 1e6 * DELIVERY_S
+        return float(self.what.frames_us[frame]) + 1e6 * self.delivery_s
 
     def pass_time(self, seconds: float) -> None:
         self.now_us += 1e6 * seconds

@@ -133,6 +133,15 @@ def test_a_fault_in_motion_ends_the_motion(supervised: Supervise) -> None:
         supervisor.go(VISIT)
 
 
+def test_a_fault_of_an_arm_at_rest_is_told(supervised: Supervise) -> None:
+    arm = Arm()
+    supervisor = supervised(arm)
+    supervisor.attend()
+    arm.fault = "protective stop"
+    with pytest.raises(DeviceFault, match="protective stop"):
+        supervisor.attend()
+
+
 @pytest.mark.parametrize(("off_deg", "moved"), [(0.009, False), (0.011, True), (-0.011, True)])
 def test_an_arm_at_rest_may_be_off_by_what_the_rig_calls_still(
     supervised: Supervise, off_deg: float, moved: bool

@@ -85,6 +85,24 @@ def test_a_frame_that_comes_after_the_last_edges_one_is_still_looked_at() -> Non
     assert {str(shot) for shot in cell.proven} == shots_of(cell)
 
 
+def test_a_surplus_frame_that_comes_last_of_all_is_seen() -> None:
+    """It is still in transfer when the last step's frame has come."""
+    clean = take(BURST)
+    over_s = max(clean.frames_us[-1] / 1e6 + 0.02, (clean.edges_us[-1] + BURST.timing.on_us) / 1e6)
+    last_round_s = 0.05 * np.ceil(over_s / 0.05)
+    cell = Cell(BURST, take(BURST, surplus_us=(1e6 * (last_round_s + 0.009 - 0.02),)))
+    verdict = cell.fire()
+    assert np.flatnonzero(verdict.match.surplus).tolist() == [len(BURST.table)]
+    assert {str(shot) for shot in cell.proven} == shots_of(cell)
+
+
+def test_frames_that_need_all_the_time_that_the_camera_states_are_awaited() -> None:
+    cell = Cell(BURST, take(BURST), delivery_s=0.045)
+    verdict = cell.fire()
+    assert not verdict.match.missing.any()
+    assert {str(shot) for shot in cell.proven} == shots_of(cell)
+
+
 def test_a_step_whose_led_drew_no_current_is_not_proven_but_told() -> None:
     what = take(BURST)
     log = what.log.copy()
@@ -135,6 +153,17 @@ def test_a_box_that_logs_nothing_more_is_a_time_out_and_the_cell_is_made_safe_fi
     with pytest.raises(DeviceTimeout, match=f"20 of {len(BURST.table)} are in its log"):
         cell.fire()
     assert cell.done[cell.done.index("started") + 1] == "made safe"
+
+
+REFUSED = DeviceError("led box", expected="to begin", happened="it did not", remedy="None.")
+
+
+@pytest.mark.parametrize("error", [REFUSED, ZeroDivisionError("a defect")], ids=repr)
+def test_a_burst_that_cannot_begin_leaves_a_safe_cell(error: Exception) -> None:
+    cell = Cell(BURST, take(BURST), start_fails=error)
+    with pytest.raises(type(error)):
+        cell.fire()
+    assert cell.done == ["camera armed", "started", "made safe", "BurstEnded"]
 
 
 def test_slots_of_frames_without_proof_are_freed() -> None:

@@ -95,6 +95,35 @@ def test_a_parameter_that_nothing_determines_is_refused() -> None:
         adjust(np.zeros(2), evaluate, lambda s, step: s + step, [Group("y", estimated=True)], 2, what="two")
 
 
+def test_a_parameter_that_is_hardly_determined_is_refused_too() -> None:
+    x = np.linspace(0.0, 1e-8, 8)
+
+    def evaluate(state: Any) -> list[Block]:
+        columns = np.column_stack([np.ones(8), 1.0 + x])
+        return [Block(VALUES - columns @ state, columns, np.array([0, 1]), 0)]
+
+    with pytest.raises(InputError, match="do not determine all parameters"):
+        adjust(np.zeros(2), evaluate, lambda s, step: s + step, [Group("y", estimated=True)], 2, what="two")
+
+
+def test_each_groups_share_of_a_variance_is_what_its_noise_brings_into_the_parameter() -> None:
+    """A line through fine and coarse points: by the weights with which each point enters the result."""
+    x, sigma = np.array([0.0, 1.0, 2.0, 5.0, 9.0]), np.array([1.0, 1.0, 3.0, 3.0, 3.0])
+    y = 2.0 * x + 1.0
+    columns = np.column_stack([np.ones(5), x]) / sigma[:, None]
+
+    def evaluate(state: Any) -> list[Block]:
+        off, both = y / sigma - columns @ state, np.array([0, 1])
+        return [Block(off[:2], columns[:2], both, 0), Block(off[2:], columns[2:], both, 1)]
+
+    groups = [Group("fine", estimated=False), Group("coarse", estimated=False)]
+    found = adjust(np.zeros(2), evaluate, lambda s, step: s + step, groups, 2, what="a line")
+    enters = np.linalg.pinv(columns)
+    fine, coarse = (enters[:, :2] ** 2).sum(axis=1), (enters[:, 2:] ** 2).sum(axis=1)
+    assert found.contributions[0] == pytest.approx(fine / (fine + coarse))
+    assert found.contributions[1] == pytest.approx(coarse / (fine + coarse))
+
+
 def test_the_coverage_factor_is_students() -> None:
     """GUM, table G.2."""
     assert coverage_factor(np.array([1.0, 5.0, 10.0])) == pytest.approx([12.706, 2.571, 2.228], abs=6e-4)

@@ -38,6 +38,9 @@ class UsbLink:
         self._muted = False
         self.halted = False
         """Between INITIATE_CLEAR and CLEAR_FEATURE: the Bulk-OUT endpoint takes nothing."""
+        self.busy = False
+        """The box takes no transfer until it is cleared."""
+        self.refused = 0
         self.gone = False
 
     def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
@@ -59,6 +62,12 @@ class UsbLink:
 
     def close(self) -> None:
         self.gone = True
+
+    def await_clear(self, timeout_ms: int) -> bool:
+        """Hold a transfer back; False if no INITIATE_CLEAR came in time."""
+        with self._ready:
+            self.refused += 1
+            return self._ready.wait_for(lambda: not self.busy, timeout_ms / 1000)
 
     def take_out(self, transfer: bytes) -> None:
         """One Bulk-OUT transfer, checked as a device would check it."""
@@ -91,6 +100,7 @@ class UsbLink:
         """INITIATE_CLEAR: both buffers, and what the box makes of it."""
         with self._ready:
             self._message, self._response, self._request, self.halted = b"", b"", None, True
+            self.busy = False
             self._ready.notify_all()
         if self._on_break is not None and not self._muted:
             self._reactor.call_threadsafe(self._on_break)
@@ -200,6 +210,8 @@ class Backend(usb.backend.IBackend):
     def bulk_write(self, dev_handle: Any, ep: int, intf: int, data: Any, timeout: int) -> int:
         self._check()
         assert ep == OUT
+        if self._link.busy and not self._link.await_clear(timeout):
+            raise usb.core.USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)
         if self._link.halted:
             raise usb.core.USBError("Pipe error", -9, errno.EPIPE)
         self._link.take_out(bytes(data))

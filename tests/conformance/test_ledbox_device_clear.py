@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import select
+import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,8 +13,11 @@ import pytest
 from ledbox_world import Call, LedBoxWorld, ledbox_world, opened, run_to_end, table, wait_until
 from test_ledbox import TcpLink, usb_world
 
+from coupole.devices import Deadline, SystemClock
 from coupole.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.ledbox.driver import LedBox, Settings
+from drivers.ledbox.link import Cleared
+from drivers.ledbox.serial_link import SerialLink
 from drivers.ledbox.wire import pack
 
 PROMISED_S = 0.1
@@ -106,6 +112,47 @@ def test_after_a_device_clear_the_next_upload_and_burst_are_whole(box: LedBox, w
     box.load(steps)
     box.start(steps)
     assert run_to_end(box, world)["led"].tolist() == list(range(200))
+
+
+def test_a_flash_whose_table_is_up_does_not_begin_after_lights_off(
+    box: LedBox, world: LedBoxWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load = box.load
+
+    def load_and_be_overtaken(table: Any) -> None:
+        load(table)
+        assert Call(box.lights_off).ended() is None
+
+    monkeypatch.setattr(box, "load", load_and_be_overtaken)
+    with pytest.raises(DeviceError, match="meanwhile the lights were switched off"):
+        box.flash(5, 2_000_000)
+    assert not box.running()
+    assert world.lights == []
+
+
+def test_a_write_to_a_line_that_takes_nothing_more_ends_when_exchanges_are_ended() -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    link = SerialLink(os.ttyname(slave), 115_200, SystemClock())
+    write = Call(lambda: link.write(bytes(1_000_000), Deadline(SystemClock(), 15.0), link.clears))
+    wait_until(lambda: bool(select.select([master], [], [], 0)[0]), "the first bytes")
+    link.end_exchanges()
+    assert isinstance(write.ended(), Cleared)
+    link.close()
+    os.close(master)
+    os.close(slave)
+
+
+def test_initiate_clear_does_not_wait_for_a_box_that_takes_no_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with usb_world(tmp_path, monkeypatch, speed=SLOW) as world, opened(world, watchdog_s=0) as box:
+        light_up(box, world)
+        world.box._link.busy = True
+        upload = Call(lambda: box.load(table(1080, on_us=1000)))
+        wait_until(lambda: bool(world.box._link.refused), "a transfer that is not taken")
+        assert dark_after_s(world, box.lights_off) < PROMISED_S
+        assert isinstance(upload.ended(), DeviceError)
 
 
 def test_a_device_clear_keeps_tables_settings_and_the_error_queue(box: LedBox, world: LedBoxWorld) -> None:

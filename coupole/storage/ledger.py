@@ -7,7 +7,6 @@ leave too high a figure: that of the last plan. Writers hold a lock on the objec
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import os
 import re
@@ -181,14 +180,11 @@ class Ledger:
             pass
 
     def _former_lines(self, texts: list[bytes]) -> list[bytes]:
-        """Lines of the former place that were not copied to the present one."""
+        """Lines of the former place that are not in the present one too."""
         if self._former_folder is None:
             return []
-        former = self._former_folder / self.path.name
-        with contextlib.suppress(OSError):
-            if former.samefile(self.path):
-                return []
-        return [text for text in _lines(former) if text not in set(texts)]
+        known = set(texts)
+        return [text for text in _lines(self._former_folder / self.path.name) if text not in known]
 
     def _append(self, line: Line) -> None:
         with self._locked() as file:

@@ -169,8 +169,10 @@ def read_wanted(posted: bytes) -> Wanted:
         return Wanted.model_validate_json(posted)
     except ValidationError as error:
         what = error.errors()[0]
-        where = ".".join(map(str, what["loc"])) or "choice"
-        raise InputError(f'{where}: expected whole numbers, like {{"led": 417}}: {what["msg"]}') from error
+        if not what["loc"]:
+            raise InputError(f'expected an object, like {{"led": 417}}: {what["msg"]}') from error
+        where = ".".join(map(str, what["loc"]))
+        raise InputError(f"{where}: expected a whole number: {what['msg']}") from error
 
 
 def choice_from(wanted: Wanted, before: Choice, leds: tuple[int, ...], longest_us: int) -> Choice:

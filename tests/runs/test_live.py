@@ -13,6 +13,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
+from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
 import cells
@@ -151,12 +152,12 @@ def test_another_sites_page_cannot_switch_lights(viewer: Viewer, headers: dict[s
 
 
 def test_a_viewer_that_hangs_holds_nobody_up(viewer: Viewer) -> None:
-    port = int(viewer.url.rsplit(":", 1)[1].strip("/"))
-    with closing(socket.create_connection(("127.0.0.1", port))) as hanging:
+    address = urlsplit(viewer.url)
+    with closing(socket.create_connection(("127.0.0.1", address.port or 0))) as hanging:
         hanging.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
         with suppress(OSError):  # the page may have hung up on it by then
             for _ in range(50):
-                hanging.send(b"GET /picture HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+                hanging.send(f"GET {address.path}picture HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
         number = viewer.figures()["shown"]["number"]
         cells.wait_until(lambda: viewer.figures()["shown"]["number"] > number + 5, "more frames")
 

@@ -192,7 +192,7 @@ def sim(
     speed: Annotated[float | None, typer.Option("--speed", min=0.01, help="Pace of the world.")] = None,
 ) -> None:
     """Serve the simulated devices of a rig for other clients; prints one JSON line with their endpoints. Ctrl-C
-    ends it."""
+    ends it; exit code 4 if they end by themselves."""
     from coupole.plan.cell import read_cell
     from coupole.plan.registry import WORLD, load_class
     from coupole.preflight.job import read_job

@@ -209,7 +209,8 @@ def sim(
     speed: Annotated[float | None, typer.Option("--speed", min=0.01, help="Pace of the world.")] = None,
 ) -> None:
     """Serve the simulated devices of a rig for other clients; prints one JSON line with their endpoints, and on
-    standard error what the robot's controller refuses, and why. Ctrl-C ends it."""
+    standard error what the robot's controller refuses, and why. Ctrl-C ends it; exit code 4 if they end by
+    themselves."""
     from coupole.plan.cell import read_cell
     from coupole.plan.registry import WORLD, load_class
     from coupole.preflight.job import read_job

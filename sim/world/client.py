@@ -90,10 +90,18 @@ class World:
             self._process.wait()
         self._process.stdout.close()
 
-    def wait(self) -> int:
-        """Wait until the world ends; returns its exit code."""
+    def wait(self) -> None:
+        """Wait until the world ends. Raises DeviceLost if it ended otherwise than by being told to."""
         assert self._process is not None
-        return self._process.wait()
+        if code := self._process.wait():
+            raise DeviceLost(
+                "world",
+                expected="the stand-ins to serve until they are told to stop",
+                happened=f"their process was killed by signal {-code}"
+                if code < 0
+                else f"it ended with code {code}",
+                remedy="See its message above; start it again.",
+            )
 
 
 def _launch() -> subprocess.Popen[str]:

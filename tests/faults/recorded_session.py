@@ -89,6 +89,7 @@ def go_on(run: Run, labels: tuple[str, ...], outcome: Literal["interrupted", "do
     recorder.note(SessionStopped(outcome=outcome))
     recorder.close_quietly()
     recorder.close()
+    (run.folder / f"trace-{outcome}.txt").write_text("as an unexpected error leaves one, not synced")
     conclude(run, make_console(quiet=True))
 
 

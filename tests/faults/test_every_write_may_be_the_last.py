@@ -19,7 +19,7 @@ import recorded_session
 import write_cuts
 from cells import CellFolder
 from places import REPO
-from write_cuts import CHANGING, SYNC, UNKNOWN, WRITE, Call, Disk
+from write_cuts import CHANGING, RENAME, SYNC, UNKNOWN, WRITE, Call, Disk
 
 from coupole.errors import InputError
 from coupole.plan.shot_id import ShotId
@@ -172,14 +172,20 @@ def cut(recorded: Recorded, number: int, how: str, folder: Path, chance: random.
 def test_wherever_it_is_cut_nothing_proven_is_lost_and_all_can_be_read(
     recorded: Recorded, tmp_path: Path, scale: Callable[[int, int], int]
 ) -> None:
-    """Killed before a call and within a write; the power gone, with what was not synced there, lost or torn."""
+    """Killed before a call and within a write; the power gone, with what was not synced there, lost or torn.
+
+    Always when a file has just got its name; elsewhere a sample that changes with the day.
+    """
     points = [number for number, call in enumerate(recorded.calls) if call.op in CHANGING]
     cuts = [(number, "killed") for number in points]
     cuts += [(number, "torn") for number in points if recorded.calls[number].op == WRITE]
     cuts += [(number, "power") for number in points for _ in range(scale(1, 4))]
     seed = datetime.now(UTC).toordinal()
     chance = random.Random(seed)
-    chosen = chance.sample(cuts, scale(40, len(cuts)))
+    renamed = [number for number, call in enumerate(recorded.calls) if call.op == RENAME]
+    after_renames = [min(number for number in points if number > rename) for rename in renamed[:-1]]
+    chosen = [(number, how) for number in after_renames for how in ("killed", "power")]
+    chosen += chance.sample(cuts, scale(30, len(cuts)))
     for count, (number, how) in enumerate(chosen):
         folder = tmp_path / str(count)
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 from xml.etree import ElementTree
 
 STOP, MOVE, ASK = range(3)
@@ -14,7 +15,7 @@ class Messages:
     """Splits a stream of documents: they become children of one that never ends."""
 
     def __init__(self) -> None:
-        self._parser = ElementTree.XMLPullParser(["start", "end"])
+        self._parser: Any = ElementTree.XMLPullParser(["start", "end"])
         self._parser.feed(b"<stream>")
         self._stream = next(self._parser.read_events())[1]
         self._open_bytes = 0

@@ -1,4 +1,4 @@
-"""Whatever a client sends, the world goes on: each stand-in gets hundreds of byte strings and still does its work."""
+"""Whatever a client sends, the world goes on: each stand-in gets hundreds of byte strings and still works."""
 
 from __future__ import annotations
 

@@ -55,10 +55,12 @@ def test_what_the_world_says_was_lit_is_what_the_pictures_show(tmp_path: Path) -
     lit = {(frame_id, timestamp_ns): shone for _, frame_id, timestamp_ns, _, shone, _ in told["exposures"]}
     assert told["next"] == len(lit) == 66
     shown = 0
-    for shot, frame in cells.stored(cell.run_folder).items():
+    frames = cells.stored(cell.run_folder)
+    expectation = cells.Expectation(cell, frames["top/led0400/e0"].base_from_camera)
+    for shot, frame in frames.items():
         shone = [led for led, _ in lit[int(frame.record["frame_id"]), int(frame.record["camera_ns"])]]
         if cells.is_light(shot):
-            shown += cells.Expectation(cell, frame.base_from_camera).led_of(frame.pixels) == shone[0]
+            shown += expectation.led_of(frame.pixels) == shone[0]
         else:
             assert shone == []
     assert shown == 54

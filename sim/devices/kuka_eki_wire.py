@@ -15,7 +15,8 @@ class Messages:
     """Splits a stream of documents: they become children of one that never ends."""
 
     def __init__(self) -> None:
-        self._parser: Any = ElementTree.XMLPullParser(["start", "end"])
+        parser: Any = ElementTree.XMLPullParser(["start", "end"])
+        self._parser = parser
         self._parser.feed(b"<stream>")
         self._stream = next(self._parser.read_events())[1]
         self._open_bytes = 0

@@ -72,7 +72,7 @@ class Onlooker:
 
 
 class Eye(Onlooker):
-    """A person who sees where the true camera goes, by the stand-in's kinematics; compares it with the words."""
+    """A person who sees where the true camera goes, by the stand-in's kinematics, and compares the words."""
 
     def __init__(self, cell: CellFolder, true_joints_deg: Callable[[], list[float]]) -> None:
         super().__init__()

@@ -8,7 +8,7 @@ import numpy as np
 
 from coupole.acquisition.commissioning.bench import Bench, StepFailedError
 from coupole.devices import ArmState, Deadline
-from coupole.errors import DeviceError
+from coupole.errors import DeviceError, DeviceFault
 
 _PACE_S = 3.0
 """Duration of each motion to and fro."""
@@ -60,7 +60,12 @@ def _moved_until_pressed(bench: Bench) -> np.ndarray:
     asked = False
     while not deadline.expired:
         out = not out
-        robot.move_to(home_deg + change_deg if out else home_deg)
+        bench.pause(_POLL_S)
+        try:
+            robot.move_to(home_deg + change_deg if out else home_deg)
+        except DeviceFault as error:  # pressed since the last look at the arm
+            bench.findings.remarks.append(f"the arm's fault: {error.happened}")
+            return bench.joints_deg()
         while (state := robot.measured()).moving or state.fault:
             if state.fault:
                 bench.findings.remarks.append(f"the arm's fault: {state.fault}")

@@ -120,7 +120,7 @@ def deviations_deg(
         worst = np.where(good, angles_deg, 0.0).argmax()
         if angles_deg[worst] <= MOST_DEVIATION_DEG or good.sum() <= _FEWEST_LEDS:
             break
-        good &= angles_deg < max(MOST_DEVIATION_DEG, 0.7 * angles_deg[worst])
+        good = good & (angles_deg < max(MOST_DEVIATION_DEG, 0.7 * angles_deg[worst]))
     spread = np.linalg.svd(_normals(pictures, lights, lit, good), compute_uv=False)
     return angles_deg, float(spread[-1] / max(spread[0], 1e-12))
 
@@ -141,8 +141,7 @@ def _normals(
 def _direction(
     picture: NDArray[np.float64], normals: NDArray[np.float64], lit: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    found: NDArray[np.float64] = np.linalg.lstsq(normals[:, lit].T, picture[lit], rcond=None)[0].astype(np.float64)
-    return found
+    return np.asarray(np.linalg.lstsq(normals[:, lit].T, picture[lit], rcond=None)[0], dtype=np.float64)
 
 
 def _angle_deg(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

@@ -1,4 +1,4 @@
-"""An arm that leaves its path is stopped so early that it comes to rest within what the path was found clear for."""
+"""An arm that leaves its path is stopped so early that it comes to rest where the path was found clear."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ POLL_S = 0.01
 
 
 class Drifting:
-    """Clock and arm in one: axis 3 moves as it should, axis 1 drifts at a constant speed. After `stop` both go on for
-    the whole stopping time at their speed: the worst that `stopping_deg` allows."""
+    """Clock and arm in one: axis 3 moves as it should, axis 1 drifts at a constant speed. After `stop` both go on
+    for the whole stopping time at their speed: the worst that `stopping_deg` allows."""
 
     def __init__(self, job: Job, drift_deg_s: float) -> None:
         self.arm = arm_of(job.cell.rig)
         self.home_deg = np.array(job.cell.rig.motion.home_joints_deg)
-        self.speeds_deg_s = np.array([drift_deg_s, 0.0, -20.0, 0.0, 0.0, 0.0])
+        self.speeds_deg_s = np.array([drift_deg_s, 0.0, -2.0, 0.0, 0.0, 0.0])
         self.now_s, self.stopped_s = 0.0, np.inf
         self.moving = False
 
@@ -86,7 +86,7 @@ def supervised(job: Job, drift_deg_s: float) -> tuple[Drifting, float]:
 
 @pytest.mark.parametrize("drift_deg_s", [0.1, 0.3, 0.6])
 def test_a_drifting_arm_comes_to_rest_within_the_tolerance(job: Job, drift_deg_s: float) -> None:
-    arm, at_rest_mm = supervised(job, drift_deg_s)
+    _, at_rest_mm = supervised(job, drift_deg_s)
     growth_mm = np.radians(drift_deg_s) * job.motion.bodies.reach_mm[0] * 4 * POLL_S
     assert PATH_TOLERANCE_MM - growth_mm <= at_rest_mm <= PATH_TOLERANCE_MM + growth_mm
 

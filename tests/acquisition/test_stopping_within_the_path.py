@@ -31,7 +31,7 @@ class Drifting:
     def __init__(self, job: Job, drift_deg_s: float) -> None:
         self.arm = arm_of(job.cell.rig)
         self.home_deg = np.array(job.cell.rig.motion.home_joints_deg)
-        self.speeds_deg_s = np.array([drift_deg_s, 0.0, -20.0, 0.0, 0.0, 0.0])
+        self.speeds_deg_s = np.array([drift_deg_s, 0.0, -2.0, 0.0, 0.0, 0.0])
         self.now_s, self.stopped_s = 0.0, np.inf
         self.moving = False
 

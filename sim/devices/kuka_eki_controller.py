@@ -11,13 +11,13 @@ import math
 import select
 import socket
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 from xml.etree import ElementTree
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from coupole.geometry import Transform, abc_from_rotation
+from sim.devices.kuka_eki_wire import ASK, MOVE, Command, Messages
 from sim.devices.kuka_kinematics import AXIS_LIMITS_DEG, AXIS_SPEEDS_DEG_S, PoseErrors, flange_pose
 from sim.devices.kuka_ptp import Motion, braked, point_to_point, standing
 from sim.world.pushes import Pushes
@@ -25,13 +25,10 @@ from sim.world.reactor import Reactor, Timer
 
 Six = tuple[float, float, float, float, float, float]
 
-_STOP, _MOVE, _ASK = range(3)
 _NO_FAULT, _EMERGENCY_STOP, _TARGET_REFUSED = 0, 1, 5
 _TRY_AGAIN_S = 0.1
 _UNSENT_BYTES = 4096
 """Send buffer. When it is full, the world pauses, so that it does not run ahead of its client."""
-_LONGEST_MESSAGE_BYTES = 4096
-"""A client that sends more without completing a message is dropped."""
 _HARD = 100.0
 """Factor on the jerk in an emergency stop, which is practically not jerk-limited."""
 
@@ -93,7 +90,7 @@ class KukaEkiController:
         self._target: tuple[tuple[float, ...], float] | None = None
         """Axes and speed (fraction of the highest) of the motion to begin once the axes are at rest."""
         self._client: socket.socket | None = None
-        self._parser = _Messages()
+        self._parser = Messages()
         self._cut = False
         """True while `lose_link` blocks all communication."""
         self._healing: Timer | None = None
@@ -193,7 +190,7 @@ class KukaEkiController:
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNSENT_BYTES)
-        self._client, self._parser = client, _Messages()
+        self._client, self._parser = client, Messages()
         self._reactor.add_reader(client, self._receive)
 
     def _receive(self) -> None:
@@ -209,7 +206,7 @@ class KukaEkiController:
             return
         try:
             for message in self._parser.messages(data):
-                self._take(_Command.of(message))
+                self._take(Command.of(message))
         except (ElementTree.ParseError, KeyError, ValueError):
             self._drop()
 
@@ -237,19 +234,19 @@ class KukaEkiController:
         self._cut = False
         self._open()
 
-    def _take(self, command: _Command) -> None:
+    def _take(self, command: Command) -> None:
         if command.session != self._session:
             self._session, self._done, self._refused = command.session, 0, False
             if not self.moving:  # the present axes become the target of the new session
                 self._motion = standing(self.joints_deg)
                 self._pushes.forget()
         self._taken = command.number
-        if command.verb == _ASK:
+        if command.verb == ASK:
             return
         self._order, self._target = command.number, None
         if self.fault:
             return
-        if command.verb == _MOVE:
+        if command.verb == MOVE:
             self._refused = not _within_limits(command.axes_deg)
             if not self._refused:
                 self._target = command.axes_deg, command.velocity_percent / 100.0
@@ -341,62 +338,3 @@ def _with_free_port(address: str) -> str:
         return address
     with socket.create_server((host, 0)) as probe:
         return f"{host}:{probe.getsockname()[1]}"
-
-
-class _Messages:
-    """Splits a stream of documents: they become children of one that never ends."""
-
-    def __init__(self) -> None:
-        self._parser = _new_parser()
-        self._parser.feed(b"<stream>")
-        self._stream = next(self._parser.read_events())[1]
-        self._open_bytes = 0
-
-    def messages(self, data: bytes) -> list[ElementTree.Element]:
-        """Messages that `data` complete. Raises ParseError for what is no XML, ValueError for an endless one."""
-        self._parser.feed(data)
-        found = [one for event, one in self._parser.read_events() if event == "end" and one.tag == "Coupole"]
-        self._stream.clear()  # of messages that were taken, and of what is none
-        self._open_bytes = 0 if found else self._open_bytes + len(data)
-        if self._open_bytes > _LONGEST_MESSAGE_BYTES:
-            raise ValueError(f"{self._open_bytes} bytes without a message")
-        return found
-
-
-def _new_parser() -> Any:
-    return ElementTree.XMLPullParser(["start", "end"])
-
-
-@dataclass(frozen=True)
-class _Command:
-    """One message, its numbers within the limits of the controller's program."""
-
-    session: int
-    number: int
-    verb: int
-    velocity_percent: int
-    acceleration_percent: int
-    axes_deg: tuple[float, ...]
-
-    @staticmethod
-    def of(message: ElementTree.Element) -> _Command:
-        """Raises KeyError for a message that lacks something, ValueError for a number out of its limits."""
-        values = {f"{child.tag}/{name}": value for child in message for name, value in child.items()}
-        largest = 2**31 - 1
-        asks = values["Command/Verb"] == str(_ASK)
-        moves = values["Command/Verb"] == str(_MOVE)
-        return _Command(
-            _whole(values["Command/Session"], 0, largest),
-            _whole(values["Command/Number"], 0, largest),
-            _whole(values["Command/Verb"], _STOP, _ASK),
-            100 if not moves else _whole(values["Command/Velocity"], 1, 100),
-            100 if asks else _whole(values["Command/Acceleration"], 1, 100),
-            tuple(float(values[f"Axes/A{axis}"]) for axis in range(1, 7)) if moves else (),
-        )
-
-
-def _whole(text: str, low: int, high: int) -> int:
-    number = int(text)
-    if not low <= number <= high:
-        raise ValueError(f"{number} is not {low} to {high}")
-    return number

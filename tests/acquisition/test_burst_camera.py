@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 from unittest import mock
 
@@ -86,4 +87,4 @@ def test_the_camera_is_disarmed_before_a_burst_is_taken_again(cell: CellFolder) 
     assert [event["kind"] for event in cells.events(cell.run_folder, "fault")] == ["ArmMoved"]
     sessions = [call for call in calls if call in {"arm", "disarm"}]
     assert sessions.count("arm") >= 2
-    assert all(after == "disarm" for call, after in zip(sessions, sessions[1:], strict=False) if call == "arm")
+    assert all(after == "disarm" for call, after in pairwise(sessions) if call == "arm")

@@ -1,0 +1,69 @@
+"""Commands of an EthernetKRL client on the stand-in's side: XML over TCP, written independently of the drivers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+from xml.etree import ElementTree
+
+STOP, MOVE, ASK = range(3)
+_LONGEST_MESSAGE_BYTES = 4096
+
+
+class Messages:
+    """Splits a stream of documents: they become children of one that never ends."""
+
+    def __init__(self) -> None:
+        self._parser = _new_parser()
+        self._parser.feed(b"<stream>")
+        self._stream = next(self._parser.read_events())[1]
+        self._open_bytes = 0
+
+    def messages(self, data: bytes) -> list[ElementTree.Element]:
+        """Messages that `data` complete. Raises ParseError for what is no XML, ValueError for an endless one."""
+        self._parser.feed(data)
+        found = [one for event, one in self._parser.read_events() if event == "end" and one.tag == "Coupole"]
+        self._stream.clear()  # of messages that were taken, and of what is none
+        self._open_bytes = 0 if found else self._open_bytes + len(data)
+        if self._open_bytes > _LONGEST_MESSAGE_BYTES:
+            raise ValueError(f"{self._open_bytes} bytes without a message")
+        return found
+
+
+def _new_parser() -> Any:
+    return ElementTree.XMLPullParser(["start", "end"])
+
+
+@dataclass(frozen=True)
+class Command:
+    """One message, its numbers within the limits of the controller's program."""
+
+    session: int
+    number: int
+    verb: int
+    velocity_percent: int
+    acceleration_percent: int
+    axes_deg: tuple[float, ...]
+
+    @staticmethod
+    def of(message: ElementTree.Element) -> Command:
+        """Raises KeyError for a message that lacks something, ValueError for a number out of its limits."""
+        values = {f"{child.tag}/{name}": value for child in message for name, value in child.items()}
+        largest = 2**31 - 1
+        asks = values["Command/Verb"] == str(ASK)
+        moves = values["Command/Verb"] == str(MOVE)
+        return Command(
+            _whole(values["Command/Session"], 0, largest),
+            _whole(values["Command/Number"], 0, largest),
+            _whole(values["Command/Verb"], STOP, ASK),
+            100 if not moves else _whole(values["Command/Velocity"], 1, 100),
+            100 if asks else _whole(values["Command/Acceleration"], 1, 100),
+            tuple(float(values[f"Axes/A{axis}"]) for axis in range(1, 7)) if moves else (),
+        )
+
+
+def _whole(text: str, low: int, high: int) -> int:
+    number = int(text)
+    if not low <= number <= high:
+        raise ValueError(f"{number} is not {low} to {high}")
+    return number

@@ -1,4 +1,4 @@
-"""The wire of the EthernetKRL programs of `configs/kuka/eki`, as their stand-in reads it: messages in XML."""
+"""Commands of an EthernetKRL client on the stand-in's side: XML over TCP, written independently of the drivers."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ from xml.etree import ElementTree
 
 STOP, MOVE, ASK = range(3)
 _LONGEST_MESSAGE_BYTES = 4096
-"""A client that sends more without completing a message is dropped."""
 
 
 class Messages:
     """Splits a stream of documents: they become children of one that never ends."""
 
     def __init__(self) -> None:
-        parser: Any = ElementTree.XMLPullParser(["start", "end"])
-        self._parser = parser
+        self._parser = _new_parser()
         self._parser.feed(b"<stream>")
         self._stream = next(self._parser.read_events())[1]
         self._open_bytes = 0
@@ -30,6 +28,10 @@ class Messages:
         if self._open_bytes > _LONGEST_MESSAGE_BYTES:
             raise ValueError(f"{self._open_bytes} bytes without a message")
         return found
+
+
+def _new_parser() -> Any:
+    return ElementTree.XMLPullParser(["start", "end"])
 
 
 @dataclass(frozen=True)

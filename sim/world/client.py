@@ -94,12 +94,11 @@ class World:
         """Wait until the world ends. Raises DeviceLost if it ended otherwise than by being told to."""
         assert self._process is not None
         if code := self._process.wait():
+            how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
             raise DeviceLost(
                 "world",
                 expected="the stand-ins to serve until they are told to stop",
-                happened=f"their process was killed by signal {-code}"
-                if code < 0
-                else f"it ended with code {code}",
+                happened=f"their process {how}",
                 remedy="See its message above; start it again.",
             )
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
+import signal
 import subprocess
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,8 @@ import pytest
 from cells import CellFolder
 from gige import gige_port, needs_aravis
 from ruamel.yaml import YAML
+
+from sim.world.client import World
 
 pytestmark = needs_aravis
 
@@ -49,7 +54,9 @@ def test_a_run_over_gige_vision_proves_every_shot(gige: CellFolder) -> None:
     ended = gige.acquire()
     assert ended.code == 0, ended.err
     assert_proven_and_labelled(gige)
-    assert cells.about(gige.run_folder)["devices"]["camera"]["model"] == "DomeCamera"
+    camera = cells.about(gige.run_folder)["devices"]["camera"]
+    assert camera["model"] == "DomeCamera"
+    assert (camera["settings"]["TriggerDelay"], camera["settings"]["ReverseX"]) == ("0.0", "False")
 
 
 def test_packets_frames_and_edges_that_get_lost_are_found_and_taken_again(
@@ -89,6 +96,26 @@ def test_a_camera_that_forgets_its_client_in_a_burst_ends_the_run_with_four_and_
         resumed = gige.acquire("--resume", run)
     assert resumed.code == 0, resumed.err
     cells.assert_each_shot_proven_once(run)
+
+
+def test_a_camera_whose_process_dies_in_a_burst_is_a_fault_of_the_camera_alone(gige: CellFolder) -> None:
+    gige.write(lights={"kind": "every", "every": 4})
+    with gige.world() as world:
+        gige.join()
+        (camera,) = cells.children(world.endpoints["pid"])
+        killing = threading.Thread(target=_kill_while_armed, args=(world, camera))
+        killing.start()
+        ended = gige.acquire()
+        killing.join()
+        assert ended.code == 4, ended
+        assert "camera: expected " in ended.err
+        cells.wait_until(lambda: cells.safe(world), "a safe cell")
+        assert world.ask("state")["t_s"] > 0
+
+
+def _kill_while_armed(world: World, pid: int) -> None:
+    cells.wait_until(lambda: world.ask("state")["camera_armed"], "a burst")
+    os.kill(pid, signal.SIGKILL)
 
 
 @pytest.mark.skipif(shutil.which("arv-tool-0.8") is None, reason="arv-tool-0.8 is not installed")

@@ -228,6 +228,30 @@ def test_the_ur_controller_serves_clients_after_garbage(tmp_path: Path) -> None:
             assert link.recv(16) == b"\x00\x04V\x01"
 
 
+@pytest.mark.parametrize(
+    "pieces",
+    [
+        pytest.param((RTDE[2], b"\x00\x03S"), id="outputs that there are not"),
+        pytest.param(
+            (struct.pack(">HB", 3 + 13, 73) + b"no_such_thing", struct.pack(">HBBi", 8, 85, 1, 35)),
+            id="inputs that there are not",
+        ),
+        pytest.param((RTDE[4], struct.pack(">HBBi", 8, 85, 0, 1)), id="recipe 0"),
+    ],
+)
+def test_an_rtde_recipe_that_makes_no_sense_harms_its_client_only(
+    tmp_path: Path, pieces: tuple[bytes, ...]
+) -> None:
+    with running(tmp_path, lambda reactor: ur_controller.UrController(reactor, ur_controller.Settings())) as arm:
+        wrong, right = tcp(arm.address, 30004), tcp(arm.address, 30004)
+        with wrong, right:
+            for data in pieces:
+                wrong.sendall(data)
+            wrong.recv(64)
+            right.sendall(RTDE[0])
+            assert right.recv(16) == b"\x00\x04V\x01"
+
+
 @pytest.mark.parametrize(("command", "largest"), [(1, 1e308), (3, 1e308), (34, -1e308), (35, 1e308)])
 def test_registers_that_make_no_sense_end_the_program_only(tmp_path: Path, command: int, largest: float) -> None:
     """Speeds and frequencies of zero, infinity and no number at all, for each command that has some."""
@@ -268,8 +292,7 @@ CAMERA = (
 
 def seqpacket(path: str) -> socket.socket:
     link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    link.setblocking(True)  # with a time-out, connecting would not wait for a busy world
-    link.connect(path)
+    link.connect(path)  # with a time-out, it would not wait for a busy world
     link.settimeout(PATIENCE_S)
     return link
 

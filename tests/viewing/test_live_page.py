@@ -252,8 +252,9 @@ def test_a_client_that_sends_byte_after_byte_is_cut_off_in_time(
 
 WORDS = (
     b"GET POST HEAD PUT OPTIONS / // http://[ ? # %00 .. HTTP/1.1 HTTP/1.0 HTTP/0.9 HTTP/9.9 HTTP/x Host: "
-    b"localhost 127.0.0.1 example.org Content-Length: Transfer-Encoding: chunked Expect: 100-continue X-Coupole-Live: 1 0 "
-    b'-1 99999 {"led":4} {"led":true} Origin: null choose figures picture picture?mark=%ff \xff\xfe \x00'
+    b"localhost 127.0.0.1 example.org Content-Length: Transfer-Encoding: chunked Expect: 100-continue "
+    b'X-Coupole-Live: 1 0 -1 99999 {"led":4} {"led":true} Origin: null choose figures picture picture?mark=%ff '
+    b"\xff\xfe \x00"
 ).split(b" ")
 
 

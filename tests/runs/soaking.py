@@ -262,7 +262,7 @@ class Soak:
     def _order_faults(self, view: str) -> None:
         """Before the bursts of a view: those of its next edges at which a fault is due are told to the world."""
         self._count_what_happened()
-        edge, frame = self.world.ask("edges")["next"], self._next_exposure()
+        edge, frame = self.world.ask("edges")["next"], self.world.ask("exposures", first=0, count=0)["next"]
         burst = next(own[0] for own in self._job.schedule.bursts if own[0].view == view)
         leds = [label.light.id for label in burst.labels if label and isinstance(label.light, Led)]
         if self._gap is None:
@@ -279,10 +279,6 @@ class Soak:
 
     def _draw_gap(self) -> int:
         return int(self._random.geometric(self._rate)) if self._rate else 2**40
-
-    def _next_exposure(self) -> int:
-        number: int = self.world.ask("exposures", first=0, count=0)["next"]
-        return number
 
     def _draw(self, edge: int, frame: int, leds: list[int]) -> tuple[str, dict[str, Any]]:
         """A fault's name here, and the fault for the world; `leds` are those to be lit next."""

@@ -162,7 +162,7 @@ class Cell:
             heard_at_rest=self.heard_at_rest,
             await_news=self.await_news,
         )
-        dose: Any = SimpleNamespace(add=lambda burst, log: 0.0)
+        dose: Any = SimpleNamespace(begin=lambda burst: None, end=lambda burst, log, **figures: (0.0,))
         outcome: Any = SimpleNamespace(over_triggers=0, lost_transfers=0)
         self.runner = BurstRunner(
             cell,

@@ -42,6 +42,9 @@ class Arm:
     def hurry(self, until_ns: int) -> None:
         """No matter here."""
 
+    def stopping_deg(self) -> Any:
+        return np.zeros(6)
+
     def move_to(self, joints_deg: Any) -> None:
         self.done.append("move")
         self.from_deg, self.to_deg, self.share = self.still_deg, joints_deg, 0.0

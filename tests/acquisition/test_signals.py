@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Iterator
 
 import pytest
 
@@ -15,6 +16,15 @@ from coupole.acquisition.signals import ENDING, SignalReceived, held, obeyed_by,
 from coupole.errors import Interrupted
 
 BLOCKED_S = 0.8
+
+
+@pytest.fixture(autouse=True)
+def as_in_a_terminal() -> Iterator[None]:
+    """Whoever runs the tests may have ignored a signal."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in ENDING}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize("number", ENDING)
@@ -60,31 +70,21 @@ def test_sigusr1_pauses_and_continues_and_stops_nothing() -> None:
 
 @pytest.mark.parametrize("number", ENDING)
 def test_outside_sessions_a_signal_raises_and_after_one_again(number: signal.Signals) -> None:
-    before = {one: signal.getsignal(one) for one in ENDING}
-    try:
-        raise_outside_sessions()
-        for _ in range(2):
-            with pytest.raises(SignalReceived) as received:
-                os.kill(os.getpid(), number)
-            assert received.value.number == number
-            with obeyed_by(Control(), lambda: None):
-                os.kill(os.getpid(), number)
-            with held():
-                os.kill(os.getpid(), number)
-    finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+    raise_outside_sessions()
+    for _ in range(2):
+        with pytest.raises(SignalReceived) as received:
+            os.kill(os.getpid(), number)
+        assert received.value.number == number
+        with obeyed_by(Control(), lambda: None):
+            os.kill(os.getpid(), number)
+        with held():
+            os.kill(os.getpid(), number)
 
 
 def test_a_hang_up_that_is_ignored_stays_ignored() -> None:
-    before = {one: signal.getsignal(one) for one in ENDING}
     control = Control()
-    try:
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        raise_outside_sessions()
-        with obeyed_by(control, lambda: None):
-            os.kill(os.getpid(), signal.SIGHUP)
-        assert not control.stop.is_set()
-    finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    raise_outside_sessions()
+    with obeyed_by(control, lambda: None):
+        os.kill(os.getpid(), signal.SIGHUP)
+    assert not control.stop.is_set()

@@ -236,7 +236,6 @@ def _acquire(
             SessionStopped(
                 outcome=ended,
                 reason=str(failure or ""),
-                dose_lux_h=outcome.dose_lux_h,
                 robot=_statistics(cell),
             )
         )

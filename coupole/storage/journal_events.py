@@ -192,8 +192,6 @@ class SessionStopped(JournalEvent):
     outcome: Literal["done", "interrupted", "failed"]
     reason: str = ""
     """Why, if not all was done: who stopped it, or what failed."""
-    dose_lux_h: float | None = None
-    """Light of this session on the object, where it received most."""
     robot: dict[str, Any] = Field(default_factory=dict)
     """Figures of the robot's link."""
 

@@ -50,8 +50,6 @@ class Session:
     paused_s: float = 0.0
     light_s: float = 0.0
     """Sum of the on-times of its LEDs."""
-    dose_lux_h: float | None = None
-    """None for one that was killed, or by a version that did not note it."""
 
     @property
     def duration_s(self) -> float:
@@ -142,7 +140,7 @@ def _note_event(found: Status, event: Event) -> None:
             session.pauses += 1
         case SessionStopped():
             found.state, found.reason = event.outcome, event.reason or found.reason
-            session.outcome, session.reason, session.dose_lux_h = event.outcome, found.reason, event.dose_lux_h
+            session.outcome, session.reason = event.outcome, found.reason
         case ReshootBegun():
             found.reshot += len(event.shots)
         case FaultNoted():

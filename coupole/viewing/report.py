@@ -94,13 +94,9 @@ def _answers(run: Run, found: Status) -> dict[str, str]:
 
 
 def _light(found: Status) -> str:
-    known = [session.dose_lux_h for session in found.sessions if session.dose_lux_h is not None]
+    """Of all sessions; a burst whose end was not recorded counts as planned."""
     light_s = sum(session.light_s for session in found.sessions)
-    given = f"{sum(known):.3f} lux h, LEDs on for {light_s:.1f} s"
-    unknown = len(found.sessions) - len(known)
-    if unknown and found.state in ("running", "paused"):
-        return f"{given}, without the present session's dose"
-    return given if not unknown else f"at least {given}: the dose of {unknown} sessions was not noted"
+    return f"{found.dose_lux_h:.3f} lux h, LEDs on for {light_s:.1f} s"
 
 
 def _duration(found: Status) -> str:

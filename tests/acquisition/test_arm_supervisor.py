@@ -103,7 +103,7 @@ def test_an_arm_on_its_path_arrives(supervised: Supervise) -> None:
 @pytest.mark.parametrize("off_mm", [10.5, 14.0, -14.0, 19.0])
 def test_an_arm_more_than_10_mm_beside_its_path_is_stopped(supervised: Supervise, off_mm: float) -> None:
     arm = Arm(lambda share: off_mm if share > 0.5 else 0.0)
-    with pytest.raises(DeviceFault, match=f"during its motion it deviated by up to {abs(off_mm):.1f} mm"):
+    with pytest.raises(DeviceFault, match=f"during its motion .* comes to rest up to {abs(off_mm):.1f} mm"):
         supervised(arm).go(VISIT)
     assert arm.done == ["move", "stop"]
 
@@ -118,7 +118,7 @@ def test_an_arm_that_is_not_where_its_path_begins_does_not_start(supervised: Sup
     arm = Arm()
     supervisor = supervised(arm)
     arm.still_deg = np.add(HERE_DEG, [14 * MRAD_DEG, 0, 0, 0, 0, 0])
-    with pytest.raises(DeviceFault, match=r"before it started it deviated by up to 14\.0 mm"):
+    with pytest.raises(DeviceFault, match=r"before it started .* up to 14\.0 mm"):
         supervisor.go(VISIT)
     assert "move" not in arm.done
 

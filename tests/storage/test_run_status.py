@@ -12,6 +12,7 @@ from archives import make_run
 
 from coupole.storage.journal import event_line
 from coupole.storage.journal_events import (
+    BurstBegun,
     BurstEnded,
     Continued,
     Event,
@@ -79,7 +80,7 @@ def test_a_look_at_the_lock_does_not_keep_a_session_out(run: Run) -> None:
     assert not run.in_use
 
 
-def test_sessions_have_durations_pauses_light_and_dose(run: Run) -> None:
+def test_sessions_have_durations_pauses_and_light(run: Run) -> None:
     burst = BurstEnded(view="top", steps=3, on_s=0.5, frames=3)
     events = [SessionStarted(), burst, Paused(), Continued(), STOPPED, SessionResumed(), burst, burst]
     first, second = told(run, events).sessions
@@ -89,14 +90,16 @@ def test_sessions_have_durations_pauses_light_and_dose(run: Run) -> None:
 
 
 def test_a_report_can_be_made_after_a_crash(run: Run) -> None:
-    """Also of a view whose file is damaged; a killed session's dose is not guessed."""
-    told(run, [SessionStarted(), STOPPED, SessionResumed()])
+    """Also of a view whose file is damaged; the burst in which a session was killed counts as planned."""
+    given = BurstEnded(view="top", steps=3, on_s=0.5, frames=3, given_lux_h=(0.1, 0.25))
+    planned = BurstBegun(view="top", planned_lux_h=(0.1, 0.5))
+    told(run, [SessionStarted(), planned, given, STOPPED, SessionResumed(), planned])
     run.view_path("top").write_bytes(b"damaged")
     ended = cells.here("report", run.folder, "--json")
     assert ended.code == 0, ended.err
     page = Path(ended.document["report"]).read_text()
     assert "<b class=stopped>interrupted</b>: its last session has no end" in page
-    assert "at least 0.250 lux h" in page
+    assert "0.750 lux h" in page
     assert "not a view file of a run" in page
     assert f"<code>coupole acquire --resume {run.folder}</code> (1 frames are left)" in page
 

@@ -42,7 +42,7 @@ def _nearest(
 ) -> tuple[float, NDArray[np.float64]]:
     """Deviation from the nearest motion of the path, mm, and that motion [6], each axis times its reach."""
     best, nearest = np.inf, np.zeros(6)
-    for a, b in pairwise([*way_deg, way_deg[-1]]):
+    for a, b in pairwise(way_deg) if len(way_deg) > 1 else [(way_deg[0], way_deg[0])]:
         along, off = (b - a) * reach_mm, (joints_deg - a) * reach_mm
         length = float(along @ along)
         share = min(1.0, max(0.0, float(off @ along) / length)) if length else 0.0

@@ -21,6 +21,8 @@ REPLY_MARGIN_S = 2.0
 _SHORT_REPLY_BYTES = 200
 _ERROR = re.compile(r'([+-]?[0-9]+),"(.*)"')
 _MAX_TEXT_BYTES = 4096
+_MOST_ERRORS = 64
+"""A queue that is not empty after so many errors never will be."""
 
 Unit = str | bytes
 """Text as received, or the content of a definite-length block."""
@@ -141,7 +143,7 @@ class ScpiSession:
     def _raise_errors(self, unit: Unit, shown: str, clears: int) -> None:
         """Empty the device's error queue, whose first entry is `unit`, and raise if it holds errors."""
         errors = [self._error(unit, shown)]
-        while errors[-1][0]:
+        while errors[-1][0] and len(errors) <= _MOST_ERRORS:
             units = self._exchange(b"SYST:ERR?\n", "SYST:ERR?", REPLY_MARGIN_S, clears)
             errors.append(self._error(units[-1], "SYST:ERR?"))
         if len(errors) == 1:
@@ -150,7 +152,7 @@ class ScpiSession:
         raise kind(
             self._name,
             expected=f"{shown} to be executed",
-            happened="; ".join(f"{code} {text}" for code, text in errors[:-1]),
+            happened="; ".join(f"{code} {text}" for code, text in errors if code),
             remedy="Find and correct what the device names"
             + ("; reopening it resets the fault." if kind is DeviceFault else "."),
         )

@@ -62,11 +62,11 @@ class LedBoxWorld:
         link = self.box._link
         send = link.send
 
-        def lose(data: bytes) -> None:
+        def lose(data: bytes) -> bool:
             if len(lost) < count:
                 lost.append(data)
-            else:
-                send(data)
+                return True
+            return send(data)
 
         self.do(lambda: setattr(link, "send", lose))
         return lost

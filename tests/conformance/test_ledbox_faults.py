@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import zlib
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -254,3 +255,17 @@ def test_all_errors_of_the_queue_are_told_and_none_is_left_for_the_next_call(
     with pytest.raises(DeviceRefused, match=r"-113 .*FOO; -114 .*panel 7.*; -113 .*BAR"):
         box.running()
     assert not box.running()
+
+
+def test_a_queue_that_never_ends_is_given_up(box: LedBox, world: LedBoxWorld) -> None:
+    """Else no lights_off would ever come to its end."""
+
+    class Endless(deque[str]):
+        def popleft(self) -> str:
+            return self[0]
+
+    endless = Endless(['-350,"Queue overflow"'])
+    world.do(lambda: setattr(world.box._scpi, "_errors", endless))
+    with pytest.raises(DeviceRefused, match="-350"):
+        box.running()
+    world.do(lambda: setattr(world.box._scpi, "_errors", deque()))

@@ -41,6 +41,8 @@ def connect(
             while True:
                 listener.settimeout(max(_LOOK_S, give_up - time.monotonic()))
                 try:
+                    if strangers and time.monotonic() > give_up:  # they may knock without pause
+                        raise TimeoutError
                     link, (caller, _) = listener.accept()
                 except TimeoutError:
                     if not strangers:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from coupole.acquisition.signals import SignalReceived
 from coupole.storage import manifest
 from coupole.storage.run import Run
 from coupole.viewing import report
@@ -56,7 +57,7 @@ def conclude(run: Run, console: Console) -> None:
             )
         elif views:
             manifest.enter(run.folder, views)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SignalReceived):
         console.print(f"  {manifest.NAME} is not complete: `coupole verify {run.folder} --manifest` completes it")
     except Exception as error:  # noqa: BLE001  it must not hide what ended the run
         console.print(f"  [yellow]the report or {manifest.NAME} could not be written:[/] {error}")

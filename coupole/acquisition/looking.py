@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -150,3 +151,5 @@ def _show_live(
             server.server_close()
     if failures:
         raise failures[0]
+    if control.stop.is_set() and control.signal_number != signal.SIGINT:  # Ctrl-C is how a live view ends
+        raise control.interrupted()

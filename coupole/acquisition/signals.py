@@ -19,8 +19,8 @@ from coupole.acquisition.observer import Control
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class SignalReceived(KeyboardInterrupt):
-    """One of `ENDING`, outside a session."""
+class SignalReceived(BaseException):
+    """One of `ENDING`, outside a session. No KeyboardInterrupt: typer would make exit code 130 of each."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)

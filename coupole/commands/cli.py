@@ -61,7 +61,7 @@ def main() -> None:
         _say(error)
         code = error.exit_code
     except SignalReceived as received:
-        interrupted = Interrupted("stopped by the operator", received.number)
+        interrupted = Interrupted("stopped", received.number)
         _say(interrupted)
         code = interrupted.exit_code
     except typer.Abort:

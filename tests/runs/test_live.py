@@ -210,3 +210,17 @@ def test_a_camera_that_is_unplugged_ends_the_live_view_with_four(cell: CellFolde
     ended = cells.finish(process)
     assert ended.code == 4
     assert "camera: expected" in ended.err
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_live_view_that_is_ended_by_a_signal_ends_with_its_code(
+    cell: CellFolder, number: signal.Signals, code: int
+) -> None:
+    process = cells.start(
+        "live", cell.rig, "--yes", preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    )
+    assert process.stderr is not None
+    while "live at http" not in process.stderr.readline():
+        assert process.poll() is None
+    process.send_signal(number)
+    assert cells.finish(process).code == code

@@ -365,20 +365,15 @@ class Robot(Protocol):
     def self_test(self) -> Mapping[str, str]: ...
 
     def move_to(self, joints_deg: NDArray[np.float64]) -> None:
-        """Start a jerk-limited motion to joint angles [6]; returns at once. During a motion the arm first comes to
-        rest.
-
-        Raises DeviceRefused out of limits, or if another thread called `stop` since this call began: no motion is
-        then started.
-        """
+        """Start a jerk-limited motion to joint angles [6]; returns at once. Raises DeviceRefused out of limits, or
+        if another thread has called `stop` since this call began; no motion is then started."""
         ...
 
     def wait_settled(self) -> ArmState:
         """Wait until the arm is at rest at the target; the time-out is derived from the commanded motion.
 
-        Raises DeviceFault on a latched fault, DeviceLost if the link is gone, DeviceTimeout, and DeviceRefused if
-        another thread commands the arm meanwhile.
-        """
+        Raises DeviceFault on a latched fault, DeviceLost if the link is gone, DeviceTimeout, DeviceRefused if
+        another thread commands the arm meanwhile."""
         ...
 
     def measured(self) -> ArmState: ...
@@ -386,10 +381,8 @@ class Robot(Protocol):
     def stop(self) -> None:
         """Stop the arm along its path, as fast as its limits allow; returns when it is at rest.
 
-        May be called from any thread at any moment, also while another call on the same robot is in progress. A
-        target that waits until the arm is at rest is forgotten. In any motion started by `move_to`, each axis
-        turns by at most `stopping_deg` more.
-        """
+        May be called from any thread at any moment, also during another call on the same robot. A target that
+        waits for the arm to rest is forgotten. Each axis turns by at most `stopping_deg` more."""
         ...
 
     def stopping_deg(self) -> NDArray[np.float64]:

@@ -72,6 +72,13 @@ def test_half_a_plate_beside_the_field_is_half_in_the_field() -> None:
     assert seen.in_field == pytest.approx(0.5, abs=0.03)
 
 
+def test_what_another_part_hides_counts_neither_in_nor_out_of_the_field() -> None:
+    """A lid over a smaller plate, and another lid beside the field: half of what is visible is in it."""
+    parts = slab(100, 80, z_mm=100.0), slab(90, 70, z_mm=50.0), slab(100, 80, z_mm=100.0, x_mm=400.0)
+    seen = seen_of(np.concatenate(parts), distance_mm=435.0, target=(0, 0, 0))
+    assert seen.in_field == pytest.approx(0.5, abs=0.02)
+
+
 def test_the_field_is_that_of_the_paper() -> None:
     """Seed 003: 14.5 x 19.3 cm at 47 um per pixel; the simulated sensor has an eighth of the pixels."""
     seen = seen_of(slab(400, 400), distance_mm=335.0, target=(0, 0, 0))

@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import cells
 import pytest
 from cells import CellFolder
+from real_cells import commission
 
 from coupole.acquisition.operator import refuse_uncommissioned
-from coupole.calibration.record import Limit
 from coupole.devices import Identity
 from coupole.errors import InputError, PreflightRefused
-from coupole.plan.cell import Cell, read_cell
+from coupole.plan.cell import read_cell
 from coupole.plan.rig import WorldSection
 from coupole.preflight.commissioned import (
-    STEPS,
-    Answer,
-    StepResult,
     commissioning_refusals,
-    devices_of,
     empty_record,
     read_commissioning,
     record_path,
-    settings_of,
     write_commissioning,
 )
 from coupole.storage.arm_faults import ArmFaults
@@ -48,24 +42,6 @@ def real(tmp_path: Path) -> CellFolder:
     return cell
 
 
-def commissioned(cell: Cell, *, missed: str = "", no: str = "") -> None:
-    """A record of every step with DEVICES, passed but for those that are named."""
-    record = empty_record(cell)
-    for step in STEPS:
-        result = StepResult(
-            step=step,
-            person="A. Person",
-            ended=datetime.now(UTC),
-            devices=devices_of(step, DEVICES),
-            settings=settings_of(cell, step),
-            limits=(Limit(what="a figure", found=2.0 if step == missed else 1.0, limit=1.0, unit="deg"),),
-            answers=(Answer(question="Seen?", yes=step != no),),
-            remarks=(),
-        )
-        record = record.with_result(result)
-    write_commissioning(cell, record)
-
-
 def checked(real: CellFolder) -> list[str]:
     """Refusals of `coupole check` that are about commissioning."""
     ended = cells.here("check", real.plan, "--no-paths", "--json")
@@ -83,20 +59,20 @@ def test_a_simulated_cell_needs_none(cell: CellFolder) -> None:
 
 
 def test_a_record_that_passed_and_fits_is_accepted(real: CellFolder) -> None:
-    commissioned(read_cell(real.rig))
+    commission(read_cell(real.rig), DEVICES)
     assert checked(real) == []
     refuse_uncommissioned(read_cell(real.rig), DEVICES)
 
 
 @pytest.mark.parametrize("how", ["missed", "no"])
 def test_a_step_that_did_not_pass_is_refused(real: CellFolder, how: str) -> None:
-    commissioned(read_cell(real.rig), **{how: "watchdog"})
+    commission(read_cell(real.rig), DEVICES, **{how: "watchdog"})
     (why,) = checked(real)
     assert "the step watchdog did not pass" in why
 
 
 def test_a_changed_setting_asks_for_the_steps_that_depend_on_it_and_for_no_others(real: CellFolder) -> None:
-    commissioned(read_cell(real.rig))
+    commission(read_cell(real.rig), DEVICES)
     real.rig_data["motion"]["acceleration_deg_s2"] = 500.0
     real.write()
     refusals = checked(real)
@@ -105,14 +81,14 @@ def test_a_changed_setting_asks_for_the_steps_that_depend_on_it_and_for_no_other
 
 
 def test_another_watchdog_time_is_refused(real: CellFolder) -> None:
-    commissioned(read_cell(real.rig))
+    commission(read_cell(real.rig), DEVICES)
     real.rig_data["ledbox"]["settings"]["watchdog_s"] = 0
     real.write()
     assert [why.split()[3] for why in checked(real)] == ["lamps", "trigger", "watchdog"]
 
 
 def test_another_led_table_asks_for_the_lamps(real: CellFolder) -> None:
-    commissioned(read_cell(real.rig))
+    commission(read_cell(real.rig), DEVICES)
     table = Path(real.rig_data["dome"]["leds"]).read_text()
     (real.folder / "other.csv").write_text(table + "\n")
     real.rig_data["dome"]["leds"] = "other.csv"
@@ -121,14 +97,14 @@ def test_another_led_table_asks_for_the_lamps(real: CellFolder) -> None:
 
 
 def test_another_address_is_no_other_cell(real: CellFolder) -> None:
-    commissioned(read_cell(real.rig))
+    commission(read_cell(real.rig), DEVICES)
     real.rig_data["ledbox"]["settings"]["port"] = "/dev/ttyACM7"
     real.write()
     assert checked(real) == []
 
 
 def test_another_box_is_refused_when_it_is_opened(real: CellFolder) -> None:
-    commissioned(read_cell(real.rig))
+    commission(read_cell(real.rig), DEVICES)
     others = DEVICES | {"ledbox": replace(DEVICES["ledbox"], serial="0018")}
     with pytest.raises(PreflightRefused, match=r"LED control box 0018 .*was .* 0017") as refused:
         refuse_uncommissioned(read_cell(real.rig), others)
@@ -137,7 +113,7 @@ def test_another_box_is_refused_when_it_is_opened(real: CellFolder) -> None:
 
 def test_a_record_that_was_edited_is_refused(real: CellFolder) -> None:
     cell = read_cell(real.rig)
-    commissioned(cell, no="axes")
+    commission(cell, DEVICES, no="axes")
     path = record_path(cell)
     path.write_text(path.read_text().replace('"yes": false', '"yes": true'))
     with pytest.raises(InputError, match="edited"):
@@ -148,7 +124,7 @@ def test_a_record_that_was_edited_is_refused(real: CellFolder) -> None:
 
 def test_a_record_of_a_simulated_cell_does_not_serve_a_real_one(real: CellFolder) -> None:
     cell = read_cell(real.rig)
-    commissioned(cell)
+    commission(cell, DEVICES)
     assert commissioning_refusals(cell) == []
     simulated = replace(cell, rig=cell.rig.model_copy(update={"world": WorldSection()}))
     write_commissioning(cell, empty_record(simulated))

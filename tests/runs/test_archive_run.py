@@ -8,6 +8,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cells
 import pytest
@@ -56,9 +57,15 @@ def test_archive_says_what_it_did(tmp_path: Path, codec: str) -> None:
 
 def test_verify_and_status_say_the_same_of_an_archived_run(tmp_path: Path) -> None:
     made = make_run(tmp_path)
-    before = [cells.here(what, made.run.folder, "--json") for what in ("verify", "status")]
+
+    def said() -> list[dict[str, Any]]:
+        """Without what the manifest lists, which archiving completes."""
+        found = [cells.here(what, made.run.folder, "--json").document for what in ("verify", "status")]
+        return [{key: value for key, value in one.items() if key not in ("listed", "unlisted")} for one in found]
+
+    before = said()
     cells.here("archive", made.run.folder)
-    assert [cells.here(what, made.run.folder, "--json") for what in ("verify", "status")] == before
+    assert said() == before
 
 
 def test_archiving_a_run_that_is_not_complete_ends_with_five(tmp_path: Path) -> None:

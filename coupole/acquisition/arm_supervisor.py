@@ -167,10 +167,12 @@ class ArmSupervisor:
         if off_mm <= PATH_TOLERANCE_MM:
             return
         self._robot.stop()
+        cause = self._robot.measured().fault  # an emergency stop, too, takes the axes off their common line
         raise DeviceFault(
             "robot",
             expected=f"all of the arm within {PATH_TOLERANCE_MM:g} mm of the path that was checked",
-            happened=f"{when} it deviated and was stopped; it comes to rest up to {off_mm:.1f} mm off the path",
+            happened=f"{when} it deviated and was stopped; it comes to rest up to {off_mm:.1f} mm off the path"
+            + (f"; {cause}" if cause else ""),
             remedy="Check the cell; perhaps the controller does not move on straight lines in joint space.",
         )
 

@@ -1,7 +1,8 @@
 """A cell in memory for the burst's loop: box, camera, arm, clock and recorder that do what a take says.
 
 Time stands still but for the clock's `sleep`. Frames reach the grabber's thread while the clock sleeps, or while
-the box is asked for its log; the cell waits until the thread has them, so that nothing depends on the machine.
+the box is asked for its log; the cell waits until they are taken and written, so that the machine's speed does not
+matter.
 """
 
 from __future__ import annotations
@@ -145,7 +146,7 @@ class Cell:
     """Frames that had come one round before the arm was last heard of."""
     arrived_last_round: int = 0
     awaited_news: int = 0
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _written: threading.Condition = field(default_factory=threading.Condition)
 
     def __post_init__(self) -> None:
         self.camera, self.box = Camera(self.done), Box(self)
@@ -204,7 +205,10 @@ class Cell:
             due.append(Frame(int(self.what.frame_ids[number]), int(self.what.timestamps_ns[number]), pixels))
             self.arrived += 1
         if due:
+            written = len(self.slots) + len(due)
             self.camera.deliver(due)
+            with self._written:
+                assert self._written.wait_for(lambda: len(self.slots) == written, 10.0)
 
     # arm
     def _arm(self) -> ArmState:
@@ -226,8 +230,9 @@ class Cell:
 
     # recorder
     def put(self, frame: Frame, exposure_us: int) -> int:
-        with self._lock:
+        with self._written:
             self.slots.append(int(frame.pixels[0, 0]))
+            self._written.notify_all()
             return len(self.slots) - 1
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:

@@ -108,6 +108,17 @@ def test_an_arm_more_than_10_mm_beside_its_path_is_stopped(supervised: Supervise
     assert arm.done == ["move", "stop"]
 
 
+def test_what_took_the_arm_off_its_path_is_told_if_the_controller_knows_it(supervised: Supervise) -> None:
+    class Braked(Arm):
+        def stop(self) -> None:
+            super().stop()
+            self.fault = "emergency stop"
+
+    arm = Braked(lambda share: 14.0 if share > 0.5 else 0.0)
+    with pytest.raises(DeviceFault, match="off the path; emergency stop"):
+        supervised(arm).go(VISIT)
+
+
 def test_an_arm_9_mm_beside_its_path_goes_on(supervised: Supervise) -> None:
     arm = Arm(lambda share: 9.0 if 0.3 < share < 0.9 else 0.0)
     supervised(arm).go(VISIT)

@@ -22,8 +22,8 @@ from sim.optics.led_light import LedModel, led_flux_factor
 
 LEDS = {"kind": "every", "every": 24}
 """45 of them, all round the dome."""
-HOURS_SHONE, AMBIENT_C = 3000.0, 38.0
-WARM_K, COOLING_S = 34.0, 14.0
+HOURS_SHONE, AMBIENT_C = 3000.0, 30.0
+WARM_K, COOLING_S = 50.0, 22.0
 """In the later run boards are warm from one before it, and cool."""
 BESIDE_MM = (60.0, -90.0)
 """Where the tile lies beside an object."""

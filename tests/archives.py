@@ -24,6 +24,7 @@ METADATA = {
     "simulated": True,
     "pixel_pitch_um": 5.5,
     "focal_length_mm": 35.0,
+    "focus_distance_mm": 335.0,
     "f_number": 8.0,
     "base_from_support": np.eye(4),
     "camera": "memory camera sim-0",

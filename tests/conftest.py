@@ -30,8 +30,14 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "full: at full scale only; left out without --full")
 
 
+COMPILES_LONGEST = "tests/calibration/test_corner_fit.py"
+"""Its kernels take ten seconds to compile: it comes first, so that not every worker does that when others want
+them."""
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what is for `--full` alone."""
+    """Order the tests, and leave out what is for `--full` alone."""
+    items.sort(key=lambda item: not item.nodeid.startswith(COMPILES_LONGEST))
     if config.getoption("--full"):
         return
     left_out = [item for item in items if item.get_closest_marker("full")]

@@ -14,21 +14,19 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.grey_image import COLOUR, Picture
 from coupole.calibration.poses import PoseFile, ReportedPoses, read_poses, reported
 from coupole.calibration.rotations import Floats
-from coupole.errors import InputError, StorageError
-from coupole.storage import frame_file
+from coupole.errors import InputError
 from coupole.storage.durable import sha256
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 from coupole.storage.step_fields import temperature_range_c
+from coupole.storage.view_reader import View, read_view
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
 POSES_NAME, BOARD_NAME = "poses.yaml", "board.yaml"
@@ -137,24 +135,23 @@ def _of_run(run: Run) -> Sources:
     for shot, frame in run.proven().items():
         by_view.setdefault(shot.view, []).append(frame)
     images, flanges, inputs = [], [], [(f"{run.folder.name}/run.json", sha256(run.folder / "run.json"))]
-    about = About(simulated=bool(run.about["simulated"]))
+    about = About(simulated=run.simulated)
     lit_records: list[np.void] = []
     for view, frames in by_view.items():
         path = run.view_path(view)
-        table = frame_file.read_frames(path)
-        poses, attributes = poses_and_attributes(path)
-        lit = _at_one_pose([frame for frame in frames if frame.shot.is_shot], table)
+        file = read_view(path, frames)
+        lit = _at_one_pose([frame for frame in frames if frame.shot.is_shot], file.records)
         if not lit:
             continue
         dark = [frame for frame in frames if frame.shot.is_dark]
-        records = table[[frame.index for frame in lit]]
-        pose = poses[int(records["pose"][0])]
+        records = file.records[[frame.index for frame in lit]]
+        pose = file.poses[int(records["pose"][0])]
         lit_records += list(records)
-        read = partial(_mean_frame, view, path, lit, dark, table)
+        read = partial(_mean_frame, view, file, lit, dark)
         images.append(Source(view, read, tuple(map(float, pose["joints_deg"]))))
         flanges.append(np.array(pose["base_from_flange"], dtype=np.float64))
         inputs.append((f"{run.folder.name}/views/{path.name}", frames_sha256([*lit, *dark])))
-        about = about_of(run, attributes)
+        about = about_of(run, file)
     if not images:
         raise InputError(f"{run.folder}: no proven frame under light; acquire the plan first")
     about = replace(about, temperature_c=temperature_range_c(lit_records), begun=run.created)
@@ -167,28 +164,23 @@ def _at_one_pose(frames: Sequence[FrameProven], table: NDArray[np.void]) -> list
     return [frame for frame in frames if int(table[frame.index]["pose"]) == taken.most_common(1)[0][0]]
 
 
-def _mean_frame(
-    name: str, path: Path, lit: Sequence[FrameProven], dark: Sequence[FrameProven], table: NDArray[np.void]
-) -> Picture:
+def _mean_frame(name: str, file: View, lit: Sequence[FrameProven], dark: Sequence[FrameProven]) -> Picture:
     """Mean of the frames at the longest exposure with few clipped pixels, dark frames subtracted."""
-    layout, facts = frame_file.read_layout(path), frame_file.read_facts(path)
-    exposures = {frame.shot: int(table[frame.index]["exposure_us"]) for frame in (*lit, *dark)}
+    exposures = {frame.shot: int(file.records[frame.index]["exposure_us"]) for frame in (*lit, *dark)}
     for exposure_us in sorted({exposures[frame.shot] for frame in lit}, reverse=True):
         mine = [frame for frame in lit if exposures[frame.shot] == exposure_us]
-        frames = [frame_file.read_frame(path, layout, frame.index) for frame in _spread(mine)]
-        clipped = np.mean([np.mean(frame >= facts["white_dn"]) for frame in frames])
+        frames = [file.pixels(frame.index) for frame in _spread(mine)]
+        clipped = np.mean([np.mean(frame >= file.white_dn) for frame in frames])
         if clipped < _CLIPPED:
             break
     mean = _mean(frames)
     darks = [frame for frame in dark if exposures[frame.shot] == exposure_us]
     if darks:
-        black = np.mean(
-            [frame_file.read_frame(path, layout, f.index) for f in _spread(darks)], axis=0, dtype=np.float64
-        )
+        black = np.mean([file.pixels(frame.index) for frame in _spread(darks)], axis=0, dtype=np.float64)
     else:
-        black = np.full(mean.shape, float(facts["black_dn"]))
-    white = facts["white_dn"] - float(black.mean())
-    return Picture(mean - black, facts["pattern"], white, name)
+        black = np.full(mean.shape, float(file.black_dn))
+    white = file.white_dn - float(black.mean())
+    return Picture(mean - black, file.pattern, white, name)
 
 
 def _mean(frames: Sequence[NDArray[np.uint16]]) -> Floats:
@@ -211,28 +203,15 @@ def frames_sha256(frames: Sequence[FrameProven]) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
-    """The table of poses and the attributes of a view's file. Raises StorageError."""
-    try:
-        with h5py.File(path, "r") as file:
-            return file[frame_file.POSES][:], dict(file["entry"].attrs)
-    except (OSError, KeyError) as error:
-        raise StorageError(f"{path}: not a view file of a run: {error}") from error
-
-
-def about_of(run: Run, attributes: dict[str, Any]) -> About:
-    """Camera and lens by a view's attributes."""
-
-    def number(key: str) -> float | None:
-        return float(attributes[key]) if key in attributes else None
-
-    camera = attributes.get("camera")
+def about_of(run: Run, file: View) -> About:
+    """Camera and lens by the attributes of a view's file. Raises StorageError."""
+    camera = file.attributes.get("camera")
     return About(
-        simulated=bool(run.about["simulated"]),
+        simulated=run.simulated,
         camera=str(camera) if camera is not None else None,
-        focal_length_mm=number("focal_length_mm"),
-        focus_distance_mm=number("focus_distance_mm"),
-        f_number=number("f_number"),
+        focal_length_mm=file.number("focal_length_mm"),
+        focus_distance_mm=file.number("focus_distance_mm"),
+        f_number=file.number("f_number"),
     )
 
 

@@ -10,9 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from coupole.errors import ChecksumMismatch, DiskFull, InputError, StorageError
 from coupole.exchange import FORMATS
@@ -21,6 +19,7 @@ from coupole.storage import frame_file
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 from coupole.storage.step_fields import STORED_NO_LED, board_temperature_c
+from coupole.storage.view_reader import read_view
 
 
 @dataclass(frozen=True)
@@ -93,17 +92,14 @@ def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
         by_file.setdefault(frame.file, []).append(frame)
     for name, mine in by_file.items():
         path = run.folder / name
-        layout, facts, table = (
-            frame_file.read_layout(path),
-            frame_file.read_facts(path),
-            frame_file.read_frames(path),
-        )
-        poses, attributes = _poses_and_attributes(path)
+        file = read_view(path, mine)
+        attributes = _plain(file.attributes)
         for frame in mine:
-            pixels = frame_file.read_frame(path, layout, frame.index)
+            pixels = file.pixels(frame.index)
             if f"{frame_file.checksum(pixels):016x}" != frame.xxh3:
                 raise ChecksumMismatch(f"{path}: {frame.shot} is not what was proven. See `coupole verify`.")
-            record = table[frame.index]
+            record = file.records[frame.index]
+            pose = file.poses[record["pose"]]
             about = {
                 "shot": str(frame.shot),
                 "run": run.folder.name,
@@ -113,18 +109,24 @@ def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
                 "led_current_ma": int(record["led_current_ma"]),
                 "frame_id": frame.frame_id,
                 "xxh3": frame.xxh3,
-                "joints_deg": poses[record["pose"]]["joints_deg"].tolist(),
-                "base_from_camera": poses[record["pose"]]["base_from_camera"].tolist(),
+                "joints_deg": pose["joints_deg"].tolist(),
+                "base_from_camera": pose["base_from_camera"].tolist(),
                 **attributes,
             }
-            yield Picture(pixels, **facts, exposure_us=int(record["exposure_us"]), about=about)
+            yield Picture(
+                pixels,
+                pattern=file.pattern,
+                black_dn=file.black_dn,
+                white_dn=file.white_dn,
+                exposure_us=int(record["exposure_us"]),
+                about=about,
+            )
 
 
-def _poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
-    """Measured poses of a view, and the attributes of its file (object, lens, gain) in JSON types."""
-    with h5py.File(path, "r") as file:
-        attributes = {k: v for k, v in file["entry"].attrs.items() if k not in ("NX_class", "default")}
-        return file[frame_file.POSES][:], {key: np.asarray(value).tolist() for key, value in attributes.items()}
+def _plain(attributes: dict[str, Any]) -> dict[str, Any]:
+    """Attributes of a view's file (object, lens, gain) in JSON types."""
+    own = {key: value for key, value in attributes.items() if key not in ("NX_class", "default")}
+    return {key: np.asarray(value).tolist() for key, value in own.items()}
 
 
 def _write(path: Path, content: bytes) -> int:

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import mmap
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,6 +58,9 @@ POSE_DTYPE = np.dtype(
 
 PAGE = mmap.PAGESIZE
 MAX_POSES = 256
+PATTERNS = ("MONO", "RGGB", "BGGR", "GRBG", "GBRG")
+_WRONG = (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError, MemoryError)
+"""What h5py and NumPy raise for a file that is damaged, or another one."""
 DATA, FRAMES, POSES = (
     "entry/instrument/detector/data",
     "entry/instrument/detector/frames",
@@ -93,59 +98,86 @@ class Layout:
         return pixels * 3 // 2 if self.packed else pixels * 2
 
 
-def read_layout(path: Path) -> Layout:
-    """Layout of a view's file. Raises StorageError if it is not such a file."""
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """A view's file, to be read. What h5py or the caller then finds wrong in it raises StorageError."""
     try:
-        inode = path.stat().st_ino  # before the file is opened: if it is replaced now, `read_frame` sees it
         with h5py.File(path, "r") as file:
-            data, frames, poses = file[DATA], file[FRAMES], file[POSES]
-            packed = data.dtype == np.uint8
-            slots, height_px, columns = data.shape
-            return Layout(
-                slots,
-                height_px,
-                columns * 2 // 3 if packed else columns,
-                data.id.get_offset() or 0,
-                frames.id.get_offset(),
-                poses.id.get_offset(),
-                archived=data.chunks is not None,
-                packed=packed,
-                inode=inode,
-            )
-    except (OSError, KeyError) as error:
+            yield file
+    except _WRONG as error:
         raise StorageError(f"{path}: not a view file of a run: {error}") from error
 
 
+def read_layout(path: Path) -> Layout:
+    """Layout of a view's file. Raises StorageError if it is not such a file."""
+    with opened(path) as file:
+        inode = os.fstat(file.id.get_vfd_handle()).st_ino
+        data, frames, poses = file[DATA], file[FRAMES], file[POSES]
+        packed = data.dtype == np.uint8
+        slots, height_px, columns = data.shape
+        if data.dtype not in (np.uint8, np.uint16) or frames.dtype != FRAME_DTYPE or poses.dtype != POSE_DTYPE:
+            raise ValueError("pixels or tables have another type")
+        if frames.shape != (slots,) or len(poses) > MAX_POSES:
+            raise ValueError(f"{slots} frames, a table of {frames.shape}, {len(poses)} poses")
+        return Layout(
+            slots,
+            height_px,
+            columns * 2 // 3 if packed else columns,
+            data.id.get_offset() or 0,
+            frames.id.get_offset(),
+            poses.id.get_offset(),
+            archived=data.chunks is not None,
+            packed=packed,
+            inode=inode,
+        )
+
+
 def read_facts(path: Path) -> dict[str, Any]:
-    """`pattern`, `black_dn` and `white_dn` of a view's frames."""
-    with h5py.File(path, "r") as file:
+    """`pattern`, `black_dn` and `white_dn` of a view's frames. Raises StorageError."""
+    with opened(path) as file:
         detector = file["entry/instrument/detector"]
-        return {
-            "pattern": detector["bayer_pattern"][()].decode(),
+        found = {
+            "pattern": detector["bayer_pattern"][()].decode("ascii"),
             "black_dn": int(detector["black_level"][()]),
             "white_dn": int(detector["saturation_value"][()]),
         }
+        if found["pattern"] not in PATTERNS or not 0 <= found["black_dn"] < found["white_dn"] <= 65535:
+            raise ValueError(f"impossible levels or colours: {found}")
+        return found
+
+
+def read_poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
+    """The table of poses, POSE_DTYPE, and the attributes of a view's file. Raises StorageError."""
+    read_layout(path)
+    with opened(path) as file:
+        return file[POSES][:], dict(file["entry"].attrs)
 
 
 def read_frames(path: Path) -> NDArray[np.void]:
-    """The frame table [slots], FRAME_DTYPE."""
+    """The frame table [slots], FRAME_DTYPE. Raises StorageError."""
     layout = read_layout(path)
     with path.open("rb") as file:
         file.seek(layout.table_offset)
-        return np.frombuffer(file.read(layout.frames * FRAME_DTYPE.itemsize), FRAME_DTYPE).copy()
+        table = file.read(layout.frames * FRAME_DTYPE.itemsize)
+    if len(table) != layout.frames * FRAME_DTYPE.itemsize:
+        raise StorageError(f"{path}: ends within the table of its frames")
+    return np.frombuffer(table, FRAME_DTYPE).copy()
 
 
 def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
     """Pixels [H, W] of one slot, DN, also if the file was archived since its layout was read.
 
-    Raises StorageError if an archived frame cannot be read.
+    Raises StorageError if the frame cannot be read.
     """
     if layout.archived:
         return _read_archived_frame(path, slot)
     with path.open("rb") as file:
         if os.fstat(file.fileno()).st_ino == layout.inode:
             file.seek(layout.data_offset + slot * layout.frame_bytes)
-            return pixels_of(file.read(layout.frame_bytes), layout)
+            stored = file.read(layout.frame_bytes)
+            if len(stored) != layout.frame_bytes:
+                raise StorageError(f"{path}: ends within slot {slot}")
+            return pixels_of(stored, layout)
     return read_frame(path, read_layout(path), slot)
 
 
@@ -164,9 +196,6 @@ def pixels_of(stored: bytes | mmap.mmap, layout: Layout) -> NDArray[np.uint16]:
 def _read_archived_frame(path: Path, slot: int) -> NDArray[np.uint16]:
     import hdf5plugin  # noqa: F401  # registers the filter
 
-    try:
-        with h5py.File(path, "r") as file:
-            pixels: NDArray[np.uint16] = file[DATA][slot]
-            return pixels
-    except OSError as error:
-        raise StorageError(f"{path}: slot {slot} cannot be read: {error}") from error
+    with opened(path) as file:
+        pixels: NDArray[np.uint16] = file[DATA][slot]
+        return pixels

@@ -41,10 +41,9 @@ from coupole.storage.journal_events import (
 )
 from coupole.storage.line_file import utc_now
 from coupole.storage.run_inputs import Inputs, changes_since, keep
+from coupole.storage.run_json import RUN_JSON, SCHEMA_VERSION, read_description
 from coupole.storage.run_readme import readme
 
-SCHEMA_VERSION = 1
-RUN_JSON = "run.json"
 _LOCK_TRIALS, _LOCK_NAP_S = 20, 0.01
 
 
@@ -52,17 +51,9 @@ class Run:
     """An open run folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Open an existing run. Raises InputError if there is none."""
+        """Open an existing run. Raises InputError if there is none, or its run.json is wrong."""
         self.folder = folder.resolve()
-        try:
-            self.about: dict[str, Any] = json.loads((folder / RUN_JSON).read_text(encoding="utf-8"))
-        except (OSError, json.JSONDecodeError) as error:
-            raise InputError(f"{folder}: not a run folder: {error}") from error
-        if self.about.get("schema_version") != SCHEMA_VERSION:
-            raise InputError(
-                f"{folder}: expected run.json of schema version {SCHEMA_VERSION}, "
-                f"found {self.about.get('schema_version')}"
-            )
+        self.about = read_description(folder)
 
     @staticmethod
     def create(parent: Path, name: str, inputs: Inputs, about: dict[str, Any]) -> Run:
@@ -119,6 +110,11 @@ class Run:
         """LEDs that were left out of views, by name of view, because arm, camera or object occlude them."""
         found: dict[str, list[int]] = self.about.get("hidden_leds", {})
         return found
+
+    @property
+    def simulated(self) -> bool:
+        """True if its frames come from a simulated cell."""
+        return bool(self.about.get("simulated", False))
 
     @property
     def proof(self) -> str:

@@ -19,9 +19,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coupole.errors import InputError
 from coupole.plan.shot_id import Led
-from coupole.storage import frame_file, journal
+from coupole.storage import journal
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
+from coupole.storage.view_reader import read_view
 from coupole.viewing.raw_preview import Coding, Figures, figures
 
 _POLL_S = 0.2
@@ -144,11 +145,9 @@ class RunSource:
         return found
 
     def _read(self, event: FrameProven, number: int) -> Shown:
-        path = self._run.folder / event.file
-        layout, facts = frame_file.read_layout(path), frame_file.read_facts(path)
-        raw = frame_file.read_frame(path, layout, event.index)
-        record = frame_file.read_frames(path)[event.index]
-        coding = Coding(facts["pattern"], facts["black_dn"], facts["white_dn"])
+        file = read_view(self._run.folder / event.file, [event])
+        raw, record = file.pixels(event.index), file.records[event.index]
+        coding = Coding(file.pattern, file.black_dn, file.white_dn)
         seen = figures(raw, coding)
         exposure_us, led = int(record["exposure_us"]), int(record["led"])
         return Shown(number, str(event.shot), raw, coding, exposure_us, led, seen, 0.0, 0.0)

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 
 from coupole.errors import StorageError
-from coupole.storage import frame_file, journal
+from coupole.storage import journal
 from coupole.storage.durable import write_synced
 from coupole.storage.journal_events import BurstEnded, Event, FaultNoted, FrameProven, GapFound
 from coupole.storage.run import Run
 from coupole.storage.run_status import KILLED, Status, status
+from coupole.storage.view_reader import read_view
 from coupole.viewing.progress import ViewExposure
 from coupole.viewing.raw_preview import develop, png
 from coupole.viewing.terminal import duration_text
@@ -54,7 +55,7 @@ def _page(run: Run, found: Status) -> str:
         _view(run, view, [event for event in proven if event.shot.view == view]) for view in run.about["views"]
     ]
     name = html.escape(run.folder.name)
-    simulated = "<p>Simulated: no real light, no real object." if run.about.get("simulated") else ""
+    simulated = "<p>Simulated: no real light, no real object." if run.simulated else ""
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
@@ -177,17 +178,14 @@ def _view(run: Run, name: str, proven: list[FrameProven]) -> _View:
         return found
     path = run.view_path(name)
     try:
-        layout, table, facts = (
-            frame_file.read_layout(path),
-            frame_file.read_frames(path),
-            frame_file.read_facts(path),
-        )
-        found.exposures_us = tuple(sorted({int(table[event.index]["exposure_us"]) for event in shots}))
+        file = read_view(path, shots)
+        found.exposures_us = tuple(sorted({int(file.records[event.index]["exposure_us"]) for event in shots}))
         step = max(1, len(shots) // PICTURES_PER_VIEW)
         for event in shots[::step][:PICTURES_PER_VIEW]:
-            raw = frame_file.read_frame(path, layout, event.index)
-            found.exposure.add(raw, black_dn=facts["black_dn"], white_dn=facts["white_dn"])
-            data = base64.b64encode(png(develop(np.asarray(raw), **facts), THUMBNAIL_WIDTH_PX)).decode()
+            raw = file.pixels(event.index)
+            found.exposure.add(raw, black_dn=file.black_dn, white_dn=file.white_dn)
+            shown = develop(np.asarray(raw), pattern=file.pattern, black_dn=file.black_dn, white_dn=file.white_dn)
+            data = base64.b64encode(png(shown, THUMBNAIL_WIDTH_PX)).decode()
             shot = html.escape(str(event.shot))
             picture = f'<img src="data:image/png;base64,{data}" alt="{shot}">'
             found.figures.append(f"<figure>{picture}<figcaption>{shot}</figcaption></figure>")

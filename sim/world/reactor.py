@@ -104,6 +104,8 @@ class Reactor:
             next_ns = self._next_ns()
             wait_s = self.clock.machine_s_until(next_ns)
             for key, _ in self._selector.select(max(0.0, wait_s)):
+                if self._selector.get_map().get(key.fd) is not key:
+                    continue  # one called before it has removed it
                 self._now_ns = max(self._now_ns, min(self.clock.paced_ns(), next_ns))
                 key.data()
             self._run_due_timers()

@@ -28,7 +28,8 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
 
 from fuzz.mutation import mutated
-from fuzz.targets import CONFIGS, TARGETS, Target
+from fuzz.target import Target
+from fuzz.targets import CONFIGS, TARGETS
 
 MEMORY_BYTES = 4 * 1024**3
 CASE_S = 20.0
@@ -119,7 +120,8 @@ def outcome_of(target: Target, path: Path) -> str:
     try:
         target.read(path)
     except CoupoleError as error:
-        return "" if path.name in str(error) or "small.yaml" in str(error) else f"names no file: {error!r}"
+        named = not target.names_file or path.name in str(error) or "small.yaml" in str(error)
+        return "" if named else f"names no file: {error!r}"
     except BaseException:  # noqa: BLE001  whatever it is, it is what is looked for
         return traceback.format_exc()[-3000:]
     return ""
@@ -144,6 +146,10 @@ def _serve(folder: Path) -> None:
 
 def _placed(folder: Path, target: Target, data: bytes) -> Path:
     path = folder / target.file
+    if not path.parent.exists():
+        path.parent.mkdir(parents=True)
+        if target.beside is not None:
+            target.beside(path.parent)
     path.write_bytes(data)
     return path
 

@@ -2,30 +2,21 @@
 
 To add a kind, add a line to `TARGETS`. `seeds` gives real files as bytes; `read` gets the path of a mutated one
 (named as `file` says, in a folder that holds a copy of `configs/`) and returns, or raises an error of
-`coupole.errors` whose message names the file.
+`coupole.errors` whose message names the file. What a run keeps is in `fuzz.kept`, wires are in `fuzz.wires`.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
+from fuzz.kept import KEPT
+from fuzz.target import Target
+from fuzz.wires import WIRES
 from places import REPO
 
 CONFIGS = REPO / "configs"
-
-
-@dataclass(frozen=True)
-class Target:
-    """One kind of file."""
-
-    name: str
-    file: str
-    """Where a mutated file is put, relative to the folder with the copy of `configs/`."""
-    seeds: Callable[[], list[bytes]]
-    read: Callable[[Path], object]
 
 
 def files(pattern: str) -> Callable[[], list[bytes]]:
@@ -131,4 +122,6 @@ TARGETS = (
     Target("mesh-stl", "objects/case.stl", mesh("stl"), check_mesh),
     Target("mesh-stl-ascii", "objects/case.stl", mesh("stl", encoding="ascii"), check_mesh),
     Target("mesh-obj", "objects/case.obj", mesh("obj"), check_mesh),
+    *KEPT,
+    *WIRES,
 )

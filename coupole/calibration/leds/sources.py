@@ -13,15 +13,15 @@ import numpy as np
 from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.leds.spots import find_spots
 from coupole.calibration.rotations import Floats
-from coupole.calibration.sources import About, about_of, frames_sha256, poses_and_attributes
+from coupole.calibration.sources import About, about_of, frames_sha256
 from coupole.errors import InputError
 from coupole.plan.led_table import LedTable
 from coupole.plan.shot_id import Led, ShotId
 from coupole.storage.durable import sha256
-from coupole.storage.frame_file import Layout, read_facts, read_frame, read_frames, read_layout
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 from coupole.storage.step_fields import temperature_range_c
+from coupole.storage.view_reader import View, read_view
 
 
 @dataclass(frozen=True)
@@ -119,9 +119,9 @@ def _collect(
 ) -> None:
     """Add one view's poses and the spots of its frames under single LEDs."""
     path = run.view_path(view)
-    layout, records = read_layout(path), read_frames(path)
-    reported, attributes = poses_and_attributes(path)
-    camera = about_of(run, attributes), (layout.width_px, layout.height_px)
+    file = read_view(path, proven)
+    records, reported = file.records, file.poses
+    camera = about_of(run, file), (file.layout.width_px, file.layout.height_px)
     if collected.camera is not None and camera != collected.camera:
         raise InputError(
             f"{path}: another camera, lens or focus than in the frames before it: {camera[0]}, "
@@ -139,11 +139,11 @@ def _collect(
         collected.poses.append(np.array(reported[pose]["base_from_flange"], dtype=np.float64))
         collected.joints_deg.append(np.array(reported[pose]["joints_deg"], dtype=np.float64))
     collected.lit_records += [records[frame.frame.index] for frame in lit]
-    facts, darks = read_facts(path), _darks(path, layout, proven, records)
+    darks = _darks(file, proven)
     for frame in lit:
-        pixels = read_frame(path, layout, frame.frame.index)
-        dark = darks.get(frame.exposure_us, float(facts["black_dn"]))
-        spots = find_spots(pixels, dark, facts["pattern"], facts["white_dn"])
+        pixels = file.pixels(frame.frame.index)
+        dark = darks.get(frame.exposure_us, float(file.black_dn))
+        spots = find_spots(pixels, dark, file.pattern, file.white_dn)
         key = number_of[frame.pose[1]], row_of[frame.led]
         collected.frames.append(key)
         collected.spots += [(*key, spot.pixel, spot.covariance) for spot in spots.good]
@@ -192,11 +192,11 @@ def _dark_frames(proven: Sequence[FrameProven]) -> list[FrameProven]:
     return [frame for frame in proven if frame.shot.is_dark]
 
 
-def _darks(path: Path, layout: Layout, proven: Sequence[FrameProven], records: Any) -> dict[int, Floats]:
+def _darks(file: View, proven: Sequence[FrameProven]) -> dict[int, Floats]:
     """Mean dark frame [H, W] for each exposure that has some, DN."""
     sums: dict[int, tuple[Floats, int]] = {}
     for frame in _dark_frames(proven):
-        exposure_us = int(records[frame.index]["exposure_us"])
-        before, n_before = sums.get(exposure_us, (np.zeros((layout.height_px, layout.width_px)), 0))
-        sums[exposure_us] = before + read_frame(path, layout, frame.index), n_before + 1
+        exposure_us = int(file.records[frame.index]["exposure_us"])
+        before, n_before = sums.get(exposure_us, (np.zeros((file.layout.height_px, file.layout.width_px)), 0))
+        sums[exposure_us] = before + file.pixels(frame.index), n_before + 1
     return {exposure_us: total / n_frames for exposure_us, (total, n_frames) in sums.items()}

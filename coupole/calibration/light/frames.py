@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.rotations import Floats
-from coupole.calibration.sources import About, about_of, frames_sha256, poses_and_attributes
-from coupole.errors import InputError
+from coupole.calibration.sources import About, about_of, frames_sha256
+from coupole.errors import InputError, StorageError
 from coupole.plan.shot_id import Led, PanelMark, ShotId
-from coupole.storage import frame_file
 from coupole.storage.durable import sha256
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
+from coupole.storage.view_reader import read_view
 
 CHANNELS = ("R", "G", "B")
 
@@ -149,11 +149,11 @@ def _by_view(run: Run) -> dict[Path, list[FrameProven]]:
 def _of_view(
     run: Run, path: Path, proven: Sequence[FrameProven]
 ) -> tuple[list[LightFrame], tuple[str, int, int, float, float, About]]:
-    layout, table, facts = frame_file.read_layout(path), frame_file.read_frames(path), frame_file.read_facts(path)
-    poses, attributes = poses_and_attributes(path)
+    file = read_view(path, proven)
+    poses = file.poses
     frames = []
     for frame in proven:
-        record = table[frame.index]
+        record = file.records[frame.index]
         decicelsius = int(record["board_temperature_dc"])
         frames.append(
             LightFrame(
@@ -163,12 +163,15 @@ def _of_view(
                 decicelsius / 10.0 if decicelsius else float("nan"),
                 np.array(poses[int(record["pose"])]["base_from_flange"], dtype=np.float64),
                 np.array(poses[int(record["pose"])]["base_from_camera"], dtype=np.float64),
-                partial(frame_file.read_frame, path, layout, frame.index),
+                partial(file.pixels, frame.index),
             )
         )
-    focal_mm, focus_mm = float(attributes["focal_length_mm"]), float(attributes["focus_distance_mm"])
+    optics = file.number("focal_length_mm"), file.number("focus_distance_mm"), file.number("pixel_pitch_um")
+    focal_mm, focus_mm, pitch_um = (value or 0.0 for value in optics)
+    if not 0.0 < focal_mm < focus_mm or pitch_um <= 0.0:
+        raise StorageError(f"{path}: lacks a possible focal length, focus distance or pixel pitch: {optics}")
     image_mm = focal_mm * focus_mm / (focus_mm - focal_mm)
-    about = about_of(run, attributes)
-    focal_px = image_mm * 1e3 / float(attributes["pixel_pitch_um"])
-    gain_db = float(attributes.get("gain_db", 0.0))
-    return frames, (facts["pattern"], facts["black_dn"], facts["white_dn"], gain_db, focal_px, about)
+    about = about_of(run, file)
+    focal_px = image_mm * 1e3 / pitch_um
+    gain_db = file.number("gain_db") or 0.0
+    return frames, (file.pattern, file.black_dn, file.white_dn, gain_db, focal_px, about)

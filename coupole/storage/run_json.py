@@ -1,0 +1,104 @@
+"""What run.json must hold for the program to go on with it; more may stand there."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from coupole.errors import InputError
+from coupole.plan.shot_id import ShotLabel
+
+SCHEMA_VERSION = 1
+RUN_JSON = "run.json"
+
+
+def _label(text: str) -> str:
+    ShotLabel.parse(text)
+    return text
+
+
+def _time(text: str) -> str:
+    if datetime.fromisoformat(text).tzinfo is None:
+        raise ValueError("expected a time with its zone")
+    return text
+
+
+def _below(text: str) -> str:
+    path = PurePosixPath(text)
+    if path.is_absolute() or ".." in path.parts or "\0" in text:
+        raise ValueError("expected a path below the run's folder")
+    return text
+
+
+def _plain(text: str) -> str:
+    if "/" in text or "\0" in text or text in {".", ".."}:
+        raise ValueError("expected a name without `/`")
+    return text
+
+
+Label = Annotated[str, AfterValidator(_label)]
+View = Annotated[str, Field(min_length=1), AfterValidator(_plain)]
+
+
+class _Part(BaseModel):
+    """Keys that are not named here are kept as they are."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="allow", strict=True)
+
+
+class _Software(_Part):
+    name: str
+    version: str
+
+
+class _File(_Part):
+    path: str
+    sha256: str
+    stored: Annotated[str, AfterValidator(_below)] | None = None
+
+
+class _Description(_Part):
+    schema_version: Literal[1]
+    software: _Software
+    created: Annotated[str, AfterValidator(_time)]
+    operator: str
+    simulated: bool = False
+    proof: str = ""
+    object: str | None = None
+    calibrations: str | dict[str, str] = "none"
+    views: list[View]
+    labels: list[Label] | dict[str, list[Label]]
+    """One list for all views, or one for each."""
+    hidden_leds: dict[str, list[int]] = Field(default_factory=dict)
+    plan: _File
+    rig: _File
+    files: list[_File] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _labels_for_each_view(self) -> _Description:
+        if isinstance(self.labels, dict) and (missing := [v for v in self.views if v not in self.labels]):
+            raise ValueError(f"`labels` lacks the view {missing[0]!r}")
+        return self
+
+
+def read_description(folder: Path) -> dict[str, Any]:
+    """The content of a run's run.json. Raises InputError if the folder is no run, or something in it is wrong."""
+    path = folder / RUN_JSON
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a run folder: {error}") from error
+    version = content.get("schema_version") if isinstance(content, dict) else None
+    if version != SCHEMA_VERSION:
+        raise InputError(f"{path}: expected run.json of schema version {SCHEMA_VERSION}, found {version!r:.40}")
+    try:
+        _Description.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the whole"
+        raise InputError(f"{path}: `{where}`: {first['msg']}. Was it changed?") from error
+    return dict(content)

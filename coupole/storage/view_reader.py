@@ -1,0 +1,62 @@
+"""One view's file as readers of proven frames need it: pixels, records and poses, checked against each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import StorageError
+from coupole.storage import frame_file
+from coupole.storage.frame_file import Layout
+from coupole.storage.journal_events import FrameProven
+
+
+@dataclass(frozen=True)
+class View:
+    """Frames are named by their slots, as `FrameProven.index` gives them."""
+
+    path: Path
+    layout: Layout
+    records: NDArray[np.void]
+    """[slots], FRAME_DTYPE."""
+    poses: NDArray[np.void]
+    """POSE_DTYPE; a record's `pose` is a row of it."""
+    attributes: dict[str, Any]
+    """Of the file: object, lens, camera, gain."""
+    pattern: str
+    black_dn: int
+    white_dn: int
+
+    def pixels(self, slot: int) -> NDArray[np.uint16]:
+        """[H, W], DN. Raises StorageError."""
+        return frame_file.read_frame(self.path, self.layout, slot)
+
+    def number(self, name: str) -> float | None:
+        """An attribute that is a number; None if the file lacks it. Raises StorageError."""
+        if (value := self.attributes.get(name)) is None:
+            return None
+        try:
+            found = float(value)
+        except (TypeError, ValueError):
+            found = math.nan
+        if not math.isfinite(found):
+            raise StorageError(f"{self.path}: `{name}` is no number: {value!r:.40}")
+        return found
+
+
+def read_view(path: Path, frames: Iterable[FrameProven]) -> View:
+    """The file that holds these frames. Raises StorageError if it is damaged, or does not hold one of them."""
+    layout, records = frame_file.read_layout(path), frame_file.read_frames(path)
+    poses, attributes = frame_file.read_poses_and_attributes(path)
+    for frame in frames:
+        if not 0 <= frame.index < layout.frames:
+            raise StorageError(f"{path}: has no slot {frame.index}, where the journal has {frame.shot}")
+        if records[frame.index]["pose"] >= len(poses):
+            raise StorageError(f"{path}: slot {frame.index} names a pose that the file does not have")
+    return View(path, layout, records, poses, attributes, **frame_file.read_facts(path))

@@ -1,0 +1,134 @@
+"""What a run or a calibration keeps: run.json, journal, a view's HDF5, the manifest, a record. Each is mutated in
+a run that is whole otherwise, and all that reads a run is asked.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from fuzz.target import Target
+from places import REPO
+
+WITNESS = REPO / "tests/data/version-0.1"
+TIME = re.compile(rb"20\d\d-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z")
+
+
+@functools.cache
+def run_of_today() -> Path:
+    """A run of two views, made once in a process, without a cell; in a folder that goes with the process."""
+    from archives import make_run
+
+    from coupole.acquisition.conclusion import conclude
+    from coupole.viewing.terminal import make_console
+
+    _HELD.append(tempfile.TemporaryDirectory())
+    run = make_run(Path(_HELD[0].name), shots=2).run
+    conclude(run, make_console(quiet=True))
+    return run.folder
+
+
+_HELD: list[tempfile.TemporaryDirectory[str]] = []
+
+
+def seeds(name: str) -> Callable[[], list[bytes]]:
+    """A file of the run of today, and if there is one of the run that version 0.1 left. A case is to be the same
+    each time: times are, and what names machine and user is left out."""
+
+    def found() -> list[bytes]:
+        data = TIME.sub(b"2026-11-22T07:02:21.024Z", (run_of_today() / name).read_bytes())
+        if name == "run.json":
+            about = json.loads(data) | {"host": "here", "operator": "somebody"}
+            for key in ("plan", "rig"):
+                about[key]["path"] = f"/{key}.yaml"
+            data = json.dumps(about, indent=2).encode()
+        old = WITNESS / "run" / name
+        return [data, old.read_bytes()] if old.exists() else [data]
+
+    return found
+
+
+def refusal(read: Callable[[], object]) -> str:
+    """What the program says of a file that it does not take; empty if it takes it."""
+    from coupole.errors import CoupoleError
+
+    try:
+        read()
+    except CoupoleError as error:
+        return str(error)
+    return ""
+
+
+def run_beside(folder: Path) -> None:
+    """A whole run in the folder, or in the one above if it is that of the views."""
+    run = folder.parent if folder.name == "views" else folder
+    shutil.copytree(run_of_today(), run, dirs_exist_ok=True)
+
+
+def read_run(path: Path) -> None:
+    """What `status`, `verify`, `calibrate`, `export`, the report and `--resume` read of a run. Refusals of the
+    parts are told together: each must name a file of the run."""
+    from coupole.acquisition.conclusion import renew_report
+    from coupole.calibration.light.frames import open_light_frames
+    from coupole.calibration.sources import open_sources
+    from coupole.exchange.export import export_run
+    from coupole.storage.run import Run
+    from coupole.storage.run_status import status
+    from coupole.storage.verification import verify
+
+    folder = path.parent.parent if path.parent.name == "views" else path.parent
+    run = Run(folder)
+    readers = (
+        lambda: status(run).figures(),
+        lambda: verify(run),
+        run.robot_fault,
+        run.allocated_bytes,
+        run.refuse_old_journal,
+        lambda: [frame.read() for frame in open_light_frames([folder]).lit],
+        lambda: export_run(run, "tiff", folder.parent / "exported", views=[], shots=[], overwrite=True),
+        lambda: open_sources([folder], None),
+        lambda: renew_report(run),
+    )
+    for read in readers:
+        told = refusal(read)
+        assert not told or str(folder) in told, f"names no file: {told}"
+
+
+def read_record_of(path: Path) -> None:
+    """As it is, and once more with a seal that fits: what is wrong inside must be found too."""
+    from ruamel.yaml import YAML, YAMLError
+
+    from coupole.calibration.record import content_sha256, read_record
+
+    told = refusal(lambda: read_record(path))
+    assert not told or path.name in told
+    try:
+        plain = YAML(typ="safe").load(path.read_bytes().decode())
+        plain["sha256"] = content_sha256(json.loads(json.dumps(plain, default=str)))
+        path.write_text(json.dumps(plain, default=str))
+    except (YAMLError, ValueError, TypeError, AttributeError, RecursionError):
+        return
+    told = refusal(lambda: read_record(path))
+    assert not told or path.name in told
+
+
+def records() -> list[bytes]:
+    return [(WITNESS / "records/dark.yaml").read_bytes()]
+
+
+def record_beside(folder: Path) -> None:
+    shutil.copy(WITNESS / "records/dark.h5", folder)
+
+
+KEPT = (
+    Target("run-json", "runs/a/run.json", seeds("run.json"), read_run, run_beside),
+    Target("journal", "runs/b/journal.jsonl", seeds("journal.jsonl"), read_run, run_beside),
+    Target("manifest", "runs/c/manifest.sha256", seeds("manifest.sha256"), read_run, run_beside),
+    Target("view", "runs/d/views/top.h5", seeds("views/top.h5"), read_run, run_beside),
+    Target("record", "records/case.yaml", records, read_record_of, record_beside),
+)

@@ -6,9 +6,10 @@ To add an event: write its model here, add it to `Event`, and handle it where th
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
 
 from coupole.plan.shot_id import ShotId
 from coupole.storage.line_file import utc_now
@@ -18,6 +19,12 @@ JOURNAL_VERSION = 2
 
 def _shot(value: object) -> object:
     return ShotId.parse(value) if isinstance(value, str) else value
+
+
+def _time(text: str) -> str:
+    if text and datetime.fromisoformat(text).tzinfo is None:
+        raise ValueError("expected a time with its zone")
+    return text
 
 
 Shot = Annotated[ShotId, BeforeValidator(_shot), PlainSerializer(str, return_type=str)]
@@ -30,7 +37,7 @@ class JournalEvent(BaseModel):
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
-    t: str = Field(default_factory=utc_now)
+    t: Annotated[str, AfterValidator(_time)] = Field(default_factory=utc_now)
     """Time, UTC, ISO 8601."""
 
 

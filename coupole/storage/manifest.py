@@ -10,10 +10,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import re
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from coupole.errors import StorageError
 from coupole.storage.disk_errors import disk_error
@@ -29,6 +30,9 @@ Progress = Callable[[int, int], None]
 """Files hashed so far, and all."""
 
 
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+
+
 def read(run: Path) -> dict[str, str]:
     """SHA-256 by path in the run; empty without a manifest. Raises StorageError for a line that is none."""
     path = run / NAME
@@ -41,8 +45,10 @@ def read(run: Path) -> dict[str, str]:
     found = {}
     for number, line in enumerate(lines, 1):
         digest, _, name = line.partition("  ")
-        if len(digest) != 64 or not name:
+        if not _DIGEST.fullmatch(digest) or not name:
             raise StorageError(f"{path}: line {number} is not a SHA-256, two spaces, and a file")
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\0" in name:
+            raise StorageError(f"{path}: line {number} names a file that is not in the run's folder")
         found[name] = digest
     return found
 

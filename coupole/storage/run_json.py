@@ -55,6 +55,11 @@ class _Software(_Part):
     version: str
 
 
+class _Device(_Part):
+    model: str
+    serial: str
+
+
 class _File(_Part):
     path: str
     sha256: str
@@ -70,6 +75,7 @@ class _Description(_Part):
     proof: str = ""
     object: str | None = None
     calibrations: str | dict[str, str] = "none"
+    devices: dict[str, _Device] = Field(default_factory=dict)
     views: list[View]
     labels: list[Label] | dict[str, list[Label]]
     """One list for all views, or one for each."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -219,8 +220,8 @@ def _bursts(events: list[Event]) -> str:
         return ""
     rows = "".join(
         f"<tr><td>{html.escape(b.view)}<td>{b.steps}<td>{b.frames}<td>{b.on_s:.2f}"
-        f"<td>{b.clocks['drift_ppm']:.2f}<td>{b.clocks['residual_rms_us']:.1f}"
-        f"<td>{b.clocks['residual_max_us']:.1f}<td>{b.hottest_board_c}"
+        f"<td>{b.clocks.get('drift_ppm', math.nan):.2f}<td>{b.clocks.get('residual_rms_us', math.nan):.1f}"
+        f"<td>{b.clocks.get('residual_max_us', math.nan):.1f}<td>{b.hottest_board_c}"
         for b in bursts
         if b.clocks
     )

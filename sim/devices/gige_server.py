@@ -156,7 +156,7 @@ class GigeServer:
         if len(content) == size:
             status, answer = self._obey(command, content, client)
         if flags & _ACKNOWLEDGE:
-            head = struct.pack(">HHHH", status, command + 1, len(answer), request)
+            head = struct.pack(">HHHH", status, (command + 1) % 2**16, len(answer), request)
             with contextlib.suppress(OSError):
                 self._ports[0].sendto(head + answer, client)
 

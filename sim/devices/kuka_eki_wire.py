@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
@@ -58,8 +59,14 @@ class Command:
             _whole(values["Command/Verb"], STOP, ASK),
             100 if not moves else _whole(values["Command/Velocity"], 1, 100),
             100 if asks else _whole(values["Command/Acceleration"], 1, 100),
-            tuple(float(values[f"Axes/A{axis}"]) for axis in range(1, 7)) if moves else (),
+            tuple(_angle(values[f"Axes/A{axis}"]) for axis in range(1, 7)) if moves else (),
         )
+
+
+def _angle(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} is no angle")
+    return number
 
 
 def _whole(text: str, low: int, high: int) -> int:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from coupole.geometry import abc_from_rotation
@@ -54,16 +55,24 @@ def answer_reader(settings: Settings) -> Callable[[bytes], Answer | Unread]:
         stops = ends and stop.search(data) is not None
         try:
             if values := in_order.search(data):
-                return Answer(int(ipoc[1]), tuple(map(float, values.groups())), stops)
+                return Answer(int(ipoc[1]), _finite(values.groups()), stops)
             found = correction.search(data)
             pairs = dict(_PAIR.findall(found[1])) if found else {}
             missing = [name.decode() for name in names if name not in pairs]
             remark = f"corrections without {' '.join(missing)} in {tag.decode()} are taken as 0" if missing else ""
-            return Answer(int(ipoc[1]), tuple(float(pairs.get(name, b"0")) for name in names), stops, remark)
+            return Answer(int(ipoc[1]), _finite(pairs.get(name, b"0") for name in names), stops, remark)
         except ValueError:
             return Unread("an answer with a correction that is no number is ignored", text)
 
     return read
+
+
+def _finite(texts: Iterable[bytes]) -> tuple[float, ...]:
+    """Raises ValueError for what is no number, or none that an axis can have."""
+    numbers = tuple(map(float, texts))
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError(numbers)
+    return numbers
 
 
 class PacketWriter:

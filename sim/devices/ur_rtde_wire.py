@@ -88,8 +88,8 @@ def variable_type(name: str) -> str:
 
 
 def pack(names: Sequence[str], values: Mapping[str, Value]) -> bytes:
-    """The values of a recipe's variables; registers never written are 0."""
-    return b"".join(_pack_one(name, values.get(name, 0)) for name in names)
+    """The values of a recipe's variables; what has none, as a register never written, is 0."""
+    return b"".join(_pack_one(name, values[name]) if name in values else _zero(name) for name in names)
 
 
 def unpack(names: Sequence[str], payload: bytes) -> dict[str, Value]:
@@ -105,6 +105,10 @@ def unpack(names: Sequence[str], payload: bytes) -> dict[str, Value]:
         offset += struct.calcsize(">" + one)
         values[name] = fields[0] if len(fields) == 1 else fields
     return values
+
+
+def _zero(name: str) -> bytes:
+    return bytes(struct.calcsize(">" + _FORMATS[variable_type(name)]))
 
 
 def _pack_one(name: str, value: Value) -> bytes:

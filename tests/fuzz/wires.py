@@ -260,7 +260,7 @@ def read_rtde(path: Path) -> None:
 
     sent: list[bytes] = []
     line: Any = SimpleNamespace(inbox=bytearray(), gone=False, send=sent.append)
-    session = RtdeSession(line, lambda values: None)
+    session = RtdeSession(line, lambda inputs: None)
     for data in pieces(path.read_bytes()):
         if not line.gone:
             line.inbox += data

@@ -141,7 +141,7 @@ def _read_status(message: bytes) -> Status | None:
         }
         joints_deg = _six(values, "Axes", [f"A{axis}" for axis in range(1, 7)])
         pose = _six(values, "Pose", list("XYZABC"))
-        if not math.isfinite(sum(joints_deg)):
+        if not all(map(math.isfinite, (*joints_deg, *pose))):
             return None
         return Status(
             session=int(values["Status/@Session"]),

@@ -21,6 +21,7 @@ from unittest import mock
 import cells
 from cells import SIDE, TOP, CellFolder, Ended
 from places import REPO
+from real_cells import true_dose_lux_h
 
 from coupole.acquisition import opened_cell
 from coupole.errors import DeviceError, DeviceTimeout
@@ -48,6 +49,8 @@ CODES = {
 DARK_WITHIN_S, STILL_WITHIN_S = 0.1, 2.5
 """From the event, on the world's clock, where box and arm still listen. To brake from full speed takes 1.74 s."""
 WATCHDOG_S = 2.0
+CLOCK_SHARE = 1e-3
+"""By which the box's clock may run fast."""
 
 
 class UnexpectedError(Exception):
@@ -188,6 +191,7 @@ def run_case(folder: Path, k: int, kind: str) -> Case:
         if kind != "world":
             case.dark_s, case.still_s = watch.end()
             case.wrong += _wrong_in_the_cell(case, world)
+            case.wrong += _wrong_in_the_dose(cell, world)
     runs = sorted((folder / "storage").glob("2*/run.json"))
     if runs and kind != "sigkill":
         case.wrong += _wrong_in_the_journal(runs[0].parent, ended)
@@ -275,6 +279,18 @@ def _wrong_in_the_cell(case: Case, world: World) -> list[str]:
     if case.still_s is not None and case.still_s > STILL_WITHIN_S + (HANG_S if case.kind == "hang" else 0.0):
         wrong.append(f"the arm stood {case.still_s:.3f} s after the event")
     return wrong
+
+
+def _wrong_in_the_dose(cell: CellFolder, world: World) -> list[str]:
+    """What the run says that it gave, against the world's own account."""
+    true_lux_h = float(true_dose_lux_h(cell, world).max())
+    runs = sorted((cell.folder / "storage").glob("2*/run.json"))
+    told_lux_h = 0.0
+    if runs:
+        told_lux_h = cells.here("status", runs[0].parent, "--json").document["dose_lux_h"]
+    if true_lux_h > told_lux_h * (1.0 + CLOCK_SHARE) + 1e-9:
+        return [f"the object received {true_lux_h:.6f} lux.h, the run counts {told_lux_h:.6f}"]
+    return []
 
 
 def _wrong_in_the_journal(run: Path, ended: Ended) -> list[str]:

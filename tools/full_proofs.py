@@ -38,7 +38,11 @@ PROOFS = (
     Proof("injection", "random faults: labels true, runs completed", f"{_PYTEST} tests/faults/test_injection.py"),
     Proof("soak", "sixty runs in one world: nothing grows", f"{_PYTEST} tests/runs/test_soak.py"),
     Proof("rehearsals", "a million rehearsed shots with faults: labels true, nothing lost", "tools/soak.py"),
-    Proof("fuzz", "10,000 mutated files are read or refused", f"{_PYTEST} tests/fuzz"),
+    Proof(
+        "calls", "each call of each device fails once in each way: the cell is safe", "tools/fail_every_call.py"
+    ),
+    Proof("fuzz", "10,000 mutated files and messages are read or refused", f"{_PYTEST} tests/fuzz"),
+    Proof("mutants", "95 % of single mistakes in critical code are noticed", "tools/mutants.py"),
     Proof("cells", "intervals of 100 random cells hold", "tools/prove_calibrations.py --cells 100"),
     Proof("cells-absolute", "the same with the arm's absolute errors", "tools/prove_calibrations.py --absolute"),
     Proof("paths", "500 random plans touch nothing, by python-fcl", "tools/replay_plans.py --plans 500 --seed 1"),

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from coupole.acquisition.dose import FlashMeter
 from coupole.acquisition.live_cell import CellSource
+from coupole.acquisition.memory_recorder import MeterRecorder
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import open_cell
 from coupole.acquisition.operator import (
@@ -57,7 +58,7 @@ def meter(
     refuse_uncommissioned(job.cell)
     ArmFaults(job.cell.state_folder).refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)
-    recorder, control = exposure_advice.MeterRecorder(), Control()
+    recorder, control = MeterRecorder(), Control()
     with open_cell(job.cell, job=small, on_opened=identity_printer(console)) as cell:
         refuse_uncommissioned(job.cell, cell.identities)
         observer = RunObserver(console, job.cell.rig.frame_bytes, 0)

@@ -1,4 +1,4 @@
-"""Recorders for a run's frames and events: into a run folder, or for a dry run into statistics only."""
+"""Recorders for a run's frames and events: what the sequencer needs of one, and that of a run folder."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Protocol
-
-import numpy as np
 
 from coupole.devices import ArmState, Frame, FrameFormat
 from coupole.errors import StorageError
@@ -20,7 +18,6 @@ from coupole.storage.journal import Journal
 from coupole.storage.journal_events import Event, FrameProven
 from coupole.storage.run import Run
 from coupole.storage.view_writer import ViewWriter
-from coupole.viewing.progress import ViewExposure
 
 COMMIT_EVERY_S = 0.5
 SPARE_SLOTS = 32
@@ -203,62 +200,3 @@ class RunRecorder:
             self._writer.close()
             self._writer = None
         self._journal.close()
-
-
-class DryRecorder:
-    """For a dry run: counts proven frames, evaluates the exposure of frames with a picture."""
-
-    name = "dry run"
-
-    def __init__(self) -> None:
-        self._proven: set[ShotId] = set()
-        self.events: list[Event] = []
-        self.exposures: dict[str, ViewExposure] = {}
-        self._format: FrameFormat | None = None
-        self._slots: list[tuple[float, float] | None] = []
-        self._view = ""
-
-    def light_before_lux_h(self) -> tuple[float, ...]:
-        return ()
-
-    def proven(self) -> set[ShotId]:
-        return self._proven
-
-    def begin_view(
-        self,
-        view: str,
-        frames: int,
-        frame_format: FrameFormat,
-        arm: ArmState,
-        base_from_camera: Transform,
-        collections: Collections,
-    ) -> None:
-        self._view, self._format = view, frame_format
-
-    def put(self, frame: Frame, exposure_us: int) -> int:
-        assert self._format is not None
-        if not frame.rendered:
-            self._slots.append(None)
-        else:
-            black, white = self._format.black_dn, self._format.white_dn
-            bright = (float(np.quantile(frame.pixels, 0.999)) - black) / (white - black)
-            self._slots.append((bright, float(np.mean(frame.pixels >= white))))
-        return len(self._slots) - 1
-
-    def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
-        self._proven.add(shot)
-        judged = self._slots[slot]
-        if judged is not None and shot.is_shot:
-            self.exposures.setdefault(self._view, ViewExposure()).add_figures(*judged)
-
-    def free(self, slot: int) -> None:
-        self._slots[slot] = None
-
-    def note(self, event: Event) -> None:
-        self.events.append(event)
-
-    def commit(self, *, now: bool) -> None:
-        """A dry run writes nothing."""
-
-    def end_view(self) -> None:
-        self._slots.clear()

@@ -14,6 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from coupole.acquisition.conclusion import conclude, open_for_session
+from coupole.acquisition.memory_recorder import DryRecorder
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell, open_cell
 from coupole.acquisition.operator import (
@@ -23,7 +24,7 @@ from coupole.acquisition.operator import (
     refuse,
     refuse_uncommissioned,
 )
-from coupole.acquisition.recorder import DryRecorder, RunRecorder
+from coupole.acquisition.recorder import RunRecorder
 from coupole.acquisition.run_description import described_cell
 from coupole.acquisition.sequencer import Sequencer
 from coupole.acquisition.signals import obeyed_by

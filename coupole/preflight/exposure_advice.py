@@ -18,14 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.devices import ArmState, Frame, FrameFormat
+from coupole.devices import FrameFormat
 from coupole.errors import InputError
-from coupole.geometry import Transform
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import BracketExposure, FixedExposure, LightIds, Plan
-from coupole.plan.shot_id import Light, ShotId
-from coupole.storage.frame_file_creation import Collections
-from coupole.storage.journal_events import Event
+from coupole.plan.shot_id import Light
 
 METERING_LIGHTS = 12
 SHORTER = (16, 4, 1)
@@ -135,63 +132,11 @@ class Metered:
     samples: dict[Light, dict[int, list[NDArray[np.int32]]]] = field(default_factory=dict)
 
 
-class MeterRecorder:
-    """A `coupole.acquisition.recorder.Recorder` that only keeps a sample of the pixels in memory."""
-
-    name = "meter"
-
-    def __init__(self) -> None:
-        self.views: dict[str, Metered] = {}
-        self.events: list[Event] = []
-        self._proven: set[ShotId] = set()
-        self._slots: list[tuple[int, NDArray[np.int32]]] = []
-        self._view = ""
-
-    def light_before_lux_h(self) -> tuple[float, ...]:
-        return ()
-
-    def proven(self) -> set[ShotId]:
-        return self._proven
-
-    def begin_view(
-        self,
-        view: str,
-        frames: int,
-        frame_format: FrameFormat,
-        arm: ArmState,
-        base_from_camera: Transform,
-        collections: Collections,
-    ) -> None:
-        self._view = view
-        self.views.setdefault(view, Metered(frame_format))
-
-    def put(self, frame: Frame, exposure_us: int) -> int:
-        height, width = (size // (2 * _CELL_STEP) * 2 * _CELL_STEP for size in frame.pixels.shape)
-        cells = frame.pixels[:height, :width].reshape(
-            height // (2 * _CELL_STEP), 2 * _CELL_STEP, -1, 2 * _CELL_STEP
-        )
-        black = self.views[self._view].frame_format.black_dn
-        self._slots.append((exposure_us, cells[:, :2, :, :2].astype(np.int32).ravel() - black))
-        return len(self._slots) - 1
-
-    def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
-        self._proven.add(shot)
-        if shot.is_shot:
-            exposure_us, sample = self._slots[slot]
-            by_exposure = self.views[self._view].samples.setdefault(shot.light, {})
-            by_exposure.setdefault(exposure_us, []).append(sample)
-
-    def free(self, slot: int) -> None:
-        """Nobody asks for it again."""
-
-    def note(self, event: Event) -> None:
-        self.events.append(event)
-
-    def commit(self, *, now: bool) -> None:
-        """Nothing lasts."""
-
-    def end_view(self) -> None:
-        self._slots.clear()
+def sample_of(pixels: NDArray[np.uint16]) -> NDArray[np.int32]:
+    """[n] pixels of every n-th Bayer cell of a frame [H, W], DN."""
+    height, width = (size // (2 * _CELL_STEP) * 2 * _CELL_STEP for size in pixels.shape)
+    cells = pixels[:height, :width].reshape(height // (2 * _CELL_STEP), 2 * _CELL_STEP, -1, 2 * _CELL_STEP)
+    return cells[:, :2, :, :2].astype(np.int32).ravel()
 
 
 def noise_of(views: Iterable[Metered]) -> Noise:

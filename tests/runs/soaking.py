@@ -23,18 +23,16 @@ from typing import Any
 import numpy as np
 from cells import LOW, SIDE, TOP, CellFolder
 
+from coupole.acquisition.memory_recorder import MemoryRecorder
 from coupole.acquisition.opened_cell import open_cell
 from coupole.acquisition.operator import UNLIMITED_BYTES
-from coupole.acquisition.recorder import DryRecorder
 from coupole.acquisition.sequencer import Sequencer
-from coupole.devices import ArmState, Frame, FrameFormat
+from coupole.devices import Frame
 from coupole.errors import DeviceError, UnprovenError
-from coupole.geometry import Transform
 from coupole.plan.shot_id import Led, ShotId
 from coupole.preflight.checking import check_job
 from coupole.preflight.job import read_job
 from coupole.preflight.preflight import StorageFacts
-from coupole.storage.frame_file_creation import Collections
 from sim.world.client import World
 
 REMEMBERED, PAGE = 8_192, 400
@@ -120,8 +118,8 @@ class Rehearsed:
         return dict(vars(self))
 
 
-class CheckedRecorder(DryRecorder):
-    """A dry run's recorder that keeps which frame was proven as which shot, until the world is asked."""
+class CheckedRecorder(MemoryRecorder):
+    """Keeps which frame was proven as which shot, until the world is asked."""
 
     def __init__(self, before_view: Callable[[str], None], after_view: Callable[[], None]) -> None:
         super().__init__()
@@ -130,16 +128,8 @@ class CheckedRecorder(DryRecorder):
         self.labelled: list[tuple[ShotId, tuple[int, int]]] = []
         """Shots with id and timestamp of their frames, since the world was last asked."""
 
-    def begin_view(
-        self,
-        view: str,
-        frames: int,
-        frame_format: FrameFormat,
-        arm: ArmState,
-        base_from_camera: Transform,
-        collections: Collections,
-    ) -> None:
-        super().begin_view(view, frames, frame_format, arm, base_from_camera, collections)
+    def begin_view(self, view: str, *pose: Any) -> None:
+        super().begin_view(view, *pose)
         self._before_view(view)
 
     def put(self, frame: Frame, exposure_us: int) -> int:
@@ -147,15 +137,11 @@ class CheckedRecorder(DryRecorder):
         self._frames.append((frame.frame_id, frame.timestamp_ns))
         return slot
 
-    def free(self, slot: int) -> None:
-        """Nothing is kept of a frame but its id and time."""
-
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
-        self._proven.add(shot)
+        super().prove(slot, shot, fields)
         self.labelled.append((shot, self._frames[slot]))
 
     def end_view(self) -> None:
-        super().end_view()
         self._frames.clear()
         self._after_view()
 

@@ -1,0 +1,121 @@
+"""Recorders that write nothing: for a dry run, which judges pictures, and for metering, which samples them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.devices import ArmState, Frame, FrameFormat
+from coupole.geometry import Transform
+from coupole.plan.shot_id import ShotId
+from coupole.preflight.exposure_advice import Metered, sample_of
+from coupole.storage.frame_file_creation import Collections
+from coupole.storage.journal_events import Event
+from coupole.viewing.progress import ViewExposure
+
+
+class MemoryRecorder:
+    """A `coupole.acquisition.recorder.Recorder` that keeps events and proven shots in memory; what it keeps of a
+    frame, its kinds say."""
+
+    name = "memory"
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+        self._proven: set[ShotId] = set()
+        self._view = ""
+        self._format: FrameFormat | None = None
+
+    def light_before_lux_h(self) -> tuple[float, ...]:
+        return ()
+
+    def proven(self) -> set[ShotId]:
+        return self._proven
+
+    def begin_view(
+        self,
+        view: str,
+        frames: int,
+        frame_format: FrameFormat,
+        arm: ArmState,
+        base_from_camera: Transform,
+        collections: Collections,
+    ) -> None:
+        self._view, self._format = view, frame_format
+
+    def put(self, frame: Frame, exposure_us: int) -> int:
+        raise NotImplementedError
+
+    def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
+        self._proven.add(shot)
+
+    def free(self, slot: int) -> None:
+        """Nobody asks for it again."""
+
+    def note(self, event: Event) -> None:
+        self.events.append(event)
+
+    def commit(self, *, now: bool) -> None:
+        """Nothing lasts."""
+
+    def end_view(self) -> None:
+        raise NotImplementedError
+
+
+class DryRecorder(MemoryRecorder):
+    """For a dry run: evaluates the exposure of frames with a picture."""
+
+    name = "dry run"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.exposures: dict[str, ViewExposure] = {}
+        self._slots: list[tuple[float, float] | None] = []
+
+    def put(self, frame: Frame, exposure_us: int) -> int:
+        assert self._format is not None
+        if not frame.rendered:
+            self._slots.append(None)
+        else:
+            black, white = self._format.black_dn, self._format.white_dn
+            bright = (float(np.quantile(frame.pixels, 0.999)) - black) / (white - black)
+            self._slots.append((bright, float(np.mean(frame.pixels >= white))))
+        return len(self._slots) - 1
+
+    def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
+        super().prove(slot, shot, fields)
+        judged = self._slots[slot]
+        if judged is not None and shot.is_shot:
+            self.exposures.setdefault(self._view, ViewExposure()).add_figures(*judged)
+
+    def end_view(self) -> None:
+        self._slots.clear()
+
+
+class MeterRecorder(MemoryRecorder):
+    """For metering: keeps a sample of each frame's pixels."""
+
+    name = "meter"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.views: dict[str, Metered] = {}
+        self._slots: list[tuple[int, NDArray[np.int32]]] = []
+
+    def put(self, frame: Frame, exposure_us: int) -> int:
+        assert self._format is not None
+        self._slots.append((exposure_us, sample_of(frame.pixels) - self._format.black_dn))
+        return len(self._slots) - 1
+
+    def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
+        super().prove(slot, shot, fields)
+        if shot.is_shot:
+            assert self._format is not None
+            exposure_us, sample = self._slots[slot]
+            view = self.views.setdefault(self._view, Metered(self._format))
+            view.samples.setdefault(shot.light, {}).setdefault(exposure_us, []).append(sample)
+
+    def end_view(self) -> None:
+        self._slots.clear()

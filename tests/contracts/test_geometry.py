@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
@@ -82,6 +83,21 @@ def test_the_image_is_upright(azimuth: float, elevation: float) -> None:
 def test_seen_from_the_side_what_is_to_the_right_appears_right() -> None:
     camera_from_support = inverse(look_at((0.0, 0.0, 0.0), 500.0, azimuth_deg=0.0, elevation_deg=0.0))
     assert np.allclose(apply(camera_from_support, (0.0, 10.0, 5.0)), (10.0, -5.0, 500.0))
+
+
+@pytest.mark.parametrize(
+    ("azimuth_deg", "elevation_deg", "expected"),
+    [
+        (0, 0, (1, 0, 0)),
+        (90, 0, (0, 1, 0)),
+        (-90, 0, (0, -1, 0)),
+        (0, 90, (0, 0, 1)),
+        (0, -90, (0, 0, -1)),
+        (60, 30, (3**0.5 / 4, 0.75, 0.5)),
+    ],
+)
+def test_directions_by_hand(azimuth_deg: float, elevation_deg: float, expected: tuple[float, ...]) -> None:
+    np.testing.assert_allclose(direction(azimuth_deg, elevation_deg), expected, atol=1e-15)
 
 
 @given(azimuth=degrees(360.0), elevation=degrees(90.0))

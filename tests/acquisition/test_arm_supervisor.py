@@ -100,6 +100,14 @@ def test_an_arm_on_its_path_arrives(supervised: Supervise) -> None:
     assert arm.done == ["move"]
 
 
+def test_each_leg_begins_where_the_one_before_it_ended(supervised: Supervise) -> None:
+    arm = Arm()
+    supervisor = supervised(arm)
+    supervisor.go(VISIT)
+    aside: Any = SimpleNamespace(leg=SimpleNamespace(waypoints=[np.add(THERE_DEG, [30.0, 0, 0, 0, 0, 0])]))
+    assert supervisor.go(aside).arm.joints_deg == tuple(aside.leg.waypoints[0])
+
+
 @pytest.mark.parametrize("off_mm", [10.5, 14.0, -14.0, 19.0])
 def test_an_arm_more_than_10_mm_beside_its_path_is_stopped(supervised: Supervise, off_mm: float) -> None:
     arm = Arm(lambda share: off_mm if share > 0.5 else 0.0)

@@ -143,6 +143,28 @@ def test_a_write_to_a_line_that_takes_nothing_more_ends_when_exchanges_are_ended
     os.close(slave)
 
 
+def test_a_write_that_a_device_clear_overtakes_at_the_last_moment_sends_nothing() -> None:
+    """The clear comes when the write has seen that there was none, and that the line takes bytes."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    link = SerialLink(os.ttyname(slave), 115_200, SystemClock())
+
+    class Overtaken:
+        def __enter__(self) -> None:
+            link.clears += 1
+
+        def __exit__(self, *error: object) -> None:
+            pass
+
+    link._gate = Overtaken()  # type: ignore[assignment]
+    with pytest.raises(Cleared):
+        link.write(b"INIT\n", Deadline(SystemClock(), 15.0), link.clears)
+    assert not select.select([master], [], [], 0.1)[0]
+    link.close()
+    os.close(master)
+    os.close(slave)
+
+
 def test_initiate_clear_does_not_wait_for_a_box_that_takes_no_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -60,23 +60,20 @@ def surface_points(corners_mm: Floats, step_mm: float = MESH_STEP_MM) -> Floats:
     """Points [n, 3] on a mesh of corners [triangles, 3, 3], so dense that no point of its surface is farther than
     `step_mm` from one of them.
 
-    Triangles are halved until no edge is longer than e; then none of their points is farther than e / sqrt(3) from
-    a corner. Of the corners in a cubic cell of edge c one is kept, at most c sqrt(3) from the others.
+    Each triangle is divided into similar ones whose edges are at most e; then none of their points is farther than
+    e / sqrt(3) from a corner. Of the corners in a cubic cell of edge c one is kept, at most c sqrt(3) from the
+    others.
     """
     edge_mm = 0.6 * step_mm
     cell_mm = (step_mm - edge_mm / np.sqrt(3)) / np.sqrt(3)
-    triangles = corners_mm
-    done = [np.zeros((0, 3))]
-    while len(triangles):
-        edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
-        fine = edges <= edge_mm
-        done.append(_one_per_cell(triangles[fine].reshape(-1, 3), cell_mm))
-        a, b, c = np.moveaxis(triangles[~fine], 1, 0)
-        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-        triangles = np.concatenate(
-            [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-        )
-    return np.concatenate(done)
+    longest_mm = np.linalg.norm(corners_mm - np.roll(corners_mm, 1, axis=1), axis=2).max(axis=1, initial=0.0)
+    parts = np.maximum(1, np.ceil(longest_mm / edge_mm)).astype(np.int64)
+    found = [np.zeros((0, 3))]
+    for count in np.unique(parts):
+        first, second = np.indices((count + 1, count + 1)).reshape(2, -1)
+        shares = np.stack([count - first - second, first, second], axis=1)[first + second <= count] / count
+        found.append(_one_per_cell((shares @ corners_mm[parts == count]).reshape(-1, 3), cell_mm))
+    return _one_per_cell(np.concatenate(found), cell_mm)
 
 
 def _one_per_cell(points: Floats, cell_mm: float) -> Floats:

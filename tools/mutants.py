@@ -29,7 +29,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 LEAST_KILLED = 0.95
-TIMEOUT_S = 900.0
+TIMEOUT_S = 240.0
 """A mutant that hangs its tests is killed, too."""
 KILLED, SURVIVED, EQUIVALENT = "killed", "survived", "equivalent"
 _PASSED, _FAILED, _INTERRUPTED = 0, 1, 2

@@ -49,6 +49,8 @@ CODES = {
 DARK_WITHIN_S, STILL_WITHIN_S = 0.1, 2.5
 """From the event, on the world's clock, where box and arm still listen. To brake from full speed takes 1.74 s."""
 WATCHDOG_S = 2.0
+QUIET_S = 0.3
+"""Longer than the dark between two LEDs of a table."""
 CLOCK_SHARE = 1e-3
 """By which the box's clock may run fast."""
 
@@ -200,8 +202,8 @@ def run_case(folder: Path, k: int, kind: str) -> Case:
 
 
 class _Watch:
-    """Looks at the world every few milliseconds, from the event until the session has ended, nothing shines and
-    the arm stands."""
+    """Looks at the world every few milliseconds, from the event until the session has ended, and for `QUIET_S`
+    nothing has shone and the arm has stood: a box without its host goes on with its table, LED by LED."""
 
     def __init__(self, world: World) -> None:
         self._world, self._thread = world, threading.Thread(target=self._look, daemon=True)
@@ -223,18 +225,20 @@ class _Watch:
 
     def _look(self) -> None:
         end_s = time.monotonic() + cells.PATIENCE_S
+        busy_s = 0.0
         while time.monotonic() < end_s:
             try:
                 state = self._world.ask("state")
             except (DeviceError, ValueError):  # the world was killed
                 return
             late_s = state["t_s"] - self._event_s
-            lit, moves = bool(state["shining"] or state["panels"]), state["arm_moving"]
-            if lit:
-                self._dark_s = late_s
-            if moves:
-                self._still_s = late_s
-            if self._session_over.is_set() and not lit and not moves:
+            if state["shining"] or state["panels"]:
+                self._dark_s = busy_s = late_s
+            if state["arm_moving"]:
+                self._still_s = busy_s = late_s
+            if not self._session_over.is_set():
+                busy_s = late_s
+            elif late_s > busy_s + QUIET_S:
                 return
             time.sleep(0.002)
 

@@ -191,6 +191,18 @@ def test_a_cable_pulled_in_a_burst_is_a_device_lost(box: LedBox, world: LedBoxWo
         box.poll_log()
 
 
+def test_a_burst_that_another_program_aborts_is_not_taken_for_one_that_is_over(
+    box: LedBox, world: LedBoxWorld
+) -> None:
+    steps = table(400, on_us=2000)
+    box.load(steps)
+    box.start(steps)
+    send_behind_its_back(world, b"\nABOR\n")
+    with pytest.raises(DeviceFault, match="the burst ended in state ABORTED"):
+        while box.running():
+            box.poll_log()
+
+
 def test_a_bank_that_changed_is_uploaded_once_more(box: LedBox, world: LedBoxWorld) -> None:
     steps = table(7)
     box.load(steps)

@@ -93,6 +93,7 @@ def test_an_axis_beyond_its_correction_limit_is_named() -> None:
     limits = {"axis_correction_deg": (20.0, 10.0, 20.0, 20.0, 20.0, 20.0)}
     assert violations((0.0, -81.0, 90.0, 0.0, 90.0, 0.0), **limits) == ""
     assert "A2 would be 11.000 deg" in violations((0.0, -79.0, 90.0, 0.0, 90.0, 0.0), **limits)
+    assert "A2 would be -11.000 deg" in violations((0.0, -101.0, 90.0, 0.0, 90.0, 0.0), **limits)
 
 
 @given(joints)
@@ -105,8 +106,7 @@ def test_a_pose_too_far_from_the_start_is_refused_also_on_the_way() -> None:
     assert violations(away_deg, corrects="pose") == ""
     assert "540 mm from where RSI was started" in violations(away_deg, corrects="pose", pose_correction_mm=500)
     assert "60.0 deg" in violations(away_deg, corrects="pose", pose_correction_deg=50)
-    back_deg = (-60.0, *HOME_DEG[1:])
-    assert violations(back_deg, away_deg, corrects="pose", pose_correction_mm=500)
+    assert "540 mm" in violations(HOME_DEG, away_deg, corrects="pose", pose_correction_mm=500)
 
 
 @pytest.mark.parametrize(
@@ -129,6 +129,16 @@ def test_a_new_target_in_mid_motion_is_checked_from_the_whole_rest_of_the_way() 
     target_deg = (20.0, *HOME_DEG[1:])
     assert violations(target_deg, here_deg, corrects="pose") == ""
     assert "wrist" in violations(target_deg, here_deg, there_deg, corrects="pose")
+
+
+def test_a_trajectory_that_cannot_be_computed_leaves_the_axes_at_rest_and_is_told() -> None:
+    motion = Motion(0.004, ((100.0,) * 6, (300.0,) * 6, (3000.0,) * 6))
+    motion.stand_at(HOME_DEG)
+    motion.move_to((float("nan"), *HOME_DEG[1:]))
+    assert not motion.step()
+    assert motion.phase == shared_state.STANDING
+    assert motion.commanded_deg == HOME_DEG
+    assert motion.velocity_deg_s == (0.0,) * 6
 
 
 @pytest.mark.parametrize(

@@ -199,8 +199,7 @@ def test_a_burst_that_another_program_aborts_is_not_taken_for_one_that_is_over(
     box.start(steps)
     send_behind_its_back(world, b"\nABOR\n")
     with pytest.raises(DeviceFault, match="the burst ended in state ABORTED"):
-        while box.running():
-            box.poll_log()
+        run_to_end(box, world)
 
 
 def test_a_bank_that_changed_is_uploaded_once_more(box: LedBox, world: LedBoxWorld) -> None:

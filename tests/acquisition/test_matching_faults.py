@@ -19,8 +19,9 @@ from matching_takes import (
     whole_burst,
 )
 
-from coupole.acquisition.frame_matching import UNLABELLED
-from coupole.devices import UNKNOWN_NS
+from coupole.acquisition.clock_alignment import SURPLUS
+from coupole.acquisition.frame_matching import UNLABELLED, _Aligned, _verdict
+from coupole.devices import STEP_RECORD_DTYPE, UNKNOWN_NS
 
 LIGHT = START + 2 + 3  # a step in the middle of the lights, behind two dark frames
 
@@ -120,10 +121,11 @@ def test_the_end_marks_alone_prove_a_burst() -> None:
     assert_all_proven(what, what.verdict())
 
 
-def test_frame_ids_that_do_not_increase_prove_nothing() -> None:
+@pytest.mark.parametrize("back", [0, 1])
+def test_frame_ids_that_do_not_increase_prove_nothing(back: int) -> None:
     clean = take(whole_burst(12))
     ids = clean.frame_ids.copy()
-    ids[LIGHT] = ids[LIGHT - 1]
+    ids[LIGHT] = ids[LIGHT - 1] - back
     verdict = replace(clean, frame_ids=ids).verdict()
     assert np.all(verdict.step_of_frame == UNLABELLED)
     assert verdict.reason == "the camera's frame ids do not increase"
@@ -136,6 +138,16 @@ def test_timestamps_that_do_not_increase_prove_nothing() -> None:
     verdict = replace(clean, timestamps_ns=stamps).verdict()
     assert np.all(verdict.step_of_frame == UNLABELLED)
     assert verdict.reason == "the camera's timestamps do not increase"
+
+
+def test_a_frame_that_only_one_alignment_calls_surplus_is_not_thrown_away() -> None:
+    log = np.zeros(2, STEP_RECORD_DTYPE)
+    log["edge_sent"] = True
+    said = _Aligned(np.arange(2), np.array([0, SURPLUS, 1]), np.array([True, False, True]))
+    verdict = _verdict(log, np.array([0, 1, 2]), np.array([1, 1]), said)
+    assert not verdict.surplus.any()
+    assert verdict.ambiguous
+    assert verdict.reason == "more than one alignment of box and camera is possible"
 
 
 def test_without_frames_all_steps_are_missing_and_nothing_is_ambiguous() -> None:

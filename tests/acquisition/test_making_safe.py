@@ -90,6 +90,26 @@ def test_what_hangs_is_given_up_and_told(monkeypatch: pytest.MonkeyPatch) -> Non
     assert not cell.arm_confirmed
 
 
+def test_whatever_ends_the_use_of_a_cell_it_is_made_safe_before_its_devices_are_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[str] = []
+    device = SimpleNamespace(
+        identify=lambda: None,
+        lights_off=lambda: done.append("lights off"),
+        stop=lambda: done.append("arm stopped"),
+        disarm=lambda: done.append("camera disarmed"),
+        close=lambda: done.append("closed"),
+    )
+    monkeypatch.setattr(opened_cell, "in_world", lambda rig, dry_run: False)
+    monkeypatch.setattr(opened_cell, "_open_device", lambda *arguments, **named: device)
+    cell: Any = SimpleNamespace(rig=SimpleNamespace(sensor=None))
+    with pytest.raises(LookupError), opened_cell.open_cell(cell):
+        raise LookupError
+    assert sorted(done[:2]) == ["arm stopped", "lights off"]
+    assert done[2:] == ["camera disarmed", "closed", "closed", "closed"]
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_second_signal_does_not_cut_it_short(number: signal.Signals) -> None:
     class CutShortError(Exception):

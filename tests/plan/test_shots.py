@@ -157,6 +157,14 @@ def test_only_drops_the_labels_of_marks_that_are_not_wanted() -> None:
     assert burst.shots.count(None) == MARKS - 1
 
 
+def test_in_a_burst_that_is_shot_again_the_led_of_a_step_is_that_of_its_id() -> None:
+    burst = first_burst()
+    again = burst.only(set(burst.labels[100:200:7]))
+    assert len(lit_leds(again)) == 15
+    for led, label in zip(again.table["led"], again.labels, strict=True):
+        assert label is None if led == NO_LED else label.light == Led(led)
+
+
 def test_only_gives_the_marks_of_a_fresh_burst() -> None:
     again = first_burst(darks_per_view=0).only(labels("led0007/e0"))
     fresh = first_burst({"kind": "ids", "ids": [7]}, darks_per_view=0)

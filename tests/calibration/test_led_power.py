@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from light_synthesis import Array, coverage
 
-from coupole.calibration.light.irradiance import irradiance_per_flux, lambert_vector, led_corners_mm
+from coupole.calibration.light.irradiance import Emission, irradiance_per_flux, lambert_vector, led_corners_mm
 from coupole.calibration.light.led_power import LedPower, calibrate_led_power, prior_of
 from coupole.calibration.light.led_power_records import covariance_of
 from coupole.calibration.light.spectralon import Tile
@@ -242,3 +242,11 @@ def test_a_tile_that_moved_between_views_is_named() -> None:
     moved = views_of(positions, power, random, tilts_deg=((1.0, 0.3),))[1:]
     with pytest.raises(InputError, match=r"was moved: view p0c[01] sees it tilted by"):
         found_with([*first, *moved], positions)
+
+
+@pytest.mark.parametrize("emission", ["lambertian", "paper"])
+def test_behind_an_led_there_is_no_light(emission: Emission) -> None:
+    led = ((0.0, 0.0, 1000.0), (0.0, 0.0, -1.0))
+    assert irradiance_per_flux((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), *led, emission=emission) > 0.0
+    assert irradiance_per_flux((0.0, 0.0, 1200.0), (0.0, 0.0, -1.0), *led, emission=emission) == 0.0
+    assert irradiance_per_flux((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), *led, emission=emission) == 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from arms import KR10, KR10_R1100_SIXX
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -77,3 +78,10 @@ def test_an_arm_that_should_stand_counts_with_all_its_speed() -> None:
     here, speeds = np.zeros(6), np.array([0.0, 1.0, 0, 0, 0, 0])
     at_rest_mm = deviation_at_rest_mm([here], here, speeds, REACH_MM, 0.4)
     assert np.isclose(at_rest_mm, 0.4 * np.radians(1.0) * REACH_MM[1])
+
+
+@pytest.mark.parametrize(("at_deg", "off_deg"), [(-3.0, 3.0), (4.0, 0.0), (12.0, 2.0)])
+def test_beyond_an_end_of_its_path_the_arm_is_off_by_what_it_went_too_far(at_deg: float, off_deg: float) -> None:
+    way = [np.zeros(6), np.array([10.0, 0, 0, 0, 0, 0])]
+    found_mm = path_deviation_mm(way, np.array([at_deg, 0, 0, 0, 0, 0]), REACH_MM)
+    assert found_mm == pytest.approx(np.radians(off_deg) * REACH_MM[0], abs=1e-9)

@@ -111,6 +111,19 @@ def test_slots_are_free_stored_or_proven(tmp_path: Path) -> None:
     assert states == [frame_file.PROVEN] * 3 + [frame_file.STORED] + [frame_file.FREE] * 2
 
 
+def test_after_a_sync_the_file_says_of_each_frame_what_it_is_though_it_was_never_closed(tmp_path: Path) -> None:
+    """A process that is killed closes nothing."""
+    path = tmp_path / "top.h5"
+    create(path, 3, FORMAT, METADATA)
+    writer = ViewWriter(path, {})
+    slot = writer.put(frame(1), frame_id=1, camera_ns=1, exposure_us=8000)
+    writer.prove(slot, "top/led0007/e0", led=7)
+    writer.sync()
+    record = frame_file.read_frames(path)[slot]
+    assert (record["state"], record["led"], record["shot"]) == (frame_file.PROVEN, 7, b"top/led0007/e0")
+    writer.close()
+
+
 def test_reopening_keeps_proven_slots_and_frees_all_others(tmp_path: Path) -> None:
     path = tmp_path / "top.h5"
     write_view(path, proven=3, stored=2)

@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
 
 from coupole.plan.shot_id import ShotId
+from coupole.storage.inner_path import InnerPath
 from coupole.storage.line_file import utc_now
 
 JOURNAL_VERSION = 2
@@ -100,7 +101,7 @@ class FrameProven(JournalEvent):
 
     event: Literal["frame"] = "frame"
     shot: Shot
-    file: str
+    file: InnerPath
     """The view's file, relative to the run's folder."""
     index: int
     """Its slot in that file."""

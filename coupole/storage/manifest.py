@@ -14,11 +14,12 @@ import re
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from coupole.errors import StorageError
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256, write_synced
+from coupole.storage.inner_path import inner
 
 NAME = "manifest.sha256"
 VIEWS = "views"
@@ -47,9 +48,10 @@ def read(run: Path) -> dict[str, str]:
         digest, _, name = line.partition("  ")
         if not _DIGEST.fullmatch(digest) or not name:
             raise StorageError(f"{path}: line {number} is not a SHA-256, two spaces, and a file")
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\0" in name:
-            raise StorageError(f"{path}: line {number} names a file that is not in the run's folder")
-        found[name] = digest
+        try:
+            found[inner(name)] = digest
+        except ValueError as error:
+            raise StorageError(f"{path}: line {number}: {error}, found {name!r:.200}") from error
     return found
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from datetime import datetime
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from coupole.errors import InputError
 from coupole.plan.shot_id import ShotLabel
+from coupole.storage.inner_path import InnerPath
 
 SCHEMA_VERSION = 1
 RUN_JSON = "run.json"
@@ -24,13 +25,6 @@ def _label(text: str) -> str:
 def _time(text: str) -> str:
     if datetime.fromisoformat(text).tzinfo is None:
         raise ValueError("expected a time with its zone")
-    return text
-
-
-def _below(text: str) -> str:
-    path = PurePosixPath(text)
-    if path.is_absolute() or ".." in path.parts or "\0" in text:
-        raise ValueError("expected a path below the run's folder")
     return text
 
 
@@ -63,7 +57,7 @@ class _Device(_Part):
 class _File(_Part):
     path: str
     sha256: str
-    stored: Annotated[str, AfterValidator(_below)] | None = None
+    stored: InnerPath | None = None
 
 
 class _Description(_Part):

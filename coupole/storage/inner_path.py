@@ -1,0 +1,19 @@
+"""Paths inside a run's folder, as its own files name them: none leads out of it."""
+
+from __future__ import annotations
+
+from pathlib import PurePosixPath
+from typing import Annotated
+
+from pydantic import AfterValidator
+
+
+def inner(text: str) -> str:
+    """The path itself. Raises ValueError if it is absolute, goes up, or is none."""
+    path = PurePosixPath(text)
+    if path.is_absolute() or ".." in path.parts or "\0" in text or not path.parts:
+        raise ValueError("expected a path below the run's folder")
+    return text
+
+
+InnerPath = Annotated[str, AfterValidator(inner)]

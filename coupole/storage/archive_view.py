@@ -155,7 +155,10 @@ def _write(path: Path, partial: Path, frames: list[FrameProven], codec: Codec, p
     ):
         _reserve(on_disk.fileno(), after, path.stat().st_size - layout.frames * layout.frame_bytes)
         shape = (layout.frames, layout.height_px, layout.width_px)
-        data = _copy_all_but_frames(before, after, shape, tile, codec, {frame.index for frame in frames})
+        try:
+            data = _copy_all_but_frames(before, after, shape, tile, codec, {frame.index for frame in frames})
+        except (LookupError, RuntimeError, TypeError, ValueError) as error:  # h5py's; a full disk is an OSError
+            raise StorageError(f"{path}: is damaged: {error}") from error
 
         def compress(frame: FrameProven) -> Tiles:
             with source.frame(frame) as pixels:

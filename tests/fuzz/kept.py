@@ -99,6 +99,17 @@ def read_run(path: Path) -> None:
         assert not told or str(folder) in told, f"names no file: {told}"
 
 
+def archive_view(path: Path) -> None:
+    """`coupole archive` of the run, in a copy that it may change."""
+    from coupole.storage.archive import archive_run
+    from coupole.storage.bitshuffle import codec_of
+    from coupole.storage.run import Run
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = shutil.copytree(path.parent.parent, Path(folder) / "run")
+        archive_run(Run(run), codec_of("lz4"))
+
+
 def read_record_of(path: Path) -> None:
     """As it is, and once more with a seal that fits: what is wrong inside must be found too."""
     from ruamel.yaml import YAML, YAMLError
@@ -130,5 +141,6 @@ KEPT = (
     Target("journal", "runs/b/journal.jsonl", seeds("journal.jsonl"), read_run, run_beside),
     Target("manifest", "runs/c/manifest.sha256", seeds("manifest.sha256"), read_run, run_beside),
     Target("view", "runs/d/views/top.h5", seeds("views/top.h5"), read_run, run_beside),
+    Target("archived-view", "runs/e/views/top.h5", seeds("views/top.h5"), archive_view, run_beside),
     Target("record", "records/case.yaml", records, read_record_of, record_beside),
 )

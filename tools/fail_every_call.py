@@ -11,9 +11,12 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import os
 import random
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -38,9 +41,21 @@ def one(k: int, kind: str) -> dict[str, Any]:
             return {"k": k, "kind": kind, "wrong": [f"{type(error).__name__}: {error}"]}
 
 
+def end_with(parent_pid: int) -> None:
+    """Have this process end soon after the one that started it, also if that is killed."""
+
+    def look() -> None:
+        while os.getppid() == parent_pid:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=look, daemon=True).start()
+
+
 def done(cases: list[tuple[int, str]], jobs: int) -> Iterator[dict[str, Any]]:
     """Cases as they come; each job is a process whose main thread takes the signals."""
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, initializer=end_with, initargs=(os.getpid(),)) as pool:
         yield from (future.result() for future in as_completed([pool.submit(one, *case) for case in cases]))
 
 
@@ -71,12 +86,18 @@ def main() -> int:
 def report(lines: list[dict[str, Any]]) -> int:
     console = Console(soft_wrap=True)
     table = Table(
-        "failure", "cases", "wrong", "dark after, s (median, most)", "still after, s (median, most)", box=None
+        "failure",
+        "cases",
+        "wrong",
+        *(f"{what} after, s (median, most)" for what in ("dark", "stop", "still")),
+        box=None,
     )
     for kind in KINDS:
         mine = [line for line in lines if line["kind"] == kind]
         wrong = sum(bool(line["wrong"]) for line in mine)
-        table.add_row(kind, str(len(mine)), str(wrong), *(_spread(mine, name) for name in ("dark_s", "still_s")))
+        table.add_row(
+            kind, str(len(mine)), str(wrong), *(_spread(mine, name) for name in ("dark_s", "stop_s", "still_s"))
+        )
     console.print(table)
     bad = [line for line in lines if line["wrong"]]
     for line in bad:

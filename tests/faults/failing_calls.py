@@ -46,7 +46,7 @@ CODES = {
     "world": {0, 4},
 }
 """Exit codes; 0 where the call was one whose failure the run bears, or came when all was done."""
-DARK_WITHIN_S, STILL_WITHIN_S = 0.1, 2.5
+DARK_WITHIN_S, STOP_WITHIN_S, STILL_WITHIN_S = 0.1, 0.05, 2.5
 """From the event, on the world's clock, where box and arm still listen. To brake from full speed takes 1.74 s."""
 WATCHDOG_S = 2.0
 QUIET_S = 0.3
@@ -71,6 +71,10 @@ class Failure:
     world_pid: int = 0
     on_event: Callable[[], None] = lambda: None
     calls: list[str] = field(default_factory=list)
+    event_ns: int | None = None
+    """Of the failure, on the rig's clock."""
+    stop_s: float | None = None
+    """From then until the arm's `stop` was first called."""
     _named: bool = False
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -81,8 +85,11 @@ class Failure:
             self._named |= named
             mine = named or len(self.calls) + 1 == self.k
             self.calls.append(called)
+            if called == "robot.stop" and self.event_ns is not None and self.stop_s is None:
+                self.stop_s = (clock.now_ns() - self.event_ns) * 1e-9
         if not mine:
             return
+        self.event_ns = clock.now_ns()
         self.on_event()
         match self.kind:
             case "error":
@@ -156,6 +163,8 @@ class Case:
     code: int = 0
     dark_s: float | None = None
     """From the event until no lamp shone, on the world's clock; None if none shone, or the world died."""
+    stop_s: float | None = None
+    """From the event until the arm was told to stop; None if it was not, or the process died."""
     still_s: float | None = None
     """From the event until the arm stood; None if it did, or the world died."""
     wrong: list[str] = field(default_factory=list)
@@ -186,6 +195,7 @@ def run_case(folder: Path, k: int, kind: str) -> Case:
         else:
             ended = acquire(cell, failure)
             case.call = failure.calls[k - 1] if len(failure.calls) >= k else ""
+            case.stop_s = failure.stop_s
         case.code = ended.code
         reached = kind == "sigkill" or bool(case.call)
         if ended.code not in (CODES[kind] if reached else {0}):
@@ -280,6 +290,9 @@ def _wrong_in_the_cell(case: Case, world: World) -> list[str]:
     limit_s = (DARK_WITHIN_S if listens else WATCHDOG_S * SPEED) + (HANG_S if case.kind == "hang" else 0.0)
     if case.dark_s is not None and case.dark_s > limit_s + 0.1 * SPEED:
         wrong.append(f"dark {case.dark_s:.3f} s after the event, {limit_s:g} s promised")
+    stop_limit_s = STOP_WITHIN_S + (HANG_S if case.kind == "hang" else 0.0)
+    if case.stop_s is not None and case.stop_s > stop_limit_s + 0.1 * SPEED:
+        wrong.append(f"told the arm to stop {case.stop_s:.3f} s after the event, {stop_limit_s:g} s promised")
     if case.still_s is not None and case.still_s > STILL_WITHIN_S + (HANG_S if case.kind == "hang" else 0.0):
         wrong.append(f"the arm stood {case.still_s:.3f} s after the event")
     return wrong

@@ -114,7 +114,7 @@ class Run:
     @property
     def simulated(self) -> bool:
         """True if its frames come from a simulated cell."""
-        return bool(self.about.get("simulated", False))
+        return bool(self.about["simulated"])
 
     @property
     def proof(self) -> str:

@@ -65,7 +65,7 @@ class _Description(_Part):
     software: _Software
     created: Annotated[str, AfterValidator(_time)]
     operator: str
-    simulated: bool = False
+    simulated: bool
     proof: str = ""
     object: str | None = None
     calibrations: str | dict[str, str] = "none"

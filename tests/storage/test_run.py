@@ -31,7 +31,7 @@ def inputs(tmp_path: Path) -> Inputs:
 def finished(tmp_path: Path, inputs: Inputs) -> Run:
     """A run of one view and three shots, all proven."""
     labels = [f"led{k:04d}/e0" for k in range(3)]
-    made = Run.create(tmp_path / "runs", "test", inputs, {"views": ["top"], "labels": labels})
+    made = Run.create(tmp_path / "runs", "test", inputs, {"simulated": True, "views": ["top"], "labels": labels})
     checksums = write_view(made.view_path("top"))
     diary = Journal(made.journal_path)
     diary.write(SessionStarted())

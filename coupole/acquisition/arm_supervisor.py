@@ -5,7 +5,7 @@ Frames are proven only while the arm reports that it is at the posture measured 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -73,8 +73,9 @@ class ArmSupervisor:
         """Raise Interrupted after the operator's stop, DeviceFault if the arm is in a fault."""
         self._watched()
 
-    def go(self, visit: Visit) -> SettledPose:
-        """Follow the leg of a visit; returns the measured pose."""
+    def go(self, visit: Visit, meanwhile: Callable[[], None] = lambda: None) -> SettledPose:
+        """Follow the leg of a visit; returns the measured pose. What `meanwhile`, called every 10 ms, raises is
+        raised at once, while the arm still moves: the caller stops it."""
         self._settled = None
         self._before = None
         path = (self._from_deg, *visit.leg.waypoints)
@@ -86,6 +87,7 @@ class ArmSupervisor:
             self.hurry(move_duration_s(self._arm, here_deg, there_deg) + self._motion.settle_dwell_s)
             while (arm := self._watched()).moving:
                 self._keep_to((here_deg, there_deg), arm, "during its motion")
+                meanwhile()
                 self._clock.sleep(_POLL_S)
         self._from_deg = path[-1]
         return self._settle()

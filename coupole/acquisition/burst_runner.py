@@ -101,6 +101,12 @@ class BurstRunner:
             box = table_box(self._cell.ledbox)
             self._upload = self._uploader.submit(box.load, burst.table)
 
+    def look_at_upload(self) -> None:
+        """Raise what the upload has raised so far."""
+        if self._upload is not None and self._upload.done() and self._upload.exception() is not None:
+            upload, self._upload = self._upload, None
+            upload.result()
+
     def _await_upload(self) -> None:
         """Wait with an eye on the arm until the table is in the box. Raises what the upload raised."""
         while self._upload is not None:

@@ -123,7 +123,7 @@ class Sequencer:
         waypoints_deg = tuple(tuple(np.round(place, 6).tolist()) for place in visit.leg.waypoints)
         self._recorder.note(MoveBegun(view=view.name, joints_deg=waypoints_deg))
         self._burst_runner.prepare(left[0])
-        settled = self._arm.go(visit)
+        settled = self._arm.go(visit, meanwhile=self._burst_runner.look_at_upload)
         frame_format = self._cell.camera.configure(self._burst_runner.exposure(left[0]))
         self._check_format(frame_format)
         frames = sum(len(burst.labels) for burst in all_bursts)

@@ -108,6 +108,14 @@ def test_each_leg_begins_where_the_one_before_it_ended(supervised: Supervise) ->
     assert supervisor.go(aside).arm.joints_deg == tuple(aside.leg.waypoints[0])
 
 
+def test_what_is_looked_at_meanwhile_ends_a_motion_at_once(supervised: Supervise) -> None:
+    arm = Arm()
+    looks = iter([None, None])
+    with pytest.raises(StopIteration):
+        supervised(arm).go(VISIT, meanwhile=lambda: next(looks))
+    assert arm.share < 0.5, "long before it has arrived"
+
+
 @pytest.mark.parametrize("off_mm", [10.5, 14.0, -14.0, 19.0])
 def test_an_arm_more_than_10_mm_beside_its_path_is_stopped(supervised: Supervise, off_mm: float) -> None:
     arm = Arm(lambda share: off_mm if share > 0.5 else 0.0)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from cells import wait_until
 from matching_takes import take, whole_burst
 from scripted_cell import Cell
 
@@ -127,6 +129,23 @@ def test_an_arm_that_moves_finds_the_lights_off_before_anything_else() -> None:
     with pytest.raises(ArmMovedError):
         cell.fire()
     assert cell.done[cell.done.index("started") + 1 :] == ["lights off", "camera disarmed", "BurstEnded"]
+
+
+def test_an_upload_that_has_failed_is_heard_of_at_once_and_one_that_runs_is_not() -> None:
+    """The arm may be in motion meanwhile, and is stopped then."""
+    go_on = threading.Event()
+
+    def fails(table: Any) -> None:
+        go_on.wait(10.0)
+        raise LookupError("a defect in the upload's thread")
+
+    cell = Cell(BURST, take(BURST), on_load=fails)
+    cell.runner.prepare(BURST)
+    cell.runner.look_at_upload()
+    go_on.set()
+    with pytest.raises(LookupError):
+        wait_until(cell.runner.look_at_upload, "its failure")
+    cell.runner.look_at_upload()
 
 
 def test_after_a_push_the_upload_that_lights_off_ended_is_made_anew() -> None:

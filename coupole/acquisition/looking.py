@@ -150,7 +150,8 @@ def _show_live(
             filling.join()
             server.shutdown()
             server.server_close()
-    if failures:
+    if control.stop.is_set():  # what failed then was ended by `halt`
+        if control.signal_number != signal.SIGINT:  # Ctrl-C is how a live view ends
+            raise control.interrupted()
+    elif failures:
         raise failures[0]
-    if control.stop.is_set() and control.signal_number != signal.SIGINT:  # Ctrl-C is how a live view ends
-        raise control.interrupted()

@@ -65,9 +65,11 @@ def obeyed_by(control: Control, act: Callable[[], object]) -> Iterator[None]:
     os.set_blocking(pythons, False)
 
     def obey() -> None:
+        acted = False
         while numbers := os.read(ours, 64):
             for number in numbers:
-                if number in ENDING and not control.stop.is_set():
+                if number in ENDING and not acted:  # whether or not the main thread's handler was first
+                    acted = True
                     control.stop_by(number)
                     act()
 

@@ -50,6 +50,15 @@ def test_a_session_obeys_while_the_main_thread_is_held_by_a_call(number: signal.
     assert stopped.value.exit_code == 128 + number
 
 
+def test_a_session_obeys_though_the_main_threads_handler_was_first() -> None:
+    """Whichever hears of the signal first: the lights go off and the arm stops at once."""
+    control, acted = Control(), threading.Event()
+    with obeyed_by(control, acted.set):
+        control.stop_by(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        assert acted.wait(10.0)
+
+
 def test_the_first_signal_counts() -> None:
     control = Control()
     control.stop_by(signal.SIGTERM)

@@ -14,7 +14,8 @@ from typing import Any
 import cells
 import numpy as np
 import trimesh
-from cells import CellFolder, transform_of
+from cells import CellFolder
+from expected_pictures import transform_of
 from text_cells import BOX, SOME
 
 from coupole.calibration.record import Limit

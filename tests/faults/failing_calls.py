@@ -20,6 +20,7 @@ from unittest import mock
 
 import cells
 from cells import SIDE, TOP, CellFolder, Ended
+from expected_pictures import mislabelled
 from places import REPO
 from real_cells import true_dose_lux_h
 
@@ -340,4 +341,4 @@ def _wrong_after_resuming(cell: CellFolder, run: Path | None, ended: Ended) -> l
         cells.assert_each_shot_proven_once(cell.run_folder)
     except AssertionError as error:
         return [f"after resuming: {str(error)[:500]}"]
-    return [f"mislabelled: {line}" for line in cells.mislabelled(cell, cell.run_folder)]
+    return [f"mislabelled: {line}" for line in mislabelled(cell, cell.run_folder)]

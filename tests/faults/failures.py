@@ -6,6 +6,7 @@ from typing import Any
 
 import cells
 from cells import CellFolder, Ended
+from expected_pictures import mislabelled
 
 MORE_LIGHTS = {"kind": "every", "every": 4}
 """270 LEDs: a burst of 2.8 s."""
@@ -35,4 +36,4 @@ def assert_complete_once_mended(cell: CellFolder) -> None:
         resumed = cell.acquire("--resume", run)
     assert resumed.code == 0, resumed.err
     cells.assert_each_shot_proven_once(run)
-    assert cells.mislabelled(cell, run) == []
+    assert mislabelled(cell, run) == []

@@ -15,6 +15,7 @@ from typing import Any
 import cells
 import pytest
 from cells import SIDE, TOP, CellFolder, Ended
+from expected_pictures import mislabelled
 from failures import MORE_LIGHTS, assert_complete_once_mended, assert_told, fail_in_a_burst
 
 FRAMES = 66
@@ -45,7 +46,7 @@ def _assert_made_good(cell: CellFolder, ended: Ended, reshot: list[int]) -> None
     wanted = {f"top/{labels[edge]}" for edge in reshot if cells.is_light(f"top/{labels[edge]}")}
     assert set(cells.reshot(run)) == wanted
     assert ended.document["reshot"] == len(wanted)
-    assert cells.mislabelled(cell, run) == []
+    assert mislabelled(cell, run) == []
 
 
 def _total(run: Path, counter: str) -> int:
@@ -126,7 +127,7 @@ def test_a_trigger_that_is_lost_again_when_shot_again_is_tried_once_more(joining
     shot = f"top/{cells.labels(run)[30]}"
     assert cells.reshot(run) == [shot, shot]
     cells.assert_each_shot_proven_once(run)
-    assert cells.mislabelled(joining, run) == []
+    assert mislabelled(joining, run) == []
 
 
 def test_a_fault_in_the_second_view_is_made_good_there(joining: CellFolder) -> None:
@@ -136,7 +137,7 @@ def test_a_fault_in_the_second_view_is_made_good_there(joining: CellFolder) -> N
     run = joining.run_folder
     assert cells.reshot(run) == [f"side/{cells.labels(run)[20]}"]
     cells.assert_each_shot_proven_once(run)
-    assert cells.mislabelled(joining, run) == []
+    assert mislabelled(joining, run) == []
 
 
 def test_frame_ids_that_wrap_in_a_burst_are_followed(joining: CellFolder) -> None:
@@ -184,7 +185,7 @@ def test_a_run_with_a_dead_led_is_complete_once_it_is_repaired(joining: CellFold
     with joining.world():
         assert joining.acquire("--resume", joining.run_folder).code == 0
     cells.assert_each_shot_proven_once(joining.run_folder)
-    assert cells.mislabelled(joining, joining.run_folder) == []
+    assert mislabelled(joining, joining.run_folder) == []
 
 
 def test_a_flickering_led_changes_no_label(joining: CellFolder) -> None:
@@ -192,7 +193,7 @@ def test_a_flickering_led_changes_no_label(joining: CellFolder) -> None:
     ended = _acquire_with(joining, {"kind": "flickering_led", "led": 400, "rms": 0.3})
     assert ended.code == 0, ended.err
     cells.assert_each_shot_proven_once(joining.run_folder)
-    assert cells.mislabelled(joining, joining.run_folder) == []
+    assert mislabelled(joining, joining.run_folder) == []
 
 
 def test_an_led_that_was_dead_for_a_while_is_proven_when_it_is_taken_again(joining: CellFolder) -> None:
@@ -200,7 +201,7 @@ def test_an_led_that_was_dead_for_a_while_is_proven_when_it_is_taken_again(joini
     ended = _acquire_with(joining, {"kind": "dead_led", "led": 400, "at_edge": 0, "seconds": 0.6})
     assert ended.code == 0, ended.err
     assert cells.reshot(joining.run_folder) == ["top/led0400/e0"]
-    assert cells.mislabelled(joining, joining.run_folder) == []
+    assert mislabelled(joining, joining.run_folder) == []
 
 
 def test_a_dark_frame_that_stays_unproven_ends_the_run_with_five_and_is_named(joining: CellFolder) -> None:
@@ -329,7 +330,7 @@ def test_a_disk_that_fills_up_in_a_burst_ends_the_run_with_six_and_it_is_resumed
         (small_disk / "ballast").unlink()
         assert cell.acquire("--resume", run).code == 0
     cells.assert_each_shot_proven_once(run)
-    assert cells.mislabelled(cell, run) == []
+    assert mislabelled(cell, run) == []
 
 
 def test_a_disk_with_too_little_room_for_a_views_file_ends_the_run_with_six_before_any_light(

@@ -8,6 +8,7 @@ import cells
 import numpy as np
 import pytest
 from cells import SIDE, TOP, CellFolder
+from expected_pictures import mislabelled
 
 EDGES = 130
 """Of two views' bursts, about."""
@@ -41,7 +42,7 @@ def test_whatever_goes_wrong_labels_are_true_and_the_run_can_be_completed(cell: 
         cells.wait_until(lambda: cells.safe(world), "a safe cell")
     assert ended.code in (0, 4, 5), (faults, ended)
     run = cell.run_folder
-    assert cells.mislabelled(cell, run) == [], faults
+    assert mislabelled(cell, run) == [], faults
     if ended.code != 0:
         assert cells.events(run, "stop")[-1]["outcome"] == "failed", faults
         cell.confirm()
@@ -49,4 +50,4 @@ def test_whatever_goes_wrong_labels_are_true_and_the_run_can_be_completed(cell: 
             ended = cell.acquire("--resume", run)
         assert ended.code == 0, (faults, ended)
     cells.assert_each_shot_proven_once(run)
-    assert cells.mislabelled(cell, run) == [], faults
+    assert mislabelled(cell, run) == [], faults

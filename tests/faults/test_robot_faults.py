@@ -12,6 +12,7 @@ from unittest import mock
 import cells
 import pytest
 from cells import SIDE, TOP, CellFolder
+from expected_pictures import mislabelled
 from failures import MORE_LIGHTS, assert_complete_once_mended, assert_told, fail_in_a_burst
 
 from coupole.errors import DeviceLost
@@ -88,7 +89,7 @@ def test_a_robot_that_fails_in_a_motion_ends_the_run_with_four_and_is_resumed_af
         resumed = joining.acquire("--resume", joining.run_folder)
     assert resumed.code == 0, resumed.err
     cells.assert_each_shot_proven_once(joining.run_folder)
-    assert cells.mislabelled(joining, joining.run_folder) == []
+    assert mislabelled(joining, joining.run_folder) == []
 
 
 def test_a_latched_emergency_stop_is_not_run_over_until_it_is_reset(joining: CellFolder) -> None:
@@ -177,7 +178,7 @@ def test_an_arm_pushed_in_a_burst_that_springs_back_has_just_that_burst_taken_ag
     assert moved["message"].startswith("side")
     assert "side" in {shot.split("/")[0] for shot in cells.reshot(run)}
     cells.assert_each_shot_proven_once(run)
-    assert cells.mislabelled(joining, run) == []
+    assert mislabelled(joining, run) == []
     side = [frame.record for shot, frame in cells.stored(run).items() if shot.startswith("side/")]
     assert max(record["step"] for record in side if record["pose"] == 0) < edge - first_edge
     assert {int(record["pose"]) for record in side} == {0, 1}
@@ -200,7 +201,7 @@ def test_an_arm_that_stays_pushed_is_never_driven_back_unasked(joining: CellFold
         joining.confirm()
         assert joining.acquire("--resume", run).code == 0
     cells.assert_each_shot_proven_once(run)
-    assert cells.mislabelled(joining, run) == []
+    assert mislabelled(joining, run) == []
 
 
 def test_where_the_arm_stood_before_and_after_each_burst_is_in_the_journal(joining: CellFolder) -> None:

@@ -15,6 +15,7 @@ import cells
 import numpy as np
 import pytest
 from cells import CellFolder
+from expected_pictures import mislabelled
 from gige import gige_port, needs_aravis
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
@@ -44,7 +45,7 @@ def cell(tmp_path: Path) -> CellFolder:
 
 def assert_whole(cell: CellFolder) -> None:
     cells.assert_each_shot_proven_once(cell.run_folder)
-    assert cells.mislabelled(cell, cell.run_folder) == []
+    assert mislabelled(cell, cell.run_folder) == []
 
 
 @needs_compiler

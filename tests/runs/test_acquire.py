@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 from cells import SIDE, TOP, CellFolder, Ended
+from expected_pictures import Expectation, mislabelled
 
 TWO_LIGHTS = {"kind": "ids", "ids": [0, 700]}
 
@@ -128,13 +129,13 @@ def test_frames_lie_in_one_contiguous_page_aligned_dataset(clean: Clean) -> None
 
 
 def test_every_label_is_true_of_what_its_frame_shows(clean: Clean) -> None:
-    assert cells.mislabelled(clean.cell, clean.run) == []
+    assert mislabelled(clean.cell, clean.run) == []
 
 
 def test_a_frame_under_a_wrong_label_would_be_found(clean: Clean) -> None:
     """The check above has teeth: shown the neighbour's frame it names the neighbour."""
     frames = cells.stored(clean.run)
-    expected = cells.Expectation(clean.cell, frames["top/led0000/e0"].base_from_camera)
+    expected = Expectation(clean.cell, frames["top/led0000/e0"].base_from_camera)
     assert expected.led_of(frames["top/led0020/e0"].pixels) == 20
 
 
@@ -223,7 +224,7 @@ def test_each_kind_of_plan_is_run_to_completeness(cell: CellFolder, plan: dict[s
     assert (ended.document["shots"], ended.document["proven"]) == (shots, shots)
     cells.assert_each_shot_proven_once(cell.run_folder)
     if "panels" not in plan["lights"]["kind"]:
-        assert cells.mislabelled(cell, cell.run_folder) == []
+        assert mislabelled(cell, cell.run_folder) == []
 
 
 def test_each_exposure_of_a_bracket_is_as_bright_as_it_is_long(cell: CellFolder) -> None:

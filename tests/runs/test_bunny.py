@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 from cells import CellFolder
+from expected_pictures import transform_of
 from numpy.typing import NDArray
 from places import SHARED_DATA
 
@@ -68,7 +69,7 @@ def _seen(cell: CellFolder, run: Path, frame: cells.Stored) -> Seen:
         base_from_support = facts["base_from_support"]
         lens = {key: float(facts[key]) for key in ("focal_length_mm", "focus_distance_mm", "pixel_pitch_um")}
     vertices = np.asarray(trimesh.load(BUNNY, process=False, force="mesh").vertices) * 1000
-    base_from_object = base_from_support @ cells.transform_of(SUPPORT_FROM_OBJECT)
+    base_from_object = base_from_support @ transform_of(SUPPORT_FROM_OBJECT)
     vertices = vertices @ base_from_object[:3, :3].T + base_from_object[:3, 3]
     camera_from_base = np.linalg.inv(frame.base_from_camera)
     x, y, z = camera_from_base[:3, :3] @ vertices.T + camera_from_base[:3, 3:]

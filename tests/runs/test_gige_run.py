@@ -15,6 +15,7 @@ from typing import Any
 import cells
 import pytest
 from cells import CellFolder
+from expected_pictures import mislabelled
 from gige import gige_port, needs_aravis
 from ruamel.yaml import YAML
 
@@ -41,7 +42,7 @@ def assert_proven_and_labelled(cell: CellFolder) -> None:
     """Each shot once; on small frames, that each shows its own light (on large ones that takes minutes)."""
     cells.assert_each_shot_proven_once(cell.run_folder)
     if cell.rig_data["sensor"]["width_px"] <= 128:
-        assert cells.mislabelled(cell, cell.run_folder) == []
+        assert mislabelled(cell, cell.run_folder) == []
 
 
 def camera_counts(run: Path) -> dict[str, int]:

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 from cells import LOW, TOP, CellFolder
+from expected_pictures import mislabelled
 
 from coupole.motion.occlusion import REACHED
 
@@ -60,7 +61,7 @@ def test_hidden_leds_are_left_out_where_the_plan_says_so(hidden: CellFolder) -> 
     assert taken == asked - skipped
     assert ended.document["shots"] == len(taken)
     assert cells.here("verify", run).code == 0
-    assert cells.mislabelled(hidden, run) == []
+    assert mislabelled(hidden, run) == []
 
 
 def test_what_preflight_says_will_be_left_out_is_left_out(hidden: CellFolder) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import cells
 import pytest
 from cells import SIDE, TOP, CellFolder
+from expected_pictures import mislabelled
 from gige import gige_port, needs_aravis
 from ur import needs_ur_rtde
 
@@ -49,7 +50,7 @@ def test_a_plan_runs_through_ethernetkrl(eki: CellFolder) -> None:
     assert ended.code == 0, ended.err
     run = eki.run_folder
     cells.assert_each_shot_proven_once(run)
-    assert cells.mislabelled(eki, run) == []
+    assert mislabelled(eki, run) == []
     (stop,) = cells.events(run, "stop")
     assert stop["robot"]["statuses"] > 0
 
@@ -101,7 +102,7 @@ def test_an_arm_pushed_in_a_burst_has_it_taken_again(eki: CellFolder) -> None:
     assert cells.reshot(run)
     assert [event["kind"] for event in cells.events(run, "fault")] == ["ArmMoved"]
     cells.assert_each_shot_proven_once(run)
-    assert cells.mislabelled(eki, run) == []
+    assert mislabelled(eki, run) == []
 
 
 def test_late_rsi_answers_cannot_happen_without_rsi(eki: CellFolder) -> None:
@@ -159,7 +160,7 @@ def test_a_plan_runs_on_a_ur(tmp_path: Path, model: str, views: list[dict[str, A
     ended = cell.acquire()
     assert ended.code == 0, ended.err
     cells.assert_each_shot_proven_once(cell.run_folder)
-    assert cells.mislabelled(cell, cell.run_folder) == []
+    assert mislabelled(cell, cell.run_folder) == []
     assert cells.about(cell.run_folder)["devices"]["robot"]["model"] == model.upper().removesuffix("E")
 
 

@@ -11,6 +11,7 @@ import pytest
 import tifffile
 from archives import DATA, FORMAT, METADATA, MadeRun, make_run, noisy_frame
 from cells import CellFolder
+from expected_pictures import mislabelled
 
 from coupole.errors import StorageError
 from coupole.storage import frame_file
@@ -31,7 +32,7 @@ def test_a_run_that_packs_its_frames_proves_and_keeps_the_same_pictures(tmp_path
     assert ended.code == 0, ended.err
     assert ended.document["bytes"] == ended.document["frames"] * 128 * 96 * 3 // 2
     cells.assert_each_shot_proven_once(cell.run_folder)
-    assert cells.mislabelled(cell, cell.run_folder) == []
+    assert mislabelled(cell, cell.run_folder) == []
     assert cells.here("verify", cell.run_folder, "--json").code == 0
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import cells
 import pytest
 from cells import SIDE, TOP, CellFolder, Ended, Stored
+from expected_pictures import mislabelled
 
 from coupole.preflight.job import read_job
 from coupole.storage.run import Run
@@ -140,7 +141,7 @@ def test_bytes_that_were_proven_before_a_kill_stay_as_they_were(resumed: Resumed
 def test_labels_stay_true_over_a_kill_and_a_resume(resumed: Resumed) -> None:
     resumed.cell.plan_data["object"]["mesh"] = str(resumed.cell.folder / "relief.ply")
     resumed.cell.rig_data["dome"]["leds"] = str(resumed.cell.folder / "coupole.csv")
-    assert cells.mislabelled(resumed.cell, resumed.run) == []
+    assert mislabelled(resumed.cell, resumed.run) == []
 
 
 def test_a_torn_last_line_of_the_journal_does_not_count(killed: Killed, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 from cells import SIDE, TOP, CellFolder, Ended
+from expected_pictures import mislabelled
 from text_cells import text_cell
 
 PROOF = "one light, one exposure, one frame; host's clock"
@@ -48,7 +49,7 @@ def test_every_frame_is_proven_once(done: tuple[CellFolder, Ended]) -> None:
 
 def test_every_frame_shows_the_light_of_its_led(done: tuple[CellFolder, Ended]) -> None:
     cell, _ = done
-    assert cells.mislabelled(cell, cell.run_folder) == []
+    assert mislabelled(cell, cell.run_folder) == []
 
 
 def test_the_run_says_wherever_it_is_asked_that_its_proof_is_of_the_weaker_kind(
@@ -129,7 +130,7 @@ def test_two_leds_whose_wires_are_swapped_are_seen_in_their_pictures(cell: CellF
     cell.world_settings["dome"] = {"swapped": [[9, 41]]}
     cell.write()
     assert cell.acquire().code == 0
-    wrong = cells.mislabelled(cell, cell.run_folder)
+    wrong = mislabelled(cell, cell.run_folder)
     assert sorted(wrong) == ["top/led0009/e0 shows LED 41", "top/led0041/e0 shows LED 9"]
 
 
@@ -159,7 +160,7 @@ def test_a_frame_that_is_lost_is_taken_again(cell: CellFolder) -> None:
     ended = cell.acquire()
     assert ended.code == 0, ended.err
     assert ended.document["reshot"] >= 1  # more on a busy host
-    assert cells.mislabelled(cell, cell.run_folder) == []
+    assert mislabelled(cell, cell.run_folder) == []
 
 
 def test_without_its_last_mark_a_burst_is_not_proven(tmp_path: Path) -> None:
@@ -245,4 +246,4 @@ def test_a_run_that_was_killed_is_resumed(tmp_path: Path) -> None:
     assert ended.code == 0, ended.err
     assert len(before) == 12
     cells.assert_each_shot_proven_once(run)
-    assert cells.mislabelled(cell, run) == []
+    assert mislabelled(cell, run) == []

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cells
 from cells import SOME_LIGHTS, CellFolder
+from expected_pictures import Expectation
 
 from sim.world.exposure_log import ExposureLog
 from sim.world.lighting import Lighting
@@ -56,7 +57,7 @@ def test_what_the_world_says_was_lit_is_what_the_pictures_show(tmp_path: Path) -
     assert told["next"] == len(lit) == 66
     shown = 0
     frames = cells.stored(cell.run_folder)
-    expectation = cells.Expectation(cell, frames["top/led0400/e0"].base_from_camera)
+    expectation = Expectation(cell, frames["top/led0400/e0"].base_from_camera)
     for shot, frame in frames.items():
         shone = [led for led, _ in lit[int(frame.record["frame_id"]), int(frame.record["camera_ns"])]]
         if cells.is_light(shot):

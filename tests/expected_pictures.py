@@ -68,7 +68,9 @@ class Expectation:
             trimesh.Trimesh(corners.reshape(-1, 3), np.arange(corners.size // 3).reshape(-1, 3), process=False)
         )
         origins = np.broadcast_to(points[seen] + 1e-3 * normals[seen], to_led.shape)
-        lit[rays.intersects_any(origins.reshape(-1, 3), to_led.reshape(-1, 3)).reshape(lit.shape)] = 0.0
+        facing = np.flatnonzero(lit)
+        hidden = rays.intersects_any(origins.reshape(-1, 3)[facing], to_led.reshape(-1, 3)[facing])
+        lit.flat[facing[hidden]] = 0.0
         axis = base_from_camera[:3, 2]
         from_lens = points[seen] - base_from_camera[:3, 3]
         cos_lens = from_lens @ axis / np.linalg.norm(from_lens, axis=1)

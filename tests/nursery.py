@@ -77,6 +77,8 @@ def serve(line: socket.socket) -> None:
     """Fork a world for each message, until the line is closed."""
     from sim.world import world
 
+    importlib.import_module("trimesh")  # a third of a second, which a world with an object's mesh takes later
+
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them here
     lessons, learnt = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     while True:

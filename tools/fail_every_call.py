@@ -30,6 +30,9 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "faults")]
 
 from failing_calls import KINDS, count_calls, run_case  # noqa: E402
+from nursery import Nursery  # noqa: E402
+
+from sim.world import client  # noqa: E402
 
 
 def one(k: int, kind: str) -> dict[str, Any]:
@@ -41,8 +44,9 @@ def one(k: int, kind: str) -> dict[str, Any]:
             return {"k": k, "kind": kind, "wrong": [f"{type(error).__name__}: {error}"]}
 
 
-def end_with(parent_pid: int) -> None:
-    """Have this process end soon after the one that started it, also if that is killed."""
+def begin_job(parent_pid: int) -> None:
+    """Have this process fork its worlds, and end soon after the one that started it, also if that is killed."""
+    client._launch = Nursery().start  # type: ignore[assignment] # as the tests do
 
     def look() -> None:
         while os.getppid() == parent_pid:
@@ -55,7 +59,7 @@ def end_with(parent_pid: int) -> None:
 def done(cases: list[tuple[int, str]], jobs: int) -> Iterator[dict[str, Any]]:
     """Cases as they come; each job is a process whose main thread takes the signals."""
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, initializer=end_with, initargs=(os.getpid(),)) as pool:
+    with ProcessPoolExecutor(jobs, context, initializer=begin_job, initargs=(os.getpid(),)) as pool:
         yield from (future.result() for future in as_completed([pool.submit(one, *case) for case in cases]))
 
 

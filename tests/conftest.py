@@ -35,9 +35,28 @@ COMPILES_LONGEST = "tests/calibration/test_corner_fit.py"
 them."""
 
 
+WAITING = ("tests/runs/", "tests/faults/", "tests/conformance/")
+"""Most of the time tests in these folders wait for the clocks of worlds; those in all others compute."""
+
+
+def spread(items: list[pytest.Item]) -> list[pytest.Item]:
+    """The tests with modules that wait among modules that compute, in equal shares from begin to end: workers that
+    all wait at one time leave the machine idle."""
+    modules: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        modules.setdefault(item.nodeid.partition("::")[0], []).append(item)
+    waiting = sorted(
+        (name for name in modules if name.startswith(WAITING)),
+        key=lambda name: [name.startswith(folder) for folder in WAITING].index(True),
+    )
+    computing = [name for name in modules if name not in waiting]
+    place = {name: index / len(kind) for kind in (waiting, computing) for index, name in enumerate(kind)}
+    return [item for name in sorted(modules, key=place.__getitem__) for item in modules[name]]
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Order the tests, and leave out what is for `--full` alone."""
-    items.sort(key=lambda item: not item.nodeid.startswith(COMPILES_LONGEST))
+    items[:] = sorted(spread(items), key=lambda item: not item.nodeid.startswith(COMPILES_LONGEST))
     if config.getoption("--full"):
         return
     left_out = [item for item in items if item.get_closest_marker("full")]

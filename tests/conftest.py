@@ -40,17 +40,15 @@ WAITING = ("tests/runs/", "tests/faults/", "tests/conformance/")
 
 
 def spread(items: list[pytest.Item]) -> list[pytest.Item]:
-    """The tests with modules that wait among modules that compute, in equal shares from begin to end: workers that
-    all wait at one time leave the machine idle."""
+    """The tests with the modules of each folder that waits, and of all that compute, in equal shares from begin to
+    end: workers that all wait at one time leave the machine idle."""
     modules: dict[str, list[pytest.Item]] = {}
     for item in items:
         modules.setdefault(item.nodeid.partition("::")[0], []).append(item)
-    waiting = sorted(
-        (name for name in modules if name.startswith(WAITING)),
-        key=lambda name: [name.startswith(folder) for folder in WAITING].index(True),
-    )
-    computing = [name for name in modules if name not in waiting]
-    place = {name: index / len(kind) for kind in (waiting, computing) for index, name in enumerate(kind)}
+    kinds: dict[str, list[str]] = {}
+    for name in modules:
+        kinds.setdefault(next((folder for folder in WAITING if name.startswith(folder)), ""), []).append(name)
+    place = {name: index / len(kind) for kind in kinds.values() for index, name in enumerate(kind)}
     return [item for name in sorted(modules, key=place.__getitem__) for item in modules[name]]
 
 

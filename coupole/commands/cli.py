@@ -13,6 +13,7 @@ from coupole.commands import keeping, planning, running
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
 from coupole.commands.dose_ledger import dose
+from coupole.commands.reflectance import reflectance_app
 from coupole.commands.render_scene import render
 from coupole.commands.uncertainty import budget
 from coupole.errors import CoupoleError, InputError, Interrupted
@@ -50,6 +51,7 @@ for command in (
 plan_app.command("new")(planning.plan_new)
 app.add_typer(plan_app, name="plan")
 app.add_typer(calibrate_app, name="calibrate")
+app.add_typer(reflectance_app, name="reflectance")
 
 
 def main() -> None:

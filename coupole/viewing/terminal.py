@@ -6,13 +6,21 @@ import contextlib
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TextIO
 
 from rich.console import Console
 from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -52,6 +60,26 @@ class _Terminal:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
+
+
+@contextmanager
+def step_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
+    """Bars, one for each step of a job, with the time left; call what this gives with a step, how much of it is
+    done, and of how much. A step is over when the next one begins."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def say(step: str, done: int, of: int) -> None:
+            if step not in tasks:
+                for task in bars.tasks:
+                    bars.update(task.id, completed=task.total)
+                tasks[step] = bars.add_task(step)
+            bars.update(tasks[step], completed=done, total=of)
+
+        yield say
+        for task in bars.tasks:
+            bars.update(task.id, completed=task.total)
 
 
 def alarm(message: str) -> None:

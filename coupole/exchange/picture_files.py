@@ -1,0 +1,41 @@
+"""Linear pictures as files: NumPy, OpenEXR, PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from coupole.errors import InputError, StorageError
+
+SUFFIXES = (".npy", ".exr", ".png")
+_PNG_WHITE = 65535
+
+
+def refuse_unknown(path: Path) -> None:
+    """Raise InputError if there is no writer for such a file."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
+
+
+def write_picture(path: Path, picture: NDArray[np.float32]) -> None:
+    """Write [h, w, 3] red, green, blue. PNG has 16 bit, linear, and holds 0 to 1 alone; the others hold all of it.
+
+    Raises InputError for another kind of file, StorageError if it cannot be written.
+    """
+    refuse_unknown(path)
+    try:
+        match path.suffix.lower():
+            case ".npy":
+                np.save(path, picture)
+            case ".exr":
+                header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+                OpenEXR.File(header, {"RGB": np.ascontiguousarray(picture)}).write(str(path))
+            case _:
+                scaled = np.rint(np.clip(picture, 0.0, 1.0) * _PNG_WHITE).astype(np.uint16)
+                path.write_bytes(cv2.imencode(".png", scaled[..., ::-1])[1].tobytes())
+    except (OSError, RuntimeError) as error:
+        raise StorageError(f"{path}: {error}") from error

@@ -1,0 +1,244 @@
+"""What interpolation between lights gets wrong, learnt from the lights themselves.
+
+Shadows and highlights move as the light moves; a weighted sum of pictures fades one into the next instead. How the
+truth differs from the sum is seen wherever a light is left out: a small network is trained on those differences,
+with what the kernels say, what the nearest pictures show at the pixel and round it. Each light is left out
+together with its nearest neighbour: a new light is farther from the measured ones than they are from each other.
+
+The network sees values as shares of the pixel's mean, so its answer does not depend on exposure or albedo. What it
+adds never leaves the range of the kernels' values and the nearest pictures'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance import light_interpolation
+from coupole.reflectance.light_interpolation import KERNELS, left_without, nearest
+
+Floats = NDArray[np.float32]
+
+NEAR = 6
+"""Pictures of the nearest lights that are looked at."""
+AROUND = 4
+"""Of these so many are also looked at in the pixel's surroundings."""
+SURROUNDINGS_PX = (3, 7, 5)
+"""Widths of squares: two round the sum, one round the near pictures."""
+MARGIN_PX = 3
+LEFT_OUT_WITH = 1
+HIDDEN = (48, 48)
+_LEAK = 0.05
+_BATCH = 4096
+MOST_SAMPLES = 4_000_000
+"""That are kept for training."""
+_STEPS = 2500
+_RATE = 3e-3
+_CLIPPED = 1.0
+"""Differences beyond this many times what is common pull no harder."""
+_DISTANCE_SCALE = 5.0
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Values of a picture's rows under some lights."""
+
+    mask: NDArray[np.bool_]
+    """[rows, w]"""
+    values: Floats
+    """[lights, pixels, 3] of the mask's pixels in the order of rows."""
+    level: Floats
+    """[pixels] by which values are divided: their mean, never 0."""
+
+
+def strip_of(mask: NDArray[np.bool_], values: Floats, least_level: float) -> Strip:
+    return Strip(mask, values, values.mean(axis=(0, 2)) + np.float32(least_level))
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the network is told of one light at the pixels of a strip, and between what its answer must stay."""
+
+    summed: Floats
+    """[pixels, 3] by the first kernel, as shares of the level."""
+    features: Floats
+    """[pixels * 3, features]"""
+    low: Floats
+    high: Floats
+
+
+def look(
+    strip: Strip, directions: NDArray[np.float64], direction: NDArray[np.float64], kernels: Sequence[str]
+) -> Sight:
+    """Of a new light from the strip's values under lights from `directions`; the sum is by the first kernel."""
+    weights = np.concatenate(
+        [light_interpolation.weights(directions, direction[None], kernel) for kernel in kernels]
+    )
+    count = len(strip.level)
+    flat = strip.values.reshape(len(directions), -1)
+    sums = (weights.astype(np.float32) @ flat).reshape(len(kernels), count, 3) / strip.level[:, None]
+    summed: Floats = sums[0]
+    near = nearest(directions, direction, NEAR)
+    shown = strip.values[near] / strip.level[:, None]
+    least, most = shown.min(axis=0), shown.max(axis=0)
+    parts = [summed, *(other - summed for other in sums[1:]), *(one - summed for one in shown)]
+    parts += [least - summed, most - summed, np.broadcast_to(summed.mean(axis=1, keepdims=True), summed.shape)]
+    parts += [_mean_around(strip.mask, summed, width) - summed for width in SURROUNDINGS_PX[:2]]
+    for place in near[:AROUND]:
+        one = strip.values[place] / strip.level[:, None]
+        parts.append(_mean_around(strip.mask, one, SURROUNDINGS_PX[2]) - one)
+        distance = np.float32(_DISTANCE_SCALE * np.linalg.norm(directions[place] - direction))
+        parts.append(np.broadcast_to(distance, summed.shape))
+    features = np.stack(parts, axis=-1).astype(np.float32).reshape(count * 3, -1)
+    return Sight(summed, features, np.minimum(least, sums.min(axis=0)), np.maximum(most, sums.max(axis=0)))
+
+
+def _mean_around(mask: NDArray[np.bool_], values: Floats, width_px: int) -> Floats:
+    """[pixels, 3] means over squares, of what the mask holds."""
+    picture = np.zeros((*mask.shape, values.shape[-1]), np.float32)
+    picture[mask] = values
+    share = cv2.blur(mask.astype(np.float32), (width_px, width_px))[mask]
+    sums = cv2.blur(picture, (width_px, width_px))[mask]
+    return np.asarray(sums / np.maximum(share, 1e-6)[:, None], dtype=np.float32)
+
+
+class Network:
+    """A perceptron with leaky ramps; `layers` are pairs of a matrix and an offset, the first one scaled so that
+    features need no scaling of their own."""
+
+    def __init__(self, layers: Sequence[tuple[Floats, Floats]]) -> None:
+        self.layers = tuple(layers)
+
+    def __call__(self, features: Floats) -> Floats:
+        """[n] from features [n, m]."""
+        return self.forward(features)[-1][:, 0]
+
+    def forward(self, features: Floats) -> list[Floats]:
+        """The outputs of all layers, the features first."""
+        outputs = [features]
+        for number, (matrix, offset) in enumerate(self.layers):
+            output = outputs[-1] @ matrix + offset
+            last = number == len(self.layers) - 1
+            outputs.append(output if last else np.maximum(output, np.float32(_LEAK) * output))
+        return outputs
+
+    def gradients(self, outputs: list[Floats], slope: Floats) -> list[tuple[Floats, Floats]]:
+        """Of a cost whose derivative by the last output [n, 1] is `slope`, by matrices and offsets."""
+        found = []
+        for number in range(len(self.layers) - 1, -1, -1):
+            found.append((outputs[number].T @ slope, slope.sum(axis=0)))
+            if number:
+                ramp = np.where(outputs[number] > 0, np.float32(1.0), np.float32(_LEAK))
+                slope = (slope @ self.layers[number][0].T) * ramp
+        return found[::-1]
+
+
+def begun(features: int, generator: np.random.Generator) -> Network:
+    """A network whose answer is about 0 (He et al. 2015 for the spread of its first weights)."""
+    sizes = (features, *HIDDEN, 1)
+    layers = []
+    for number, (rows, columns) in enumerate(pairwise(sizes)):
+        spread = np.sqrt(2.0 / rows) * (0.01 if number == len(HIDDEN) else 1.0)
+        layers.append(
+            (generator.normal(0.0, spread, (rows, columns)).astype(np.float32), np.zeros(columns, np.float32))
+        )
+    return Network(layers)
+
+
+class _Adam:
+    """Steps of Kingma and Ba (2015)."""
+
+    def __init__(self, network: Network) -> None:
+        self._parts = [part for layer in network.layers for part in layer]
+        self._mean = [np.zeros_like(part) for part in self._parts]
+        self._square = [np.zeros_like(part) for part in self._parts]
+        self._count = 0
+
+    def step(self, gradients: list[tuple[Floats, Floats]], rate: float) -> None:
+        self._count += 1
+        flat = [part for layer in gradients for part in layer]
+        for part, mean, square, slope in zip(self._parts, self._mean, self._square, flat, strict=True):
+            mean[...] += np.float32(0.1) * (slope - mean)
+            square[...] += np.float32(0.001) * (slope * slope - square)
+            size = np.sqrt(square / (1.0 - 0.999**self._count)) + 1e-8
+            part[...] -= (rate / (1.0 - 0.9**self._count) * mean / size).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """A strip without one light, and what that light showed."""
+
+    features: Floats
+    wanted: Floats
+    """[n] what must be added to the sum, as shares of the level."""
+    importance: Floats
+    """[n] square of the level."""
+
+
+def lessons(
+    strip: Strip,
+    directions: NDArray[np.float64],
+    lights: Sequence[int],
+    kernels: Sequence[str],
+    *,
+    share: float,
+    generator: np.random.Generator,
+) -> Iterator[Lesson]:
+    """Of each of these lights, with a share of the pixels drawn at random."""
+    for light in lights:
+        left = left_without(directions, light, LEFT_OUT_WITH)
+        sight = look(
+            Strip(strip.mask, strip.values[left], strip.level), directions[left], directions[light], kernels
+        )
+        wanted = (strip.values[light] / strip.level[:, None] - sight.summed).ravel()
+        drawn = np.flatnonzero(generator.random(len(wanted)) < share)
+        yield Lesson(sight.features[drawn], wanted[drawn], np.repeat(strip.level**2, 3)[drawn])
+
+
+def train(
+    given: Sequence[Lesson], *, seed: int = 0, say: Callable[[int, int], None] = lambda done, of: None
+) -> Network:
+    """A network from lessons of all lights. Every light counts alike, however hard it is."""
+    features = np.concatenate([lesson.features for lesson in given])
+    wanted = np.concatenate([lesson.wanted for lesson in given])
+    errors = [float(np.mean(lesson.importance * lesson.wanted**2)) for lesson in given]
+    common = float(np.median(errors)) + 1e-20
+    roots = np.concatenate(
+        [np.sqrt(lesson.importance / (error + common)) for lesson, error in zip(given, errors, strict=True)]
+    ).astype(np.float32)
+    roots /= np.sqrt(np.mean(roots**2))
+    np.minimum(roots, np.float32(np.sqrt(20.0)), out=roots)
+    middle, spread = features.mean(axis=0), features.std(axis=0) + np.float32(1e-6)
+    generator = np.random.default_rng(seed)
+    network = begun(features.shape[1], generator)
+    adam = _Adam(network)
+    for number in range(_STEPS):
+        drawn = generator.integers(0, len(wanted), _BATCH)
+        outputs = network.forward((features[drawn] - middle) / spread)
+        root = roots[drawn][:, None]
+        off = np.clip(root * (outputs[-1] - wanted[drawn][:, None]), -_CLIPPED, _CLIPPED)
+        rate = 0.5 * _RATE * (1.0 + np.cos(np.pi * number / _STEPS))
+        adam.step(network.gradients(outputs, 2.0 / _BATCH * root * off), rate)
+        if number % 50 == 0:
+            say(number, _STEPS)
+    first, offset = network.layers[0]
+    scaled = (first / spread[:, None], offset - (middle / spread) @ first)
+    return Network([scaled, *network.layers[1:]])
+
+
+def corrected(strip: Strip, sight: Sight, network: Network | None) -> Floats:
+    """[pixels, 3] values of the light that was looked for, not below 0; the sum alone without a network."""
+    values: Floats = sight.summed
+    if network is not None:
+        values = np.clip(values + network(sight.features).reshape(values.shape), sight.low, sight.high)
+    return np.maximum(values, 0.0) * strip.level[:, None]
+
+
+def all_kernels(first: str) -> tuple[str, ...]:
+    """The kernel of the sum, then the others."""
+    return (first, *(kernel for kernel in KERNELS if kernel != first))

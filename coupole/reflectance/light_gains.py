@@ -1,0 +1,70 @@
+"""How bright each picture is beside what all together say: wrong intensities, other exposures, faulty files.
+
+A picture's gain is the median over pixels of its value over that of the fitted materials; the fit is robust, so a
+few faulty pictures of many do not move it.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.ggx import lobe
+from coupole.reflectance.normal_fit import PointMaterials
+
+Floats = NDArray[np.float64]
+
+SUSPECT = 0.05
+"""A gain that differs from 1 by more than this is told."""
+_LIT = 0.2
+"""Least cosine of the light at pixels that count."""
+_NEIGHBOURS = 3
+
+
+def gains(
+    grey: NDArray[np.float64], materials: PointMaterials, lights: NDArray[np.float64], view: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[lights] of values [pixels, lights] under unit vectors [lights, 3]."""
+    chosen = np.flatnonzero(np.isfinite(materials.kd))
+    half = lights + view
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    modelled = modelled_values(
+        materials.normals[chosen],
+        materials.kd[chosen],
+        materials.ks[chosen],
+        materials.alpha[chosen],
+        lights,
+        half,
+        view,
+    )
+    lit = materials.normals[chosen] @ lights.T > _LIT
+    ratio = np.where(lit, grey[chosen] / np.maximum(modelled, 1e-12), np.nan)
+    found = np.ones(len(lights))
+    enough = np.count_nonzero(lit, axis=0) > 0
+    found[enough] = np.nanmedian(ratio[:, enough], axis=0)
+    return found
+
+
+def gain_between(
+    measured: NDArray[np.float64], found: NDArray[np.float64], direction: NDArray[np.float64]
+) -> float:
+    """The gain that a picture from another direction would have had: the median of the nearest ones', so that one
+    faulty picture among good ones does not count."""
+    near = np.argsort(np.linalg.norm(measured - direction, axis=1), kind="stable")[:_NEIGHBOURS]
+    return float(np.median(found[near]))
+
+
+@numba.njit(cache=True, nogil=True)
+def modelled_values(normals, kd, ks, alpha, lights, half, view):  # type: ignore[no-untyped-def]
+    """[pixels, lights] values that materials give under lights; 0 where a light or the view is behind."""
+    values = np.zeros((len(normals), len(lights)))
+    for pixel in range(len(normals)):
+        n0, n1, n2 = normals[pixel]
+        nv = n0 * view[0] + n1 * view[1] + n2 * view[2]
+        for light in range(len(lights)):
+            nl = n0 * lights[light, 0] + n1 * lights[light, 1] + n2 * lights[light, 2]
+            if nl > 0.0 and nv > 0.0:
+                nh = n0 * half[light, 0] + n1 * half[light, 1] + n2 * half[light, 2]
+                values[pixel, light] = nl * (kd[pixel] + ks[pixel] * lobe(nl, nv, nh, alpha[pixel])[0])
+    return values

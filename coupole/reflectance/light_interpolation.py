@@ -1,0 +1,62 @@
+"""What a point looks like under a light between measured ones: a weighted sum of the measured values.
+
+Radial basis functions of the lights' directions with a linear tail (seed 003, 5.2): the weights of the measured
+lights depend on directions alone, so one solution serves all pixels. Which kernel is best depends on the object
+and is found by leaving lights out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+KERNELS = ("linear", "thin plate", "power 1.5", "cubic", "root")
+"""phi(r) of the distance r between unit vectors: -r, r2 log r, -r^1.5, r3, -sqrt(r)."""
+TAIL = 4
+"""Unknowns of the linear tail."""
+
+
+def _phi(r: Floats, kernel: str) -> Floats:
+    match kernel:
+        case "linear":
+            return -r
+        case "thin plate":
+            return r * r * np.log(np.maximum(r, 1e-300))
+        case "power 1.5":
+            return -(r**1.5)
+        case "cubic":
+            return r**3
+        case "root":
+            return -np.sqrt(r)
+    raise ValueError(kernel)
+
+
+def weights(measured: Floats, wanted: Floats, kernel: str) -> Floats:
+    """[wanted, measured] weights of values under lights from `measured` [n, 3] for lights from `wanted` [m, 3]."""
+    count = len(measured)
+    tail: Floats = np.hstack([np.ones((count, 1)), measured])
+    system = np.zeros((count + TAIL, count + TAIL))
+    system[:count, :count] = _phi(_distances(measured, measured), kernel)
+    system[:count, count:], system[count:, :count] = tail, tail.T
+    right: Floats = np.hstack([_phi(_distances(wanted, measured), kernel), np.ones((len(wanted), 1)), wanted])
+    # lights in one plane leave part of the tail open: the least solution is taken
+    solution = np.linalg.lstsq(system.T, right.T, rcond=1e-12)[0]
+    return np.asarray(solution.T[:, :count], dtype=np.float64)
+
+
+def _distances(a: Floats, b: Floats) -> Floats:
+    distances: Floats = np.linalg.norm(a[:, None] - b[None], axis=2)
+    return distances
+
+
+def nearest(measured: Floats, direction: Floats, count: int) -> NDArray[np.int64]:
+    """Indices of the measured lights nearest to a direction, the nearest first."""
+    return np.argsort(np.linalg.norm(measured - direction, axis=1), kind="stable")[:count]
+
+
+def left_without(measured: Floats, number: int, neighbours: int) -> NDArray[np.int64]:
+    """Indices of the lights that are left when one goes with so many of its nearest neighbours."""
+    gone = nearest(measured, measured[number], neighbours + 1)
+    return np.setdiff1d(np.arange(len(measured)), np.append(gone, number))

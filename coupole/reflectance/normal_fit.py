@@ -1,0 +1,324 @@
+"""Normals from pictures under known lights: by least squares over the middle ranks, then with a GGX material.
+
+The first is robust against shadows and highlights (Woodham 1980, with the darkest fifth and the brightest fifth of
+a pixel's samples left out). The second fits normal, kd, ks and alpha together by Levenberg-Marquardt to the square
+roots of the values, which have about equal noise, with Cauchy weights: what neither shadow nor interreflection nor
+this material explains pulls little.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.ggx import lobe
+
+Floats = NDArray[np.float64]
+
+RANKS = (0.2, 0.8)
+_STARTS = (0.08, 0.2, 0.45)
+"""Of alpha; the best end is kept."""
+_FIRST_KS = 0.02
+"""Of kd."""
+_LEAST_SHARE, _OF_QUANTILE = 0.05, 0.9
+"""Samples below this share of a pixel's quantile are in shadow."""
+_CAUCHY = 0.05
+"""Scale of the weights, as a share of sqrt(kd)."""
+_MOST_STEPS = 40
+_SETTLED = 1e-5
+_LEAST_ALPHA, _MOST_ALPHA = 0.02, 1.0
+_UNKNOWNS = 5
+_FEWEST = 6
+"""Samples that a pixel needs."""
+_BLOCK = 2000
+
+
+@dataclass(frozen=True)
+class PointMaterials:
+    """Of n pixels; NaN where there were too few samples."""
+
+    normals: Floats
+    """[n, 3] unit."""
+    kd: Floats
+    ks: Floats
+    alpha: Floats
+    residual: Floats
+    """Weighted rms of the square roots, as a share of sqrt(kd)."""
+
+    def at(self, pixels: slice) -> PointMaterials:
+        """Of some of the pixels."""
+        return PointMaterials(*(getattr(self, field.name)[pixels] for field in fields(self)))
+
+
+def rank_normals(values: Floats, lights: Floats, ranks: tuple[float, float] = RANKS) -> tuple[Floats, Floats]:
+    """Unit normals [n, 3] and albedos [n] of values [n, lights] under lights [lights, 3] (unit vectors), by least
+    squares over the samples of the middle ranks of each pixel."""
+    count = values.shape[1]
+    first, last = round(ranks[0] * count), max(round(ranks[1] * count), round(ranks[0] * count) + 3)
+    order = np.argsort(values, axis=1)[:, first:last]
+    chosen = lights[order]
+    normal = np.einsum("nki,nkj->nij", chosen, chosen) + 1e-9 * np.eye(3)
+    right = np.einsum("nki,nk->ni", chosen, np.take_along_axis(values, order, axis=1))
+    found = np.linalg.solve(normal, right[..., None])[..., 0]
+    length = np.linalg.norm(found, axis=1)
+    return found / np.maximum(length, 1e-300)[:, None], length
+
+
+def fit_materials(values: Floats, lights: Floats, view: Floats, *, threads: int | None = None) -> PointMaterials:
+    """Normal and material of each pixel from values [n, lights] under lights [lights, 3]; `view` [3] points to the
+    camera. All are unit vectors."""
+    normals, albedo = rank_normals(values, lights)
+    half = lights + view
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    found = np.full((len(values), 7), np.nan)
+    scaled = np.ascontiguousarray(values, dtype=np.float64)
+
+    def fit(begin: int) -> None:
+        part = slice(begin, begin + _BLOCK)
+        _fit_all(scaled[part], lights, half, view, normals[part], albedo[part], found[part])
+
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(fit, range(0, len(values), _BLOCK)))
+    return PointMaterials(found[:, :3], found[:, 3], found[:, 4], found[:, 5], found[:, 6])
+
+
+def colours(values: Floats, materials: PointMaterials, lights: Floats, view: Floats) -> tuple[Floats, Floats]:
+    """kd and ks [n, 3] of values [n, lights, 3], normals and alpha as they are: least squares, not below 0."""
+    half = lights + view
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    kd, ks = np.full((len(values), 3), np.nan), np.full((len(values), 3), np.nan)
+    _fit_colours(
+        values, materials.normals, materials.kd, materials.ks, materials.alpha, lights, half, view, kd, ks
+    )
+    return kd, ks
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_colours(values, normals, grey_kd, grey_ks, alphas, lights, half, view, kd, ks):  # type: ignore[no-untyped-def]
+    """Samples are weighted as the last step of the grey fit weighted them."""
+    for pixel in range(len(values)):
+        if not grey_kd[pixel] > 0.0:
+            continue
+        n0, n1, n2 = normals[pixel]
+        nv = n0 * view[0] + n1 * view[1] + n2 * view[2]
+        scale = _CAUCHY * math.sqrt(grey_kd[pixel])
+        sums = np.zeros((3, 2))
+        dd, ds, ss = 0.0, 0.0, 0.0
+        for light in range(len(lights)):
+            nl = n0 * lights[light, 0] + n1 * lights[light, 1] + n2 * lights[light, 2]
+            if nl <= 0.0:
+                continue
+            nh = n0 * half[light, 0] + n1 * half[light, 1] + n2 * half[light, 2]
+            shine = nl * lobe(nl, nv, nh, alphas[pixel])[0]
+            model = nl * grey_kd[pixel] + shine * grey_ks[pixel]
+            grey = max(0.0, (values[pixel, light, 0] + values[pixel, light, 1] + values[pixel, light, 2]) / 3.0)
+            off = (math.sqrt(model) - math.sqrt(grey)) / scale
+            weight = 1.0 / ((1.0 + off * off) * max(model, 1e-12))
+            dd += weight * nl * nl
+            ds += weight * nl * shine
+            ss += weight * shine * shine
+            for colour in range(3):
+                sums[colour, 0] += weight * nl * values[pixel, light, colour]
+                sums[colour, 1] += weight * shine * values[pixel, light, colour]
+        for colour in range(3):
+            determinant = dd * ss - ds * ds
+            diffuse, specular = sums[colour, 0] / max(dd, 1e-30), 0.0
+            if determinant > 1e-9 * dd * ss:
+                both_d = (sums[colour, 0] * ss - sums[colour, 1] * ds) / determinant
+                both_s = (sums[colour, 1] * dd - sums[colour, 0] * ds) / determinant
+                if both_s > 0.0:
+                    diffuse, specular = both_d, both_s
+                if both_d < 0.0:
+                    diffuse, specular = 0.0, sums[colour, 1] / ss
+            kd[pixel, colour], ks[pixel, colour] = max(diffuse, 0.0), max(specular, 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_all(values, lights, half, view, normals, albedo, found):  # type: ignore[no-untyped-def]
+    for pixel in range(len(values)):
+        sample = values[pixel]
+        least = _LEAST_SHARE * np.quantile(sample, _OF_QUANTILE)
+        used = np.flatnonzero(sample > max(least, 0.0))
+        if len(used) < _FEWEST or albedo[pixel] <= 0.0:
+            continue
+        roots = np.sqrt(sample[used])
+        best = np.inf
+        for alpha in _STARTS:
+            unknowns = np.empty(6)
+            unknowns[:3] = normals[pixel]
+            unknowns[3], unknowns[4], unknowns[5] = (
+                math.log(albedo[pixel]),
+                math.log(0.02 * albedo[pixel]),
+                math.log(alpha),
+            )
+            if unknowns[0] * view[0] + unknowns[1] * view[1] + unknowns[2] * view[2] < 0.05:
+                unknowns[:3] = view
+            cost, spread = _fit(roots, used, lights, half, view, unknowns)
+            if cost < best:
+                best = cost
+                found[pixel, :3] = unknowns[:3]
+                found[pixel, 3], found[pixel, 4] = math.exp(unknowns[3]), math.exp(unknowns[4])
+                found[pixel, 5], found[pixel, 6] = math.exp(unknowns[5]), spread
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit(roots, used, lights, half, view, unknowns):  # type: ignore[no-untyped-def]
+    """Levenberg-Marquardt from `unknowns` (normal, log kd, log ks, log alpha), in place; cost and weighted rms."""
+    scale = _CAUCHY * math.exp(0.5 * unknowns[3])
+    matrix, right = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
+    trial = np.empty(6)
+    cost, spread = _equations(roots, used, lights, half, view, unknowns, scale, matrix, right)
+    damping = 1e-2
+    for _ in range(_MOST_STEPS):
+        step = _solve(matrix, right, damping)
+        _move(unknowns, step, trial)
+        if trial[0] * view[0] + trial[1] * view[1] + trial[2] * view[2] > 0.02:
+            moved, moved_spread = _cost(roots, used, lights, half, view, trial, scale)
+        else:
+            moved, moved_spread = np.inf, 0.0
+        if moved < cost:
+            gain = cost - moved
+            unknowns[:] = trial
+            damping = max(damping * 0.2, 1e-9)
+            if gain < _SETTLED * cost:
+                cost, spread = moved, moved_spread
+                break
+            cost, spread = _equations(roots, used, lights, half, view, unknowns, scale, matrix, right)
+        else:
+            damping *= 6.0
+            if damping > 1e8:
+                break
+    return cost, spread / math.exp(0.5 * unknowns[3])
+
+
+@numba.njit(cache=True, nogil=True)
+def _move(unknowns, step, trial):  # type: ignore[no-untyped-def]
+    """The unknowns after a step: two tilts along the normal's tangents, then the logarithms."""
+    n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
+    t1, t2 = _tangents(n0, n1, n2)
+    x = n0 + step[0] * t1[0] + step[1] * t2[0]
+    y = n1 + step[0] * t1[1] + step[1] * t2[1]
+    z = n2 + step[0] * t1[2] + step[1] * t2[2]
+    length = math.sqrt(x * x + y * y + z * z)
+    trial[0], trial[1], trial[2] = x / length, y / length, z / length
+    trial[3] = unknowns[3] + min(1.0, max(-1.0, step[2]))
+    trial[4] = unknowns[4] + min(2.0, max(-2.0, step[3]))
+    log_alpha = unknowns[5] + min(0.7, max(-0.7, step[4]))
+    trial[5] = min(math.log(_MOST_ALPHA), max(math.log(_LEAST_ALPHA), log_alpha))
+
+
+@numba.njit(cache=True, nogil=True)
+def _tangents(x, y, z):  # type: ignore[no-untyped-def]
+    """Two unit vectors across a unit vector with z > -1 (Duff et al. 2017)."""
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
+@numba.njit(cache=True, nogil=True)
+def _cost(roots, used, lights, half, view, unknowns, scale):  # type: ignore[no-untyped-def]
+    """Cauchy's cost, and the weighted rms of the residuals."""
+    n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
+    kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
+    nv = n0 * view[0] + n1 * view[1] + n2 * view[2]
+    cost, squares, weights = 0.0, 0.0, 0.0
+    for number in range(len(used)):
+        light = used[number]
+        nl = n0 * lights[light, 0] + n1 * lights[light, 1] + n2 * lights[light, 2]
+        model = 0.0
+        if nl > 0.0:
+            nh = n0 * half[light, 0] + n1 * half[light, 1] + n2 * half[light, 2]
+            model = math.sqrt(nl * (kd + ks * lobe(nl, nv, nh, alpha)[0]))
+        off = (model - roots[number]) / scale
+        cost += math.log1p(off * off)
+        weight = 1.0 / (1.0 + off * off)
+        squares += weight * off * off
+        weights += weight
+    return cost, scale * math.sqrt(squares / weights)
+
+
+@numba.njit(cache=True, nogil=True)
+def _equations(roots, used, lights, half, view, unknowns, scale, matrix, right):  # type: ignore[no-untyped-def]
+    """Normal equations of a step, into `matrix` and `right`; cost and weighted rms."""
+    n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
+    kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
+    nv = n0 * view[0] + n1 * view[1] + n2 * view[2]
+    t1, t2 = _tangents(n0, n1, n2)
+    v1 = t1[0] * view[0] + t1[1] * view[1] + t1[2] * view[2]
+    v2 = t2[0] * view[0] + t2[1] * view[1] + t2[2] * view[2]
+    matrix[:], right[:] = 0.0, 0.0
+    row = np.empty(_UNKNOWNS)
+    cost, squares, weights = 0.0, 0.0, 0.0
+    for number in range(len(used)):
+        light = used[number]
+        l0, l1, l2 = lights[light, 0], lights[light, 1], lights[light, 2]
+        nl = n0 * l0 + n1 * l1 + n2 * l2
+        if nl <= 0.0:
+            off = -roots[number] / scale
+            cost += math.log1p(off * off)
+            continue
+        h0, h1, h2 = half[light, 0], half[light, 1], half[light, 2]
+        nh = n0 * h0 + n1 * h1 + n2 * h2
+        value, by_nl, by_nv, by_nh, by_alpha = lobe(nl, nv, nh, alpha)
+        model = math.sqrt(nl * (kd + ks * value))
+        off = (model - roots[number]) / scale
+        weight = 1.0 / (1.0 + off * off)
+        cost += math.log1p(off * off)
+        squares += weight * off * off
+        weights += weight
+        to_root = 0.5 / (model * scale)
+        by_light = kd + ks * value + nl * ks * by_nl
+        by_view, by_half = nl * ks * by_nv, nl * ks * by_nh
+        row[0] = to_root * (
+            by_light * (t1[0] * l0 + t1[1] * l1 + t1[2] * l2)
+            + by_view * v1
+            + by_half * (t1[0] * h0 + t1[1] * h1 + t1[2] * h2)
+        )
+        row[1] = to_root * (
+            by_light * (t2[0] * l0 + t2[1] * l1 + t2[2] * l2)
+            + by_view * v2
+            + by_half * (t2[0] * h0 + t2[1] * h1 + t2[2] * h2)
+        )
+        row[2] = to_root * nl * kd
+        row[3] = to_root * nl * ks * value
+        row[4] = to_root * nl * ks * by_alpha * alpha
+        for i in range(_UNKNOWNS):
+            right[i] -= weight * row[i] * off
+            for j in range(i + 1):
+                matrix[i, j] += weight * row[i] * row[j]
+    return cost, scale * math.sqrt(squares / max(weights, 1e-12))
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve(matrix, right, damping):  # type: ignore[no-untyped-def]
+    """The damped step, by Cholesky; the matrix holds its lower half."""
+    factor, step = np.zeros((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
+    for i in range(_UNKNOWNS):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            if i == j:
+                total += damping * (matrix[i, i] + 1e-9)
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                factor[i, i] = math.sqrt(max(total, 1e-14))
+            else:
+                factor[i, j] = total / factor[j, j]
+    for i in range(_UNKNOWNS):
+        total = right[i]
+        for k in range(i):
+            total -= factor[i, k] * step[k]
+        step[i] = total / factor[i, i]
+    for i in range(_UNKNOWNS - 1, -1, -1):
+        total = step[i]
+        for k in range(i + 1, _UNKNOWNS):
+            total -= factor[k, i] * step[k]
+        step[i] = total / factor[i, i]
+    return step

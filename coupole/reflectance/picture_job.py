@@ -1,0 +1,235 @@
+"""From pictures under known lights to normals, materials and what relights them, into a result folder.
+
+Each step leaves one file, complete or not there; a job that was killed goes on with the first that is missing.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.reflectance.light_gains import SUSPECT, gains
+from coupole.reflectance.normal_fit import PointMaterials, colours, fit_materials
+from coupole.reflectance.picture_result import (
+    ABOUT,
+    AXES,
+    INTERPOLATION,
+    MATERIALS,
+    NORMALS,
+    SAMPLES,
+    SCHEMA,
+    PictureResult,
+    opened,
+)
+from coupole.reflectance.picture_set import FEWEST_LIGHTS, PictureSet
+from coupole.reflectance.relighting import Interpolation, learn, read_interpolation, relit
+from coupole.storage.durable import sha256
+
+VIEW = np.array([0.0, 0.0, 1.0])
+BLOCK = 20_000
+"""Pixels that are fitted at a time."""
+PEAK_QUANTILE, _PEAK_PIXELS = 0.999, 100_000
+_GAIN_PIXELS = 20_000
+Said = Callable[[str, int, int], None]
+"""Step, how much of it is done, of how much."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A light that was left out, as it is and as it was made."""
+
+    light: int
+    psnr_db: float
+    mae: float
+    measured: NDArray[np.float32]
+    """[h, w, 3]"""
+    made: NDArray[np.float32]
+
+
+def fit_pictures(
+    pictures: PictureSet, out: Path, *, left_out: Sequence[int] = (), say: Said = lambda step, done, of: None
+) -> dict[str, Any]:
+    """Make the result, or what of it is missing; returns what `result.json` says.
+
+    Raises InputError if too few lights are left, or if the folder holds the result of other pictures or settings.
+    """
+    begun_s = time.monotonic()
+    lights = np.setdiff1d(np.arange(len(pictures)), np.asarray(left_out, dtype=int))
+    if wrong := sorted(set(left_out) - set(range(len(pictures)))):
+        raise InputError(f"--leave-out: there is no light {wrong[0]}; lights are 0 to {len(pictures) - 1}")
+    if len(lights) < FEWEST_LIGHTS:
+        raise InputError(f"--leave-out: {len(lights)} lights are left; at least {FEWEST_LIGHTS} are needed")
+    result = PictureResult(out)
+    settings: dict[str, Any] = {"left_out": sorted(set(left_out)), "inputs": _inputs(pictures)}
+    _begin(out, settings)
+    if not (out / SAMPLES).exists():
+        _store(pictures, out / SAMPLES, say)
+    if not (out / MATERIALS).exists():
+        _fit(result, lights, say)
+    materials = read_materials(out)
+    np.save(out / NORMALS, result.picture(materials.normals.astype(np.float32), np.nan))
+    if not (out / INTERPOLATION).exists():
+        interpolation = learn(
+            result, lights, _gains(result, lights, materials), say=lambda done, of: say("relighting", done, of)
+        )
+        _complete(out / INTERPOLATION, interpolation.write)
+    interpolation = read_interpolation(out)
+    peak = peak_of(result)
+    checked = [check(result, interpolation, light, peak) for light in settings["left_out"]]
+    about = _about(result, settings, interpolation, materials, checked, time.monotonic() - begun_s)
+    _complete(out / ABOUT, lambda path: path.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8"))
+    return about
+
+
+def _inputs(pictures: PictureSet) -> dict[str, Any]:
+    return {
+        "pictures": {path.name: sha256(path) for path in pictures.files},
+        "directions": pictures.directions.round(9).tolist(),
+        "intensities": pictures.intensities.tolist(),
+        "mask_pixels": pictures.pixels,
+    }
+
+
+def _begin(out: Path, settings: dict[str, Any]) -> None:
+    """Make the folder; refuse one that was begun with other pictures or settings."""
+    path = out / "settings.json"
+    text = json.dumps(settings) + "\n"
+    if path.exists():
+        if path.read_text(encoding="utf-8") != text:
+            raise InputError(
+                f"{out} holds the result of other pictures or settings: name another folder with --out"
+            )
+        return
+    if out.exists() and any(out.iterdir()):
+        raise InputError(f"{out} is not empty, and holds no result: name another folder with --out")
+    for name in ("samples", "fits"):
+        (out / name).mkdir(parents=True, exist_ok=True)
+    _complete(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def _complete(path: Path, write: Callable[[Path], Any]) -> None:
+    """Have a file written beside its place, then put there."""
+    part = path.with_name(path.name + ".part")
+    write(part)
+    part.replace(path)
+
+
+def _store(pictures: PictureSet, path: Path, say: Said) -> None:
+    def write(part: Path) -> None:
+        with h5py.File(part, "w") as file:
+            file.attrs.update(full_scale=pictures.full_scale, axes=AXES)
+            file["mask"], file["directions"] = pictures.mask, pictures.directions
+            file["intensities"] = pictures.intensities
+            file["names"] = [one.name for one in pictures.files]
+            values = file.create_dataset("values", (len(pictures), pictures.pixels, 3), pictures.dtype)
+            values.attrs["shape"] = "lights, pixels of the mask in the order of rows, rgb; as in the files"
+            for number in range(len(pictures)):
+                say("reading", number, len(pictures))
+                values[number] = pictures.raw_values(number)
+
+    _complete(path, write)
+
+
+_FIELDS = {"normal": 3, "kd": 3, "ks": 3, "alpha": 1, "residual": 1, "grey_kd": 1, "grey_ks": 1}
+
+
+def _fit(result: PictureResult, lights: NDArray[np.int64], say: Said) -> None:
+    """Block by block; those that an earlier job made are kept."""
+    part = (result.folder / MATERIALS).with_suffix(".part")
+    pixels = int(np.count_nonzero(result.mask))
+    directions = result.directions[lights]
+    with h5py.File(part, "a") as file:
+        for name, width in _FIELDS.items():
+            file.require_dataset(name, (pixels, width)[: 1 + (width > 1)], np.float32, fillvalue=np.nan)
+        file["normal"].attrs["axes"] = AXES
+        for begin in range(int(file.attrs.get("fitted", 0)), pixels, BLOCK):
+            block = slice(begin, min(begin + BLOCK, pixels))
+            say("normals and materials", begin, pixels)
+            values = result.values(lights, block).transpose(1, 0, 2).astype(np.float64)
+            found = fit_materials(values.mean(axis=2), directions, VIEW)
+            kd, ks = colours(values, found, directions, VIEW)
+            made = (found.normals, kd, ks, found.alpha, found.residual, found.kd, found.ks)
+            for name, content in zip(_FIELDS, made, strict=True):
+                file[name][block] = content
+            file.attrs["fitted"] = block.stop
+            file.flush()
+    part.replace(result.folder / MATERIALS)
+
+
+def read_materials(folder: Path) -> PointMaterials:
+    """Of the grey values, [pixels] of the mask."""
+    with opened(folder / MATERIALS) as file:
+        names = ("normal", "grey_kd", "grey_ks", "alpha", "residual")
+        return PointMaterials(*(np.asarray(file[name], dtype=np.float64) for name in names))
+
+
+def _gains(result: PictureResult, lights: NDArray[np.int64], materials: PointMaterials) -> NDArray[np.float64]:
+    some = slice(None, None, 1 + len(materials.kd) // _GAIN_PIXELS)
+    grey = result.values(lights, some).mean(axis=2).T.astype(np.float64)
+    return gains(grey, materials.at(some), result.directions[lights], VIEW)
+
+
+def peak_of(result: PictureResult) -> float:
+    """The 99.9 % quantile of all pictures."""
+    some = slice(None, None, 1 + int(np.count_nonzero(result.mask)) // _PEAK_PIXELS)
+    return float(np.quantile(result.values(np.arange(len(result.directions)), some), PEAK_QUANTILE))
+
+
+def check(result: PictureResult, interpolation: Interpolation, light: int, peak: float) -> Checked:
+    """One left-out light, made and compared, inside the mask."""
+    made = relit(result, interpolation, result.directions[light])
+    measured = result.picture(result.values(np.array([light]))[0])
+    off = (made - measured)[result.mask].astype(np.float64)
+    psnr_db = 10.0 * np.log10(peak**2 / max(float(np.mean(off**2)), 1e-30))
+    return Checked(light, psnr_db, float(np.mean(np.abs(off))), measured, made)
+
+
+def pooled_psnr_db(checked: Sequence[Checked]) -> float | None:
+    """Of all left-out lights together; None without any."""
+    if not checked:
+        return None
+    return float(-10.0 * np.log10(np.mean([10.0 ** (-one.psnr_db / 10.0) for one in checked])))
+
+
+def _about(
+    result: PictureResult,
+    settings: dict[str, Any],
+    interpolation: Interpolation,
+    materials: PointMaterials,
+    checked: Sequence[Checked],
+    seconds: float,
+) -> dict[str, Any]:
+    with opened(result.folder / SAMPLES) as file:
+        names = [name.decode() for name in file["names"][:]]
+    gained = zip(interpolation.lights.tolist(), interpolation.gains.tolist(), strict=True)
+    suspects = {names[light]: round(gain, 3) for light, gain in gained if abs(gain - 1.0) > SUSPECT}
+    peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return {
+        "schema": SCHEMA,
+        "software": {name: version(name) for name in ("coupole", "numpy", "numba", "h5py")},
+        **settings,
+        "axes": AXES,
+        "lights": len(names),
+        "pixels": int(np.count_nonzero(result.mask)),
+        "not_fitted": int(np.count_nonzero(~np.isfinite(materials.kd))),
+        "residual": float(np.nanmedian(materials.residual)),
+        "kernel": interpolation.kernel,
+        "left_out_rms": interpolation.left_out_rms,
+        "suspect_pictures": suspects,
+        "held_out": [{"light": one.light, "psnr_db": round(one.psnr_db, 3), "mae": one.mae} for one in checked],
+        "held_out_psnr_db": pooled_psnr_db(checked),
+        "seconds": round(seconds, 3),
+        "peak_memory_bytes": peak_bytes,
+    }

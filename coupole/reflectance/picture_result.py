@@ -1,0 +1,94 @@
+"""The result folder of pictures under known lights: what is in it, and how it is read.
+
+Everything large is HDF5, with shapes, units and axes in attributes; docs/reference/result-folder.md describes it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError, Problem
+
+Floats = NDArray[np.float32]
+
+SCHEMA = "coupole-reflectance-pictures/1"
+SAMPLES, MATERIALS, INTERPOLATION = "samples/pictures.h5", "fits/materials.h5", "fits/interpolation.h5"
+NORMALS, ABOUT, REPORT = "normals.npy", "result.json", "report.html"
+AXES = "x to the right of the picture, y up, z to the camera"
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """An HDF5 file of a result. Raises InputError if it cannot be read."""
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        problem = Problem(str(path), 0, 0, "", "cannot be read; make the result again into another folder")
+        raise InputError([problem]) from error
+    with file:
+        yield file
+
+
+@dataclass(frozen=True)
+class PictureResult:
+    """A result folder, whole or in the making."""
+
+    folder: Path
+
+    @cached_property
+    def about(self) -> dict[str, Any]:
+        """result.json. Raises InputError if the folder has none, or one of another kind."""
+        path = self.folder / ABOUT
+        try:
+            about = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            problem = Problem(str(path), 0, 0, "", "expected the result of `coupole reflectance --pictures`")
+            raise InputError([problem]) from error
+        if not isinstance(about, dict) or about.get("schema") != SCHEMA:
+            raise InputError([Problem(str(path), 0, 0, "schema", f"expected {SCHEMA}")])
+        return about
+
+    @cached_property
+    def mask(self) -> NDArray[np.bool_]:
+        """[h, w] what was fitted."""
+        with opened(self.folder / SAMPLES) as file:
+            return np.asarray(file["mask"], dtype=bool)
+
+    @cached_property
+    def directions(self) -> NDArray[np.float64]:
+        """[lights, 3] unit vectors to all lights, left out or not."""
+        with opened(self.folder / SAMPLES) as file:
+            return np.asarray(file["directions"], dtype=np.float64)
+
+    @cached_property
+    def _scales(self) -> Floats:
+        """[lights, 1, 3] from raw values to full scale 1 divided by the intensities."""
+        with opened(self.folder / SAMPLES) as file:
+            factors: NDArray[np.float64] = 1.0 / (file.attrs["full_scale"] * np.asarray(file["intensities"]))
+        return factors[:, None].astype(np.float32)
+
+    def values(self, lights: NDArray[np.int64], pixels: slice = slice(None)) -> Floats:
+        """[lights, pixels, 3] in full scales divided by the intensities; `lights` must rise."""
+        with opened(self.folder / SAMPLES) as file:
+            raw = file["values"]
+            values = np.empty((len(lights), *raw[0, pixels].shape), np.float32)
+            for place, light in enumerate(lights):
+                values[place] = raw[light, pixels]
+        values *= self._scales[lights]
+        return values
+
+    def picture(self, values: Floats, outside: float = 0.0) -> Floats:
+        """[h, w, ...] of values [pixels, ...]."""
+        picture = np.full((*self.mask.shape, *values.shape[1:]), outside, np.float32)
+        picture[self.mask] = values
+        return picture

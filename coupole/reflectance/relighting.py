@@ -1,0 +1,183 @@
+"""Pictures under lights that were not there, from a result of pictures under lights that were."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance import learned_correction as learned
+from coupole.reflectance import light_interpolation
+from coupole.reflectance.learned_correction import MARGIN_PX, Network, Strip
+from coupole.reflectance.light_gains import SUSPECT, gain_between
+from coupole.reflectance.light_interpolation import KERNELS, left_without
+from coupole.reflectance.picture_result import INTERPOLATION, PictureResult, opened
+
+Floats = NDArray[np.float32]
+
+STRIP_PIXELS = 60_000
+"""In which pictures are made; more only if a row has more."""
+_TAUGHT_PIXELS = 60_000
+"""Of so many, in strips drawn at random, the correction is learnt."""
+_TAUGHT_ROWS = 32
+_KERNEL_PIXELS = 20_000
+LEAST_LEVEL = 1e-3
+"""Of the values' 99.9 % quantile: pixels darker than this count as if they were so bright."""
+
+
+@dataclass(frozen=True)
+class Interpolation:
+    """How pictures between the lights are made."""
+
+    lights: NDArray[np.int64]
+    """Which of the result's lights are used, rising."""
+    gains: NDArray[np.float64]
+    """[lights] of their pictures; values are divided by them."""
+    kernel: str
+    left_out_rms: dict[str, float]
+    """By kernel: rms of what it says of a light that was left out, in full scales."""
+    peak: float
+    """99.9 % quantile of the values."""
+    network: Network | None
+
+    def write(self, path: Path) -> None:
+        with h5py.File(path, "w") as file:
+            file.attrs.update(kernel=self.kernel, peak=self.peak)
+            file["lights"], file["gains"] = self.lights, self.gains
+            for kernel, rms in self.left_out_rms.items():
+                file.attrs[f"left out rms, {kernel}"] = rms
+            for number, (matrix, offset) in enumerate(self.network.layers if self.network else ()):
+                file[f"network/{number}/matrix"], file[f"network/{number}/offset"] = matrix, offset
+
+
+def read_interpolation(folder: Path) -> Interpolation:
+    """Of a result folder. Raises InputError."""
+    with opened(folder / INTERPOLATION) as file:
+        layers = [
+            (np.asarray(file[f"network/{number}/matrix"]), np.asarray(file[f"network/{number}/offset"]))
+            for number in range(len(file["network"]) if "network" in file else 0)
+        ]
+        return Interpolation(
+            np.asarray(file["lights"]),
+            np.asarray(file["gains"]),
+            str(file.attrs["kernel"]),
+            {kernel: float(file.attrs[f"left out rms, {kernel}"]) for kernel in KERNELS},
+            float(file.attrs["peak"]),
+            Network(layers) if layers else None,
+        )
+
+
+def learn(
+    result: PictureResult,
+    lights: NDArray[np.int64],
+    gains: NDArray[np.float64],
+    *,
+    say: Callable[[int, int], None] = lambda done, of: None,
+) -> Interpolation:
+    """Choose the kernel and learn the correction by leaving lights out; pictures whose gain is suspect are
+    interpolated from, but nothing is learnt from how they differ."""
+    taught = list(_taught(result, lights, gains))
+    every = np.concatenate([values for _, values in taught], axis=1)
+    peak = float(np.quantile(every, 0.999))
+    directions = result.directions[lights]
+    rms = left_out_rms(every[:, :: max(1, every.shape[1] // _KERNEL_PIXELS)], directions)
+    kernel = min(KERNELS, key=lambda name: rms[name])
+    sound = np.flatnonzero(np.abs(gains - 1.0) <= SUSPECT)
+    share, generator = learned.MOST_SAMPLES / (every.size + 1), np.random.default_rng(0)
+    given = []
+    for mask, values in taught:
+        strip = learned.strip_of(mask, values, LEAST_LEVEL * peak)
+        kernels = learned.all_kernels(kernel)
+        given.append(
+            list(learned.lessons(strip, directions, sound.tolist(), kernels, share=share, generator=generator))
+        )
+    by_light = [_joined(parts) for parts in zip(*given, strict=True)]
+    network = learned.train(by_light, say=say) if by_light else None
+    return Interpolation(lights, gains, kernel, rms, peak, network)
+
+
+def _joined(parts: Sequence[learned.Lesson]) -> learned.Lesson:
+    return learned.Lesson(
+        np.concatenate([part.features for part in parts]),
+        np.concatenate([part.wanted for part in parts]),
+        np.concatenate([part.importance for part in parts]),
+    )
+
+
+def left_out_rms(values: Floats, directions: NDArray[np.float64]) -> dict[str, float]:
+    """By kernel, of values [lights, pixels, 3]: rms over all lights, each left out with its nearest neighbour."""
+    flat = values.reshape(len(values), -1)
+    squares = dict.fromkeys(KERNELS, 0.0)
+    for light in range(len(values)):
+        left = left_without(directions, light, learned.LEFT_OUT_WITH)
+        for kernel in KERNELS:
+            row = light_interpolation.weights(directions[left], directions[light][None], kernel)[0]
+            squares[kernel] += float(np.mean((row.astype(np.float32) @ flat[left] - flat[light]) ** 2))
+    return {kernel: float(np.sqrt(square / len(values))) for kernel, square in squares.items()}
+
+
+def relit(result: PictureResult, interpolation: Interpolation, direction: NDArray[np.float64]) -> Floats:
+    """[h, w, 3] linear, in full scales divided by the intensities, 0 outside the mask; `direction` [3], of any
+    length, points to a distant light."""
+    unit = direction / np.linalg.norm(direction)
+    lights = interpolation.lights
+    directions = result.directions[lights]
+    kernels = learned.all_kernels(interpolation.kernel)
+    gain = np.float32(gain_between(directions, interpolation.gains, unit))
+    picture = np.zeros((*result.mask.shape, 3), np.float32)
+    for top, bottom in strips(result.mask):
+        above, below = max(0, top - MARGIN_PX), min(len(result.mask), bottom + MARGIN_PX)
+        strip = strip_between(result, interpolation, above, below)
+        sight = learned.look(strip, directions, unit, kernels)
+        made = np.zeros((below - above, result.mask.shape[1], 3), np.float32)
+        made[strip.mask] = gain * learned.corrected(strip, sight, interpolation.network)
+        picture[top:bottom] = made[top - above : bottom - above]
+    return picture
+
+
+def strip_between(result: PictureResult, interpolation: Interpolation, top: int, bottom: int) -> Strip:
+    """The values of rows, divided by the pictures' gains."""
+    values = _rows(result, interpolation.lights, interpolation.gains, top, bottom)
+    return learned.strip_of(result.mask[top:bottom], values, LEAST_LEVEL * interpolation.peak)
+
+
+def strips(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Rows from and to, of about `STRIP_PIXELS` pixels of the mask each; rows without any are left out."""
+    counts = np.count_nonzero(mask, axis=1)
+    top, pixels = 0, 0
+    for row, count in enumerate(counts):
+        if pixels and pixels + count > STRIP_PIXELS:
+            yield top, row
+            top, pixels = row, 0
+        pixels += int(count)
+    if pixels:
+        yield top, len(mask)
+
+
+def _rows(
+    result: PictureResult, lights: NDArray[np.int64], gains: NDArray[np.float64], top: int, bottom: int
+) -> Floats:
+    before, within = np.count_nonzero(result.mask[:top]), np.count_nonzero(result.mask[top:bottom])
+    values = result.values(lights, slice(before, before + within))
+    values /= gains[:, None, None].astype(np.float32)
+    return values
+
+
+def _taught(
+    result: PictureResult, lights: NDArray[np.int64], gains: NDArray[np.float64]
+) -> Iterator[tuple[NDArray[np.bool_], Floats]]:
+    """Strips of rows, drawn at random, until they have enough pixels; all of a small picture."""
+    mask = result.mask
+    tops = [top for top in range(0, len(mask), _TAUGHT_ROWS) if mask[top : top + _TAUGHT_ROWS].any()]
+    np.random.default_rng(0).shuffle(tops)
+    pixels = 0
+    for top in tops:
+        if pixels >= _TAUGHT_PIXELS:
+            return
+        part = mask[top : top + _TAUGHT_ROWS]
+        pixels += int(np.count_nonzero(part))
+        yield part, _rows(result, lights, gains, top, top + _TAUGHT_ROWS)

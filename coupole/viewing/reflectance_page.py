@@ -1,0 +1,124 @@
+"""`report.html` of a result of pictures under known lights: pictures first, then what must be known about them."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import StorageError
+from coupole.reflectance.picture_job import PEAK_QUANTILE
+from coupole.reflectance.picture_result import MATERIALS, REPORT, PictureResult
+from coupole.reflectance.relighting import read_interpolation, relit
+from coupole.storage.durable import write_synced
+from coupole.viewing.raw_preview import png
+
+WIDTH_PX = 480
+MOST_CHECKS = 6
+POOR_RESIDUAL = 0.05
+"""Of square roots of values, as a share of the diffuse part's: beyond it the material model itself is in doubt."""
+_STYLE = """
+body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}
+table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left;vertical-align:top}
+figure{display:inline-block;margin:.3em}figcaption{font-size:12px;color:#666}img{display:block;background:#000}
+.bad{color:#b00}
+"""
+
+
+def write(folder: Path) -> Path:
+    """Write the report of a result into its folder. Raises InputError, StorageError."""
+    path = folder / REPORT
+    try:
+        write_synced(path, "".join(_page(PictureResult(folder))))
+    except OSError as error:
+        raise StorageError(f"{path}: {error.strerror}") from error
+    return path
+
+
+def remarks(about: dict[str, Any]) -> Iterator[str]:
+    """What its maker must know, one sentence each."""
+    yield (
+        f"{about['pixels']} pixels under {about['lights'] - len(about['left_out'])} lights; the materials leave "
+        f"{100 * about['residual']:.1f} % (median, of square roots)"
+    )
+    if about["not_fitted"]:
+        yield f"{about['not_fitted']} pixels saw too few lights and have no normal"
+    if about["residual"] > POOR_RESIDUAL:
+        yield (
+            "the materials explain the pictures poorly: is the object translucent or fluorescent, are the "
+            "pictures linear, are the lights in the order of the pictures?"
+        )
+    if about["suspect_pictures"]:
+        told = ", ".join(f"{name} ({gain:.2f})" for name, gain in about["suspect_pictures"].items())
+        yield f"pictures brighter or darker than all others say they should be: {told}"
+    if about["held_out_psnr_db"] is not None:
+        yield f"left-out lights are made with {about['held_out_psnr_db']:.2f} dB (PSNR, linear, inside the mask)"
+
+
+def _page(result: PictureResult) -> Iterator[str]:
+    about = result.about
+    title = html.escape(result.folder.resolve().name)
+    yield f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>"
+    for remark in remarks(about):
+        yield f"<p>{html.escape(remark)}"
+    with h5py.File(result.folder / MATERIALS) as file:
+        fields = {name: np.asarray(file[name]) for name in ("normal", "kd", "ks", "alpha", "residual")}
+    yield "<h2>Normals and materials</h2>"
+    yield _figure("normals", result.picture(0.5 + 0.5 * fields["normal"].astype(np.float32)))
+    yield _figure("diffuse", _display(result.picture(fields["kd"])))
+    yield _figure("specular", _display(result.picture(fields["ks"])))
+    yield _figure("roughness alpha, white 1", _grey(result.picture(fields["alpha"])))
+    yield _figure("what the materials leave, white 10 %", _grey(result.picture(fields["residual"]) / 0.1))
+    yield "<p>Where no light stands near the mirror direction, specular and roughness are guesses."
+    if about["left_out"]:
+        yield "<h2>Left-out lights: measured, made, difference (white 5 % of white)</h2>"
+        yield from _checks(result)
+    yield "<h2>Figures</h2><table>"
+    yield f"<tr><th>kernel<td>{html.escape(about['kernel'])}"
+    for kernel, rms in about["left_out_rms"].items():
+        yield f"<tr><th>{html.escape(kernel)}: rms at lights left out<td>{rms:.5f} of full scale"
+    for one in about["held_out"]:
+        yield f"<tr><th>light {one['light']}<td>{one['psnr_db']:.2f} dB, mean absolute error {one['mae']:.5f}"
+    yield f"<tr><th>time<td>{about['seconds']:.1f} s</table>"
+    yield "<p>No uncertainty is stated for these normals and materials yet."
+
+
+def _checks(result: PictureResult) -> Iterator[str]:
+    interpolation = read_interpolation(result.folder)
+    left_out = np.asarray(result.about["left_out"])
+    for light in left_out[:: 1 + len(left_out) // MOST_CHECKS]:
+        measured = result.picture(result.values(np.array([light]))[0])
+        made = relit(result, interpolation, result.directions[light])
+        white = float(np.quantile(measured[result.mask], PEAK_QUANTILE))
+        yield "<div>"
+        yield _figure(f"light {light}, measured", _display(measured, white))
+        yield _figure("made", _display(made, white))
+        yield _figure("difference", np.clip(np.abs(made - measured) / (0.05 * white), 0, 1))
+        yield "</div>"
+
+
+def _display(picture: NDArray[np.float32], white: float = 0.0) -> NDArray[np.float32]:
+    """[h, w, 3] for the eye: gamma 2.2, the brightest thousandth white."""
+    known = np.nan_to_num(picture)
+    shown: NDArray[np.float32] = np.clip(
+        known / (white or max(float(np.quantile(known, PEAK_QUANTILE)), 1e-12)), 0, 1
+    )
+    return shown ** np.float32(1 / 2.2)
+
+
+def _grey(picture: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.repeat(np.clip(np.nan_to_num(picture), 0, 1)[..., None], 3, axis=2)
+
+
+def _figure(caption: str, picture: NDArray[np.float32]) -> str:
+    shown = (255 * np.clip(np.nan_to_num(picture), 0, 1)).astype(np.uint8)
+    width = min(WIDTH_PX, shown.shape[1])
+    data = base64.b64encode(png(shown, width)).decode()
+    image = f'<img src="data:image/png;base64,{data}" alt="{caption}">'
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"

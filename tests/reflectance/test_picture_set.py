@@ -1,0 +1,91 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from coupole.errors import InputError
+from coupole.reflectance.picture_set import read_pictures
+
+DIRECTIONS = "".join(f"{x} {y} 1\n" for x in (-0.5, 0, 0.5) for y in (-0.5, 0.5))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for number in range(6):
+        picture = np.full((4, 5, 3), [10, 20, 30 + number], np.uint8)
+        picture[1, 2] = 200
+        cv2.imwrite(str(pictures / f"{number}.png"), picture)
+    (tmp_path / "lights.txt").write_text(DIRECTIONS)
+    return tmp_path
+
+
+def test_pictures_are_read_in_the_order_of_their_names_or_of_the_list(folder: Path) -> None:
+    given = read_pictures(folder / "pictures", folder / "lights.txt")
+    assert [path.name for path in given.files] == [f"{number}.png" for number in range(6)]
+    assert given.full_scale == 255
+    assert given.raw_values(3)[0].tolist() == [33, 20, 10]  # red first
+    assert given.raw_values(3)[7].tolist() == [200] * 3
+    (folder / "pictures" / "filenames.txt").write_text("5.png 4.png 3.png 2.png 1.png 0.png")
+    assert read_pictures(folder / "pictures", folder / "lights.txt").raw_values(0)[0].tolist() == [35, 20, 10]
+
+
+def test_an_lp_file_names_the_pictures(folder: Path) -> None:
+    rows = DIRECTIONS.splitlines()
+    (folder / "dome.lp").write_text("6\n" + "".join(f"C:\\rti\\{5 - k}.png {row}\n" for k, row in enumerate(rows)))
+    given = read_pictures(folder / "pictures", folder / "dome.lp")
+    assert given.files[0].name == "5.png"
+    np.testing.assert_allclose(np.linalg.norm(given.directions, axis=1), 1)
+
+
+def test_the_mask_says_what_is_fitted_and_intensities_may_be_one_number(folder: Path) -> None:
+    mask = np.zeros((4, 5), np.uint8)
+    mask[1, 2:4] = 255
+    cv2.imwrite(str(folder / "pictures" / "mask.png"), mask)
+    (folder / "intensities.txt").write_text("2\n" * 6)
+    given = read_pictures(
+        folder / "pictures",
+        folder / "lights.txt",
+        mask=folder / "pictures" / "mask.png",
+        intensities=folder / "intensities.txt",
+    )
+    assert given.pixels == 2
+    assert len(given) == 6
+    assert given.intensities.tolist() == [[2.0] * 3] * 6
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("lights.txt", DIRECTIONS + "0 0\n", "lights.txt:7:1: 2 values; expected 3"),
+        ("lights.txt", DIRECTIONS.replace("0.5 1", "x 1", 1), "lights.txt:1:1: '-x' is no number"),
+        ("lights.txt", DIRECTIONS.replace("0.5 1", "nan 1", 1), "lights.txt:1:1: '-nan' is no number"),
+        ("lights.txt", DIRECTIONS + "0 0 1\n", "has 7 lights"),
+        (
+            "lights.txt",
+            DIRECTIONS.replace("-0.5 -0.5 1", "0 0 0", 1),
+            "lights.txt:1:1: a light's direction has no length",
+        ),
+        ("lights.lp", "7\n" + DIRECTIONS, "lights.lp:2:1: expected `name x y z`"),
+        ("lights.lp", "six\n", "lights.lp:1:1: expected the number of lights"),
+        ("lights.lp", "1\n9.png 0 0 1\n", "at least 6 are needed"),
+        ("intensities.txt", "1\n1\n", "expected 6 lines of positive intensities, got 2"),
+        ("intensities.txt", "1\n" * 5 + "-1\n", "positive intensities"),
+        ("mask.png", "no picture", "is no picture that can be read"),
+    ],
+)
+def test_what_is_wrong_is_refused_with_its_place(folder: Path, name: str, content: str, message: str) -> None:
+    (folder / name).write_text(content)
+    lights = folder / (name if name.startswith("lights") else "lights.txt")
+    other = {name.partition(".")[0]: folder / name} if not name.startswith("lights") else {}
+    with pytest.raises(InputError, match=message.replace("(", "\\(").replace("`", ".")):
+        read_pictures(folder / "pictures", lights, **other)
+
+
+def test_pictures_that_differ_are_refused(folder: Path) -> None:
+    cv2.imwrite(str(folder / "pictures" / "2.png"), np.zeros((4, 6, 3), np.uint16))
+    given = read_pictures(folder / "pictures", folder / "lights.txt")
+    with pytest.raises(InputError, match=r"2\.png: has 6 x 4 pixels of 16 bit; the first picture has 5 x 4 of 8"):
+        given.raw_values(2)

@@ -1,0 +1,231 @@
+"""`coupole reflectance --pictures` as its user has it: a folder of pictures in, normals and new light out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cells
+import cv2
+import h5py
+import numpy as np
+import OpenEXR
+import pytest
+from picture_cases import Case, write_case
+from places import SHARED_DATA
+
+from coupole.reflectance.light_interpolation import weights
+
+LEFT_OUT = [3, 12, 21, 30]
+Made = tuple[Case, Path, dict[str, Any]]
+"""A case, the folder of its result, and what `--json` said."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    case = write_case(tmp_path_factory.mktemp("ball") / "pictures")
+    out = case.folder.parent / "result"
+    ended = cells.here(
+        "reflectance", *case.arguments(), "--leave-out", ",".join(map(str, LEFT_OUT)), "--out", out, "--json"
+    )
+    assert ended.code == 0, ended.err
+    return case, out, ended.document
+
+
+def psnr_db(made: np.ndarray, wanted: np.ndarray, peak: float) -> float:
+    return float(10 * np.log10(peak**2 / np.mean((made - wanted) ** 2)))
+
+
+def test_normals_are_written_where_the_contract_says(made: Made) -> None:
+    case, out, _ = made
+    normals = np.load(out / "normals.npy")
+    assert normals.dtype == np.float32
+    assert normals.shape == case.normals.shape
+    ball = (case.normals[..., 2] < 0.999) & (case.normals[..., 2] > 0.5)
+    off = np.degrees(np.arccos(np.clip(np.sum(normals * case.normals, axis=-1)[ball], -1, 1)))
+    assert off.mean() < 1.0
+
+
+def test_left_out_lights_are_made_better_than_by_interpolation_alone(
+    made: Made,
+) -> None:
+    case, out, document = made
+    peak = float(np.quantile(case.pictures, 0.999))
+    left = np.setdiff1d(np.arange(len(case.directions)), LEFT_OUT)
+    sums = weights(case.directions[left], case.directions[LEFT_OUT], "linear")
+    by_sums = np.maximum(np.einsum("tl,lhwc->thwc", sums, case.pictures[left]), 0)
+    pictures = []
+    for light in LEFT_OUT:
+        to = out / f"light{light}.npy"
+        direction = ",".join(map(str, case.directions[light]))
+        ended = cells.here("reflectance", "relight", out, "--direction", direction, "--to", to)
+        assert ended.code == 0, ended.err
+        pictures.append(np.load(to))
+    assert pictures[0].dtype == np.float32
+    ours = psnr_db(np.stack(pictures), case.pictures[LEFT_OUT], peak)
+    assert ours > psnr_db(by_sums, case.pictures[LEFT_OUT], peak) + 0.5
+    assert document["held_out_psnr_db"] == pytest.approx(ours, abs=0.2)  # the pictures have noise
+    assert [one["light"] for one in document["held_out"]] == LEFT_OUT
+
+
+def test_pictures_are_written_as_exr_and_png(made: Made, tmp_path: Path) -> None:
+    _, out, _ = made
+    for name in ("a.npy", "a.exr", "a.png"):
+        ended = cells.here("reflectance", "relight", out, "--direction", "0.2,-0.1,2", "--to", tmp_path / name)
+        assert ended.code == 0, ended.err
+    whole = np.load(tmp_path / "a.npy")
+    with OpenEXR.File(str(tmp_path / "a.exr")) as file:
+        np.testing.assert_array_equal(file.channels()["RGB"].pixels, whole)
+    png = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    np.testing.assert_allclose(png / 65535, np.clip(whole, 0, 1), atol=1e-5)
+
+
+def test_the_result_is_read_by_plain_h5py(made: Made) -> None:
+    case, out, _ = made
+    with h5py.File(out / "samples" / "pictures.h5") as file:
+        assert file["values"].shape == (46, 64 * 64, 3)
+        first = file["values"][7].reshape(64, 64, 3)
+        assert np.array_equal(first, cv2.imread(str(case.folder / "007.png"), cv2.IMREAD_UNCHANGED)[..., ::-1])
+    with h5py.File(out / "fits" / "materials.h5") as file:
+        assert file["normal"].shape == (64 * 64, 3)
+        assert file["kd"].shape == (64 * 64, 3)
+        assert "y up" in file["normal"].attrs["axes"]
+    about = json.loads((out / "result.json").read_text())
+    assert about["left_out"] == LEFT_OUT
+    assert len(about["inputs"]["pictures"]["007.png"]) == 64
+
+
+def test_the_report_shows_what_was_made(made: Made) -> None:
+    _, out, _ = made
+    page = (out / "report.html").read_text()
+    assert page.count("<img") == 5 + 3 * len(LEFT_OUT)
+    assert "left-out lights are made with" in page
+    assert "No uncertainty is stated" in page
+
+
+def test_a_job_that_was_killed_goes_on_where_it_was(made: Made) -> None:
+    case, out, document = made
+    before = (out / "fits" / "materials.h5").stat().st_mtime_ns
+    (out / "result.json").unlink()
+    (out / "fits" / "interpolation.h5").rename(out / "fits" / "interpolation.h5.part")
+    again = ["reflectance", *case.arguments(), "--leave-out", ",".join(map(str, LEFT_OUT)), "--out", out, "--json"]
+    ended = cells.here(*again)
+    assert ended.code == 0, ended.err
+    assert (out / "fits" / "materials.h5").stat().st_mtime_ns == before
+    assert ended.document["held_out_psnr_db"] == pytest.approx(document["held_out_psnr_db"], abs=0.5)
+
+
+def test_other_pictures_are_not_mixed_into_a_result(made: Made) -> None:
+    case, out, _ = made
+    ended = cells.here("reflectance", *case.arguments(), "--out", out)
+    assert ended.code == 2
+    assert "other pictures or settings" in ended.err
+
+
+def test_a_folder_with_something_else_is_left_alone(made: Made, tmp_path: Path) -> None:
+    case, _, _ = made
+    (tmp_path / "thesis.txt").write_text("precious")
+    ended = cells.here("reflectance", *case.arguments(), "--out", tmp_path)
+    assert ended.code == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--leave-out", "4,x"], "--leave-out: expected numbers"),
+        (["--leave-out", "46"], "there is no light 46; lights are 0 to 45"),
+        (["--leave-out", ",".join(map(str, range(41)))], "5 lights are left; at least 6"),
+    ],
+)
+def test_lights_that_cannot_be_left_out_are_refused(
+    made: Made, tmp_path: Path, options: list[str], message: str
+) -> None:
+    ended = cells.here("reflectance", *made[0].arguments(), *options, "--out", tmp_path / "out", "--json")
+    assert ended.code == 2
+    assert message in ended.document["error"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--direction", "0,0", "--to", "a.npy"], "expected X,Y,Z"),
+        (["--direction", "0,0,nan", "--to", "a.npy"], "expected X,Y,Z"),
+        (["--direction", "0,0,1", "--to", "a.gif"], "ends in .npy, .exr, .png"),
+    ],
+)
+def test_a_light_that_is_none_is_refused(made: Made, options: list[str], message: str) -> None:
+    ended = cells.here("reflectance", "relight", made[1], *options)
+    assert ended.code == 2
+    assert message in ended.err
+
+
+def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
+    ended = cells.here("reflectance", "relight", tmp_path, "--direction", "0,0,1", "--to", tmp_path / "a.npy")
+    assert ended.code == 2
+    assert "expected the result of" in ended.err
+
+
+DILIGENT = SHARED_DATA / "photometric"
+HELD_OUT = list(range(4, 96, 8))
+real = pytest.mark.skipif(not DILIGENT.is_dir(), reason="no real data beside the project")
+
+
+def made_of(name: str, folder: Path, *, rows: slice = slice(None)) -> tuple[Path, dict[str, Any], np.ndarray]:
+    """The result of DiLiGenT's object (its rows), what it says, and the mask."""
+    given = DILIGENT / name
+    mask = cv2.imread(str(given / "mask.png"), cv2.IMREAD_UNCHANGED)
+    mask = mask if mask.ndim == 2 else mask[..., 0]
+    cut = np.zeros_like(mask)
+    cut[rows] = mask[rows]
+    cv2.imwrite(str(folder / "mask.png"), cut)
+    options = ["--pictures", given, "--lights", given / "light_directions.txt", "--mask", folder / "mask.png"]
+    options += ["--intensities", given / "light_intensities.txt", "--leave-out", ",".join(map(str, HELD_OUT))]
+    ended = cells.here("reflectance", *options, "--out", folder / "out", "--json")
+    assert ended.code == 0, ended.err
+    return folder / "out", ended.document, cut > 0
+
+
+def normal_error_deg(name: str, out: Path, mask: np.ndarray) -> float:
+    truth, found = np.load(DILIGENT / name / "normal_gt.npy"), np.load(out / "normals.npy")
+    assert np.array_equal(np.isfinite(found[..., 0]), mask)
+    return float(np.degrees(np.arccos(np.clip(np.sum(truth * found, axis=-1)[mask], -1, 1))).mean())
+
+
+def by_linear_sums_db(name: str, mask: np.ndarray) -> float:
+    """PSNR of the linear kernel alone, reckoned here (facts: 32.8 dB for bear, 34.0 for cat)."""
+    given = DILIGENT / name
+    directions = np.loadtxt(given / "light_directions.txt")
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    intensities = np.loadtxt(given / "light_intensities.txt")
+    names = (given / "filenames.txt").read_text().split()
+    values = np.stack(
+        [
+            cv2.imread(str(given / one), cv2.IMREAD_UNCHANGED)[..., ::-1][mask] / 65535 / intensity
+            for one, intensity in zip(names, intensities, strict=True)
+        ]
+    )
+    left = np.setdiff1d(np.arange(96), HELD_OUT)
+    made = np.tensordot(weights(directions[left], directions[HELD_OUT], "linear"), values[left], 1)
+    return psnr_db(np.maximum(made, 0), values[HELD_OUT], float(np.quantile(values, 0.999)))
+
+
+@real
+def test_part_of_a_real_cat_is_measured_and_relit_better_than_by_sums(tmp_path: Path) -> None:
+    out, document, mask = made_of("cat", tmp_path, rows=slice(100, 170))
+    assert normal_error_deg("cat", out, mask) < 5.0
+    assert document["held_out_psnr_db"] > by_linear_sums_db("cat", mask) + 0.3
+    assert len(document["suspect_pictures"]) <= 1  # a corner light, by 5 %
+
+
+@real
+@pytest.mark.full
+@pytest.mark.parametrize(("name", "most_deg", "linear_db"), [("bear", 4.4, 32.8), ("cat", 4.7, 34.0)])
+def test_real_objects_are_measured_and_relit(tmp_path: Path, name: str, most_deg: float, linear_db: float) -> None:
+    out, document, mask = made_of(name, tmp_path)
+    assert normal_error_deg(name, out, mask) <= most_deg
+    assert by_linear_sums_db(name, mask) == pytest.approx(linear_db, abs=0.1)
+    assert document["held_out_psnr_db"] >= linear_db + 0.5
+    faulty = {f"{number:03}.png" for number in range(1, 21) if number - 1 not in HELD_OUT} - {"020.png"}
+    assert set(document["suspect_pictures"]) == (faulty if name == "bear" else set())

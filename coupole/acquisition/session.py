@@ -213,36 +213,37 @@ def _acquire(
     outcome = sequencer.outcome
     ended: Literal["done", "interrupted", "failed"] = "failed"
     failure: BaseException | None = None
-    try:
-        with obeyed_by(control, cell.halt), observer.showing(job.schedule.frames, len(job.schedule.views)):
-            try:
-                sequencer.acquire()
-            finally:
-                cell.make_safe()
-            _refuse_unsafe_end(cell)
-            ended = "done"
-    except BaseException as error:
-        failure = control.interrupted() if control.stop.is_set() else error
-        ended = "interrupted" if isinstance(failure, Interrupted) else "failed"
-        if isinstance(failure, Interrupted):
-            raise failure from error
-        _note_failure(error, cell, run, recorder)
-        raise
-    finally:
-        _note_faults_of_the_arm(failure, cell, run, faults)
-        for trouble in cell.trouble:
-            recorder.note(FaultNoted(kind="unsafe", message=trouble))
-            alarm(trouble)
-        recorder.note(
-            SessionStopped(
-                outcome=ended,
-                reason=str(failure or ""),
-                robot=_statistics(cell),
+    with obeyed_by(control, cell.halt):  # to the journal's last line: a signal must not cut that off
+        try:
+            with observer.showing(job.schedule.frames, len(job.schedule.views)):
+                try:
+                    sequencer.acquire()
+                finally:
+                    cell.make_safe()
+                _refuse_unsafe_end(cell)
+                ended = "done"
+        except BaseException as error:
+            failure = control.interrupted() if control.stop.is_set() else error
+            ended = "interrupted" if isinstance(failure, Interrupted) else "failed"
+            if isinstance(failure, Interrupted):
+                raise failure from error
+            _note_failure(error, cell, run, recorder)
+            raise
+        finally:
+            _note_faults_of_the_arm(failure, cell, run, faults)
+            for trouble in cell.trouble:
+                recorder.note(FaultNoted(kind="unsafe", message=trouble))
+                alarm(trouble)
+            recorder.note(
+                SessionStopped(
+                    outcome=ended,
+                    reason=str(failure or ""),
+                    robot=_statistics(cell),
+                )
             )
-        )
-        recorder.close_quietly()
-        found.update({**_figures(run, job, outcome), "unsafe": cell.trouble})
-        _say_outcome(console, run, outcome, ended)
+            recorder.close_quietly()
+            found.update({**_figures(run, job, outcome), "unsafe": cell.trouble})
+            _say_outcome(console, run, outcome, ended)
 
 
 def _refuse_unsafe_end(cell: OpenedCell) -> None:

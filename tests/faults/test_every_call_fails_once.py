@@ -49,6 +49,15 @@ def test_an_unexpected_error_ends_with_one_a_safe_cell_a_true_journal_and_its_tr
     assert (run / "report.html").exists()
 
 
+def test_a_signal_while_the_end_is_noted_cuts_nothing_off(tmp_path: Path) -> None:
+    cell = cell_in(tmp_path)
+    with cell.world():
+        ended = acquire(cell, Failure(0, "sighup", "robot.statistics"))
+    assert ended.code == 0
+    assert cells.events(cell.run_folder, "stop")[-1]["outcome"] == "done"
+    assert ended.document["missing"] == 0
+
+
 def test_an_unsafe_end_is_told_and_is_no_success(tmp_path: Path) -> None:
     """All frames are there, but nobody knows whether the lights went off."""
     cell = cell_in(tmp_path)

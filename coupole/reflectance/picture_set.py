@@ -152,7 +152,7 @@ def read_lp(path: Path) -> tuple[list[str], NDArray[np.float64]]:
     """Names of pictures and directions [n, 3] of an .lp file: a count, then `name x y z` in each line."""
     names, rows = [], []
     lines = [(number, text) for number, text in enumerate(_lines(path), start=1) if text.strip()]
-    if not lines or not lines[0][1].strip().isdigit():
+    if not lines or not lines[0][1].strip().isdecimal():
         refuse(path, "expected the number of lights", lines[0][0] if lines else 1)
     for line, text in lines[1:]:
         words = text.split()

@@ -1,11 +1,15 @@
+import contextlib
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from coupole.errors import InputError
-from coupole.reflectance.picture_set import read_pictures
+from coupole.reflectance.picture_set import read_lp, read_pictures, read_rows
 
 DIRECTIONS = "".join(f"{x} {y} 1\n" for x in (-0.5, 0, 0.5) for y in (-0.5, 0.5))
 
@@ -89,3 +93,20 @@ def test_pictures_that_differ_are_refused(folder: Path) -> None:
     given = read_pictures(folder / "pictures", folder / "lights.txt")
     with pytest.raises(InputError, match=r"2\.png: has 6 x 4 pixels of 16 bit; the first picture has 5 x 4 of 8"):
         given.raw_values(2)
+
+
+@settings(max_examples=200)
+@given(
+    text=st.one_of(
+        st.text(max_size=80), st.from_regex(r"[0-9²]{1,2}\n(a\.png( [-0-9.einf]{1,5}){3}\n?)*", fullmatch=True)
+    )
+)
+@example(text="²\na.png 0 0 1")
+@pytest.mark.parametrize("reader", [read_lp, lambda path: read_rows(path, (3,))])
+def test_any_text_is_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, reader: Callable[[Path], object], text: str
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.lp"
+    path.write_text(text, encoding="utf-8")
+    with contextlib.suppress(InputError):
+        reader(path)

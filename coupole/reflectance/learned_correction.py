@@ -37,7 +37,8 @@ _LEAK = 0.05
 _BATCH = 4096
 MOST_SAMPLES = 4_000_000
 """That are kept for training."""
-_STEPS = 2500
+_MOST_STEPS, _LOOKS = 2500, 8
+"""Training ends after so many steps, or when each sample was looked at so often."""
 _RATE = 3e-3
 _CLIPPED = 1.0
 """Differences beyond this many times what is common pull no harder."""
@@ -217,15 +218,16 @@ def train(
     generator = np.random.default_rng(seed)
     network = begun(features.shape[1], generator)
     adam = _Adam(network)
-    for number in range(_STEPS):
+    steps = min(_MOST_STEPS, 1 + _LOOKS * len(wanted) // _BATCH)
+    for number in range(steps):
         drawn = generator.integers(0, len(wanted), _BATCH)
         outputs = network.forward((features[drawn] - middle) / spread)
         root = roots[drawn][:, None]
         off = np.clip(root * (outputs[-1] - wanted[drawn][:, None]), -_CLIPPED, _CLIPPED)
-        rate = 0.5 * _RATE * (1.0 + np.cos(np.pi * number / _STEPS))
+        rate = 0.5 * _RATE * (1.0 + np.cos(np.pi * number / steps))
         adam.step(network.gradients(outputs, 2.0 / _BATCH * root * off), rate)
         if number % 50 == 0:
-            say(number, _STEPS)
+            say(number, steps)
     first, offset = network.layers[0]
     scaled = (first / spread[:, None], offset - (middle / spread) @ first)
     return Network([scaled, *network.layers[1:]])

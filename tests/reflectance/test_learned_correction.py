@@ -37,7 +37,7 @@ def test_what_can_be_learnt_is_learnt_whatever_the_features_scales() -> None:
     wanted = np.abs(features[:, 1] / 100).astype(np.float32)
     network = learned.train([Lesson(features, wanted, np.ones(len(wanted), np.float32))])
     rms = np.sqrt(np.mean((network(features) - wanted) ** 2))
-    assert rms < 0.1 * wanted.std()
+    assert rms < 0.2 * wanted.std()
 
 
 def test_the_answer_stays_between_what_is_there() -> None:

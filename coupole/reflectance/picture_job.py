@@ -42,20 +42,20 @@ BLOCK = 20_000
 """Pixels that are fitted at a time."""
 PEAK_QUANTILE, _PEAK_PIXELS = 0.999, 100_000
 _GAIN_PIXELS = 20_000
+_FIRST = "fits/first.h5"
+"""Materials fitted with all pictures, before any is known as suspect."""
 Said = Callable[[str, int, int], None]
 """Step, how much of it is done, of how much."""
 
 
 @dataclass(frozen=True)
 class Checked:
-    """A light that was left out, as it is and as it was made."""
+    """How a light that was left out was made."""
 
     light: int
     psnr_db: float
     mae: float
-    measured: NDArray[np.float32]
-    """[h, w, 3]"""
-    made: NDArray[np.float32]
+    """Mean absolute error."""
 
 
 def fit_pictures(
@@ -77,8 +77,8 @@ def fit_pictures(
     if not (out / SAMPLES).exists():
         _store(pictures, out / SAMPLES, say)
     if not (out / MATERIALS).exists():
-        _fit(result, lights, say)
-    materials = read_materials(out)
+        _fit_twice(result, lights, say)
+    materials = read_materials(out / MATERIALS)
     np.save(out / NORMALS, result.picture(materials.normals.astype(np.float32), np.nan))
     if not (out / INTERPOLATION).exists():
         interpolation = learn(
@@ -145,18 +145,31 @@ def _store(pictures: PictureSet, path: Path, say: Said) -> None:
 _FIELDS = {"normal": 3, "kd": 3, "ks": 3, "alpha": 1, "residual": 1, "grey_kd": 1, "grey_ks": 1}
 
 
-def _fit(result: PictureResult, lights: NDArray[np.int64], say: Said) -> None:
+def _fit_twice(result: PictureResult, lights: NDArray[np.int64], say: Said) -> None:
+    """With all lights; then, if there are suspect pictures, again without them."""
+    first, last = result.folder / _FIRST, result.folder / MATERIALS
+    if not first.exists():
+        _fit(result, lights, first, "normals and materials", say)
+    sound = lights[np.abs(_gains(result, lights, read_materials(first)) - 1.0) <= SUSPECT]
+    if FEWEST_LIGHTS <= len(sound) < len(lights):
+        _fit(result, sound, last, "again without suspect pictures", say)
+        first.unlink()
+    else:
+        first.replace(last)
+
+
+def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str, say: Said) -> None:
     """Block by block; those that an earlier job made are kept."""
-    part = (result.folder / MATERIALS).with_suffix(".part")
+    part = path.with_suffix(".part")
     pixels = int(np.count_nonzero(result.mask))
     directions = result.directions[lights]
     with h5py.File(part, "a") as file:
         for name, width in _FIELDS.items():
             file.require_dataset(name, (pixels, width)[: 1 + (width > 1)], np.float32, fillvalue=np.nan)
-        file["normal"].attrs["axes"] = AXES
+        file["normal"].attrs["axes"], file.attrs["lights"] = AXES, lights
         for begin in range(int(file.attrs.get("fitted", 0)), pixels, BLOCK):
             block = slice(begin, min(begin + BLOCK, pixels))
-            say("normals and materials", begin, pixels)
+            say(step, begin, pixels)
             values = result.values(lights, block).transpose(1, 0, 2).astype(np.float64)
             found = fit_materials(values.mean(axis=2), directions, VIEW)
             kd, ks = colours(values, found, directions, VIEW)
@@ -165,12 +178,12 @@ def _fit(result: PictureResult, lights: NDArray[np.int64], say: Said) -> None:
                 file[name][block] = content
             file.attrs["fitted"] = block.stop
             file.flush()
-    part.replace(result.folder / MATERIALS)
+    part.replace(path)
 
 
-def read_materials(folder: Path) -> PointMaterials:
+def read_materials(path: Path) -> PointMaterials:
     """Of the grey values, [pixels] of the mask."""
-    with opened(folder / MATERIALS) as file:
+    with opened(path) as file:
         names = ("normal", "grey_kd", "grey_ks", "alpha", "residual")
         return PointMaterials(*(np.asarray(file[name], dtype=np.float64) for name in names))
 
@@ -190,10 +203,10 @@ def peak_of(result: PictureResult) -> float:
 def check(result: PictureResult, interpolation: Interpolation, light: int, peak: float) -> Checked:
     """One left-out light, made and compared, inside the mask."""
     made = relit(result, interpolation, result.directions[light])
-    measured = result.picture(result.values(np.array([light]))[0])
-    off = (made - measured)[result.mask].astype(np.float64)
+    measured = result.values(np.array([light]))[0]
+    off = (made[result.mask] - measured).astype(np.float64)
     psnr_db = 10.0 * np.log10(peak**2 / max(float(np.mean(off**2)), 1e-30))
-    return Checked(light, psnr_db, float(np.mean(np.abs(off))), measured, made)
+    return Checked(light, psnr_db, float(np.mean(np.abs(off))))
 
 
 def pooled_psnr_db(checked: Sequence[Checked]) -> float | None:

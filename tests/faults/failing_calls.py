@@ -317,7 +317,7 @@ def _wrong_in_the_journal(run: Path, ended: Ended) -> list[str]:
         return [] if not cells.events(run) else ["the journal has no line of the session's end"]
     done = stops[-1]["outcome"] == "done"
     expected = {0: "done", 130: "interrupted", 143: "interrupted", 129: "interrupted"}.get(ended.code, "failed")
-    if stops[-1]["outcome"] != expected and not (ended.code in {4, 129, 130, 143} and done):  # while it closed
+    if stops[-1]["outcome"] != expected and not (ended.code in {1, 4, 129, 130, 143} and done):  # while it closed
         return [f"the journal says {stops[-1]['outcome']}, the exit code was {ended.code}"]
     proven = len({event["shot"] for event in cells.events(run, "frame")})
     return (

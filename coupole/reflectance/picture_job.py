@@ -5,6 +5,7 @@ Each step leaves one file, complete or not there; a job that was killed goes on 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import resource
 import sys
@@ -35,6 +36,7 @@ from coupole.reflectance.picture_result import (
 )
 from coupole.reflectance.picture_set import FEWEST_LIGHTS, PictureSet
 from coupole.reflectance.relighting import Interpolation, learn, read_interpolation, relit
+from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256
 
 VIEW = np.array([0.0, 0.0, 1.0])
@@ -63,8 +65,16 @@ def fit_pictures(
 ) -> dict[str, Any]:
     """Make the result, or what of it is missing; returns what `result.json` says.
 
-    Raises InputError if too few lights are left, or if the folder holds the result of other pictures or settings.
+    Raises InputError if too few lights are left, or if the folder holds the result of other pictures or settings,
+    StorageError if the disk does not take it.
     """
+    try:
+        return _fit_pictures(pictures, out, left_out, say)
+    except OSError as error:
+        raise disk_error(out, error) from error
+
+
+def _fit_pictures(pictures: PictureSet, out: Path, left_out: Sequence[int], say: Said) -> dict[str, Any]:
     begun_s = time.monotonic()
     lights = np.setdiff1d(np.arange(len(pictures)), np.asarray(left_out, dtype=int))
     if wrong := sorted(set(left_out) - set(range(len(pictures)))):
@@ -98,7 +108,7 @@ def _inputs(pictures: PictureSet) -> dict[str, Any]:
         "pictures": {path.name: sha256(path) for path in pictures.files},
         "directions": pictures.directions.round(9).tolist(),
         "intensities": pictures.intensities.tolist(),
-        "mask_pixels": pictures.pixels,
+        "mask": hashlib.sha256(np.packbits(pictures.mask).tobytes()).hexdigest(),
     }
 
 

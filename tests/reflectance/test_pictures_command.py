@@ -123,6 +123,12 @@ def test_other_pictures_are_not_mixed_into_a_result(made: Made) -> None:
     assert "other pictures or settings" in ended.err
 
 
+def test_a_disk_that_takes_nothing_is_told_with_six(made: Made) -> None:
+    ended = cells.here("reflectance", *made[0].arguments(), "--out", "/proc/result")
+    assert ended.code == 6
+    assert "/proc/result" in ended.err
+
+
 def test_a_folder_with_something_else_is_left_alone(made: Made, tmp_path: Path) -> None:
     case, _, _ = made
     (tmp_path / "thesis.txt").write_text("precious")

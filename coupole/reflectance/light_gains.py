@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.reflectance.ggx import lobe
+from coupole.reflectance.light_interpolation import nearest
 from coupole.reflectance.normal_fit import PointMaterials
 
 Floats = NDArray[np.float64]
@@ -51,8 +52,7 @@ def gain_between(
 ) -> float:
     """The gain that a picture from another direction would have had: the median of the nearest ones', so that one
     faulty picture among good ones does not count."""
-    near = np.argsort(np.linalg.norm(measured - direction, axis=1), kind="stable")[:_NEIGHBOURS]
-    return float(np.median(found[near]))
+    return float(np.median(found[nearest(measured, direction, _NEIGHBOURS)]))
 
 
 @numba.njit(cache=True, nogil=True)

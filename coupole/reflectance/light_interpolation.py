@@ -14,6 +14,7 @@ Floats = NDArray[np.float64]
 
 KERNELS = ("linear", "thin plate", "power 1.5", "cubic", "root")
 """phi(r) of the distance r between unit vectors: -r, r2 log r, -r^1.5, r3, -sqrt(r)."""
+_DIGITS = 9
 TAIL = 4
 """Unknowns of the linear tail."""
 
@@ -52,8 +53,9 @@ def _distances(a: Floats, b: Floats) -> Floats:
 
 
 def nearest(measured: Floats, direction: Floats, count: int) -> NDArray[np.int64]:
-    """Indices of the measured lights nearest to a direction, the nearest first."""
-    return np.argsort(np.linalg.norm(measured - direction, axis=1), kind="stable")[:count]
+    """Indices of the measured lights nearest to a direction, the nearest first; of equals, which rings of lamps have,
+    the first in the table, whatever the last bits say."""
+    return np.argsort(_distances(direction[None], measured)[0].round(_DIGITS), kind="stable")[:count]
 
 
 def left_without(measured: Floats, number: int, neighbours: int) -> NDArray[np.int64]:

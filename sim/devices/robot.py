@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import secrets
 import socket
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Protocol, assert_never
@@ -89,11 +91,21 @@ def build(
             assert_never(settings)
 
 
+_PORTS = range(20_000, 32_000)
+"""Below those that the system hands out by itself: nobody gets one by chance before the driver binds it."""
+
+
 def _with_free_port(address: str) -> str:
     """The UDP address, with port 0 replaced by a free port."""
     host, port = address.rsplit(":", 1)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        if port == "0":
-            probe.bind((host, 0))
-            port = probe.getsockname()[1]
+    while port == "0":
+        drawn = secrets.choice(_PORTS)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind((host, drawn))
+            except OSError as error:
+                if error.errno != errno.EADDRINUSE:
+                    raise
+            else:
+                port = str(drawn)
     return f"{host}:{port}"

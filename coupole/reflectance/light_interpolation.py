@@ -53,8 +53,8 @@ def _distances(a: Floats, b: Floats) -> Floats:
 
 
 def nearest(measured: Floats, direction: Floats, count: int) -> NDArray[np.int64]:
-    """Indices of the measured lights nearest to a direction, the nearest first; of equals, which rings of lamps have,
-    the first in the table, whatever the last bits say."""
+    """Indices of the measured lights nearest to a direction, the nearest first; of equals, as rings of lamps have
+    them, the first in the table, whatever the last bits say."""
     return np.argsort(_distances(direction[None], measured)[0].round(_DIGITS), kind="stable")[:count]
 
 

@@ -53,4 +53,4 @@ def test_a_light_goes_with_its_neighbours() -> None:
 def test_of_lights_that_are_equally_near_the_first_is_taken_whatever_the_last_bits_say() -> None:
     top = np.array([0.0, 0.0, 1.0])
     for off in (0.0, 1e-15, -1e-15):
-        assert nearest(LIGHTS, top + [off, -off, 0], 10).tolist() == list(range(10))
+        assert nearest(LIGHTS, top + np.array([off, -off, 0]), 10).tolist() == list(range(10))

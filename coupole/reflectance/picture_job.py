@@ -171,6 +171,8 @@ def _fit_twice(result: PictureResult, lights: NDArray[np.int64], say: Said) -> N
 def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str, say: Said) -> None:
     """Block by block; those that an earlier job made are kept."""
     part = path.with_suffix(".part")
+    if part.exists() and not h5py.is_hdf5(part):  # killed before its first block was on disk
+        part.unlink()
     pixels = int(np.count_nonzero(result.mask))
     directions = result.directions[lights]
     with h5py.File(part, "a") as file:

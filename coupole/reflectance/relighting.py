@@ -87,6 +87,10 @@ def learn(
     rms = left_out_rms(every[:, :: max(1, every.shape[1] // _KERNEL_PIXELS)], directions)
     kernel = min(KERNELS, key=lambda name: rms[name])
     sound = np.flatnonzero(np.abs(gains - 1.0) <= SUSPECT)
+    if (
+        len(lights) <= learned.NEAR + learned.LEFT_OUT_WITH
+    ):  # a lesson would have fewer near pictures than are asked
+        return Interpolation(lights, gains, kernel, rms, peak, None)
     share, generator = learned.MOST_SAMPLES / (every.size + 1), np.random.default_rng(0)
     given = []
     for mask, values in taught:

@@ -123,6 +123,18 @@ def test_other_pictures_are_not_mixed_into_a_result(made: Made) -> None:
     assert "other pictures or settings" in ended.err
 
 
+def test_six_lights_are_enough_for_sums(made: Made, tmp_path: Path) -> None:
+    case, _, _ = made
+    left_out = [str(light) for light in range(46) if light not in (0, 10, 13, 16, 37, 42)]
+    options = [*case.arguments(), "--leave-out", ",".join(left_out), "--out", tmp_path / "out", "--json"]
+    ended = cells.here("reflectance", *options)
+    assert ended.code == 0, ended.err
+    ended = cells.here(
+        "reflectance", "relight", tmp_path / "out", "--direction", "0,0,1", "--to", tmp_path / "a.npy"
+    )
+    assert ended.code == 0, ended.err
+
+
 def test_a_disk_that_takes_nothing_is_told_with_six(made: Made) -> None:
     ended = cells.here("reflectance", *made[0].arguments(), "--out", "/proc/result")
     assert ended.code == 6

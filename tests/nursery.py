@@ -8,6 +8,7 @@ same pipes.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib
 import os
 import pickle
@@ -16,9 +17,11 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from typing import IO, Any
 
 from numba.core.dispatcher import Dispatcher
+from numba.np.ufunc import parallel
 from places import REPO
 
 FDS = 4
@@ -94,6 +97,7 @@ def serve(line: socket.socket) -> None:
         line.close()
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         os.setsid()
+        start_threads()
         for theirs, number in zip(fds, range(3), strict=False):
             os.dup2(theirs, number)
         code = 1
@@ -114,16 +118,50 @@ def signatures() -> set[tuple[str, str, Any]]:
         for module, content in list(sys.modules.items())
         if module.startswith("sim.")
         for name, kernel in vars(content).items()
-        if isinstance(kernel, Dispatcher) and not kernel.targetoptions.get("parallel")
+        if isinstance(kernel, Dispatcher)
         for signature in kernel.signatures
     }
 
 
 def learn(lessons: socket.socket) -> None:
-    """Compile (that is, load from numba's cache) what worlds used, but for what has threads: they do not fork."""
+    """Compile (that is, load from numba's cache) what worlds used; nothing is run here."""
     while select.select([lessons], [], [], 0)[0]:
-        for module, name, signature in pickle.loads(lessons.recv(1 << 20)):
-            getattr(importlib.import_module(module), name).compile(signature)
+        with no_threads():
+            for module, name, signature in pickle.loads(lessons.recv(1 << 20)):
+                getattr(importlib.import_module(module), name).compile(signature)
+
+
+LAUNCH = ctypes.CFUNCTYPE(None, ctypes.c_int)
+_launch_none = LAUNCH(lambda count: None)
+
+
+def threading_layers() -> dict[str, Any]:
+    """Those of numba's libraries of threads that this machine can load, by the name that numba gives them."""
+    found = {}
+    for name, module in {"tbb": "tbbpool", "omp": "omppool", "workqueue": "workqueue"}.items():
+        with contextlib.suppress(ImportError):
+            found[name] = importlib.import_module(f"numba.np.ufunc.{module}")
+    return found
+
+
+@contextlib.contextmanager
+def no_threads() -> Iterator[None]:
+    """Kernels with threads are loaded here without any being started: they would not be there in a fork."""
+    launches = {layer: layer.launch_threads for layer in threading_layers().values()}
+    for layer in launches:
+        layer.launch_threads = ctypes.cast(_launch_none, ctypes.c_void_p).value
+    try:
+        yield
+    finally:
+        for layer, launch in launches.items():
+            layer.launch_threads = launch
+
+
+def start_threads() -> None:
+    """In a fork: the threads that `no_threads` held back."""
+    if parallel._is_initialized:
+        layer = threading_layers()[parallel._threading_layer]
+        LAUNCH(layer.launch_threads)(parallel.NUM_THREADS)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,8 @@ from sim.world import client
 
 client._launch = Nursery().start  # type: ignore[assignment] # for what runs in the tests' own process
 
-settings.register_profile("coupole", deadline=None)  # no test asserts wall-clock speed
+settings.register_profile("coupole", deadline=None, max_examples=50)  # no test asserts wall-clock speed
+settings.register_profile("coupole at full scale", deadline=None, max_examples=500)
 settings.load_profile("coupole")
 
 
@@ -28,6 +29,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "full: at full scale only; left out without --full")
+    if config.getoption("--full"):
+        settings.load_profile("coupole at full scale")
 
 
 COMPILES_LONGEST = "tests/calibration/test_corner_fit.py"

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from coupole.acquisition.frame_matching import UNLABELLED
 
 
-@examples(2000)
+@examples(times=10)
 @given(takes())
 def test_no_frame_of_a_finished_burst_gets_a_wrong_label(what: Take) -> None:
     assert_no_wrong_label(what, what.verdict())
 
 
-@examples(1000)
+@examples(times=5)
 @given(takes(), st.integers(0, 2**32))
 def test_no_frame_of_a_running_burst_gets_a_wrong_label_and_no_label_is_changed_later(
     what: Take, seed: int
@@ -53,7 +53,7 @@ def assert_same_where_both(early: NDArray[np.int64], late: NDArray[np.int64]) ->
     assert np.array_equal(early[both], late[both])
 
 
-@examples(800)
+@examples(times=4)
 @given(takes())
 def test_a_step_is_called_missing_only_if_no_frame_of_it_is_here(what: Take) -> None:
     here = np.zeros(len(what.log), np.bool_)
@@ -61,7 +61,7 @@ def test_a_step_is_called_missing_only_if_no_frame_of_it_is_here(what: Take) -> 
     assert not np.any(what.verdict().missing & here)
 
 
-@examples(800)
+@examples(times=4)
 @given(takes())
 def test_a_step_is_called_lost_in_transfer_only_if_the_camera_counted_it(what: Take) -> None:
     assert not np.any(what.verdict().lost_in_transfer & ~what.exposed)

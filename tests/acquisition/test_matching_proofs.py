@@ -31,7 +31,7 @@ clocks = {
 }
 
 
-@examples(500)
+@examples(times=3)
 @given(bursts(), st.fixed_dictionaries(clocks))
 def test_a_clean_burst_is_proven_completely(burst: Burst, clock: dict[str, float]) -> None:
     what = take(burst, **clock)
@@ -40,7 +40,7 @@ def test_a_clean_burst_is_proven_completely(burst: Burst, clock: dict[str, float
     assert not verdict.missing.any()
 
 
-@examples(500)
+@examples(times=3)
 @given(st.integers(1, MAX_LIGHTS), st.sampled_from(EXPOSURES_US), st.fixed_dictionaries(clocks), st.data())
 def test_up_to_five_percent_of_lost_transfers_leave_all_other_frames_proven(
     lights: int, exposure_us: int, clock: dict[str, float], data: st.DataObject
@@ -55,7 +55,7 @@ def test_up_to_five_percent_of_lost_transfers_leave_all_other_frames_proven(
     assert set(np.flatnonzero(verdict.missing)) == set(np.flatnonzero(verdict.lost_in_transfer)) == set(lost)
 
 
-@examples(300)
+@examples(times=2)
 @given(st.integers(1, MAX_LIGHTS), st.fixed_dictionaries(clocks), st.data())
 def test_one_missed_trigger_leaves_exactly_its_step_unproven(
     lights: int, clock: dict[str, float], data: st.DataObject
@@ -69,7 +69,7 @@ def test_one_missed_trigger_leaves_exactly_its_step_unproven(
     assert not verdict.lost_in_transfer.any()
 
 
-@examples(300)
+@examples(times=2)
 @given(st.integers(1, MAX_LIGHTS), st.floats(0, 20), st.floats(1, 100) | st.floats(500, 5_000), st.data())
 def test_one_double_trigger_leaves_at_most_its_step_unproven(
     lights: int, jitter_us: float, after_us: float, data: st.DataObject

@@ -67,7 +67,7 @@ def live(what: Path, *options: str) -> Iterator[tuple[Viewer, subprocess.Popen[s
 @pytest.fixture(scope="module")
 def camera(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
     """Of a simulated cell's camera."""
-    with live(CellFolder(tmp_path_factory.mktemp("live")).plan, "--fps", "20") as (viewer, _):
+    with live(CellFolder(tmp_path_factory.mktemp("live")).plan, "--fps", "8") as (viewer, _):
         yield viewer
 
 
@@ -189,7 +189,7 @@ def _title(viewer: Viewer) -> str:
 
 
 def test_a_run_is_watched_through_its_folder_and_never_slowed(cell: CellFolder) -> None:
-    cell.write(lights={"kind": "all"})
+    cell.write(lights={"kind": "every", "every": 3})
     acquiring = cell.start_acquire()
     run = cell.run_folder
     with live(run) as (viewer, _):
@@ -201,7 +201,7 @@ def test_a_run_is_watched_through_its_folder_and_never_slowed(cell: CellFolder) 
         refused.value.close()
         ended = cells.finish(acquiring)
     assert ended.code == 0, ended.err
-    assert ended.document["proven"] == 1080
+    assert ended.document["proven"] == 360
 
 
 def test_a_camera_that_is_unplugged_ends_the_live_view_with_four(cell: CellFolder) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+Said = Callable[[str, int, int], None]
+Made = tuple[dict[str, Any], list[str], Path]
+"""What `result.json` says, remarks, the report."""
 JOB = "from"
 """Name of the main job among the steps; nobody types it."""
 
@@ -31,72 +35,175 @@ class JobOrStep(TyperGroup):
 
 reflectance_app = typer.Typer(
     cls=JobOrStep,
-    help="Normals and materials at each pixel from pictures under known lights, and pictures under new lights.\n\n"
-    "`coupole reflectance --pictures FOLDER --lights FILE --out OUT` makes a result; "
+    help="Reflectance of an object's surface from runs, normals and materials from pictures under known lights, "
+    "and pictures under new lights.\n\n"
+    "`coupole reflectance RUN --out OUT` and `coupole reflectance --pictures FOLDER --lights FILE --out OUT` make "
+    "results; "
     "`coupole reflectance from --help` lists its options. A step's name as first word is the step.",
     no_args_is_help=True,
 )
 
 
+OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the result.", show_default=False)]
+MeshOption = Annotated[
+    Path | None, typer.Option("--mesh", help="Mesh of the object; without it the one that the run names.")
+]
+RecordsOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--calibrations",
+        help="A record (hand-eye, leds, led-power; dark, response, flat-field, drift), or a folder of records; "
+        "again for more. Without it those that the run names.",
+        show_default=False,
+    ),
+]
+NoiseOption = Annotated[
+    float, typer.Option("--scan-noise-um", min=0.1, help="Standard uncertainty of the mesh's vertices.")
+]
+MemoryOption = Annotated[
+    str, typer.Option("--memory", help="For the samples that are fitted together: 500MB, 4GB.")
+]
+PicturesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--pictures",
+        help="Folder of 8- or 16-bit pictures, linear, in the order of its filenames.txt, else sorted.",
+        show_default=False,
+    ),
+]
+LightsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--lights",
+        help="Directions to the lights, one in each line (x right, y up, z to the camera), or an .lp file.",
+        show_default=False,
+    ),
+]
+IntensitiesOption = Annotated[
+    Path | None,
+    typer.Option("--intensities", help="One number or three (r g b) for each light; values are divided by them."),
+]
+MaskOption = Annotated[Path | None, typer.Option("--mask", help="Picture that is black where nothing is fitted.")]
+LeaveOutOption = Annotated[
+    str,
+    typer.Option(
+        "--leave-out",
+        help="Lights (of pictures, from 0) or LEDs (of runs; every twelfth without it) that are kept for the "
+        "check: 4,12,20.",
+        show_default=False,
+    ),
+]
+
+
 @reflectance_app.command(JOB)
-def from_pictures(
-    pictures: Annotated[
-        Path,
-        typer.Option(
-            "--pictures",
-            help="Folder of 8- or 16-bit pictures, linear, in the order of its filenames.txt, else sorted.",
-            show_default=False,
-        ),
-    ],
-    lights: Annotated[
-        Path,
-        typer.Option(
-            "--lights",
-            help="Directions to the lights, one in each line (x right, y up, z to the camera), or an .lp file.",
-            show_default=False,
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the result.", show_default=False)],
-    intensities: Annotated[
-        Path | None,
-        typer.Option(
-            "--intensities", help="One number or three (r g b) for each light; values are divided by them."
-        ),
+def from_runs_or_pictures(
+    runs: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Runs of one object, or no run but --pictures.", show_default=False),
     ] = None,
-    mask: Annotated[
-        Path | None, typer.Option("--mask", help="Picture that is black where nothing is fitted.")
-    ] = None,
-    leave_out: Annotated[
-        str,
-        typer.Option(
-            "--leave-out", help="Lights (from 0) that are kept for the check: 4,12,20.", show_default=False
-        ),
-    ] = "",
+    out: OutOption = None,
+    mesh: MeshOption = None,
+    calibrations: RecordsOption = None,
+    scan_noise_um: NoiseOption = 30.0,
+    memory: MemoryOption = "2GB",
+    pictures: PicturesOption = None,
+    lights: LightsOption = None,
+    intensities: IntensitiesOption = None,
+    mask: MaskOption = None,
+    leave_out: LeaveOutOption = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Fit normals and materials to pictures of one view under distant lights, learn to relight them, check it.
+    """Fit normals and materials to proven frames of runs, or to pictures under known distant lights; check them.
 
     A job that was stopped goes on where it was when it is given again.
     """
-    from coupole.reflectance.picture_job import fit_pictures
-    from coupole.reflectance.picture_set import read_pictures
-    from coupole.viewing import reflectance_page
     from coupole.viewing.terminal import make_console, step_bars
 
     console = make_console(quiet=as_json)
     try:
-        given = read_pictures(pictures, lights, intensities=intensities, mask=mask)
+        if out is None:
+            raise InputError("--out: expected the folder of the result")
+        if bool(runs) == (pictures is not None):
+            raise InputError("expected runs, or --pictures with --lights; see coupole reflectance from --help")
         with step_bars(console) as say:
-            about = fit_pictures(given, out, left_out=_numbers(leave_out), say=say)
-        page = reflectance_page.write(out)
+            if pictures is not None:
+                made = _of_pictures(pictures, lights, intensities, mask, _numbers(leave_out), out, say)
+            else:
+                records = _records(calibrations or [])
+                left_out = tuple(_numbers(leave_out))
+                made = _of_runs(runs or [], mesh, records, left_out, scan_noise_um, _bytes(memory), out, say)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
-    for remark in reflectance_page.remarks(about):
+    about, remarks, page = made
+    for remark in remarks:
         console.print(remark)
     console.print(f"report {page}")
     if as_json:
-        print(json.dumps({name: value for name, value in about.items() if name != "inputs"}))
+        print(json.dumps({name: value for name, value in about.items() if name not in {"inputs", "runs"}}))
+
+
+def _of_pictures(
+    pictures: Path,
+    lights: Path | None,
+    intensities: Path | None,
+    mask: Path | None,
+    left_out: list[int],
+    out: Path,
+    say: Said,
+) -> Made:
+    from coupole.reflectance.picture_job import fit_pictures
+    from coupole.reflectance.picture_set import read_pictures
+    from coupole.viewing import reflectance_page
+
+    if lights is None:
+        raise InputError("--lights: expected the file of the lights' directions")
+    given = read_pictures(pictures, lights, intensities=intensities, mask=mask)
+    about = fit_pictures(given, out, left_out=left_out, say=say)
+    return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
+
+
+def _of_runs(
+    runs: list[Path],
+    mesh: Path | None,
+    records: tuple[Path, ...],
+    left_out: tuple[int, ...],
+    scan_noise_um: float,
+    memory_bytes: int,
+    out: Path,
+    say: Said,
+) -> Made:
+    from coupole.reflectance.run_job import RunRequest, fit_runs
+    from coupole.viewing import run_reflectance_page
+
+    request = RunRequest(tuple(runs), mesh, records, left_out, scan_noise_um, memory_bytes)
+    about = fit_runs(request, out, say=say)
+    return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)
+
+
+def _records(named: list[Path]) -> tuple[Path, ...]:
+    """Records, and those in folders that are named."""
+    from coupole.calibration.record import SEAL
+
+    found: list[Path] = []
+    for path in named:
+        if path.is_dir():
+            files = sorted(path.glob("*.yaml"))
+            found += [file for file in files if file.read_text(encoding="utf-8").startswith(SEAL)]
+        else:
+            found.append(path)
+    return tuple(found)
+
+
+def _bytes(text: str) -> int:
+    units = {"GB": 10**9, "MB": 10**6}
+    try:
+        size = float(text[:-2]) * units[text[-2:].upper()]
+    except (KeyError, ValueError) as error:
+        raise InputError(f"--memory: expected a size as 500MB or 4GB, got {text!r}") from error
+    if not 50e6 <= size < 1e15:
+        raise InputError(f"--memory: expected 50MB or more, got {text!r}")
+    return int(size)
 
 
 def _numbers(text: str) -> list[int]:

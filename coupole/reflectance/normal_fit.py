@@ -79,9 +79,11 @@ def fit_materials(values: Floats, lights: Floats, view: Floats, *, threads: int 
     found = np.full((len(values), 7), np.nan)
     scaled = np.ascontiguousarray(values, dtype=np.float64)
 
+    only_view = np.zeros(len(lights), np.int64)
+
     def fit(begin: int) -> None:
         part = slice(begin, begin + _BLOCK)
-        _fit_all(scaled[part], lights, half, view, normals[part], albedo[part], found[part])
+        _fit_all(scaled[part], lights, half, view[None], only_view, normals[part], albedo[part], found[part])
 
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(fit, range(0, len(values), _BLOCK)))
@@ -101,46 +103,61 @@ def colours(values: Floats, materials: PointMaterials, lights: Floats, view: Flo
 
 @numba.njit(cache=True, nogil=True)
 def _fit_colours(values, normals, grey_kd, grey_ks, alphas, lights, half, view, kd, ks):  # type: ignore[no-untyped-def]
-    """Samples are weighted as the last step of the grey fit weighted them."""
+    views, only_view, used = view.reshape(1, 3), np.zeros(len(lights), np.int64), np.arange(len(lights))
+    grey = np.empty(3)
     for pixel in range(len(values)):
-        if not grey_kd[pixel] > 0.0:
-            continue
-        n0, n1, n2 = normals[pixel]
-        nv = n0 * view[0] + n1 * view[1] + n2 * view[2]
-        scale = _CAUCHY * math.sqrt(grey_kd[pixel])
-        sums = np.zeros((3, 2))
-        dd, ds, ss = 0.0, 0.0, 0.0
-        for light in range(len(lights)):
-            nl = n0 * lights[light, 0] + n1 * lights[light, 1] + n2 * lights[light, 2]
-            if nl <= 0.0:
-                continue
-            nh = n0 * half[light, 0] + n1 * half[light, 1] + n2 * half[light, 2]
-            shine = nl * lobe(nl, nv, nh, alphas[pixel])[0]
-            model = nl * grey_kd[pixel] + shine * grey_ks[pixel]
-            grey = max(0.0, (values[pixel, light, 0] + values[pixel, light, 1] + values[pixel, light, 2]) / 3.0)
-            off = (math.sqrt(model) - math.sqrt(grey)) / scale
-            weight = 1.0 / ((1.0 + off * off) * max(model, 1e-12))
-            dd += weight * nl * nl
-            ds += weight * nl * shine
-            ss += weight * shine * shine
-            for colour in range(3):
-                sums[colour, 0] += weight * nl * values[pixel, light, colour]
-                sums[colour, 1] += weight * shine * values[pixel, light, colour]
-        for colour in range(3):
-            determinant = dd * ss - ds * ds
-            diffuse, specular = sums[colour, 0] / max(dd, 1e-30), 0.0
-            if determinant > 1e-9 * dd * ss:
-                both_d = (sums[colour, 0] * ss - sums[colour, 1] * ds) / determinant
-                both_s = (sums[colour, 1] * dd - sums[colour, 0] * ds) / determinant
-                if both_s > 0.0:
-                    diffuse, specular = both_d, both_s
-                if both_d < 0.0:
-                    diffuse, specular = 0.0, sums[colour, 1] / ss
-            kd[pixel, colour], ks[pixel, colour] = max(diffuse, 0.0), max(specular, 0.0)
+        if grey_kd[pixel] > 0.0:
+            grey[0], grey[1], grey[2] = grey_kd[pixel], grey_ks[pixel], alphas[pixel]
+            colours_from(
+                values[pixel], used, normals[pixel], grey, lights, half, views, only_view, kd[pixel], ks[pixel]
+            )
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_all(values, lights, half, view, normals, albedo, found):  # type: ignore[no-untyped-def]
+def colours_from(values, used, normal, grey, lights, half, views, view_of, kd, ks):  # type: ignore[no-untyped-def]
+    """kd and ks [channels] of the samples `used` of values [samples, channels], with a normal and `grey` (kd, ks,
+    alpha) that were fitted to their means; samples are weighted as the last step of that fit weighted them."""
+    n0, n1, n2 = normal
+    channels = values.shape[1]
+    scale = _CAUCHY * math.sqrt(grey[0])
+    sums = np.zeros((channels, 2))
+    dd, ds, ss = 0.0, 0.0, 0.0
+    for number in range(len(used)):
+        light = used[number]
+        nl = n0 * lights[light, 0] + n1 * lights[light, 1] + n2 * lights[light, 2]
+        if nl <= 0.0:
+            continue
+        view = views[view_of[light]]
+        nv = n0 * view[0] + n1 * view[1] + n2 * view[2]
+        nh = n0 * half[light, 0] + n1 * half[light, 1] + n2 * half[light, 2]
+        shine = nl * lobe(nl, nv, nh, grey[2])[0]
+        model = nl * grey[0] + shine * grey[1]
+        mean = 0.0
+        for channel in range(channels):
+            mean += values[light, channel] / channels
+        off = (math.sqrt(model) - math.sqrt(max(0.0, mean))) / scale
+        weight = 1.0 / ((1.0 + off * off) * max(model, 1e-12))
+        dd += weight * nl * nl
+        ds += weight * nl * shine
+        ss += weight * shine * shine
+        for channel in range(channels):
+            sums[channel, 0] += weight * nl * values[light, channel]
+            sums[channel, 1] += weight * shine * values[light, channel]
+    determinant = dd * ss - ds * ds
+    for channel in range(channels):
+        diffuse, specular = sums[channel, 0] / max(dd, 1e-30), 0.0
+        if determinant > 1e-9 * dd * ss:
+            both_d = (sums[channel, 0] * ss - sums[channel, 1] * ds) / determinant
+            both_s = (sums[channel, 1] * dd - sums[channel, 0] * ds) / determinant
+            if both_s > 0.0:
+                diffuse, specular = both_d, both_s
+            if both_d < 0.0:
+                diffuse, specular = 0.0, sums[channel, 1] / ss
+        kd[channel], ks[channel] = max(diffuse, 0.0), max(specular, 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_all(values, lights, half, views, view_of, normals, albedo, found):  # type: ignore[no-untyped-def]
     for pixel in range(len(values)):
         sample = values[pixel]
         least = _LEAST_SHARE * np.quantile(sample, _OF_QUANTILE)
@@ -157,9 +174,9 @@ def _fit_all(values, lights, half, view, normals, albedo, found):  # type: ignor
                 math.log(0.02 * albedo[pixel]),
                 math.log(alpha),
             )
-            if unknowns[0] * view[0] + unknowns[1] * view[1] + unknowns[2] * view[2] < 0.05:
-                unknowns[:3] = view
-            cost, spread = _fit(roots, used, lights, half, view, unknowns)
+            if _least_cosine(unknowns, views) < 0.05:
+                unknowns[:3] = views[0]
+            cost, spread = fit_from(roots, used, lights, half, views, view_of, unknowns, views[0], 0.0)
             if cost < best:
                 best = cost
                 found[pixel, :3] = unknowns[:3]
@@ -168,18 +185,24 @@ def _fit_all(values, lights, half, view, normals, albedo, found):  # type: ignor
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit(roots, used, lights, half, view, unknowns):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt from `unknowns` (normal, log kd, log ks, log alpha), in place; cost and weighted rms."""
+def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffness):  # type: ignore[no-untyped-def]
+    """Levenberg-Marquardt from `unknowns` (normal, log kd, log ks, log alpha), in place; cost and weighted rms.
+
+    `roots` are square roots of the samples `used`; `lights` and `half` [samples, 3], `views` [v, 3] that
+    `view_of` [samples] names. The normal is held to `prior` by `stiffness`, 1 over its variance in rad^2.
+    """
     scale = _CAUCHY * math.exp(0.5 * unknowns[3])
     matrix, right = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
     trial = np.empty(6)
-    cost, spread = _equations(roots, used, lights, half, view, unknowns, scale, matrix, right)
+    cost, spread = _equations(
+        roots, used, lights, half, views, view_of, unknowns, prior, stiffness, scale, matrix, right
+    )
     damping = 1e-2
     for _ in range(_MOST_STEPS):
         step = _solve(matrix, right, damping)
         _move(unknowns, step, trial)
-        if trial[0] * view[0] + trial[1] * view[1] + trial[2] * view[2] > 0.02:
-            moved, moved_spread = _cost(roots, used, lights, half, view, trial, scale)
+        if _least_cosine(trial, views) > 0.02:
+            moved, moved_spread = _cost(roots, used, lights, half, views, view_of, trial, prior, stiffness, scale)
         else:
             moved, moved_spread = np.inf, 0.0
         if moved < cost:
@@ -189,12 +212,24 @@ def _fit(roots, used, lights, half, view, unknowns):  # type: ignore[no-untyped-
             if gain < _SETTLED * cost:
                 cost, spread = moved, moved_spread
                 break
-            cost, spread = _equations(roots, used, lights, half, view, unknowns, scale, matrix, right)
+            cost, spread = _equations(
+                roots, used, lights, half, views, view_of, unknowns, prior, stiffness, scale, matrix, right
+            )
         else:
             damping *= 6.0
             if damping > 1e8:
                 break
     return cost, spread / math.exp(0.5 * unknowns[3])
+
+
+@numba.njit(cache=True, nogil=True)
+def _least_cosine(normal, views):  # type: ignore[no-untyped-def]
+    """Between the normal and the views."""
+    least = 1.0
+    for view in range(len(views)):
+        cosine = normal[0] * views[view, 0] + normal[1] * views[view, 1] + normal[2] * views[view, 2]
+        least = min(least, cosine)
+    return least
 
 
 @numba.njit(cache=True, nogil=True)
@@ -223,19 +258,20 @@ def _tangents(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _cost(roots, used, lights, half, view, unknowns, scale):  # type: ignore[no-untyped-def]
+def _cost(roots, used, lights, half, views, view_of, unknowns, prior, stiffness, scale):  # type: ignore[no-untyped-def]
     """Cauchy's cost, and the weighted rms of the residuals."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
-    nv = n0 * view[0] + n1 * view[1] + n2 * view[2]
-    cost, squares, weights = 0.0, 0.0, 0.0
+    to_view = views[:, 0] * n0 + views[:, 1] * n1 + views[:, 2] * n2
+    cost = stiffness * ((n0 - prior[0]) ** 2 + (n1 - prior[1]) ** 2 + (n2 - prior[2]) ** 2)
+    squares, weights = 0.0, 0.0
     for number in range(len(used)):
         light = used[number]
         nl = n0 * lights[light, 0] + n1 * lights[light, 1] + n2 * lights[light, 2]
         model = 0.0
         if nl > 0.0:
             nh = n0 * half[light, 0] + n1 * half[light, 1] + n2 * half[light, 2]
-            model = math.sqrt(nl * (kd + ks * lobe(nl, nv, nh, alpha)[0]))
+            model = math.sqrt(nl * (kd + ks * lobe(nl, to_view[view_of[light]], nh, alpha)[0]))
         off = (model - roots[number]) / scale
         cost += math.log1p(off * off)
         weight = 1.0 / (1.0 + off * off)
@@ -245,19 +281,24 @@ def _cost(roots, used, lights, half, view, unknowns, scale):  # type: ignore[no-
 
 
 @numba.njit(cache=True, nogil=True)
-def _equations(roots, used, lights, half, view, unknowns, scale, matrix, right):  # type: ignore[no-untyped-def]
+def _equations(roots, used, lights, half, views, view_of, unknowns, prior, stiffness, scale, matrix, right):  # type: ignore[no-untyped-def]
     """Normal equations of a step, into `matrix` and `right`; cost and weighted rms."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
-    nv = n0 * view[0] + n1 * view[1] + n2 * view[2]
     t1, t2 = _tangents(n0, n1, n2)
-    v1 = t1[0] * view[0] + t1[1] * view[1] + t1[2] * view[2]
-    v2 = t2[0] * view[0] + t2[1] * view[1] + t2[2] * view[2]
+    to_view = views[:, 0] * n0 + views[:, 1] * n1 + views[:, 2] * n2
+    view_1 = views[:, 0] * t1[0] + views[:, 1] * t1[1] + views[:, 2] * t1[2]
+    view_2 = views[:, 0] * t2[0] + views[:, 1] * t2[1] + views[:, 2] * t2[2]
     matrix[:], right[:] = 0.0, 0.0
     row = np.empty(_UNKNOWNS)
-    cost, squares, weights = 0.0, 0.0, 0.0
+    d0, d1, d2 = n0 - prior[0], n1 - prior[1], n2 - prior[2]
+    cost, squares, weights = stiffness * (d0 * d0 + d1 * d1 + d2 * d2), 0.0, 0.0
+    right[0] = -stiffness * (t1[0] * d0 + t1[1] * d1 + t1[2] * d2)
+    right[1] = -stiffness * (t2[0] * d0 + t2[1] * d1 + t2[2] * d2)
+    matrix[0, 0] = matrix[1, 1] = stiffness
     for number in range(len(used)):
         light = used[number]
+        view = view_of[light]
         l0, l1, l2 = lights[light, 0], lights[light, 1], lights[light, 2]
         nl = n0 * l0 + n1 * l1 + n2 * l2
         if nl <= 0.0:
@@ -266,7 +307,7 @@ def _equations(roots, used, lights, half, view, unknowns, scale, matrix, right):
             continue
         h0, h1, h2 = half[light, 0], half[light, 1], half[light, 2]
         nh = n0 * h0 + n1 * h1 + n2 * h2
-        value, by_nl, by_nv, by_nh, by_alpha = lobe(nl, nv, nh, alpha)
+        value, by_nl, by_nv, by_nh, by_alpha = lobe(nl, to_view[view], nh, alpha)
         model = math.sqrt(nl * (kd + ks * value))
         off = (model - roots[number]) / scale
         weight = 1.0 / (1.0 + off * off)
@@ -278,12 +319,12 @@ def _equations(roots, used, lights, half, view, unknowns, scale, matrix, right):
         by_view, by_half = nl * ks * by_nv, nl * ks * by_nh
         row[0] = to_root * (
             by_light * (t1[0] * l0 + t1[1] * l1 + t1[2] * l2)
-            + by_view * v1
+            + by_view * view_1[view]
             + by_half * (t1[0] * h0 + t1[1] * h1 + t1[2] * h2)
         )
         row[1] = to_root * (
             by_light * (t2[0] * l0 + t2[1] * l1 + t2[2] * l2)
-            + by_view * v2
+            + by_view * view_2[view]
             + by_half * (t2[0] * h0 + t2[1] * h1 + t2[2] * h2)
         )
         row[2] = to_root * nl * kd

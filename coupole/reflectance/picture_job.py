@@ -36,6 +36,7 @@ from coupole.reflectance.picture_result import (
 )
 from coupole.reflectance.picture_set import FEWEST_LIGHTS, PictureSet
 from coupole.reflectance.relighting import Interpolation, learn, read_interpolation, relit
+from coupole.reflectance.result_folder import begin, complete
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256
 
@@ -83,7 +84,7 @@ def _fit_pictures(pictures: PictureSet, out: Path, left_out: Sequence[int], say:
         raise InputError(f"--leave-out: {len(lights)} lights are left; at least {FEWEST_LIGHTS} are needed")
     result = PictureResult(out)
     settings: dict[str, Any] = {"left_out": sorted(set(left_out)), "inputs": _inputs(pictures)}
-    _begin(out, settings)
+    begin(out, settings)
     if not (out / SAMPLES).exists():
         _store(pictures, out / SAMPLES, say)
     if not (out / MATERIALS).exists():
@@ -94,12 +95,12 @@ def _fit_pictures(pictures: PictureSet, out: Path, left_out: Sequence[int], say:
         interpolation = learn(
             result, lights, _gains(result, lights, materials), say=lambda done, of: say("relighting", done, of)
         )
-        _complete(out / INTERPOLATION, interpolation.write)
+        complete(out / INTERPOLATION, interpolation.write)
     interpolation = read_interpolation(out)
     peak = peak_of(result)
     checked = [check(result, interpolation, light, peak) for light in settings["left_out"]]
     about = _about(result, settings, interpolation, materials, checked, time.monotonic() - begun_s)
-    _complete(out / ABOUT, lambda path: path.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8"))
+    complete(out / ABOUT, lambda path: path.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8"))
     return about
 
 
@@ -110,30 +111,6 @@ def _inputs(pictures: PictureSet) -> dict[str, Any]:
         "intensities": pictures.intensities.tolist(),
         "mask": hashlib.sha256(np.packbits(pictures.mask).tobytes()).hexdigest(),
     }
-
-
-def _begin(out: Path, settings: dict[str, Any]) -> None:
-    """Make the folder; refuse one that was begun with other pictures or settings."""
-    path = out / "settings.json"
-    text = json.dumps(settings) + "\n"
-    if path.exists():
-        if path.read_text(encoding="utf-8") != text:
-            raise InputError(
-                f"{out} holds the result of other pictures or settings: name another folder with --out"
-            )
-        return
-    if out.exists() and any(out.iterdir()):
-        raise InputError(f"{out} is not empty, and holds no result: name another folder with --out")
-    for name in ("samples", "fits"):
-        (out / name).mkdir(parents=True, exist_ok=True)
-    _complete(path, lambda part: part.write_text(text, encoding="utf-8"))
-
-
-def _complete(path: Path, write: Callable[[Path], Any]) -> None:
-    """Have a file written beside its place, then put there."""
-    part = path.with_name(path.name + ".part")
-    write(part)
-    part.replace(path)
 
 
 def _store(pictures: PictureSet, path: Path, say: Said) -> None:
@@ -149,7 +126,7 @@ def _store(pictures: PictureSet, path: Path, say: Said) -> None:
                 say("reading", number, len(pictures))
                 values[number] = pictures.raw_values(number)
 
-    _complete(path, write)
+    complete(path, write)
 
 
 _FIELDS = {"normal": 3, "kd": 3, "ks": 3, "alpha": 1, "residual": 1, "grey_kd": 1, "grey_ks": 1}

@@ -23,7 +23,7 @@ WIDTH_PX = 480
 MOST_CHECKS = 6
 POOR_RESIDUAL = 0.05
 """Of square roots of values, as a share of the diffuse part's: beyond it the material model itself is in doubt."""
-_STYLE = """
+STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left;vertical-align:top}
 figure{display:inline-block;margin:.3em}figcaption{font-size:12px;color:#666}img{display:block;background:#000}
@@ -64,17 +64,17 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
 def _page(result: PictureResult) -> Iterator[str]:
     about = result.about
     title = html.escape(result.folder.resolve().name)
-    yield f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>"
+    yield f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
     for remark in remarks(about):
         yield f"<p>{html.escape(remark)}"
     with h5py.File(result.folder / MATERIALS) as file:
         fields = {name: np.asarray(file[name]) for name in ("normal", "kd", "ks", "alpha", "residual")}
     yield "<h2>Normals and materials</h2>"
-    yield _figure("normals", result.picture(0.5 + 0.5 * fields["normal"].astype(np.float32)))
-    yield _figure("diffuse", _display(result.picture(fields["kd"])))
-    yield _figure("specular", _display(result.picture(fields["ks"])))
-    yield _figure("roughness alpha, white 1", _grey(result.picture(fields["alpha"])))
-    yield _figure("what the materials leave, white 10 %", _grey(result.picture(fields["residual"]) / 0.1))
+    yield figure("normals", result.picture(0.5 + 0.5 * fields["normal"].astype(np.float32)))
+    yield figure("diffuse", display(result.picture(fields["kd"])))
+    yield figure("specular", display(result.picture(fields["ks"])))
+    yield figure("roughness alpha, white 1", grey(result.picture(fields["alpha"])))
+    yield figure("what the materials leave, white 10 %", grey(result.picture(fields["residual"]) / 0.1))
     yield "<p>Where no light stands near the mirror direction, specular and roughness are guesses."
     if about["left_out"]:
         yield "<h2>Left-out lights: measured, made, difference (white 5 % of white)</h2>"
@@ -97,13 +97,13 @@ def _checks(result: PictureResult) -> Iterator[str]:
         made = relit(result, interpolation, result.directions[light])
         white = float(np.quantile(measured[result.mask], PEAK_QUANTILE))
         yield "<div>"
-        yield _figure(f"light {light}, measured", _display(measured, white))
-        yield _figure("made", _display(made, white))
-        yield _figure("difference", np.clip(np.abs(made - measured) / (0.05 * white), 0, 1))
+        yield figure(f"light {light}, measured", display(measured, white))
+        yield figure("made", display(made, white))
+        yield figure("difference", np.clip(np.abs(made - measured) / (0.05 * white), 0, 1))
         yield "</div>"
 
 
-def _display(picture: NDArray[np.float32], white: float = 0.0) -> NDArray[np.float32]:
+def display(picture: NDArray[np.float32], white: float = 0.0) -> NDArray[np.float32]:
     """[h, w, 3] for the eye: gamma 2.2, the brightest thousandth white."""
     known = np.nan_to_num(picture)
     shown: NDArray[np.float32] = np.clip(
@@ -112,11 +112,11 @@ def _display(picture: NDArray[np.float32], white: float = 0.0) -> NDArray[np.flo
     return shown ** np.float32(1 / 2.2)
 
 
-def _grey(picture: NDArray[np.float32]) -> NDArray[np.float32]:
+def grey(picture: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.repeat(np.clip(np.nan_to_num(picture), 0, 1)[..., None], 3, axis=2)
 
 
-def _figure(caption: str, picture: NDArray[np.float32]) -> str:
+def figure(caption: str, picture: NDArray[np.float32]) -> str:
     shown = (255 * np.clip(np.nan_to_num(picture), 0, 1)).astype(np.uint8)
     width = min(WIDTH_PX, shown.shape[1])
     data = base64.b64encode(png(shown, width)).decode()

@@ -42,6 +42,8 @@ class LightFrame:
     """[4, 4] mm, by the rig's hand-eye, or by a record's (`seen_through`)."""
     read: Callable[[], NDArray[np.uint16]]
     """[H, W] DN."""
+    joints_deg: Floats | None = None
+    """[6] measured with the pose."""
 
     @property
     def view(self) -> str:
@@ -164,6 +166,7 @@ def _of_view(
                 np.array(poses[int(record["pose"])]["base_from_flange"], dtype=np.float64),
                 np.array(poses[int(record["pose"])]["base_from_camera"], dtype=np.float64),
                 partial(file.pixels, frame.index),
+                np.array(poses[int(record["pose"])]["joints_deg"], dtype=np.float64),
             )
         )
     optics = file.number("focal_length_mm"), file.number("focus_distance_mm"), file.number("pixel_pitch_um")

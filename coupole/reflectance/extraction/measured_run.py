@@ -1,0 +1,242 @@
+"""What a run was measured with: its frames, the object's triangles, and the calibrations that give them units.
+
+The run's own folder is enough: plan, rig, mesh and records are kept in it.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.calibrated_arm import calibrated_poses, has_axis_zeros, read_arm
+from coupole.calibration.earlier import read_accepted
+from coupole.calibration.light.frames import LightFrame, LightFrames, channels_of, open_light_frames
+from coupole.calibration.light.irradiance import Emission
+from coupole.calibration.light.led_power_tile import calibrated_positions
+from coupole.calibration.light.tile_views import Positions
+from coupole.calibration.optics import Intrinsics
+from coupole.calibration.posed_camera import CameraPrior, read_posed_camera
+from coupole.calibration.record import Record, read_record
+from coupole.errors import InputError
+from coupole.geometry import apply
+from coupole.plan.reading import read_plan
+from coupole.plan.rig import Rig
+from coupole.plan.rig_devices import described_arm
+from coupole.preflight.object_shape import MM_PER_UNIT
+from coupole.scan.mesh_files import read_mesh
+from coupole.storage.run import Run
+
+Floats = NDArray[np.float64]
+
+NEEDED = ("hand-eye", "leds", "led-power")
+USED = (*NEEDED, "dark", "response", "flat-field", "camera", "drift")
+TYPICAL_PER_K = -0.003
+"""Of white power LEDs, relative."""
+MOST_MOVED_MM = 0.1
+"""Within a view; an arm comes back to a pose within less when a run is resumed."""
+_HOW = "name them with --calibrations, or make them: `coupole calibrate all --rig RIG`"
+
+
+@dataclass(frozen=True)
+class MeasuredView:
+    """Frames of one view under single LEDs, all taken at one pose."""
+
+    name: str
+    base_from_camera: Floats
+    """[4, 4] mm, by the hand-eye's record, the arm's axis zeros applied."""
+    frames: tuple[LightFrame, ...]
+
+
+@dataclass(frozen=True)
+class Powers:
+    """Power of the LEDs of a record, by channel."""
+
+    ids: NDArray[np.int64]
+    power: Floats
+    """[leds, channels] DN s^-1 m^2 sr; NaN or 0 where there is none."""
+    board_c: Floats
+    """[leds] temperature of the board for which the power holds."""
+    u_own: Floats
+    """[leds, channels] relative standard uncertainty that an LED shares with no other."""
+    u_shared: Floats
+    """[leds, channels] relative, of what all LEDs share: the tile, its place."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Power of the LEDs over their calibrated power: ln = level + rate_per_h (t - start_s) / 3600 + per_k dT."""
+
+    level: float = 0.0
+    rate_per_h: float = 0.0
+    per_k: float = TYPICAL_PER_K
+    start_s: float = 0.0
+
+    def factor(self, warmer_k: float, t_s: float) -> float:
+        """1 for a temperature that is not known."""
+        hours = (t_s - self.start_s) / 3600.0
+        return float(np.exp(self.level + self.rate_per_h * hours + self.per_k * np.nan_to_num(warmer_k)))
+
+
+@dataclass(frozen=True)
+class MeasuredRun:
+    """A run with all that turns its DN into reflectance."""
+
+    run: Run
+    frames: LightFrames
+    views: tuple[MeasuredView, ...]
+    lens: Intrinsics
+    corners_mm: Floats
+    """[triangles, 3, 3] in the base frame."""
+    triangles: NDArray[np.uint32]
+    """[triangles, 3] rows of the mesh's vertices."""
+    leds: Positions
+    powers: Powers
+    emission: Emission
+    records: Mapping[str, Path]
+    """By kind."""
+    mesh_path: Path
+    optics: tuple[float, float, float]
+    """Focal length and focus distance in mm, f-number."""
+    base_from_support: Floats
+    drift: Drift
+
+    def power_of(self, frame: LightFrame) -> Floats:
+        """[channels] power of the LED of a frame at its board's temperature and time; NaN where there is none."""
+        row = np.flatnonzero(self.powers.ids == frame.led)
+        if not len(row):
+            return np.full(len(self.channels), np.nan)
+        warmer_k = frame.temperature_c - float(self.powers.board_c[row[0]])
+        power: Floats = self.powers.power[row[0]] * self.drift.factor(warmer_k, frame.t_s)
+        return power
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return channels_of(self.frames.pattern)
+
+
+def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[Path] = ()) -> MeasuredRun:
+    """A run with the records that are named here, else by its plan. Raises InputError with the remedy: no mesh, a
+    record that lacks or does not belong to the run, no proven frame under single LEDs."""
+    run = Run(folder)
+    files = read_plan(run.plan_path, run.rig_path)
+    mesh_path = mesh or files.mesh_path
+    if mesh_path is None or files.plan.object is None:
+        raise InputError(f"{folder}: its plan names no mesh of the object; name it with --mesh")
+    by_kind = _by_kind(records or files.record_paths or ())
+    if missing := [kind for kind in NEEDED if kind not in by_kind]:
+        raise InputError(f"{folder}: no calibration record of the kind {', '.join(missing)} is named; {_HOW}")
+    frames = open_light_frames([folder])
+    hand_eye = by_kind["hand-eye"]
+    prior = read_posed_camera(hand_eye, by_kind.get("camera"), frames.about, frames.size_px)
+    base_from_support = files.cell.rig.support.base_from_support.matrix()
+    power_record = read_accepted(by_kind["led-power"], "led-power")
+    lens = files.cell.rig.lens
+    views = _views(run, frames, hand_eye, files.cell.rig, prior)
+    shape = read_mesh(mesh_path)
+    base_from_object = base_from_support @ files.plan.object.support_from_object.matrix()
+    vertices_mm = apply(base_from_object, shape.vertices * MM_PER_UNIT[files.plan.object.mesh_unit])
+    return MeasuredRun(
+        run,
+        frames,
+        views,
+        prior.lens,
+        vertices_mm[shape.triangles],
+        shape.triangles,
+        calibrated_positions(by_kind["leds"]),
+        read_powers(by_kind["led-power"], channels_of(frames.pattern)),
+        emission_of(power_record),
+        by_kind,
+        mesh_path,
+        (lens.focal_length_mm, lens.focus_distance_mm, lens.f_number),
+        base_from_support,
+        _drift(by_kind.get("drift")),
+    )
+
+
+def emission_of(record: Record) -> Emission:
+    """The emission that a record's powers were fitted with; the same must turn them into irradiance."""
+    return "paper" if any("emission profile `paper`" in remark for remark in record.remarks) else "lambertian"
+
+
+def read_powers(path: Path, channels: Sequence[str]) -> Powers:
+    """The table beside a record of the kind `led-power`. Raises InputError for a record of other channels."""
+    record = read_accepted(path, "led-power")
+    table = path.parent / record.files[0].name
+    lines = [line for line in table.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    rows = list(csv.DictReader(lines))
+    if absent := [channel for channel in channels if f"power_{channel}" not in rows[0]]:
+        raise InputError(f"{path}: has no power of the channel {absent[0]}; make a record with this camera")
+
+    def column(name: str) -> Floats:
+        return np.stack([[float(row[f"{name}_{channel}"]) for channel in channels] for row in rows])
+
+    whole, own = column("u"), column("u_own")
+    shared = np.sqrt(np.maximum(whole**2 - own**2, 0.0))
+    board_c = np.array([float(row["board_c"]) for row in rows])
+    return Powers(np.array([int(row["id"]) for row in rows]), column("power"), board_c, own, shared)
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _drift(path: Path | None) -> Drift:
+    """By a record of the run's own drift; else white LEDs' usual loss of light with warmth."""
+    if path is None:
+        return Drift()
+    record = read_accepted(path, "drift")
+    return Drift(*(record.value(name) for name in ("level", "rate_per_h", "per_k", "start_s")))
+
+
+def _by_kind(paths: Sequence[Path]) -> dict[str, Path]:
+    """Records by their kind, those that are not used left out. Raises InputError for two of a kind."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        kind = read_record(path).kind
+        if kind in found:
+            raise InputError(f"{path} and {found[kind]} are both of the kind `{kind}`; name one of them")
+        if kind in USED:
+            found[kind] = path
+    return found
+
+
+def _views(
+    run: Run, frames: LightFrames, hand_eye: Path, rig: Rig, prior: CameraPrior
+) -> tuple[MeasuredView, ...]:
+    """Frames by view, with the camera's pose by the record."""
+    lit: dict[str, list[LightFrame]] = {}
+    for frame in frames.lit:
+        if frame.led is not None:
+            lit.setdefault(frame.view, []).append(frame)
+    if not lit:
+        raise InputError(f"{run.folder}: no proven frame under a single LED; acquire the plan first")
+    poses = {name: _only_pose(run, name, mine) for name, mine in lit.items()}
+    base_from_flange = np.stack(list(poses.values()))
+    if has_axis_zeros(hand_eye):
+        arm = described_arm(rig)
+        if arm is None:
+            raise InputError(f"{hand_eye}: has zeros of axes, but the run's rig describes no arm")
+        joints_deg = np.stack([mine[0].joints_deg for mine in lit.values() if mine[0].joints_deg is not None])
+        calibrated = read_arm(hand_eye, arm.arm)
+        base_from_flange, prior = calibrated_poses(base_from_flange, joints_deg, calibrated, prior)
+    base_from_camera = base_from_flange @ prior.flange_from_camera
+    return tuple(
+        MeasuredView(name, pose, tuple(mine))
+        for (name, mine), pose in zip(lit.items(), base_from_camera, strict=True)
+    )
+
+
+def _only_pose(run: Run, view: str, frames: Sequence[LightFrame]) -> Floats:
+    """[4, 4] base_from_flange. Raises InputError if the arm was moved within the view, as after a fault."""
+    first = frames[0].base_from_flange
+    off_mm = max(float(np.linalg.norm(frame.base_from_flange[:3, 3] - first[:3, 3])) for frame in frames)
+    if off_mm > MOST_MOVED_MM:
+        raise InputError(
+            f"{run.folder}: the camera stood in two places in the view {view}, {off_mm:.3f} mm apart; acquire "
+            "this view again in a run of its own, and name both runs"
+        )
+    return first

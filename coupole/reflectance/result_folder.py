@@ -1,0 +1,32 @@
+"""A result folder in the making: begun once, one whole file after the other."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from coupole.errors import InputError
+
+
+def begin(out: Path, settings: dict[str, Any]) -> None:
+    """Make the folder; refuse one that was begun with other input or settings."""
+    path = out / "settings.json"
+    text = json.dumps(settings) + "\n"
+    if path.exists():
+        if path.read_text(encoding="utf-8") != text:
+            raise InputError(f"{out} holds the result of other input or settings: name another folder with --out")
+        return
+    if out.exists() and any(out.iterdir()):
+        raise InputError(f"{out} is not empty, and holds no result: name another folder with --out")
+    for name in ("samples", "fits"):
+        (out / name).mkdir(parents=True, exist_ok=True)
+    complete(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def complete(path: Path, write: Callable[[Path], Any]) -> None:
+    """Have a file written beside its place, then put there."""
+    part = path.with_name(path.name + ".part")
+    write(part)
+    part.replace(path)

@@ -1,0 +1,195 @@
+"""GGX materials of triangles from the samples of all views, with the mesh's normal and with a fitted one.
+
+The normal of the mesh is the prior of the fitted one, with the variance that noise of the scanner's vertices gives
+it: for a triangle of area A about that of an equilateral one, 2 s^2 / a^2 with a^2 = 4 A / sqrt 3 (a plane through
+three points, each off by s). The fit is that of `coupole.reflectance.normal_fit`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.ggx import lobe
+from coupole.reflectance.normal_fit import colours_from, fit_from
+
+Floats = NDArray[np.float64]
+
+FEWEST = 12
+"""Samples that a triangle needs: twice the unknowns."""
+_STARTS = (0.08, 0.2, 0.45)
+_FIRST_KS = 0.02
+_HELD = 1e9
+"""Stiffness of a normal that is not fitted."""
+_PART = 256
+
+
+@dataclass(frozen=True)
+class TriangleSamples:
+    """Samples of b triangles in v views; the samples of all views stand one after the other."""
+
+    values: NDArray[np.float32]
+    """[b, samples, channels] f cos_i, 1/sr, with the cosine of the mesh's normal; NaN where there is none."""
+    led_mm: Floats
+    """[samples, 3] positions of their LEDs."""
+    view_of: NDArray[np.int64]
+    """[samples]"""
+    cameras_mm: Floats
+    """[v, 3]"""
+    centres_mm: Floats
+    """[b, 3]"""
+    normals: Floats
+    """[b, 3] of the mesh."""
+    areas_mm2: Floats
+    """[b]"""
+
+
+@dataclass(frozen=True)
+class TriangleMaterials:
+    """Of b triangles; NaN where there were too few samples."""
+
+    normals: Floats
+    kd: Floats
+    """[b, channels] 1/sr."""
+    ks: Floats
+    alpha: Floats
+    residual: Floats
+    """Weighted rms of the square roots, as a share of sqrt(kd)."""
+
+
+def prior_stiffness(areas_mm2: Floats, noise_um: float) -> Floats:
+    """1 over the variance, rad^2, of normals of triangles whose vertices are off by `noise_um` (standard)."""
+    side2_mm2 = 4.0 * areas_mm2 / math.sqrt(3.0)
+    stiffness: Floats = side2_mm2 / (2.0 * (noise_um * 1e-3) ** 2)
+    return stiffness
+
+
+def fit_triangles(
+    samples: TriangleSamples, used: NDArray[np.bool_], noise_um: float | None, *, threads: int | None = None
+) -> TriangleMaterials:
+    """Materials from the samples `used` [samples]; normals are fitted if `noise_um` is given."""
+    count, _, channels = samples.values.shape
+    stiffness = np.full(count, _HELD) if noise_um is None else prior_stiffness(samples.areas_mm2, noise_um)
+    found = np.full((count, 5 + 2 * channels), np.nan)
+
+    def fit(first: int) -> None:
+        part = slice(first, min(first + _PART, count))
+        _fit_part(
+            samples.values[part], samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm[part],
+            samples.normals[part], stiffness[part], noise_um is not None, np.flatnonzero(used), found[part],
+        )  # fmt: skip
+
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(fit, range(0, count, _PART)))
+    kd, ks = found[:, 5 : 5 + channels], found[:, 5 + channels :]
+    return TriangleMaterials(found[:, :3], kd, ks, found[:, 3], found[:, 4])
+
+
+def model_values(samples: TriangleSamples, materials: TriangleMaterials) -> NDArray[np.float32]:
+    """[b, samples, channels] what the materials give where the samples were measured; NaN without material."""
+    made = np.full(samples.values.shape, np.nan, np.float32)
+    _model(
+        samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, materials.normals, materials.kd,
+        materials.ks, materials.alpha, made,
+    )  # fmt: skip
+    return made
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffness, free, used, found):  # type: ignore[no-untyped-def]
+    count, samples, channels = values.shape
+    lights, half = np.empty((samples, 3)), np.empty((samples, 3))
+    views = np.empty((len(cameras_mm), 3))
+    good, roots = np.empty(samples, np.int64), np.empty(samples)
+    unknowns = np.empty(6)
+    own = np.empty((samples, channels))
+    for triangle in range(count):
+        for view in range(len(cameras_mm)):
+            _towards(centres_mm[triangle], cameras_mm[view], views[view])
+        n = 0
+        for number in range(len(used)):
+            sample = used[number]
+            grey = 0.0
+            for channel in range(channels):
+                own[sample, channel] = values[triangle, sample, channel]
+                grey += own[sample, channel] / channels
+            if not grey > 0.0:
+                continue
+            _towards(centres_mm[triangle], led_mm[sample], lights[sample])
+            _between(lights[sample], views[view_of[sample]], half[sample])
+            good[n], roots[n] = sample, math.sqrt(grey)
+            n += 1
+        if n < FEWEST:
+            continue
+        kd = _first_kd(roots[:n], good[:n], lights, normals[triangle])
+        best = np.inf
+        for alpha in _STARTS:
+            unknowns[:3] = normals[triangle]
+            unknowns[3], unknowns[4], unknowns[5] = math.log(kd), math.log(_FIRST_KS * kd), math.log(alpha)
+            cost, spread = fit_from(
+                roots[:n], good[:n], lights, half, views, view_of, unknowns, normals[triangle], stiffness[triangle]
+            )
+            if cost < best:
+                best = cost
+                found[triangle, :3] = unknowns[:3] if free else normals[triangle]
+                found[triangle, 3], found[triangle, 4] = math.exp(unknowns[5]), spread
+                grey_material = np.exp(unknowns[3:6])
+        colours_from(
+            own, good[:n], found[triangle, :3], grey_material, lights, half, views, view_of,
+            found[triangle, 5 : 5 + channels], found[triangle, 5 + channels :],
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _first_kd(roots, good, lights, normal):  # type: ignore[no-untyped-def]
+    """Median of value over cosine: highlights are few."""
+    ratios = np.empty(len(good))
+    for n in range(len(good)):
+        light = lights[good[n]]
+        cosine = light[0] * normal[0] + light[1] * normal[1] + light[2] * normal[2]
+        ratios[n] = roots[n] * roots[n] / max(cosine, 0.02)
+    return max(np.median(ratios), 1e-9)
+
+
+@numba.njit(cache=True, nogil=True)
+def _towards(place, target, direction):  # type: ignore[no-untyped-def]
+    x, y, z = target[0] - place[0], target[1] - place[1], target[2] - place[2]
+    length = math.sqrt(x * x + y * y + z * z)
+    direction[0], direction[1], direction[2] = x / length, y / length, z / length
+
+
+@numba.njit(cache=True, nogil=True)
+def _between(light, view, half):  # type: ignore[no-untyped-def]
+    x, y, z = light[0] + view[0], light[1] + view[1], light[2] + view[2]
+    length = math.sqrt(x * x + y * y + z * z)
+    half[0], half[1], half[2] = x / length, y / length, z / length
+
+
+@numba.njit(cache=True, nogil=True)
+def _model(led_mm, view_of, cameras_mm, centres_mm, normals, kd, ks, alpha, made):  # type: ignore[no-untyped-def]
+    count, samples, channels = made.shape
+    views, light, half = np.empty((len(cameras_mm), 3)), np.empty(3), np.empty(3)
+    for triangle in range(count):
+        n = normals[triangle]
+        if not alpha[triangle] > 0.0:
+            continue
+        for view in range(len(cameras_mm)):
+            _towards(centres_mm[triangle], cameras_mm[view], views[view])
+        for sample in range(samples):
+            view = views[view_of[sample]]
+            _towards(centres_mm[triangle], led_mm[sample], light)
+            _between(light, view, half)
+            nl = n[0] * light[0] + n[1] * light[1] + n[2] * light[2]
+            nv = n[0] * view[0] + n[1] * view[1] + n[2] * view[2]
+            nh = n[0] * half[0] + n[1] * half[1] + n[2] * half[2]
+            shine = lobe(nl, nv, nh, alpha[triangle])[0] if nl > 0.0 and nv > 0.0 else 0.0
+            for channel in range(channels):
+                made[triangle, sample, channel] = max(nl, 0.0) * (
+                    kd[triangle, channel] + ks[triangle, channel] * shine
+                )

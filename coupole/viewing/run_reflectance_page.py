@@ -1,0 +1,110 @@
+"""`report.html` of the reflectance of runs: maps of each view, what was left out, what the materials miss."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import StorageError
+from coupole.reflectance.run_result import FITS, REPORT, read_about
+from coupole.storage.durable import write_synced
+from coupole.viewing.reflectance_page import STYLE, display, figure, grey
+
+POOR_RESIDUAL = 0.05
+"""Of square roots, as a share of the diffuse part's: beyond it the material model itself is in doubt."""
+TOLD = {"ggx": "GGX, mesh's normals", "ggx_normal": "GGX, normals fitted"}
+
+
+def write(folder: Path) -> Path:
+    """Write the report of a result into its folder. Raises InputError, StorageError."""
+    path = folder / REPORT
+    try:
+        write_synced(path, "".join(_page(folder)))
+    except OSError as error:
+        raise StorageError(f"{path}: {error.strerror}") from error
+    return path
+
+
+def remarks(about: dict[str, Any]) -> Iterator[str]:
+    """What its maker must know, one sentence each."""
+    if about["simulated"]:
+        yield "frames of a simulated cell"
+    views = f"{len(about['views'])} view{'s' if len(about['views']) > 1 else ''}"
+    yield f"{about['triangles']} triangles in {views}, {about['samples']} samples in all channels"
+    if about["not_fitted"]:
+        yield f"{about['not_fitted']} triangles have too few samples and no material"
+    for name, mae in about["mae"].items():
+        if mae is not None:
+            psnr_db = about["held_out_psnr_db"][name]
+            off = f"off by {100 * mae:.3f} % of range, {psnr_db:.1f} dB"
+            yield f"{TOLD[name]}: under the LEDs kept for the check {off}"
+    high = about["median_interval_percent"]["high"]
+    if np.isfinite(high):
+        yield f"95 % interval of the median sample: +- {high:.1f} %, by noise and the LEDs' power alone"
+    if min(about["residual"].values()) > POOR_RESIDUAL:
+        yield (
+            "the materials explain the samples poorly: is the object translucent or fluorescent, did it move, do "
+            "mesh and records belong to it?"
+        )
+
+
+def _page(folder: Path) -> Iterator[str]:
+    about = read_about(folder)
+    title = html.escape(folder.resolve().name)
+    yield f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
+    for remark in remarks(about):
+        yield f"<p>{html.escape(remark)}"
+    fits = {name: _fields(folder / path) for name, path in FITS.items()}
+    for view in sorted((folder / "samples").glob("*.h5")):
+        yield f"<h2>View {html.escape(view.stem)}</h2>"
+        yield from _view(view, fits)
+    yield "<h2>Share of triangles and LEDs</h2><table><tr><th>view"
+    codes = about["views"][0]["share_by_code"]
+    yield "".join(f"<th>{html.escape(name)}" for name in codes)
+    for summary in about["views"]:
+        yield f"<tr><th>{html.escape(summary['view'])}"
+        yield "".join(f"<td>{100 * share:.1f} %" for share in summary["share_by_code"].values())
+    yield f"</table><p>{about['seconds']:.1f} s, at most {about['peak_memory_bytes'] / 1e9:.1f} GB."
+    yield (
+        "<p>Inter-reflection and veiling glare are not subtracted. No uncertainty is stated for these normals and "
+        "materials yet."
+    )
+
+
+def _fields(path: Path) -> dict[str, NDArray[Any]]:
+    with h5py.File(path, "r") as file:
+        return {name: values[()] for name, values in file.items()}
+
+
+def _view(path: Path, fits: dict[str, dict[str, NDArray[Any]]]) -> Iterator[str]:
+    with h5py.File(path, "r") as file:
+        seen, triangles, channels = file["seen"][()], file["triangles"][()], file.attrs["channels"]
+    found = fits["ggx_normal"]
+    row = np.searchsorted(found["triangles"], triangles)
+    mesh, fitted = fits["ggx"]["normals"][row], found["normals"][row]
+    kd, ks = (_rgb(found[name][row], channels) for name in ("kd", "ks"))
+    yield figure("normals of the mesh", _picture(seen, 0.5 + 0.5 * mesh))
+    yield figure("fitted", _picture(seen, 0.5 + 0.5 * fitted))
+    turned = np.degrees(np.arccos(np.clip(np.sum(mesh * fitted, axis=1), -1, 1)))
+    yield figure("angle between them, white 10 degrees", grey(_picture(seen, turned[:, None] / 10.0)[..., 0]))
+    yield figure("diffuse", display(_picture(seen, kd)))
+    yield figure("specular", display(_picture(seen, ks)))
+    yield figure("roughness alpha, white 1", grey(_picture(seen, found["alpha"][row][:, None])[..., 0]))
+    yield figure("what is left, white 10 %", grey(_picture(seen, found["residual"][row][:, None] / 0.1)[..., 0]))
+
+
+def _rgb(values: NDArray[Any], channels: str) -> NDArray[Any]:
+    return values if len(channels) == 3 else np.repeat(values, 3, axis=1)
+
+
+def _picture(seen: NDArray[np.int32], values: NDArray[Any]) -> NDArray[np.float32]:
+    """[h, w, n] of values [triangles, n]; 0 where nothing is seen."""
+    picture = np.zeros((*seen.shape, values.shape[1]), np.float32)
+    picture[seen >= 0] = values[seen[seen >= 0]]
+    return picture

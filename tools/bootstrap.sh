@@ -97,9 +97,9 @@ set_up() {
     local told=()
     [[ -t 2 ]] || told=(--quiet) # no bars to watch: a list of packages would bury what follows
     if [[ -n "$python" ]]; then
-        UV_PYTHON_DOWNLOADS=never "$uv" sync "${told[@]}" --compile-bytecode --inexact --no-managed-python --python "$python"
+        UV_PYTHON_DOWNLOADS=never "$uv" sync "${told[@]}" --inexact --no-managed-python --python "$python"
     else
-        "$uv" sync "${told[@]}" --compile-bytecode --inexact --python '>=3.11,<3.14'
+        "$uv" sync "${told[@]}" --inexact --python '>=3.11,<3.14'
     fi
     stamp_now >"$root/.tools/stamp.new"
     mv "$root/.tools/stamp.new" "$root/.tools/stamp"

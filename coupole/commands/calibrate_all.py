@@ -29,6 +29,10 @@ def calibrate_all(
     repeatability_mm: RepeatabilityMm = 0.03,
     repeatability_deg: RepeatabilityDeg = 0.003,
     only: Annotated[list[str] | None, typer.Option("--only", help="This step alone; again for more.")] = None,
+    valid_days: Annotated[
+        int | None,
+        typer.Option("--valid-days", min=1, max=3650, help="When the records expire; else as each kind has it."),
+    ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before each step of a real cell.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -53,9 +57,9 @@ def calibrate_all(
             raise InputError(f"--only {MESH}: needs the object's scan, as `coupole scan` writes it: --scan FOLDER")
         known.remove(MESH)
         console.print(f"{MESH}: skipped, as no --scan is given")
-    stated = Repeatability(repeatability_mm, repeatability_deg)
+    stated, ask = Repeatability(repeatability_mm, repeatability_deg), not yes and not simulated
     campaign = Campaign(
-        rig, out, scan, stated, simulated=simulated, ask=not yes and not simulated, console=console
+        rig, out, scan, stated, simulated=simulated, ask=ask, console=console, valid_days=valid_days
     )
     try:
         for step in STEPS:
@@ -66,12 +70,11 @@ def calibrate_all(
         raise
     if as_json:
         print(json.dumps({"records": campaign.found()}))
-    else:
-        for kind, record in campaign.found().items():
-            console.print(f"[green]{kind}[/]: {record}")
-        console.print(
-            f"To put them in force for all plans of {rig}, write there:\n{_for_a_rig(rig, campaign.found())}"
-        )
+    for kind, record in campaign.found().items():
+        console.print(f"[green]{kind}[/]: {record}")
+    console.print(
+        f"To put them in force for all plans of {rig}, write there:\n{_for_a_rig(rig, campaign.found())}"
+    )
 
 
 def _for_a_rig(rig: Path, records: dict[str, str]) -> str:

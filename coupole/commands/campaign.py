@@ -92,8 +92,10 @@ class Campaign:
         simulated: bool,
         ask: bool,
         console: Console,
+        valid_days: int | None = None,
     ) -> None:
         self._rig, self._out, self._console = rig.resolve(), out.resolve(), console
+        self._days = {} if valid_days is None else {"valid_days": valid_days}
         self._given_scan, self._stated = scan, stated
         self._simulated, self._ask = simulated, ask
         for folder in ("plans", "rigs", "runs"):
@@ -232,32 +234,35 @@ class Campaign:
         record, out = self._record, self._out
         dark, response, flat = record("dark"), record("response"), record("flat-field")
         camera, hand_eye = record("camera"), record("hand-eye")
-        board = self._out / "board.yaml"
+        board, days = self._out / "board.yaml", self._days
+        stated = {"repeatability_mm": self._stated.mm, "repeatability_deg": self._stated.deg}
         return {
-            "dark": lambda run: calibrate_light.dark([run], name="dark", out=out),
-            "response": lambda run: calibrate_light.response([run], dark_record=dark, name="response", out=out),
+            "dark": lambda run: calibrate_light.dark([run], name="dark", out=out, **days),
+            "response": lambda run: calibrate_light.response(
+                [run], dark_record=dark, name="response", out=out, **days
+            ),
             "flat-field": lambda run: calibrate_light.flat_field(
                 [run], dark_record=dark, response_record=response, name="flat-field", out=out
             ),
-            "camera": lambda run: calibrate_lens.camera([run], board=board, name="camera", out=out),
+            "camera": lambda run: calibrate_lens.camera([run], board=board, name="camera", out=out, **days),
             "hand-eye": lambda run: calibrate_lens.hand_eye(
                 [run],
                 board=board,
                 rig=self._rig,
-                repeatability_mm=self._stated.mm,
-                repeatability_deg=self._stated.deg,
+                **stated,
                 name="hand-eye",
                 out=out,
+                **days,
             ),
             "leds": lambda run: calibrate_geometry.leds(
                 [run],
                 hand_eye=hand_eye,
                 camera=camera,
                 rig=self._rig,
-                repeatability_mm=self._stated.mm,
-                repeatability_deg=self._stated.deg,
+                **stated,
                 name="leds",
                 out=out,
+                **days,
             ),
             "led-power": lambda run: calibrate_light.led_power(
                 [run],
@@ -271,15 +276,16 @@ class Campaign:
                 flat=flat,
                 name="led-power",
                 out=out,
+                **days,
             ),
             "mesh": lambda run: calibrate_geometry.mesh(
                 [run],
                 scan=self._scan(),
                 hand_eye=hand_eye,
                 rig=self._rig,
-                repeatability_mm=self._stated.mm,
-                repeatability_deg=self._stated.deg,
+                **stated,
                 name="mesh",
                 out=out,
+                **days,
             ),
         }

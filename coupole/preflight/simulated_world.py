@@ -44,7 +44,7 @@ def world_config(
     if problems := world_problems(cell.document, rig, settings):
         raise InputError(problems)
     exposures_us = job.plan.exposure.exposures_us if job else (8000,)
-    nominal_us = exposures_us[len(exposures_us) // 2]
+    nominal_us = settings.get("white_at_us") or exposures_us[len(exposures_us) // 2]
     scale = exposure_scale(job) if job is not None and dry_run else None
     return {
         "settings": settings,

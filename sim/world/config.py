@@ -130,6 +130,9 @@ class Settings(_Model):
     hurry_only_when_told: bool = False
     """Real time, except for `speed` while the controller announces that it only waits (dry runs)."""
     seed: int = 1
+    white_at_us: Annotated[int, Field(gt=0)] | None = None
+    """The exposure at which white reaches a fixed share of full scale; None: the plan's, so that whatever it asks
+    is exposed well. A camera that is calibrated must have one, or each plan has a camera of its own."""
     ledbox: LedBoxSettings = ledbox_firmware.Settings()
     robot: RobotSettings = kuka_controller.Settings()
     camera: CameraSettings = camera_server.Settings()

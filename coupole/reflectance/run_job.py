@@ -24,6 +24,7 @@ from coupole.errors import InputError
 from coupole.reflectance.extraction.extraction import extract_view, geometry_of
 from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.extraction.measured_run import MeasuredRun, read_measured_run
+from coupole.reflectance.extraction.radiance import Radiometry
 from coupole.reflectance.result_folder import begin, complete
 from coupole.reflectance.run_result import ABOUT, FITS, SCHEMA, RunResult, write_materials
 from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
@@ -136,13 +137,13 @@ def _extract(measured_runs: Sequence[MeasuredRun], out: Path, say: Said) -> list
     """Samples of all views; what the report says of each."""
     told = []
     for measured in measured_runs:
-        geometry = None
+        prepared = None
         for view in measured.views:
             name = view.name if len(measured_runs) == 1 else f"{measured.run.folder.name}-{view.name}"
             path, summary = out / "samples" / f"{name}.h5", out / "samples" / f"{name}.json"
             if not summary.exists():
-                geometry = geometry or geometry_of(measured)
-                found = extract_view(measured, geometry, view, path, say)
+                prepared = prepared or (geometry_of(measured), Radiometry(measured))
+                found = extract_view(measured, *prepared, view, path, say)
                 write_synced(summary, json.dumps(found))
             told.append(json.loads(summary.read_text(encoding="utf-8")))
     return told

@@ -25,6 +25,8 @@ FEWEST = 12
 """Samples that a triangle needs: twice the unknowns."""
 _STARTS = (0.08, 0.2, 0.45)
 _FIRST_KS = 0.02
+_TO_CHOOSE = 256
+"""Samples, about, by which the best start is chosen."""
 _HELD = 1e9
 """Stiffness of a normal that is not fitted."""
 _PART = 256
@@ -107,7 +109,7 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
     lights, half = np.empty((samples, 3)), np.empty((samples, 3))
     views = np.empty((len(cameras_mm), 3))
     good, roots = np.empty(samples, np.int64), np.empty(samples)
-    unknowns = np.empty(6)
+    unknowns, chosen = np.empty(6), np.empty(6)
     own = np.empty((samples, channels))
     for triangle in range(count):
         for view in range(len(cameras_mm)):
@@ -128,18 +130,23 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
         if n < FEWEST:
             continue
         kd = _first_kd(roots[:n], good[:n], lights, normals[triangle])
+        step = max(1, n // _TO_CHOOSE)
+        few_roots, few = roots[:n:step].copy(), good[:n:step].copy()
         best = np.inf
         for alpha in _STARTS:
             unknowns[:3] = normals[triangle]
             unknowns[3], unknowns[4], unknowns[5] = math.log(kd), math.log(_FIRST_KS * kd), math.log(alpha)
-            cost, spread = fit_from(
-                roots[:n], good[:n], lights, half, views, view_of, unknowns, normals[triangle], stiffness[triangle]
+            cost, _ = fit_from(
+                few_roots, few, lights, half, views, view_of, unknowns, normals[triangle], stiffness[triangle]
             )
             if cost < best:
-                best = cost
-                found[triangle, :3] = unknowns[:3] if free else normals[triangle]
-                found[triangle, 3], found[triangle, 4] = math.exp(unknowns[5]), spread
-                grey_material = np.exp(unknowns[3:6])
+                best, chosen = cost, unknowns.copy()
+        _, spread = fit_from(
+            roots[:n], good[:n], lights, half, views, view_of, chosen, normals[triangle], stiffness[triangle]
+        )
+        found[triangle, :3] = chosen[:3] if free else normals[triangle]
+        found[triangle, 3], found[triangle, 4] = math.exp(chosen[5]), spread
+        grey_material = np.exp(chosen[3:6])
         colours_from(
             own, good[:n], found[triangle, :3], grey_material, lights, half, views, view_of,
             found[triangle, 5 : 5 + channels], found[triangle, 5 + channels :],

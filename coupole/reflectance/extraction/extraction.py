@@ -25,7 +25,7 @@ from coupole.motion import occlusion
 from coupole.reflectance.extraction.lamp_sight import AWAY, PENUMBRA, REACHED, SHADED, lamp_codes, lit_by
 from coupole.reflectance.extraction.lamp_sight import neighbours_of as sides_of
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
-from coupole.reflectance.extraction.radiance import SignalReader
+from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
 from coupole.reflectance.extraction.seen_surface import SeenSurface, seen_surface
 
 Floats = NDArray[np.float64]
@@ -64,7 +64,7 @@ def geometry_of(measured: MeasuredRun) -> Geometry:
 
 
 def extract_view(
-    measured: MeasuredRun, geometry: Geometry, view: MeasuredView, path: Path, say: Say
+    measured: MeasuredRun, geometry: Geometry, radiometry: Radiometry, view: MeasuredView, path: Path, say: Say
 ) -> dict[str, Any]:
     """Write a view's samples to an HDF5 file, whole or not at all; what the report says of them."""
     focal_mm, focus_mm, f_number = measured.optics
@@ -76,8 +76,8 @@ def extract_view(
         measured.frames.size_px,
         blur=(focal_mm, focus_mm, f_number, MOST_BLUR_PX),
     )
-    reader = SignalReader(measured, surface)
-    leds = np.array(sorted({int(frame.led) for frame in view.frames if frame.led is not None}))
+    reader = SignalReader(radiometry, surface)
+    leds = np.array(list(view.by_led), np.int64)
     codes = _codes(measured, geometry, view, surface, leds)
     part = path.with_suffix(".part")
     part.unlink(missing_ok=True)
@@ -177,7 +177,7 @@ def _write_head(
 
 def _dn_share(measured: MeasuredRun, view: MeasuredView, led: int) -> Floats:
     """[channels] share of the camera's range that f cos_i E/Phi of 1 gives."""
-    frame = max((frame for frame in view.frames if frame.led == led), key=lambda frame: frame.exposure_us)
+    frame = max(view.by_led[led], key=lambda frame: frame.exposure_us)
     range_dn = measured.frames.white_dn - measured.frames.black_dn
     share: Floats = measured.power_of(frame) * frame.exposure_us * 1e-6 / range_dn
     return share
@@ -216,15 +216,16 @@ def _write_samples(
         data[name].attrs["told"] = text
     mine = surface.triangles
     centres_mm, normals = geometry.centres_mm[mine], geometry.normals[mine]
+    led_mm, led_normals = measured.leds.of(leds)
     used = done = 0
     for first in range(0, len(leds), batch):
         part = slice(first, min(first + batch, len(leds)))
         f = np.full((count, part.stop - first, channels), np.nan, np.float32)
         u = np.full(f.shape, np.nan, np.float32)
         for column, led in enumerate(leds[part]):
-            frames = [frame for frame in view.frames if frame.led == led]
+            frames = view.by_led[int(led)]
             signal, u_signal = _merged(reader, frames)
-            centre_mm, axis = (values[0] for values in measured.leds.of(np.array([led])))
+            centre_mm, axis = led_mm[first + column], led_normals[first + column]
             power = measured.power_of(frames[0])
             _reflectance(
                 signal, centres_mm, normals, centre_mm, axis, power, measured.emission == "paper",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,15 @@ class MeasuredView:
     base_from_camera: Floats
     """[4, 4] mm, by the hand-eye's record, the arm's axis zeros applied."""
     frames: tuple[LightFrame, ...]
+
+    @cached_property
+    def by_led(self) -> dict[int, list[LightFrame]]:
+        """Frames of each LED, LEDs rising."""
+        found: dict[int, list[LightFrame]] = {}
+        for frame in self.frames:
+            if frame.led is not None:
+                found.setdefault(frame.led, []).append(frame)
+        return dict(sorted(found.items()))
 
 
 @dataclass(frozen=True)

@@ -30,41 +30,45 @@ class Means:
     """Relative, of noise."""
 
 
+class Radiometry:
+    """What turns the DN of a run's frames into linear signal, read once for all its views."""
+
+    def __init__(self, measured: MeasuredRun) -> None:
+        frames, records = measured.frames, measured.records
+        width, height = frames.size_px
+        self.white_dn, self.black_dn = frames.white_dn, frames.black_dn
+        self.dark: Callable[[LightFrame], NDArray[np.float32]] = dark_signal(frames, records.get("dark"))
+        self.channel = np.zeros((height, width), np.int8)
+        """[h, w] number of a pixel's channel."""
+        for number, channel in enumerate(measured.channels):
+            self.channel[channel_mask((height, width), frames.pattern, channel)] = number
+        self.channels = len(measured.channels)
+        self.flat = np.ones((height, width), np.float32)
+        if "flat-field" in records:
+            self.flat = map_beside(records["flat-field"], "flat-field", "g", frames)
+        self.curve, self.noise = _response(measured)
+
+
 class SignalReader:
     """Reads frames of one view."""
 
-    def __init__(self, measured: MeasuredRun, surface: SeenSurface) -> None:
-        frames, records = measured.frames, measured.records
-        self._white_dn, self._black_dn = frames.white_dn, frames.black_dn
-        self._dark: Callable[[LightFrame], NDArray[np.float32]] = dark_signal(frames, records.get("dark"))
-        width, height = frames.size_px
+    def __init__(self, radiometry: Radiometry, surface: SeenSurface) -> None:
         places = surface.rows, surface.columns
-        letters = np.zeros((height, width), np.int8)
-        for number, channel in enumerate(measured.channels):
-            letters[channel_mask((height, width), frames.pattern, channel)] = number
-        self._channel = letters[places]
-        flat = np.ones((height, width), np.float32)
-        if "flat-field" in records:
-            flat = map_beside(records["flat-field"], "flat-field", "g", frames)
-        self._flat = flat[places]
-        self._surface = surface
-        self._places = (surface.rows.astype(np.int64) * width + surface.columns).astype(np.int64)
-        self._curve, self._noise = _response(measured)
-        self.pixels = np.zeros((len(surface.triangles), len(measured.channels)), np.int32)
+        self._radiometry, self._surface = radiometry, surface
+        self._channel, self._flat = radiometry.channel[places], radiometry.flat[places]
+        self._places = surface.rows.astype(np.int64) * radiometry.flat.shape[1] + surface.columns
+        self.pixels = np.zeros((len(surface.triangles), radiometry.channels), np.int32)
         np.add.at(self.pixels, (surface.triangle, self._channel), 1)
 
     def means(self, frame: LightFrame) -> Means:
         """Mean signals of the triangles in one frame. Raises StorageError."""
-        raw = frame.read().ravel()
-        dark = self._dark(frame).ravel()
-        shape = self.pixels.shape
-        top_dn = self._white_dn - RANGE_LEFT_OUT * (self._white_dn - self._black_dn)
-        least = RANGE_LEFT_OUT * (self._white_dn - self._black_dn)
+        known, shape = self._radiometry, self.pixels.shape
+        least = RANGE_LEFT_OUT * (known.white_dn - known.black_dn)
         sums, variances, full = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.bool_)
         above = np.zeros(shape)
         _sum(
-            raw, dark, self._places, self._surface.triangle, self._channel, self._flat, self._curve, self._noise,
-            top_dn, sums, variances, above, full,
+            frame.read().ravel(), known.dark(frame).ravel(), self._places, self._surface.triangle, self._channel,
+            self._flat, known.curve, known.noise, known.white_dn - least, sums, variances, above, full,
         )  # fmt: skip
         with np.errstate(invalid="ignore", divide="ignore"):
             signal = sums / self.pixels

@@ -218,7 +218,12 @@ def _numbers(text: str) -> list[int]:
 def relight(
     result: Annotated[Path, typer.Argument(help="Folder of a result.", show_default=False)],
     direction: Annotated[
-        str, typer.Option("--direction", help="To the light: x right, y up, z to the camera.", show_default=False)
+        str,
+        typer.Option(
+            "--direction",
+            help="To the light. Of pictures: x right, y up, z to the camera; of runs: in the support frame, z up.",
+            show_default=False,
+        ),
     ],
     to: Annotated[
         Path,
@@ -226,24 +231,38 @@ def relight(
             "--to", help="picture.npy or .exr: float32, linear; .png: 16 bit, linear.", show_default=False
         ),
     ],
+    view: Annotated[str | None, typer.Option("--view", help="Of a result of runs; the first without it.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make the picture that a distant light from a new direction would give."""
     from coupole.exchange.picture_files import refuse_unknown, write_picture
-    from coupole.reflectance.picture_result import PictureResult
-    from coupole.reflectance.relighting import read_interpolation, relit
 
     try:
         refuse_unknown(to)
-        towards = _direction(direction)
-        made = PictureResult(result)
-        made.about  # noqa: B018  refuses what is no result
-        write_picture(to, relit(made, read_interpolation(result), towards))
+        write_picture(to, _relit(result, _direction(direction), view))
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
     if as_json:
         print(json.dumps({"picture": str(to.resolve())}))
+
+
+def _relit(result: Path, towards: NDArray[np.float64], view: str | None) -> NDArray[np.float32]:
+    import numpy as np
+
+    from coupole.reflectance import picture_result, run_result
+    from coupole.reflectance.relighting import read_interpolation, relit
+    from coupole.reflectance.run_relighting import relit_view
+
+    if (result / run_result.OBJECT).exists():
+        run_result.read_about(result)
+        picture = relit_view(run_result.RunResult(result), towards, view)
+        return picture if picture.shape[2] == 3 else np.repeat(picture, 3, axis=2)
+    if view is not None:
+        raise InputError("--view: a result of pictures has one view")
+    made = picture_result.PictureResult(result)
+    made.about  # noqa: B018  refuses what is no result
+    return relit(made, read_interpolation(result), towards)
 
 
 def _direction(text: str) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.extraction.measured_run import MeasuredRun, read_measured_run
 from coupole.reflectance.extraction.radiance import Radiometry
 from coupole.reflectance.result_folder import begin, complete
-from coupole.reflectance.run_result import ABOUT, FITS, SCHEMA, RunResult, write_materials
+from coupole.reflectance.run_result import ABOUT, FITS, OBJECT, SCHEMA, RunResult, write_materials, write_object
 from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256, write_synced
@@ -93,8 +93,10 @@ def fit_runs(request: RunRequest, out: Path, *, say: Said = lambda step, done, o
     try:
         settings = _settings(request, measured_runs)
         begin(out, settings)
+        first = measured_runs[0]
+        complete(out / OBJECT, lambda path: write_object(path, first.corners_mm, first.base_from_support))
         views = _extract(measured_runs, out, say)
-        result = RunResult(out, _areas_mm2(measured_runs[0]))
+        result = RunResult(out)
         for name in FITS:
             if not (out / FITS[name]).exists():
                 _fit(result, name, request, settings["left_out"], say)
@@ -149,13 +151,6 @@ def _extract(measured_runs: Sequence[MeasuredRun], out: Path, say: Said) -> list
     return told
 
 
-def _areas_mm2(measured: MeasuredRun) -> NDArray[np.float64]:
-    corners = measured.corners_mm
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas: NDArray[np.float64] = 0.5 * np.linalg.norm(across, axis=1)
-    return areas
-
-
 def _fit(result: RunResult, name: str, request: RunRequest, left_out: Sequence[int], say: Said) -> None:
     noise_um = None if name == "ggx" else request.scan_noise_um
     parts = []
@@ -192,8 +187,9 @@ def _check(
     return checks
 
 
-def _interval_percent(result: RunResult) -> dict[str, float]:
-    """Median 95 % interval of samples by noise and the LEDs' power; geometry is not in it."""
+def _interval_percent(result: RunResult) -> dict[str, float] | None:
+    """Median 95 % interval of samples by noise and the LEDs' power, without geometry. None without a record of
+    the response, by which noise is known."""
     found = []
     for view in result.views:
         with h5py.File(view.path, "r") as file:
@@ -201,8 +197,15 @@ def _interval_percent(result: RunResult) -> dict[str, float]:
             own = file["u_own"][::step]
             whole = np.sqrt(own**2 + file["led_u_own"][()] ** 2 + file["led_u_shared"][()] ** 2)
             found.append(whole[np.isfinite(own)])
-    half = 100.0 * _NORMAL_QUANTILE * float(np.median(np.concatenate(found)))
+    known = np.concatenate(found)
+    if not len(known):
+        return None
+    half = 100.0 * _NORMAL_QUANTILE * float(np.median(known))
     return {"coverage": COVERAGE, "low": -half, "high": half}
+
+
+def _median(values: NDArray[np.float64]) -> float | None:
+    return float(np.median(values)) if len(values) else None
 
 
 def _about(
@@ -214,7 +217,8 @@ def _about(
     seconds: float,
 ) -> dict[str, Any]:
     peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    residual = {name: float(np.nanmedian(result.materials(name).residual)) for name in FITS}
+    left = {name: result.materials(name).residual for name in FITS}
+    residual = {name: _median(values[np.isfinite(values)]) for name, values in left.items()}
     return {
         "schema": SCHEMA,
         "software": {name: version(name) for name in ("coupole", "numpy", "numba", "h5py")},

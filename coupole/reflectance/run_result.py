@@ -17,7 +17,7 @@ from coupole.errors import InputError, Problem
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples
 
 SCHEMA = "coupole-reflectance-run/1"
-ABOUT, REPORT = "result.json", "report.html"
+ABOUT, REPORT, OBJECT = "result.json", "report.html", "object.h5"
 FITS = {"ggx": "fits/ggx.h5", "ggx_normal": "fits/ggx_normal.h5"}
 """GGX with the mesh's normals, and with normals that are fitted too."""
 _HEAD = ("triangles", "camera_mm", "leds", "led_positions_mm", "led_normals", "full_scales")
@@ -50,8 +50,25 @@ class RunResult:
     """A result folder of runs, whole or in the making."""
 
     folder: Path
-    areas_mm2: NDArray[np.float64]
-    """Of all triangles of the mesh."""
+
+    @cached_property
+    def corners_mm(self) -> NDArray[np.float32]:
+        """[m, 3, 3] of all triangles of the mesh, base frame."""
+        with h5py.File(self.folder / OBJECT, "r") as file:
+            return np.asarray(file["corners_mm"])
+
+    @cached_property
+    def base_from_support(self) -> NDArray[np.float64]:
+        with h5py.File(self.folder / OBJECT, "r") as file:
+            return np.asarray(file["base_from_support"])
+
+    @cached_property
+    def areas_mm2(self) -> NDArray[np.float64]:
+        """[m]"""
+        corners = self.corners_mm.astype(np.float64)
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas: NDArray[np.float64] = 0.5 * np.linalg.norm(across, axis=1)
+        return areas
 
     @property
     def files(self) -> list[Path]:
@@ -158,6 +175,14 @@ def _cosines(
     square = np.sum(leds_mm**2, axis=1) + np.sum(centres_mm**2, axis=1)[:, None] - 2 * centres_mm @ leds_mm.T
     found: NDArray[np.float32] = (cosine / np.sqrt(square)).astype(np.float32)
     return found
+
+
+def write_object(path: Path, corners_mm: NDArray[np.float64], base_from_support: NDArray[np.float64]) -> None:
+    """The mesh as it stood in the cell."""
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("corners_mm", data=corners_mm.astype(np.float32), track_times=False)
+        data.attrs["told"] = "[triangles, corners, 3] mm, base frame"
+        file.create_dataset("base_from_support", data=base_from_support, track_times=False)
 
 
 def write_materials(path: Path, parts: Sequence[TriangleMaterials], triangles: NDArray[np.int64]) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numba
 import numpy as np
@@ -63,6 +63,10 @@ class TriangleMaterials:
     alpha: Floats
     residual: Floats
     """Weighted rms of the square roots, as a share of sqrt(kd)."""
+
+    def at(self, triangles: NDArray[np.int64]) -> TriangleMaterials:
+        """Of some of the triangles."""
+        return TriangleMaterials(*(getattr(self, field.name)[triangles] for field in fields(self)))
 
 
 def prior_stiffness(areas_mm2: Floats, noise_um: float) -> Floats:

@@ -13,11 +13,15 @@ from numpy.typing import NDArray
 
 from coupole.errors import StorageError
 from coupole.reflectance.run_result import FITS, REPORT, read_about
+from coupole.reflectance.triangle_fit import FEWEST
 from coupole.storage.durable import write_synced
 from coupole.viewing.reflectance_page import STYLE, display, figure, grey
 
 POOR_RESIDUAL = 0.05
 """Of square roots, as a share of the diffuse part's: beyond it the material model itself is in doubt."""
+WHITE_KS = 0.1
+LEAST_KS = 0.004
+"""A tenth of a dielectric's: below it the roughness says nothing."""
 TOLD = {"ggx": "GGX, mesh's normals", "ggx_normal": "GGX, normals fitted"}
 
 
@@ -38,16 +42,16 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
     views = f"{len(about['views'])} view{'s' if len(about['views']) > 1 else ''}"
     yield f"{about['triangles']} triangles in {views}, {about['samples']} samples in all channels"
     if about["not_fitted"]:
-        yield f"{about['not_fitted']} triangles have too few samples and no material"
+        yield f"{about['not_fitted']} triangles have fewer than {FEWEST} samples and no material"
     for name, mae in about["mae"].items():
         if mae is not None:
             psnr_db = about["held_out_psnr_db"][name]
             off = f"off by {100 * mae:.3f} % of range, {psnr_db:.1f} dB"
             yield f"{TOLD[name]}: under the LEDs kept for the check {off}"
-    high = about["median_interval_percent"]["high"]
-    if np.isfinite(high):
-        yield f"95 % interval of the median sample: +- {high:.1f} %, by noise and the LEDs' power alone"
-    if min(about["residual"].values()) > POOR_RESIDUAL:
+    if interval := about["median_interval_percent"]:
+        half = f"+- {interval['high']:.1f} %"
+        yield f"95 % interval of the median sample: {half}, by noise and the LEDs' power alone"
+    if min((left for left in about["residual"].values() if left is not None), default=0.0) > POOR_RESIDUAL:
         yield (
             "the materials explain the samples poorly: is the object translucent or fluorescent, did it move, do "
             "mesh and records belong to it?"
@@ -94,8 +98,10 @@ def _view(path: Path, fits: dict[str, dict[str, NDArray[Any]]]) -> Iterator[str]
     turned = np.degrees(np.arccos(np.clip(np.sum(mesh * fitted, axis=1), -1, 1)))
     yield figure("angle between them, white 10 degrees", grey(_picture(seen, turned[:, None] / 10.0)[..., 0]))
     yield figure("diffuse", display(_picture(seen, kd)))
-    yield figure("specular", display(_picture(seen, ks)))
-    yield figure("roughness alpha, white 1", grey(_picture(seen, found["alpha"][row][:, None])[..., 0]))
+    yield figure("specular ks, white 0.1", display(_picture(seen, ks), WHITE_KS))
+    rough = np.where(ks.max(axis=1) > LEAST_KS, found["alpha"][row], 0.0)
+    caption = f"roughness alpha, white 1, where ks is above {LEAST_KS:g}"
+    yield figure(caption, grey(_picture(seen, rough[:, None])[..., 0]))
     yield figure("what is left, white 10 %", grey(_picture(seen, found["residual"][row][:, None] / 0.1)[..., 0]))
 
 

@@ -241,20 +241,21 @@ def _write_samples(
 
 
 def _merged(reader: SignalReader, frames: list[LightFrame]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Signal and its relative uncertainty of all exposures under one LED, weighted by their variances."""
-    one = reader.means(frames[0])
-    if len(frames) == 1:
-        return one.signal, one.u_signal
-    weights = np.zeros(one.signal.shape)
-    total = np.zeros(one.signal.shape)
-    for means in (one, *map(reader.means, frames[1:])):
-        with np.errstate(invalid="ignore", divide="ignore"):
-            weight = np.nan_to_num(1.0 / (means.signal * means.u_signal) ** 2, posinf=0.0)
-        total += weight * np.nan_to_num(means.signal)
-        weights += weight
+    """Signal and its relative uncertainty of all exposures under one LED, weighted by their variances; by their
+    times where noise is not known."""
+    read = [reader.means(frame) for frame in frames]
+    if len(read) == 1:
+        return read[0].signal, read[0].u_signal
+    signals = np.stack([one.signal for one in read]).astype(np.float64)
+    absolute = signals * np.stack([one.u_signal for one in read])
+    times = np.array([frame.exposure_us for frame in frames])[:, None, None]
+    weights = np.where(np.isnan(absolute).all(), np.broadcast_to(times, signals.shape), absolute**-2.0)
+    weights = np.where(np.isfinite(signals) & np.isfinite(weights), weights, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        signal = total / weights
-        return signal.astype(np.float32), (1.0 / np.sqrt(weights) / signal).astype(np.float32)
+        total = weights.sum(axis=0)
+        signal = np.sum(weights * np.nan_to_num(signals), axis=0) / total
+        relative = total**-0.5 / signal if np.isfinite(absolute).any() else np.full(signal.shape, np.nan)
+    return signal.astype(np.float32), relative.astype(np.float32)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,0 +1,212 @@
+"""`coupole reflectance RUN`: a glossy relief in the shipped cell, its material found with the shipped records."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cells
+import h5py
+import numpy as np
+import pytest
+from cells import CellFolder
+
+RECORDS = cells.REPO / "configs/calibrations"
+DIFFUSE, F0, ROUGHNESS = (0.5, 0.35, 0.2), (0.05, 0.05, 0.05), 0.3
+SIDE = {**cells.TOP, "name": "side", "azimuth_deg": -60, "elevation_deg": 55}
+Made = tuple[CellFolder, Path, dict[str, Any]]
+
+
+def shipped_cell(folder: Path, **world: Any) -> CellFolder:
+    """A cell with the camera of `sim.yaml`, for which the records hold."""
+    cell = CellFolder(folder, speed=10.0)
+    shipped = {"width_px": 512, "height_px": 384, "pixel_pitch_um": 44.0}
+    cell.rig_data["sensor"] |= shipped
+    cell.world_settings.update(white_at_us=8000, **world)
+    cell.write(views=[cells.TOP, SIDE], lights={"kind": "every", "every": 18}, darks_per_view=2)
+    return cell
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    material = {"diffuse": DIFFUSE, "f0": F0, "roughness": ROUGHNESS}
+    cell = shipped_cell(tmp_path_factory.mktemp("cell"), material=material)
+    assert cell.acquire().code == 0
+    out = cell.folder / "result"
+    ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", out, "--json")
+    assert ended.code == 0, ended.err
+    return cell, out, ended.document
+
+
+def walter(normals: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """[..., 3] reflectance of the relief: Walter et al. 2007, Smith's G of each direction, Schlick's F."""
+    half = light + view
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    nl, nv, nh = (np.sum(normals * v, axis=-1) for v in (light, view, half))
+    vh = np.sum(view * half, axis=-1)
+    a2 = ROUGHNESS**2
+
+    def masked(cosine: np.ndarray) -> np.ndarray:
+        return 2 / (1 + np.sqrt(1 + a2 * (1 / cosine**2 - 1)))
+
+    d = a2 / (np.pi * (nh**2 * (a2 - 1) + 1) ** 2)
+    fresnel = np.array(F0) + (1 - np.array(F0)) * (1 - vh[..., None]) ** 5
+    lobe = (d * masked(nl) * masked(nv) / (4 * nl * nv))[..., None] * fresnel
+    result: np.ndarray = np.array(DIFFUSE) / np.pi + lobe
+    return result
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("view", ["top", "side"])
+def test_samples_are_the_reflectance_that_was_there(made: Made, view: str) -> None:
+    _, out, _ = made
+    with h5py.File(out / "samples" / f"{view}.h5") as file:
+        f, u_own = file["f"][()], file["u_own"][()]
+        whole = np.sqrt(u_own**2 + file["led_u_own"][()] ** 2 + file["led_u_shared"][()] ** 2)
+        centres, normals = file["centres_mm"][()], file["normals"][()]
+        light = unit(file["led_positions_mm"][()] - centres[:, None])
+        towards = unit(file["camera_mm"][()] - centres)[:, None]
+    truth = walter(normals[:, None], light, towards)
+    known = np.isfinite(f)
+    assert known.sum() > 300_000
+    ratio = np.where(known, f / truth, np.nan)
+    np.testing.assert_allclose(np.nanmedian(ratio, axis=(0, 1)), 1.0, atol=0.01)
+    incidence = np.broadcast_to(np.einsum("nlk,nk->nl", light, normals)[..., None], f.shape)
+    for low, high in ((0.0, 0.5), (0.5, 0.87), (0.87, 1.0)):
+        mine = known & (incidence > low) & (incidence <= high)
+        within = np.abs(ratio - 1)[mine] < 1.96 * whole[mine]
+        assert 0.9 < within.mean() < 0.99, (low, high, within.mean())
+
+
+def test_the_material_is_found_and_makes_the_pictures_under_leds_kept_for_the_check(made: Made) -> None:
+    _, out, document = made
+    with h5py.File(out / "fits/ggx_normal.h5") as file:
+        kd, alpha, ks = (file[name][()] for name in ("kd", "alpha", "ks"))
+    np.testing.assert_allclose(np.nanmedian(kd, axis=0) * np.pi, DIFFUSE, rtol=0.05)
+    np.testing.assert_allclose(np.nanmedian(alpha), ROUGHNESS, rtol=0.15)
+    np.testing.assert_allclose(np.nanmedian(ks, axis=0), F0, rtol=0.25)
+    assert len(document["left_out"]) == 5
+    assert document["simulated"]
+    for name in ("ggx", "ggx_normal"):
+        assert document["mae"][name] < 0.008  # of range; the noise of some four pixels is 0.005
+        assert document["held_out_psnr_db"][name] > 35
+
+
+def test_brackets_are_merged(tmp_path: Path) -> None:
+    """Some pixels are saturated in the longer exposure, some lost in the noise of the shorter. Six LEDs are enough
+    for samples, and too few for a material."""
+    cell = shipped_cell(tmp_path)
+    exposures = {"kind": "bracket", "exposures_us": [1000, 16_000]}
+    cell.write(views=[cells.TOP], lights={"kind": "every", "every": 180}, exposure=exposures)
+    assert cell.acquire().code == 0
+    out = tmp_path / "result"
+    ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", out, "--json")
+    assert ended.code == 0, ended.err
+    assert ended.document["not_fitted"] == ended.document["triangles"]
+    assert ended.document["mae"] == {"ggx": None, "ggx_normal": None}
+    with h5py.File(out / "samples/top.h5") as file:
+        f, u_own, reached = file["f"][()], file["u_own"][()], file["codes"][()] == 0
+    stone = np.array([0.62, 0.55, 0.42]) / np.pi  # of objects for which no rig gives a material
+    np.testing.assert_allclose(np.nanmedian(f, axis=(0, 1)), stone, rtol=0.01)
+    assert np.isfinite(f[reached]).mean() > 0.9
+    z = ((f / stone - 1) / np.hypot(u_own, 0.006))[np.isfinite(f)]
+    assert 0.9 < np.mean(np.abs(z) < 1.96) < 0.99
+
+
+def test_a_mesh_whose_normals_are_off_is_mended(made: Made, tmp_path: Path) -> None:
+    import trimesh
+
+    cell, out, _ = made
+    mesh = trimesh.load(cell.plan_data["object"]["mesh"], process=False)
+    mesh.vertices += np.random.default_rng(3).normal(0, 0.03, mesh.vertices.shape)
+    noisy = tmp_path / "noisy.ply"
+    mesh.export(noisy)
+    options = ("--calibrations", RECORDS, "--mesh", noisy, "--out", tmp_path / "result", "--json")
+    ended = cells.here("reflectance", cell.run_folder, *options)
+    assert ended.code == 0, ended.err
+    off = {}
+    with h5py.File(out / "fits/ggx.h5") as file:
+        triangles, truth = file["triangles"][()], file["normals"][()]
+    for name in ("ggx", "ggx_normal"):
+        with h5py.File(tmp_path / "result" / f"fits/{name}.h5") as file:
+            _, at, here = np.intersect1d(triangles, file["triangles"][()], return_indices=True)
+            cosine = np.sum(file["normals"][()][here] * truth[at], axis=1)
+        off[name] = float(np.nanmedian(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
+    assert off["ggx"] > 0.8
+    assert off["ggx_normal"] < 0.5 * off["ggx"], off
+
+
+def test_a_job_that_was_stopped_goes_on_and_another_is_refused(made: Made) -> None:
+    cell, out, document = made
+    (out / "fits/ggx_normal.h5").unlink()
+    before = {path: path.stat().st_mtime_ns for path in (out / "samples").iterdir()}
+    again = ("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", out, "--json")
+    ended = cells.here(*again)
+    assert ended.code == 0, ended.err
+    assert {path: path.stat().st_mtime_ns for path in (out / "samples").iterdir()} == before
+    assert ended.document["mae"]["ggx"] == document["mae"]["ggx"]
+    other = cells.here(*again, "--leave-out", "18,36")
+    assert other.code == 2
+    assert "name another folder" in other.err
+    assert "normals of the mesh" in (out / "report.html").read_text()
+
+
+def test_runs_without_what_is_needed_are_refused_with_the_remedy(made: Made, tmp_path: Path) -> None:
+    cell, _, _ = made
+
+    def refused(*arguments: str | Path) -> str:
+        ended = cells.here("reflectance", *arguments, "--out", tmp_path / "none")
+        assert ended.code == 2
+        return " ".join(ended.err.split())
+
+    assert "no calibration record of the kind hand-eye, leds, led-power" in refused(cell.run_folder)
+    assert "expected runs, or --pictures" in refused()
+    few = [word for kind in ("hand-eye", "leds") for word in ("--calibrations", RECORDS / f"{kind}.yaml")]
+    assert "kind led-power is named" in refused(cell.run_folder, *few)
+    records = ("--calibrations", RECORDS)
+    assert "there is no" in refused(cell.run_folder, *records, "--mesh", tmp_path / "nothing.ply")
+    assert "no frame under LED 1 in these runs" in refused(cell.run_folder, *records, "--leave-out", "1")
+    assert "--memory" in refused(cell.run_folder, *records, "--memory", "much")
+    assert not (tmp_path / "none").exists()
+
+
+def test_records_of_another_camera_are_refused(made: Made, tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path, speed=10.0)
+    cell.write(lights={"kind": "every", "every": 360})
+    assert cell.acquire().code == 0
+    ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / "result")
+    assert ended.code == 2
+    assert "frames of 512 x 384 pixels" in " ".join(ended.err.split())
+    assert json.loads((cell.run_folder / "run.json").read_text())["simulated"]
+
+
+def test_a_view_is_relit_with_its_shadows(made: Made) -> None:
+    """From a direction in which no LED stands; the light's frame is the support's, whose z is the base's -z."""
+    _, out, _ = made
+    to = out / "relit.npy"
+    ended = cells.here("reflectance", "relight", out, "--direction", "0.6,0.3,1", "--view", "side", "--to", to)
+    assert ended.code == 0, ended.err
+    picture = np.load(to)
+    with h5py.File(out / "samples/side.h5") as file:
+        seen, normals, centres = file["seen"][()], file["normals"][()], file["centres_mm"][()]
+        camera = file["camera_mm"][()]
+    with h5py.File(out / "fits/ggx.h5") as file:
+        known = np.isfinite(file["alpha"][()])
+        known = known[np.searchsorted(file["triangles"][()], h5py.File(out / "samples/side.h5")["triangles"][()])]
+    towards = unit(np.array([0.6, -0.3, -1.0]))
+    cosine = normals @ towards
+    truth = np.pi * walter(normals, towards[None], unit(camera - centres)) * cosine[:, None]
+    shown, wanted = picture[seen >= 0], truth[seen[seen >= 0]]
+    lit = (shown[:, 1] > 0) & (cosine[seen[seen >= 0]] > 0.2)
+    assert lit.mean() > 0.5
+    np.testing.assert_allclose(np.median(shown[lit] / wanted[lit], axis=0), 1.0, atol=0.02)
+    shadowed = (shown[:, 1] == 0) & (cosine[seen[seen >= 0]] > 0.2) & known[seen[seen >= 0]]
+    assert shadowed.mean() > 0.02
+    assert (picture[seen < 0] == 0).all()
+    wrong = cells.here("reflectance", "relight", out, "--direction", "0,0,1", "--view", "none", "--to", to)
+    assert wrong.code == 2
+    assert "expected one of side, top" in wrong.err

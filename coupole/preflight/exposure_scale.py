@@ -1,8 +1,8 @@
 """What a white surface gives in this cell's pictures, by what is known of its lamps, lens and sensor.
 
-The simulated world scales its light to the plan, so its frames say nothing about a cell's exposure. The scale is
-known from a record of the LEDs' power that is in force, or from the rig's `white_response`; without either it is
-not known, and nothing is assumed.
+The simulated world scales its light to the plan (but with `world.settings.white_at_us`), so its frames say nothing
+about a cell's exposure. The scale is known from a record of the LEDs' power that is in force, or from the rig's
+`white_response`; without either it is not known, and nothing is assumed.
 """
 
 from __future__ import annotations

@@ -109,7 +109,7 @@ def test_a_rig_without_an_arm_is_that_of_its_driver() -> None:
 
 def test_a_ur_without_an_arm_is_that_of_its_model(tmp_path: Path) -> None:
     text = SHIPPED.replace("drivers.kuka.rsi:KukaRsi", "drivers.ur:UrRobot\n  settings: {model: ur5e}")
-    text = text.replace(", robot: {cycle_ms: 4}", "")  # of the stand-in for RSI
+    text = text.replace("    robot: {cycle_ms: 4}\n", "")  # of the stand-in for RSI
     (tmp_path / "rig.yaml").write_text(text)
     assert described_arm(read_cell(tmp_path / "rig.yaml").rig) == UR5E
     (tmp_path / "rig.yaml").write_text(text.replace("ur5e", "ur3e"))

@@ -20,7 +20,7 @@ ABOVE_MM = 1000.0
 
 
 def job_with(white_response: dict[str, float] | None, **plan: Any) -> Job:
-    """The demo under one LED of 1800 lm, straight above the support's centre."""
+    """The demo, uncalibrated, under one LED of 1800 lm, straight above the support's centre."""
     from coupole.plan.rig import Rig
 
     job = read_job(REPO / "configs/plans/demo.yaml")
@@ -28,7 +28,8 @@ def job_with(white_response: dict[str, float] | None, **plan: Any) -> Job:
     pose = rig.support.base_from_support.matrix()
     centre, up = pose[:3, 3], pose[:3, 2]
     one = LedTable(np.array([0]), np.array([0]), (centre + ABOVE_MM * up)[None], -up[None], np.array([1800.0]))
-    return replace(job, cell=replace(job.cell, rig=rig, leds=one), plan=job.plan.model_copy(update=plan))
+    cell = replace(job.cell, rig=rig, leds=one)
+    return replace(job, cell=cell, plan=job.plan.model_copy(update=plan), calibrations=None)
 
 
 def test_white_under_an_led_of_the_dome_is_as_bright_as_its_illuminance() -> None:

@@ -169,14 +169,14 @@ def _mean_frame(name: str, file: View, lit: Sequence[FrameProven], dark: Sequenc
     exposures = {frame.shot: int(file.records[frame.index]["exposure_us"]) for frame in (*lit, *dark)}
     for exposure_us in sorted({exposures[frame.shot] for frame in lit}, reverse=True):
         mine = [frame for frame in lit if exposures[frame.shot] == exposure_us]
-        frames = [file.pixels(frame.index) for frame in _spread(mine)]
+        frames = [file.proven_pixels(frame) for frame in _spread(mine)]
         clipped = np.mean([np.mean(frame >= file.white_dn) for frame in frames])
         if clipped < _CLIPPED:
             break
     mean = _mean(frames)
     darks = [frame for frame in dark if exposures[frame.shot] == exposure_us]
     if darks:
-        black = np.mean([file.pixels(frame.index) for frame in _spread(darks)], axis=0, dtype=np.float64)
+        black = np.mean([file.proven_pixels(frame) for frame in _spread(darks)], axis=0, dtype=np.float64)
     else:
         black = np.full(mean.shape, float(file.black_dn))
     white = file.white_dn - float(black.mean())

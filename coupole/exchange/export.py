@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from coupole.errors import ChecksumMismatch, DiskFull, InputError, StorageError
+from coupole.errors import DiskFull, InputError, StorageError
 from coupole.exchange import FORMATS
 from coupole.exchange.exported_frame import Picture
-from coupole.storage import frame_file
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 from coupole.storage.step_fields import STORED_NO_LED, board_temperature_c
@@ -95,9 +94,7 @@ def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
         file = read_view(path, mine)
         attributes = _plain(file.attributes)
         for frame in mine:
-            pixels = file.pixels(frame.index)
-            if f"{frame_file.checksum(pixels):016x}" != frame.xxh3:
-                raise ChecksumMismatch(f"{path}: {frame.shot} is not what was proven. See `coupole verify`.")
+            pixels = file.proven_pixels(frame)
             record = file.records[frame.index]
             pose = file.poses[record["pose"]]
             about = {

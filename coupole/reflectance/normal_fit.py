@@ -30,6 +30,8 @@ _LEAST_SHARE, _OF_QUANTILE = 0.05, 0.9
 """Samples below this share of a pixel's quantile are in shadow."""
 _CAUCHY = 0.05
 """Scale of the weights, as a share of sqrt(kd)."""
+_USUAL_KS, _SPREAD_KS, _USUAL_ALPHA = math.log(0.04), 2.0, math.log(0.3)
+"""Logarithms, for materials in 1/sr: a dielectric's ks within a factor of 7, alpha within one of 3."""
 _MOST_STEPS = 40
 _SETTLED = 1e-5
 _LEAST_ALPHA, _MOST_ALPHA = 0.02, 1.0
@@ -176,7 +178,7 @@ def _fit_all(values, lights, half, views, view_of, normals, albedo, found):  # t
             )
             if _least_cosine(unknowns, views) < 0.05:
                 unknowns[:3] = views[0]
-            cost, spread = fit_from(roots, used, lights, half, views, view_of, unknowns, views[0], 0.0)
+            cost, spread = fit_from(roots, used, lights, half, views, view_of, unknowns, views[0], 0.0, 0.0)
             if cost < best:
                 best = cost
                 found[pixel, :3] = unknowns[:3]
@@ -185,24 +187,27 @@ def _fit_all(values, lights, half, views, view_of, normals, albedo, found):  # t
 
 
 @numba.njit(cache=True, nogil=True)
-def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffness):  # type: ignore[no-untyped-def]
+def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual):  # type: ignore[no-untyped-def]
     """Levenberg-Marquardt from `unknowns` (normal, log kd, log ks, log alpha), in place; cost and weighted rms.
 
     `roots` are square roots of the samples `used`; `lights` and `half` [samples, 3], `views` [v, 3] that
-    `view_of` [samples] names. The normal is held to `prior` by `stiffness`, 1 over its variance in rad^2.
+    `view_of` [samples] names. The normal is held to `prior` by `stiffness`, 1 over its variance in rad^2;
+    roughness and ks to what is usual by `usual`, so that no highlight is invented where no sample could show it.
     """
     scale = _CAUCHY * math.exp(0.5 * unknowns[3])
     matrix, right = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
     trial = np.empty(6)
     cost, spread = _equations(
-        roots, used, lights, half, views, view_of, unknowns, prior, stiffness, scale, matrix, right
+        roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right
     )
     damping = 1e-2
     for _ in range(_MOST_STEPS):
         step = _solve(matrix, right, damping)
         _move(unknowns, step, trial)
         if _least_cosine(trial, views) > 0.02:
-            moved, moved_spread = _cost(roots, used, lights, half, views, view_of, trial, prior, stiffness, scale)
+            moved, moved_spread = _cost(
+                roots, used, lights, half, views, view_of, trial, prior, stiffness, usual, scale
+            )
         else:
             moved, moved_spread = np.inf, 0.0
         if moved < cost:
@@ -213,7 +218,7 @@ def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffne
                 cost, spread = moved, moved_spread
                 break
             cost, spread = _equations(
-                roots, used, lights, half, views, view_of, unknowns, prior, stiffness, scale, matrix, right
+                roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right
             )
         else:
             damping *= 6.0
@@ -258,12 +263,13 @@ def _tangents(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _cost(roots, used, lights, half, views, view_of, unknowns, prior, stiffness, scale):  # type: ignore[no-untyped-def]
+def _cost(roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale):  # type: ignore[no-untyped-def]
     """Cauchy's cost, and the weighted rms of the residuals."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
     to_view = views[:, 0] * n0 + views[:, 1] * n1 + views[:, 2] * n2
     cost = stiffness * ((n0 - prior[0]) ** 2 + (n1 - prior[1]) ** 2 + (n2 - prior[2]) ** 2)
+    cost += usual * ((unknowns[5] - _USUAL_ALPHA) ** 2 + ((unknowns[4] - _USUAL_KS) / _SPREAD_KS) ** 2)
     squares, weights = 0.0, 0.0
     for number in range(len(used)):
         light = used[number]
@@ -281,7 +287,7 @@ def _cost(roots, used, lights, half, views, view_of, unknowns, prior, stiffness,
 
 
 @numba.njit(cache=True, nogil=True)
-def _equations(roots, used, lights, half, views, view_of, unknowns, prior, stiffness, scale, matrix, right):  # type: ignore[no-untyped-def]
+def _equations(roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right):  # type: ignore[no-untyped-def]
     """Normal equations of a step, into `matrix` and `right`; cost and weighted rms."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
@@ -296,6 +302,10 @@ def _equations(roots, used, lights, half, views, view_of, unknowns, prior, stiff
     right[0] = -stiffness * (t1[0] * d0 + t1[1] * d1 + t1[2] * d2)
     right[1] = -stiffness * (t2[0] * d0 + t2[1] * d1 + t2[2] * d2)
     matrix[0, 0] = matrix[1, 1] = stiffness
+    more_ks, more_alpha = (unknowns[4] - _USUAL_KS) / _SPREAD_KS, unknowns[5] - _USUAL_ALPHA
+    cost += usual * (more_alpha * more_alpha + more_ks * more_ks)
+    right[3], right[4] = -usual * more_ks / _SPREAD_KS, -usual * more_alpha
+    matrix[3, 3], matrix[4, 4] = usual / _SPREAD_KS**2, usual
     for number in range(len(used)):
         light = used[number]
         view = view_of[light]

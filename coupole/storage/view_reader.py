@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import StorageError
+from coupole.errors import ChecksumMismatch, StorageError
 from coupole.storage import frame_file
 from coupole.storage.frame_file import Layout
 from coupole.storage.journal_events import FrameProven
@@ -36,6 +36,13 @@ class View:
     def pixels(self, slot: int) -> NDArray[np.uint16]:
         """[H, W], DN. Raises StorageError."""
         return frame_file.read_frame(self.path, self.layout, slot)
+
+    def proven_pixels(self, frame: FrameProven) -> NDArray[np.uint16]:
+        """[H, W], DN, of a frame of this file. Raises StorageError; ChecksumMismatch if not what was proven."""
+        pixels = self.pixels(frame.index)
+        if f"{frame_file.checksum(pixels):016x}" != frame.xxh3:
+            raise ChecksumMismatch(f"{self.path}: {frame.shot} is not what was proven. See `coupole verify`.")
+        return pixels
 
     def number(self, name: str) -> float | None:
         """An attribute that is a number; None if the file lacks it. Raises StorageError."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,31 @@ def test_brackets_are_merged(tmp_path: Path) -> None:
     assert 0.9 < np.mean(np.abs(z) < 1.96) < 0.99
 
 
+def test_runs_of_one_object_are_fitted_together(made: Made, tmp_path: Path) -> None:
+    first, _, alone = made
+    material = {"diffuse": DIFFUSE, "f0": F0, "roughness": ROUGHNESS}
+    second = shipped_cell(tmp_path, material=material)
+    third = {**SIDE, "name": "third", "azimuth_deg": -120}
+    second.write(views=[third], lights={"kind": "every", "every": 60})
+    assert second.acquire().code == 0
+    runs, out = (first.run_folder, second.run_folder), tmp_path / "result"
+    ended = cells.here("reflectance", *runs, "--calibrations", RECORDS, "--out", out, "--json")
+    assert ended.code == 0, ended.err
+    names = {path.stem for path in (out / "samples").glob("*.h5")}
+    assert names == {f"{runs[0].name}-top", f"{runs[0].name}-side", f"{runs[1].name}-third"}
+    assert ended.document["triangles"] > alone["triangles"]
+    assert ended.document["held_out_psnr_db"]["ggx_normal"] > 35
+    second.plan_data["object"]["support_from_object"] = {"translation_mm": [1.0, 0, 0]}
+    second.write()
+    moved = second.acquire()
+    assert moved.code == 0
+    ended = cells.here(
+        "reflectance", runs[0], moved.document["run"], "--calibrations", RECORDS, "--out", tmp_path / "b"
+    )
+    assert ended.code == 2
+    assert "shows another object, or in another place" in ended.err
+
+
 def test_a_mesh_whose_normals_are_off_is_mended(made: Made, tmp_path: Path) -> None:
     import trimesh
 
@@ -182,6 +208,19 @@ def test_records_of_another_camera_are_refused(made: Made, tmp_path: Path) -> No
     assert ended.code == 2
     assert "frames of 512 x 384 pixels" in " ".join(ended.err.split())
     assert json.loads((cell.run_folder / "run.json").read_text())["simulated"]
+
+
+def test_a_frame_that_is_not_the_one_that_was_proven_is_refused(made: Made, tmp_path: Path) -> None:
+    cell, _, _ = made
+    run = shutil.copytree(cell.run_folder, tmp_path / "run")
+    with h5py.File(run / "views/top.h5", "r+") as file:
+        data = file["entry/instrument/detector/data"]
+        led = int(np.flatnonzero(file["entry/instrument/detector/frames"]["led"] == 540)[0])
+        data[led, 100, 100] ^= 1
+    ended = cells.here("reflectance", run, "--calibrations", RECORDS, "--out", tmp_path / "result")
+    assert ended.code == 6
+    assert "top/led0540/e0 is not what was proven" in " ".join(ended.err.split())
+    assert not list((tmp_path / "result/samples").glob("top*"))
 
 
 def test_a_view_is_relit_with_its_shadows(made: Made) -> None:

@@ -141,7 +141,7 @@ def _collect(
     collected.lit_records += [records[frame.frame.index] for frame in lit]
     darks = _darks(file, proven)
     for frame in lit:
-        pixels = file.pixels(frame.frame.index)
+        pixels = file.proven_pixels(frame.frame)
         dark = darks.get(frame.exposure_us, float(file.black_dn))
         spots = find_spots(pixels, dark, file.pattern, file.white_dn)
         key = number_of[frame.pose[1]], row_of[frame.led]
@@ -198,5 +198,5 @@ def _darks(file: View, proven: Sequence[FrameProven]) -> dict[int, Floats]:
     for frame in _dark_frames(proven):
         exposure_us = int(file.records[frame.index]["exposure_us"])
         before, n_before = sums.get(exposure_us, (np.zeros((file.layout.height_px, file.layout.width_px)), 0))
-        sums[exposure_us] = before + file.pixels(frame.index), n_before + 1
+        sums[exposure_us] = before + file.proven_pixels(frame), n_before + 1
     return {exposure_us: total / n_frames for exposure_us, (total, n_frames) in sums.items()}

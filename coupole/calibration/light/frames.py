@@ -165,7 +165,7 @@ def _of_view(
                 decicelsius / 10.0 if decicelsius else float("nan"),
                 np.array(poses[int(record["pose"])]["base_from_flange"], dtype=np.float64),
                 np.array(poses[int(record["pose"])]["base_from_camera"], dtype=np.float64),
-                partial(file.pixels, frame.index),
+                partial(file.proven_pixels, frame),
                 np.array(poses[int(record["pose"])]["joints_deg"], dtype=np.float64),
             )
         )

@@ -88,6 +88,8 @@ def extract_view(
         part.replace(path)
     except OSError as error:
         raise StorageError(f"{path}: cannot write samples: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
     share = {name: float(np.mean(codes == code)) for name, code in CODES.items()}
     return {
         "view": view.name,

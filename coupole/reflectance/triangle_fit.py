@@ -118,67 +118,69 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
     lights, half = np.empty((samples, 3)), np.empty((samples, 3))
     views = np.empty((len(cameras_mm), 3))
     good, roots = np.empty(samples, np.int64), np.empty(samples)
-    unknowns, chosen = np.empty(6), np.empty(6)
     own = np.empty((samples, channels))
     for triangle in range(count):
-        for view in range(len(cameras_mm)):
-            _towards(centres_mm[triangle], cameras_mm[view], views[view])
-        n = 0
-        for number in range(len(used)):
-            sample = used[number]
-            grey = 0.0
-            for channel in range(channels):
-                own[sample, channel] = values[triangle, sample, channel]
-                grey += own[sample, channel] / channels
-            if not grey > 0.0:
-                continue
-            _towards(centres_mm[triangle], led_mm[sample], lights[sample])
-            _between(lights[sample], views[view_of[sample]], half[sample])
-            good[n], roots[n] = sample, math.sqrt(grey)
-            n += 1
+        normal, held = normals[triangle], stiffness[triangle]
+        n = _gather(
+            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normal, used, own, good, roots,
+            lights, half, views,
+        )  # fmt: skip
         if n < FEWEST:
             continue
-        kd = _first_kd(roots[:n], good[:n], lights, normals[triangle])
-        step = max(1, n // _TO_CHOOSE)
-        few_roots, few = roots[:n:step].copy(), good[:n:step].copy()
-        best = np.inf
-        for alpha in _STARTS:
-            unknowns[:3] = normals[triangle]
-            unknowns[3], unknowns[4], unknowns[5] = math.log(kd), math.log(_FIRST_KS * kd), math.log(alpha)
-            cost, _ = fit_from(
-                few_roots,
-                few,
-                lights,
-                half,
-                views,
-                view_of,
-                unknowns,
-                normals[triangle],
-                stiffness[triangle],
-                _USUAL,
-            )
-            if cost < best:
-                best, chosen = cost, unknowns.copy()
-        _, spread = fit_from(
-            roots[:n],
-            good[:n],
-            lights,
-            half,
-            views,
-            view_of,
-            chosen,
-            normals[triangle],
-            stiffness[triangle],
-            _USUAL,
-        )
-        found[triangle, :3] = chosen[:3] if free else normals[triangle]
+        chosen = _best_start(roots[:n], good[:n], lights, half, views, view_of, normal, held)
+        _, spread = fit_from(roots[:n], good[:n], lights, half, views, view_of, chosen, normal, held, _USUAL)
+        found[triangle, :3] = chosen[:3] if free else normal
         found[triangle, 3], found[triangle, 4] = math.exp(chosen[5]), spread
-        grey_material = np.exp(chosen[3:6])
-        colours_from(
-            own, good[:n], found[triangle, :3], grey_material, lights, half, views, view_of,
-            found[triangle, 5 : 5 + channels], found[triangle, 5 + channels :],
-        )  # fmt: skip
-        found[triangle, 5 + channels :] = np.minimum(found[triangle, 5 + channels :], _MOST_KS)
+        kd, ks = found[triangle, 5 : 5 + channels], found[triangle, 5 + channels :]
+        grey = np.exp(chosen[3:6])
+        colours_from(own, good[:n], found[triangle, :3], grey, lights, half, views, view_of, kd, ks)
+        ks[:] = np.minimum(ks, _MOST_KS)
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(  # type: ignore[no-untyped-def]
+    values, led_mm, view_of, cameras_mm, centre_mm, normal, used, own, good, roots, lights, half, views
+):
+    """Fill the arrays with one triangle's samples and directions; how many there are. A camera that does not see
+    the triangle is put on its normal, so that it forbids no normal."""
+    seeing = np.zeros(len(cameras_mm), np.bool_)
+    for view in range(len(cameras_mm)):
+        _towards(centre_mm, cameras_mm[view], views[view])
+    n = 0
+    for number in range(len(used)):
+        sample = used[number]
+        grey = 0.0
+        for channel in range(values.shape[1]):
+            own[sample, channel] = values[sample, channel]
+            grey += own[sample, channel] / values.shape[1]
+        if not grey > 0.0:
+            continue
+        _towards(centre_mm, led_mm[sample], lights[sample])
+        _between(lights[sample], views[view_of[sample]], half[sample])
+        seeing[view_of[sample]] = True
+        good[n], roots[n] = sample, math.sqrt(grey)
+        n += 1
+    for view in range(len(cameras_mm)):
+        if not seeing[view]:
+            views[view] = normal
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def _best_start(roots, good, lights, half, views, view_of, normal, stiffness):  # type: ignore[no-untyped-def]
+    """Where the best of the starts ends, by some of the samples."""
+    kd = _first_kd(roots, good, lights, normal)
+    step = max(1, len(good) // _TO_CHOOSE)
+    few_roots, few = roots[::step].copy(), good[::step].copy()
+    unknowns, chosen, best = np.empty(6), np.empty(6), np.inf
+    for alpha in _STARTS:
+        unknowns[:3] = normal
+        unknowns[3], unknowns[4], unknowns[5] = math.log(kd), math.log(_FIRST_KS * kd), math.log(alpha)
+        cost, _ = fit_from(few_roots, few, lights, half, views, view_of, unknowns, normal, stiffness, _USUAL)
+        if cost < best:
+            best = cost
+            chosen[:] = unknowns
+    return chosen
 
 
 @numba.njit(cache=True, nogil=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,6 +69,15 @@ def test_normals_come_nearer_to_the_truth_than_the_mesh(views: int) -> None:
         return float(np.nanmean(np.abs(off)))
 
     assert mae(fitted) < 0.5 * mae(rigid)
+
+
+def test_a_camera_that_does_not_see_a_triangle_forbids_it_no_normal() -> None:
+    samples, truth = noisy_case(1)
+    behind = np.concatenate([samples.cameras_mm, [[0.0, 0.0, -500.0]]])
+    some = np.ones(len(samples.led_mm), bool)
+    fitted = fit_triangles(replace(samples, cameras_mm=behind), some, 30.0)
+    np.testing.assert_allclose(fitted.normals, fit_triangles(samples, some, 30.0).normals, atol=1e-9)
+    assert np.median(off_deg(fitted.normals, truth)) < 1.0
 
 
 def test_a_normal_is_held_as_the_noise_of_the_scanner_tells() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -207,7 +206,15 @@ def test_records_of_another_camera_are_refused(made: Made, tmp_path: Path) -> No
     ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / "result")
     assert ended.code == 2
     assert "frames of 512 x 384 pixels" in " ".join(ended.err.split())
-    assert json.loads((cell.run_folder / "run.json").read_text())["simulated"]
+
+
+def test_powers_for_another_gain_are_refused(tmp_path: Path) -> None:
+    cell = shipped_cell(tmp_path)
+    cell.write(views=[cells.TOP], lights={"kind": "every", "every": 360}, gain_db=6.0)
+    assert cell.acquire().code == 0
+    ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / "result")
+    assert ended.code == 2
+    assert "holds for a gain of 0 dB; the run has 6 dB" in " ".join(ended.err.split())
 
 
 def test_a_frame_that_is_not_the_one_that_was_proven_is_refused(made: Made, tmp_path: Path) -> None:

@@ -167,10 +167,9 @@ def _write_head(
     centres_mm, normals = measured.leds.of(leds)
     _dataset(file, "led_positions_mm", centres_mm, "mm, base frame")
     _dataset(file, "led_normals", normals, "unit, base frame")
-    powers = measured.powers
-    row = np.searchsorted(powers.ids, leds)
-    _dataset(file, "led_u_own", powers.u_own[row], "relative standard uncertainty of an LED's power, its own")
-    _dataset(file, "led_u_shared", powers.u_shared[row], "relative, of what all LEDs share")
+    powers = measured.powers.of(leds)
+    _dataset(file, "led_u_own", powers.u_own, "relative standard uncertainty of an LED's power, its own")
+    _dataset(file, "led_u_shared", powers.u_shared, "relative, of what all LEDs share")
     scales = np.stack([_dn_share(measured, view, int(led)) for led in leds])
     _dataset(file, "full_scales", scales, "of the camera that f cos_i E/Phi of 1 gives in the longest exposure")
     told = ", ".join(f"{code} {name}" for name, code in CODES.items())

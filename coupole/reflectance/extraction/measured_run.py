@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.calibrated_arm import calibrated_poses, has_axis_zeros, read_arm
-from coupole.calibration.earlier import read_accepted
+from coupole.calibration.earlier import read_accepted, read_earlier
 from coupole.calibration.light.frames import LightFrame, LightFrames, channels_of, open_light_frames
 from coupole.calibration.light.irradiance import Emission
 from coupole.calibration.light.led_power_tile import calibrated_positions
@@ -38,6 +38,7 @@ NEEDED = ("hand-eye", "leds", "led-power")
 USED = (*NEEDED, "dark", "response", "flat-field", "camera", "drift")
 TYPICAL_PER_K = -0.003
 """Of white power LEDs, relative."""
+SAME_GAIN_DB = 0.01
 MOST_MOVED_MM = 0.1
 """Within a view; an arm comes back to a pose within less when a run is resumed."""
 _HOW = "name them with --calibrations, or make them: `coupole calibrate all --rig RIG`"
@@ -75,6 +76,18 @@ class Powers:
     """[leds, channels] relative standard uncertainty that an LED shares with no other."""
     u_shared: Floats
     """[leds, channels] relative, of what all LEDs share: the tile, its place."""
+
+    def of(self, leds: NDArray[np.int64]) -> Powers:
+        """Of some LEDs; NaN for those that the record does not have."""
+        row = {int(led): number for number, led in enumerate(self.ids)}
+        rows = np.array([row.get(int(led), -1) for led in leds])
+
+        def picked(values: Floats) -> Floats:
+            found: Floats = values[rows]
+            found[rows < 0] = np.nan
+            return found
+
+        return Powers(leds, *map(picked, (self.power, self.board_c, self.u_own, self.u_shared)))
 
 
 @dataclass(frozen=True)
@@ -117,11 +130,9 @@ class MeasuredRun:
 
     def power_of(self, frame: LightFrame) -> Floats:
         """[channels] power of the LED of a frame at its board's temperature and time; NaN where there is none."""
-        row = np.flatnonzero(self.powers.ids == frame.led)
-        if not len(row):
-            return np.full(len(self.channels), np.nan)
-        warmer_k = frame.temperature_c - float(self.powers.board_c[row[0]])
-        power: Floats = self.powers.power[row[0]] * self.drift.factor(warmer_k, frame.t_s)
+        known = self.powers.of(np.array([frame.led]))
+        warmer_k = frame.temperature_c - float(known.board_c[0])
+        power: Floats = known.power[0] * self.drift.factor(warmer_k, frame.t_s)
         return power
 
     @property
@@ -144,9 +155,11 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
     hand_eye = by_kind["hand-eye"]
     prior = read_posed_camera(hand_eye, by_kind.get("camera"), frames.about, frames.size_px)
     base_from_support = files.cell.rig.support.base_from_support.matrix()
-    power_record = read_accepted(by_kind["led-power"], "led-power")
-    lens = files.cell.rig.lens
+    power_record = read_earlier(by_kind["led-power"], "led-power", frames.about, frames.size_px)
+    _refuse_other_gain(by_kind["led-power"], power_record, frames)
+    lens, leds = files.cell.rig.lens, calibrated_positions(by_kind["leds"])
     views = _views(run, frames, hand_eye, files.cell.rig, prior)
+    _refuse_unknown_leds(by_kind["leds"], leds, views)
     shape = read_mesh(mesh_path)
     base_from_object = base_from_support @ files.plan.object.support_from_object.matrix()
     vertices_mm = apply(base_from_object, shape.vertices * MM_PER_UNIT[files.plan.object.mesh_unit])
@@ -157,7 +170,7 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
         prior.lens,
         vertices_mm[shape.triangles],
         shape.triangles,
-        calibrated_positions(by_kind["leds"]),
+        leds,
         read_powers(by_kind["led-power"], channels_of(frames.pattern)),
         emission_of(power_record),
         by_kind,
@@ -192,6 +205,21 @@ def read_powers(path: Path, channels: Sequence[str]) -> Powers:
 
 
 # -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _refuse_other_gain(path: Path, record: Record, frames: LightFrames) -> None:
+    gain_db = record.fixed.get("gain_db", 0.0)
+    if abs(gain_db - frames.gain_db) > SAME_GAIN_DB:
+        raise InputError(
+            f"{path}: holds for a gain of {gain_db:g} dB; the run has {frames.gain_db:g} dB. Name a record of that "
+            "gain"
+        )
+
+
+def _refuse_unknown_leds(path: Path, leds: Positions, views: Sequence[MeasuredView]) -> None:
+    lit = {led for view in views for led in view.by_led}
+    if unknown := sorted(lit - set(map(int, leds.ids))):
+        raise InputError(f"{path}: does not have LED {unknown[0]}, which the run has lit; calibrate the LEDs anew")
 
 
 def _drift(path: Path | None) -> Drift:

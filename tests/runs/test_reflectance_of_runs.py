@@ -10,6 +10,7 @@ import cells
 import h5py
 import numpy as np
 import pytest
+import trimesh
 from cells import CellFolder
 
 RECORDS = cells.REPO / "configs/calibrations"
@@ -143,8 +144,6 @@ def test_runs_of_one_object_are_fitted_together(made: Made, tmp_path: Path) -> N
 
 
 def test_a_mesh_whose_normals_are_off_is_mended(made: Made, tmp_path: Path) -> None:
-    import trimesh
-
     cell, out, _ = made
     mesh = trimesh.load(cell.plan_data["object"]["mesh"], process=False)
     mesh.vertices += np.random.default_rng(3).normal(0, 0.03, mesh.vertices.shape)
@@ -197,6 +196,9 @@ def test_runs_without_what_is_needed_are_refused_with_the_remedy(made: Made, tmp
     assert "no frame under LED 1 in these runs" in refused(cell.run_folder, *records, "--leave-out", "1")
     assert "--memory" in refused(cell.run_folder, *records, "--memory", "much")
     assert not (tmp_path / "none").exists()
+    elsewhere = trimesh.creation.box(bounds=[[4e3, 0, 0], [4.1e3, 10, 10]])
+    elsewhere.export(tmp_path / "elsewhere.ply")
+    assert "shows the mesh" in refused(cell.run_folder, *records, "--mesh", tmp_path / "elsewhere.ply")
 
 
 def test_records_of_another_camera_are_refused(made: Made, tmp_path: Path) -> None:

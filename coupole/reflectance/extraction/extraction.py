@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from coupole.calibration.light.frames import LightFrame
-from coupole.errors import StorageError
+from coupole.errors import InputError, StorageError
 from coupole.geometry import apply
 from coupole.motion import occlusion
 from coupole.reflectance.extraction.lamp_sight import AWAY, PENUMBRA, REACHED, SHADED, lamp_codes, lit_by
@@ -76,6 +76,11 @@ def extract_view(
         measured.frames.size_px,
         blur=(focal_mm, focus_mm, f_number, MOST_BLUR_PX),
     )
+    if not len(surface.rows):
+        raise InputError(
+            f"{measured.run.folder}: no pixel of the view {view.name} shows the mesh: do mesh and hand-eye "
+            "belong to this run, and is the object in focus?"
+        )
     reader = SignalReader(radiometry, surface)
     leds = np.array(list(view.by_led), np.int64)
     codes = _codes(measured, geometry, view, surface, leds)

@@ -211,8 +211,7 @@ def _refuse_other_gain(path: Path, record: Record, frames: LightFrames) -> None:
     gain_db = record.fixed.get("gain_db", 0.0)
     if abs(gain_db - frames.gain_db) > SAME_GAIN_DB:
         raise InputError(
-            f"{path}: holds for a gain of {gain_db:g} dB; the run has {frames.gain_db:g} dB. Name a record of that "
-            "gain"
+            f"{path}: holds for a gain of {gain_db:g} dB; the run has {frames.gain_db:g} dB. Name one of that gain"
         )
 
 

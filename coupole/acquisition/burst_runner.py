@@ -174,6 +174,7 @@ class BurstRunner:
         statistics = camera.statistics()
         camera.disarm()
         self._end(running, camera=statistics)
+        grabber.raise_error()  # after its last frame: all are stored, but the camera is not to be trusted
         log = running.log
         dark = (log["led"] != NO_LED) & log["led_open"]
         assert running.judged is not None

@@ -70,9 +70,13 @@ class FrameGrabber:
 
     def __len__(self) -> int:
         """Frames taken so far. Raises what the camera raised on the taking thread."""
+        self.raise_error()
+        return len(self._frame_ids)
+
+    def raise_error(self) -> None:
+        """Raise what the camera raised on the taking thread, if it did."""
         if self._error is not None:
             raise self._error
-        return len(self._frame_ids)
 
     @property
     def count(self) -> int:

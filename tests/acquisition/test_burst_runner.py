@@ -15,6 +15,7 @@ from scripted_cell import Cell
 from coupole.acquisition import burst_runner
 from coupole.acquisition.arm_supervisor import ArmMovedError
 from coupole.acquisition.frame_matching import Match, match
+from coupole.devices import CameraStatistics, Frame
 from coupole.errors import DeviceError, DeviceTimeout
 
 BURST = whole_burst(40)
@@ -32,6 +33,33 @@ def test_a_clean_burst_is_proven_whole_with_every_frame_under_its_own_light() ->
     assert {str(shot) for shot in cell.proven} == shots_of(cell)
     for shot, frame in zip(cell.proven, cell.proven_frames, strict=True):
         assert shot == cell.burst.shots[cell.what.truth[frame]]
+
+
+def test_a_camera_that_fails_after_its_last_frame_is_told_and_no_frame_is_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The burst's loop has counted its frames by then, and asks no more."""
+    cell = Cell(BURST, take(BURST))
+    over, failed = threading.Event(), threading.Event()
+    take_one, statistics = cell.camera.next_frame, cell.camera.statistics
+
+    def next_frame(timeout_s: float) -> Frame | None:
+        if over.is_set():
+            failed.set()
+            raise RuntimeError("a defect of the driver")
+        return take_one(timeout_s)
+
+    def after_the_loop() -> CameraStatistics:
+        over.set()
+        assert failed.wait(10.0)
+        return statistics()
+
+    monkeypatch.setattr(cell.camera, "next_frame", next_frame)
+    monkeypatch.setattr(cell.camera, "statistics", after_the_loop)
+    with pytest.raises(RuntimeError, match="a defect of the driver"):
+        cell.fire()
+    assert {str(shot) for shot in cell.proven} == shots_of(cell)
+    assert cell.done[-2:] == ["camera disarmed", "BurstEnded"]
 
 
 def test_most_of_a_burst_is_proven_while_it_runs() -> None:

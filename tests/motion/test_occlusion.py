@@ -167,7 +167,7 @@ def test_segments_are_as_far_apart_as_their_nearest_samples(p: Points, q: Points
     sampled = np.linalg.norm((p + share * (q - p))[:, None] - (a + share * (b - a)), axis=2).min()
     between = (np.linalg.norm(q - p) + np.linalg.norm(b - a)) / 200
     found = segment_distance_mm(p, q, a, b)
-    assert sampled - between - 1e-6 <= found <= sampled + 1e-6
+    assert sampled - between - 1e-5 <= found <= sampled + 1e-5  # 10 nm, of lines that are almost parallel
 
 
 @settings(max_examples=200, deadline=None)

@@ -106,7 +106,7 @@ def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_leds_powers_tell_how_bright_white_will_be(calibrated: Path) -> None:
-    """The world's word: white reaches 60 % of full scale in the plan's middle exposure under the median LED."""
+    """The world's word: white reaches 60 % of full scale in the rig's `white_at_us` under the median LED."""
     content = json.loads((calibrated / "plan.yaml").read_text())
     content |= {"calibrations": ["led-power.yaml"]}
     (calibrated / "known.yaml").write_text(json.dumps(content))
@@ -114,7 +114,8 @@ def test_the_leds_powers_tell_how_bright_white_will_be(calibrated: Path) -> None
     scale = exposure_scale(job)
     assert scale is not None
     known = scale.dn_per_s > 0
-    shares = scale.dn_per_s[known] * 6000e-6 / (job.cell.rig.sensor.white_dn - job.cell.rig.sensor.black_dn)
+    white_at_s = 1e-6 * job.cell.rig.world.settings["white_at_us"]
+    shares = scale.dn_per_s[known] * white_at_s / (job.cell.rig.sensor.white_dn - job.cell.rig.sensor.black_dn)
     assert known.sum() == 45
     assert np.median(shares) == pytest.approx(0.6, rel=0.15)  # 45 of 1080 LEDs, each with a flux of its own
 

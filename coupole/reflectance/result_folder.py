@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from coupole.errors import InputError
+from coupole.storage.durable import sync_folder
 
 
 def begin(out: Path, settings: dict[str, Any]) -> None:
@@ -26,7 +28,13 @@ def begin(out: Path, settings: dict[str, Any]) -> None:
 
 
 def complete(path: Path, write: Callable[[Path], Any]) -> None:
-    """Have a file written beside its place, then put there."""
+    """Have a file written beside its place, then put there: it is whole or not there, also after a crash."""
     part = path.with_name(path.name + ".part")
-    write(part)
-    part.replace(path)
+    try:
+        write(part)
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    sync_folder(path.parent)

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from coupole.calibration.light.frames import LightFrame
-from coupole.errors import InputError, StorageError
+from coupole.calibration.light.tile_views import Positions
+from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.motion import occlusion
 from coupole.reflectance.extraction.lamp_sight import AWAY, PENUMBRA, REACHED, SHADED, lamp_codes, lit_by
@@ -27,6 +28,7 @@ from coupole.reflectance.extraction.lamp_sight import neighbours_of as sides_of
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
 from coupole.reflectance.extraction.seen_surface import SeenSurface, seen_surface
+from coupole.reflectance.result_folder import complete
 
 Floats = NDArray[np.float64]
 
@@ -84,17 +86,15 @@ def extract_view(
     reader = SignalReader(radiometry, surface)
     leds = np.array(list(view.by_led), np.int64)
     codes = _codes(measured, geometry, view, surface, leds)
-    part = path.with_suffix(".part")
-    part.unlink(missing_ok=True)
-    try:
+    used = 0
+
+    def write(part: Path) -> None:
+        nonlocal used
         with h5py.File(part, "w") as file:
             _write_head(file, measured, geometry, view, surface, reader, leds, codes)
             used = _write_samples(file, measured, geometry, view, surface, reader, leds, codes, say)
-        part.replace(path)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot write samples: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
+
+    complete(path, write)
     share = {name: float(np.mean(codes == code)) for name, code in CODES.items()}
     return {
         "view": view.name,
@@ -120,7 +120,7 @@ def _codes(
     sides = geometry.sides[mine]
     sides = np.where(sides >= 0, place[sides], -1)
     centres_mm, led_normals = measured.leds.of(leds)
-    positions = type(measured.leds)(leds, centres_mm, led_normals)
+    positions = Positions(leds, centres_mm, led_normals)
     codes = lamp_codes(geometry.scene, geometry.centres_mm[mine], geometry.normals[mine], sides, positions)
     hidden = _hidden_by_cell(measured, view, geometry.centres_mm[mine], leds)
     codes[(codes == REACHED) & hidden] = BY_CELL

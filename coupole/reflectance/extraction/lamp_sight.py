@@ -89,7 +89,7 @@ def _away(centres, normals, led_centres, led_normals, least_cosine, codes):  # t
 def lit_by(centre, led_centre, led_normal, paper, towards):  # type: ignore[no-untyped-def]
     """E / Phi in m^-2 on a surface at `centre` that faces the LED, whose direction is written to `towards` [3].
 
-    That of a small Lambertian emitter, cos / (pi d^2): at 0.5 m, that of a square of 7 mm differs by 5e-5. `paper`
+    That of a small Lambertian emitter, cos / (pi d^2): at 0.5 m, that of a square of 7 mm differs by 7e-5. `paper`
     has the emitter's cosine twice (seed 003, Eq. 2).
     """
     for k in range(3):

@@ -48,8 +48,8 @@ if __name__ == "__main__":
             time.sleep(0.2)
         getattr(api.motion, what)(**values)
         print("told", flush=True)
-        sys.stdin.readline()
-        print(json.dumps(api.motion.get_current_joints()), flush=True)
+        for _ in sys.stdin:
+            print(json.dumps(api.motion.get_current_joints()), flush=True)
 """
 _ECHO_SERVER = """
 import sys
@@ -109,9 +109,10 @@ def test_its_client_moves_our_stand_in(
     with (
         CellFolder(tmp_path, speed=1.0).world(robot=robot) as world,
         subprocess.Popen(
-            arguments, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            arguments, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
         ) as client,
     ):
+        assert client.stdin is not None
         assert client.stdout is not None
         assert client.stdout.readline() == "told\n"
 
@@ -119,11 +120,17 @@ def test_its_client_moves_our_stand_in(
             joints_deg = world.ask("state")["joints_deg"]
             return bool(np.allclose(forward(KR10_R1100_SIXX, joints_deg), wanted, atol=1e-3))
 
+        def seen() -> bool:
+            assert client.stdin is not None
+            assert client.stdout is not None
+            client.stdin.write("\n")
+            seen_deg = list(json.loads(client.stdout.readline()).values())
+            return bool(np.allclose(seen_deg, world.ask("state")["joints_deg"], atol=1e-3))
+
         wait_until(there, "the stand-in where RSIPI's corrections lead")
-        out, _ = client.communicate("\n", timeout=30.0)
-        assert client.returncode == 0
-        seen_deg = list(json.loads(out).values())
-        assert np.allclose(seen_deg, world.ask("state")["joints_deg"], atol=1e-3)
+        wait_until(seen, "what RSIPI reads of the stand-in to be where it is")
+        client.stdin.close()
+        assert client.wait(timeout=30.0) == 0
 
 
 @contextmanager

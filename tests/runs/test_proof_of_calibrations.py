@@ -18,19 +18,24 @@ COMMAND = (sys.executable, str(cells.REPO / "tools/prove_calibrations.py"), "--j
 
 @pytest.fixture(scope="module")
 def proof(tmp_path_factory: pytest.TempPathFactory, scale: Callable[[int, int], int]) -> list[dict[str, Any]]:
-    """Lines of the tool: small frames, few boards of LEDs."""
+    """Lines of the tool: small frames, few pictures and boards of LEDs."""
     kept = tmp_path_factory.mktemp("proof") / "cells.jsonl"
-    options = ["--images", "16", "--samples", "3", "--led-boards", "24", "--keep", str(kept)]
-    width, count = str(scale(512, 1024)), str(scale(2, 100))
-    ended = subprocess.run(
-        [*COMMAND, "--cells", count, "--width", width, *options], capture_output=True, text=True, check=False
-    )
+    settings = {
+        "cells": scale(1, 100),
+        "width": scale(512, 1024),
+        "images": scale(8, 16),
+        "samples": scale(2, 3),
+        "led-boards": scale(6, 24),
+    }
+    options = [word for name, value in settings.items() for word in (f"--{name}", str(value))]
+    ended = subprocess.run([*COMMAND, *options, "--keep", str(kept)], capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     return [json.loads(line) for line in ended.stdout.splitlines()]
 
 
 @pytest.mark.timeout(9000)  # 100 cells with --full
-def test_stated_intervals_hold_the_truth(proof: list[dict[str, Any]]) -> None:
+def test_stated_intervals_hold_the_truth(proof: list[dict[str, Any]], scale: Callable[[int, int], int]) -> None:
+    """A hundred cells tell whether 95 % hold; one tells an interval that is wrong altogether."""
     judged = [line for line in proof if "covered" in line]
     assert {line["name"].split(".")[0] for line in judged} == {
         "camera",
@@ -42,11 +47,10 @@ def test_stated_intervals_hold_the_truth(proof: list[dict[str, Any]]) -> None:
     values = sum(line["values"] for line in judged)
     covered = sum(line["covered"] * line["values"] for line in judged) / values
     mean_square = sum(line["rms_over_u"] ** 2 * line["values"] for line in judged) / values
-    assert 0.90 <= covered <= 0.99
-    assert 0.8 < mean_square**0.5 < 1.25
-    for line in judged:  # two cells, a parameter each: one may lie outside, and none far
-        assert line["covered"] >= 0.5, line
-        assert line["rms_over_u"] < 2.0, line
+    assert scale(80, 90) <= 100 * covered <= scale(100, 99)
+    assert scale(70, 80) < 100 * mean_square**0.5 < scale(150, 125)
+    for line in judged:
+        assert line["rms_over_u"] < scale(4, 2), line
 
 
 def test_camera_leds_and_mesh_are_near_the_truth(proof: list[dict[str, Any]]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import colour as colour_science
 import numpy as np
 import pytest
 from spectral_scenes import camera, constant, everywhere, illuminant, plane, rendered, scene
@@ -42,6 +41,8 @@ def test_bands_20_nm_apart_are_the_same_as_those_5_nm_apart() -> None:
     ("name", "observer"), [("D65", "10 deg"), ("A", "10 deg"), ("E", "10 deg"), ("D65", "2 deg")]
 )
 def test_a_white_diffuser_has_the_illuminants_white_point(name: str, observer: str) -> None:
+    import colour as colour_science
+
     white = {"kind": "diffuse", "reflectance": constant(1.0)}
     one = scene([plane(white)], [{**DOWNWARDS, "spectrum": illuminant(name)}], samples=1, observer=observer)
     xyz = colour.tristimulus(rendered(one).radiance.mean(axis=(0, 1)), bands.chosen(5), 5, observer)
@@ -142,6 +143,8 @@ def test_light_that_misses_everything_leaves_bands_equally_noisy_but_not_coloure
 
 @pytest.mark.parametrize("transform", ["CAT16", "Bradford"])
 def test_adaptation_agrees_with_colour_science(transform: str) -> None:
+    import colour as colour_science
+
     white, stimulus = np.array([1.1, 1.0, 0.35]), np.array([0.3, 0.25, 0.1])
     d65 = np.array([0.95047, 1.0, 1.08883])
     matrix = colour_science.adaptation.matrix_chromatic_adaptation_VonKries(white, d65, transform=transform)

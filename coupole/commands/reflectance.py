@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from coupole.commands.common import JsonOption, fail
+from coupole.commands.common import JsonOption
+from coupole.commands.common import fail as fail_with
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -133,7 +134,7 @@ def from_runs_or_pictures(
                 left_out = tuple(_numbers(leave_out))
                 made = _of_runs(runs or [], mesh, records, left_out, scan_noise_um, _bytes(memory), out, say)
     except CoupoleError as error:
-        fail(error, as_json=as_json)
+        fail_with(error, as_json=as_json)
         raise
     about, remarks, page = made
     for remark in remarks:
@@ -173,11 +174,11 @@ def _of_runs(
     out: Path,
     say: Said,
 ) -> Made:
-    from coupole.reflectance.run_job import RunRequest, fit_runs
+    from coupole.reflectance.run_job import RunRequest, reflectance_of
     from coupole.viewing import run_reflectance_page
 
     request = RunRequest(tuple(runs), mesh, records, left_out, scan_noise_um, memory_bytes)
-    about = fit_runs(request, out, say=say)
+    about = reflectance_of(request, out, say=say)
     return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)
 
 
@@ -214,9 +215,77 @@ def _numbers(text: str) -> list[int]:
         raise InputError(f"--leave-out: expected numbers with commas between, got {text!r}") from error
 
 
+ResultArgument = Annotated[Path, typer.Argument(help="Folder of a result.", show_default=False)]
+
+
+@reflectance_app.command()
+def extract(
+    runs: Annotated[list[Path], typer.Argument(help="Runs of one object.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the result.", show_default=False)],
+    mesh: MeshOption = None,
+    calibrations: RecordsOption = None,
+    scan_noise_um: NoiseOption = 30.0,
+    leave_out: LeaveOutOption = "",
+    as_json: JsonOption = False,
+) -> None:
+    """The first step alone: samples of reflectance of each triangle under each LED, from proven frames."""
+
+    def step(say: Said) -> dict[str, Any]:
+        from coupole.reflectance.run_job import RunRequest, extract_runs
+        from coupole.reflectance.run_result import RunResult
+
+        records, left_out = _records(calibrations or []), tuple(_numbers(leave_out))
+        extract_runs(RunRequest(tuple(runs), mesh, records, left_out, scan_noise_um), out, say=say)
+        return {"views": RunResult(out).summaries}
+
+    _do(step, as_json=as_json)
+
+
+@reflectance_app.command()
+def fit(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOption = False) -> None:
+    """The second step alone: materials of each triangle, and the slice of reflectance that each view has seen."""
+
+    def step(say: Said) -> dict[str, Any]:
+        from coupole.reflectance.run_fits import fit_result
+        from coupole.reflectance.run_result import FITS
+
+        fit_result(result, _bytes(memory), say=say)
+        return {"fits": FITS}
+
+    _do(step, as_json=as_json)
+
+
+@reflectance_app.command()
+def check(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOption = False) -> None:
+    """The third step alone: what the fits miss under the LEDs that were left out, and the report."""
+
+    def step(say: Said) -> dict[str, Any]:
+        from coupole.reflectance.run_check import check_result
+        from coupole.viewing import run_reflectance_page
+
+        about = check_result(result, _bytes(memory), say=say)
+        return {**about, "report": str(run_reflectance_page.write(result))}
+
+    _do(step, as_json=as_json)
+
+
+def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool) -> None:
+    """A step by itself, with bars; what it returns is its `--json`."""
+    from coupole.viewing.terminal import make_console, step_bars
+
+    try:
+        with step_bars(make_console(quiet=as_json)) as say:
+            told = step(say)
+    except CoupoleError as error:
+        fail_with(error, as_json=as_json)
+        raise
+    if as_json:
+        print(json.dumps(told))
+
+
 @reflectance_app.command()
 def relight(
-    result: Annotated[Path, typer.Argument(help="Folder of a result.", show_default=False)],
+    result: ResultArgument,
     direction: Annotated[
         str,
         typer.Option(
@@ -232,6 +301,14 @@ def relight(
         ),
     ],
     view: Annotated[str | None, typer.Option("--view", help="Of a result of runs; the first without it.")] = None,
+    fit: Annotated[
+        str | None,
+        typer.Option(
+            "--fit",
+            help="Of a result of runs: ggx, ggx_normal, sh, rbf or ggx_rbf; without it the one that missed least "
+            "in the check.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make the picture that a distant light from a new direction would give."""
@@ -239,15 +316,15 @@ def relight(
 
     try:
         refuse_unknown(to)
-        write_picture(to, _relit(result, _direction(direction), view))
+        write_picture(to, _relit(result, _direction(direction), view, fit))
     except CoupoleError as error:
-        fail(error, as_json=as_json)
+        fail_with(error, as_json=as_json)
         raise
     if as_json:
         print(json.dumps({"picture": str(to.resolve())}))
 
 
-def _relit(result: Path, towards: NDArray[np.float64], view: str | None) -> NDArray[np.float32]:
+def _relit(result: Path, towards: NDArray[np.float64], view: str | None, fit: str | None) -> NDArray[np.float32]:
     import numpy as np
 
     from coupole.reflectance import picture_result, run_result
@@ -256,10 +333,11 @@ def _relit(result: Path, towards: NDArray[np.float64], view: str | None) -> NDAr
 
     if (result / run_result.OBJECT).exists():
         run_result.read_about(result)
-        picture = relit_view(run_result.RunResult(result), towards, view)
+        picture = relit_view(run_result.RunResult(result), towards, view, fit)
         return picture if picture.shape[2] == 3 else np.repeat(picture, 3, axis=2)
-    if view is not None:
-        raise InputError("--view: a result of pictures has one view")
+    for option, value in (("--view", view), ("--fit", fit)):
+        if value is not None:
+            raise InputError(f"{option}: a result of pictures has one view and one way to relight it")
     made = picture_result.PictureResult(result)
     made.about  # noqa: B018  refuses what is no result
     return relit(made, read_interpolation(result), towards)

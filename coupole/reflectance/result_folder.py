@@ -11,10 +11,12 @@ from typing import Any
 from coupole.errors import InputError
 from coupole.storage.durable import sync_folder
 
+SETTINGS = "settings.json"
+
 
 def begin(out: Path, settings: dict[str, Any]) -> None:
     """Make the folder; refuse one that was begun with other input or settings."""
-    path = out / "settings.json"
+    path = out / SETTINGS
     text = json.dumps(settings) + "\n"
     if path.exists():
         if path.read_text(encoding="utf-8") != text:
@@ -25,6 +27,18 @@ def begin(out: Path, settings: dict[str, Any]) -> None:
     for name in ("samples", "fits"):
         (out / name).mkdir(parents=True, exist_ok=True)
     complete(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def read_settings(out: Path) -> dict[str, Any]:
+    """What a result was begun with. Raises InputError if there is none."""
+    path = out / SETTINGS
+    try:
+        settings = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(settings, dict) or "runs" not in settings:
+            raise ValueError
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: expected the settings of a result of runs") from error
+    return settings
 
 
 def complete(path: Path, write: Callable[[Path], Any]) -> None:

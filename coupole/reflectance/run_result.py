@@ -14,12 +14,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError, Problem
+from coupole.reflectance.slice_basis import HARMONICS, RADIAL, RESIDUAL, Basis, centres
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples
 
 SCHEMA = "coupole-reflectance-run/1"
 ABOUT, REPORT, OBJECT = "result.json", "report.html", "object.h5"
-FITS = {"ggx": "fits/ggx.h5", "ggx_normal": "fits/ggx_normal.h5"}
-"""GGX with the mesh's normals, and with normals that are fitted too."""
+MATERIALS = ("ggx", "ggx_normal")
+"""Fits to the samples of all views: GGX with the mesh's normals, and with normals that are fitted too."""
+
+
+@dataclass(frozen=True)
+class SliceKind:
+    """A fit to the samples of each view by itself."""
+
+    basis: Basis
+    over: str | None = None
+    """The material that it is added to; it was fitted to what that left."""
+
+
+SLICES = {
+    "sh": SliceKind(HARMONICS),
+    "rbf": SliceKind(RADIAL),
+    "ggx_rbf": SliceKind(RESIDUAL, over="ggx_normal"),
+}
+FITS = (*MATERIALS, *SLICES)
 _HEAD = ("triangles", "camera_mm", "leds", "led_positions_mm", "led_normals", "full_scales")
 FIELDS = {
     "normals": "unit, base frame",
@@ -78,6 +96,25 @@ class RunResult:
     def views(self) -> tuple[ViewSamples, ...]:
         return tuple(map(read_view_samples, self.files))
 
+    @property
+    def summaries(self) -> list[dict[str, Any]]:
+        """What extraction said of each view."""
+        files = sorted((self.folder / "samples").glob("*.json"))
+        return [json.loads(path.read_text(encoding="utf-8")) for path in files]
+
+    def refuse_unfinished(self, names: Sequence[str], *, fits: bool = False) -> None:
+        """Raises InputError if the samples of a view of these names, or a fit, are missing."""
+        for name in names:
+            if not (self.folder / "samples" / f"{name}.json").exists():
+                raise InputError(
+                    f"{self.folder}: the samples of the view {name} are not there; `coupole reflectance extract`, "
+                    "as it was begun, makes them"
+                )
+        paths = [self.materials_path(name) for name in MATERIALS]
+        paths += [self.slices_path(name, view) for name in SLICES for view in self.views]
+        if fits and (missing := [path for path in paths if not path.exists()]):
+            raise InputError(f"{missing[0]}: is not there; `coupole reflectance fit {self.folder}` makes it")
+
     @cached_property
     def triangles(self) -> NDArray[np.int64]:
         """All that any view sees, rising."""
@@ -85,42 +122,49 @@ class RunResult:
 
     def blocks(self, budget_bytes: int) -> Iterator[slice]:
         """Places in `triangles` that are processed together within a budget of memory."""
-        samples = sum(len(view.leds) for view in self.views)
-        each = 64 * samples  # values, a model's, and what is copied between
-        step = int(np.clip(budget_bytes // max(1, each), 64, 1 << 16))
-        for first in range(0, len(self.triangles), step):
-            yield slice(first, min(first + step, len(self.triangles)))
+        return _parts(len(self.triangles), sum(len(view.leds) for view in self.views), budget_bytes)
+
+    def view_blocks(self, view: ViewSamples, budget_bytes: int) -> Iterator[slice]:
+        """The same of the rows of a view's file."""
+        return _parts(len(view.triangles), len(view.leds), budget_bytes)
 
     def samples(self, block: slice) -> TriangleSamples:
         """Those of the triangles of a block, in all views that see one of them."""
         wanted = self.triangles[block]
         values: list[NDArray[np.float32]] = []
-        led_mm: list[NDArray[np.float64]] = []
-        view_of: list[NDArray[np.int64]] = []
-        cameras: list[NDArray[np.float64]] = []
+        seeing = [view for view in self.views if _rows(view, wanted)]
         centres, normals = np.zeros((len(wanted), 3)), np.zeros((len(wanted), 3))
-        for view in self.views:
-            if not (rows := _rows(view, wanted)):
-                continue
+        for view in seeing:
+            rows = _rows(view, wanted)
             at = np.searchsorted(wanted, view.triangles[rows.start : rows.stop])
-            with h5py.File(view.path, "r") as file:
-                f = file["f"][rows.start : rows.stop]
-                centres[at] = file["centres_mm"][rows.start : rows.stop]
-                normals[at] = file["normals"][rows.start : rows.stop]
-            mine = np.full((len(wanted), *f.shape[1:]), np.nan, np.float32)
-            mine[at] = f * _cosines(centres[at], normals[at], view.led_mm)[..., None]
-            values.append(mine)
-            led_mm.append(view.led_mm)
-            view_of.append(np.full(len(view.leds), len(cameras)))
-            cameras.append(view.camera_mm)
+            mine = self.view_samples(view, slice(rows.start, rows.stop))
+            centres[at], normals[at] = mine.centres_mm, mine.normals
+            all_of_them = np.full((len(wanted), *mine.values.shape[1:]), np.nan, np.float32)
+            all_of_them[at] = mine.values
+            values.append(all_of_them)
         return TriangleSamples(
             np.concatenate(values, axis=1),
-            np.concatenate(led_mm),
-            np.concatenate(view_of),
-            np.stack(cameras),
+            np.concatenate([view.led_mm for view in seeing]),
+            np.concatenate([np.full(len(view.leds), number) for number, view in enumerate(seeing)]),
+            np.stack([view.camera_mm for view in seeing]),
             centres,
             normals,
             self.areas_mm2[wanted],
+        )
+
+    def view_samples(self, view: ViewSamples, rows: slice) -> TriangleSamples:
+        """Those of some rows of a view's file."""
+        with h5py.File(view.path, "r") as file:
+            values, centres, normals = (file[name][rows] for name in ("f", "centres_mm", "normals"))
+        values *= _cosines(centres, normals, view.led_mm)[..., None]
+        return TriangleSamples(
+            values,
+            view.led_mm,
+            np.zeros(len(view.leds), np.int64),
+            view.camera_mm[None],
+            centres,
+            normals,
+            self.areas_mm2[view.triangles[rows]],
         )
 
     def along_samples(self, block: slice, name: str) -> NDArray[Any]:
@@ -129,10 +173,22 @@ class RunResult:
         wanted = self.triangles[block]
         return np.concatenate([getattr(view, name) for view in self.views if _rows(view, wanted)])
 
+    def materials_path(self, name: str) -> Path:
+        return self.folder / "fits" / f"{name}.h5"
+
+    def slices_path(self, name: str, view: ViewSamples) -> Path:
+        return self.folder / "fits" / name / view.path.name
+
     def materials(self, name: str, block: slice = slice(None)) -> TriangleMaterials:
-        """A fit by its name in `FITS`."""
-        with h5py.File(self.folder / FITS[name], "r") as file:
+        """A fit by its name in `MATERIALS`."""
+        with h5py.File(self.materials_path(name), "r") as file:
             return TriangleMaterials(*(file[field][block].astype(np.float64) for field in FIELDS))
+
+    def slices(self, name: str, view: ViewSamples, rows: slice = slice(None)) -> NDArray[np.float32]:
+        """[n, channels, coefficients] of rows of a view's file, by a fit's name in `SLICES`."""
+        with h5py.File(self.slices_path(name, view), "r") as file:
+            found: NDArray[np.float32] = file["coefficients"][rows]
+            return found
 
 
 def read_view_samples(path: Path) -> ViewSamples:
@@ -140,10 +196,7 @@ def read_view_samples(path: Path) -> ViewSamples:
         return ViewSamples(
             path,
             str(file.attrs["view"]),
-            *(
-                file[name][()]
-                for name in ("triangles", "camera_mm", "leds", "led_positions_mm", "led_normals", "full_scales")
-            ),
+            *(file[name][()] for name in _HEAD),
         )
 
 
@@ -158,6 +211,13 @@ def read_about(folder: Path) -> dict[str, Any]:
     if not isinstance(about, dict) or about.get("schema") != SCHEMA:
         raise InputError([Problem(str(path), 0, 0, "schema", f"expected {SCHEMA}")])
     return about
+
+
+def _parts(count: int, samples: int, budget_bytes: int) -> Iterator[slice]:
+    each = 64 * samples  # values, a model's, and what is copied between
+    step = int(np.clip(budget_bytes // max(1, each), 64, 1 << 16))
+    for first in range(0, count, step):
+        yield slice(first, min(first + step, count))
 
 
 def _rows(view: ViewSamples, wanted: NDArray[np.int64]) -> range:
@@ -192,3 +252,19 @@ def write_materials(path: Path, parts: Sequence[TriangleMaterials], triangles: N
         for field, told in FIELDS.items():
             values = np.concatenate([getattr(part, field) for part in parts]).astype(np.float32)
             file.create_dataset(field, data=values, track_times=False).attrs["told"] = told
+
+
+def write_slices(path: Path, parts: Sequence[NDArray[np.float32]], kind: SliceKind) -> None:
+    """A fit of all triangles of a view, from those of blocks."""
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("coefficients", data=np.concatenate(parts), track_times=False)
+        data.attrs["told"] = "[triangles of the view, channels, coefficients] 1/sr; NaN where too few samples are"
+        data.attrs["basis"] = (
+            "real spherical harmonics, orthonormal, degrees 0 to 9, order by order"
+            if kind.basis.harmonic
+            else "-r to each of `centres`, then 1, x, y, z"
+        )
+        data.attrs["frame"] = "z the mesh's normal, x towards the camera along the surface"
+        data.attrs["added_to"] = kind.over or ""
+        if not kind.basis.harmonic:
+            file.create_dataset("centres", data=centres(), track_times=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import StorageError
-from coupole.reflectance.run_result import FITS, REPORT, read_about
+from coupole.reflectance.run_fits import predicted
+from coupole.reflectance.run_result import FITS, MATERIALS, REPORT, RunResult, read_about
 from coupole.reflectance.triangle_fit import FEWEST
 from coupole.storage.durable import write_synced
 from coupole.viewing.reflectance_page import STYLE, display, figure, grey
@@ -22,7 +24,13 @@ POOR_RESIDUAL = 0.05
 WHITE_KS = 0.1
 LEAST_KS = 0.004
 """A tenth of a dielectric's: below it the roughness says nothing."""
-TOLD = {"ggx": "GGX, mesh's normals", "ggx_normal": "GGX, normals fitted"}
+TOLD = {
+    "ggx": "GGX, mesh's normals",
+    "ggx_normal": "GGX, normals fitted",
+    "sh": "spherical harmonics",
+    "rbf": "radial functions",
+    "ggx_rbf": "GGX, normals fitted, with radial functions of what is left",
+}
 
 
 def write(folder: Path) -> Path:
@@ -64,10 +72,12 @@ def _page(folder: Path) -> Iterator[str]:
     yield f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
     for remark in remarks(about):
         yield f"<p>{html.escape(remark)}"
-    fits = {name: _fields(folder / path) for name, path in FITS.items()}
+    yield from _missed(about)
+    fits = {name: _fields(RunResult(folder).materials_path(name)) for name in MATERIALS}
     for view in sorted((folder / "samples").glob("*.h5")):
         yield f"<h2>View {html.escape(view.stem)}</h2>"
         yield from _view(view, fits)
+        yield from _reconstructed(RunResult(folder), view, about)
     yield "<h2>Share of triangles and LEDs</h2><table><tr><th>view"
     codes = about["views"][0]["share_by_code"]
     yield "".join(f"<th>{html.escape(name)}" for name in codes)
@@ -79,6 +89,42 @@ def _page(folder: Path) -> Iterator[str]:
         "<p>Inter-reflection and veiling glare are not subtracted. No uncertainty is stated for these normals and "
         "materials yet."
     )
+
+
+def _missed(about: dict[str, Any]) -> Iterator[str]:
+    """A table of the fits."""
+    yield "<h2>Under the LEDs kept for the check</h2><table><tr><th><th>mean error, % of range<th>PSNR, dB"
+    for name, mae in about["mae"].items():
+        if mae is not None:
+            yield f"<tr><th>{TOLD[name]}<td>{100 * mae:.3f}<td>{about['held_out_psnr_db'][name]:.1f}"
+    yield "</table>"
+
+
+def _reconstructed(result: RunResult, path: Path, about: dict[str, Any]) -> Iterator[str]:
+    """What each fit makes of one LED that was kept for the check, and how far it is off; the LED that lights most
+    triangles."""
+    view = next(view for view in result.views if view.path == path)
+    held = np.flatnonzero(np.isin(view.leds, about["left_out"]))
+    with h5py.File(path, "r") as file:
+        seen = file["seen"][()]
+        shares = [np.isfinite(file["f"][:, led, 0]).mean() for led in held]
+    if not shares:
+        return
+    one = held[int(np.argmax(shares))]
+    rows = slice(0, len(view.triangles))
+    samples = result.view_samples(view, rows)
+    under = replace(
+        samples, values=samples.values[:, [one]], led_mm=samples.led_mm[[one]], view_of=samples.view_of[[one]]
+    )
+    measured = _rgb(under.values[:, 0], about["channels"])
+    white = float(np.nanquantile(measured, 0.995))
+    yield f"<p>f cos under LED {view.leds[one]}, and how far each fit is off, white a tenth of that<br>"
+    yield figure("measured", display(np.nan_to_num(_picture(seen, measured)), white))
+    for name in FITS:
+        made = _rgb(predicted(result, name, view, rows, under)[:, 0], about["channels"])
+        off = np.abs(made - measured).mean(axis=1, keepdims=True)
+        yield figure(TOLD[name], display(np.nan_to_num(_picture(seen, made)), white))
+        yield figure("off", grey(np.nan_to_num(_picture(seen, off))[..., 0] / (0.1 * white)))
 
 
 def _fields(path: Path) -> dict[str, NDArray[Any]]:

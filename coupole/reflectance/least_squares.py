@@ -1,0 +1,62 @@
+"""Many small regularised least-squares problems, one after the other in compiled code, by SciPy's BLAS and LAPACK.
+
+Their own threads are to be turned off by the caller (`one_thread`): whole problems are what is done side by side.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import llvmlite.binding
+import numba
+import numpy as np
+from numba import types
+from numba.extending import get_cython_function_address
+from threadpoolctl import threadpool_limits
+
+_INT, _DOUBLE, _CHAR = map(types.CPointer, (types.intc, types.float64, types.uint8))
+
+
+def _routine(module: str, name: str, *kinds: Any) -> Any:
+    """A Fortran routine that compiled code may call. It is known by name, so that what calls it can be cached."""
+    symbol = f"coupole_{name}"
+    llvmlite.binding.add_symbol(symbol, get_cython_function_address(f"scipy.linalg.cython_{module}", name))
+    return types.ExternalFunction(symbol, types.void(*kinds))
+
+
+_dsyrk = _routine("blas", "dsyrk", _CHAR, _CHAR, _INT, _INT, _DOUBLE, _DOUBLE, _INT, _DOUBLE, _DOUBLE, _INT)
+_dpotrf = _routine("lapack", "dpotrf", _CHAR, _INT, _DOUBLE, _INT, _INT)
+_dpotrs = _routine("lapack", "dpotrs", _CHAR, _INT, _INT, _DOUBLE, _INT, _DOUBLE, _INT, _INT)
+
+
+def one_thread() -> Any:
+    """While it is entered, BLAS takes one thread for each call."""
+    return threadpool_limits(1, user_api="blas")
+
+
+@numba.njit(cache=True, nogil=True)
+def factorise(rows, penalty, factor):  # type: ignore[no-untyped-def]
+    """Into `factor` [n, n], Cholesky's of rows^T rows + diag(penalty), for `rows` [samples, n]; whether there is
+    one."""
+    upper, plain = np.array([85], np.uint8), np.array([78], np.uint8)  # U and N
+    sizes = np.array([rows.shape[1], rows.shape[0], 0], np.intc)
+    factors = np.array([1.0, 0.0])
+    _dsyrk(
+        upper.ctypes, plain.ctypes, sizes.ctypes, sizes[1:].ctypes, factors.ctypes, rows.ctypes, sizes.ctypes,
+        factors[1:].ctypes, factor.ctypes, sizes.ctypes,
+    )  # fmt: skip
+    for n in range(rows.shape[1]):
+        factor[n, n] += penalty[n]
+    _dpotrf(upper.ctypes, sizes.ctypes, factor.ctypes, sizes.ctypes, sizes[2:].ctypes)
+    return sizes[2] == 0
+
+
+@numba.njit(cache=True, nogil=True)
+def solve(factor, right):  # type: ignore[no-untyped-def]
+    """In place: the solution for `right` [n], by what `factorise` left."""
+    upper = np.array([85], np.uint8)
+    sizes = np.array([len(right), 1, 0], np.intc)
+    _dpotrs(
+        upper.ctypes, sizes.ctypes, sizes[1:].ctypes, factor.ctypes, sizes.ctypes, right.ctypes, sizes.ctypes,
+        sizes[2:].ctypes,
+    )  # fmt: skip

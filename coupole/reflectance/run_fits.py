@@ -1,0 +1,85 @@
+"""The fits of a result of runs, each a file of its own, and what they give in a direction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.result_folder import complete, read_settings
+from coupole.reflectance.run_result import (
+    MATERIALS,
+    SLICES,
+    RunResult,
+    ViewSamples,
+    write_materials,
+    write_slices,
+)
+from coupole.reflectance.slice_fit import fit_slices, slice_values
+from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
+from coupole.storage.disk_errors import disk_error
+
+Said = Callable[[str, int, int], None]
+
+
+def fit_result(out: Path, memory_bytes: int, *, say: Said = lambda step, done, of: None) -> None:
+    """Make the fits that a result lacks. Raises InputError if its samples are not all there, StorageError."""
+    settings = read_settings(out)
+    result = RunResult(out)
+    result.refuse_unfinished(settings["view_names"])
+    try:
+        for name in MATERIALS:
+            if not result.materials_path(name).exists():
+                noise_um = settings["scan_noise_um"] if name == "ggx_normal" else None
+                _fit_materials(result, name, noise_um, settings["left_out"], memory_bytes, say)
+        for name in SLICES:
+            for view in result.views:
+                if not result.slices_path(name, view).exists():
+                    _fit_slices(result, name, view, settings["left_out"], memory_bytes, say)
+    except OSError as error:
+        raise disk_error(out, error) from error
+
+
+def predicted(
+    result: RunResult, name: str, view: ViewSamples, rows: slice, samples: TriangleSamples
+) -> NDArray[np.float32]:
+    """[b, samples, channels] f cos_i, 1/sr, that a fit gives for `samples` of rows of a view's file, whatever
+    their lights are; NaN where the fit has nothing."""
+    kind = SLICES.get(name)
+    material = name if kind is None else kind.over
+    model = None
+    if material is not None:
+        places = np.searchsorted(result.triangles, view.triangles[rows])
+        model = model_values(samples, result.materials(material).at(places))
+    if kind is None:
+        assert model is not None
+        return model
+    return slice_values(samples, result.slices(name, view, rows), kind.basis, model)
+
+
+def _fit_materials(
+    result: RunResult, name: str, noise_um: float | None, left_out: list[int], memory_bytes: int, say: Said
+) -> None:
+    parts = []
+    for block in result.blocks(memory_bytes):
+        used = ~np.isin(result.along_samples(block, "leds"), left_out)
+        parts.append(fit_triangles(result.samples(block), used, noise_um))
+        say(f"fit {name}", block.stop, len(result.triangles))
+    complete(result.materials_path(name), lambda path: write_materials(path, parts, result.triangles))
+
+
+def _fit_slices(
+    result: RunResult, name: str, view: ViewSamples, left_out: list[int], memory_bytes: int, say: Said
+) -> None:
+    kind, parts = SLICES[name], []
+    used = ~np.isin(view.leds, left_out)
+    for rows in result.view_blocks(view, memory_bytes):
+        samples = result.view_samples(view, rows)
+        model = None if kind.over is None else predicted(result, kind.over, view, rows, samples)
+        parts.append(fit_slices(samples, used, kind.basis, model))
+        say(f"fit {name} of {view.view}", rows.stop, len(view.triangles))
+    path = result.slices_path(name, view)
+    path.parent.mkdir(exist_ok=True)
+    complete(path, lambda part: write_slices(part, parts, kind))

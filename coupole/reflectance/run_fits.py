@@ -46,7 +46,7 @@ def predicted(
     result: RunResult, name: str, view: ViewSamples, rows: slice, samples: TriangleSamples
 ) -> NDArray[np.float32]:
     """[b, samples, channels] f cos_i, 1/sr, that a fit gives for `samples` of rows of a view's file, whatever
-    their lights are; NaN where the fit has nothing."""
+    their lights are; NaN where the fit has nothing, the material alone where what it leaves was not fitted."""
     kind = SLICES.get(name)
     material = name if kind is None else kind.over
     model = None
@@ -56,7 +56,10 @@ def predicted(
     if kind is None:
         assert model is not None
         return model
-    return slice_values(samples, result.slices(name, view, rows), kind.basis, model)
+    coefficients = result.slices(name, view, rows)
+    if model is not None:
+        coefficients = np.nan_to_num(coefficients)
+    return slice_values(samples, coefficients, kind.basis, model)
 
 
 def _fit_materials(

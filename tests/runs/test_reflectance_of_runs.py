@@ -92,9 +92,12 @@ def test_the_material_is_found_and_makes_the_pictures_under_leds_kept_for_the_ch
     np.testing.assert_allclose(np.nanmedian(ks, axis=0), F0, rtol=0.25)
     assert len(document["left_out"]) == 4
     assert document["simulated"]
-    for name in ("ggx", "ggx_normal"):
+    assert set(document["mae"]) == {"ggx", "ggx_normal", "sh", "rbf", "ggx_rbf"}
+    for name in ("ggx", "ggx_normal", "ggx_rbf"):
         assert document["mae"][name] < 0.008  # of range; the noise of some four pixels is 0.005
         assert document["held_out_psnr_db"][name] > 35
+    for name in ("sh", "rbf"):  # 41 LEDs for 100 coefficients
+        assert document["mae"][name] < 0.03
 
 
 def test_brackets_are_merged(tmp_path: Path) -> None:
@@ -108,7 +111,7 @@ def test_brackets_are_merged(tmp_path: Path) -> None:
     ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", out, "--json")
     assert ended.code == 0, ended.err
     assert ended.document["not_fitted"] == ended.document["triangles"]
-    assert ended.document["mae"] == {"ggx": None, "ggx_normal": None}
+    assert set(ended.document["mae"].values()) == {None}
     with h5py.File(out / "samples/top.h5") as file:
         f, u_own, reached = file["f"][()], file["u_own"][()], file["codes"][()] == 0
     stone = np.array([0.62, 0.55, 0.42]) / np.pi  # of objects for which no rig gives a material
@@ -166,13 +169,16 @@ def test_a_mesh_whose_normals_are_off_is_mended(made: Made, tmp_path: Path) -> N
 
 def test_a_job_that_was_stopped_goes_on_and_another_is_refused(made: Made) -> None:
     cell, out, document = made
-    (out / "fits/ggx_normal.h5").unlink()
+    (out / "fits/ggx_rbf/side.h5").unlink()
+    ended = cells.here("reflectance", "check", out)
+    assert ended.code == 2
+    assert "`coupole reflectance fit" in ended.err
     before = {path: path.stat().st_mtime_ns for path in (out / "samples").iterdir()}
     again = ("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", out, "--json")
     ended = cells.here(*again)
     assert ended.code == 0, ended.err
     assert {path: path.stat().st_mtime_ns for path in (out / "samples").iterdir()} == before
-    assert ended.document["mae"]["ggx"] == document["mae"]["ggx"]
+    assert ended.document["mae"] == document["mae"]
     other = cells.here(*again, "--leave-out", "24,48")
     assert other.code == 2
     assert "name another folder" in other.err
@@ -234,10 +240,16 @@ def test_a_frame_that_is_not_the_one_that_was_proven_is_refused(made: Made, tmp_
 
 def test_a_view_is_relit_with_its_shadows(made: Made) -> None:
     """From a direction in which no LED stands; the light's frame is the support's, whose z is the base's -z."""
-    _, out, _ = made
+    out = made[1]
     to = out / "relit.npy"
     ended = cells.here("reflectance", "relight", out, "--direction", "0.6,0.3,1", "--view", "side", "--to", to)
     assert ended.code == 0, ended.err
+    best = min(made[2]["mae"], key=made[2]["mae"].__getitem__)
+    by_name = out / "named.npy"
+    for name, same in ((best, True), ("sh", False)):
+        arguments = ("--direction", "0.6,0.3,1", "--view", "side", "--fit", name, "--to", by_name)
+        assert cells.here("reflectance", "relight", out, *arguments).code == 0
+        assert np.array_equal(np.load(by_name), np.load(to)) is same
     picture = np.load(to)
     with h5py.File(out / "samples/side.h5") as file:
         seen, normals, centres = file["seen"][()], file["normals"][()], file["centres_mm"][()]
@@ -258,3 +270,6 @@ def test_a_view_is_relit_with_its_shadows(made: Made) -> None:
     wrong = cells.here("reflectance", "relight", out, "--direction", "0,0,1", "--view", "none", "--to", to)
     assert wrong.code == 2
     assert "expected one of side, top" in wrong.err
+    wrong = cells.here("reflectance", "relight", out, "--direction", "0,0,1", "--fit", "none", "--to", to)
+    assert wrong.code == 2
+    assert "expected one of ggx, ggx_normal, sh, rbf, ggx_rbf" in wrong.err

@@ -35,20 +35,27 @@ def one_thread() -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def factorise(rows, penalty, factor):  # type: ignore[no-untyped-def]
-    """Into `factor` [n, n], Cholesky's of rows^T rows + diag(penalty), for `rows` [samples, n]; whether there is
-    one."""
+def gram(rows, product):  # type: ignore[no-untyped-def]
+    """Into `product` [n, n], rows^T rows of `rows` [samples, n]: the half that `factorise` reads."""
     upper, plain = np.array([85], np.uint8), np.array([78], np.uint8)  # U and N
-    sizes = np.array([rows.shape[1], rows.shape[0], 0], np.intc)
+    sizes = np.array([rows.shape[1], rows.shape[0]], np.intc)
     factors = np.array([1.0, 0.0])
     _dsyrk(
         upper.ctypes, plain.ctypes, sizes.ctypes, sizes[1:].ctypes, factors.ctypes, rows.ctypes, sizes.ctypes,
-        factors[1:].ctypes, factor.ctypes, sizes.ctypes,
+        factors[1:].ctypes, product.ctypes, sizes.ctypes,
     )  # fmt: skip
-    for n in range(rows.shape[1]):
+
+
+@numba.njit(cache=True, nogil=True)
+def factorise(product, penalty, factor):  # type: ignore[no-untyped-def]
+    """Into `factor` [n, n], Cholesky's of what `gram` left + diag(penalty); whether there is one."""
+    upper = np.array([85], np.uint8)
+    sizes = np.array([len(penalty), 0], np.intc)
+    factor[:] = product
+    for n in range(len(penalty)):
         factor[n, n] += penalty[n]
-    _dpotrf(upper.ctypes, sizes.ctypes, factor.ctypes, sizes.ctypes, sizes[2:].ctypes)
-    return sizes[2] == 0
+    _dpotrf(upper.ctypes, sizes.ctypes, factor.ctypes, sizes.ctypes, sizes[1:].ctypes)
+    return sizes[1] == 0
 
 
 @numba.njit(cache=True, nogil=True)

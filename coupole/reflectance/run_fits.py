@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,8 @@ from coupole.reflectance.slice_fit import fit_slices, slice_values
 from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
 from coupole.storage.disk_errors import disk_error
 
+TOGETHER = (("sh",), ("rbf", "ggx_rbf"))
+"""Names in `SLICES` that share their functions, fitted in one pass."""
 Said = Callable[[str, int, int], None]
 
 
@@ -34,10 +37,10 @@ def fit_result(out: Path, memory_bytes: int, *, say: Said = lambda step, done, o
             if not result.materials_path(name).exists():
                 noise_um = settings["scan_noise_um"] if name == "ggx_normal" else None
                 _fit_materials(result, name, noise_um, settings["left_out"], memory_bytes, say)
-        for name in SLICES:
+        for names in TOGETHER:
             for view in result.views:
-                if not result.slices_path(name, view).exists():
-                    _fit_slices(result, name, view, settings["left_out"], memory_bytes, say)
+                if not all(result.slices_path(name, view).exists() for name in names):
+                    _fit_slices(result, names, view, settings["left_out"], memory_bytes, say)
     except OSError as error:
         raise disk_error(out, error) from error
 
@@ -74,15 +77,25 @@ def _fit_materials(
 
 
 def _fit_slices(
-    result: RunResult, name: str, view: ViewSamples, left_out: list[int], memory_bytes: int, say: Said
+    result: RunResult, names: Sequence[str], view: ViewSamples, left_out: list[int], memory_bytes: int, say: Said
 ) -> None:
-    kind, parts = SLICES[name], []
+    parts: dict[str, list[NDArray[np.float32]]] = {name: [] for name in names}
     used = ~np.isin(view.leds, left_out)
     for rows in result.view_blocks(view, memory_bytes):
         samples = result.view_samples(view, rows)
-        model = None if kind.over is None else predicted(result, kind.over, view, rows, samples)
-        parts.append(fit_slices(samples, used, kind.basis, model))
-        say(f"fit {name} of {view.view}", rows.stop, len(view.triangles))
-    path = result.slices_path(name, view)
-    path.parent.mkdir(exist_ok=True)
-    complete(path, lambda part: write_slices(part, parts, kind))
+        fits = [(SLICES[name].basis, _under(result, name, view, rows, samples)) for name in names]
+        for name, found in zip(names, fit_slices(samples, used, *fits), strict=True):
+            parts[name].append(found)
+        say(f"fit {', '.join(names)} of {view.view}", rows.stop, len(view.triangles))
+    for name in names:
+        path = result.slices_path(name, view)
+        path.parent.mkdir(exist_ok=True)
+        complete(path, partial(write_slices, parts=parts[name], kind=SLICES[name]))
+
+
+def _under(
+    result: RunResult, name: str, view: ViewSamples, rows: slice, samples: TriangleSamples
+) -> NDArray[np.float32] | None:
+    """What the material gives that a fit is added to."""
+    over = SLICES[name].over
+    return None if over is None else predicted(result, over, view, rows, samples)

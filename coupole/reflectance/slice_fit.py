@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.least_squares import factorise, one_thread, solve
+from coupole.reflectance.least_squares import factorise, gram, one_thread, solve
 from coupole.reflectance.slice_basis import COUNT, Basis, functions
 from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 
@@ -25,28 +25,29 @@ _FLAT = 1e-9
 def fit_slices(
     samples: TriangleSamples,
     used: NDArray[np.bool_],
-    basis: Basis,
-    model: NDArray[np.float32] | None = None,
-    *,
+    *fits: tuple[Basis, NDArray[np.float32] | None],
     threads: int | None = None,
-) -> NDArray[np.float32]:
-    """[b, channels, COUNT] coefficients from those `used` [samples] of one view's samples, or of what a `model`
-    [b, samples, channels] leaves of them; NaN where there are too few."""
+) -> list[NDArray[np.float32]]:
+    """For each of some fits with the same functions, [b, channels, COUNT] coefficients; NaN for too few samples.
+
+    From those `used` [samples] of one view's samples, or of what a model [b, samples, channels] leaves of them.
+    """
     count, _, channels = samples.values.shape
-    found = np.full((count, channels, COUNT), np.nan, np.float32)
-    left = samples.values if model is None else samples.values - model
+    found = np.full((len(fits), count, channels, COUNT), np.nan, np.float32)
+    left = np.stack([samples.values if model is None else samples.values - model for _, model in fits])
+    penalties = np.stack([basis.penalty for basis, _ in fits])
     camera_mm, which = samples.cameras_mm[0], np.flatnonzero(used)
 
     def fit(first: int) -> None:
         part = slice(first, min(first + _PART, count))
         _fit_part(
-            left[part], samples.led_mm, camera_mm, samples.centres_mm[part], samples.normals[part], which,
-            basis.harmonic, basis.penalty, found[part],
+            samples.values[part], left[:, part], samples.led_mm, camera_mm, samples.centres_mm[part],
+            samples.normals[part], which, fits[0][0].harmonic, penalties, found[:, part],
         )  # fmt: skip
 
     with one_thread(), ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(fit, range(0, count, _PART)))
-    return found
+    return list(found)
 
 
 def slice_values(
@@ -92,39 +93,65 @@ def _local(frame, centre_mm, led_mm, direction):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_part(values, led_mm, camera_mm, centres_mm, normals, used, harmonic, penalty, found):  # type: ignore[no-untyped-def]
+def _fit_part(  # type: ignore[no-untyped-def]
+    values, left, led_mm, camera_mm, centres_mm, normals, used, harmonic, penalties, found
+):
     count, _, channels = values.shape
-    whole, rows = np.empty((len(used), COUNT)), np.empty((len(used), COUNT))
-    factor, right = np.zeros((COUNT, COUNT)), np.empty(COUNT)
-    frame, direction, cosine = np.empty((3, 3)), np.empty(3), np.empty(len(used))
+    whole, rows, which = np.empty((len(used), COUNT)), np.empty((len(used), COUNT)), np.empty(len(used), np.int64)
+    product, factor, right = np.zeros((COUNT, COUNT)), np.empty((COUNT, COUNT)), np.empty(COUNT)
+    factors, there = np.empty((len(left), COUNT, COUNT)), np.zeros(len(left), np.bool_)
     for triangle in range(count):
-        _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
-        for number in range(len(used)):
-            cosine[number] = 0.0
-            if _any_known(values[triangle, used[number]]):
-                _local(frame, centres_mm[triangle], led_mm[used[number]], direction)
-                cosine[number] = direction[2]
-                functions(harmonic, direction, whole[number])
-        there = False
+        _functions_of(
+            values[triangle], used, led_mm, camera_mm, centres_mm[triangle], normals[triangle], harmonic, whole
+        )
+        n = 0
         for channel in range(channels):
-            n = 0
-            right[:] = 0.0
-            for number in range(len(used)):
-                value = values[triangle, used[number], channel]
-                if cosine[number] > 0.0 and not math.isnan(value):
-                    for k in range(COUNT):
-                        rows[n, k] = cosine[number] * whole[number, k]
-                        right[k] += rows[n, k] * value
-                    n += 1
+            if channel == 0 or not _same(values[triangle], used, channel):
+                n = _gather(values[triangle, :, channel], used, whole, rows, which)
+                if n >= FEWEST:
+                    gram(rows[:n], product)
+                    for fit in range(len(left)):
+                        there[fit] = factorise(product, penalties[fit], factor)
+                        factors[fit] = factor
             if n < FEWEST:
                 continue
-            if channel == 0 or not there or not _same(values[triangle], used, channel):
-                factor[:] = 0.0
-                there = factorise(rows[:n], penalty, factor)
-            if there:
-                solve(factor, right)
+            for fit in range(len(left)):
+                right[:] = 0.0
+                for number in range(n):
+                    value = left[fit, triangle, which[number], channel]
+                    for k in range(COUNT):
+                        right[k] += rows[number, k] * value
+                if there[fit]:
+                    solve(factors[fit], right)
+                    found[fit, triangle, channel] = right
+
+
+@numba.njit(cache=True, nogil=True)
+def _functions_of(values, used, led_mm, camera_mm, centre_mm, normal, harmonic, whole):  # type: ignore[no-untyped-def]
+    """Into `whole` [used, COUNT] a triangle's functions times the cosine; a row without sample begins with 0."""
+    frame, direction = np.empty((3, 3)), np.empty(3)
+    _frame(normal, centre_mm, camera_mm, frame)
+    for number in range(len(used)):
+        whole[number, 0] = 0.0
+        if _any_known(values[used[number]]):
+            _local(frame, centre_mm, led_mm[used[number]], direction)
+            if direction[2] > 0.0:
+                functions(harmonic, direction, whole[number])
                 for k in range(COUNT):
-                    found[triangle, channel, k] = right[k]
+                    whole[number, k] *= direction[2]
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(values, used, whole, rows, which):  # type: ignore[no-untyped-def]
+    """Rows and numbers of the samples of a channel that are there; how many."""
+    n = 0
+    for number in range(len(used)):
+        if whole[number, 0] != 0.0 and not math.isnan(values[used[number]]):
+            for k in range(COUNT):
+                rows[n, k] = whole[number, k]
+            which[n] = used[number]
+            n += 1
+    return n
 
 
 @numba.njit(cache=True, nogil=True)

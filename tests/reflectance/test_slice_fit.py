@@ -9,7 +9,7 @@ import pytest
 from scipy.special import sph_harm_y
 from triangle_cases import noisy_case, unit
 
-from coupole.reflectance.least_squares import factorise, one_thread, solve
+from coupole.reflectance.least_squares import factorise, gram, one_thread, solve
 from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis, centres, functions
 from coupole.reflectance.slice_fit import fit_slices, slice_values
 from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
@@ -59,20 +59,22 @@ def test_radial_functions_are_distances_and_a_plane() -> None:
 def test_least_squares_are_those_of_numpy() -> None:
     random = np.random.default_rng(2)
     matrix, right, penalty = random.normal(size=(40, 9)), random.normal(size=40), random.uniform(0.1, 1, 9)
-    factor, found = np.zeros((9, 9)), matrix.T @ right
+    product, factor, found = np.zeros((9, 9)), np.zeros((9, 9)), matrix.T @ right
     with one_thread():
-        assert factorise(matrix, penalty, factor)
+        gram(matrix, product)
+        assert factorise(product, penalty, factor)
         solve(factor, found)
     stacked = np.vstack([matrix, np.diag(np.sqrt(penalty))])
     wanted = np.linalg.lstsq(stacked, np.append(right, np.zeros(9)))[0]
     np.testing.assert_allclose(found, wanted, rtol=1e-9)
-    assert not factorise(matrix[:3], np.zeros(9), np.zeros((9, 9)))  # fewer samples than unknowns
+    gram(matrix[:3], product)
+    assert not factorise(product, np.zeros(9), factor)  # fewer samples than unknowns
 
 
 @pytest.mark.parametrize("basis", [HARMONICS, RADIAL])
 def test_a_fit_is_the_least_squares_solution_in_the_slices_frame(shiny: TriangleSamples, basis: Basis) -> None:
     """By NumPy, for one triangle and channel: rows times cosine, the frame written out anew."""
-    found = fit_slices(shiny, ~HELD_OUT, basis)
+    found = fit_slices(shiny, ~HELD_OUT, (basis, None))[0]
     t, channel = 7, 1
     normal, towards = shiny.normals[t], unit(shiny.cameras_mm[0] - shiny.centres_mm[t])
     x = unit(towards - normal * (normal @ towards))
@@ -88,12 +90,12 @@ def test_a_fit_is_the_least_squares_solution_in_the_slices_frame(shiny: Triangle
 
 def test_what_a_slice_gives_is_what_was_fitted_and_never_negative(shiny: TriangleSamples) -> None:
     for basis in (HARMONICS, RADIAL):
-        made = slice_values(shiny, fit_slices(shiny, ~HELD_OUT, basis), basis)
+        made = slice_values(shiny, fit_slices(shiny, ~HELD_OUT, (basis, None))[0], basis)
         assert (made >= 0).all()
         off = (made - shiny.values)[:, ~HELD_OUT]
         assert np.nanmean(np.abs(off)) < 0.02 * np.nanmean(shiny.values)
     below = replace(shiny, values=shiny.values[:, :1], led_mm=-shiny.led_mm[:1], view_of=shiny.view_of[:1])
-    assert (slice_values(below, fit_slices(shiny, ~HELD_OUT, RADIAL), RADIAL) == 0).all()
+    assert (slice_values(below, fit_slices(shiny, ~HELD_OUT, (RADIAL, None))[0], RADIAL) == 0).all()
 
 
 def test_a_material_with_what_it_leaves_is_nearer_than_either(shiny: TriangleSamples) -> None:
@@ -108,8 +110,9 @@ def test_a_material_with_what_it_leaves_is_nearer_than_either(shiny: TriangleSam
     )
     made = {"ggx": model[:, HELD_OUT]}
     for name, basis in (("sh", HARMONICS), ("rbf", RADIAL)):
-        made[name] = slice_values(under, fit_slices(shiny, ~HELD_OUT, basis), basis)
-    left = fit_slices(shiny, ~HELD_OUT, RESIDUAL, model)
+        made[name] = slice_values(under, fit_slices(shiny, ~HELD_OUT, (basis, None))[0], basis)
+    left, radial = fit_slices(shiny, ~HELD_OUT, (RESIDUAL, model), (RADIAL, None))
+    np.testing.assert_array_equal(radial, fit_slices(shiny, ~HELD_OUT, (RADIAL, None))[0])
     made["both"] = slice_values(under, left, RESIDUAL, model[:, HELD_OUT])
     off = {name: float(np.nanmean(np.abs(values - under.values))) for name, values in made.items()}
     assert off["both"] < min(off["ggx"], off["sh"], off["rbf"]), off
@@ -122,8 +125,8 @@ def test_channels_with_other_samples_and_triangles_with_too_few(shiny: TriangleS
     values[1, :, 1] = np.nan
     values[2] = np.nan
     some = replace(shiny, values=values)
-    found = fit_slices(some, ~HELD_OUT, RADIAL, threads=1)
+    found = fit_slices(some, ~HELD_OUT, (RADIAL, None), threads=1)[0]
     known = np.isfinite(found).all(axis=2)
     assert known[:4].tolist() == [[True, True, False], [True, False, True], [False] * 3, [True] * 3]
-    alone = fit_slices(replace(shiny, values=values[..., 2:]), ~HELD_OUT, RADIAL)
+    alone = fit_slices(replace(shiny, values=values[..., 2:]), ~HELD_OUT, (RADIAL, None))[0]
     np.testing.assert_array_equal(alone[:, 0], found[:, 2])

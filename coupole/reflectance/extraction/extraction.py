@@ -7,7 +7,9 @@ triangle stands for the paper's prefilter of 0.1 degree: neighbouring LEDs are d
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -223,26 +225,29 @@ def _write_samples(
     mine = surface.triangles
     centres_mm, normals = geometry.centres_mm[mine], geometry.normals[mine]
     led_mm, led_normals = measured.leds.of(leds)
+
+    def extract(column: int, f: NDArray[np.float32], u: NDArray[np.float32]) -> int:
+        frames = view.by_led[int(leds[column])]
+        signal, u_signal = _merged(reader, frames)
+        _reflectance(
+            signal, u_signal, centres_mm, normals, led_mm[column], led_normals[column],
+            measured.power_of(frames[0]), measured.emission == "paper", codes[:, column], f, u,
+        )  # fmt: skip
+        return len(frames)
+
     used = done = 0
-    for first in range(0, len(leds), batch):
-        part = slice(first, min(first + batch, len(leds)))
-        f = np.full((count, part.stop - first, channels), np.nan, np.float32)
-        u = np.full(f.shape, np.nan, np.float32)
-        for column, led in enumerate(leds[part]):
-            frames = view.by_led[int(led)]
-            signal, u_signal = _merged(reader, frames)
-            centre_mm, axis = led_mm[first + column], led_normals[first + column]
-            power = measured.power_of(frames[0])
-            _reflectance(
-                signal, centres_mm, normals, centre_mm, axis, power, measured.emission == "paper",
-                codes[:, first + column], f[:, column],
-            )  # fmt: skip
-            u[:, column] = u_signal
-            done += len(frames)
-            say(f"samples of {view.name}", done, len(view.frames))
-        u[np.isnan(f)] = np.nan
-        used += int(np.isfinite(f).sum())
-        data["f"][:, part], data["u_own"][:, part] = f, u
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        for first in range(0, len(leds), batch):
+            part = slice(first, min(first + batch, len(leds)))
+            f = np.full((count, part.stop - first, channels), np.nan, np.float32)
+            u = np.full(f.shape, np.nan, np.float32)
+            columns = range(part.stop - first)
+            each = pool.map(lambda n: extract(first + n, f[:, n], u[:, n]), columns)  # noqa: B023  taken below
+            for frames in each:
+                done += frames
+                say(f"samples of {view.name}", done, len(view.frames))
+            used += int(np.isfinite(f).sum())
+            data["f"][:, part], data["u_own"][:, part] = f, u
     return used
 
 
@@ -265,7 +270,9 @@ def _merged(reader: SignalReader, frames: list[LightFrame]) -> tuple[NDArray[np.
 
 
 @numba.njit(cache=True, nogil=True)
-def _reflectance(signal, centres, normals, led_centre, led_normal, power, paper, codes, f):  # type: ignore[no-untyped-def]
+def _reflectance(  # type: ignore[no-untyped-def]
+    signal, u_signal, centres, normals, led_centre, led_normal, power, paper, codes, f, u
+):
     towards = np.empty(3)
     for triangle in range(len(signal)):
         if codes[triangle] != REACHED:
@@ -277,6 +284,8 @@ def _reflectance(signal, centres, normals, led_centre, led_normal, power, paper,
         for channel in range(signal.shape[1]):
             if power[channel] > 0.0:
                 f[triangle, channel] = signal[triangle, channel] / (power[channel] * lit * cosine)
+                if not np.isnan(f[triangle, channel]):
+                    u[triangle, channel] = u_signal[triangle, channel]
 
 
 def blocks(path: Path) -> Iterator[slice]:

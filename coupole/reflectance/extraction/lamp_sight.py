@@ -5,6 +5,8 @@ From a triangle's centre rays go to the centres of all LEDs, and near the edges 
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numba
@@ -20,7 +22,7 @@ Floats = NDArray[np.float64]
 REACHED, AWAY, SHADED, PENUMBRA = range(4)
 """Codes of a triangle and an LED; AWAY: below `MOST_INCIDENCE_DEG`, or behind the LED."""
 MOST_INCIDENCE_DEG = 89.0
-_RAYS = 2_000_000
+_RAYS = 1_000_000
 _LEDS = 64
 """Traced together."""
 _MOST_RINGS = 8
@@ -35,11 +37,15 @@ def lamp_codes(
     _away(centres_mm, normals, leds.centres_mm, leds.normals, np.cos(np.radians(MOST_INCIDENCE_DEG)), codes)
     starts_mm = centres_mm + RAY_START_MM * normals
     step = max(1, _RAYS // max(1, len(centres_mm)))
-    for first in range(0, codes.shape[1], step):
+
+    def shade(first: int) -> None:
         part = codes[:, first : first + step]
         triangle, led = np.nonzero(part == REACHED)
         hidden = blocked(scene, starts_mm[triangle], leds.centres_mm[first + led])
         part[triangle[hidden], led[hidden]] = SHADED
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(shade, range(0, codes.shape[1], step)))
     _penumbra(scene, starts_mm, neighbours, leds, codes)
     return codes
 

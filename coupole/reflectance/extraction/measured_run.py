@@ -77,10 +77,13 @@ class Powers:
     u_shared: Floats
     """[leds, channels] relative, of what all LEDs share: the tile, its place."""
 
+    @cached_property
+    def _row(self) -> dict[int, int]:
+        return {int(led): number for number, led in enumerate(self.ids)}
+
     def of(self, leds: NDArray[np.int64]) -> Powers:
         """Of some LEDs; NaN for those that the record does not have."""
-        row = {int(led): number for number, led in enumerate(self.ids)}
-        rows = np.array([row.get(int(led), -1) for led in leds])
+        rows = np.array([self._row.get(int(led), -1) for led in leds])
 
         def picked(values: Floats) -> Floats:
             found: Floats = values[rows]

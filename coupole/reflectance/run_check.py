@@ -7,7 +7,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -95,13 +95,7 @@ def _check_view(
     by the same ones."""
     held = np.isin(view.leds, settings["left_out"])
     for rows in result.view_blocks(view, memory_bytes):
-        samples = result.view_samples(view, rows)
-        some = replace(
-            samples,
-            values=samples.values[:, held],
-            led_mm=samples.led_mm[held],
-            view_of=samples.view_of[held],
-        )
+        some = result.view_samples(view, rows, held)
         lit = lit_on(some.centres_mm, some.led_mm, view.led_normals[held], settings["emission"] == "paper")
         share = lit[..., None] * view.full_scales[held]
         made = {name: predicted(result, name, view, rows, some) for name in checks}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -152,15 +154,19 @@ class RunResult:
             self.areas_mm2[wanted],
         )
 
-    def view_samples(self, view: ViewSamples, rows: slice) -> TriangleSamples:
-        """Those of some rows of a view's file."""
+    def view_samples(
+        self, view: ViewSamples, rows: slice, leds: NDArray[np.bool_] | None = None
+    ) -> TriangleSamples:
+        """Those of some rows of a view's file, under some of its LEDs [leds]."""
+        columns = np.arange(len(view.leds)) if leds is None else np.flatnonzero(leds)
         with h5py.File(view.path, "r") as file:
-            values, centres, normals = (file[name][rows] for name in ("f", "centres_mm", "normals"))
-        values *= _cosines(centres, normals, view.led_mm)[..., None]
+            values = file["f"][rows] if leds is None else file["f"][rows, columns]
+            centres, normals = file["centres_mm"][rows], file["normals"][rows]
+        _times_cosine(values, centres, normals, view.led_mm[columns])
         return TriangleSamples(
             values,
-            view.led_mm,
-            np.zeros(len(view.leds), np.int64),
+            view.led_mm[columns],
+            np.zeros(len(columns), np.int64),
             view.camera_mm[None],
             centres,
             normals,
@@ -226,15 +232,16 @@ def _rows(view: ViewSamples, wanted: NDArray[np.int64]) -> range:
     return range(int(first), int(end))
 
 
-def _cosines(
-    centres_mm: NDArray[np.float64], normals: NDArray[np.float64], leds_mm: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """[triangles, leds] of incidence."""
-    across = np.sum(centres_mm * normals, axis=1)
-    cosine = normals @ leds_mm.T - across[:, None]
-    square = np.sum(leds_mm**2, axis=1) + np.sum(centres_mm**2, axis=1)[:, None] - 2 * centres_mm @ leds_mm.T
-    found: NDArray[np.float32] = (cosine / np.sqrt(square)).astype(np.float32)
-    return found
+@numba.njit(cache=True, nogil=True)
+def _times_cosine(values, centres_mm, normals, led_mm):  # type: ignore[no-untyped-def]
+    """Multiply values [triangles, leds, channels] with the cosines of incidence."""
+    for triangle in range(len(values)):
+        centre, normal = centres_mm[triangle], normals[triangle]
+        for led in range(len(led_mm)):
+            x, y, z = led_mm[led, 0] - centre[0], led_mm[led, 1] - centre[1], led_mm[led, 2] - centre[2]
+            cosine = (x * normal[0] + y * normal[1] + z * normal[2]) / math.sqrt(x * x + y * y + z * z)
+            for channel in range(values.shape[2]):
+                values[triangle, led, channel] *= cosine
 
 
 def write_object(path: Path, corners_mm: NDArray[np.float64], base_from_support: NDArray[np.float64]) -> None:

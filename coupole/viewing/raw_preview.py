@@ -67,7 +67,7 @@ def png(picture: NDArray[np.uint8], width_px: int | None = None) -> bytes:
     if width_px and image.width > width_px:
         image = image.resize((width_px, max(1, image.height * width_px // image.width)))
     buffer = io.BytesIO()
-    image.save(buffer, "PNG", optimize=True)
+    image.save(buffer, "PNG")
     return buffer.getvalue()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import StorageError
+from coupole.reflectance.extraction.lamp_sight import REACHED
 from coupole.reflectance.run_fits import predicted
 from coupole.reflectance.run_result import FITS, MATERIALS, REPORT, RunResult, read_about
 from coupole.reflectance.triangle_fit import FEWEST
@@ -105,17 +105,13 @@ def _reconstructed(result: RunResult, path: Path, about: dict[str, Any]) -> Iter
     triangles."""
     view = next(view for view in result.views if view.path == path)
     held = np.flatnonzero(np.isin(view.leds, about["left_out"]))
-    with h5py.File(path, "r") as file:
-        seen = file["seen"][()]
-        shares = [np.isfinite(file["f"][:, led, 0]).mean() for led in held]
-    if not shares:
+    if not len(held):
         return
-    one = held[int(np.argmax(shares))]
+    with h5py.File(path, "r") as file:
+        seen, codes = file["seen"][()], file["codes"][()]
+    one = held[int(np.argmax(np.count_nonzero(codes[:, held] == REACHED, axis=0)))]
     rows = slice(0, len(view.triangles))
-    samples = result.view_samples(view, rows)
-    under = replace(
-        samples, values=samples.values[:, [one]], led_mm=samples.led_mm[[one]], view_of=samples.view_of[[one]]
-    )
+    under = result.view_samples(view, rows, np.arange(len(view.leds)) == one)
     measured = _rgb(under.values[:, 0], about["channels"])
     white = float(np.nanquantile(measured, 0.995))
     yield f"<p>f cos under LED {view.leds[one]}, and how far each fit is off, white a tenth of that<br>"

@@ -12,7 +12,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,13 +19,12 @@ from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.result_folder import read_settings
 from coupole.reflectance.run_fits import predicted
 from coupole.reflectance.run_result import ABOUT, FITS, MATERIALS, SCHEMA, RunResult, ViewSamples
+from coupole.reflectance.run_uncertainty import uncertainty_of
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import write_synced
 
 Said = Callable[[str, int, int], None]
 PEAK_QUANTILE = 0.999
-COVERAGE = 0.95
-_NORMAL_QUANTILE = 1.96
 
 
 @dataclass
@@ -107,21 +105,12 @@ def _check_view(
         say(f"check of {view.view}", rows.stop, len(view.triangles))
 
 
-def _interval_percent(result: RunResult) -> dict[str, float] | None:
-    """Median 95 % interval of samples by noise and the LEDs' power, without geometry. None without a record of
-    the response, by which noise is known."""
-    found = []
-    for view in result.views:
-        with h5py.File(view.path, "r") as file:
-            step = max(1, len(view.triangles) // 2000)
-            own = file["u_own"][::step]
-            whole = np.sqrt(own**2 + file["led_u_own"][()] ** 2 + file["led_u_shared"][()] ** 2)
-            found.append(whole[np.isfinite(own)])
-    known = np.concatenate(found)
-    if not len(known):
+def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | None:
+    """Of the median sample."""
+    if uncertainty is None:
         return None
-    half = 100.0 * _NORMAL_QUANTILE * float(np.median(known))
-    return {"coverage": COVERAGE, "low": -half, "high": half}
+    low, high = uncertainty["interval"]["median"]
+    return {"coverage": uncertainty["interval"]["coverage"], "low": low, "high": high}
 
 
 def _median(values: NDArray[np.float64]) -> float | None:
@@ -134,6 +123,7 @@ def _about(
     peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     left = {name: result.materials(name).residual for name in MATERIALS}
     views = result.summaries
+    uncertainty = uncertainty_of(result, settings["scan_noise_um"], paper=settings["emission"] == "paper")
     return {
         "schema": SCHEMA,
         "software": {name: version(name) for name in ("coupole", "numpy", "numba", "h5py")},
@@ -145,7 +135,8 @@ def _about(
         "residual": {name: _median(values[np.isfinite(values)]) for name, values in left.items()},
         "mae": {name: check.mae for name, check in checks.items()},
         "held_out_psnr_db": {name: check.psnr_db for name, check in checks.items()},
-        "median_interval_percent": _interval_percent(result),
+        "median_interval_percent": _interval_percent(uncertainty),
+        "uncertainty_percent": uncertainty,
         "seconds": round(seconds, 3),
         "peak_memory_bytes": peak_bytes,
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,12 @@ TOLD = {
 }
 
 
+PUBLISHED = (
+    ("the paper, scanner of 30 um", (-10.66, 14.00), (-15.23, 22.42), "57 to 74 % without vertices"),
+    ("the paper, scanner of 20 um", (-8.11, 9.51), None, ""),
+)
+
+
 def write(folder: Path) -> Path:
     """Write the report of a result into its folder. Raises InputError, StorageError."""
     path = folder / REPORT
@@ -57,8 +63,10 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
             off = f"off by {100 * mae:.3f} % of range, {psnr_db:.1f} dB"
             yield f"{TOLD[name]}: under the LEDs kept for the check {off}"
     if interval := about["median_interval_percent"]:
-        half = f"+- {interval['high']:.1f} %"
-        yield f"95 % interval of the median sample: {half}, by noise and the LEDs' power alone"
+        yield (
+            f"95 % interval of the median sample: {_bounds([interval['low'], interval['high']])}, if the mesh's "
+            f"vertices are off by {about['scan_noise_um']:g} um"
+        )
     if min((left for left in about["residual"].values() if left is not None), default=0.0) > POOR_RESIDUAL:
         yield (
             "the materials explain the samples poorly: is the object translucent or fluorescent, did it move, do "
@@ -73,6 +81,7 @@ def _page(folder: Path) -> Iterator[str]:
     for remark in remarks(about):
         yield f"<p>{html.escape(remark)}"
     yield from _missed(about)
+    yield from _uncertain(about)
     fits = {name: _fields(RunResult(folder).materials_path(name)) for name in MATERIALS}
     for view in sorted((folder / "samples").glob("*.h5")):
         yield f"<h2>View {html.escape(view.stem)}</h2>"
@@ -86,9 +95,41 @@ def _page(folder: Path) -> Iterator[str]:
         yield "".join(f"<td>{100 * share:.1f} %" for share in summary["share_by_code"].values())
     yield f"</table><p>{about['seconds']:.1f} s, at most {about['peak_memory_bytes'] / 1e9:.1f} GB."
     yield (
-        "<p>Inter-reflection and veiling glare are not subtracted. No uncertainty is stated for these normals and "
-        "materials yet."
+        "<p>Inter-reflection and veiling glare are not subtracted, nor are they in the bounds. No uncertainty is "
+        "stated for normals and materials yet."
     )
+
+
+def _uncertain(about: dict[str, Any]) -> Iterator[str]:
+    """A table of sources, beside the paper's."""
+    if not (known := about["uncertainty_percent"]):
+        return
+    drawn = known["monte_carlo"]
+    yield (
+        f"<h2>Uncertainty of samples</h2><p>Bounds at {100 * drawn['coverage']:.0f} %, by Monte Carlo through the "
+        f"measurement equation ({drawn['samples']} samples, {drawn['draws']} draws of each), and with one source "
+        "removed at a time; last, what was published of La Coupole (seed 003, 6.1 and 7)."
+    )
+    yield "<table><tr><th><th>median sample<th>95th percentile<th>narrower by"
+    whole = _width(drawn)
+    rows = [("all sources", drawn), *((f"without {name}", row) for name, row in known["without"].items())]
+    for name, row in rows:
+        narrower = "" if row is drawn else f"{100 * (1 - _width(row) / whole):.0f} %"
+        middle, far = _bounds(row["median"]), _bounds(row["percentile_95"])
+        yield f"<tr><th>{html.escape(name)}<td>{middle}<td>{far}<td>{narrower}"
+    for name, median, percentile_95, narrower in PUBLISHED:
+        far = "" if percentile_95 is None else _bounds(percentile_95)
+        yield f"<tr><th>{name}<td>{_bounds(median)}<td>{far}<td>{narrower}"
+    yield "</table>"
+
+
+def _width(row: dict[str, Any]) -> float:
+    low, high = row["median"]
+    return float(high - low)
+
+
+def _bounds(pair: Sequence[float]) -> str:
+    return f"{pair[0]:+.2f} to {pair[1]:+.2f} %"
 
 
 def _missed(about: dict[str, Any]) -> Iterator[str]:

@@ -13,6 +13,8 @@ import pytest
 import trimesh
 from cells import CellFolder
 
+from coupole.reflectance.sample_uncertainty import Places, Sources, bounds
+
 RECORDS = cells.REPO / "configs/calibrations"
 DIFFUSE, F0, ROUGHNESS = (0.5, 0.35, 0.2), (0.05, 0.05, 0.05), 0.3
 SIDE = {**cells.TOP, "name": "side", "azimuth_deg": -60, "elevation_deg": 55}
@@ -165,6 +167,39 @@ def test_a_mesh_whose_normals_are_off_is_mended(made: Made, tmp_path: Path) -> N
         off[name] = float(np.nanmedian(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
     assert off["ggx"] > 0.8
     assert off["ggx_normal"] < 0.5 * off["ggx"], off
+    # its samples are wrong by their cosines, and their intervals say so
+    ratio, places, sources = noisy_samples(tmp_path / "result", out)
+    low, high = bounds(places, sources, 1.959964)
+    assert 0.93 < np.mean((ratio > low) & (ratio < high)) < 0.97
+    low, high = bounds(places, sources.without("vertex_um"), 1.959964)
+    assert np.mean((ratio > low) & (ratio < high)) < 0.8
+    told = ended.document["uncertainty_percent"]
+    interval = ended.document["median_interval_percent"]
+    assert told["interval"]["median"] == [interval["low"], interval["high"]]
+    widest = min(told["without"], key=lambda name: told["without"][name]["median"][1])
+    assert widest == "vertices of the mesh"
+    np.testing.assert_allclose(told["closed_form"]["median"], told["monte_carlo"]["median"], rtol=0.1)
+
+
+def noisy_samples(noisy: Path, clean: Path) -> tuple[np.ndarray, Places, Sources]:
+    """Of the top view's green samples: the true reflectance over that with a noisy mesh; where; what is known."""
+    with h5py.File(clean / "samples/top.h5") as file:
+        numbers, truths = file["triangles"][()], file["normals"][()]
+    with h5py.File(noisy / "samples/top.h5") as file:
+        _, at, here = np.intersect1d(numbers, file["triangles"][()], return_indices=True)
+        f, u_own = file["f"][()][here][..., 1], file["u_own"][()][here][..., 1]
+        leds, axes, triangles = file["led_positions_mm"][()], file["led_normals"][()], file["triangles"][()][here]
+        u_led, u_leds = file["led_u_own"][:, 1], file["led_u_shared"][:, 1]
+        centres, camera, led_mm = file["centres_mm"][()][here], file["camera_mm"][()], file.attrs["led_u_mm"]
+    triangle, led = np.nonzero(np.isfinite(f))
+    triangle, led = triangle[::37], led[::37]
+    light, towards = unit(leds[led] - centres[triangle]), unit(camera - centres[triangle])
+    truth = walter(truths[at][triangle], light, towards)[..., 1]
+    with h5py.File(noisy / "object.h5") as file:
+        corners = file["corners_mm"][()].astype(float)[triangles[triangle]]
+    same = np.ones(len(led))
+    sources = Sources(u_own[triangle, led].astype(float), u_led[led], u_leds[led], 30.0 * same, led_mm * same)
+    return truth / f[triangle, led], Places(corners, leds[led], axes[led]), sources
 
 
 def test_a_job_that_was_stopped_goes_on_and_another_is_refused(made: Made) -> None:

@@ -160,6 +160,7 @@ def _write_head(
     file.attrs["channels"] = "".join(measured.channels)
     file.attrs["simulated"] = measured.run.simulated
     file.attrs["frame"] = "base of the robot"
+    file.attrs["led_u_mm"] = measured.led_u_mm  # of each coordinate of an LED's place
     width, height = measured.frames.size_px
     seen = np.full((height, width), -1, np.int32)
     seen[surface.rows, surface.columns] = surface.triangle

@@ -125,6 +125,8 @@ class MeasuredRun:
     emission: Emission
     records: Mapping[str, Path]
     """By kind."""
+    led_u_mm: float
+    """Standard uncertainty of each coordinate of an LED's place, as the record has it for the median LED."""
     mesh_path: Path
     optics: tuple[float, float, float]
     """Focal length and focus distance in mm, f-number."""
@@ -177,6 +179,7 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
         read_powers(by_kind["led-power"], channels_of(frames.pattern)),
         emission_of(power_record),
         by_kind,
+        read_accepted(by_kind["leds"], "leds").value("led_centre_median_u_mm"),
         mesh_path,
         (lens.focal_length_mm, lens.focus_distance_mm, lens.f_number),
         base_from_support,

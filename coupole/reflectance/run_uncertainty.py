@@ -1,0 +1,80 @@
+"""Uncertainty of the samples of a result of runs: bounds of what is typical, and a table by source."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.run_result import RunResult, ViewSamples
+from coupole.reflectance.sample_uncertainty import SOURCES, Places, Sources, bounds, drawn
+
+Floats = NDArray[np.float64]
+
+COVERAGE, QUANTILE = 0.95, 1.959964
+TABLE_COVERAGE, TABLE_QUANTILE = 0.68, 0.994458
+"""Of the table, as in seed 003, 6.1."""
+_TRIANGLES = 2000
+"""Of each view, for what is typical."""
+_DRAWN, _DRAWS = 1000, 1000
+"""Samples, of all views, and draws for each."""
+
+
+def uncertainty_of(result: RunResult, scan_noise_um: float, *, paper: bool) -> dict[str, Any] | None:
+    """What `result.json` says of it; None without a record of the response, by which noise is known."""
+    picked = [_picked(result, view, scan_noise_um) for view in result.views]
+    places = Places(*(np.concatenate(part) for part in zip(*(_fields(p) for p, _ in picked), strict=True)))
+    sources = Sources(*(np.concatenate(part) for part in zip(*(_fields(s) for _, s in picked), strict=True)))
+    if not len(sources.u_noise):
+        return None
+    random = np.random.default_rng(0)
+    some = random.choice(len(sources.u_noise), min(_DRAWN, len(sources.u_noise)), replace=False)
+    places_drawn, sources_drawn = places.at(some), sources.at(some)
+
+    def table(of: Sources) -> dict[str, Any]:
+        ratios = drawn(places_drawn, of, _DRAWS, np.random.default_rng(1), paper=paper)
+        below, above = 0.5 - TABLE_COVERAGE / 2, 0.5 + TABLE_COVERAGE / 2
+        return _percentiles(*np.nanquantile(ratios, [below, above], axis=1))
+
+    whole = table(sources_drawn)
+    return {
+        "interval": _percentiles(*bounds(places, sources, QUANTILE)) | {"coverage": COVERAGE},
+        "closed_form": _percentiles(*bounds(places_drawn, sources_drawn, TABLE_QUANTILE)),
+        "monte_carlo": whole | {"coverage": TABLE_COVERAGE, "samples": len(some), "draws": _DRAWS},
+        "without": {told: table(sources_drawn.without(source)) for source, told in SOURCES.items()},
+    }
+
+
+def _percentiles(low: Floats, high: Floats) -> dict[str, Any]:
+    """Median and 95th percentile of bounds, percent; infinite ones are left out and counted."""
+    known = np.isfinite(high)
+    below, above = 100.0 * (low[known] - 1.0), 100.0 * (high[known] - 1.0)
+    return {
+        "median": [float(np.median(below)), float(np.median(above))],
+        "percentile_95": [float(np.quantile(below, 0.05)), float(np.quantile(above, 0.95))],
+        "unbounded_share": float(1.0 - known.mean()),
+    }
+
+
+def _fields(values: Places | Sources) -> list[Floats]:
+    return list(vars(values).values())
+
+
+def _picked(result: RunResult, view: ViewSamples, scan_noise_um: float) -> tuple[Places, Sources]:
+    """A view's samples in the middle channel under all LEDs, of some of its triangles."""
+    step = max(1, len(view.triangles) // _TRIANGLES)
+    with h5py.File(view.path, "r") as file:
+        channel = file["u_own"].shape[2] // 2
+        noise = file["u_own"][::step][..., channel]
+        own, shared = file["led_u_own"][:, channel], file["led_u_shared"][:, channel]
+        led_mm = float(file.attrs["led_u_mm"])
+    triangle, led = np.nonzero(np.isfinite(noise))
+    corners = result.corners_mm[view.triangles[::step]].astype(np.float64)
+    places = Places(corners[triangle], view.led_mm[led], view.led_normals[led])
+    same = np.ones(len(led))
+    sources = Sources(
+        noise[triangle, led].astype(np.float64), own[led], shared[led], scan_noise_um * same, led_mm * same
+    )
+    return places, sources

@@ -1,0 +1,151 @@
+"""Uncertainty of samples of reflectance: in closed form for each, and by Monte Carlo through the whole measurement
+equation, source by source (seed 003, 6.1; JCGM 101).
+
+A sample is f = S / (P L cos): the signal S over the LED's power P, the geometry L of its emission and distance,
+and the cosine of incidence. Relative errors are normal: a of the signal above, b of all that stands below, the
+cosine's by the tilt that noise of the scanner's vertices gives a triangle. The ratio of two such values is
+asymmetric; its bounds are Fieller's (1954).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.extraction.lamp_sight import lit_by
+
+Floats = NDArray[np.float64]
+
+SOURCES = {
+    "u_noise": "noise of the frames",
+    "u_own": "power of each LED",
+    "u_shared": "power of all LEDs",
+    "vertex_um": "vertices of the mesh",
+    "led_mm": "places of the LEDs",
+}
+"""Fields of `Sources`, and what they are."""
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Standard uncertainties of n samples."""
+
+    u_noise: Floats
+    """[n] relative."""
+    u_own: Floats
+    """[n] relative, of an LED's power."""
+    u_shared: Floats
+    """[n] relative, of what all LEDs share."""
+    vertex_um: Floats
+    """[n] of each coordinate of a vertex, independent."""
+    led_mm: Floats
+    """[n] of each coordinate of an LED."""
+
+    def without(self, source: str) -> Sources:
+        """The same with one of `SOURCES` at 0."""
+        return replace(self, **{source: np.zeros_like(getattr(self, source))})
+
+    def at(self, picked: NDArray[np.int64]) -> Sources:
+        return Sources(*(getattr(self, field.name)[picked] for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where n samples were measured, mm, base frame."""
+
+    corners_mm: Floats
+    """[n, 3, 3] of their triangles."""
+    led_mm: Floats
+    """[n, 3]"""
+    led_normals: Floats
+    """[n, 3] unit."""
+
+    def at(self, picked: NDArray[np.int64]) -> Places:
+        return Places(*(getattr(self, field.name)[picked] for field in fields(self)))
+
+
+def bounds(places: Places, sources: Sources, quantile: float) -> tuple[Floats, Floats]:
+    """[n] lower and upper bounds of the true reflectance over the measured one, `quantile` standard deviations of
+    a normal distribution away; the upper one is infinite where the light grazes too much to tell."""
+    centres, normals = _centres_and_normals(places.corners_mm)
+    ways = places.led_mm - centres
+    distances = np.linalg.norm(ways, axis=1)
+    towards = ways / distances[:, None]
+    cosine = np.sum(towards * normals, axis=1)
+    tilt = tilt_covariance(places.corners_mm, sources.vertex_um)
+    by_tilt2 = np.einsum("ni,nij,nj->n", towards, tilt, towards) / cosine**2
+    by_place2 = (sources.led_mm / distances) ** 2 * (4.0 + 1.0 / cosine**2 - 1.0)
+    below2 = quantile**2 * (by_tilt2 + by_place2 + sources.u_own**2 + sources.u_shared**2)
+    above2 = (quantile * sources.u_noise) ** 2
+    root = np.sqrt(1.0 - (1.0 - below2) * (1.0 - above2))
+    # a tilt to any side makes the mean of the cosine smaller
+    longer = np.sqrt(1.0 + np.trace(tilt, axis1=1, axis2=2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low, high = (1.0 - root) / (1.0 - below2), (1.0 + root) / (1.0 - below2)
+    return longer * low, np.where(below2 < 1.0, longer * high, np.inf)
+
+
+def tilt_covariance(corners_mm: Floats, vertex_um: Floats) -> Floats:
+    """[n, 3, 3] rad^2 of the tilt of triangles whose vertices are off: a vertex that is higher by h tilts the
+    normal by -h times the gradient of its barycentric coordinate, which is 1 over the triangle's height there."""
+    across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    twice_area = np.linalg.norm(across, axis=1, keepdims=True)
+    normals = across / twice_area
+    covariance = np.zeros((len(corners_mm), 3, 3))
+    for corner in range(3):
+        opposite = corners_mm[:, (corner + 2) % 3] - corners_mm[:, (corner + 1) % 3]
+        gradient = np.cross(normals, opposite) / twice_area
+        covariance += gradient[:, :, None] * gradient[:, None, :]
+    return covariance * ((vertex_um * 1e-3) ** 2)[:, None, None]
+
+
+def drawn(
+    places: Places, sources: Sources, draws: int, random: np.random.Generator, *, paper: bool = False
+) -> Floats:
+    """[n, draws] true over measured reflectance, by Monte Carlo: power, vertices and LEDs are drawn anew, and the
+    signal is divided by what they give. Draws in which the light would come from below are NaN."""
+    count = len(sources.u_noise)
+
+    def normal(*shape: int) -> Floats:
+        return random.standard_normal((count, draws, *shape))
+
+    def of_each(values: Floats, dimensions: int) -> Floats:
+        return values.reshape(count, 1, *[1] * dimensions)
+
+    measured = _geometry(places.corners_mm, places.led_mm, places.led_normals, paper)
+    corners = places.corners_mm[:, None] + of_each(sources.vertex_um * 1e-3, 2) * normal(3, 3)
+    leds = places.led_mm[:, None] + of_each(sources.led_mm, 1) * normal(3)
+    axes = np.broadcast_to(places.led_normals[:, None], leds.shape)
+    flat = _geometry(corners.reshape(-1, 3, 3), leds.reshape(-1, 3), axes.reshape(-1, 3), paper)
+    geometry = flat.reshape(count, draws)
+    signal = 1.0 + sources.u_noise[:, None] * normal()
+    power = (1.0 + sources.u_own[:, None] * normal()) * (1.0 + sources.u_shared[:, None] * normal())
+    with np.errstate(divide="ignore"):
+        found: Floats = signal * measured[:, None] / (power * geometry)
+    found[geometry <= 0.0] = np.nan
+    return found
+
+
+def _geometry(corners_mm: Floats, led_mm: Floats, led_normals: Floats, paper: bool) -> Floats:
+    """[n] irradiance for a power of 1."""
+    centres, normals = _centres_and_normals(corners_mm)
+    ways = led_mm - centres
+    cosine = np.sum(ways * normals, axis=1) / np.linalg.norm(ways, axis=1)
+    geometry: Floats = _lit_each(centres, led_mm, led_normals, paper) * cosine
+    return geometry
+
+
+@numba.njit(cache=True, nogil=True)
+def _lit_each(centres, led_mm, led_normals, paper):  # type: ignore[no-untyped-def]
+    lit, towards = np.empty(len(centres)), np.empty(3)
+    for n in range(len(centres)):
+        lit[n] = lit_by(centres[n], led_mm[n], led_normals[n], paper, towards)
+    return lit
+
+
+def _centres_and_normals(corners_mm: Floats) -> tuple[Floats, Floats]:
+    across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    return corners_mm.mean(axis=1), across / np.linalg.norm(across, axis=1, keepdims=True)

@@ -269,6 +269,20 @@ def check(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOpt
     _do(step, as_json=as_json)
 
 
+@reflectance_app.command()
+def ablate(result: ResultArgument, as_json: JsonOption = False) -> None:
+    """What the fits would miss with fewer LEDs, without grazing light, with fewer coefficients: one page."""
+
+    def step(say: Said) -> dict[str, Any]:
+        from coupole.reflectance.run_ablation import ablate_result
+        from coupole.viewing import ablation_page
+
+        told = ablate_result(result, say=say)
+        return {**told, "report": str(ablation_page.write(result, told))}
+
+    _do(step, as_json=as_json)
+
+
 def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool) -> None:
     """A step by itself, with bars; what it returns is its `--json`."""
     from coupole.viewing.terminal import make_console, step_bars
@@ -281,6 +295,8 @@ def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool) -> None:
         raise
     if as_json:
         print(json.dumps(told))
+    elif "report" in told:
+        print(f"report {told['report']}")
 
 
 @reflectance_app.command()

@@ -24,6 +24,8 @@ _RADIAL, _RESIDUAL = 1e-3, 0.1
 """Ridge of the radial functions: of reflectance, and of what a material leaves of it, which is noise for the most
 part. Chosen on simulated glossy reliefs by lights left out; a tenth and tenfold change the error by 5 %."""
 _TAIL_SHARE = 0.01
+_HELD = 1e9
+"""Ridge of a coefficient that is to be 0."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,18 @@ HARMONICS = Basis(True, 1e-6 + TIKHONOV * _roll_off())
 RADIAL = Basis(False, _ridge(_RADIAL))
 """-r of the distance r to each centre, then 1, x, y, z."""
 RESIDUAL = Basis(False, _ridge(_RESIDUAL))
+
+
+def fewer(basis: Basis, count: int) -> Basis:
+    """The same with some `count` of the coefficients free and the others held at 0: whole degrees, or centres that
+    are spread as all of them, and the tail."""
+    if basis.harmonic:
+        free = _degrees() < int(count**0.5)
+    else:
+        free = np.ones(COUNT, np.bool_)
+        places = np.linspace(0, COUNT - _TAIL - 1, count - _TAIL).astype(int)
+        free[: COUNT - _TAIL] = np.isin(np.arange(COUNT - _TAIL), places)
+    return Basis(basis.harmonic, np.where(free, basis.penalty, _HELD))
 
 
 def _recurrence() -> tuple[Floats, Floats]:

@@ -10,7 +10,7 @@ from scipy.special import sph_harm_y
 from triangle_cases import noisy_case, unit
 
 from coupole.reflectance.least_squares import factorise, gram, one_thread, solve
-from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis, centres, functions
+from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis, centres, fewer, functions
 from coupole.reflectance.slice_fit import fit_slices, slice_values
 from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
 
@@ -116,6 +116,18 @@ def test_a_material_with_what_it_leaves_is_nearer_than_either(shiny: TriangleSam
     made["both"] = slice_values(under, left, RESIDUAL, model[:, HELD_OUT])
     off = {name: float(np.nanmean(np.abs(values - under.values))) for name, values in made.items()}
     assert off["both"] < min(off["ggx"], off["sh"], off["rbf"]), off
+
+
+def test_fewer_coefficients_are_low_degrees_and_some_of_the_centres(shiny: TriangleSamples) -> None:
+    low, few = fewer(HARMONICS, 16), fewer(RADIAL, 16)
+    for basis, free in ((low, np.arange(COUNT) < 16), (few, few.penalty < 1.0)):
+        assert free.sum() == 16
+        found = fit_slices(shiny, ~HELD_OUT, (basis, None))[0]
+        share = np.abs(found).max(axis=(0, 1)) / np.abs(found).max()
+        assert (share[~free] < 1e-6).all()
+        assert (share[free] > 1e-6).all()
+    np.testing.assert_array_equal(fewer(RADIAL, COUNT).penalty, RADIAL.penalty)
+    np.testing.assert_array_equal(fewer(HARMONICS, COUNT).penalty, HARMONICS.penalty)
 
 
 def test_channels_with_other_samples_and_triangles_with_too_few(shiny: TriangleSamples) -> None:

@@ -220,6 +220,24 @@ def test_a_job_that_was_stopped_goes_on_and_another_is_refused(made: Made) -> No
     assert "normals of the mesh" in (out / "report.html").read_text()
 
 
+def test_ablation_tells_what_fewer_leds_angles_and_coefficients_cost(made: Made) -> None:
+    _, out, document = made
+    ended = cells.here("reflectance", "ablate", out, "--json")
+    assert ended.code == 0, ended.err
+    mae = {setting: dict(steps) for setting, steps in ended.document["mae"].items()}
+    for whole in (mae["share of the LEDs"][1.0], mae["most incidence, degrees"][89], mae["coefficients"][100]):
+        assert whole == mae["coefficients"][100]
+        for name, value in whole.items():
+            assert value == pytest.approx(document["mae"][name], rel=0.25), name
+    assert set(mae["share of the LEDs"][0.125].values()) == {None}  # 5 of 41 LEDs are too few
+    assert set(mae["most incidence, degrees"][60].values()) == {None}
+    few, many = mae["coefficients"][16], mae["coefficients"][100]
+    assert {name: few[name] == many[name] for name in few} == {
+        "ggx": True, "ggx_normal": True, "sh": False, "rbf": False, "ggx_rbf": False
+    }  # fmt: skip
+    assert "share of the LEDs" in (out / "ablation.html").read_text()
+
+
 def test_runs_without_what_is_needed_are_refused_with_the_remedy(made: Made, tmp_path: Path) -> None:
     cell, _, _ = made
 

@@ -1,0 +1,166 @@
+"""How much each fit depends on the number of LEDs, on grazing samples and on the number of coefficients.
+
+By some triangles of a result, spread over it: their fits are made anew from fewer samples or coefficients, and
+compared under the LEDs that were left out of all of them (seed 003, 6.3 and 6.4).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.extraction.lamp_sight import lit_on
+from coupole.reflectance.least_squares import one_thread
+from coupole.reflectance.result_folder import read_settings
+from coupole.reflectance.run_result import FITS, SLICES, RunResult
+from coupole.reflectance.slice_basis import fewer
+from coupole.reflectance.slice_fit import fit_slices, slice_values
+from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
+from coupole.storage.disk_errors import disk_error
+from coupole.storage.durable import write_synced
+
+Floats = NDArray[np.float64]
+
+Said = Callable[[str, int, int], None]
+ABLATION = "ablation.json"
+LED_STEPS = (1, 2, 4, 8)
+"""Every LED, every second, ..."""
+MOST_INCIDENCES_DEG = (89, 80, 70, 60)
+COEFFICIENTS = (100, 64, 36, 16)
+_BLOCKS, _TRIANGLES = 16, 48
+"""Places in the result, and neighbouring triangles at each."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What a fit is given."""
+
+    led_step: int = 1
+    most_incidence_deg: float = 89
+    coefficients: int = 100
+
+
+VARIANTS: dict[str, list[tuple[float, Variant]]] = {
+    "share of the LEDs": [(1.0 / step, Variant(led_step=step)) for step in LED_STEPS],
+    "most incidence, degrees": [(deg, Variant(most_incidence_deg=deg)) for deg in MOST_INCIDENCES_DEG],
+    "coefficients": [(count, Variant(coefficients=count)) for count in COEFFICIENTS],
+}
+
+
+def ablate_result(out: Path, *, say: Said = lambda step, done, of: None) -> dict[str, Any]:
+    """By each setting, the mean absolute error of each fit as a share of the camera's range; written to the
+    result too. Raises InputError if its samples are not all there, StorageError if the disk takes nothing."""
+    settings = read_settings(out)
+    result = RunResult(out)
+    result.refuse_unfinished(settings["view_names"])
+    variants = {variant for steps in VARIANTS.values() for _, variant in steps}
+    blocks = _blocks(result)
+    errors: dict[Variant, dict[str, list[Floats]]] = {variant: {} for variant in variants}
+
+    def of_block(block: slice) -> dict[Variant, dict[str, Floats]]:
+        case = _case(result, block, settings)
+        return {variant: _errors(case, variant, settings["scan_noise_um"]) for variant in variants}
+
+    with one_thread(), ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        for done, found in enumerate(pool.map(of_block, blocks), start=1):
+            for variant, of_fits in found.items():
+                for name, off in of_fits.items():
+                    errors[variant].setdefault(name, []).append(off)
+            say("ablate", done, len(blocks))
+    mae = {
+        setting: [[value, {name: _mean(off) for name, off in errors[variant].items()}] for value, variant in steps]
+        for setting, steps in VARIANTS.items()
+    }
+    told = {"triangles": sum(block.stop - block.start for block in blocks), "mae": mae}
+    try:
+        write_synced(out / ABLATION, json.dumps(told, indent=1) + "\n")
+    except OSError as error:
+        raise disk_error(out, error) from error
+    return told
+
+
+def _mean(off: list[Floats]) -> float | None:
+    whole = np.concatenate(off)
+    return float(np.abs(whole).mean()) if len(whole) else None
+
+
+def _blocks(result: RunResult) -> list[slice]:
+    """Of places in `triangles`."""
+    count = len(result.triangles)
+    firsts = np.unique(np.linspace(0, max(0, count - _TRIANGLES), _BLOCKS).astype(int))
+    return [slice(int(first), min(int(first) + _TRIANGLES, count)) for first in firsts]
+
+
+@dataclass(frozen=True)
+class _Case:
+    """Samples of some triangles."""
+
+    samples: TriangleSamples
+    leds: NDArray[np.int64]
+    """[samples]"""
+    held: NDArray[np.bool_]
+    """[samples] those under LEDs that were left out."""
+    incidence_deg: Floats
+    """[b, samples]"""
+    share: Floats
+    """[b, samples, channels] of the camera's range for a value of 1."""
+
+
+def _case(result: RunResult, block: slice, settings: dict[str, Any]) -> _Case:
+    samples, leds = result.samples(block), result.along_samples(block, "leds")
+    lit = lit_on(
+        samples.centres_mm,
+        samples.led_mm,
+        result.along_samples(block, "led_normals"),
+        settings["emission"] == "paper",
+    )
+    ways = samples.led_mm - samples.centres_mm[:, None]
+    cosine = np.einsum("nsk,nk->ns", ways, samples.normals) / np.linalg.norm(ways, axis=2)
+    return _Case(
+        samples,
+        leds,
+        np.isin(leds, settings["left_out"]),
+        np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))),
+        lit[..., None] * result.along_samples(block, "full_scales"),
+    )
+
+
+def _errors(case: _Case, variant: Variant, noise_um: float) -> dict[str, Floats]:
+    """Of each fit, under the LEDs that were left out, where every fit has something."""
+    of_leds = np.unique(case.leds[~case.held])[:: variant.led_step]
+    used = np.isin(case.leds, of_leds)
+    values = np.where(case.incidence_deg[..., None] <= variant.most_incidence_deg, case.samples.values, np.nan)
+    given = replace(case.samples, values=values.astype(np.float32))
+    models = {
+        "ggx": model_values(given, fit_triangles(given, used, None, threads=1)),
+        "ggx_normal": model_values(given, fit_triangles(given, used, noise_um, threads=1)),
+    }
+    made = {name: np.full(values.shape, np.nan, np.float32) for name in SLICES} | models
+    for view in range(len(given.cameras_mm)):
+        mine = given.view_of == view
+        seen = replace(
+            given,
+            values=given.values[:, mine],
+            led_mm=given.led_mm[mine],
+            view_of=given.view_of[mine] * 0,
+            cameras_mm=given.cameras_mm[view][None],
+        )
+        for name, kind in SLICES.items():
+            model = None if kind.over is None else models[kind.over][:, mine]
+            basis = fewer(kind.basis, variant.coefficients)
+            coefficients = fit_slices(seen, used[mine], (basis, model), threads=1)[0]
+            made[name][:, mine] = slice_values(seen, coefficients, basis, model)
+    wanted = case.samples.values[:, case.held]
+    known = np.isfinite(wanted)
+    for found in made.values():
+        known &= np.isfinite(found[:, case.held])
+    share = case.share[:, case.held]
+    return {name: ((made[name][:, case.held] - wanted) * share)[known] for name in FITS}

@@ -47,8 +47,8 @@ def _page(name: str, told: dict[str, Any]) -> Iterator[str]:
         yield "</table>"
     yield (
         "<p>Published (seed 003, 6.3 and 6.4): with half of the photos radial functions miss least of the three "
-        "that the paper compares (it has no GGX with radial functions), and spherical harmonics are the least robust. "
-        "Fewer harmonics are lower degrees; fewer radial functions are fewer centres."
+        "that the paper compares (it has no GGX with radial functions), and spherical harmonics are the least "
+        "robust. Fewer harmonics are lower degrees; fewer radial functions are fewer centres."
     )
 
 

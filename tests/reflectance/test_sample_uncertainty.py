@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from triangle_cases import unit
 
+from coupole.calibration.budget.measurement import reflectance
+from coupole.calibration.light.irradiance import Emission
 from coupole.reflectance.sample_uncertainty import SOURCES, Places, Sources, bounds, drawn, tilt_covariance
 
 COUNT = 40
@@ -92,6 +94,31 @@ def test_tilts_are_those_of_moved_vertices() -> None:
     equal = np.array([[[0, 0, 0], [0.2, 0, 0], [0.1, 0.1 * 3**0.5, 0.0]]])
     deg = np.degrees(np.sqrt(tilt_covariance(equal, np.array([30.0]))[0, 0, 0]))
     assert deg == pytest.approx(np.degrees(2**0.5 * 0.03 / 0.2), rel=1e-6)  # some 12 degrees
+
+
+@pytest.mark.parametrize("emission", ["lambertian", "paper"])
+def test_draws_are_those_of_the_budgets_measurement_equation(emission: Emission) -> None:
+    """Which was written for `coupole budget`, with the exact square of the LED."""
+    places, draws = placed(60.0), 4000
+    random = np.random.default_rng(8)
+    corners = places.corners_mm[:, None] + random.normal(0, 0.03, (COUNT, draws, 3, 3))
+    leds = places.led_mm[:, None] + random.normal(0, 0.5, (COUNT, draws, 3))
+    power = (1 + random.normal(0, 0.01, (COUNT, draws))) * (1 + random.normal(0, 0.006, (COUNT, draws)))
+    normals = unit(np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]))
+    axes = np.broadcast_to(places.led_normals[:, None], leds.shape)
+    signal = 1 + random.normal(0, 0.02, (COUNT, draws))
+
+    def true(*arguments: np.ndarray) -> np.ndarray:
+        return reflectance(arguments[0], 1.0, 1.0, *arguments[1:], emission=emission)
+
+    flat = unit(np.cross(*(places.corners_mm[:, k] - places.corners_mm[:, 0] for k in (1, 2))))
+    middle = places.corners_mm.mean(axis=1)
+    measured = true(np.ones(COUNT), np.ones(COUNT), middle, flat, places.led_mm, places.led_normals)
+    budget = true(signal, power, corners.mean(axis=2), normals, leds, axes) / measured[:, None]
+    whole = sources(u_noise=0.02, u_own=0.01, u_shared=0.006, vertex_um=30.0, led_mm=0.5)
+    mine = drawn(places, whole, draws, random, paper=emission == "paper")
+    known, found = (np.nanquantile(ratios, [0.05, 0.16, 0.5, 0.84, 0.95], axis=1) for ratios in (budget, mine))
+    np.testing.assert_allclose((found - known) / (known[-1] - known[0]), 0.0, atol=0.06)
 
 
 def test_the_papers_emission_counts_in_the_draws() -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ def read_settings(out: Path) -> dict[str, Any]:
     path = out / SETTINGS
     try:
         settings = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(settings, dict) or "runs" not in settings:
+        if not isinstance(settings, dict) or "view_names" not in settings:
             raise ValueError
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: expected the settings of a result of runs") from error
@@ -43,9 +44,16 @@ def read_settings(out: Path) -> dict[str, Any]:
 
 def complete(path: Path, write: Callable[[Path], Any]) -> None:
     """Have a file written beside its place, then put there: it is whole or not there, also after a crash."""
+    with in_the_making(path) as part:
+        write(part)
+
+
+@contextmanager
+def in_the_making(path: Path) -> Iterator[Path]:
+    """Where to write a file that is put in its place, whole, when all has gone well."""
     part = path.with_name(path.name + ".part")
     try:
-        write(part)
+        yield part
         with part.open("rb") as file:
             os.fsync(file.fileno())
         part.replace(path)

@@ -73,7 +73,9 @@ def check_result(
     checks: dict[str, _Check] = {name: _Check() for name in FITS}
     for view in result.views:
         _check_view(result, view, settings, memory_bytes, checks, say)
-    about = _about(result, settings, checks, time.monotonic() - begun_s)
+    paper = settings["emission"] == "paper"
+    uncertainty = uncertainty_of(result, settings["scan_noise_um"], paper=paper, say=say)
+    about = _about(result, settings, checks, uncertainty, time.monotonic() - begun_s)
     try:
         write_synced(out / ABOUT, json.dumps(about, indent=1) + "\n")
     except OSError as error:
@@ -118,12 +120,15 @@ def _median(values: NDArray[np.float64]) -> float | None:
 
 
 def _about(
-    result: RunResult, settings: dict[str, Any], checks: dict[str, _Check], seconds: float
+    result: RunResult,
+    settings: dict[str, Any],
+    checks: dict[str, _Check],
+    uncertainty: dict[str, Any] | None,
+    seconds: float,
 ) -> dict[str, Any]:
     peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     left = {name: result.materials(name).residual for name in MATERIALS}
     views = result.summaries
-    uncertainty = uncertainty_of(result, settings["scan_noise_um"], paper=settings["emission"] == "paper")
     return {
         "schema": SCHEMA,
         "software": {name: version(name) for name in ("coupole", "numpy", "numba", "h5py")},

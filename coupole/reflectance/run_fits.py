@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from contextlib import ExitStack
 from pathlib import Path
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.result_folder import complete, read_settings
+from coupole.reflectance.result_folder import complete, in_the_making, read_settings
 from coupole.reflectance.run_result import (
     MATERIALS,
     SLICES,
     RunResult,
     ViewSamples,
+    begin_slices,
     write_materials,
-    write_slices,
 )
 from coupole.reflectance.slice_fit import fit_slices, slice_values
 from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
@@ -79,18 +80,21 @@ def _fit_materials(
 def _fit_slices(
     result: RunResult, names: Sequence[str], view: ViewSamples, left_out: list[int], memory_bytes: int, say: Said
 ) -> None:
-    parts: dict[str, list[NDArray[np.float32]]] = {name: [] for name in names}
     used = ~np.isin(view.leds, left_out)
-    for rows in result.view_blocks(view, memory_bytes):
-        samples = result.view_samples(view, rows)
-        fits = [(SLICES[name].basis, _under(result, name, view, rows, samples)) for name in names]
-        for name, found in zip(names, fit_slices(samples, used, *fits), strict=True):
-            parts[name].append(found)
-        say(f"fit {', '.join(names)} of {view.view}", rows.stop, len(view.triangles))
-    for name in names:
-        path = result.slices_path(name, view)
-        path.parent.mkdir(exist_ok=True)
-        complete(path, partial(write_slices, parts=parts[name], kind=SLICES[name]))
+    with ExitStack() as files:
+        coefficients = []
+        for name in names:
+            path = result.slices_path(name, view)
+            path.parent.mkdir(exist_ok=True)
+            part = files.enter_context(in_the_making(path))
+            file = files.enter_context(h5py.File(part, "w"))
+            coefficients.append(begin_slices(file, SLICES[name], view, result.channels))
+        for rows in result.view_blocks(view, memory_bytes):
+            samples = result.view_samples(view, rows)
+            fits = [(SLICES[name].basis, _under(result, name, view, rows, samples)) for name in names]
+            for data, found in zip(coefficients, fit_slices(samples, used, *fits), strict=True):
+                data[rows] = found
+            say(f"fit {', '.join(names)} of {view.view}", rows.stop, len(view.triangles))
 
 
 def _under(

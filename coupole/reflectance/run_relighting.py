@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.motion.occlusion import RAY_START_MM, blocked, ray_mesh
 from coupole.reflectance.run_fits import predicted
-from coupole.reflectance.run_result import FITS, RunResult, read_about
+from coupole.reflectance.run_result import FITS, SLICES, RunResult, read_about
 from coupole.reflectance.triangle_fit import TriangleSamples
 
 FAR_MM = 1e5
@@ -43,7 +43,7 @@ def relit_view(
     towards = result.base_from_support[:3, :3] @ (direction / np.linalg.norm(direction))
     count = len(centres)
     light = TriangleSamples(
-        np.zeros((count, 1, len(read_about(result.folder)["channels"])), np.float32),
+        np.zeros((count, 1, result.channels), np.float32),
         (centres.mean(axis=0) + FAR_MM * towards)[None],
         np.zeros(1, np.int64),
         mine.camera_mm[None],
@@ -51,7 +51,10 @@ def relit_view(
         normals,
         np.ones(count),
     )
-    made = predicted(result, fit or best_fit(result), mine, slice(0, count), light)
+    name = fit or best_fit(result)
+    if name in SLICES and not result.slices_path(name, mine).exists():
+        raise InputError(f"{result.folder}: has no fit {name}; `coupole reflectance fit {result.folder}` makes it")
+    made = predicted(result, name, mine, slice(0, count), light)
     values = np.pi * np.nan_to_num(made[:, 0])
     starts = centres + RAY_START_MM * normals
     values[blocked(ray_mesh(result.corners_mm.astype(np.float64)), starts, starts + _SHADOW_MM * towards)] = 0.0

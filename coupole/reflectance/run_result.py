@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError, Problem
-from coupole.reflectance.slice_basis import HARMONICS, RADIAL, RESIDUAL, Basis, centres
+from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis, centres
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples
 
 SCHEMA = "coupole-reflectance-run/1"
@@ -97,6 +97,11 @@ class RunResult:
     @cached_property
     def views(self) -> tuple[ViewSamples, ...]:
         return tuple(map(read_view_samples, self.files))
+
+    @cached_property
+    def channels(self) -> int:
+        with h5py.File(self.files[0], "r") as file:
+            return int(file["f"].shape[2])
 
     @property
     def summaries(self) -> list[dict[str, Any]]:
@@ -261,17 +266,18 @@ def write_materials(path: Path, parts: Sequence[TriangleMaterials], triangles: N
             file.create_dataset(field, data=values, track_times=False).attrs["told"] = told
 
 
-def write_slices(path: Path, parts: Sequence[NDArray[np.float32]], kind: SliceKind) -> None:
-    """A fit of all triangles of a view, from those of blocks."""
-    with h5py.File(path, "w") as file:
-        data = file.create_dataset("coefficients", data=np.concatenate(parts), track_times=False)
-        data.attrs["told"] = "[triangles of the view, channels, coefficients] 1/sr; NaN where too few samples are"
-        data.attrs["basis"] = (
-            "real spherical harmonics, orthonormal, degrees 0 to 9, order by order"
-            if kind.basis.harmonic
-            else "-r to each of `centres`, then 1, x, y, z"
-        )
-        data.attrs["frame"] = "z the mesh's normal, x towards the camera along the surface"
-        data.attrs["added_to"] = kind.over or ""
-        if not kind.basis.harmonic:
-            file.create_dataset("centres", data=centres(), track_times=False)
+def begin_slices(file: h5py.File, kind: SliceKind, view: ViewSamples, channels: int) -> h5py.Dataset:
+    """Describe a fit of a view in a new file; where its coefficients [triangles, channels, COUNT] go."""
+    shape = (len(view.triangles), channels, COUNT)
+    data = file.create_dataset("coefficients", shape, np.float32, fillvalue=np.nan, track_times=False)
+    data.attrs["told"] = "[triangles of the view, channels, coefficients] 1/sr; NaN where too few samples are"
+    data.attrs["basis"] = (
+        "real spherical harmonics, orthonormal, degrees 0 to 9, order by order"
+        if kind.basis.harmonic
+        else "-r to each of `centres`, then 1, x, y, z"
+    )
+    data.attrs["frame"] = "z the mesh's normal, x towards the camera along the surface"
+    data.attrs["added_to"] = kind.over or ""
+    if not kind.basis.harmonic:
+        file.create_dataset("centres", data=centres(), track_times=False)
+    return data

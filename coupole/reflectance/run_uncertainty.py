@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import h5py
@@ -12,19 +13,25 @@ from coupole.reflectance.run_result import RunResult, ViewSamples
 from coupole.reflectance.sample_uncertainty import SOURCES, Places, Sources, bounds, drawn
 
 Floats = NDArray[np.float64]
+Said = Callable[[str, int, int], None]
 
 COVERAGE, QUANTILE = 0.95, 1.959964
 TABLE_COVERAGE, TABLE_QUANTILE = 0.68, 0.994458
 """Of the table, as in seed 003, 6.1."""
+_TYPICAL = 200_000
+"""Samples of all views, for what is typical."""
 _TRIANGLES = 2000
-"""Of each view, for what is typical."""
+"""Of each view, which they are taken of."""
 _DRAWN, _DRAWS = 1000, 1000
 """Samples, of all views, and draws for each."""
 
 
-def uncertainty_of(result: RunResult, scan_noise_um: float, *, paper: bool) -> dict[str, Any] | None:
+def uncertainty_of(
+    result: RunResult, scan_noise_um: float, *, paper: bool, say: Said = lambda step, done, of: None
+) -> dict[str, Any] | None:
     """What `result.json` says of it; None without a record of the response, by which noise is known."""
-    picked = [_picked(result, view, scan_noise_um) for view in result.views]
+    most = _TYPICAL // len(result.views)
+    picked = [_picked(result, view, scan_noise_um, most) for view in result.views]
     places = Places(*(np.concatenate(part) for part in zip(*(_fields(p) for p, _ in picked), strict=True)))
     sources = Sources(*(np.concatenate(part) for part in zip(*(_fields(s) for _, s in picked), strict=True)))
     if not len(sources.u_noise):
@@ -39,11 +46,15 @@ def uncertainty_of(result: RunResult, scan_noise_um: float, *, paper: bool) -> d
         return _percentiles(*np.nanquantile(ratios, [below, above], axis=1))
 
     whole = table(sources_drawn)
+    without = {}
+    for number, (source, told) in enumerate(SOURCES.items(), start=1):
+        say("uncertainty", number, len(SOURCES))
+        without[told] = table(sources_drawn.without(source))
     return {
         "interval": _percentiles(*bounds(places, sources, QUANTILE)) | {"coverage": COVERAGE},
         "closed_form": _percentiles(*bounds(places_drawn, sources_drawn, TABLE_QUANTILE)),
         "monte_carlo": whole | {"coverage": TABLE_COVERAGE, "samples": len(some), "draws": _DRAWS},
-        "without": {told: table(sources_drawn.without(source)) for source, told in SOURCES.items()},
+        "without": without,
     }
 
 
@@ -62,15 +73,18 @@ def _fields(values: Places | Sources) -> list[Floats]:
     return list(vars(values).values())
 
 
-def _picked(result: RunResult, view: ViewSamples, scan_noise_um: float) -> tuple[Places, Sources]:
-    """A view's samples in the middle channel under all LEDs, of some of its triangles."""
+def _picked(result: RunResult, view: ViewSamples, scan_noise_um: float, most: int) -> tuple[Places, Sources]:
+    """Some of a view's samples in the middle channel, spread over its triangles and LEDs."""
     step = max(1, len(view.triangles) // _TRIANGLES)
     with h5py.File(view.path, "r") as file:
         channel = file["u_own"].shape[2] // 2
         noise = file["u_own"][::step][..., channel]
         own, shared = file["led_u_own"][:, channel], file["led_u_shared"][:, channel]
         led_mm = float(file.attrs["led_u_mm"])
-    triangle, led = np.nonzero(np.isfinite(noise))
+    known = np.flatnonzero(np.isfinite(noise))
+    if len(known) > most:
+        known = np.random.default_rng(2).choice(known, most, replace=False)
+    triangle, led = np.unravel_index(known, noise.shape)
     corners = result.corners_mm[view.triangles[::step]].astype(np.float64)
     places = Places(corners[triangle], view.led_mm[led], view.led_normals[led])
     same = np.ones(len(led))

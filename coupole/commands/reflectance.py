@@ -283,6 +283,29 @@ def ablate(result: ResultArgument, as_json: JsonOption = False) -> None:
     _do(step, as_json=as_json)
 
 
+@reflectance_app.command()
+def cluster(
+    result: ResultArgument,
+    clusters: Annotated[
+        int | None,
+        typer.Option("--clusters", min=1, help="At most so many; without it one for 400 triangles, 16 to 1000."),
+    ] = None,
+    memory: MemoryOption = "2GB",
+    as_json: JsonOption = False,
+) -> None:
+    """A few materials for all triangles, from the samples of all that look alike; triangles with too few samples
+    for a material borrow one."""
+
+    def step(say: Said) -> dict[str, Any]:
+        from coupole.reflectance.run_clusters import cluster_result
+        from coupole.viewing import cluster_page
+
+        told = cluster_result(result, clusters, _bytes(memory), say=say)
+        return {**told, "report": str(cluster_page.write(result, told))}
+
+    _do(step, as_json=as_json)
+
+
 def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool) -> None:
     """A step by itself, with bars; what it returns is its `--json`."""
     from coupole.viewing.terminal import make_console, step_bars
@@ -321,8 +344,8 @@ def relight(
         str | None,
         typer.Option(
             "--fit",
-            help="Of a result of runs: ggx, ggx_normal, sh, rbf or ggx_rbf; without it the one that missed least "
-            "in the check.",
+            help="Of a result of runs: ggx, ggx_normal, sh, rbf, ggx_rbf or clusters; without it the one that "
+            "missed least in the check.",
         ),
     ] = None,
     as_json: JsonOption = False,

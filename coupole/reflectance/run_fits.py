@@ -51,11 +51,14 @@ def predicted(
 ) -> NDArray[np.float32]:
     """[b, samples, channels] f cos_i, 1/sr, that a fit gives for `samples` of rows of a view's file, whatever
     their lights are; NaN where the fit has nothing, the material alone where what it leaves was not fitted."""
+    places = np.searchsorted(result.triangles, view.triangles[rows])
+    if name == "clusters":
+        own = result.materials("ggx_normal").at(places)
+        return model_values(samples, result.clusters.at(own, samples.normals, places))
     kind = SLICES.get(name)
     material = name if kind is None else kind.over
     model = None
     if material is not None:
-        places = np.searchsorted(result.triangles, view.triangles[rows])
         model = model_values(samples, result.materials(material).at(places))
     if kind is None:
         assert model is not None

@@ -35,8 +35,8 @@ def relit_view(
     names = [one.view for one in result.views]
     if view is not None and view not in names:
         raise InputError(f"--view: expected one of {', '.join(names)}; got {view!r}")
-    if fit is not None and fit not in FITS:
-        raise InputError(f"--fit: expected one of {', '.join(FITS)}; got {fit!r}")
+    if fit is not None and fit not in (known := (*FITS, "clusters")):
+        raise InputError(f"--fit: expected one of {', '.join(known)}; got {fit!r}")
     mine = result.views[0 if view is None else names.index(view)]
     with h5py.File(mine.path, "r") as file:
         seen, centres, normals = file["seen"][()], file["centres_mm"][()], file["normals"][()]

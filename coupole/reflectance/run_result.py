@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import h5py
 import numba
@@ -40,6 +40,7 @@ SLICES = {
     "ggx_rbf": SliceKind(RESIDUAL, over="ggx_normal"),
 }
 FITS = (*MATERIALS, *SLICES)
+CLUSTERS = "fits/clusters.h5"
 _HEAD = ("triangles", "camera_mm", "leds", "led_positions_mm", "led_normals", "full_scales")
 FIELDS = {
     "normals": "unit, base frame",
@@ -63,6 +64,33 @@ class ViewSamples:
     led_normals: NDArray[np.float64]
     full_scales: NDArray[np.float64]
     """[leds, channels] of the camera, that f cos_i E/Phi of 1 gives."""
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """Materials that many triangles share."""
+
+    OF_CLUSTERS: ClassVar = ("kd", "ks", "alpha", "residual")
+    cluster: NDArray[np.int32]
+    """[n] of all triangles of the fits; -1 for none."""
+    borrowed: NDArray[np.bool_]
+    """[n]"""
+    kd: NDArray[np.float64]
+    """[clusters, channels]"""
+    ks: NDArray[np.float64]
+    alpha: NDArray[np.float64]
+    residual: NDArray[np.float64]
+
+    def at(
+        self, own: TriangleMaterials, mesh_normals: NDArray[np.float64], block: slice | NDArray[np.int64]
+    ) -> TriangleMaterials:
+        """Of triangles by their places in `RunResult.triangles`, with the normals of their `own` materials, or
+        the mesh's where they borrow."""
+        number, borrowed = self.cluster[block], self.borrowed[block, None]
+        kd, ks, alpha, residual = (getattr(self, name)[number] for name in self.OF_CLUSTERS)
+        alpha[number < 0] = np.nan
+        normals = np.where(borrowed, mesh_normals, own.normals)
+        return TriangleMaterials(normals, kd, ks, alpha, residual)
 
 
 @dataclass(frozen=True)
@@ -194,6 +222,19 @@ class RunResult:
         """A fit by its name in `MATERIALS`."""
         with h5py.File(self.materials_path(name), "r") as file:
             return TriangleMaterials(*(file[field][block].astype(np.float64) for field in FIELDS))
+
+    @cached_property
+    def clusters(self) -> Clusters:
+        """Raises InputError if there are none."""
+        path = self.folder / CLUSTERS
+        if not path.exists():
+            raise InputError(f"{path}: is not there; `coupole reflectance cluster {self.folder}` makes it")
+        with h5py.File(path, "r") as file:
+            return Clusters(
+                file["cluster"][()],
+                file["borrowed"][()],
+                *(file[name][()].astype(np.float64) for name in Clusters.OF_CLUSTERS),
+            )
 
     def slices(self, name: str, view: ViewSamples, rows: slice = slice(None)) -> NDArray[np.float32]:
         """[n, channels, coefficients] of rows of a view's file, by a fit's name in `SLICES`."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numba
 import numpy as np
@@ -23,16 +23,16 @@ Floats = NDArray[np.float64]
 
 FEWEST = 24
 """Samples that a triangle needs: about five times the unknowns."""
-_USUAL = 0.1
+USUAL = 0.1
 """Weight of the usual roughness and ks beside that of a sample, which can be some 6: it decides where no sample is
 near a highlight. Without it one triangle in thousands shone five times as bright as white between the LEDs."""
-_MOST_KS = 1.0
+MOST_KS = 1.0
 """No more light than there is."""
 _STARTS = (0.08, 0.2, 0.45)
 _FIRST_KS = 0.02
 _TO_CHOOSE = 256
 """Samples, about, by which the best start is chosen."""
-_HELD = 1e9
+HELD = 1e9
 """Stiffness of a normal that is not fitted."""
 _PART = 256
 
@@ -55,6 +55,11 @@ class TriangleSamples:
     """[b, 3] of the mesh."""
     areas_mm2: Floats
     """[b]"""
+
+    def of_triangles(self, rows: NDArray[np.int64]) -> TriangleSamples:
+        """Those of some of the triangles."""
+        of_all = ("values", "centres_mm", "normals", "areas_mm2")
+        return replace(self, **{name: getattr(self, name)[rows] for name in of_all})
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,7 @@ def fit_triangles(
 ) -> TriangleMaterials:
     """Materials from the samples `used` [samples]; normals are fitted if `noise_um` is given."""
     count, _, channels = samples.values.shape
-    stiffness = np.full(count, _HELD) if noise_um is None else prior_stiffness(samples.areas_mm2, noise_um)
+    stiffness = np.full(count, HELD) if noise_um is None else prior_stiffness(samples.areas_mm2, noise_um)
     found = np.full((count, 5 + 2 * channels), np.nan)
 
     def fit(first: int) -> None:
@@ -128,13 +133,13 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
         if n < FEWEST:
             continue
         chosen = _best_start(roots[:n], good[:n], lights, half, views, view_of, normal, held)
-        _, spread = fit_from(roots[:n], good[:n], lights, half, views, view_of, chosen, normal, held, _USUAL)
+        _, spread = fit_from(roots[:n], good[:n], lights, half, views, view_of, chosen, normal, held, USUAL)
         found[triangle, :3] = chosen[:3] if free else normal
         found[triangle, 3], found[triangle, 4] = math.exp(chosen[5]), spread
         kd, ks = found[triangle, 5 : 5 + channels], found[triangle, 5 + channels :]
         grey = np.exp(chosen[3:6])
         colours_from(own, good[:n], found[triangle, :3], grey, lights, half, views, view_of, kd, ks)
-        ks[:] = np.minimum(ks, _MOST_KS)
+        ks[:] = np.minimum(ks, MOST_KS)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -176,7 +181,7 @@ def _best_start(roots, good, lights, half, views, view_of, normal, stiffness):  
     for alpha in _STARTS:
         unknowns[:3] = normal
         unknowns[3], unknowns[4], unknowns[5] = math.log(kd), math.log(_FIRST_KS * kd), math.log(alpha)
-        cost, _ = fit_from(few_roots, few, lights, half, views, view_of, unknowns, normal, stiffness, _USUAL)
+        cost, _ = fit_from(few_roots, few, lights, half, views, view_of, unknowns, normal, stiffness, USUAL)
         if cost < best:
             best = cost
             chosen[:] = unknowns

@@ -6,13 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from triangle_cases import noisy_case
+from triangle_cases import noisy_case, off_deg
 
 from coupole.reflectance.triangle_fit import fit_triangles, model_values, prior_stiffness
-
-
-def off_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    return np.degrees(np.arccos(np.clip(np.sum(found * truth, axis=1), -1, 1)))
 
 
 @pytest.mark.parametrize("views", [1, 2])

@@ -43,3 +43,7 @@ def noisy_case(views: int, noise: float = 0.01, leds: int = 120) -> tuple[Triang
     mesh = unit(truth + turn * random.normal(size=truth.shape))
     areas = np.full(COUNT, 0.05)
     return TriangleSamples(values.astype(np.float32), led_mm, view_of, cameras, centres, mesh, areas), truth
+
+
+def off_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(np.clip(np.sum(found * truth, axis=1), -1, 1)))

@@ -325,4 +325,36 @@ def test_a_view_is_relit_with_its_shadows(made: Made) -> None:
     assert "expected one of side, top" in wrong.err
     wrong = cells.here("reflectance", "relight", out, "--direction", "0,0,1", "--fit", "none", "--to", to)
     assert wrong.code == 2
-    assert "expected one of ggx, ggx_normal, sh, rbf, ggx_rbf" in wrong.err
+    assert "expected one of ggx, ggx_normal, sh, rbf, ggx_rbf, clusters" in " ".join(wrong.err.split())
+
+
+def test_clusters_are_a_few_materials_for_all_and_fill_what_has_too_few_samples(made: Made) -> None:
+    _, out, document = made
+    to = out / "clustered.npy"
+    relight = ("reflectance", "relight", out, "--direction", "0.3,0.2,1", "--to", to)
+    none = cells.here(*relight, "--fit", "clusters")
+    assert none.code == 2
+    assert "`coupole reflectance cluster" in none.err
+    many = cells.here("reflectance", "cluster", out, "--clusters", "1000000")
+    assert many.code == 2
+    assert f"expected at most {document['triangles'] - document['not_fitted']}" in " ".join(many.err.split())
+    ended = cells.here("reflectance", "cluster", out, "--json")
+    assert ended.code == 0, ended.err
+    told = ended.document
+    assert 16 <= told["clusters"] <= 40
+    assert 0 < told["borrowed"] <= document["not_fitted"]
+    assert told["triangles"] + told["without"] == document["triangles"]
+    assert told["mae_ratio"] < 1.3
+    assert told["mae"]["borrowed"] < 2 * told["mae"]["own"]
+    with h5py.File(out / "fits/clusters.h5") as file:
+        cluster, borrowed, alpha = file["cluster"][()], file["borrowed"][()], file["alpha"][()]
+        np.testing.assert_allclose(np.median(file["kd"][()], axis=0) * np.pi, DIFFUSE, rtol=0.05)
+        assert file["members"][()].sum() == (cluster >= 0).sum() - borrowed.sum()
+    with h5py.File(out / "fits/ggx_normal.h5") as file:
+        assert not np.isfinite(file["alpha"][()][borrowed]).any()
+    assert cluster.max() == len(alpha) - 1
+    assert cells.here(*relight, "--fit", "clusters").code == 0
+    filled = np.load(to)
+    assert cells.here(*relight, "--fit", "ggx_normal").code == 0
+    assert np.count_nonzero(filled) > np.count_nonzero(np.load(to))
+    assert "any colours" in (out / "clusters.html").read_text()

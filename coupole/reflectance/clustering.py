@@ -1,0 +1,234 @@
+"""Triangles of one material, found by what they look like, and the material from the samples of all of them (seed
+003, section 7: 1,000 materials for 400,000 triangles).
+
+Each sample is turned into the frame of its own triangle, whose z is the fitted normal: without that, normals that
+are off by degrees would blur what is pooled.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2, vq
+
+from coupole.reflectance.ggx import lobe
+from coupole.reflectance.normal_fit import colours_from, fit_from
+from coupole.reflectance.triangle_fit import FEWEST, HELD, MOST_KS, USUAL, TriangleMaterials, TriangleSamples
+
+Floats = NDArray[np.float64]
+
+MOST_POOLED = 4096
+"""Samples of a cluster that are kept for its fit."""
+_LEAST_EACH = 8
+_SLANT_COS = math.cos(math.radians(30.0))
+_OFF_DEG = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+"""Of the half vector to the normal: there materials are compared, lights and views slanted by 30 degrees."""
+_LEARNT_FROM = 20_000
+_ROUNDS = 10
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Samples of k clusters, at most `MOST_POOLED` of each."""
+
+    values: NDArray[np.float32]
+    """[k, MOST_POOLED, channels] f cos_i."""
+    lights: NDArray[np.float32]
+    """[k, MOST_POOLED, 3] directions, z the triangle's normal."""
+    views: NDArray[np.float32]
+    counts: NDArray[np.int64]
+    """[k]"""
+
+
+def empty_pool(clusters: int, channels: int) -> Pool:
+    shape = (clusters, MOST_POOLED)
+    values, lights, views = (np.empty((*shape, last), np.float32) for last in (channels, 3, 3))
+    return Pool(values, lights, views, np.zeros(clusters, np.int64))
+
+
+def looks(materials: TriangleMaterials) -> Floats:
+    """[b, channels * 6] square roots of reflectance about the mirror direction."""
+    found = np.empty((len(materials.alpha), materials.kd.shape[1], len(_OFF_DEG)))
+    _looks(materials.kd, materials.ks, materials.alpha, np.cos(np.radians(_OFF_DEG)), found)
+    return found.reshape(len(found), -1)
+
+
+def clusters_of(features: Floats, count: int) -> NDArray[np.int64]:
+    """[b] number of the cluster of each point [b, n], 0 to at most `count` - 1 without gaps, by k-means."""
+    random = np.random.default_rng(0)
+    some = features
+    if len(features) > _LEARNT_FROM:
+        some = features[random.choice(len(features), _LEARNT_FROM, replace=False)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of clusters that lost all their points: they are left out
+        centres, _ = kmeans2(some, min(count, len(some)), iter=_ROUNDS, minit="points", rng=random)
+    numbers = vq(features, centres)[0]
+    return np.unique(numbers, return_inverse=True)[1].astype(np.int64)
+
+
+def pool_samples(
+    pool: Pool,
+    samples: TriangleSamples,
+    used: NDArray[np.bool_],
+    normals: Floats,
+    cluster: NDArray[np.int64],
+    members: NDArray[np.int64],
+    random: np.random.Generator,
+) -> None:
+    """Add samples of triangles with fitted `normals` [b, 3] to the pools of their clusters [b], -1 for none; each
+    of a cluster's `members` [k] gives an equal share."""
+    each = np.maximum(_LEAST_EACH, MOST_POOLED // np.maximum(members, 1))
+    order = random.permutation(np.flatnonzero(used))
+    _pool(
+        samples.values, samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, normals, cluster,
+        each, order, pool.values, pool.lights, pool.views, pool.counts,
+    )  # fmt: skip
+
+
+def fit_pool(pool: Pool, starts: TriangleMaterials) -> TriangleMaterials:
+    """[k] materials of clusters, from `starts` [k]; those whose pool is too small keep their start."""
+    count, channels = len(pool.counts), pool.values.shape[2]
+    found = np.concatenate([starts.kd, starts.ks, starts.alpha[:, None], np.full((count, 1), np.nan)], axis=1)
+
+    def fit(number: int) -> None:
+        n = pool.counts[number]
+        if n >= FEWEST:
+            _fit_one(
+                pool.values[number, :n].astype(np.float64), pool.lights[number, :n].astype(np.float64),
+                pool.views[number, :n].astype(np.float64), found[number],
+            )  # fmt: skip
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
+        list(threads.map(fit, range(count)))
+    kd, ks = found[:, :channels], np.minimum(found[:, channels : 2 * channels], MOST_KS)
+    return TriangleMaterials(np.tile([0.0, 0.0, 1.0], (count, 1)), kd, ks, found[:, -2], found[:, -1])
+
+
+def nearest_cluster(
+    samples: TriangleSamples, used: NDArray[np.bool_], materials: TriangleMaterials, fewest: int
+) -> NDArray[np.int64]:
+    """[b] the cluster whose material explains a triangle's samples best, the mesh's normal taken; -1 for fewer
+    than `fewest` samples."""
+    found = np.full(len(samples.values), -1, np.int64)
+    _nearest(
+        samples.values, samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, samples.normals,
+        np.flatnonzero(used), materials.kd, materials.ks, materials.alpha, fewest, found,
+    )  # fmt: skip
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _looks(kd, ks, alpha, off_cos, found):  # type: ignore[no-untyped-def]
+    for n in range(len(alpha)):
+        for k in range(len(off_cos)):
+            shine = lobe(_SLANT_COS, _SLANT_COS, off_cos[k], alpha[n])[0]
+            for channel in range(kd.shape[1]):
+                found[n, channel, k] = math.sqrt(kd[n, channel] + ks[n, channel] * shine)
+
+
+@numba.njit(cache=True, nogil=True)
+def _axes(normal, axes):  # type: ignore[no-untyped-def]
+    """Rows x, y, z of a frame about a normal (Duff et al. 2017)."""
+    x, y, z = normal
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    axes[0, 0], axes[0, 1], axes[0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    axes[1, 0], axes[1, 1], axes[1, 2] = b, sign + y * y * a, -y
+    axes[2, 0], axes[2, 1], axes[2, 2] = x, y, z
+
+
+@numba.njit(cache=True, nogil=True)
+def _turned(axes, place, target, direction):  # type: ignore[no-untyped-def]
+    d0, d1, d2 = target[0] - place[0], target[1] - place[1], target[2] - place[2]
+    length = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+    for k in range(3):
+        direction[k] = (axes[k, 0] * d0 + axes[k, 1] * d1 + axes[k, 2] * d2) / length
+
+
+@numba.njit(cache=True, nogil=True)
+def _pool(  # type: ignore[no-untyped-def]
+    values, led_mm, view_of, cameras_mm, centres_mm, normals, cluster, each, order, pooled, lights, views, counts
+):
+    axes = np.empty((3, 3))
+    for triangle in range(len(values)):
+        number, taken = cluster[triangle], 0
+        if number < 0:
+            continue
+        _axes(normals[triangle], axes)
+        for sample in order:
+            place = counts[number]
+            if taken == each[number] or place == pooled.shape[1]:
+                break
+            known = True
+            for channel in range(values.shape[2]):
+                known &= values[triangle, sample, channel] > 0.0
+            if not known:
+                continue
+            pooled[number, place] = values[triangle, sample]
+            _turned(axes, centres_mm[triangle], led_mm[sample], lights[number, place])
+            _turned(axes, centres_mm[triangle], cameras_mm[view_of[sample]], views[number, place])
+            taken += 1
+            counts[number] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_one(values, lights, views, found):  # type: ignore[no-untyped-def]
+    """A material (kd, ks, alpha, residual) in place, from the start that is there."""
+    count, channels = values.shape
+    half, roots, grey = np.empty((count, 3)), np.empty(count), np.zeros(2)
+    for n in range(count):
+        x, y, z = lights[n, 0] + views[n, 0], lights[n, 1] + views[n, 1], lights[n, 2] + views[n, 2]
+        length = math.sqrt(x * x + y * y + z * z)
+        half[n, 0], half[n, 1], half[n, 2] = x / length, y / length, z / length
+        views[n, 2] = max(views[n, 2], 0.03)  # a view below a fitted normal forbids no step
+        roots[n] = math.sqrt(np.sum(values[n]) / channels)
+    for channel in range(channels):
+        grey[0] += found[channel] / channels
+        grey[1] += found[channels + channel] / channels
+    z_axis, used = np.array([0.0, 0.0, 1.0]), np.arange(count)
+    unknowns = np.array([0.0, 0.0, 1.0, 0.0, 0.0, math.log(found[2 * channels])])
+    unknowns[3], unknowns[4] = math.log(max(grey[0], 1e-9)), math.log(max(grey[1], 1e-6))
+    _, spread = fit_from(roots, used, lights, half, views, used, unknowns, z_axis, HELD, USUAL)
+    colours_from(
+        values, used, z_axis, np.exp(unknowns[3:6]), lights, half, views, used, found[:channels],
+        found[channels : 2 * channels],
+    )  # fmt: skip
+    found[2 * channels], found[2 * channels + 1] = math.exp(unknowns[5]), spread
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest(  # type: ignore[no-untyped-def]
+    values, led_mm, view_of, cameras_mm, centres_mm, normals, used, kd, ks, alpha, fewest, found
+):
+    axes, light, view = np.empty((3, 3)), np.empty(3), np.empty(3)
+    misses = np.empty(len(alpha))
+    for triangle in range(len(values)):
+        _axes(normals[triangle], axes)
+        misses[:] = 0.0
+        count = 0
+        for sample in used:
+            value = values[triangle, sample]
+            if np.isnan(value).all():
+                continue
+            _turned(axes, centres_mm[triangle], led_mm[sample], light)
+            _turned(axes, centres_mm[triangle], cameras_mm[view_of[sample]], view)
+            if light[2] <= 0.0 or view[2] <= 0.0:
+                continue
+            count += 1
+            length = math.sqrt((light[0] + view[0]) ** 2 + (light[1] + view[1]) ** 2 + (light[2] + view[2]) ** 2)
+            for number in range(len(alpha)):
+                shine = lobe(light[2], view[2], (light[2] + view[2]) / length, alpha[number])[0]
+                for channel in range(len(value)):
+                    if not math.isnan(value[channel]):
+                        made = light[2] * (kd[number, channel] + ks[number, channel] * shine)
+                        misses[number] += (math.sqrt(made) - math.sqrt(max(value[channel], 0.0))) ** 2
+        if count >= fewest:
+            found[triangle] = np.argmin(misses)

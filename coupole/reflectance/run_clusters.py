@@ -1,0 +1,167 @@
+"""Clusters of a result of runs: a few materials for all triangles, and one for those that had too few samples."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.reflectance.clustering import (
+    clusters_of,
+    empty_pool,
+    fit_pool,
+    looks,
+    nearest_cluster,
+    pool_samples,
+)
+from coupole.reflectance.extraction.lamp_sight import lit_on
+from coupole.reflectance.result_folder import complete, read_settings
+from coupole.reflectance.run_result import CLUSTERS, FIELDS, Clusters, RunResult
+from coupole.reflectance.triangle_fit import TriangleMaterials, model_values
+from coupole.storage.disk_errors import disk_error
+from coupole.storage.durable import write_synced
+
+Said = Callable[[str, int, int], None]
+ABOUT_CLUSTERS = "clusters.json"
+FEWEST_TO_BORROW = 4
+"""Samples that tell which cluster a triangle belongs to."""
+USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS = 400, 16, 1000
+"""Of clusters whose number is not given: as the paper has them, and some for small objects."""
+_FROM = "ggx_normal"
+
+
+def cluster_result(
+    out: Path, count: int | None, memory_bytes: int, *, say: Said = lambda step, done, of: None
+) -> dict[str, Any]:
+    """Find at most `count` materials for all triangles, write them, and say what is missed with them under the
+    LEDs that were left out. Raises InputError if samples or fits are not all there, StorageError."""
+    settings = read_settings(out)
+    result = RunResult(out)
+    result.refuse_unfinished(settings["view_names"], fits=True)
+    materials = result.materials(_FROM)
+    fitted = np.isfinite(materials.alpha)
+    known = int(np.count_nonzero(fitted))
+    count = count or int(np.clip(known // USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS))
+    if known < count:
+        raise InputError(f"--clusters: expected at most {known}, the triangles with a material; got {count}")
+    cluster = np.full(len(fitted), -1, np.int64)
+    cluster[fitted] = clusters_of(looks(materials.at(np.flatnonzero(fitted))), count)
+    members = np.bincount(cluster[fitted])
+    pool = empty_pool(len(members), materials.kd.shape[1])
+    random = np.random.default_rng(0)
+    for block in result.blocks(memory_bytes):
+        used = ~np.isin(result.along_samples(block, "leds"), settings["left_out"])
+        samples, normals = result.samples(block), materials.normals[block]
+        pool_samples(pool, samples, used, normals, cluster[block], members, random)
+        say("pool samples", block.stop, len(fitted))
+    pooled = fit_pool(pool, _medians(materials, cluster, len(members)))
+    borrowed = _borrow(result, pooled, cluster, settings["left_out"], memory_bytes, say)
+    try:
+        complete(out / CLUSTERS, lambda path: _write(path, pooled, cluster, borrowed, members))
+        told = {
+            "clusters": len(members),
+            "triangles": int(np.count_nonzero(cluster >= 0)),
+            "borrowed": int(np.count_nonzero(borrowed)),
+            "without": int(np.count_nonzero(cluster < 0)),
+            **_missed(result, settings, memory_bytes, say),
+        }
+        write_synced(out / ABOUT_CLUSTERS, json.dumps(told, indent=1) + "\n")
+    except OSError as error:
+        raise disk_error(out, error) from error
+    return told
+
+
+def _medians(materials: TriangleMaterials, cluster: NDArray[np.int64], count: int) -> TriangleMaterials:
+    """[count] of the members of each cluster."""
+    order = np.argsort(cluster, kind="stable")
+    firsts = np.searchsorted(cluster[order], np.arange(count + 1))
+    rows = [order[first:end] for first, end in pairwise(firsts)]
+
+    def of(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([np.median(values[row], axis=0) for row in rows])
+
+    return TriangleMaterials(*map(of, (getattr(materials, field) for field in FIELDS)))
+
+
+def _borrow(
+    result: RunResult,
+    pooled: TriangleMaterials,
+    cluster: NDArray[np.int64],
+    left_out: list[int],
+    memory_bytes: int,
+    say: Said,
+) -> NDArray[np.bool_]:
+    """Give triangles without material the cluster that explains their few samples best; which ones got one."""
+    borrowed = np.zeros(len(cluster), np.bool_)
+    for block in result.blocks(memory_bytes):
+        lacking = np.flatnonzero(cluster[block] < 0)
+        if len(lacking):
+            used = ~np.isin(result.along_samples(block, "leds"), left_out)
+            some = result.samples(block).of_triangles(lacking)
+            found = nearest_cluster(some, used, pooled, FEWEST_TO_BORROW)
+            cluster[block.start + lacking] = found
+            borrowed[block.start + lacking] = found >= 0
+        say("borrow", block.stop, len(cluster))
+    return borrowed
+
+
+def _missed(result: RunResult, settings: dict[str, Any], memory_bytes: int, say: Said) -> dict[str, Any]:
+    """Mean absolute errors, shares of the camera's range, under the LEDs that were left out: of triangles with a
+    material of their own, by it and by their cluster's; of those that borrowed one."""
+    clusters = result.clusters
+    sums = {"own": 0.0, "clustered": 0.0, "borrowed": 0.0}
+    counts = dict.fromkeys(sums, 0)
+    for block in result.blocks(memory_bytes):
+        held = np.isin(result.along_samples(block, "leds"), settings["left_out"])
+        samples = result.samples(block)
+        some = replace(
+            samples,
+            values=samples.values[:, held],
+            led_mm=samples.led_mm[held],
+            view_of=samples.view_of[held],
+        )
+        axes, paper = result.along_samples(block, "led_normals")[held], settings["emission"] == "paper"
+        lit = lit_on(some.centres_mm, some.led_mm, axes, paper)
+        share = lit[..., None] * result.along_samples(block, "full_scales")[held]
+        by = {
+            "own": model_values(some, result.materials(_FROM, block)),
+            "clustered": model_values(some, clusters.at(result.materials(_FROM, block), some.normals, block)),
+        }
+        by["borrowed"] = np.where(clusters.borrowed[block][:, None, None], by["clustered"], np.nan)
+        by["clustered"] = np.where(clusters.borrowed[block][:, None, None], np.nan, by["clustered"])
+        for name, made in by.items():
+            off = np.abs((made - some.values) * share)
+            known = np.isfinite(off)
+            sums[name] += float(off[known].sum())
+            counts[name] += int(np.count_nonzero(known))
+        say("check of clusters", block.stop, len(result.triangles))
+    mae = {name: sums[name] / counts[name] if counts[name] else None for name in sums}
+    ratio = mae["clustered"] / mae["own"] if mae["own"] and mae["clustered"] else None
+    return {"mae": mae, "mae_ratio": ratio}
+
+
+def _write(
+    path: Path,
+    pooled: TriangleMaterials,
+    cluster: NDArray[np.int64],
+    borrowed: NDArray[np.bool_],
+    members: NDArray[np.int64],
+) -> None:
+    with h5py.File(path, "w") as file:
+        data: dict[str, tuple[NDArray[Any], str]] = {
+            "cluster": (cluster.astype(np.int32), "of the triangles of the fits; -1 for none"),
+            "borrowed": (borrowed, "whether a triangle has its cluster's material for want of samples"),
+            "members": (members, "triangles that a cluster was found by"),
+        }
+        for field in Clusters.OF_CLUSTERS:
+            data[field] = (getattr(pooled, field).astype(np.float32), f"of the clusters: {FIELDS[field]}")
+        for name, (values, told) in data.items():
+            file.create_dataset(name, data=values, track_times=False).attrs["told"] = told

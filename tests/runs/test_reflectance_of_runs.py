@@ -13,7 +13,9 @@ import pytest
 import trimesh
 from cells import CellFolder
 
+from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.sample_uncertainty import Places, Sources, bounds
+from coupole.reflectance.triangle_fit import fit_triangles
 
 RECORDS = cells.REPO / "configs/calibrations"
 DIFFUSE, F0, ROUGHNESS = (0.5, 0.35, 0.2), (0.05, 0.05, 0.05), 0.3
@@ -131,12 +133,18 @@ def test_runs_of_one_object_are_fitted_together(made: Made, tmp_path: Path) -> N
     second.write(views=[third], lights={"kind": "every", "every": 60})
     assert second.acquire().code == 0
     runs, out = (first.run_folder, second.run_folder), tmp_path / "result"
-    ended = cells.here("reflectance", *runs, "--calibrations", RECORDS, "--out", out, "--json")
+    ended = cells.here("reflectance", "extract", *runs, "--calibrations", RECORDS, "--out", out, "--json")
     assert ended.code == 0, ended.err
     names = {path.stem for path in (out / "samples").glob("*.h5")}
     assert names == {f"{runs[0].name}-top", f"{runs[0].name}-side", f"{runs[1].name}-third"}
-    assert ended.document["triangles"] > alone["triangles"]
-    assert ended.document["held_out_psnr_db"]["ggx_normal"] > 35
+    result = RunResult(out)
+    assert len(result.triangles) > alone["triangles"]
+    block = slice(6000, 6200)
+    samples = result.samples(block)
+    assert len(samples.led_mm) == 45 + 45 + 18
+    fitted = fit_triangles(samples, np.ones(108, bool), 30.0)
+    np.testing.assert_allclose(np.nanmedian(fitted.kd, axis=0) * np.pi, DIFFUSE, rtol=0.05)
+    np.testing.assert_allclose(np.nanmedian(fitted.alpha), ROUGHNESS, rtol=0.15)
     second.plan_data["object"]["support_from_object"] = {"translation_mm": [1.0, 0, 0]}
     second.write()
     moved = second.acquire()

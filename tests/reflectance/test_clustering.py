@@ -60,6 +60,8 @@ def test_a_few_materials_stand_for_all(varying: tuple[TriangleSamples, TriangleM
     shared = replace(of_clusters.at(cluster), normals=materials.normals)
     assert mae(samples, shared) < 1.7 * mae(samples, materials)  # the paper's ratio
     one = pooled(samples, materials, np.zeros(COUNT, np.int64))
+    share = one.kd[0] / np.median(materials.kd, axis=0)
+    assert ((share > 0.9) & (share < 1.35)).all()  # 0.6 were it of the first triangles alone
     alike = replace(one.at(np.zeros(COUNT, np.int64)), normals=materials.normals)
     assert mae(samples, alike) > 4 * mae(samples, materials)
 

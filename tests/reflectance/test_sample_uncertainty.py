@@ -78,6 +78,14 @@ def test_each_source_alone_is_what_it_is_known_to_be() -> None:
     far = np.nanstd(drawn(places, sources(led_mm=1.0), 20_000, random), axis=1)
     known = 1e-3 * np.sqrt(4 + np.tan(np.radians(60)) ** 2)  # distance, and incidence
     np.testing.assert_allclose(far, known, rtol=0.05)
+    low, high = bounds(places, sources(led_mm=1.0), 1.0)
+    np.testing.assert_allclose((high - low) / 2, known, rtol=0.01)
+
+
+def test_draws_lit_from_below_do_not_count() -> None:
+    ratios = drawn(placed(88.0), sources(vertex_um=60.0), 500, np.random.default_rng(7))
+    assert 0.05 < np.isnan(ratios).mean() < 0.6
+    assert np.nanmin(ratios) > 0
 
 
 def test_tilts_are_those_of_moved_vertices() -> None:

@@ -90,8 +90,10 @@ def test_a_fit_is_the_least_squares_solution_in_the_slices_frame(shiny: Triangle
 
 def test_what_a_slice_gives_is_what_was_fitted_and_never_negative(shiny: TriangleSamples) -> None:
     for basis in (HARMONICS, RADIAL):
-        made = slice_values(shiny, fit_slices(shiny, ~HELD_OUT, (basis, None))[0], basis)
+        found = fit_slices(shiny, ~HELD_OUT, (basis, None))[0]
+        made = slice_values(shiny, found, basis)
         assert (made >= 0).all()
+        assert (slice_values(shiny, -found, basis) == 0).mean() > 0.9
         off = (made - shiny.values)[:, ~HELD_OUT]
         assert np.nanmean(np.abs(off)) < 0.02 * np.nanmean(shiny.values)
     below = replace(shiny, values=shiny.values[:, :1], led_mm=-shiny.led_mm[:1], view_of=shiny.view_of[:1])
@@ -136,9 +138,11 @@ def test_channels_with_other_samples_and_triangles_with_too_few(shiny: TriangleS
     values[0, 10:, 2] = np.nan
     values[1, :, 1] = np.nan
     values[2] = np.nan
+    values[3, ::3, 1] = np.nan
     some = replace(shiny, values=values)
     found = fit_slices(some, ~HELD_OUT, (RADIAL, None), threads=1)[0]
     known = np.isfinite(found).all(axis=2)
     assert known[:4].tolist() == [[True, True, False], [True, False, True], [False] * 3, [True] * 3]
-    alone = fit_slices(replace(shiny, values=values[..., 2:]), ~HELD_OUT, (RADIAL, None))[0]
-    np.testing.assert_array_equal(alone[:, 0], found[:, 2])
+    for channel in range(3):
+        alone = fit_slices(replace(shiny, values=values[..., [channel]]), ~HELD_OUT, (RADIAL, None))[0]
+        np.testing.assert_array_equal(alone[:, 0], found[:, channel])

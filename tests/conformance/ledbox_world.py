@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import linecache
 import sys
 import threading
@@ -121,7 +122,11 @@ class Call:
 
     def waits_for_a_lock(self) -> bool:
         """True if its thread is about to take a lock: the line of code that it stands in says so."""
-        frame = sys._current_frames().get(self._thread.ident or 0)
+        gc.disable()  # a collection in there may wait for ever (CPython's gh-106883)
+        try:
+            frame = sys._current_frames().get(self._thread.ident or 0)
+        finally:
+            gc.enable()
         if frame is None:
             return False
         file = frame.f_code.co_filename

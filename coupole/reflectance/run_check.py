@@ -108,8 +108,8 @@ def _check_view(
 
 
 def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | None:
-    """Of the median sample."""
-    if uncertainty is None:
+    """Of the median sample; None if it is not known, or all are open."""
+    if uncertainty is None or uncertainty["interval"]["median"] is None:
         return None
     low, high = uncertainty["interval"]["median"]
     return {"coverage": uncertainty["interval"]["coverage"], "low": low, "high": high}

@@ -43,7 +43,7 @@ def uncertainty_of(
     def table(of: Sources) -> dict[str, Any]:
         ratios = drawn(places_drawn, of, _DRAWS, np.random.default_rng(1), paper=paper)
         below, above = 0.5 - TABLE_COVERAGE / 2, 0.5 + TABLE_COVERAGE / 2
-        return _percentiles(*np.nanquantile(ratios, [below, above], axis=1))
+        return percentiles(*np.nanquantile(ratios, [below, above], axis=1))
 
     whole = table(sources_drawn)
     without = {}
@@ -51,16 +51,18 @@ def uncertainty_of(
         say("uncertainty", number, len(SOURCES))
         without[told] = table(sources_drawn.without(source))
     return {
-        "interval": _percentiles(*bounds(places, sources, QUANTILE)) | {"coverage": COVERAGE},
-        "closed_form": _percentiles(*bounds(places_drawn, sources_drawn, TABLE_QUANTILE)),
+        "interval": percentiles(*bounds(places, sources, QUANTILE)) | {"coverage": COVERAGE},
+        "closed_form": percentiles(*bounds(places_drawn, sources_drawn, TABLE_QUANTILE)),
         "monte_carlo": whole | {"coverage": TABLE_COVERAGE, "samples": len(some), "draws": _DRAWS},
         "without": without,
     }
 
 
-def _percentiles(low: Floats, high: Floats) -> dict[str, Any]:
-    """Median and 95th percentile of bounds, percent; infinite ones are left out and counted."""
+def percentiles(low: Floats, high: Floats) -> dict[str, Any]:
+    """Median and 95th percentile of bounds, percent; infinite ones are left out and counted; None if all are."""
     known = np.isfinite(high)
+    if not known.any():
+        return {"median": None, "percentile_95": None, "unbounded_share": 1.0}
     below, above = 100.0 * (low[known] - 1.0), 100.0 * (high[known] - 1.0)
     return {
         "median": [float(np.median(below)), float(np.median(above))],

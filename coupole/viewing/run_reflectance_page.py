@@ -102,7 +102,7 @@ def _page(folder: Path) -> Iterator[str]:
 
 def _uncertain(about: dict[str, Any]) -> Iterator[str]:
     """A table of sources, beside the paper's."""
-    if not (known := about["uncertainty_percent"]):
+    if not (known := about["uncertainty_percent"]) or known["monte_carlo"]["median"] is None:
         return
     drawn = known["monte_carlo"]
     yield (

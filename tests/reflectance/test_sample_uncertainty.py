@@ -10,6 +10,7 @@ from triangle_cases import unit
 
 from coupole.calibration.budget.measurement import reflectance
 from coupole.calibration.light.irradiance import Emission
+from coupole.reflectance.run_uncertainty import percentiles
 from coupole.reflectance.sample_uncertainty import SOURCES, Places, Sources, bounds, drawn, tilt_covariance
 
 COUNT = 40
@@ -139,3 +140,11 @@ def test_the_papers_emission_counts_in_the_draws() -> None:
         np.nanstd(drawn(aside, some, 4000, np.random.default_rng(1), paper=two), axis=1) for two in (False, True)
     ]
     assert (widths[1] > widths[0]).mean() > 0.9
+
+
+def test_samples_whose_bounds_are_all_open_are_counted_and_no_error() -> None:
+    told = percentiles(np.full(4, 0.5), np.full(4, np.inf))
+    assert told == {"median": None, "percentile_95": None, "unbounded_share": 1.0}
+    some = percentiles(np.array([0.9, 0.5]), np.array([1.1, np.inf]))
+    assert some["median"] == pytest.approx([-10.0, 10.0])
+    assert some["unbounded_share"] == 0.5

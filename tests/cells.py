@@ -46,6 +46,8 @@ TOP = {
 }
 SIDE = {**TOP, "name": "side", "azimuth_deg": -60, "elevation_deg": 45}
 LOW = {**TOP, "name": "low", "azimuth_deg": -120, "elevation_deg": 45}
+PLAIN = {"seed": 1, "arm_shadows": False, "shading": "flat"}
+"""Settings of worlds whose pictures `expected_pictures` can reckon: it knows of no arm, and of direct light only."""
 SOME_LIGHTS = {"kind": "every", "every": 20}
 """54 LEDs, all round the dome."""
 
@@ -83,7 +85,7 @@ class CellFolder:
         rig["ledbox"]["settings"]["watchdog_s"] = 4 * self.speed  # of the world's time; the machine may be busy
         rig["storage"] = {"folder": str(self.folder / "storage"), "reserve_bytes": 0}
         rig["ledger"] = str(self.folder / "ledger")
-        settings = {"seed": 1, "speed": self.speed, "arm_shadows": False}  # `expected_pictures` know of no arm
+        settings = {**PLAIN, "speed": self.speed}
         rig["world"] = {"serves": "always", "settings": settings}
         self.rig_data = rig
         self.plan_data = {
@@ -165,7 +167,7 @@ class CellFolder:
         """The world that the rig joins: it outlives its controllers, and holds the plan's object."""
         job = read_job(self.plan)
         config = world_config(job.cell, job, job.cell.rig.sensor, speed=self.speed)
-        config["settings"] |= {"seed": 1, "arm_shadows": False, "faults": list(faults), **settings}
+        config["settings"] |= {**PLAIN, "faults": list(faults), **settings}
         world = World.start(config)
         self._endpoints.write_text(json.dumps(world.endpoints) + "\n")
         try:

@@ -160,7 +160,7 @@ def photographer(root: Path, mesh: Path, size: tuple[int, int]) -> Any:
     }
     config = Config.model_validate(told)
     pose = np.array(config.scene.base_from_support) @ camera_pose()
-    return Photographer(config.scene, config.camera, config.settings), pose
+    return Photographer(config.scene, config.photographed, config.settings), pose
 
 
 def render_leds(by: Any, pose: NDArray[np.float64], out: NDArray[np.uint16], leds: range) -> None:

@@ -38,6 +38,8 @@ def world_config(
     settings: dict[str, Any] = dict(rig.world.settings) if rig.world else {}
     if speed is not None:
         settings |= {"speed": speed, "hurry_only_when_told": dry_run}
+    if dry_run:
+        settings |= {"shading": "flat", "detail": (), "interreflection": None}
     settings["robot"] = _robot_config(rig, settings.get("robot", {}), dry_run=dry_run)
     settings["camera"] = _camera_config(rig, settings.get("camera", {}), job if dry_run else None, dry_run=dry_run)
     settings["ledbox"] = _ledbox_config(rig, settings.get("ledbox", {}), dry_run=dry_run)

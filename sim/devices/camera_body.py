@@ -60,8 +60,8 @@ class Settings(BaseModel):
     """Rays through each pixel, k x k: for targets whose corners are located to a fraction of a pixel."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 of the true lens (Brown-Conrady, OpenCV's order), to be found by calibration."""
-    blur: bool = False
-    """Apply defocus and diffraction; takes seconds per full-size frame."""
+    blur: bool | None = None
+    """Whether defocus and diffraction blur pictures; None: where each pixel is shaded."""
     rim_radius: Annotated[float, Field(gt=0)] = 3.0
     rim_shift: Annotated[float, Field(ge=0)] = 4.0
     """Mechanical vignetting, as in `sim.optics.objective.Objective`."""

@@ -82,15 +82,6 @@ def diffraction_px(objective: Objective, wavelength_um: ArrayLike, pixel_pitch_u
     return np.asarray(0.42 * np.asarray(wavelength_um) * objective.working_f_number / pixel_pitch_um)
 
 
-def blur_px(objective: Objective, depth_mm: ArrayLike, channel: int, pixel_pitch_um: float) -> Array:
-    """Standard deviation of the blur per axis, pixels, of points at a depth in one channel (0 red to 2 blue).
-
-    A disk of diameter c has c/4; the variances of defocus and diffraction add.
-    """
-    disk = 0.25 * defocus_px(objective, depth_mm, pixel_pitch_um)
-    return np.hypot(disk, diffraction_px(objective, CHANNEL_UM[channel], pixel_pitch_um))
-
-
 def _overlap(rim: float, shift: Array) -> Array:
     """Fraction of a unit disk that is covered by a disk of radius `rim` with its centre `shift` away."""
     d = np.clip(shift, abs(1.0 - rim) + 1e-12, 1.0 + rim - 1e-12)

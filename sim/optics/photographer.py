@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,26 +16,24 @@ from coupole.geometry import Transform, inverse
 from sim.devices.arm_bodies import NONE, Capsules
 from sim.devices.camera_body import Exposed
 from sim.optics import panels
-from sim.optics.blur import through
+from sim.optics.blur import defocus_blur_px, through
 from sim.optics.dome import as_built
 from sim.optics.glow import Glow, glow
 from sim.optics.led_light import channel_factors
 from sim.optics.objective import Objective, vignetting
-from sim.optics.sensor import electrons, expose, expose_electrons, mosaic
+from sim.optics.sensor import electrons, expose, expose_electrons
 from sim.render import arm_shadow
 from sim.render.camera_view import View, Viewer, tangents
 from sim.render.embree import Obstacles
 from sim.render.emitter import LED_SIDE_MM, Emitter, irradiance_of_each, square, squares
+from sim.render.interreflection import Neighbourhood, add_indirect, exchange, indirect_lux, neighbourhood
 from sim.render.lens import Lens, sight
-from sim.render.radiance import led_radiance, panel_radiance
+from sim.render.radiance import albedo, led_radiance, panel_radiance
 from sim.render.shadows import Shadows
 from sim.scene.scene import Scene, build_scene, load_surface, support_disk
 from sim.scene.surface import Material, Surface
 from sim.scene.things import placed
 from sim.world.config import CameraConfig, MeshConfig, SceneConfig, Settings
-
-if TYPE_CHECKING:
-    from sim.render.interreflection import Prepared
 
 _POSE_TOLERANCE, _ARM_TOLERANCE_MM = 1e-6, 1e-3
 _SHADOW_BYTES = 512 << 20
@@ -56,12 +54,16 @@ class Look:
     arm_mm: Capsules
     """Capsules of the arm, which cast shadows."""
     view: View
-    places: NDArray[np.int32]
-    """[seen] places of the seen triangles in the table of shadows."""
+    places: NDArray[np.int32] | None
+    """[sites] places in the table of shadows; None if each pixel is shaded."""
     samples: int
     scene: Scene
     radiance: dict[int, Radiance] = field(default_factory=dict)
-    """Radiance of the seen triangles, by LED, or by minus the number of a panel."""
+    """Radiance of the sites, by LED, or by minus the number of a panel."""
+    around: Neighbourhood | None = None
+    """Where interreflection is interpolated, once it is needed."""
+    disk_px: NDArray[np.float32] | None = None
+    """Blur by defocus, once it is needed."""
     glows: dict[int, Glow | None] = field(default_factory=dict)
     """Images of lamps, by the same numbers."""
 
@@ -71,11 +73,9 @@ class Look:
         return self.view.empty(self.samples)
 
     @cached_property
-    def prepared(self) -> Prepared:
-        """Scene and sensors for interreflections."""
-        from sim.render.interreflection import prepare
-
-        return prepare(self.scene, self.view.sides >> 1, self.view.towards_camera)
+    def albedo(self) -> NDArray[np.float32]:
+        """[sites, 3] for light from all directions."""
+        return albedo(self.view, self.scene.materials)
 
 
 class Photographer:
@@ -116,7 +116,8 @@ class Photographer:
         )
         self._sight = sight(lens)
         self._falloff = vignetting(self._objective, tangents(self._sight)).astype(np.float32)
-        self._viewer = Viewer(self._scene, lens, camera.samples_per_side)
+        self._shading = settings.shading
+        self._viewer = Viewer(self._scene, lens, camera.samples_per_side, self._shading)
         self.sensor = camera.true_sensor(settings.seed)
         self.flange_from_camera: Transform = np.array(camera.flange_from_camera)
         self.reference_lux = _reference_lux(_emitters(table), base_from_support)
@@ -129,9 +130,11 @@ class Photographer:
         pieces = [piece for panel, unevenness in self._panels for piece in panels.pieces(panel, unevenness)]
         self._pieces = pieces
         places_mm = np.array([*self.leds.positions_mm, *(piece.centre_mm for piece in pieces)])
-        self._shadows = Shadows(Obstacles(self._scene.corners_mm), places_mm, _SHADOW_BYTES)
+        self._obstacles = Obstacles(self._scene.corners_mm)
+        self._shadows = Shadows(self._obstacles, places_mm, _SHADOW_BYTES)
         self._look: Look | None = None
-        self._interreflection = settings.interreflection
+        self._interreflection = asked = settings.light_between_surfaces
+        self._exchange = None if asked is None else exchange(self._scene, self._obstacles, asked.rays)
         self._colour: dict[int, NDArray[np.float32]] = {}
         self._warm_up(base_from_support)
 
@@ -158,18 +161,21 @@ class Photographer:
         glows = self._glows(look, exposed)
         scale = self._electrons * seconds
         if self._camera.blur:
-            sharp = electrons(look.view.triangle, radiance, self._falloff, electrons_per_radiance=scale)
-            k = self._camera.samples_per_side
-            depth_mm = look.view.depth_mm(look.base_from_camera)[k // 2 :: k, k // 2 :: k]
-            image = through(self._objective, sharp, depth_mm, pixel_pitch_um=self._camera.pixel_pitch_um)
-            mean_e = mosaic(image, self.sensor)
+            sharp = electrons(look.view.site, radiance, self._falloff, electrons_per_radiance=scale)
+            mean_e = through(
+                self._objective,
+                sharp,
+                self._disk_px(look),
+                self.sensor.channels(),
+                pixel_pitch_um=self._camera.pixel_pitch_um,
+            )
             if glows is not None:
                 mean_e += glows
             expose_electrons(out, mean_e, **sensed)
         else:
             expose(
                 out,
-                look.view.triangle,
+                look.view.site,
                 radiance,
                 self._falloff,
                 electrons_per_radiance=scale,
@@ -177,13 +183,20 @@ class Photographer:
                 **sensed,
             )
 
+    def _disk_px(self, look: Look) -> NDArray[np.float32]:
+        """[h, w] standard deviation of the blur by defocus, computed once per pose."""
+        if look.disk_px is None:
+            depth_mm = look.view.depth_mm(look.base_from_camera, look.samples)
+            look.disk_px = defocus_blur_px(self._objective, depth_mm, self._camera.pixel_pitch_um)
+        return look.disk_px
+
     def _lit(self, look: Look, exposed: Exposed) -> tuple[Radiance, float]:
-        """Radiance of the seen triangles, and its duration in seconds."""
+        """Radiance of the sites, and its duration in seconds."""
         lights = [(self._led(look, led), lit_s) for led, lit_s in exposed.seconds_of_led.items()]
         lights += [(self._panel(look, panel), exposed.exposure_s) for panel in exposed.panels]
         if len(lights) == 1:
             return lights[0]
-        count = len(look.view.sides)
+        count = len(look.view.points_mm)
         radiance = np.zeros((max(1, count), 3), np.float32)
         for each, lit_s in lights:
             radiance[:count] += each * np.float32(lit_s)
@@ -195,7 +208,8 @@ class Photographer:
         look = self._look
         if look is None or np.abs(base_from_camera - look.base_from_camera).max() > _POSE_TOLERANCE:
             view = self._viewer.look(base_from_camera)
-            places, samples = self._shadows.places(view.sides), self._camera.samples_per_side
+            places = self._shadows.places(view.sides) if self._shading == "flat" else None
+            samples = self._camera.samples_per_side
             look = self._look = Look(base_from_camera, arm_mm, view, places, samples, self._scene)
         arm_moved = arm_mm.shape != look.arm_mm.shape or np.abs(arm_mm - look.arm_mm).max(initial=0.0)
         if arm_moved > _ARM_TOLERANCE_MM:
@@ -206,50 +220,53 @@ class Photographer:
     # -- light on the scene -------------------------------------------------------------------------------
 
     def _led(self, look: Look, led: int) -> Radiance:
-        """Radiance of the seen triangles under one LED at its tabulated flux."""
+        """Radiance of the sites under one LED at its tabulated flux."""
         row = self._row_of_led[led]
-        return _remembered(look, led, lambda: self._lit_by_led(look, row) * self._colour_of(led))
+        return _remembered(look, led, lambda: self._lit_by_led(look, row, led))
 
-    def _lit_by_led(self, look: Look, row: int) -> Radiance:
-        return self._shaded(look, self._emitters[row], row) + self._indirect(look, self._emitters[row])
+    def _lit_by_led(self, look: Look, row: int, led: int) -> Radiance:
+        radiance = self._shaded(look, self._emitters[row], row)
+        self._add_indirect(radiance, look, self._emitters[row], self._emission)
+        if self._led_model.pump_spread_nm > 0.0:
+            radiance *= self._colour_of(led)
+        return radiance
 
     def _panel(self, look: Look, panel: int) -> Radiance:
-        """Radiance of the seen triangles under panel 1 to 4."""
+        """Radiance of the sites under panel 1 to 4."""
         if not self._panels:
             return panel_radiance(look.view, self._scene.materials, self.reference_lux)
         if panel > len(self._panels):
-            return np.zeros((len(look.view.sides), 3), np.float32)
+            return np.zeros((len(look.view.points_mm), 3), np.float32)
         return _remembered(look, -panel, lambda: self._lit_by_panel(look, panel))
 
     def _lit_by_panel(self, look: Look, panel: int) -> Radiance:
         count = panels.PARTS**2
-        radiance = np.zeros((len(look.view.sides), 3), np.float32) + self._indirect(
-            look, self._panels[panel - 1][0]
-        )
+        radiance = np.zeros((len(look.view.points_mm), 3), np.float32)
+        self._add_indirect(radiance, look, self._panels[panel - 1][0], "lambertian")
         for piece in range((panel - 1) * count, panel * count):
             radiance += self._shaded(look, self._pieces[piece], len(self._emitters) + piece, "lambertian")
         return radiance
 
     def _shaded(self, look: Look, emitter: Emitter, row: int, emission: str = "") -> Radiance:
-        radiance = led_radiance(
-            look.view,
-            self._scene.materials,
-            emitter,
-            emission or self._emission,
-            look.places,
-            self._shadows.reached(row),
-        )
-        arm_shadow.cast(radiance, look.view.centroids_mm, look.arm_mm, emitter.centre_mm)
+        view, materials, emission = look.view, self._scene.materials, emission or self._emission
+        if look.places is not None:
+            reached = self._shadows.reached(row)
+            radiance = led_radiance(view, materials, emitter, emission, look.places, reached)
+        else:
+            radiance = led_radiance(view, materials, emitter, emission)
+            self._obstacles.cast(radiance, view.points_mm, view.triangle, view.normals, emitter.centre_mm)
+        arm_shadow.cast(radiance, view.points_mm, look.arm_mm, emitter.centre_mm)
         return radiance
 
-    def _indirect(self, look: Look, emitter: Emitter) -> Radiance:
-        """Radiance by interreflection; zeros if that is switched off."""
-        if self._interreflection is None or len(look.view.sides) == 0:
-            return np.zeros((len(look.view.sides), 3), np.float32)
-        from sim.render.interreflection import indirect_radiance
-
-        asked = self._interreflection
-        return indirect_radiance(look.prepared, emitter, bounces=asked.bounces, samples=asked.samples)
+    def _add_indirect(self, radiance: Radiance, look: Look, emitter: Emitter, emission: str) -> None:
+        """Add what interreflection makes of a light, if it is on."""
+        between, asked = self._exchange, self._interreflection
+        if between is None or asked is None or len(radiance) == 0:
+            return
+        if look.around is None:
+            look.around = neighbourhood(between, self._scene.corners_mm, look.view.sides, look.view.normals)
+        lux = indirect_lux(between, self._obstacles, emitter, emission, look.arm_mm, asked.bounces)
+        add_indirect(radiance, lux, look.around, look.albedo, look.view.triangle)
 
     def _colour_of(self, led: int) -> NDArray[np.float32]:
         """[3] signal of white under this LED relative to the median one, at equal flux."""
@@ -314,5 +331,5 @@ def _reference_lux(emitters: list[Emitter], base_from_support: Transform) -> flo
 def _surface(mesh: MeshConfig, settings: Settings) -> Surface:
     given = mesh.material or settings.material
     material = Material(mesh.path.stem, given.diffuse, given.f0, given.roughness) if given else None
-    surface = load_surface(mesh.path, mesh.unit, material)
+    surface = load_surface(mesh.path, mesh.unit, material, settings.detail)
     return settings.stickers.on(surface) if settings.stickers else surface

@@ -57,7 +57,7 @@ def fixed_pattern(model: SensorModel, height_px: int, width_px: int) -> FixedPat
 
 def expose(
     out: NDArray[np.uint16],
-    triangle: NDArray[np.int32],
+    site: NDArray[np.int32],
     radiance: NDArray[np.float32],
     falloff: NDArray[np.float32],
     *,
@@ -71,7 +71,7 @@ def expose(
 ) -> None:
     """Fill `out` [h, w] with one frame, DN.
 
-    `triangle` [h k, w k] holds, for k x k samples of each pixel, a row of `radiance` [seen, 3], or -1 for nothing;
+    `site` [h k, w k] holds, for k x k samples of each pixel, a row of `radiance` [sites, 3], or -1 for nothing;
     the pixel takes their mean. Radiance times `falloff` [h, w] times `electrons_per_radiance` is the mean number
     of electrons of a pixel with response 1. `exposure_s` and `temperature_c` set dark current and ambient light,
     `gain` divides the electrons per DN. `more_e` [h, w] are mean electrons of other light, such as that of lamps
@@ -81,21 +81,21 @@ def expose(
         InputError: The shapes do not fit together.
     """
     height, width = out.shape
-    k = triangle.shape[0] // height
-    if k < 1 or triangle.shape != (height * k, width * k) or falloff.shape != out.shape:
+    k = site.shape[0] // height
+    if k < 1 or site.shape != (height * k, width * k) or falloff.shape != out.shape:
         raise InputError(
-            f"sensor: expected triangles of k times {out.shape} parts and a falloff of {out.shape}; "
-            f"found {triangle.shape} and {falloff.shape}; render for the camera's size"
+            f"sensor: expected sites of k times {out.shape} parts and a falloff of {out.shape}; "
+            f"found {site.shape} and {falloff.shape}; render for the camera's size"
         )
     mean_e = np.empty(out.shape, np.float32)
-    _collect(mean_e, triangle, radiance, falloff, model.channels(), electrons_per_radiance)
+    _collect(mean_e, site, radiance, falloff, model.channels(), electrons_per_radiance)
     if more_e is not None:
         mean_e += more_e
     _develop(out, mean_e, *_settings(model, out.shape, frame, exposure_s, gain, temperature_c))
 
 
 def electrons(
-    triangle: NDArray[np.int32],
+    site: NDArray[np.int32],
     radiance: NDArray[np.float32],
     falloff: NDArray[np.float32],
     *,
@@ -103,20 +103,9 @@ def electrons(
 ) -> NDArray[np.float32]:
     """[h, w, 3] mean electrons in all three channels at every pixel, for stages before the Bayer filter, such as
     the lens's blur. Arguments as in `expose`."""
-    seen = np.vstack([radiance, np.zeros((1, 3), np.float32)])  # index -1 (nothing) is the row of zeros
-    k = len(triangle) // len(falloff)
-    mean_e = np.zeros((*falloff.shape, 3), np.float32)
-    for part in range(k * k):
-        mean_e += seen[triangle[part // k :: k, part % k :: k]]
-    mean_e *= (falloff * np.float32(electrons_per_radiance / (k * k)))[..., None]
+    mean_e = np.empty((*falloff.shape, 3), np.float32)
+    _collect_all(mean_e, site, radiance, falloff, electrons_per_radiance)
     return mean_e
-
-
-def mosaic(image: NDArray[np.float32], model: SensorModel) -> NDArray[np.float32]:
-    """[h, w] of an image [h, w, 3] after the Bayer filter, for `expose_electrons`."""
-    height, width, _ = image.shape
-    rows, columns = np.ogrid[:height, :width]
-    return np.ascontiguousarray(image[rows, columns, model.channels()[rows & 1, columns & 1]])
 
 
 def expose_electrons(
@@ -182,23 +171,42 @@ def _fill_pattern(response, offset_e, dark, hot, figures, response_key, dark_key
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _collect(mean_e, triangle, radiance, falloff, channels, electrons):  # type: ignore[no-untyped-def]
+def _collect(mean_e, site, radiance, falloff, channels, electrons):  # type: ignore[no-untyped-def]
     height, width = mean_e.shape
-    k = len(triangle) // height
+    k = len(site) // height
     share = np.float32(electrons / (k * k))
     for row in numba.prange(height):
         for col in range(width):
             channel = channels[row & 1, col & 1]
             total = np.float32(0.0)
             if k == 1:
-                if triangle[row, col] >= 0:
-                    total = radiance[triangle[row, col], channel]
+                if site[row, col] >= 0:
+                    total = radiance[site[row, col], channel]
             else:
                 for y in range(row * k, row * k + k):
                     for x in range(col * k, col * k + k):
-                        if triangle[y, x] >= 0:
-                            total += radiance[triangle[y, x], channel]
+                        if site[y, x] >= 0:
+                            total += radiance[site[y, x], channel]
             mean_e[row, col] = total * falloff[row, col] * share
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _collect_all(mean_e, site, radiance, falloff, electrons):  # type: ignore[no-untyped-def]
+    height, width, _ = mean_e.shape
+    k = len(site) // height
+    share = np.float32(electrons / (k * k))
+    for row in numba.prange(height):
+        for col in range(width):
+            red, green, blue = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            for y in range(row * k, row * k + k):
+                for x in range(col * k, col * k + k):
+                    place = site[y, x]
+                    if place >= 0:
+                        red, green = red + radiance[place, 0], green + radiance[place, 1]
+                        blue += radiance[place, 2]
+            scale = falloff[row, col] * share
+            mean_e[row, col, 0], mean_e[row, col, 1] = red * scale, green * scale
+            mean_e[row, col, 2] = blue * scale
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)

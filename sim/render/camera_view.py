@@ -1,8 +1,13 @@
-"""The view from one camera pose: a triangle for each pixel, and the shading data of each triangle seen."""
+"""The view from one camera pose: what each pixel sees, and the sites at which light on it is computed.
+
+Shaded `flat`, the sites are the centroids of the triangles seen: one radiance for each triangle. Shaded by
+`pixel`, each pixel has its own: for each triangle that its rays meet, the mean of the points where they do.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numba
 import numpy as np
@@ -10,41 +15,51 @@ from numpy.typing import NDArray
 
 from coupole.geometry import Transform
 from sim.render.embree import centroid_and_normal
+from sim.render.fine_surface import Fine, fine_surface
 from sim.render.lens import Lens, Sight, sight
+from sim.render.pixel_sites import pixel_sites
 from sim.render.raster import visible_triangles
 from sim.scene.scene import Scene
+
+Shading = Literal["pixel", "flat"]
 
 
 @dataclass(frozen=True)
 class View:
-    """`triangle` [h k, w k] int32: row of the tables below that a pixel (or its k x k samples) sees, or -1."""
+    """Tables of the triangles seen, and of the sites on them; all in the base frame."""
 
+    site: NDArray[np.int32]
+    """[h k, w k] row of the tables of sites that a pixel (or each of its k x k rays) sees, or -1."""
+    points_mm: NDArray[np.float32]
+    """[sites, 3]."""
     triangle: NDArray[np.int32]
+    """[sites] row of the tables of triangles."""
+    fine: Fine | None
+    """What the sites' surface has beyond its triangles; None: nothing."""
+    eye_mm: NDArray[np.float64]
+    """[3] the projection centre."""
     sides: NDArray[np.int64]
     """[seen] 2 t if the front of the scene's triangle t is seen (counter-clockwise), 2 t + 1 for its back."""
-    centroids_mm: NDArray[np.float32]
-    """[seen, 3] in the base frame, as all below."""
     normals: NDArray[np.float32]
     """[seen, 3] flat unit normals of the sides seen."""
     shading_normals: NDArray[np.float32]
     """[seen, 3]; the flat ones if the scene has no others."""
-    towards_camera: NDArray[np.float32]
-    """[seen, 3] unit."""
     diffuse: NDArray[np.float32]
     """[seen, 3] reflectance, tint included."""
     material: NDArray[np.int32]
     """[seen] row of the scene's materials."""
 
-    def depth_mm(self, base_from_camera: Transform) -> NDArray[np.float32]:
-        """[h k, w k] depth of each pixel along the optical axis; infinite where it sees nothing."""
+    def depth_mm(self, base_from_camera: Transform, samples: int) -> NDArray[np.float32]:
+        """[h, w] depth along the optical axis of what the ray in the middle of each pixel's `samples` x `samples`
+        sees; infinite where it sees nothing."""
         axis, eye = base_from_camera[:3, 2], base_from_camera[:3, 3]
-        depths = np.append(self.centroids_mm @ axis - eye @ axis, np.inf).astype(np.float32)
-        of_pixel: NDArray[np.float32] = depths[self.triangle]
+        depths = np.append(self.points_mm @ axis.astype(np.float32) - np.float32(eye @ axis), np.float32(np.inf))
+        of_pixel: NDArray[np.float32] = depths[self.site[samples // 2 :: samples, samples // 2 :: samples]]
         return of_pixel
 
     def empty(self, samples: int) -> NDArray[np.float32]:
         """[h, w] fraction of each pixel's `samples` x `samples` that see nothing."""
-        nothing = self.triangle < 0
+        nothing = self.site < 0
         if samples > 1:
             height, width = nothing.shape
             nothing = nothing.reshape(height // samples, samples, width // samples, samples)
@@ -55,25 +70,30 @@ class View:
 class Viewer:
     """Views of one scene through one lens, from any pose; `samples` k divides pixels into k x k."""
 
-    def __init__(self, scene: Scene, lens: Lens, samples: int = 1) -> None:
+    def __init__(self, scene: Scene, lens: Lens, samples: int = 1, shading: Shading = "flat") -> None:
         self._scene = scene
         self._sight: Sight = sight(lens.supersampled(samples))
+        self._shading = shading
 
     def look(self, base_from_camera: Transform) -> View:
         """Rasterise from a pose."""
         scene = self._scene
-        triangle, seen = visible_triangles(scene.corners_mm, self._sight, base_from_camera)
-        sides = np.empty(len(seen), np.int64)
-        centroids, normals, towards = (np.empty((len(seen), 3), np.float32) for _ in range(3))
-        _gather(scene.corners_mm, seen, base_from_camera[:3, 3].copy(), sides, centroids, normals, towards)
+        site, seen = visible_triangles(scene.corners_mm, self._sight, base_from_camera)
+        eye = base_from_camera[:3, 3].copy()
+        sides, triangle, fine = np.empty(len(seen), np.int64), np.arange(len(seen), dtype=np.int32), None
+        points, normals = (np.empty((len(seen), 3), np.float32) for _ in range(2))
+        _gather(scene.corners_mm, seen, eye, sides, points, normals)
         shading = normals
         if scene.normals is not None:
             shading = scene.normals[seen] * np.where(sides & 1, np.float32(-1), np.float32(1))[:, None]
         material = scene.material[seen]
+        if self._shading == "pixel":
+            points, triangle = pixel_sites(site, points, normals, self._sight, base_from_camera)
+            fine = fine_surface(scene.waves, points, triangle, shading, material, sides)
         diffuse = scene.materials[material, :3].astype(np.float32)
         if scene.tint is not None:
             diffuse *= scene.tint[seen]
-        return View(triangle, sides, centroids, normals, shading, towards, diffuse, material)
+        return View(site, points, triangle, fine, eye, sides, normals, shading, diffuse, material)
 
 
 def tangents(through: Sight) -> NDArray[np.float64]:
@@ -87,17 +107,16 @@ def tangents(through: Sight) -> NDArray[np.float64]:
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _gather(corners, seen, eye, sides, centroids, normals, towards):  # type: ignore[no-untyped-def]
+def _gather(corners, seen, eye, sides, centroids, normals):  # type: ignore[no-untyped-def]
     chunk = 4096
     for part in numba.prange(-(-len(seen) // chunk)):
         centroid, normal = np.empty(3), np.empty(3)
         for i in range(part * chunk, min(len(seen), (part + 1) * chunk)):
             centroid_and_normal(corners, seen[i], centroid, normal)
-            x, y, z = eye[0] - centroid[0], eye[1] - centroid[1], eye[2] - centroid[2]
-            distance = np.sqrt(x * x + y * y + z * z)
-            back = x * normal[0] + y * normal[1] + z * normal[2] < 0.0
-            sides[i] = 2 * seen[i] + back
-            towards[i, 0], towards[i, 1], towards[i, 2] = x / distance, y / distance, z / distance
+            back = 0.0
+            for k in range(3):
+                back += (eye[k] - centroid[k]) * normal[k]
+            sides[i] = 2 * seen[i] + (back < 0.0)
             for k in range(3):
                 centroids[i, k] = centroid[k]
-                normals[i, k] = -normal[k] if back else normal[k]
+                normals[i, k] = -normal[k] if back < 0.0 else normal[k]

@@ -27,6 +27,10 @@ _COHERENT, _ALL_FEATURES = 1 << 16, 0xFFFFFFFF
 _ARGUMENTS = np.array([_ALL_FEATURES << 32 | _COHERENT, 0, 0, 0, 0, 0], np.uint64)
 """RTCOccludedArguments: flags, features; no context, filter or function. Rays from neighbouring triangles to one
 light are coherent: they traverse the tree alike."""
+_SCATTERED = np.array([_ALL_FEATURES << 32, 0, 0, 0, 0, 0], np.uint64)
+"""RTCIntersectArguments, for rays in all directions."""
+_HIT_ROWS = 9
+"""Rows of RTCHit16 after those of the rays: normal xyz, u, v, triangle, geometry, instance, its part."""
 OFFSET_MM = 2e-3
 """Height above its triangle, on the light's side, at which a shadow ray starts: ten times the rounding of float32
 coordinates of 2 m, and a hundredth of a scanned triangle."""
@@ -55,6 +59,7 @@ class _Library:
         self.release_scene = self._bind("rtcReleaseScene", None, pointer)
         self.release_device = self._bind("rtcReleaseDevice", None, pointer)
         self.occluded = np.uint64(ctypes.cast(self._library.rtcOccluded16, pointer).value or 0)
+        self.intersect = np.uint64(ctypes.cast(self._library.rtcIntersect16, pointer).value or 0)
 
     def _bind(self, name: str, result: Any, *arguments: Any) -> Any:
         function = getattr(self._library, name)
@@ -104,14 +109,38 @@ class Obstacles:
         address, scene = self._library.occluded, np.uint64(self._scene)
         _trace(address, scene, self.corners_mm, sides, light_mm, first, bits, _ARGUMENTS)
 
+    def cast(
+        self,
+        radiance: NDArray[np.float32],
+        points_mm: NDArray[np.float32],
+        triangle: NDArray[np.int32],
+        normals: NDArray[np.float32],
+        light_mm: NDArray[np.float64],
+    ) -> None:
+        """Set `radiance` [n, 3] to 0 where an obstacle is between a light's centre and a point [n, 3].
+
+        Each is on a triangle of flat unit normal `normals[triangle[i]]`, which faces the light wherever there is
+        radiance."""
+        address, scene = self._library.occluded, np.uint64(self._scene)
+        _cast(address, scene, points_mm, triangle, normals, light_mm, radiance, _ARGUMENTS)
+
+    def first_met(self, origins_mm: NDArray[np.float32], ways: NDArray[np.float32]) -> NDArray[np.int32]:
+        """[n] side of a triangle, as in `trace`, that rays from points [n, 3] in directions [n, 3] meet first, or
+        -1."""
+        met = np.empty(len(origins_mm), np.int32)
+        address, scene = self._library.intersect, np.uint64(self._scene)
+        _meet(address, scene, self.corners_mm, origins_mm, ways, met, _SCATTERED)
+        return met
+
     def __del__(self) -> None:
         if hasattr(self, "_scene"):
             self._library.release_scene(self._scene)
             self._library.release_device(self._device)
 
 
-def _occluded16(_context, _address, _valid, _scene, _rays, _arguments):  # type: ignore[no-untyped-def]
-    """`rtcOccluded16(valid, scene, rays, arguments)` with its address as argument, so that code can be cached."""
+def _packet_call(_context, _address, _valid, _scene, _rays, _arguments):  # type: ignore[no-untyped-def]
+    """`rtcOccluded16` or `rtcIntersect16` (valid, scene, rays, arguments), its address as argument: such code can
+    be cached."""
 
     def generate(context, builder, _signature, values):  # type: ignore[no-untyped-def]
         word = ir.IntType(64)
@@ -123,7 +152,7 @@ def _occluded16(_context, _address, _valid, _scene, _rays, _arguments):  # type:
     return types.void(types.uint64, types.uint64, types.uint64, types.uint64, types.uint64), generate
 
 
-_call_occluded16: Any = intrinsic(_occluded16)
+_call_embree: Any = intrinsic(_packet_call)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -167,7 +196,7 @@ def _trace(occluded, scene, corners, sides, light, first, bits, arguments):  # t
                 lane += 1
             if lane == _PACKET or (place == last - 1 and lane > 0):
                 valid[lane:] = 0
-                _call_occluded16(
+                _call_embree(
                     occluded,
                     np.uint64(valid.ctypes.data),
                     scene,
@@ -180,12 +209,76 @@ def _trace(occluded, scene, corners, sides, light, first, bits, arguments):  # t
                 lane = 0
 
 
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _cast(occluded, scene, points, triangle, normals, light, radiance, arguments):  # type: ignore[no-untyped-def]
+    for chunk in numba.prange(-(-len(points) // _CHUNK)):
+        rays, words, valid = _packet()
+        site_of_lane = np.empty(_PACKET, np.int64)
+        lane = 0
+        last = min(len(points), (chunk + 1) * _CHUNK)
+        for i in range(chunk * _CHUNK, last):
+            if radiance[i, 0] != 0.0 or radiance[i, 1] != 0.0 or radiance[i, 2] != 0.0:
+                for k in range(3):
+                    origin = np.float32(np.float64(points[i, k]) + OFFSET_MM * np.float64(normals[triangle[i], k]))
+                    rays[k, lane], rays[4 + k, lane] = origin, np.float32(light[k] - origin)
+                rays[3, lane], rays[8, lane] = 0.0, 1.0
+                words[9, lane], words[11, lane] = np.uint32(0xFFFFFFFF), np.uint32(0)
+                valid[lane], site_of_lane[lane] = -1, i
+                lane += 1
+            if lane == _PACKET or (i == last - 1 and lane > 0):
+                valid[lane:] = 0
+                _call_embree(
+                    occluded,
+                    np.uint64(valid.ctypes.data),
+                    scene,
+                    np.uint64(rays.ctypes.data),
+                    np.uint64(arguments.ctypes.data),
+                )
+                for k in range(lane):
+                    if rays[8, k] < 0.0:
+                        radiance[site_of_lane[k], :] = 0.0
+                lane = 0
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _meet(intersect, scene, corners, origins, ways, met, arguments):  # type: ignore[no-untyped-def]
+    for chunk in numba.prange(-(-len(met) // _CHUNK)):
+        rays, words, valid = _packet()
+        centroid, normal = np.empty(3), np.empty(3)
+        last = min(len(met), (chunk + 1) * _CHUNK)
+        for first in range(chunk * _CHUNK, last, _PACKET):
+            count = min(_PACKET, last - first)
+            valid[:count], valid[count:] = -1, 0
+            for lane in range(count):
+                for k in range(3):
+                    rays[k, lane], rays[4 + k, lane] = origins[first + lane, k], ways[first + lane, k]
+            rays[3, :], rays[8, :] = 0.0, np.inf
+            words[9, :], words[11, :] = np.uint32(0xFFFFFFFF), np.uint32(0)
+            words[18, :] = np.uint32(0xFFFFFFFF)  # no geometry met
+            _call_embree(
+                intersect,
+                np.uint64(valid.ctypes.data),
+                scene,
+                np.uint64(rays.ctypes.data),
+                np.uint64(arguments.ctypes.data),
+            )
+            for lane in range(count):
+                met[first + lane] = -1
+                if words[18, lane] != np.uint32(0xFFFFFFFF):
+                    triangle, facing = np.int64(words[17, lane]), 0.0
+                    centroid_and_normal(corners, triangle, centroid, normal)
+                    for k in range(3):
+                        facing += ways[first + lane, k] * normal[k]
+                    met[first + lane] = 2 * triangle + (facing > 0.0)
+
+
 @numba.njit(cache=True, nogil=True)
 def _packet():  # type: ignore[no-untyped-def]
-    """Memory of one RTCRay16, aligned to 64 bytes: 12 rows of 16 (org xyz, tnear, dir xyz, time, tfar, mask, id,
-    flags) as float32 and as uint32, and the 16 lanes' valid mask."""
-    memory = np.zeros(13 * _PACKET + 16, np.float32)
+    """Memory of one RTCRayHit16, aligned to 64 bytes: 12 rows of 16 for the rays (org xyz, tnear, dir xyz, time,
+    tfar, mask, id, flags) and those of the hits, as float32 and as uint32; and the 16 lanes' valid mask."""
+    rows = 12 + _HIT_ROWS
+    memory = np.zeros((rows + 1) * _PACKET + 16, np.float32)
     skip = np.int64((-np.int64(memory.ctypes.data) // 4) % 16)
-    rays = memory[skip : skip + 12 * _PACKET].reshape(12, _PACKET)
-    valid = memory[skip + 12 * _PACKET : skip + 13 * _PACKET].view(np.int32)
+    rays = memory[skip : skip + rows * _PACKET].reshape(rows, _PACKET)
+    valid = memory[skip + rows * _PACKET : skip + (rows + 1) * _PACKET].view(np.int32)
     return rays, rays.view(np.uint32), valid

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 LED_SIDE_MM = 7.0
-FAR_SIDES = 30.0
-"""At this distance in sides, 2 x 2 Gauss points differ from the polygon by less than 1e-6 if the emitter is
-above the horizon by a tenth of its distance (measured in tests/unit/render/test_emitter.py)."""
+FAR_SIDES = 36.0
+"""From this distance in sides, 2 x 2 Gauss points differ from the polygon by less than 1e-6 if all of the emitter
+is above the horizon (measured in tests/sim/render/test_emitter.py)."""
 _GAUSS = 1.0 / np.sqrt(3.0)
 
 
@@ -123,7 +123,11 @@ def per_lumen(px, py, pz, nx, ny, nz, led, shares, work):  # type: ignore[no-unt
     half2 = led[6] * led[6] + led[7] * led[7] + led[8] * led[8]
     distance2 = tx * tx + ty * ty + tz * tz
     height = tx * nx + ty * ny + tz * nz
-    if distance2 < 4.0 * half2 * FAR_SIDES * FAR_SIDES or height * height < 0.01 * distance2:
+    # Twice the height of the highest corner above the centre: half of it is enough to be above the horizon.
+    reach = 2.0 * abs(led[6] * nx + led[7] * ny + led[8] * nz) + 2.0 * abs(
+        led[9] * nx + led[10] * ny + led[11] * nz
+    )
+    if distance2 < 4.0 * half2 * FAR_SIDES * FAR_SIDES or height < reach:
         exact = _polygon(tx, ty, tz, nx, ny, nz, led, work) / (8.0 * np.pi * half2) * 1e6
         if total > 0.0:
             for k in range(4):

@@ -1,168 +1,331 @@
-"""Interreflections, computed with Mitsuba: light that meets two or more surfaces, which `sim.render` omits.
+"""Interreflection: light that meets two or more surfaces, from patch to patch (radiosity by final gathering).
 
-    prepared = prepare(scene, view.sides >> 1, view.towards_camera)
-    radiance += indirect_radiance(prepared, emitter)
+The scene's triangles are grouped into patches of like normal. From points on both sides of each patch, rays in a
+cosine distribution tell once which sides of patches it sees. Then, for each light, the irradiance of all patches
+is gathered bounce by bounce: a side receives the mean over its rays of what the others reflect.
 
-A radiance meter looks at each seen triangle's centroid from the camera's direction. It computes paths of up to
-`bounces` surfaces, then those of one surface alone; the difference met at least two surfaces. Far from a small
-emitter direct light has almost no noise, so little of it remains in the difference (tested: below 1e-3 of it).
-Triangles are flat here (no `Scene.normals`), Schlick's Fresnel factor is replaced by that of a real index, and
-LEDs are Lambertian.
+All surfaces reflect this light as if they were diffuse, with their diffuse reflectance and that along the normal:
+right for matt surfaces, an approximation for glossy ones, and wrong in direction for mirrors. Concave places finer
+than patches, normals for shading and detail finer than the mesh are left out.
 """
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
+import numba
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from coupole.appearance.render import variant
-from coupole.appearance.render.bands import Description
-from sim.render.emitter import Emitter
+from sim.render import arm_shadow
+from sim.render.embree import OFFSET_MM, Obstacles, centroid_and_normal
+from sim.render.emitter import Emitter, irradiance
 from sim.scene.scene import Scene
 
-_START_MM = 0.05
-"""Distance of a meter from its triangle: a quarter of a scanned triangle."""
-_MM2 = 1e-6
-_BATCH = 20_000
-_LEAST_ROUGHNESS = 0.01
+POINTS = 4
+"""Points on each side of a patch where its light is computed."""
+PATCHES_OF_A_MATERIAL = 1000
+"""Their size follows from the area of all triangles of a material divided by this number."""
+_NEIGHBOURS = 8
+_LEAST_WEIGHT = 1e-6
+_CELL_BITS, _OFFSET_CELLS = 16, 1 << 15
+_CHUNK = 4096
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """Shapes of a scene and meters on the seen triangles; valid for all LEDs of a pose."""
+class Exchange:
+    """Patches of a scene, and what each side sees. Row 2 p is the front of patch p, row 2 p + 1 its back."""
 
-    shapes: dict[str, Any]
-    meters: list[Any]
-    """Each a batch of at most `_BATCH` triangles."""
-    origin_mm: NDArray[np.float64]
-    """Origin of Mitsuba's frame, at the object, for the sake of its single precision."""
-
-
-def prepare(scene: Scene, triangles: NDArray[np.integer], towards_camera: ArrayLike) -> Prepared:
-    """Shapes and meters for the scene's `triangles` [seen], seen from unit directions [seen, 3].
-
-    Takes about 50 us per triangle. Raises InputError without Mitsuba.
-    """
-    mi = variant.mitsuba("scalar_rgb")
-    centroids = scene.corners_mm[triangles].mean(axis=1, dtype=np.float64)
-    origin = centroids.mean(axis=0)
-    towards = np.asarray(towards_camera, dtype=np.float64)
-    starts = centroids - origin + _START_MM * towards
-    meters = [
-        _meters(mi, starts[first : first + _BATCH], -towards[first : first + _BATCH])
-        for first in range(0, len(triangles), _BATCH)
-    ]
-    return Prepared(_shapes(mi, scene, origin), meters, origin)
+    patch: NDArray[np.int32]
+    """[triangles]."""
+    points_mm: NDArray[np.float32]
+    """[2 patches * POINTS, 3], where light is computed."""
+    normals: NDArray[np.float32]
+    """[2 patches * POINTS, 3] flat unit normals there."""
+    albedo: NDArray[np.float32]
+    """[2 patches, 3]."""
+    seen: NDArray[np.int32]
+    """[2 patches, rays] side that each ray meets, or -1."""
+    neighbours: NDArray[np.int32]
+    """[patches, _NEIGHBOURS] nearest patches of the same material, itself first; filled up with itself."""
+    centres_mm: NDArray[np.float32]
+    """[patches, 3]."""
+    facing: NDArray[np.float32]
+    """[patches, 3] unit normal of the front."""
+    cells_mm: NDArray[np.float32]
+    """[patches] size."""
 
 
-def indirect_radiance(
-    prepared: Prepared, emitter: Emitter, *, bounces: int = 4, samples: int = 64, seed: int = 1
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Sides of patches around each triangle of a view, with weights of sum 1."""
+
+    sides: NDArray[np.int32]
+    """[seen, _NEIGHBOURS]."""
+    weights: NDArray[np.float32]
+    """[seen, _NEIGHBOURS]."""
+
+
+def exchange(scene: Scene, obstacles: Obstacles, rays: int) -> Exchange:
+    """Divide a scene into patches, and trace `rays`, rounded up to a multiple of POINTS, from each side."""
+    key, cells_mm = _keys(scene)
+    order = np.argsort(key, kind="stable")
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    counts = np.diff(np.append(starts, len(order)))
+    patch = np.empty(len(order), np.int32)
+    patch[order] = np.repeat(np.arange(len(starts), dtype=np.int32), counts)
+    # Evenly among the patch's triangles, in the order of the mesh.
+    shares = (np.arange(POINTS) + 0.5) / POINTS
+    chosen = order[starts[:, None] + (shares * counts[:, None]).astype(np.int64)]
+    points, normals = np.empty((2, len(starts), 2, POINTS, 3), np.float32)
+    _place(scene.corners_mm, chosen, points, normals)
+    facing = normals[:, 0].sum(axis=1)
+    facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), np.float32(1e-9))
+    material = scene.material[order[starts]]
+    diffuse = scene.materials[material, :3]
+    if scene.tint is not None:
+        diffuse = diffuse * np.add.reduceat(scene.tint[order].astype(np.float64), starts, axis=0) / counts[:, None]
+    albedo = np.repeat((diffuse + scene.materials[material, 3:6]).astype(np.float32), 2, axis=0)
+    centres = points[:, 0].mean(axis=1)
+    seen = _seen(obstacles, points.reshape(-1, 3), normals.reshape(-1, 3), patch, -(-rays // POINTS))
+    return Exchange(
+        patch,
+        points.reshape(-1, 3),
+        normals.reshape(-1, 3),
+        albedo,
+        seen.reshape(2 * len(starts), -1),
+        _neighbours(centres, material),
+        centres,
+        facing,
+        cells_mm[material].astype(np.float32),
+    )
+
+
+def neighbourhood(
+    between: Exchange, corners_mm: NDArray[np.float32], sides: NDArray[np.int64], normals: NDArray[np.float32]
+) -> Neighbourhood:
+    """Where light from other surfaces is interpolated for sides [seen] of triangles, as in `View`."""
+    shape = (len(sides), _NEIGHBOURS)
+    found = Neighbourhood(np.empty(shape, np.int32), np.empty(shape, np.float32))
+    _weigh(
+        corners_mm,
+        sides,
+        normals,
+        between.patch,
+        between.neighbours,
+        between.centres_mm,
+        between.facing,
+        between.cells_mm,
+        found.sides,
+        found.weights,
+    )
+    return found
+
+
+def indirect_lux(
+    between: Exchange,
+    obstacles: Obstacles,
+    emitter: Emitter,
+    emission: str,
+    arm_mm: NDArray[np.float64],
+    bounces: int,
 ) -> NDArray[np.float32]:
-    """[seen, 3] lm/(m^2 sr), red green blue: light that met 2 to `bounces` surfaces."""
-    mi = variant.mitsuba("scalar_rgb")
-    light = _square(mi, emitter, prepared.origin_mm)
-    sums = []
-    for surfaces in (bounces, 1):
-        integrator = {"type": "path", "max_depth": surfaces + 1, "rr_depth": surfaces + 2}
-        whole = variant.loaded(mi, {"type": "scene", "integrator": integrator, "light": light, **prepared.shapes})
-        rows = [
-            np.array(mi.render(whole, sensor=meter, spp=samples, seed=seed + number), np.float64)[0]
-            for number, meter in enumerate(prepared.meters)
-        ]
-        sums.append(np.concatenate(rows))
-    radiance: NDArray[np.float32] = (sums[0] - sums[1]).astype(np.float32)
-    return radiance
+    """[sides, 3] lux by light that has met 1 to `bounces` - 1 surfaces; `arm_mm` are capsules in its way."""
+    direct = irradiance(emitter, between.points_mm, between.normals, emission)
+    lit = np.repeat(direct.astype(np.float32)[:, None], 3, axis=1)
+    rows = np.arange(len(lit), dtype=np.int32)
+    obstacles.cast(lit, between.points_mm, rows, between.normals, emitter.centre_mm)
+    arm_shadow.cast(lit, between.points_mm, arm_mm, emitter.centre_mm)
+    sent = lit.reshape(-1, POINTS, 3).mean(axis=1) * between.albedo
+    total: NDArray[np.float32] = np.zeros_like(sent)
+    for _ in range(bounces - 1):
+        received = np.empty_like(sent)
+        _gather_light(between.seen, sent, received)
+        total += received
+        sent = received * between.albedo
+    return total
 
 
-def _meters(mi: Any, starts_mm: NDArray[np.float64], directions: NDArray[np.float64]) -> Any:
-    pixel = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
-    film = {**pixel, "width": len(starts_mm), "component_format": "float32"}
-    meters = {
-        f"meter{number:06d}": {"type": "radiancemeter", "origin": start, "direction": direction, "film": pixel}
-        for number, (start, direction) in enumerate(zip(starts_mm.tolist(), directions.tolist(), strict=True))
-    }
-    return variant.loaded(mi, {"type": "batch", "film": film, **meters})
+def add_indirect(
+    radiance: NDArray[np.float32],
+    lux: NDArray[np.float32],
+    around: Neighbourhood,
+    albedo: NDArray[np.float32],
+    triangle: NDArray[np.int32],
+) -> None:
+    """Add to `radiance` [sites, 3] what irradiances of the sides of patches, `lux` [sides, 3], make of sites of
+    `albedo` [sites, 3] on the view's triangles [sites]."""
+    of_triangle = np.empty((len(around.sides), 3), np.float32)
+    _interpolate(around.sides, around.weights, lux, of_triangle)
+    _add(radiance, of_triangle, albedo, triangle)
 
 
-def _shapes(mi: Any, scene: Scene, origin_mm: NDArray[np.float64]) -> dict[str, Any]:
-    """A mesh for each material, with its tint by triangle."""
-    import trimesh
+def _keys(scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """A number for each triangle [triangles], equal within a patch; and the size of each material's patches."""
+    count = len(scene.corners_mm)
+    area, key = np.empty(count, np.float32), np.empty(count, np.int64)
+    _areas(scene.corners_mm, area)
+    of_material = np.bincount(scene.material, area.astype(np.float64), len(scene.materials))
+    cells_mm = np.maximum(np.sqrt(of_material / PATCHES_OF_A_MATERIAL), 1e-3)
+    # The cells' numbers must fit into their bits, however thinly a material is spread over the scene.
+    reach_mm = float(np.abs(scene.corners_mm).max(initial=1.0))
+    cells_mm = np.maximum(cells_mm, 1.01 * reach_mm / _OFFSET_CELLS)
+    _find_keys(scene.corners_mm, scene.material, cells_mm, key)
+    return key, cells_mm
 
-    shapes = {}
-    with tempfile.TemporaryDirectory(prefix="coupole-shapes-") as folder:
-        for row in np.unique(scene.material):
-            chosen = scene.material == row
-            corners = scene.corners_mm[chosen].reshape(-1, 3) - origin_mm
-            path = Path(folder) / f"{row}.ply"
-            trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False).export(path)
-            material = scene.materials[row]
-            tinted = scene.tint is not None
-            mesh = mi.load_dict(
-                {
-                    "type": "ply",
-                    "filename": str(path),
-                    "face_normals": True,
-                    "bsdf": {"type": "twosided", "material": _material(material, tinted=tinted)},
-                }
+
+def _neighbours(centres_mm: NDArray[np.float32], material: NDArray[np.int32]) -> NDArray[np.int32]:
+    from scipy.spatial import cKDTree
+
+    found = np.repeat(np.arange(len(centres_mm), dtype=np.int32)[:, None], _NEIGHBOURS, axis=1)
+    for one in np.unique(material):
+        mine = np.flatnonzero(material == one)
+        near = cKDTree(centres_mm[mine]).query(centres_mm[mine], k=np.arange(1, _NEIGHBOURS + 1))[1]
+        # cKDTree numbers what is missing by the number of points.
+        found[mine] = np.where(near < len(mine), mine[np.minimum(near, len(mine) - 1)], mine[:, None])
+    return found
+
+
+def _seen(
+    obstacles: Obstacles,
+    points: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    patch: NDArray[np.int32],
+    rays: int,
+) -> NDArray[np.int32]:
+    """[points, rays] side of a patch that each ray meets, or -1."""
+    seen = np.empty((len(points), rays), np.int32)
+    block = max(1, (1 << 22) // rays)
+    for first in range(0, len(points), block):
+        part = slice(first, min(len(points), first + block))
+        origins, ways = np.empty((2, (part.stop - first) * rays, 3), np.float32)
+        _aim(points[part], normals[part], first, rays, origins, ways)
+        met = obstacles.first_met(origins, ways)
+        side = np.where(met >= 0, 2 * patch[met >> 1] + (met & 1), -1)
+        seen[part] = side.reshape(-1, rays)
+    return seen
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _areas(corners, area):  # type: ignore[no-untyped-def]
+    for t in numba.prange(len(area)):
+        square = 0.0
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            one = np.float64(corners[t, 1, i] - corners[t, 0, i]) * np.float64(corners[t, 2, j] - corners[t, 0, j])
+            two = np.float64(corners[t, 1, j] - corners[t, 0, j]) * np.float64(corners[t, 2, i] - corners[t, 0, i])
+            square += (one - two) * (one - two)
+        area[t] = 0.5 * np.sqrt(square)
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _find_keys(corners, material, cells, key):  # type: ignore[no-untyped-def]
+    """Material, cell, and the axis to which the normal is nearest, with its sign."""
+    for chunk in numba.prange(-(-len(key) // _CHUNK)):
+        centroid, normal = np.empty(3), np.empty(3)
+        for t in range(chunk * _CHUNK, min(len(key), (chunk + 1) * _CHUNK)):
+            centroid_and_normal(corners, t, centroid, normal)
+            number, axis = np.int64(material[t]), 0
+            for k in range(3):
+                cell = np.int64(np.floor(centroid[k] / cells[material[t]])) + _OFFSET_CELLS
+                number = (number << _CELL_BITS) | cell
+                if abs(normal[k]) > abs(normal[axis]):
+                    axis = k
+            key[t] = number * 6 + 2 * axis + (normal[axis] < 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _place(corners, chosen, points, normals):  # type: ignore[no-untyped-def]
+    centroid, normal = np.empty(3), np.empty(3)
+    for patch in range(len(chosen)):
+        for number in range(chosen.shape[1]):
+            centroid_and_normal(corners, chosen[patch, number], centroid, normal)
+            for k in range(3):
+                points[patch, 0, number, k] = points[patch, 1, number, k] = centroid[k]
+                normals[patch, 0, number, k], normals[patch, 1, number, k] = normal[k], -normal[k]
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _aim(points, normals, first, rays, origins, ways):  # type: ignore[no-untyped-def]
+    """Rays from points, which are numbered from `first` on, in a cosine distribution: evenly over a disk, lifted
+    to the hemisphere. The points of a side share a Fibonacci spiral, which is turned by an angle of its own."""
+    total, golden = rays * POINTS, np.pi * (3.0 - np.sqrt(5.0))
+    for p in numba.prange(len(points)):
+        nx, ny, nz = np.float64(normals[p, 0]), np.float64(normals[p, 1]), np.float64(normals[p, 2])
+        # Duff et al., Building an orthonormal basis, revisited, 2017.
+        sign = 1.0 if nz >= 0.0 else -1.0
+        a = -1.0 / (sign + nz)
+        b = nx * ny * a
+        side = (first + p) // POINTS
+        turn = 2.0 * np.pi * ((side * 0.7548776662466927) % 1.0)
+        for ray in range(rays):
+            number = ray * POINTS + (first + p) % POINTS
+            share = (number + 0.5) / total
+            x, y = np.sqrt(share) * np.cos(number * golden + turn), np.sqrt(share) * np.sin(number * golden + turn)
+            z, at = np.sqrt(1.0 - share), p * rays + ray
+            ways[at, 0] = x * (1.0 + sign * nx * nx * a) + y * b + z * nx
+            ways[at, 1] = x * sign * b + y * (sign + ny * ny * a) + z * ny
+            ways[at, 2] = -x * sign * nx - y * ny + z * nz
+            for k in range(3):
+                origins[at, k] = points[p, k] + OFFSET_MM * normals[p, k]
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _gather_light(seen, sent, received):  # type: ignore[no-untyped-def]
+    for side in numba.prange(len(seen)):
+        red, green, blue = 0.0, 0.0, 0.0
+        for ray in range(seen.shape[1]):
+            other = seen[side, ray]
+            if other >= 0:
+                red, green, blue = red + sent[other, 0], green + sent[other, 1], blue + sent[other, 2]
+        rays = seen.shape[1]
+        received[side, 0], received[side, 1], received[side, 2] = red / rays, green / rays, blue / rays
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _weigh(corners, sides, normals, patch, neighbours, centres, facing, cells, found, weights):  # type: ignore[no-untyped-def]
+    """A smooth bump two patches wide, times how much the normals agree."""
+    for chunk in numba.prange(-(-len(sides) // _CHUNK)):
+        centroid, normal = np.empty(3), np.empty(3)
+        for i in range(chunk * _CHUNK, min(len(sides), (chunk + 1) * _CHUNK)):
+            centroid_and_normal(corners, sides[i] >> 1, centroid, normal)
+            back = sides[i] & 1
+            own, total = patch[sides[i] >> 1], 0.0
+            for n in range(neighbours.shape[1]):
+                other = neighbours[own, n]
+                squared, agree = 0.0, 0.0
+                for k in range(3):
+                    squared += (centroid[k] - centres[other, k]) ** 2
+                    agree += normal[k] * facing[other, k]
+                reach = 2.0 * np.float64(cells[own])
+                weight = max(0.0, 1.0 - squared / (reach * reach)) ** 2 * max(0.0, agree) ** 4
+                if n > 0 and other == own:
+                    weight = 0.0
+                found[i, n], weights[i, n] = 2 * other + back, weight
+                total += weight
+            if total < _LEAST_WEIGHT:
+                weights[i, :] = 0.0
+                weights[i, 0], total = 1.0, 1.0
+            for n in range(neighbours.shape[1]):
+                weights[i, n] /= total
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _interpolate(sides, weights, lux, out):  # type: ignore[no-untyped-def]
+    for i in numba.prange(len(out)):
+        red, green, blue = 0.0, 0.0, 0.0
+        for n in range(sides.shape[1]):
+            side, weight = sides[i, n], weights[i, n]
+            red, green, blue = (
+                red + weight * lux[side, 0],
+                green + weight * lux[side, 1],
+                blue + weight * lux[side, 2],
             )
-            if scene.tint is not None:
-                factor = _lambert(material) * scene.tint[chosen]
-                mesh.add_attribute("face_diffuse", 3, factor.astype(np.float32).ravel())
-            shapes[f"shape{row}"] = mesh
-    return shapes
+        out[i, 0], out[i, 1], out[i, 2] = red, green, blue
 
 
-def _material(figures: NDArray[np.float64], *, tinted: bool) -> Description:
-    """Lambert and GGX for a row of `Scene.materials`, blended half and half, each at twice its strength."""
-    plain = _figures(_lambert(figures))
-    body = {
-        "type": "diffuse",
-        "reflectance": {"type": "mesh_attribute", "name": "face_diffuse"} if tinted else plain,
-    }
-    if not _glossy(figures):
-        return body
-    f0 = np.clip(figures[3:6], 0.0, 0.9999)
-    index = (1.0 + np.sqrt(f0)) / (1.0 - np.sqrt(f0))
-    gloss = {
-        "type": "roughconductor",
-        "distribution": "ggx",
-        "alpha": max(float(figures[6]), _LEAST_ROUGHNESS),
-        "eta": _figures(index),
-        "k": _figures(np.zeros(3)),
-        "specular_reflectance": _figures(np.full(3, 2.0)),
-    }
-    return {"type": "blendbsdf", "weight": 0.5, "gloss": gloss, "body": body}
-
-
-def _lambert(figures: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Diffuse reflectance [3], doubled if it is one half of a blend."""
-    return np.asarray(figures[:3] * (2.0 if _glossy(figures) else 1.0))
-
-
-def _glossy(figures: NDArray[np.float64]) -> bool:
-    return bool(figures[6] > 0.0 and figures[3:6].any())
-
-
-def _figures(values: NDArray[np.float64]) -> Description:
-    """Three numbers without colour conversion."""
-    return {"type": "srgb", "color": values.tolist(), "unbounded": True}
-
-
-def _square(mi: Any, emitter: Emitter, origin_mm: NDArray[np.float64]) -> Description:
-    """The emitter as a rectangle whose sides run from -1 to 1 in its own frame."""
-    place = np.eye(4)
-    columns = (emitter.half_u_mm, emitter.half_v_mm, emitter.normal, emitter.centre_mm - origin_mm)
-    for column, vector in enumerate(columns):
-        place[:3, column] = vector
-    area_m2 = 4.0 * np.linalg.norm(emitter.half_u_mm) * np.linalg.norm(emitter.half_v_mm) * _MM2
-    radiance = np.full(3, emitter.flux_lm / (np.pi * area_m2))
-    return {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f(place),
-        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance.tolist()}},
-    }
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _add(radiance, lux, albedo, triangle):  # type: ignore[no-untyped-def]
+    for i in numba.prange(len(radiance)):
+        for k in range(3):
+            radiance[i, k] += lux[triangle[i], k] * albedo[i, k] * np.float32(1.0 / np.pi)

@@ -1,4 +1,4 @@
-"""Radiance of visible triangles towards the camera under one LED, or under a panel.
+"""Radiance of the sites of a view towards the camera under one LED, or under a panel.
 
 L = f E with f = diffuse / pi + D G F / (4 n.l n.v): Lambert and GGX with Smith's separable G (Walter et al. 2007,
 Eqs. 33 and 34) and Schlick's F, as in `surface.Material`. E is that of the whole square emitter; f is evaluated
@@ -26,21 +26,25 @@ def led_radiance(
     materials: NDArray[np.float64],
     emitter: Emitter,
     emission: str,
-    places: NDArray[np.int32],
-    reached: NDArray[np.uint8],
+    places: NDArray[np.int32] | None = None,
+    reached: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.float32]:
-    """[seen, 3] lm/(m^2 sr), red green blue. `reached` are the bits of `Shadows.reached`, `places` the indices.
+    """[sites, 3] lm/(m^2 sr), red green blue. `reached` are the bits of `Shadows.reached`, `places` the indices;
+    without them nothing is in the light's way.
 
-    `paper` applies the emitter's cosine, towards the triangle, twice (seed 003, Eq. 2).
+    `paper` applies the emitter's cosine, towards the site, twice (seed 003, Eq. 2).
     """
-    radiance = np.empty((len(view.sides), 3), np.float32)
+    radiance = np.empty((len(view.points_mm), 3), np.float32)
     _shade(
-        view.centroids_mm,
+        view.points_mm,
+        view.triangle,
         view.normals,
         view.shading_normals,
-        view.towards_camera,
         view.diffuse,
         view.material,
+        view.eye_mm,
+        None if view.fine is None else view.fine.texture,
+        None if view.fine is None else view.fine.normals,
         materials,
         packed(emitter),
         emission == "paper",
@@ -51,21 +55,30 @@ def led_radiance(
     return radiance
 
 
+def albedo(view: View, materials: NDArray[np.float64]) -> NDArray[np.float32]:
+    """[sites, 3] of light from all directions: diffuse reflectance and that along the normal."""
+    diffuse = view.diffuse[view.triangle]
+    if view.fine is not None:
+        diffuse *= view.fine.texture[:, None]
+    return np.asarray(diffuse + materials[view.material, 3:6].astype(np.float32)[view.triangle])
+
+
 def panel_radiance(view: View, materials: NDArray[np.float64], panel_lux: float) -> NDArray[np.float32]:
-    """[seen, 3] under an ideal flat white panel: the same irradiance everywhere, from all directions."""
-    albedo = view.diffuse + materials[view.material, 3:6]
-    radiance: NDArray[np.float32] = (panel_lux / np.pi * albedo).astype(np.float32)
-    return radiance
+    """[sites, 3] under an ideal flat white panel: the same irradiance everywhere, from all directions."""
+    return np.asarray(np.float32(panel_lux / np.pi) * albedo(view, materials))
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _shade(  # type: ignore[no-untyped-def]
-    centroids,
+    points,
+    triangle,
     normals,
     shading_normals,
-    towards_camera,
     diffuse,
     material,
+    eye,
+    texture,
+    turned,
     materials,
     led,
     paper,
@@ -78,37 +91,43 @@ def _shade(  # type: ignore[no-untyped-def]
         shares, work = np.empty(4), np.empty((2, 8, 3))
         for i in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
             out[i, 0], out[i, 1], out[i, 2] = 0.0, 0.0, 0.0
-            place = places[i]
-            if not (reached[place >> 3] >> (place & 7)) & 1:
+            if reached is not None and not (reached[places[i] >> 3] >> (places[i] & 7)) & 1:
                 continue
-            px, py, pz = np.float64(centroids[i, 0]), np.float64(centroids[i, 1]), np.float64(centroids[i, 2])
+            seen, factor = triangle[i], 1.0
+            px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
             tx, ty, tz = led[0] - px, led[1] - py, led[2] - pz
-            nx, ny, nz = (
-                np.float64(shading_normals[i, 0]),
-                np.float64(shading_normals[i, 1]),
-                np.float64(shading_normals[i, 2]),
-            )
-            if tx * normals[i, 0] + ty * normals[i, 1] + tz * normals[i, 2] <= 0.0:
+            if tx * normals[seen, 0] + ty * normals[seen, 1] + tz * normals[seen, 2] <= 0.0:
                 continue
+            normal = shading_normals[seen]
+            if turned is not None:
+                factor, normal = texture[i], turned[i]
+            nx, ny, nz = np.float64(normal[0]), np.float64(normal[1]), np.float64(normal[2])
             if tx * nx + ty * ny + tz * nz <= 0.0:
                 continue
             lux = led[12] * per_lumen(px, py, pz, nx, ny, nz, led, shares, work)
             if paper:
                 lux *= -(tx * led[3] + ty * led[4] + tz * led[5]) / np.sqrt(tx * tx + ty * ty + tz * tz)
             for k in range(3):
-                out[i, k] = lux * diffuse[i, k] / np.pi
-            m = material[i]
-            alpha = materials[m, 6]
-            vx, vy, vz = towards_camera[i, 0], towards_camera[i, 1], towards_camera[i, 2]
-            if alpha == 0.0 or lux == 0.0 or vx * nx + vy * ny + vz * nz <= 0.0:
-                continue
-            if alpha >= FINE_ROUGHNESS:
-                fixed, grazing = _lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha)
-            else:
-                fixed, grazing = _mean_lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha, led, shares)
-            for k in range(3):
-                f0 = materials[m, 3 + k]
-                out[i, k] += lux * (f0 * fixed + (1.0 - f0) * grazing)
+                out[i, k] = lux * factor * diffuse[seen, k] / np.pi
+            surface = materials[material[seen]]
+            if surface[6] > 0.0 and lux > 0.0:
+                _add_gloss(px, py, pz, tx, ty, tz, nx, ny, nz, eye, surface, led, shares, lux, out[i])
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_gloss(px, py, pz, tx, ty, tz, nx, ny, nz, eye, surface, led, shares, lux, out):  # type: ignore[no-untyped-def]
+    """Add to `out` [3] what the specular part of `surface`, a row of the scene's materials, makes of `lux`."""
+    vx, vy, vz, alpha = eye[0] - px, eye[1] - py, eye[2] - pz, surface[6]
+    distance = np.sqrt(vx * vx + vy * vy + vz * vz)
+    vx, vy, vz = vx / distance, vy / distance, vz / distance
+    if vx * nx + vy * ny + vz * nz <= 0.0:
+        return
+    if alpha >= FINE_ROUGHNESS:
+        fixed, grazing = _lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha)
+    else:
+        fixed, grazing = _mean_lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha, led, shares)
+    for k in range(3):
+        out[k] += lux * (surface[3 + k] * fixed + (1.0 - surface[3 + k]) * grazing)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -6,7 +6,7 @@ Everything is in the robot's base frame, in mm; fluxes in lm.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.geometry import Transform
-from sim.scene.surface import Material, Surface
+from sim.scene.surface import Layer, Material, Surface
 
 STONE = Material("warm stone", (0.62, 0.55, 0.42))
 """Material of an object for which neither file nor rig gives one (assumed)."""
@@ -26,6 +26,16 @@ _UNIT_MM = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
 SUPPORT_CELL_MM = 5.0
 """Edge length of the support's triangles, which is the resolution of shadows on it."""
 _CHUNK = 1 << 18
+
+
+@dataclass(frozen=True)
+class Waves:
+    """The waves of `Layer.waves` of all materials, in the base frame."""
+
+    table: NDArray[np.float64]
+    """[waves, 6]."""
+    first: NDArray[np.int64]
+    """[materials + 1] the first wave of each material, and the number of all."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +52,18 @@ class Scene:
     """[triangles, 3] factor of the diffuse reflectance."""
     normals: NDArray[np.float32] | None
     """[triangles, 3] unit normals for shading; None for flat ones."""
+    waves: Waves | None = None
+    """Detail finer than triangles; None if no surface has any."""
 
 
-def load_surface(path: Path, unit: str, material: Material | None = None) -> Surface:
+def load_surface(
+    path: Path, unit: str, material: Material | None = None, detail: tuple[Layer, ...] = ()
+) -> Surface:
     """Any mesh that trimesh reads (PLY, STL, OBJ, ...), in mm; no vertex is merged or dropped.
 
     Colours of vertices or faces, or a texture (at triangles' centroids), become the tint; they are sRGB. Without
-    `material` a coloured mesh reflects diffusely by its colours, any other is of `STONE`. Raises InputError.
+    `material` a coloured mesh reflects diffusely by its colours, any other is of `STONE`. `detail` is added to it.
+    Raises InputError.
     """
     import trimesh
 
@@ -63,7 +78,15 @@ def load_surface(path: Path, unit: str, material: Material | None = None) -> Sur
     plain = PAINTED if tint is not None else STONE
     corners = np.asarray(mesh.vertices)[faces]
     corners *= _UNIT_MM[unit]
-    return Surface(corners, (material or plain,), np.zeros(len(faces), np.int32), tint)
+    made = replace(material or plain, detail=detail)
+    brightest = max(made.diffuse) * (1.0 if tint is None else float(tint.max()))
+    texture = sum(layer.texture for layer in detail)
+    if texture > 1.0 or texture * brightest > max(0.0, 1.0 - brightest):
+        raise InputError(
+            f"{path}: expected textures in `detail` that keep its diffuse reflectance of up to {brightest:.2f} "
+            f"between 0 and 1; found changes of {texture:g} in all; make them weaker, or the material darker"
+        )
+    return Surface(corners, (made,), np.zeros(len(faces), np.int32), tint)
 
 
 def _tint(mesh: Any) -> NDArray[np.float32] | None:
@@ -122,6 +145,7 @@ def build_scene(things: Sequence[tuple[Surface, Transform]]) -> Scene:
     detailed = any(surface.normals is not None for surface, _ in things)
     normals = np.empty((total, 3), np.float32) if detailed else None
     materials: list[Material] = []
+    waves: list[NDArray[np.float64]] = []
     first = 0
     for (surface, base_from_surface), count in zip(things, counts, strict=True):
         part = slice(first, first + count)
@@ -132,6 +156,7 @@ def build_scene(things: Sequence[tuple[Surface, Transform]]) -> Scene:
             corners[first + start : first + start + len(piece)] = placed.reshape(-1, 3, 3)
         material[part] = surface.material + len(materials)
         materials += surface.materials
+        waves += [_waves(one, base_from_surface) for one in surface.materials]
         if tint is not None and surface.tint is not None:
             tint[part] = surface.tint
         if normals is not None:
@@ -139,7 +164,17 @@ def build_scene(things: Sequence[tuple[Surface, Transform]]) -> Scene:
             normals[part] = own @ base_from_surface[:3, :3].T
         first += count
     table = np.array([[*m.diffuse, *m.f0, m.roughness] for m in materials], np.float64).reshape(-1, 7)
-    return Scene(corners, material, table, tint, normals)
+    firsts = np.cumsum([0, *(len(own) for own in waves)])
+    fine = Waves(np.concatenate(waves), firsts) if firsts[-1] else None
+    return Scene(corners, material, table, tint, normals, fine)
+
+
+def _waves(material: Material, base_from_surface: Transform) -> NDArray[np.float64]:
+    """[waves, 6] of a material's detail, as functions of the place in the base frame."""
+    table = np.concatenate([np.empty((0, 6)), *(layer.waves() for layer in material.detail)])
+    table[:, :3] = table[:, :3] @ base_from_surface[:3, :3].T
+    table[:, 3] -= table[:, :3] @ base_from_surface[:3, 3]
+    return table
 
 
 def _flat_normals(corners_mm: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,11 +3,52 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
 
 Rgb = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Detail of a surface that is finer than its triangles: a field of waves through space, cut by the surface.
+
+    They are `WAVES` plane waves of one period, in evenly distributed directions with random phases. Their mean
+    scales the diffuse reflectance (a texture). Their sum is also a height, whose slope turns the normals: bumps,
+    or, with a long period, normals that deviate from the mesh. Heights cast no shadows.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+    WAVES: ClassVar[int] = 8
+
+    period_mm: Annotated[float, Field(gt=0)]
+    """The finest on the surface: waves that meet it at an angle are longer there."""
+    texture: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Greatest relative change of the diffuse reflectance; its root mean square is a quarter of it."""
+    slope_deg: Annotated[float, Field(ge=0, le=45)] = 0.0
+    """Root mean square of the slope, as a tangent."""
+    seed: Annotated[int, Field(ge=0)] = 1
+
+    def waves(self) -> NDArray[np.float64]:
+        """[WAVES, 6] wave vector, rad/mm, phase, amplitude of the texture, amplitude of the height, mm."""
+        from scipy.spatial.transform import Rotation
+
+        random = np.random.default_rng((self.seed, self.WAVES))
+        # Half a Fibonacci sphere: a wave and its opposite are the same.
+        height = (np.arange(self.WAVES) + 0.5) / self.WAVES
+        angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(self.WAVES)
+        ring = np.sqrt(1.0 - height * height)
+        ways = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
+        ways = Rotation.random(random_state=random).apply(ways)
+        per_mm = 2.0 * np.pi / self.period_mm
+        # The slope's square is half of the amplitudes' squares times per_mm^2, two thirds of it along the surface.
+        height_mm = np.tan(np.radians(self.slope_deg)) / per_mm / np.sqrt(self.WAVES / 3.0)
+        phases = random.uniform(0.0, 2.0 * np.pi, (self.WAVES, 1))
+        amplitudes = np.tile([self.texture / self.WAVES, height_mm], (self.WAVES, 1))
+        return np.concatenate([per_mm * ways, phases, amplitudes], axis=1)
 
 
 @dataclass(frozen=True)
@@ -25,6 +66,8 @@ class Material:
     """Reflectance at normal incidence of the specular part."""
     roughness: float = 0.0
     """GGX alpha (Walter et al. 2007)."""
+    detail: tuple[Layer, ...] = ()
+    """Finer than triangles; only seen where each pixel is shaded."""
 
 
 @dataclass(frozen=True)

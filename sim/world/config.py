@@ -19,6 +19,7 @@ from sim.optics.dome import DomeErrors
 from sim.optics.led_light import STEADY, LedModel
 from sim.optics.panels import Panel
 from sim.optics.sensor_model import SensorModel
+from sim.scene.surface import Layer
 from sim.scene.things import Stickers, Thing
 from sim.world import faults as script
 
@@ -75,11 +76,12 @@ class SceneConfig(_Model):
 
 
 class InterreflectionConfig(_Model):
-    """Interreflections, computed with Mitsuba (the extra `mitsuba`): seconds for each LED and pose."""
+    """Light from surface to surface, as in `sim.render.interreflection`."""
 
     bounces: Annotated[int, Field(ge=2, le=16)] = 4
-    samples: Annotated[int, Field(ge=1, le=4096)] = 64
-    """Paths per seen triangle."""
+    """The most surfaces that light meets."""
+    rays: Annotated[int, Field(ge=4, le=4096)] = 128
+    """From each side of a patch."""
 
 
 class CameraConfig(_Model):
@@ -139,12 +141,17 @@ class Settings(_Model):
     faults: tuple[script.Fault, ...] = ()
     things: tuple[Thing, ...] = ()
     """Things on the support in addition to the plan's object."""
-    interreflection: InterreflectionConfig | None = None
-    """`{}` switches it on; without it light meets one surface only."""
+    shading: Literal["pixel", "flat"] = "pixel"
+    """`pixel`: light and shadow on each pixel, with interreflection and blur. `flat`: one radiance for each
+    triangle, without these two. Both can be set by themselves."""
+    interreflection: InterreflectionConfig | bool | None = None
+    """None: as `shading` has it."""
     arm_shadows: bool = True
     """Whether arm and tool block light."""
     material: MaterialConfig | None = None
     """Of the plan's object, multiplied by its mesh's own colours; None: these alone, or warm stone."""
+    detail: tuple[Layer, ...] = ()
+    """Of the plan's object: texture, bumps and turned normals that its mesh does not have."""
     stickers: Stickers | None = None
     """On the plan's object."""
     leds: LedModel = STEADY
@@ -156,8 +163,18 @@ class Settings(_Model):
     panels: tuple[Panel, ...] = ()
     """The flat white panels 1 to 4, visible to the camera; without them a panel is uniform ambient light."""
 
+    @property
+    def light_between_surfaces(self) -> InterreflectionConfig | None:
+        """Interreflection, or None if it is off."""
+        if isinstance(self.interreflection, InterreflectionConfig):
+            return self.interreflection
+        asked = self.shading == "pixel" if self.interreflection is None else self.interreflection
+        return InterreflectionConfig() if asked else None
+
     @model_validator(mode="after")
     def _possible(self) -> Settings:
+        if self.detail and self.shading == "flat":
+            raise ValueError("`detail` is finer than triangles: it needs `shading: pixel`")
         for fault in self.faults:
             if why := (
                 impossible(fault, self.robot)
@@ -183,4 +200,6 @@ class Config(_Model):
     def photographed(self) -> CameraConfig:
         """The camera as the renderer needs it: with the true lens, and the rays per pixel set in the rig."""
         true = {name: getattr(self.settings.camera, name) for name in _OF_THE_TRUE_CAMERA}
+        if true["blur"] is None:
+            true["blur"] = self.settings.shading == "pixel"
         return self.camera.model_copy(update=true)

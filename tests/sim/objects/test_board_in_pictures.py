@@ -11,7 +11,7 @@ from coupole.geometry import inverse
 from sim.objects.charuco import Charuco, charuco_board, inner_corners_mm, opencv_board
 from sim.optics import blur
 from sim.optics.objective import Objective, vignetting
-from sim.optics.sensor import electrons, expose, expose_electrons, mosaic
+from sim.optics.sensor import electrons, expose, expose_electrons
 from sim.optics.sensor_model import SensorModel
 from sim.render.camera_view import View, Viewer, tangents
 from sim.render.lens import Lens, sight
@@ -70,7 +70,7 @@ def test_corners_of_a_supersampled_frame_are_found_to_a_tenth_of_a_pixel(
 ) -> None:
     view = view_of_board(base_from_camera, 4)
     frame = np.empty((768, 1024), np.uint16)
-    light = (view.triangle, view.diffuse, FALLOFF)
+    light = (view.site, view.diffuse, FALLOFF)
     expose(frame, *light, model=MONO, electrons_per_radiance=WHITE_E, frame=1)
     misses = misses_px(frame, base_from_camera)
     assert np.sqrt(np.mean(misses**2)) < 0.14
@@ -79,13 +79,14 @@ def test_corners_of_a_supersampled_frame_are_found_to_a_tenth_of_a_pixel(
 
 def test_blur_leaves_the_corners_in_place(base_from_camera: NDArray[np.float64]) -> None:
     view = view_of_board(base_from_camera, 1)
-    image = electrons(view.triangle, view.diffuse, FALLOFF, electrons_per_radiance=WHITE_E)
-    depth_mm = np.full(view.triangle.shape, 380.0, np.float32)
-    soft = blur.through(Objective(f_number=4.0), image, depth_mm, pixel_pitch_um=PITCH_UM)
+    image = electrons(view.site, view.diffuse, FALLOFF, electrons_per_radiance=WHITE_E)
+    lens = Objective(f_number=4.0)
+    disk_px = blur.defocus_blur_px(lens, np.full(view.site.shape, 380.0, np.float32), PITCH_UM)
+    soft = blur.through(lens, image, disk_px, MONO.channels(), pixel_pitch_um=PITCH_UM)
     misses = []
-    for each in (image, soft):
+    for mean_e in (np.ascontiguousarray(image[..., 1]), soft):
         frame = np.empty((768, 1024), np.uint16)
-        expose_electrons(frame, mosaic(each, MONO), model=MONO, frame=1)
+        expose_electrons(frame, mean_e, model=MONO, frame=1)
         misses.append(misses_px(frame, base_from_camera))
     moved = misses[1] - misses[0]
     assert np.sqrt(np.mean(moved**2)) < 0.15

@@ -12,7 +12,6 @@ from coupole.errors import InputError
 from sim.optics import blur
 from sim.optics.objective import (
     Objective,
-    blur_px,
     defocus_px,
     diffraction_px,
     illuminance_per_radiance,
@@ -20,6 +19,8 @@ from sim.optics.objective import (
 )
 
 LENS = Objective()
+RED, GREEN, BLUE = (np.full((2, 2), channel) for channel in range(3))
+GBRG = np.array([[1, 2], [0, 1]])
 PITCH_UM = 5.5
 
 
@@ -112,27 +113,50 @@ def test_an_even_image_stays_as_it_is_whatever_the_depths() -> None:
     depth_mm = np.random.default_rng(1).uniform(250.0, 450.0, (40, 50)).astype(np.float32)
     depth_mm[:5] = np.inf
     image = np.full((40, 50, 3), 700.0, np.float32)
-    assert np.allclose(blur.through(LENS, image, depth_mm, pixel_pitch_um=PITCH_UM), 700.0, rtol=1e-5)
+    disk_px = blur.defocus_blur_px(LENS, depth_mm, PITCH_UM)
+    assert np.allclose(blur.through(LENS, image, disk_px, GBRG, pixel_pitch_um=PITCH_UM), 700.0, rtol=1e-5)
+
+
+def test_an_image_of_several_tiles_is_blurred_as_its_spectrum_is_damped() -> None:
+    """Lindeberg's curve damps a frequency w by exp(t (cos w - 1)); an image continued by reflection is a sum of
+    cosines."""
+    from scipy.fft import dctn, idctn
+
+    image = np.random.default_rng(2).uniform(0.0, 1000.0, (151, 613)).astype(np.float32)
+    down, along = (np.cos(np.pi * np.arange(n) / n) - 1.0 for n in image.shape)
+    damped = dctn(image) * np.exp(3.0**2 * (down[:, None] + along))
+    assert np.allclose(blur.blurred(image, np.full(image.shape, 3.0, np.float32)), idctn(damped), atol=0.02)
+
+
+def test_each_pixel_gets_the_channel_that_its_filter_passes_blurred_in_full_resolution() -> None:
+    image = np.random.default_rng(3).uniform(0.0, 1000.0, (70, 301, 3)).astype(np.float32)
+    disk_px = np.random.default_rng(4).uniform(0.0, 2.0, (70, 301)).astype(np.float32)
+    mosaic, red, green, blue = (
+        blur.through(LENS, image, disk_px, channels, pixel_pitch_um=PITCH_UM)
+        for channels in (GBRG, RED, GREEN, BLUE)
+    )
+    assert np.array_equal(mosaic[0::2, 0::2], green[0::2, 0::2])
+    assert np.array_equal(mosaic[0::2, 1::2], blue[0::2, 1::2])
+    assert np.array_equal(mosaic[1::2, 0::2], red[1::2, 0::2])
+    assert np.array_equal(mosaic[1::2, 1::2], green[1::2, 1::2])
 
 
 def test_what_is_in_focus_is_blurred_by_diffraction_alone() -> None:
-    depth_mm = np.full((61, 61), LENS.focus_distance_mm, np.float32)
+    disk_px = blur.defocus_blur_px(LENS, np.full((61, 61), LENS.focus_distance_mm, np.float32), PITCH_UM)
     image = np.repeat(point()[..., None], 3, axis=2)
-    through = blur.through(LENS, image, depth_mm, pixel_pitch_um=PITCH_UM)
-    red, blue = (float(blur_px(LENS, LENS.focus_distance_mm, c, PITCH_UM)) for c in (0, 2))
-    assert red > blue
-    assert spread_px(through[..., 0])[0] == pytest.approx(red, rel=0.01)
+    for channels, wavelength_um in ((RED, 0.60), (BLUE, 0.46)):
+        through = blur.through(LENS, image, disk_px, channels, pixel_pitch_um=PITCH_UM)
+        assert spread_px(through)[0] == pytest.approx(diffraction_px(LENS, wavelength_um, PITCH_UM), rel=0.01)
 
 
 def test_lateral_colour_moves_a_corner_outwards_and_leaves_the_middle() -> None:
     lens = Objective(lateral_colour=(0.02, 0.0, 0.0), f_number=2.0)
     image = np.zeros((101, 101, 3), np.float32)
     image[50, 90] = image[50, 50] = 100.0
-    sharp = np.full((101, 101), lens.focus_distance_mm, np.float32)
-    moved = blur.through(lens, image, sharp, pixel_pitch_um=PITCH_UM)
+    sharp = np.zeros((101, 101), np.float32)
     cols = np.arange(101)
     far, near = slice(80, 101), slice(40, 61)
-    for channel, shift_px in ((0, 0.8), (1, 0.0)):
-        row = moved[..., channel].sum(axis=0)
+    for channels, shift_px in ((RED, 0.8), (GREEN, 0.0)):
+        row = blur.through(lens, image, sharp, channels, pixel_pitch_um=PITCH_UM).sum(axis=0)
         assert (row[far] * cols[far]).sum() / row[far].sum() == pytest.approx(90.0 + shift_px, abs=0.03)
         assert (row[near] * cols[near]).sum() / row[near].sum() == pytest.approx(50.0, abs=0.03)

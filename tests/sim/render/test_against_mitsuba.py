@@ -152,7 +152,7 @@ def test_radiance_is_mitsubas_where_light_falls(
 def test_shadows_are_mitsubas(shape: str, tmp_path: Path, scale: Callable[[int, int], int]) -> None:
     corners = np.concatenate([MESHES[shape], relief(400.0, 100, 0.0) - [0.0, 0.0, 40.0]])
     triangles, view, radiance = ours(corners, Material("", DIFFUSE), LOW_LED_MM)
-    facing = np.flatnonzero(np.einsum("ij,ij->i", view.normals, LOW_LED_MM - view.centroids_mm) > 0)
+    facing = np.flatnonzero(np.einsum("ij,ij->i", view.normals, LOW_LED_MM - view.points_mm) > 0)
     chosen = np.random.default_rng(1).permutation(facing)[: scale(500, 20_000)]
     oracle = Oracle(tmp_path, corners, [])
     theirs = np.array(

@@ -145,7 +145,7 @@ for threads in (1, 2, 8):
     places = shadows.places(view.sides)
     lit = led_radiance(view, scene.materials, square(light[0], -light[0], side_mm=7.0, flux_lm=1800.0),
                        "lambertian", places, shadows.reached(0))
-    digest = hashlib.sha256(view.triangle.tobytes() + view.sides.tobytes() + lit.tobytes())
+    digest = hashlib.sha256(view.site.tobytes() + view.sides.tobytes() + lit.tobytes())
     print(digest.hexdigest(), lit.max() > 0)
 """
 

@@ -1,0 +1,123 @@
+"""Where the rays of each pixel meet the surface: one site for each pixel and triangle that it sees.
+
+A pixel's k x k rays that meet one triangle share a site, the mean of their points on it: light on a triangle
+varies little within a pixel, while its edges are resolved by all rays.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.geometry import Transform
+from sim.render.lens import Sight, rook_shifts_px
+
+_LEAST_SLOPE = 1e-6
+
+
+def pixel_sites(
+    triangle: NDArray[np.int32],
+    centroids_mm: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    sight: Sight,
+    base_from_camera: Transform,
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Points [sites, 3] in the base frame, mm, and the row of each one's triangle [sites].
+
+    `triangle` [h k, w k], the row seen by each ray or -1, is replaced by the rows of the sites, which are counted
+    along the rows of the image. `centroids_mm` and `normals` [seen, 3] give the triangles' planes.
+    """
+    lens = sight.lens
+    k = lens.samples
+    first = np.zeros(lens.height_px // k + 1, np.int64)
+    _count(triangle, k, first)
+    first = np.cumsum(first)
+    points, of_triangle = np.empty((int(first[-1]), 3), np.float32), np.empty(int(first[-1]), np.int32)
+    rooks = rook_shifts_px(k, max(lens.width_px, lens.height_px)) / lens.focal_px
+    centre = np.array([*lens.centre_px, 1.0 / lens.focal_px])
+    _fill(
+        triangle,
+        k,
+        first,
+        centroids_mm,
+        normals,
+        base_from_camera,
+        centre,
+        rooks,
+        sight.shift,
+        points,
+        of_triangle,
+    )
+    return points, of_triangle
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_first(triangle, k, row, col):  # type: ignore[no-untyped-def]
+    """True if no earlier ray of the same pixel met the triangle."""
+    top, left = row - row % k, col - col % k
+    for y in range(top, row + 1):
+        for x in range(left, left + k if y < row else col):
+            if triangle[y, x] == triangle[row, col]:
+                return False
+    return True
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _count(triangle, k, counts):  # type: ignore[no-untyped-def]
+    """Number of sites of each row of pixels, in the place after it."""
+    for line in numba.prange(len(counts) - 1):
+        count = 0
+        for row in range(line * k, line * k + k):
+            for col in range(triangle.shape[1]):
+                if triangle[row, col] >= 0 and (k == 1 or _is_first(triangle, k, row, col)):
+                    count += 1
+        counts[line + 1] = count
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _fill(  # type: ignore[no-untyped-def]
+    triangle, k, first, centroids, normals, pose, centre, rooks, shift, points, of_triangle
+):
+    for line in numba.prange(len(first) - 1):
+        site = first[line]
+        rays, met = np.empty((k * k, 3)), np.empty(k * k, np.int64)
+        for left in range(0, triangle.shape[1], k):
+            for part in range(k * k):
+                row, col = line * k + part // k, left + part % k
+                met[part] = triangle[row, col]
+                x, y = (col - centre[0]) * centre[2], (row - centre[1]) * centre[2]
+                if shift is not None:
+                    x, y = x + shift[0, row, col], y + shift[1, row, col]
+                else:
+                    x, y = x + rooks[row], y - rooks[col]
+                for i in range(3):
+                    rays[part, i] = pose[i, 0] * x + pose[i, 1] * y + pose[i, 2]
+            for part in range(k * k):
+                if met[part] < 0:
+                    continue
+                seen = met[part]
+                _mean_point(rays, met, seen, centroids, normals, pose, points[site])
+                of_triangle[site] = seen
+                for other in range(part, k * k):
+                    if met[other] == seen:
+                        triangle[line * k + other // k, left + other % k] = site
+                        met[other] = -1
+                site += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _mean_point(rays, met, seen, centroids, normals, pose, point):  # type: ignore[no-untyped-def]
+    """Fill `point` [3] with the mean of the points where rays meet the plane of the triangle `seen`."""
+    height, depth, x, y, z, count = 0.0, 0.0, 0.0, 0.0, 0.0, 0
+    for i in range(3):
+        way = np.float64(centroids[seen, i]) - pose[i, 3]
+        height, depth = height + normals[seen, i] * way, depth + pose[i, 2] * way
+    for part in range(len(met)):
+        if met[part] == seen:
+            ray = rays[part]
+            slope = normals[seen, 0] * ray[0] + normals[seen, 1] * ray[1] + normals[seen, 2] * ray[2]
+            # A ray within the plane, by rounding, is given the centroid's depth.
+            along = height / slope if abs(slope) > _LEAST_SLOPE else depth
+            x, y, z, count = x + along * ray[0], y + along * ray[1], z + along * ray[2], count + 1
+    point[0], point[1], point[2] = pose[0, 3] + x / count, pose[1, 3] + y / count, pose[2, 3] + z / count

@@ -47,7 +47,7 @@ TOP = {
 SIDE = {**TOP, "name": "side", "azimuth_deg": -60, "elevation_deg": 45}
 LOW = {**TOP, "name": "low", "azimuth_deg": -120, "elevation_deg": 45}
 PLAIN = {"seed": 1, "arm_shadows": False, "shading": "flat"}
-"""Settings of worlds whose pictures `expected_pictures` can reckon: it knows of no arm, and of direct light only."""
+"""Settings of worlds whose pictures `expected_pictures` can reckon: without an arm, by direct light."""
 SOME_LIGHTS = {"kind": "every", "every": 20}
 """54 LEDs, all round the dome."""
 

@@ -17,6 +17,8 @@ import math
 import numba
 
 KD, KS, ALPHA = range(3)
+UNKNOWNS = 5
+"""Of a fit: two tilts of the normal along its `tangents`, and the logarithms of kd, ks and alpha."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -35,3 +37,35 @@ def lobe(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
     by_alpha = value * (2.0 / alpha - 4.0 * alpha * nh * nh / t)
     by_alpha -= value / s * alpha * (nl * (1.0 - nv * nv) / b + nv * (1.0 - nl * nl) / a)
     return value, by_nl, by_nv, by_nh, by_alpha
+
+
+@numba.njit(cache=True, nogil=True)
+def tangents(x, y, z):  # type: ignore[no-untyped-def]
+    """Two unit vectors across a unit vector (Duff et al. 2017)."""
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
+@numba.njit(cache=True, nogil=True)
+def root_by_unknowns(normal, t1, t2, light, half, nv, v1, v2, kd, ks, alpha, row):  # type: ignore[no-untyped-def]
+    """Square root of the radiance, and its derivatives by the unknowns into `row`; n l must be positive. The view
+    is given by its components nv, v1, v2 along the normal and the tangents t1, t2."""
+    nl = normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
+    nh = normal[0] * half[0] + normal[1] * half[1] + normal[2] * half[2]
+    value, by_nl, by_nv, by_nh, by_alpha = lobe(nl, nv, nh, alpha)
+    root = math.sqrt(nl * (kd + ks * value))
+    to_root = 0.5 / root
+    by_light = kd + ks * value + nl * ks * by_nl
+    by_view, by_half = nl * ks * by_nv, nl * ks * by_nh
+    l1 = t1[0] * light[0] + t1[1] * light[1] + t1[2] * light[2]
+    l2 = t2[0] * light[0] + t2[1] * light[1] + t2[2] * light[2]
+    h1 = t1[0] * half[0] + t1[1] * half[1] + t1[2] * half[2]
+    h2 = t2[0] * half[0] + t2[1] * half[1] + t2[2] * half[2]
+    row[0] = to_root * (by_light * l1 + by_view * v1 + by_half * h1)
+    row[1] = to_root * (by_light * l2 + by_view * v2 + by_half * h2)
+    row[2] = to_root * nl * kd
+    row[3] = to_root * nl * ks * value
+    row[4] = to_root * nl * ks * by_alpha * alpha
+    return root

@@ -17,7 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.ggx import lobe
+from coupole.reflectance.ggx import UNKNOWNS, lobe, root_by_unknowns, tangents
 
 Floats = NDArray[np.float64]
 
@@ -28,14 +28,13 @@ _FIRST_KS = 0.02
 """Of kd."""
 _LEAST_SHARE, _OF_QUANTILE = 0.05, 0.9
 """Samples below this share of a pixel's quantile are in shadow."""
-_CAUCHY = 0.05
+CAUCHY = 0.05
 """Scale of the weights, as a share of sqrt(kd)."""
-_USUAL_KS, _SPREAD_KS, _USUAL_ALPHA = math.log(0.04), 2.0, math.log(0.3)
+_USUAL_KS, SPREAD_KS, _USUAL_ALPHA = math.log(0.04), 2.0, math.log(0.3)
 """Logarithms, for materials in 1/sr: a dielectric's ks within a factor of 7, alpha within one of 3."""
 _MOST_STEPS = 40
 _SETTLED = 1e-5
 _LEAST_ALPHA, _MOST_ALPHA = 0.02, 1.0
-_UNKNOWNS = 5
 _FEWEST = 6
 """Samples that a pixel needs."""
 _BLOCK = 2000
@@ -121,7 +120,6 @@ def colours_from(values, used, normal, grey, lights, half, views, view_of, kd, k
     alpha) that were fitted to their means; samples are weighted as the last step of that fit weighted them."""
     n0, n1, n2 = normal
     channels = values.shape[1]
-    scale = _CAUCHY * math.sqrt(grey[0])
     sums = np.zeros((channels, 2))
     dd, ds, ss = 0.0, 0.0, 0.0
     for number in range(len(used)):
@@ -133,12 +131,7 @@ def colours_from(values, used, normal, grey, lights, half, views, view_of, kd, k
         nv = n0 * view[0] + n1 * view[1] + n2 * view[2]
         nh = n0 * half[light, 0] + n1 * half[light, 1] + n2 * half[light, 2]
         shine = nl * lobe(nl, nv, nh, grey[2])[0]
-        model = nl * grey[0] + shine * grey[1]
-        mean = 0.0
-        for channel in range(channels):
-            mean += values[light, channel] / channels
-        off = (math.sqrt(model) - math.sqrt(max(0.0, mean))) / scale
-        weight = 1.0 / ((1.0 + off * off) * max(model, 1e-12))
+        weight = colour_weight(nl * grey[0] + shine * grey[1], values[light], grey[0])
         dd += weight * nl * nl
         ds += weight * nl * shine
         ss += weight * shine * shine
@@ -156,6 +149,13 @@ def colours_from(values, used, normal, grey, lights, half, views, view_of, kd, k
             if both_d < 0.0:
                 diffuse, specular = 0.0, sums[channel, 1] / ss
         kd[channel], ks[channel] = max(diffuse, 0.0), max(specular, 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def colour_weight(model, values, grey_kd):  # type: ignore[no-untyped-def]
+    """Of a sample in `colours_from`: values [channels] where grey gives `model`."""
+    off = (math.sqrt(model) - math.sqrt(max(0.0, values.mean()))) / (CAUCHY * math.sqrt(grey_kd))
+    return 1.0 / ((1.0 + off * off) * max(model, 1e-12))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -194,8 +194,8 @@ def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffne
     `view_of` [samples] names. The normal is held to `prior` by `stiffness`, 1 over its variance in rad^2;
     roughness and ks to what is usual by `usual`, so that no highlight is invented where no sample could show it.
     """
-    scale = _CAUCHY * math.exp(0.5 * unknowns[3])
-    matrix, right = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
+    scale = CAUCHY * math.exp(0.5 * unknowns[3])
+    matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     trial = np.empty(6)
     cost, spread = _equations(
         roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right
@@ -241,7 +241,7 @@ def _least_cosine(normal, views):  # type: ignore[no-untyped-def]
 def _move(unknowns, step, trial):  # type: ignore[no-untyped-def]
     """The unknowns after a step: two tilts along the normal's tangents, then the logarithms."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
-    t1, t2 = _tangents(n0, n1, n2)
+    t1, t2 = tangents(n0, n1, n2)
     x = n0 + step[0] * t1[0] + step[1] * t2[0]
     y = n1 + step[0] * t1[1] + step[1] * t2[1]
     z = n2 + step[0] * t1[2] + step[1] * t2[2]
@@ -254,22 +254,13 @@ def _move(unknowns, step, trial):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _tangents(x, y, z):  # type: ignore[no-untyped-def]
-    """Two unit vectors across a unit vector with z > -1 (Duff et al. 2017)."""
-    sign = 1.0 if z >= 0.0 else -1.0
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
-
-
-@numba.njit(cache=True, nogil=True)
 def _cost(roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale):  # type: ignore[no-untyped-def]
     """Cauchy's cost, and the weighted rms of the residuals."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
     to_view = views[:, 0] * n0 + views[:, 1] * n1 + views[:, 2] * n2
     cost = stiffness * ((n0 - prior[0]) ** 2 + (n1 - prior[1]) ** 2 + (n2 - prior[2]) ** 2)
-    cost += usual * ((unknowns[5] - _USUAL_ALPHA) ** 2 + ((unknowns[4] - _USUAL_KS) / _SPREAD_KS) ** 2)
+    cost += usual * ((unknowns[5] - _USUAL_ALPHA) ** 2 + ((unknowns[4] - _USUAL_KS) / SPREAD_KS) ** 2)
     squares, weights = 0.0, 0.0
     for number in range(len(used)):
         light = used[number]
@@ -291,21 +282,21 @@ def _equations(roots, used, lights, half, views, view_of, unknowns, prior, stiff
     """Normal equations of a step, into `matrix` and `right`; cost and weighted rms."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
-    t1, t2 = _tangents(n0, n1, n2)
+    t1, t2 = tangents(n0, n1, n2)
     to_view = views[:, 0] * n0 + views[:, 1] * n1 + views[:, 2] * n2
     view_1 = views[:, 0] * t1[0] + views[:, 1] * t1[1] + views[:, 2] * t1[2]
     view_2 = views[:, 0] * t2[0] + views[:, 1] * t2[1] + views[:, 2] * t2[2]
     matrix[:], right[:] = 0.0, 0.0
-    row = np.empty(_UNKNOWNS)
+    row = np.empty(UNKNOWNS)
     d0, d1, d2 = n0 - prior[0], n1 - prior[1], n2 - prior[2]
     cost, squares, weights = stiffness * (d0 * d0 + d1 * d1 + d2 * d2), 0.0, 0.0
     right[0] = -stiffness * (t1[0] * d0 + t1[1] * d1 + t1[2] * d2)
     right[1] = -stiffness * (t2[0] * d0 + t2[1] * d1 + t2[2] * d2)
     matrix[0, 0] = matrix[1, 1] = stiffness
-    more_ks, more_alpha = (unknowns[4] - _USUAL_KS) / _SPREAD_KS, unknowns[5] - _USUAL_ALPHA
+    more_ks, more_alpha = (unknowns[4] - _USUAL_KS) / SPREAD_KS, unknowns[5] - _USUAL_ALPHA
     cost += usual * (more_alpha * more_alpha + more_ks * more_ks)
-    right[3], right[4] = -usual * more_ks / _SPREAD_KS, -usual * more_alpha
-    matrix[3, 3], matrix[4, 4] = usual / _SPREAD_KS**2, usual
+    right[3], right[4] = -usual * more_ks / SPREAD_KS, -usual * more_alpha
+    matrix[3, 3], matrix[4, 4] = usual / SPREAD_KS**2, usual
     for number in range(len(used)):
         light = used[number]
         view = view_of[light]
@@ -315,32 +306,18 @@ def _equations(roots, used, lights, half, views, view_of, unknowns, prior, stiff
             off = -roots[number] / scale
             cost += math.log1p(off * off)
             continue
-        h0, h1, h2 = half[light, 0], half[light, 1], half[light, 2]
-        nh = n0 * h0 + n1 * h1 + n2 * h2
-        value, by_nl, by_nv, by_nh, by_alpha = lobe(nl, to_view[view], nh, alpha)
-        model = math.sqrt(nl * (kd + ks * value))
+        model = root_by_unknowns(
+            unknowns[:3], t1, t2, lights[light], half[light], to_view[view], view_1[view], view_2[view], kd, ks,
+            alpha, row,
+        )  # fmt: skip
         off = (model - roots[number]) / scale
         weight = 1.0 / (1.0 + off * off)
         cost += math.log1p(off * off)
         squares += weight * off * off
         weights += weight
-        to_root = 0.5 / (model * scale)
-        by_light = kd + ks * value + nl * ks * by_nl
-        by_view, by_half = nl * ks * by_nv, nl * ks * by_nh
-        row[0] = to_root * (
-            by_light * (t1[0] * l0 + t1[1] * l1 + t1[2] * l2)
-            + by_view * view_1[view]
-            + by_half * (t1[0] * h0 + t1[1] * h1 + t1[2] * h2)
-        )
-        row[1] = to_root * (
-            by_light * (t2[0] * l0 + t2[1] * l1 + t2[2] * l2)
-            + by_view * view_2[view]
-            + by_half * (t2[0] * h0 + t2[1] * h1 + t2[2] * h2)
-        )
-        row[2] = to_root * nl * kd
-        row[3] = to_root * nl * ks * value
-        row[4] = to_root * nl * ks * by_alpha * alpha
-        for i in range(_UNKNOWNS):
+        for i in range(UNKNOWNS):
+            row[i] /= scale
+        for i in range(UNKNOWNS):
             right[i] -= weight * row[i] * off
             for j in range(i + 1):
                 matrix[i, j] += weight * row[i] * row[j]
@@ -350,8 +327,8 @@ def _equations(roots, used, lights, half, views, view_of, unknowns, prior, stiff
 @numba.njit(cache=True, nogil=True)
 def _solve(matrix, right, damping):  # type: ignore[no-untyped-def]
     """The damped step, by Cholesky; the matrix holds its lower half."""
-    factor, step = np.zeros((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
-    for i in range(_UNKNOWNS):
+    factor, step = np.zeros((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    for i in range(UNKNOWNS):
         for j in range(i + 1):
             total = matrix[i, j]
             if i == j:
@@ -362,14 +339,14 @@ def _solve(matrix, right, damping):  # type: ignore[no-untyped-def]
                 factor[i, i] = math.sqrt(max(total, 1e-14))
             else:
                 factor[i, j] = total / factor[j, j]
-    for i in range(_UNKNOWNS):
+    for i in range(UNKNOWNS):
         total = right[i]
         for k in range(i):
             total -= factor[i, k] * step[k]
         step[i] = total / factor[i, i]
-    for i in range(_UNKNOWNS - 1, -1, -1):
+    for i in range(UNKNOWNS - 1, -1, -1):
         total = step[i]
-        for k in range(i + 1, _UNKNOWNS):
+        for k in range(i + 1, UNKNOWNS):
             total -= factor[k, i] * step[k]
         step[i] = total / factor[i, i]
     return step

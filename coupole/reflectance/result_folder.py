@@ -52,6 +52,7 @@ def complete(path: Path, write: Callable[[Path], Any]) -> None:
 def in_the_making(path: Path) -> Iterator[Path]:
     """Where to write a file that is put in its place, whole, when all has gone well."""
     part = path.with_name(path.name + ".part")
+    path.parent.mkdir(exist_ok=True)
     try:
         yield part
         with part.open("rb") as file:

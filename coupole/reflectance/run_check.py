@@ -1,4 +1,8 @@
-"""What the fits of runs miss under LEDs that they have not seen, and what `result.json` says."""
+"""What the fits of runs miss under LEDs that they have not seen, and what `result.json` says.
+
+They are compared with pictures, block by block of 2 x 2 pixels (seed 003, 6.3), and with the samples, which are
+means over triangles and have less noise.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.reflectance.extraction.lamp_sight import lit_on
+from coupole.reflectance.material_uncertainty import relative_uncertainty
 from coupole.reflectance.result_folder import read_settings
 from coupole.reflectance.run_fits import predicted
+from coupole.reflectance.run_pictures import read_check_frames
 from coupole.reflectance.run_result import ABOUT, FITS, MATERIALS, SCHEMA, RunResult, ViewSamples
-from coupole.reflectance.run_uncertainty import uncertainty_of
+from coupole.reflectance.run_uncertainty import QUANTILE, uncertainty_of
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import write_synced
 
@@ -28,8 +34,8 @@ PEAK_QUANTILE = 0.999
 
 
 @dataclass
-class _Check:
-    """Grows block by block: held-out samples of one fit."""
+class _Missed:
+    """Grows block by block: what one fit misses."""
 
     absolute: float = 0.0
     square: float = 0.0
@@ -55,6 +61,18 @@ class _Check:
         return float(10 * np.log10(peak**2 / max(self.square / self.count, 1e-30)))
 
 
+@dataclass
+class _Check:
+    """What all fits miss."""
+
+    pictures: dict[str, _Missed] = field(default_factory=lambda: {name: _Missed() for name in FITS})
+    triangles: dict[str, _Missed] = field(default_factory=lambda: {name: _Missed() for name in FITS})
+    noise: list[float] = field(default_factory=list)
+    """Mean absolute error of the pictures by noise, of each."""
+    inside: dict[str, list[NDArray[np.bool_]]] = field(default_factory=lambda: {name: [] for name in MATERIALS})
+    """Of triangles' samples, whether they lie in the interval of what the material gives."""
+
+
 def check_result(
     out: Path,
     memory_bytes: int,
@@ -70,12 +88,12 @@ def check_result(
     settings = read_settings(out)
     result = RunResult(out)
     result.refuse_unfinished(settings["view_names"], fits=True)
-    checks: dict[str, _Check] = {name: _Check() for name in FITS}
+    check = _Check()
     for view in result.views:
-        _check_view(result, view, settings, memory_bytes, checks, say)
+        _check_view(result, view, settings, memory_bytes, check, say)
     paper = settings["emission"] == "paper"
     uncertainty = uncertainty_of(result, settings["scan_noise_um"], paper=paper, say=say)
-    about = _about(result, settings, checks, uncertainty, time.monotonic() - begun_s)
+    about = _about(result, settings, check, uncertainty, time.monotonic() - begun_s)
     try:
         write_synced(out / ABOUT, json.dumps(about, indent=1) + "\n")
     except OSError as error:
@@ -84,27 +102,57 @@ def check_result(
 
 
 def _check_view(
-    result: RunResult,
-    view: ViewSamples,
-    settings: dict[str, Any],
-    memory_bytes: int,
-    checks: dict[str, _Check],
-    say: Said,
+    result: RunResult, view: ViewSamples, settings: dict[str, Any], memory_bytes: int, check: _Check, say: Said
 ) -> None:
-    """Samples of a view, in shares of the camera's range, where every fit has something: all fits are compared
-    by the same ones."""
+    """Pictures and samples of a view, in shares of the camera's range, where every fit has something: all fits are
+    compared by the same ones."""
     held = np.isin(view.leds, settings["left_out"])
+    frames = read_check_frames(result, view)
+    column = {int(led): n for n, led in enumerate(view.leds[held])}
+    columns = [column[int(led)] for led in frames.leds]
+    check.noise += list(frames.noise)
     for rows in result.view_blocks(view, memory_bytes):
         some = result.view_samples(view, rows, held)
         lit = lit_on(some.centres_mm, some.led_mm, view.led_normals[held], settings["emission"] == "paper")
         share = lit[..., None] * view.full_scales[held]
-        made = {name: predicted(result, name, view, rows, some) for name in checks}
-        known = np.isfinite(some.values)
-        for values in made.values():
-            known &= np.isfinite(values)
-        for name, check in checks.items():
-            check.add((made[name] * share)[known], (some.values * share)[known])
+        made = {name: predicted(result, name, view, rows, some) * share for name in FITS}
+        _compare(made, some.values * share, check.triangles)
+        for name, inside in check.inside.items():
+            places = np.searchsorted(result.triangles, view.triangles[rows])
+            covariance = result.material_covariances(name, places)
+            relative = relative_uncertainty(some, result.materials(name).at(places), covariance)
+            inside.append(_inside(made[name] / share, relative, some.values, result.view_noise(view, rows, held)))
+        for channel in range(result.channels):
+            place, measured = frames.pairs(rows, channel)
+            pixels = {name: values[:, columns, channel][place] for name, values in made.items()}
+            _compare(pixels, measured, check.pictures)
         say(f"check of {view.view}", rows.stop, len(view.triangles))
+
+
+def _inside(
+    made: NDArray[np.float64],
+    relative: NDArray[np.float32],
+    measured: NDArray[np.float32],
+    noise: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Of the channels' means of samples [n, leds, channels] that have all: whether they lie in the interval of
+    what was made, by its uncertainty [n, leds] and theirs."""
+    middle = made.mean(axis=2)
+    variance = (relative * middle) ** 2 + np.sum((noise * measured) ** 2, axis=2) / measured.shape[2] ** 2
+    off = np.abs(measured.mean(axis=2) - middle)
+    known = np.isfinite(off) & np.isfinite(variance)
+    found: NDArray[np.bool_] = off[known] < QUANTILE * np.sqrt(variance[known])
+    return found
+
+
+def _compare(
+    made: dict[str, NDArray[np.float64]], measured: NDArray[np.floating], missed: dict[str, _Missed]
+) -> None:
+    known = np.isfinite(measured)
+    for values in made.values():
+        known &= np.isfinite(values)
+    for name, values in made.items():
+        missed[name].add(values[known], measured[known])
 
 
 def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | None:
@@ -115,6 +163,22 @@ def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | 
     return {"coverage": uncertainty["interval"]["coverage"], "low": low, "high": high}
 
 
+def _share(inside: list[NDArray[np.bool_]]) -> float | None:
+    every = np.concatenate(inside)
+    return float(every.mean()) if len(every) else None
+
+
+def _typical(result: RunResult, name: str) -> dict[str, float | None]:
+    """Medians of standard uncertainties of a material; of kd and ks with what all samples of a triangle, and all
+    triangles, share."""
+    variances = np.einsum("nii->ni", result.material_covariances(name)).copy()
+    variances[:, 2:4] += (result.u_triangles(slice(None)) ** 2 + result.u_shared**2)[:, None]
+    known = np.sqrt(variances[np.isfinite(variances).all(axis=1)])
+    tilt = np.degrees(np.hypot(known[:, 0], known[:, 1]))
+    percent = {f"{key}_percent": _median(100 * known[:, 2 + n]) for n, key in enumerate(("kd", "ks", "alpha"))}
+    return {"normal_deg": _median(tilt), **percent}
+
+
 def _median(values: NDArray[np.float64]) -> float | None:
     return float(np.median(values)) if len(values) else None
 
@@ -122,7 +186,7 @@ def _median(values: NDArray[np.float64]) -> float | None:
 def _about(
     result: RunResult,
     settings: dict[str, Any],
-    checks: dict[str, _Check],
+    check: _Check,
     uncertainty: dict[str, Any] | None,
     seconds: float,
 ) -> dict[str, Any]:
@@ -138,8 +202,12 @@ def _about(
         "not_fitted": int(np.count_nonzero(~np.isfinite(result.materials("ggx").alpha))),
         "samples": sum(view["samples"] for view in views),
         "residual": {name: _median(values[np.isfinite(values)]) for name, values in left.items()},
-        "mae": {name: check.mae for name, check in checks.items()},
-        "held_out_psnr_db": {name: check.psnr_db for name, check in checks.items()},
+        "mae": {name: missed.mae for name, missed in check.pictures.items()},
+        "held_out_psnr_db": {name: missed.psnr_db for name, missed in check.pictures.items()},
+        "mae_of_triangles": {name: missed.mae for name, missed in check.triangles.items()},
+        "held_out_inside": {name: _share(inside) for name, inside in check.inside.items()},
+        "material_uncertainty": {name: _typical(result, name) for name in MATERIALS},
+        "mae_of_noise": float(np.mean(check.noise)) if np.isfinite(check.noise).any() else None,
         "median_interval_percent": _interval_percent(uncertainty),
         "uncertainty_percent": uncertainty,
         "seconds": round(seconds, 3),

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.reflectance.material_uncertainty import covariances
 from coupole.reflectance.result_folder import complete, in_the_making, read_settings
 from coupole.reflectance.run_result import (
     MATERIALS,
@@ -36,8 +38,7 @@ def fit_result(out: Path, memory_bytes: int, *, say: Said = lambda step, done, o
     try:
         for name in MATERIALS:
             if not result.materials_path(name).exists():
-                noise_um = settings["scan_noise_um"] if name == "ggx_normal" else None
-                _fit_materials(result, name, noise_um, settings["left_out"], memory_bytes, say)
+                _fit_materials(result, name, settings, memory_bytes, say)
         for names in TOGETHER:
             for view in result.views:
                 if not all(result.slices_path(name, view).exists() for name in names):
@@ -69,15 +70,21 @@ def predicted(
     return slice_values(samples, coefficients, kind.basis, model)
 
 
-def _fit_materials(
-    result: RunResult, name: str, noise_um: float | None, left_out: list[int], memory_bytes: int, say: Said
-) -> None:
-    parts = []
+def _fit_materials(result: RunResult, name: str, settings: dict[str, Any], memory_bytes: int, say: Said) -> None:
+    parts, uncertain = [], []
+    noise_um, fitted_normals = settings["scan_noise_um"], name == "ggx_normal"
     for block in result.blocks(memory_bytes):
-        used = ~np.isin(result.along_samples(block, "leds"), left_out)
-        parts.append(fit_triangles(result.samples(block), used, noise_um))
+        used = ~np.isin(result.along_samples(block, "leds"), settings["left_out"])
+        samples = result.samples(block)
+        parts.append(fit_triangles(samples, used, noise_um if fitted_normals else None))
+        uncertain.append(covariances(samples, used, parts[-1], noise_um, fitted_normals=fitted_normals))
         say(f"fit {name}", block.stop, len(result.triangles))
-    complete(result.materials_path(name), lambda path: write_materials(path, parts, result.triangles))
+    u_triangle = np.concatenate([result.u_triangles(block) for block in result.blocks(memory_bytes)])
+
+    def write(path: Path) -> None:
+        write_materials(path, parts, uncertain, u_triangle, result.u_shared, result.triangles)
+
+    complete(result.materials_path(name), write)
 
 
 def _fit_slices(
@@ -88,7 +95,6 @@ def _fit_slices(
         coefficients = []
         for name in names:
             path = result.slices_path(name, view)
-            path.parent.mkdir(exist_ok=True)
             part = files.enter_context(in_the_making(path))
             file = files.enter_context(h5py.File(part, "w"))
             coefficients.append(begin_slices(file, SLICES[name], view, result.channels))

@@ -10,6 +10,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,13 @@ import numpy as np
 
 from coupole.errors import InputError
 from coupole.reflectance.extraction.extraction import extract_view, geometry_of
+from coupole.reflectance.extraction.frames_for_check import write_frames
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView, read_measured_run
 from coupole.reflectance.extraction.radiance import Radiometry
-from coupole.reflectance.result_folder import begin, complete
+from coupole.reflectance.result_folder import begin, complete, read_settings
 from coupole.reflectance.run_check import check_result
 from coupole.reflectance.run_fits import fit_result
-from coupole.reflectance.run_result import OBJECT, write_object
+from coupole.reflectance.run_result import FRAMES, OBJECT, write_object
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256, write_synced
 
@@ -64,7 +66,7 @@ def extract_runs(request: RunRequest, out: Path, *, say: Said = lambda step, don
         begin(out, _settings(request, measured_runs))
         first = measured_runs[0]
         complete(out / OBJECT, lambda path: write_object(path, first.corners_mm, first.base_from_support))
-        _extract(measured_runs, out, say)
+        _extract(measured_runs, out, read_settings(out)["left_out"], say)
     except OSError as error:
         raise disk_error(out, error) from error
 
@@ -99,16 +101,18 @@ def _settings(request: RunRequest, measured_runs: Sequence[MeasuredRun]) -> dict
     }
 
 
-def _extract(measured_runs: Sequence[MeasuredRun], out: Path, say: Said) -> None:
-    """Samples of all views, and what the report says of each."""
+def _extract(measured_runs: Sequence[MeasuredRun], out: Path, left_out: Sequence[int], say: Said) -> None:
+    """Of all views samples, frames for the check, and what the report says."""
     for measured in measured_runs:
         prepared = None
         for view in measured.views:
             name = _name(measured_runs, measured, view)
             path, summary = out / "samples" / f"{name}.h5", out / "samples" / f"{name}.json"
             if not summary.exists():
-                prepared = prepared or (geometry_of(measured), Radiometry(measured))
-                found = extract_view(measured, *prepared, view, path, say)
+                geometry, radiometry = prepared = prepared or (geometry_of(measured), Radiometry(measured))
+                found = extract_view(measured, geometry, radiometry, view, path, say)
+                frames = out / FRAMES / f"{name}.h5"
+                complete(frames, partial(write_frames, radiometry, view, path, left_out))
                 write_synced(summary, json.dumps(found))
 
 

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError, Problem
+from coupole.reflectance.ggx import UNKNOWNS
+from coupole.reflectance.material_uncertainty import MaterialUncertainty
 from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis, centres
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples
 
@@ -41,6 +43,9 @@ SLICES = {
 }
 FITS = (*MATERIALS, *SLICES)
 CLUSTERS = "fits/clusters.h5"
+FRAMES = "samples/frames"
+"""Folder of the pictures that the fits are compared with."""
+_LOWER = np.tril_indices(UNKNOWNS)
 _HEAD = ("triangles", "camera_mm", "leds", "led_positions_mm", "led_normals", "full_scales")
 FIELDS = {
     "normals": "unit, base frame",
@@ -48,6 +53,12 @@ FIELDS = {
     "ks": "by channel; f = kd + ks D V",
     "alpha": "GGX's roughness",
     "residual": "weighted rms of the square roots that are left, as a share of sqrt(kd)",
+}
+UNCERTAIN = {
+    "covariance": "lower half, row by row, of tilts (rad) along two tangents of the normal and of the logarithms "
+    "of kd, ks (the channels' mean) and alpha; without u_triangle and u_shared",
+    "u_kd": "relative standard uncertainty by channel, without u_triangle and u_shared",
+    "u_ks": "the same of ks",
 }
 
 
@@ -206,6 +217,33 @@ class RunResult:
             self.areas_mm2[view.triangles[rows]],
         )
 
+    def view_noise(self, view: ViewSamples, rows: slice, leds: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """[n, leds, channels] relative standard uncertainty of `view_samples` by noise and each LED's power."""
+        columns = np.flatnonzero(leds)
+        with h5py.File(view.path, "r") as file:
+            noise: NDArray[np.float64] = np.hypot(file["u_own"][rows, columns], file["led_u_own"][columns])
+            return noise
+
+    def u_triangles(self, block: slice) -> NDArray[np.float32]:
+        """[n] relative standard uncertainty, mean of channels, that samples of a triangle share by the responses
+        of its pixels, which are others in each view. NaN without a record of the response."""
+        wanted = self.triangles[block]
+        squares, views = np.zeros(len(wanted)), np.zeros(len(wanted))
+        for view in self.views:
+            if rows := _rows(view, wanted):
+                at = np.searchsorted(wanted, view.triangles[rows.start : rows.stop])
+                with h5py.File(view.path, "r") as file:
+                    each = file["u_response"][rows.start : rows.stop]
+                squares[at] += np.sum(np.where(np.isinf(each), 0.0, each) ** 2, axis=1) / each.shape[1] ** 2
+                views[at] += 1
+        return np.sqrt(squares / views**2).astype(np.float32)
+
+    @cached_property
+    def u_shared(self) -> float:
+        """Relative standard uncertainty that all samples share."""
+        files = (h5py.File(view.path, "r") for view in self.views)
+        return float(np.mean([np.mean(file["led_u_shared"][()]) for file in files]))
+
     def along_samples(self, block: slice, name: str) -> NDArray[Any]:
         """[samples, ...] what each sample of `samples(block)` has by its LED: `leds`, `led_normals`,
         `full_scales`."""
@@ -222,6 +260,17 @@ class RunResult:
         """A fit by its name in `MATERIALS`."""
         with h5py.File(self.materials_path(name), "r") as file:
             return TriangleMaterials(*(file[field][block].astype(np.float64) for field in FIELDS))
+
+    def material_covariances(
+        self, name: str, block: slice | NDArray[np.int64] = slice(None)
+    ) -> NDArray[np.float64]:
+        """[n, 5, 5] of a fit by its name in `MATERIALS`, as `material_uncertainty.covariances` gives them."""
+        with h5py.File(self.materials_path(name), "r") as file:
+            lower = file["covariance"][()][block].astype(np.float64)
+        found = np.empty((len(lower), UNKNOWNS, UNKNOWNS))
+        found[:, *_LOWER] = lower
+        found[:, *_LOWER[::-1]] = lower
+        return found
 
     @cached_property
     def clusters(self) -> Clusters:
@@ -298,13 +347,32 @@ def write_object(path: Path, corners_mm: NDArray[np.float64], base_from_support:
         file.create_dataset("base_from_support", data=base_from_support, track_times=False)
 
 
-def write_materials(path: Path, parts: Sequence[TriangleMaterials], triangles: NDArray[np.int64]) -> None:
-    """A fit of all triangles, from those of blocks."""
+def write_materials(
+    path: Path,
+    parts: Sequence[TriangleMaterials],
+    uncertain: Sequence[MaterialUncertainty],
+    u_triangle: NDArray[np.float32],
+    u_shared: float,
+    triangles: NDArray[np.int64],
+) -> None:
+    """A fit of all triangles, from those of blocks; `u_triangle` [n] and `u_shared` are relative standard
+    uncertainties of kd and ks, of a triangle and of all."""
     with h5py.File(path, "w") as file:
         file.create_dataset("triangles", data=triangles, track_times=False).attrs["told"] = "numbers in the mesh"
         for field, told in FIELDS.items():
             values = np.concatenate([getattr(part, field) for part in parts]).astype(np.float32)
             file.create_dataset(field, data=values, track_times=False).attrs["told"] = told
+        for field, told in UNCERTAIN.items():
+            values = np.concatenate([getattr(part, field) for part in uncertain]).astype(np.float32)
+            if field == "covariance":
+                values = values[:, *_LOWER]
+            file.create_dataset(field, data=values, track_times=False).attrs["told"] = told
+        file.create_dataset("u_triangle", data=u_triangle, track_times=False).attrs["told"] = (
+            "relative standard uncertainty of kd and ks, that of the responses of the triangle's pixels"
+        )
+        file.create_dataset("u_shared", data=u_shared, track_times=False).attrs["told"] = (
+            "relative standard uncertainty of kd and ks, that of the power of all LEDs"
+        )
 
 
 def begin_slices(file: h5py.File, kind: SliceKind, view: ViewSamples, channels: int) -> h5py.Dataset:

@@ -22,7 +22,7 @@ _TYPICAL = 200_000
 """Samples of all views, for what is typical."""
 _TRIANGLES = 2000
 """Of each view, which they are taken of."""
-_DRAWN, _DRAWS = 1000, 1000
+_DRAWN, _DRAWS = 1000, 300
 """Samples, of all views, and draws for each."""
 
 
@@ -82,6 +82,7 @@ def _picked(result: RunResult, view: ViewSamples, scan_noise_um: float, most: in
         channel = file["u_own"].shape[2] // 2
         noise = file["u_own"][::step][..., channel]
         own, shared = file["led_u_own"][:, channel], file["led_u_shared"][:, channel]
+        response = file["u_response"][::step, channel]
         led_mm = float(file.attrs["led_u_mm"])
     known = np.flatnonzero(np.isfinite(noise))
     if len(known) > most:
@@ -91,6 +92,11 @@ def _picked(result: RunResult, view: ViewSamples, scan_noise_um: float, most: in
     places = Places(corners[triangle], view.led_mm[led], view.led_normals[led])
     same = np.ones(len(led))
     sources = Sources(
-        noise[triangle, led].astype(np.float64), own[led], shared[led], scan_noise_um * same, led_mm * same
+        noise[triangle, led].astype(np.float64),
+        response[triangle],
+        own[led],
+        shared[led],
+        scan_noise_um * same,
+        led_mm * same,
     )
     return places, sources

@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 
 SOURCES = {
     "u_noise": "noise of the frames",
+    "u_response": "own responses of pixels",
     "u_own": "power of each LED",
     "u_shared": "power of all LEDs",
     "vertex_um": "vertices of the mesh",
@@ -35,6 +36,8 @@ class Sources:
 
     u_noise: Floats
     """[n] relative."""
+    u_response: Floats
+    """[n] relative, of the responses of the pixels that a triangle covers."""
     u_own: Floats
     """[n] relative, of an LED's power."""
     u_shared: Floats
@@ -79,7 +82,7 @@ def bounds(places: Places, sources: Sources, quantile: float) -> tuple[Floats, F
     by_tilt2 = np.einsum("ni,nij,nj->n", towards, tilt, towards) / cosine**2
     by_place2 = (sources.led_mm / distances) ** 2 * (4.0 + 1.0 / cosine**2 - 1.0)
     below2 = quantile**2 * (by_tilt2 + by_place2 + sources.u_own**2 + sources.u_shared**2)
-    above2 = (quantile * sources.u_noise) ** 2
+    above2 = quantile**2 * (sources.u_noise**2 + sources.u_response**2)
     root = np.sqrt(1.0 - (1.0 - below2) * (1.0 - above2))
     # a tilt to any side makes the mean of the cosine smaller
     longer = np.sqrt(1.0 + np.trace(tilt, axis1=1, axis2=2))
@@ -121,7 +124,7 @@ def drawn(
     axes = np.broadcast_to(places.led_normals[:, None], leds.shape)
     flat = _geometry(corners.reshape(-1, 3, 3), leds.reshape(-1, 3), axes.reshape(-1, 3), paper)
     geometry = flat.reshape(count, draws)
-    signal = 1.0 + sources.u_noise[:, None] * normal()
+    signal = (1.0 + sources.u_noise[:, None] * normal()) * (1.0 + sources.u_response[:, None] * normal())
     power = (1.0 + sources.u_own[:, None] * normal()) * (1.0 + sources.u_shared[:, None] * normal())
     with np.errstate(divide="ignore"):
         found: Floats = signal * measured[:, None] / (power * geometry)

@@ -126,7 +126,7 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
     own = np.empty((samples, channels))
     for triangle in range(count):
         normal, held = normals[triangle], stiffness[triangle]
-        n = _gather(
+        n = gather(
             values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normal, used, own, good, roots,
             lights, half, views,
         )  # fmt: skip
@@ -143,14 +143,14 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
 
 
 @numba.njit(cache=True, nogil=True)
-def _gather(  # type: ignore[no-untyped-def]
+def gather(  # type: ignore[no-untyped-def]
     values, led_mm, view_of, cameras_mm, centre_mm, normal, used, own, good, roots, lights, half, views
 ):
     """Fill the arrays with one triangle's samples and directions; how many there are. A camera that does not see
     the triangle is put on its normal, so that it forbids no normal."""
     seeing = np.zeros(len(cameras_mm), np.bool_)
     for view in range(len(cameras_mm)):
-        _towards(centre_mm, cameras_mm[view], views[view])
+        towards(centre_mm, cameras_mm[view], views[view])
     n = 0
     for number in range(len(used)):
         sample = used[number]
@@ -160,8 +160,8 @@ def _gather(  # type: ignore[no-untyped-def]
             grey += own[sample, channel] / values.shape[1]
         if not grey > 0.0:
             continue
-        _towards(centre_mm, led_mm[sample], lights[sample])
-        _between(lights[sample], views[view_of[sample]], half[sample])
+        towards(centre_mm, led_mm[sample], lights[sample])
+        between(lights[sample], views[view_of[sample]], half[sample])
         seeing[view_of[sample]] = True
         good[n], roots[n] = sample, math.sqrt(grey)
         n += 1
@@ -200,14 +200,14 @@ def _first_kd(roots, good, lights, normal):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _towards(place, target, direction):  # type: ignore[no-untyped-def]
+def towards(place, target, direction):  # type: ignore[no-untyped-def]
     x, y, z = target[0] - place[0], target[1] - place[1], target[2] - place[2]
     length = math.sqrt(x * x + y * y + z * z)
     direction[0], direction[1], direction[2] = x / length, y / length, z / length
 
 
 @numba.njit(cache=True, nogil=True)
-def _between(light, view, half):  # type: ignore[no-untyped-def]
+def between(light, view, half):  # type: ignore[no-untyped-def]
     x, y, z = light[0] + view[0], light[1] + view[1], light[2] + view[2]
     length = math.sqrt(x * x + y * y + z * z)
     half[0], half[1], half[2] = x / length, y / length, z / length
@@ -222,11 +222,11 @@ def _model(led_mm, view_of, cameras_mm, centres_mm, normals, kd, ks, alpha, made
         if not alpha[triangle] > 0.0:
             continue
         for view in range(len(cameras_mm)):
-            _towards(centres_mm[triangle], cameras_mm[view], views[view])
+            towards(centres_mm[triangle], cameras_mm[view], views[view])
         for sample in range(samples):
             view = views[view_of[sample]]
-            _towards(centres_mm[triangle], led_mm[sample], light)
-            _between(light, view, half)
+            towards(centres_mm[triangle], led_mm[sample], light)
+            between(light, view, half)
             nl = n[0] * light[0] + n[1] * light[1] + n[2] * light[2]
             nv = n[0] * view[0] + n[1] * view[1] + n[2] * view[2]
             nh = n[0] * half[0] + n[1] * half[1] + n[2] * half[2]

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import StorageError
-from coupole.reflectance.extraction.lamp_sight import REACHED
+from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.run_fits import predicted
+from coupole.reflectance.run_pictures import read_check_frames
 from coupole.reflectance.run_result import FITS, MATERIALS, REPORT, RunResult, read_about
 from coupole.reflectance.triangle_fit import FEWEST
 from coupole.storage.durable import write_synced
@@ -24,6 +25,8 @@ POOR_RESIDUAL = 0.05
 WHITE_KS = 0.1
 LEAST_KS = 0.004
 """A tenth of a dielectric's: below it the roughness says nothing."""
+_VARIANCES = [0, 2, 5, 9, 14]
+"""Places in the lower half of a covariance."""
 TOLD = {
     "ggx": "GGX, mesh's normals",
     "ggx_normal": "GGX, normals fitted",
@@ -82,6 +85,7 @@ def _page(folder: Path) -> Iterator[str]:
         yield f"<p>{html.escape(remark)}"
     yield from _missed(about)
     yield from _uncertain(about)
+    yield from _material_uncertainty(about)
     fits = {name: _fields(RunResult(folder).materials_path(name)) for name in MATERIALS}
     for view in sorted((folder / "samples").glob("*.h5")):
         yield f"<h2>View {html.escape(view.stem)}</h2>"
@@ -94,10 +98,7 @@ def _page(folder: Path) -> Iterator[str]:
         yield f"<tr><th>{html.escape(summary['view'])}"
         yield "".join(f"<td>{100 * share:.1f} %" for share in summary["share_by_code"].values())
     yield f"</table><p>{about['seconds']:.1f} s, at most {about['peak_memory_bytes'] / 1e9:.1f} GB."
-    yield (
-        "<p>Inter-reflection and veiling glare are not subtracted, nor are they in the bounds. No uncertainty is "
-        "stated for normals and materials yet."
-    )
+    yield ("<p>Inter-reflection and veiling glare are not subtracted, nor are they in the bounds.")
 
 
 def _uncertain(about: dict[str, Any]) -> Iterator[str]:
@@ -123,6 +124,21 @@ def _uncertain(about: dict[str, Any]) -> Iterator[str]:
     yield "</table>"
 
 
+def _material_uncertainty(about: dict[str, Any]) -> Iterator[str]:
+    yield (
+        "<h2>Uncertainty of normals and materials</h2><p>Median standard uncertainties, and how many of the "
+        "samples kept for the check lie in the 95 % interval of what is made."
+        "<table><tr><th><th>normal, degrees<th>kd<th>ks<th>alpha<th>inside"
+    )
+    for name, known in about["material_uncertainty"].items():
+        if known["normal_deg"] is not None:
+            yield f"<tr><th>{TOLD[name]}<td>{known['normal_deg']:.2f}"
+            yield "".join(f"<td>{known[f'{field}_percent']:.1f} %" for field in ("kd", "ks", "alpha"))
+            inside = about["held_out_inside"][name]
+            yield "<td>" if inside is None else f"<td>{100 * inside:.1f} %"
+    yield "</table><p>Fewer than 95 % inside: the material misses something that neighbouring LEDs do not share."
+
+
 def _width(row: dict[str, Any]) -> float:
     low, high = row["median"]
     return float(high - low)
@@ -134,34 +150,41 @@ def _bounds(pair: Sequence[float]) -> str:
 
 def _missed(about: dict[str, Any]) -> Iterator[str]:
     """A table of the fits."""
-    yield "<h2>Under the LEDs kept for the check</h2><table><tr><th><th>mean error, % of range<th>PSNR, dB"
+    yield (
+        "<h2>Under the LEDs kept for the check</h2><table><tr><th><th>mean error of pictures, % of range"
+        "<th>PSNR, dB<th>mean error of triangles, % of range"
+    )
     for name, mae in about["mae"].items():
         if mae is not None:
-            yield f"<tr><th>{TOLD[name]}<td>{100 * mae:.3f}<td>{about['held_out_psnr_db'][name]:.1f}"
-    yield "</table>"
+            psnr_db, of_triangles = about["held_out_psnr_db"][name], about["mae_of_triangles"][name]
+            yield f"<tr><th>{TOLD[name]}<td>{100 * mae:.3f}<td>{psnr_db:.1f}<td>{100 * of_triangles:.3f}"
+    if (noise := about["mae_of_noise"]) is not None:
+        yield f"<tr><th>the camera's noise alone<td>{100 * noise:.3f}"
+    yield "</table><p>Pictures are compared by blocks of 2 x 2 pixels, one pixel of each channel (seed 003, 6.3)."
 
 
 def _reconstructed(result: RunResult, path: Path, about: dict[str, Any]) -> Iterator[str]:
-    """What each fit makes of one LED that was kept for the check, and how far it is off; the LED that lights most
-    triangles."""
+    """A frame that was kept for the check, and what each fit makes of it; that which shows most."""
     view = next(view for view in result.views if view.path == path)
-    held = np.flatnonzero(np.isin(view.leds, about["left_out"]))
-    if not len(held):
+    frames = read_check_frames(result, view)
+    if not len(frames.leds):
         return
-    with h5py.File(path, "r") as file:
-        seen, codes = file["seen"][()], file["codes"][()]
-    one = held[int(np.argmax(np.count_nonzero(codes[:, held] == REACHED, axis=0)))]
+    number = int(np.argmax(np.isfinite(frames.share[..., 0]).sum(axis=(1, 2))))
+    one, measured = frames.leds[number], frames.share[number].astype(np.float32)
     rows = slice(0, len(view.triangles))
-    under = result.view_samples(view, rows, np.arange(len(view.leds)) == one)
-    measured = _rgb(under.values[:, 0], about["channels"])
-    white = float(np.nanquantile(measured, 0.995))
-    yield f"<p>f cos under LED {view.leds[one]}, and how far each fit is off, white a tenth of that<br>"
-    yield figure("measured", display(np.nan_to_num(_picture(seen, measured)), white))
+    led = view.leds == one
+    under = result.view_samples(view, rows, led)
+    lit = lit_on(under.centres_mm, under.led_mm, view.led_normals[led], about["emission"] == "paper")
+    share = (lit[..., None] * view.full_scales[led])[:, 0]
+    shown = np.isfinite(measured).all(axis=2, keepdims=True)
+    white = float(np.nanquantile(measured, 0.995)) if shown.any() else 1.0
+    yield f"<p>The frame under LED {one}, made by each fit, and how far each is off, white a tenth of that<br>"
+    yield figure("measured", display(_rgb(np.nan_to_num(measured)), white))
     for name in FITS:
-        made = _rgb(predicted(result, name, view, rows, under)[:, 0], about["channels"])
-        off = np.abs(made - measured).mean(axis=1, keepdims=True)
-        yield figure(TOLD[name], display(np.nan_to_num(_picture(seen, made)), white))
-        yield figure("off", grey(np.nan_to_num(_picture(seen, off))[..., 0] / (0.1 * white)))
+        made = frames.picture(predicted(result, name, view, rows, under)[:, 0] * share)
+        off = np.where(shown, np.abs(made - measured), 0.0).mean(axis=2)
+        yield figure(TOLD[name], display(_rgb(np.nan_to_num(np.where(shown, made, 0.0))), white))
+        yield figure("off", grey(np.nan_to_num(off) / (0.1 * white)))
 
 
 def _fields(path: Path) -> dict[str, NDArray[Any]]:
@@ -171,25 +194,35 @@ def _fields(path: Path) -> dict[str, NDArray[Any]]:
 
 def _view(path: Path, fits: dict[str, dict[str, NDArray[Any]]]) -> Iterator[str]:
     with h5py.File(path, "r") as file:
-        seen, triangles, channels = file["seen"][()], file["triangles"][()], file.attrs["channels"]
+        seen, triangles = file["seen"][()], file["triangles"][()]
     found = fits["ggx_normal"]
     row = np.searchsorted(found["triangles"], triangles)
     mesh, fitted = fits["ggx"]["normals"][row], found["normals"][row]
-    kd, ks = (_rgb(found[name][row], channels) for name in ("kd", "ks"))
+    kd, ks = (_rgb(found[name][row]) for name in ("kd", "ks"))
+    uncertain = np.sqrt(found["covariance"][row][:, _VARIANCES])
     yield figure("normals of the mesh", _picture(seen, 0.5 + 0.5 * mesh))
     yield figure("fitted", _picture(seen, 0.5 + 0.5 * fitted))
     turned = np.degrees(np.arccos(np.clip(np.sum(mesh * fitted, axis=1), -1, 1)))
     yield figure("angle between them, white 10 degrees", grey(_picture(seen, turned[:, None] / 10.0)[..., 0]))
+    sd_deg = np.degrees(np.hypot(uncertain[:, :1], uncertain[:, 1:2]))
+    yield figure(
+        "standard uncertainty of fitted normals, white 10 degrees", grey(_picture(seen, sd_deg / 10)[..., 0])
+    )
     yield figure("diffuse", display(_picture(seen, kd)))
+    caption = "standard uncertainty of diffuse, white 10 %"
+    yield figure(caption, grey(_picture(seen, uncertain[:, 2:3] / 0.1)[..., 0]))
     yield figure("specular ks, white 0.1", display(_picture(seen, ks), WHITE_KS))
     rough = np.where(ks.max(axis=1) > LEAST_KS, found["alpha"][row], 0.0)
     caption = f"roughness alpha, white 1, where ks is above {LEAST_KS:g}"
     yield figure(caption, grey(_picture(seen, rough[:, None])[..., 0]))
+    doubt = np.where(ks.max(axis=1) > LEAST_KS, uncertain[:, 4], 0.0)[:, None]
+    yield figure("its relative standard uncertainty, white 50 %", grey(_picture(seen, doubt / 0.5)[..., 0]))
     yield figure("what is left, white 10 %", grey(_picture(seen, found["residual"][row][:, None] / 0.1)[..., 0]))
 
 
-def _rgb(values: NDArray[Any], channels: str) -> NDArray[Any]:
-    return values if len(channels) == 3 else np.repeat(values, 3, axis=1)
+def _rgb(values: NDArray[Any]) -> NDArray[Any]:
+    """Of one channel three."""
+    return values if values.shape[-1] == 3 else np.repeat(values, 3, axis=-1)
 
 
 def _picture(seen: NDArray[np.int32], values: NDArray[Any]) -> NDArray[np.float32]:

@@ -108,7 +108,7 @@ def test_tilts_are_those_of_moved_vertices() -> None:
 @pytest.mark.parametrize("emission", ["lambertian", "paper"])
 def test_draws_are_those_of_the_budgets_measurement_equation(emission: Emission) -> None:
     """Which was written for `coupole budget`, with the exact square of the LED."""
-    places, draws = placed(60.0), 4000
+    places, draws = placed(60.0), 8000
     random = np.random.default_rng(8)
     corners = places.corners_mm[:, None] + random.normal(0, 0.03, (COUNT, draws, 3, 3))
     leds = places.led_mm[:, None] + random.normal(0, 0.5, (COUNT, draws, 3))

@@ -24,8 +24,15 @@ Made = tuple[CellFolder, Path, dict[str, Any]]
 
 
 def shipped_cell(folder: Path, **world: Any) -> CellFolder:
-    """A cell with the camera of `sim.yaml`, for which the records hold."""
+    """A cell with the camera of `sim.yaml`, for which the records hold, and a quarter of its relief: a high dome
+    with lower ones around it."""
     cell = CellFolder(folder, speed=10.0)
+    relief = trimesh.load(cell.plan_data["object"]["mesh"], process=False)
+    x, y, _ = relief.triangles_center.T
+    relief.update_faces((x > 10) & (y > -20))
+    relief.remove_unreferenced_vertices()
+    relief.export(folder / "relief.ply")
+    cell.plan_data["object"]["mesh"] = str(folder / "relief.ply")
     shipped = {"width_px": 512, "height_px": 384, "pixel_pitch_um": 44.0}
     cell.rig_data["sensor"] |= shipped
     cell.world_settings.update(white_at_us=8000, **world)
@@ -77,7 +84,7 @@ def test_samples_are_the_reflectance_that_was_there(made: Made, view: str) -> No
         towards = unit(file["camera_mm"][()] - centres)[:, None]
     truth = walter(normals[:, None], light, towards)
     known = np.isfinite(f)
-    assert known.sum() > 200_000
+    assert known.sum() > 100_000
     ratio = np.where(known, f / truth, np.nan)
     np.testing.assert_allclose(np.nanmedian(ratio, axis=(0, 1)), 1.0, atol=0.01)
     incidence = np.broadcast_to(np.einsum("nlk,nk->nl", light, normals)[..., None], f.shape)
@@ -102,6 +109,50 @@ def test_the_material_is_found_and_makes_the_pictures_under_leds_kept_for_the_ch
         assert document["held_out_psnr_db"][name] > 35
     for name in ("sh", "rbf"):  # 41 LEDs for 100 coefficients
         assert document["mae"][name] < 0.03
+
+
+def test_stated_intervals_hold_the_material(made: Made) -> None:
+    """All parts together, and without what all triangles share: as they lie around their own middle."""
+    _, out, document = made
+    with h5py.File(out / "fits/ggx_normal.h5") as file:
+        kd, u_kd, u_triangle, u_shared = (file[name][()] for name in ("kd", "u_kd", "u_triangle", "u_shared"))
+    off = np.log(np.maximum(kd, 1e-9) * np.pi / DIFFUSE)
+    alone = np.hypot(u_kd, u_triangle[:, None])
+    known = np.isfinite(alone).all(axis=1)
+    assert (np.abs(off) < 1.96 * np.hypot(alone, u_shared))[known].mean() > 0.95
+    around = np.abs(off - np.nanmedian(off, axis=0)) < 1.96 * alone
+    assert 0.9 < around[known].mean() <= 1.0
+    assert 0.9 < document["held_out_inside"]["ggx_normal"] < 0.99
+    assert document["held_out_inside"]["ggx"] > 0.9
+    assert (
+        document["material_uncertainty"]["ggx"]["normal_deg"]
+        > document["material_uncertainty"]["ggx_normal"]["normal_deg"]
+    )
+
+
+def test_pictures_for_the_check_are_the_frames_and_fits_miss_little_more_than_noise(made: Made) -> None:
+    """Read from the run itself: one pixel of each channel of a block, dark and fall-off taken out."""
+    cell, out, document = made
+    with h5py.File(out / "samples/frames/top.h5") as file:
+        share, leds = file["share"][()].astype(float), file["leds"][()]
+    with h5py.File(cell.run_folder / "views/top.h5") as file:
+        detector = file["entry/instrument/detector"]
+        data, led = detector["data"][()].astype(float), detector["frames"]["led"]
+        pattern = detector["bayer_pattern"][()].decode()
+    with h5py.File(RECORDS / "flat-field.h5") as file:
+        over = file["g"][()] * file["pixel_response"][()] * 4031.0  # range of the camera, by its response record
+    raw = (data[led == leds[0]][0] - data[led == 65535].mean(axis=0)) / over
+    for channel, letter in enumerate("RGB"):
+        row, column = divmod(pattern.index(letter), 2)
+        mine = share[0, ..., channel]
+        off = (raw[row::2, column::2] - mine)[np.isfinite(mine)]
+        assert len(off) > 1000
+        assert abs(np.median(off)) < 5e-4
+        assert np.abs(off).max() < 0.01
+    assert leds.tolist() == document["left_out"]
+    noise = document["mae_of_noise"]
+    assert noise < document["mae"]["ggx_normal"] < 1.5 * noise
+    assert document["mae_of_triangles"]["ggx_normal"] < document["mae"]["ggx_normal"]
 
 
 def test_brackets_are_merged(tmp_path: Path) -> None:
@@ -139,7 +190,7 @@ def test_runs_of_one_object_are_fitted_together(made: Made, tmp_path: Path) -> N
     assert names == {f"{runs[0].name}-top", f"{runs[0].name}-side", f"{runs[1].name}-third"}
     result = RunResult(out)
     assert len(result.triangles) > alone["triangles"]
-    block = slice(6000, 6200)
+    block = slice(2000, 2200)
     samples = result.samples(block)
     assert len(samples.led_mm) == 45 + 45 + 18
     fitted = fit_triangles(samples, np.ones(108, bool), 30.0)
@@ -197,6 +248,7 @@ def noisy_samples(noisy: Path, clean: Path) -> tuple[np.ndarray, Places, Sources
         _, at, here = np.intersect1d(numbers, file["triangles"][()], return_indices=True)
         f, u_own = file["f"][()][here][..., 1], file["u_own"][()][here][..., 1]
         leds, axes, triangles = file["led_positions_mm"][()], file["led_normals"][()], file["triangles"][()][here]
+        u_response = file["u_response"][()][here][:, 1]
         u_led, u_leds = file["led_u_own"][:, 1], file["led_u_shared"][:, 1]
         centres, camera, led_mm = file["centres_mm"][()][here], file["camera_mm"][()], file.attrs["led_u_mm"]
     triangle, led = np.nonzero(np.isfinite(f))
@@ -206,7 +258,8 @@ def noisy_samples(noisy: Path, clean: Path) -> tuple[np.ndarray, Places, Sources
     with h5py.File(noisy / "object.h5") as file:
         corners = file["corners_mm"][()].astype(float)[triangles[triangle]]
     same = np.ones(len(led))
-    sources = Sources(u_own[triangle, led].astype(float), u_led[led], u_leds[led], 30.0 * same, led_mm * same)
+    noise = u_own[triangle, led].astype(float)
+    sources = Sources(noise, u_response[triangle], u_led[led], u_leds[led], 30.0 * same, led_mm * same)
     return truth / f[triangle, led], Places(corners, leds[led], axes[led]), sources
 
 
@@ -236,7 +289,7 @@ def test_ablation_tells_what_fewer_leds_angles_and_coefficients_cost(made: Made)
     for whole in (mae["share of the LEDs"][1.0], mae["most incidence, degrees"][89], mae["coefficients"][100]):
         assert whole == mae["coefficients"][100]
         for name, value in whole.items():
-            assert value == pytest.approx(document["mae"][name], rel=0.25), name
+            assert value == pytest.approx(document["mae_of_triangles"][name], rel=0.25), name
     assert set(mae["share of the LEDs"][0.125].values()) == {None}  # 5 of 41 LEDs are too few
     assert set(mae["most incidence, degrees"][60].values()) == {None}
     few, many = mae["coefficients"][16], mae["coefficients"][100]

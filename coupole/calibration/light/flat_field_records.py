@@ -79,7 +79,7 @@ def flat_field_outcome(
         for channel in channels
     }
     g = _map_of_pattern({channel: fit.map() for channel, fit in fits.items()}, frames.pattern)
-    ratio = _ratio(list(by_view.values()), dark, straight, fits, frames, base_from_panel)
+    ratio, u_ratio = _ratio(list(by_view.values()), dark, straight, fits, frames, base_from_panel)
     spots = dust_spots(ratio)
     parameters, covariance = _flat_parameters(fits)
     corners = np.array([(0.0, 0.0), (width - 1.0, 0.0), (0.0, height - 1.0), (width - 1.0, height - 1.0)])
@@ -103,7 +103,7 @@ def flat_field_outcome(
             limit_of("deepest dust", deepest, _MOST_DUST_DEPTH),
         ),
         files={f"{request.name}.h5": h5_of({"g": g, "pixel_response": ratio, "dust_x_y_pixels_depth": table})},
-        fixed={"focal_px": frames.focal_px},
+        fixed={"focal_px": frames.focal_px, "u_pixel_response": u_ratio},
         remarks=remarks,
         more_inputs=(*record_input(dark_record), *record_input(response_record)),
     )
@@ -195,11 +195,12 @@ def _ratio(
     fits: Mapping[str, FlatField],
     frames: LightFrames,
     base_from_panel: Floats,
-) -> NDArray[np.float32]:
-    """[H, W] mean over views of signal over fitted signal: response of single pixels, and dust."""
+) -> tuple[NDArray[np.float32], float]:
+    """[H, W] mean over views of signal over fitted signal, the response of single pixels and dust, and its
+    standard uncertainty by the differences between views."""
     size_px = next(iter(fits.values())).size_px
     width, height = size_px
-    total = np.zeros((height, width), np.float32)
+    total, squares = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     masks = {channel: channel_mask((height, width), frames.pattern, channel) for channel in fits}
     for found in views:
         signal = mean_of(found) - dark(found[0])
@@ -215,8 +216,12 @@ def _ratio(
                 values = straight[channel](signal[at[:, 0], at[:, 1]].astype(np.float64))
                 ratio[at[:, 0], at[:, 1]] = values / (fit.at(pixels) * shine)
             mine = ratio[masks[channel]]
-            total[masks[channel]] += mine / np.float32(np.median(mine) * len(views))
-    return total
+            mine /= np.float32(np.median(mine))
+            total[masks[channel]] += mine
+            squares[masks[channel]] += (mine - 1) ** 2
+    mean = total / np.float32(len(views))
+    variance = (squares / np.float32(len(views)) - (mean - 1) ** 2) / (len(views) - 1)
+    return mean, float(np.sqrt(max(float(variance.mean(dtype=np.float64)), 0.0)))
 
 
 def _any_saturated(frames: Sequence[LightFrame], white_dn: int) -> NDArray[np.bool_]:

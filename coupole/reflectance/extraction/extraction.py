@@ -168,6 +168,8 @@ def _write_head(
     file["seen"].attrs["told"] = "[h, w] place in `triangles` of what a pixel sees, -1 where it is not used"
     _dataset(file, "triangles", surface.triangles, "numbers of the mesh's triangles, from 0")
     _dataset(file, "pixels", reader.pixels, "pixels of each channel on each triangle")
+    told = "relative standard uncertainty that a triangle's samples share, of pixels' own responses"
+    _dataset(file, "u_response", reader.u_response, told)
     _dataset(file, "centres_mm", geometry.centres_mm[surface.triangles], "of the triangles, mm, base frame")
     _dataset(file, "normals", geometry.normals[surface.triangles], "of the triangles, unit, base frame")
     _dataset(file, "camera_mm", view.base_from_camera[:3, 3], "projection centre, mm, base frame")

@@ -44,9 +44,10 @@ class Radiometry:
             self.channel[channel_mask((height, width), frames.pattern, channel)] = number
         self.channels = len(measured.channels)
         self.flat = np.ones((height, width), np.float32)
+        self.curve, self.noise, self.u_pixel = _response(measured)
         if "flat-field" in records:
-            self.flat = map_beside(records["flat-field"], "flat-field", "g", frames)
-        self.curve, self.noise = _response(measured)
+            self.flat, u_pixel = _flat_field(measured)
+            self.u_pixel = np.full(self.channels, u_pixel)
 
 
 class SignalReader:
@@ -59,6 +60,9 @@ class SignalReader:
         self._places = surface.rows.astype(np.int64) * radiometry.flat.shape[1] + surface.columns
         self.pixels = np.zeros((len(surface.triangles), radiometry.channels), np.int32)
         np.add.at(self.pixels, (surface.triangle, self._channel), 1)
+        with np.errstate(divide="ignore"):
+            self.u_response = radiometry.u_pixel / np.sqrt(self.pixels)
+            """[triangles, channels] relative standard uncertainty that all means share, of pixels' responses."""
 
     def means(self, frame: LightFrame) -> Means:
         """Mean signals of the triangles in one frame. Raises StorageError."""
@@ -78,11 +82,13 @@ class SignalReader:
         return Means((signal / (frame.exposure_us * 1e-6)).astype(np.float32), relative.astype(np.float32))
 
 
-def _response(measured: MeasuredRun) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """[channels, 3] c2, c3 and range of the response, [channels, 2] variance in the dark (DN^2) and gain (DN/e);
-    without a record a straight line, and NaN."""
+def _response(measured: MeasuredRun) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """[channels, 3] c2, c3 and range of the response, [channels, 2] variance in the dark (DN^2) and gain (DN/e),
+    [channels] relative spread of pixels' own responses (0 where the scene did not let it be measured); without a
+    record a straight line, and NaN."""
     path, channels = measured.records.get("response"), measured.channels
     curve, noise = np.zeros((len(channels), 3)), np.full((len(channels), 2), np.nan)
+    u_pixel = np.full(len(channels), np.nan)
     curve[:, 2] = 1.0
     if path is not None:
         record = read_earlier(path, "response", measured.frames.about, measured.frames.size_px)
@@ -90,7 +96,17 @@ def _response(measured: MeasuredRun) -> tuple[NDArray[np.float64], NDArray[np.fl
             linearise(path, channel, measured.frames)  # refuses a record of another camera
             curve[number] = [record.value(name) for name in (f"c2.{channel}", f"c3.{channel}", "range_dn")]
             noise[number] = [record.value(f"{name}.{channel}") for name in ("dark_variance_dn2", "gain_dn_per_e")]
-    return curve, noise
+            u_pixel[number] = record.fixed.get(f"prnu.{channel}", 0.0)
+    return curve, noise, u_pixel
+
+
+def _flat_field(measured: MeasuredRun) -> tuple[NDArray[np.float32], float]:
+    """[h, w] fall-off and response of each pixel, and the latter's relative standard uncertainty: their spread,
+    where a record does not say how well they were measured."""
+    path, frames = measured.records["flat-field"], measured.frames
+    fall_off, response = (map_beside(path, "flat-field", name, frames) for name in ("g", "pixel_response"))
+    record = read_earlier(path, "flat-field", frames.about, frames.size_px)
+    return fall_off * response, float(record.fixed.get("u_pixel_response", np.std(response)))
 
 
 @numba.njit(cache=True, nogil=True)

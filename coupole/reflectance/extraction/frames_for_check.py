@@ -1,0 +1,105 @@
+"""Frames of LEDs that are kept for the check, as pictures: one value for each block of 2 x 2 pixels and channel.
+
+Of a block, one pixel of each channel counts, so that green does not count twice (seed 003, 6.3). Pixels are
+linear, in shares of the camera's range, dark and flat field taken out, as the samples are.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import h5py
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.light.frames import LightFrame
+from coupole.reflectance.extraction.lamp_sight import REACHED
+from coupole.reflectance.extraction.measured_run import MeasuredView
+from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT, Radiometry
+
+MOST_FRAMES = 12
+"""Of a view; more LEDs than that are thinned out evenly."""
+
+
+def write_frames(
+    radiometry: Radiometry, view: MeasuredView, samples: Path, left_out: Sequence[int], to: Path
+) -> None:
+    """Write the pictures of some of the LEDs `left_out`, the longest exposure of each. `samples` is the view's
+    file; a block has a value where all its pixels see triangles that the LED reaches, unclipped. Raises
+    StorageError."""
+    leds = [led for led in view.by_led if led in set(left_out)]
+    leds = leds[:: -(-len(leds) // MOST_FRAMES)] if leds else []
+    with h5py.File(samples, "r") as file:
+        seen, codes, of_led = file["seen"][()], file["codes"][()], list(file["leds"][()])
+    offsets = block_offsets(radiometry.channel, radiometry.channels)
+    height, width = seen.shape
+
+    def picture(led: int) -> tuple[NDArray[np.float16], float]:
+        frame = max(view.by_led[led], key=lambda frame: frame.exposure_us)
+        reached = np.append(codes[:, of_led.index(led)] == REACHED, False)  # the last one: what is not seen
+        return _picture(radiometry, frame, seen, reached, offsets)
+
+    with h5py.File(to, "w") as file, ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        shape = (len(leds), height // 2, width // 2, radiometry.channels)
+        data = file.create_dataset("share", shape, np.float16, track_times=False)
+        data.attrs["told"] = "[leds, h / 2, w / 2, channels] of the camera's range; NaN where there is none"
+        noise = np.full(len(leds), np.nan)
+        for number, (values, expected) in enumerate(pool.map(picture, leds)):
+            data[number], noise[number] = values, expected
+        file.create_dataset("leds", data=np.array(leds, np.int64), track_times=False)
+        file.create_dataset("noise", data=noise, track_times=False)
+        file["noise"].attrs["told"] = (
+            "mean absolute error of `share` by noise; NaN without a record of the response"
+        )
+        file.create_dataset("offsets", data=offsets, track_times=False)
+        file["offsets"].attrs["told"] = "[channels, 2] row and column in a block of the pixel that counts"
+
+
+def block_offsets(channel: NDArray[np.int8], channels: int) -> NDArray[np.int64]:
+    """[channels, 2] row and column, in a block of 2 x 2, of the first pixel of each channel of a map [h, w]."""
+    return np.stack([np.argwhere(channel[:2, :2] == number)[0] for number in range(channels)])
+
+
+def _picture(
+    known: Radiometry,
+    frame: LightFrame,
+    seen: NDArray[np.int32],
+    reached: NDArray[np.bool_],
+    offsets: NDArray[np.int64],
+) -> tuple[NDArray[np.float16], float]:
+    """One LED's picture, and its mean absolute error by noise."""
+    height, width = seen.shape
+    range_dn = known.white_dn - known.black_dn
+    top_dn = known.white_dn - RANGE_LEFT_OUT * range_dn
+    share = np.full((height // 2, width // 2, len(offsets)), np.nan, np.float32)
+    noise = np.full(share.shape, np.nan, np.float32)
+    _blocks(
+        frame.read(), known.dark(frame), seen, reached, offsets, known.flat, known.curve, known.noise, top_dn,
+        float(range_dn), share, noise,
+    )  # fmt: skip
+    some = noise[np.isfinite(noise)]
+    return share.astype(np.float16), float(np.sqrt(2 / np.pi) * some.mean()) if len(some) else float("nan")
+
+
+@numba.njit(cache=True, nogil=True)
+def _blocks(raw, dark, seen, reached, offsets, flat, curve, noise, top_dn, range_dn, share, deviation):  # type: ignore[no-untyped-def]
+    for row in range(share.shape[0]):
+        for column in range(share.shape[1]):
+            good = True
+            for pixel in range(4):
+                y, x = 2 * row + pixel // 2, 2 * column + pixel % 2
+                good &= reached[seen[y, x]] and raw[y, x] < top_dn
+            if not good:
+                continue
+            for c in range(share.shape[2]):
+                y, x = 2 * row + offsets[c, 0], 2 * column + offsets[c, 1]
+                signal = float(raw[y, x]) - dark[y, x]
+                over = signal / curve[c, 2]
+                straight = signal * (1.0 + over * (curve[c, 0] + over * curve[c, 1]))
+                share[row, column, c] = straight / (flat[y, x] * range_dn)
+                variance = noise[c, 0] + noise[c, 1] * max(signal, 0.0)
+                deviation[row, column, c] = np.sqrt(variance) / (flat[y, x] * range_dn)

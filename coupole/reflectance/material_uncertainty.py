@@ -1,0 +1,275 @@
+"""Covariance of normals and materials of triangles, and what it makes of values in any direction.
+
+The fit solves equations of scores: sums over samples of weight times derivative times residual, and the priors.
+Its covariance is H^-1 M H^-1 with H the derivatives of the scores and M their variance (Huber 1967). M comes from
+the residuals, summed by groups of neighbouring LEDs before they are squared, since a material that does not fit,
+an LED's power and a shadow's edge are off together there (Liang and Zeger 1986); so it has noise, each LED's own
+power, and what the model misses. To it come the scanner's noise, which turns normals that are held, and what is
+unknown where only the usual roughness and ks hold them. What all LEDs share is a factor of kd and ks, kept apart.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.ggx import UNKNOWNS, lobe, root_by_unknowns, tangents
+from coupole.reflectance.normal_fit import CAUCHY, SPREAD_KS, colour_weight
+from coupole.reflectance.triangle_fit import (
+    HELD,
+    USUAL,
+    TriangleMaterials,
+    TriangleSamples,
+    between,
+    gather,
+    prior_stiffness,
+    towards,
+)
+
+Floats = NDArray[np.float64]
+
+GROUPS = 8
+"""Of LEDs, of each view."""
+_LEAST_KS = 1e-3
+"""Of kd: below it the logarithm's covariance would say nothing of the highlight that may be there."""
+_PART = 256
+
+
+@dataclass(frozen=True)
+class MaterialUncertainty:
+    """Of b triangles; NaN without material."""
+
+    covariance: Floats
+    """[b, 5, 5] of the `ggx.UNKNOWNS`, for the channels' mean."""
+    u_kd: Floats
+    """[b, channels] relative standard uncertainty."""
+    u_ks: Floats
+
+
+def groups_of(samples: TriangleSamples) -> NDArray[np.int64]:
+    """[samples] numbers of groups of neighbouring LEDs, view by view: about those, spread evenly, that are
+    nearest to them as seen from the triangles' middle."""
+    middle = samples.centres_mm.mean(axis=0)
+    ways = samples.led_mm - middle
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    chosen, nearest = [0], np.full(len(ways), -np.inf)
+    for _ in range(min(GROUPS, len(ways))):
+        nearest = np.maximum(nearest, ways @ ways[chosen[-1]])
+        chosen.append(int(np.argmin(nearest)))
+    group: NDArray[np.int64] = np.argmax(ways @ ways[chosen[:-1]].T, axis=1) + GROUPS * samples.view_of
+    return group
+
+
+def covariances(
+    samples: TriangleSamples,
+    used: NDArray[np.bool_],
+    materials: TriangleMaterials,
+    noise_um: float,
+    *,
+    fitted_normals: bool,
+    threads: int | None = None,
+) -> MaterialUncertainty:
+    """Of materials that were fitted to the samples `used` [samples]; `noise_um` is that of the mesh's vertices."""
+    prior = prior_stiffness(samples.areas_mm2, noise_um)
+    held = prior if fitted_normals else np.full(len(prior), HELD)
+    group = groups_of(samples)
+    order = np.flatnonzero(used)
+    order = order[np.argsort(group[order], kind="stable")]
+    grey = np.stack([materials.kd.mean(axis=1), materials.ks.mean(axis=1), materials.alpha], axis=1)
+    grey[:, 1] = np.maximum(grey[:, 1], _LEAST_KS * grey[:, 0])
+    found = np.full((len(prior), UNKNOWNS, UNKNOWNS), np.nan)
+    u_kd, u_ks = np.full(materials.kd.shape, np.nan), np.full(materials.kd.shape, np.nan)
+
+    def fill(first: int) -> None:
+        part = slice(first, first + _PART)
+        _fill(
+            samples.values[part], samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm[part],
+            materials.normals[part], grey[part], materials.kd[part], materials.ks[part], held[part], prior[part],
+            order, group, found[part], u_kd[part], u_ks[part],
+        )  # fmt: skip
+
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(fill, range(0, len(prior), _PART)))
+    return MaterialUncertainty(found, u_kd, u_ks)
+
+
+def relative_uncertainty(
+    samples: TriangleSamples, materials: TriangleMaterials, covariance: Floats
+) -> NDArray[np.float32]:
+    """[b, samples] relative standard uncertainty of what materials give where samples were measured, without what
+    all LEDs share; NaN where they give nothing."""
+    found = np.full(samples.values.shape[:2], np.nan, np.float32)
+    grey = np.stack([materials.kd.mean(axis=1), materials.ks.mean(axis=1), materials.alpha], axis=1)
+    _relative(
+        samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, materials.normals, grey,
+        covariance, found,
+    )  # fmt: skip
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill(  # type: ignore[no-untyped-def]
+    values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, kd, ks, held, prior, order, group, found, u_kd,
+    u_ks,
+):  # fmt: skip
+    samples = values.shape[1]
+    lights, half = np.empty((samples, 3)), np.empty((samples, 3))
+    views, own = np.empty((len(cameras_mm), 3)), np.empty((samples, values.shape[2]))
+    good, roots = np.empty(samples, np.int64), np.empty(samples)
+    for triangle in range(len(values)):
+        if not grey[triangle, 2] > 0.0:
+            continue
+        n = gather(
+            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normals[triangle], order, own,
+            good, roots, lights, half, views,
+        )  # fmt: skip
+        bread, meat = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((UNKNOWNS, UNKNOWNS))
+        _sums(
+            roots[:n],
+            good[:n],
+            lights,
+            half,
+            views,
+            view_of,
+            group,
+            normals[triangle],
+            grey[triangle],
+            bread,
+            meat,
+        )
+        for tilt in range(2):
+            bread[tilt, tilt] += held[triangle]
+            meat[tilt, tilt] += held[triangle] * held[triangle] / prior[triangle]
+        bread[3, 3] += USUAL / SPREAD_KS**2
+        meat[3, 3] += USUAL / SPREAD_KS**2
+        bread[4, 4] += USUAL
+        meat[4, 4] += USUAL
+        inverse = np.linalg.inv(bread)
+        found[triangle] = inverse @ meat @ inverse.T
+        _colours(
+            own, good[:n], lights, half, views, view_of, group, normals[triangle], grey[triangle], kd[triangle],
+            ks[triangle], found[triangle], u_kd[triangle], u_ks[triangle],
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _sums(roots, good, lights, half, views, view_of, group, normal, grey, bread, meat):  # type: ignore[no-untyped-def]
+    """Derivatives of the scores of samples in the order of their groups, and the scores' variance."""
+    scale = CAUCHY * math.sqrt(grey[0])
+    t1, t2 = tangents(normal[0], normal[1], normal[2])
+    row, score = np.empty(UNKNOWNS), np.zeros(UNKNOWNS)
+    groups, before = 0, -1
+    for number in range(len(good)):
+        sample = good[number]
+        light, view = lights[sample], views[view_of[sample]]
+        if normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2] <= 0.0:
+            continue
+        root = _root(normal, t1, t2, light, half[sample], view, grey, row)
+        off = (root - roots[number]) / scale
+        weight = 1.0 / (1.0 + off * off)
+        if group[sample] != before:
+            groups, before = groups + 1, group[sample]
+            _add_square(score, meat)
+            score[:] = 0.0
+        bend = max(1.0 - off * off, 0.0) * weight * weight / (scale * scale)
+        for i in range(UNKNOWNS):
+            score[i] += weight * off * row[i] / scale
+            for j in range(UNKNOWNS):
+                bread[i, j] += bend * row[i] * row[j]
+    _add_square(score, meat)
+    few = groups / max(groups - 1.0, 1.0) * (len(good) - 1.0) / max(len(good) - UNKNOWNS, 1.0)
+    for i in range(UNKNOWNS):
+        for j in range(UNKNOWNS):
+            meat[i, j] *= few
+
+
+@numba.njit(cache=True, nogil=True)
+def _colours(  # type: ignore[no-untyped-def]
+    own, good, lights, half, views, view_of, group, normal, grey, kd, ks, covariance, u_kd, u_ks
+):
+    """Relative uncertainties of each channel's kd and ks: what their own least squares (`normal_fit.colours_from`)
+    say, with normal and roughness as they are, and what these add to the channels' mean."""
+    channels = len(kd)
+    bread, meat = np.zeros((2, 2)), np.zeros((channels + 1, 2, 2))
+    score, row = np.zeros((channels + 1, 2)), np.empty(2)
+    before = -1
+    for number in range(len(good)):
+        sample = good[number]
+        light, view = lights[sample], views[view_of[sample]]
+        nl = normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
+        if nl <= 0.0:
+            continue
+        nv = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
+        nh = normal[0] * half[sample, 0] + normal[1] * half[sample, 1] + normal[2] * half[sample, 2]
+        row[0], row[1] = nl, nl * lobe(nl, nv, nh, grey[2])[0]
+        weight = colour_weight(row[0] * grey[0] + row[1] * grey[1], own[sample], grey[0])
+        if group[sample] != before:
+            before = group[sample]
+            for channel in range(channels + 1):
+                _add_square(score[channel], meat[channel])
+            score[:] = 0.0
+        for i in range(2):
+            for j in range(2):
+                bread[i, j] += weight * row[i] * row[j]
+            for channel in range(channels):
+                off = own[sample, channel] - row[0] * kd[channel] - row[1] * ks[channel]
+                score[channel, i] += weight * row[i] * off
+                score[channels, i] += weight * row[i] * off / channels
+    for channel in range(channels + 1):
+        _add_square(score[channel], meat[channel])
+    bread[1, 1] += 1e-9 * bread[0, 0]
+    inverse = np.linalg.inv(bread)
+    mean = inverse @ meat[channels] @ inverse
+    more_kd = max(covariance[2, 2] - mean[0, 0] / grey[0] ** 2, 0.0)
+    more_ks = max(covariance[3, 3] - mean[1, 1] / grey[1] ** 2, 0.0)
+    for channel in range(channels):
+        alone = inverse @ meat[channel] @ inverse
+        u_kd[channel] = math.sqrt(alone[0, 0] / max(kd[channel], 1e-9) ** 2 + more_kd)
+        u_ks[channel] = math.sqrt(alone[1, 1] / max(ks[channel], 1e-9) ** 2 + more_ks)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_square(score, meat):  # type: ignore[no-untyped-def]
+    for i in range(len(score)):
+        for j in range(len(score)):
+            meat[i, j] += score[i] * score[j]
+
+
+@numba.njit(cache=True, nogil=True)
+def _root(normal, t1, t2, light, half, view, grey, row):  # type: ignore[no-untyped-def]
+    nv = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
+    v1 = t1[0] * view[0] + t1[1] * view[1] + t1[2] * view[2]
+    v2 = t2[0] * view[0] + t2[1] * view[1] + t2[2] * view[2]
+    return root_by_unknowns(normal, t1, t2, light, half, nv, v1, v2, grey[0], grey[1], grey[2], row)
+
+
+@numba.njit(cache=True, nogil=True)
+def _relative(led_mm, view_of, cameras_mm, centres_mm, normals, grey, covariance, found):  # type: ignore[no-untyped-def]
+    views, light, half, row = np.empty((len(cameras_mm), 3)), np.empty(3), np.empty(3), np.empty(UNKNOWNS)
+    for triangle in range(len(found)):
+        normal = normals[triangle]
+        if not grey[triangle, 2] > 0.0:
+            continue
+        t1, t2 = tangents(normal[0], normal[1], normal[2])
+        for view in range(len(cameras_mm)):
+            towards(centres_mm[triangle], cameras_mm[view], views[view])
+        for sample in range(found.shape[1]):
+            view = views[view_of[sample]]
+            towards(centres_mm[triangle], led_mm[sample], light)
+            between(light, view, half)
+            nl = normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
+            nv = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
+            if nl <= 0.0 or nv <= 0.0:
+                continue
+            root = _root(normal, t1, t2, light, half, view, grey[triangle], row)
+            variance = 0.0
+            for i in range(UNKNOWNS):
+                for j in range(UNKNOWNS):
+                    variance += row[i] * covariance[triangle, i, j] * row[j]
+            found[triangle, sample] = 2.0 * math.sqrt(max(variance, 0.0)) / root

@@ -61,6 +61,18 @@ RecordsOption = Annotated[
 NoiseOption = Annotated[
     float, typer.Option("--scan-noise-um", min=0.1, help="Standard uncertainty of the mesh's vertices.")
 ]
+SupportOption = Annotated[
+    float,
+    typer.Option(
+        "--support-reflectance",
+        min=0.0,
+        max=0.95,
+        help="Of the disk under the object, which lights it too.",
+    ),
+]
+KeepOption = Annotated[
+    bool, typer.Option("--keep-inter-reflection", help="Leave in the samples what comes by way of other surfaces.")
+]
 MemoryOption = Annotated[
     str, typer.Option("--memory", help="For the samples that are fitted together: 500MB, 4GB.")
 ]
@@ -106,6 +118,8 @@ def from_runs_or_pictures(
     mesh: MeshOption = None,
     calibrations: RecordsOption = None,
     scan_noise_um: NoiseOption = 30.0,
+    support_reflectance: SupportOption = 0.0,
+    keep_inter_reflection: KeepOption = False,
     memory: MemoryOption = "2GB",
     pictures: PicturesOption = None,
     lights: LightsOption = None,
@@ -130,9 +144,12 @@ def from_runs_or_pictures(
             if pictures is not None:
                 made = _of_pictures(pictures, lights, intensities, mask, _numbers(leave_out), out, say)
             else:
-                records = _records(calibrations or [])
-                left_out = tuple(_numbers(leave_out))
-                made = _of_runs(runs or [], mesh, records, left_out, scan_noise_um, _bytes(memory), out, say)
+                records, left_out = _records(calibrations or []), tuple(_numbers(leave_out))
+                made = _of_runs(
+                    out, say, runs=tuple(runs or ()), mesh=mesh, calibrations=records, left_out=left_out,
+                    scan_noise_um=scan_noise_um, memory_bytes=_bytes(memory),
+                    support_reflectance=support_reflectance, keep_inter_reflection=keep_inter_reflection,
+                )  # fmt: skip
     except CoupoleError as error:
         fail_with(error, as_json=as_json)
         raise
@@ -164,21 +181,11 @@ def _of_pictures(
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 
-def _of_runs(
-    runs: list[Path],
-    mesh: Path | None,
-    records: tuple[Path, ...],
-    left_out: tuple[int, ...],
-    scan_noise_um: float,
-    memory_bytes: int,
-    out: Path,
-    say: Said,
-) -> Made:
+def _of_runs(out: Path, say: Said, **request: Any) -> Made:
     from coupole.reflectance.run_job import RunRequest, reflectance_of
     from coupole.viewing import run_reflectance_page
 
-    request = RunRequest(tuple(runs), mesh, records, left_out, scan_noise_um, memory_bytes)
-    about = reflectance_of(request, out, say=say)
+    about = reflectance_of(RunRequest(**request), out, say=say)
     return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)
 
 
@@ -225,6 +232,8 @@ def extract(
     mesh: MeshOption = None,
     calibrations: RecordsOption = None,
     scan_noise_um: NoiseOption = 30.0,
+    support_reflectance: SupportOption = 0.0,
+    keep_inter_reflection: KeepOption = False,
     leave_out: LeaveOutOption = "",
     as_json: JsonOption = False,
 ) -> None:
@@ -235,7 +244,11 @@ def extract(
         from coupole.reflectance.run_result import RunResult
 
         records, left_out = _records(calibrations or []), tuple(_numbers(leave_out))
-        extract_runs(RunRequest(tuple(runs), mesh, records, left_out, scan_noise_um), out, say=say)
+        request = RunRequest(
+            tuple(runs), mesh, records, left_out, scan_noise_um,
+            support_reflectance=support_reflectance, keep_inter_reflection=keep_inter_reflection,
+        )  # fmt: skip
+        extract_runs(request, out, say=say)
         return {"views": RunResult(out).summaries}
 
     _do(step, as_json=as_json)

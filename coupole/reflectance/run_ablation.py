@@ -60,7 +60,7 @@ def ablate_result(out: Path, *, say: Said = lambda step, done, of: None) -> dict
     result too. Raises InputError if its samples are not all there, StorageError if the disk takes nothing."""
     settings = read_settings(out)
     result = RunResult(out)
-    result.refuse_unfinished(settings["view_names"])
+    result.refuse_unfinished(settings)
     variants = {variant for steps in VARIANTS.values() for _, variant in steps}
     blocks = _blocks(result)
     errors: dict[Variant, dict[str, list[Floats]]] = {variant: {} for variant in variants}

@@ -87,7 +87,7 @@ def check_result(
     begun_s = time.monotonic() if begun_s is None else begun_s
     settings = read_settings(out)
     result = RunResult(out)
-    result.refuse_unfinished(settings["view_names"], fits=True)
+    result.refuse_unfinished(settings, fits=True)
     check = _Check()
     for view in result.views:
         _check_view(result, view, settings, memory_bytes, check, say)

@@ -45,7 +45,7 @@ def cluster_result(
     LEDs that were left out. Raises InputError if samples or fits are not all there, StorageError."""
     settings = read_settings(out)
     result = RunResult(out)
-    result.refuse_unfinished(settings["view_names"], fits=True)
+    result.refuse_unfinished(settings, fits=True)
     materials = result.materials(_FROM)
     fitted = np.isfinite(materials.alpha)
     known = int(np.count_nonzero(fitted))

@@ -13,14 +13,8 @@ from numpy.typing import NDArray
 
 from coupole.reflectance.material_uncertainty import covariances
 from coupole.reflectance.result_folder import complete, in_the_making, read_settings
-from coupole.reflectance.run_result import (
-    MATERIALS,
-    SLICES,
-    RunResult,
-    ViewSamples,
-    begin_slices,
-    write_materials,
-)
+from coupole.reflectance.run_result import MATERIALS, SLICES, RunResult, ViewSamples
+from coupole.reflectance.run_result_files import begin_slices, write_materials
 from coupole.reflectance.slice_fit import fit_slices, slice_values
 from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
 from coupole.storage.disk_errors import disk_error
@@ -34,7 +28,7 @@ def fit_result(out: Path, memory_bytes: int, *, say: Said = lambda step, done, o
     """Make the fits that a result lacks. Raises InputError if its samples are not all there, StorageError."""
     settings = read_settings(out)
     result = RunResult(out)
-    result.refuse_unfinished(settings["view_names"])
+    result.refuse_unfinished(settings)
     try:
         for name in MATERIALS:
             if not result.materials_path(name).exists():

@@ -21,10 +21,12 @@ from coupole.reflectance.extraction.extraction import extract_view, geometry_of
 from coupole.reflectance.extraction.frames_for_check import write_frames
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView, read_measured_run
 from coupole.reflectance.extraction.radiance import Radiometry
+from coupole.reflectance.inter_reflection import subtract
 from coupole.reflectance.result_folder import begin, complete, read_settings
 from coupole.reflectance.run_check import check_result
 from coupole.reflectance.run_fits import fit_result
-from coupole.reflectance.run_result import FRAMES, OBJECT, write_object
+from coupole.reflectance.run_result import FRAMES, OBJECT, RunResult
+from coupole.reflectance.run_result_files import write_object
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256, write_synced
 
@@ -44,6 +46,10 @@ class RunRequest:
     """LEDs; empty for every twelfth."""
     scan_noise_um: float = 30.0
     memory_bytes: int = 2_000_000_000
+    support_reflectance: float = 0.0
+    """Of the disk, from which light comes to the object too."""
+    keep_inter_reflection: bool = False
+    """Do not take it off the samples."""
 
 
 def reflectance_of(request: RunRequest, out: Path, *, say: Said = lambda step, done, of: None) -> dict[str, Any]:
@@ -67,6 +73,13 @@ def extract_runs(request: RunRequest, out: Path, *, say: Said = lambda step, don
         first = measured_runs[0]
         complete(out / OBJECT, lambda path: write_object(path, first.corners_mm, first.base_from_support))
         _extract(measured_runs, out, read_settings(out)["left_out"], say)
+        if read_settings(out)["subtracted"]:
+            subtract(
+                RunResult(out),
+                paper=first.emission == "paper",
+                support_reflectance=request.support_reflectance,
+                say=say,
+            )
     except OSError as error:
         raise disk_error(out, error) from error
 
@@ -90,6 +103,8 @@ def _settings(request: RunRequest, measured_runs: Sequence[MeasuredRun]) -> dict
         raise InputError(f"--leave-out: no frame under LED {wrong[0]} in these runs")
     return {
         "left_out": left_out,
+        "subtracted": not (request.keep_inter_reflection or all(m.direct_light_alone for m in measured_runs)),
+        "support_reflectance": request.support_reflectance,
         "scan_noise_um": request.scan_noise_um,
         "runs": {m.run.folder.name: dict(m.frames.inputs) for m in measured_runs},
         "records": [{kind: sha256(path) for kind, path in m.records.items()} for m in measured_runs],

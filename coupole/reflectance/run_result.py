@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError, Problem
 from coupole.reflectance.ggx import UNKNOWNS
-from coupole.reflectance.material_uncertainty import MaterialUncertainty
-from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis, centres
+from coupole.reflectance.slice_basis import HARMONICS, RADIAL, RESIDUAL, Basis
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples
 
 SCHEMA = "coupole-reflectance-run/1"
@@ -45,7 +44,9 @@ FITS = (*MATERIALS, *SLICES)
 CLUSTERS = "fits/clusters.h5"
 FRAMES = "samples/frames"
 """Folder of the pictures that the fits are compared with."""
-_LOWER = np.tril_indices(UNKNOWNS)
+INTER_REFLECTION = "inter_reflection"
+"""Attribute of a file of samples that it was taken from."""
+LOWER = np.tril_indices(UNKNOWNS)
 _HEAD = ("triangles", "camera_mm", "leds", "led_positions_mm", "led_normals", "full_scales")
 FIELDS = {
     "normals": "unit, base frame",
@@ -68,6 +69,8 @@ class ViewSamples:
 
     path: Path
     view: str
+    inter_reflection: tuple[float, float] | None
+    """Median and 95th percentile of its share that was taken off f; None if nothing was."""
     triangles: NDArray[np.int64]
     camera_mm: NDArray[np.float64]
     leds: NDArray[np.int64]
@@ -146,16 +149,25 @@ class RunResult:
     def summaries(self) -> list[dict[str, Any]]:
         """What extraction said of each view."""
         files = sorted((self.folder / "samples").glob("*.json"))
-        return [json.loads(path.read_text(encoding="utf-8")) for path in files]
+        told = [json.loads(path.read_text(encoding="utf-8")) for path in files]
+        return [
+            {**summary, INTER_REFLECTION: view.inter_reflection}
+            for summary, view in zip(told, self.views, strict=True)
+        ]
 
-    def refuse_unfinished(self, names: Sequence[str], *, fits: bool = False) -> None:
-        """Raises InputError if the samples of a view of these names, or a fit, are missing."""
-        for name in names:
+    def refuse_unfinished(self, settings: dict[str, Any], *, fits: bool = False) -> None:
+        """Raises InputError if the samples of a view, or a fit, are missing."""
+        for name in settings["view_names"]:
             if not (self.folder / "samples" / f"{name}.json").exists():
                 raise InputError(
                     f"{self.folder}: the samples of the view {name} are not there; `coupole reflectance extract`, "
                     "as it was begun, makes them"
                 )
+        if settings["subtracted"] and any(view.inter_reflection is None for view in self.views):
+            raise InputError(
+                f"{self.folder}: inter-reflection is still in its samples; `coupole reflectance extract`, as it "
+                "was begun, takes it off"
+            )
         paths = [self.materials_path(name) for name in MATERIALS]
         paths += [self.slices_path(name, view) for name in SLICES for view in self.views]
         if fits and (missing := [path for path in paths if not path.exists()]):
@@ -268,8 +280,8 @@ class RunResult:
         with h5py.File(self.materials_path(name), "r") as file:
             lower = file["covariance"][()][block].astype(np.float64)
         found = np.empty((len(lower), UNKNOWNS, UNKNOWNS))
-        found[:, *_LOWER] = lower
-        found[:, *_LOWER[::-1]] = lower
+        found[:, *LOWER] = lower
+        found[:, *LOWER[::-1]] = lower
         return found
 
     @cached_property
@@ -294,9 +306,11 @@ class RunResult:
 
 def read_view_samples(path: Path) -> ViewSamples:
     with h5py.File(path, "r") as file:
+        share = file.attrs.get(INTER_REFLECTION)
         return ViewSamples(
             path,
             str(file.attrs["view"]),
+            None if share is None else (float(share[0]), float(share[1])),
             *(file[name][()] for name in _HEAD),
         )
 
@@ -337,56 +351,3 @@ def _times_cosine(values, centres_mm, normals, led_mm):  # type: ignore[no-untyp
             cosine = (x * normal[0] + y * normal[1] + z * normal[2]) / math.sqrt(x * x + y * y + z * z)
             for channel in range(values.shape[2]):
                 values[triangle, led, channel] *= cosine
-
-
-def write_object(path: Path, corners_mm: NDArray[np.float64], base_from_support: NDArray[np.float64]) -> None:
-    """The mesh as it stood in the cell."""
-    with h5py.File(path, "w") as file:
-        data = file.create_dataset("corners_mm", data=corners_mm.astype(np.float32), track_times=False)
-        data.attrs["told"] = "[triangles, corners, 3] mm, base frame"
-        file.create_dataset("base_from_support", data=base_from_support, track_times=False)
-
-
-def write_materials(
-    path: Path,
-    parts: Sequence[TriangleMaterials],
-    uncertain: Sequence[MaterialUncertainty],
-    u_triangle: NDArray[np.float32],
-    u_shared: float,
-    triangles: NDArray[np.int64],
-) -> None:
-    """A fit of all triangles, from those of blocks; `u_triangle` [n] and `u_shared` are relative standard
-    uncertainties of kd and ks, of a triangle and of all."""
-    with h5py.File(path, "w") as file:
-        file.create_dataset("triangles", data=triangles, track_times=False).attrs["told"] = "numbers in the mesh"
-        for field, told in FIELDS.items():
-            values = np.concatenate([getattr(part, field) for part in parts]).astype(np.float32)
-            file.create_dataset(field, data=values, track_times=False).attrs["told"] = told
-        for field, told in UNCERTAIN.items():
-            values = np.concatenate([getattr(part, field) for part in uncertain]).astype(np.float32)
-            if field == "covariance":
-                values = values[:, *_LOWER]
-            file.create_dataset(field, data=values, track_times=False).attrs["told"] = told
-        file.create_dataset("u_triangle", data=u_triangle, track_times=False).attrs["told"] = (
-            "relative standard uncertainty of kd and ks, that of the responses of the triangle's pixels"
-        )
-        file.create_dataset("u_shared", data=u_shared, track_times=False).attrs["told"] = (
-            "relative standard uncertainty of kd and ks, that of the power of all LEDs"
-        )
-
-
-def begin_slices(file: h5py.File, kind: SliceKind, view: ViewSamples, channels: int) -> h5py.Dataset:
-    """Describe a fit of a view in a new file; where its coefficients [triangles, channels, COUNT] go."""
-    shape = (len(view.triangles), channels, COUNT)
-    data = file.create_dataset("coefficients", shape, np.float32, fillvalue=np.nan, track_times=False)
-    data.attrs["told"] = "[triangles of the view, channels, coefficients] 1/sr; NaN where too few samples are"
-    data.attrs["basis"] = (
-        "real spherical harmonics, orthonormal, degrees 0 to 9, order by order"
-        if kind.basis.harmonic
-        else "-r to each of `centres`, then 1, x, y, z"
-    )
-    data.attrs["frame"] = "z the mesh's normal, x towards the camera along the surface"
-    data.attrs["added_to"] = kind.over or ""
-    if not kind.basis.harmonic:
-        file.create_dataset("centres", data=centres(), track_times=False)
-    return data

@@ -98,7 +98,18 @@ def _page(folder: Path) -> Iterator[str]:
         yield f"<tr><th>{html.escape(summary['view'])}"
         yield "".join(f"<td>{100 * share:.1f} %" for share in summary["share_by_code"].values())
     yield f"</table><p>{about['seconds']:.1f} s, at most {about['peak_memory_bytes'] / 1e9:.1f} GB."
-    yield ("<p>Inter-reflection and veiling glare are not subtracted, nor are they in the bounds.")
+    yield f"<p>{_inter_reflection(about)} Veiling glare is not subtracted, and neither is in the bounds."
+
+
+def _inter_reflection(about: dict[str, Any]) -> str:
+    if not about["subtracted"]:
+        return "Inter-reflection is left in the samples."
+    each = (view["inter_reflection"] for view in about["views"])
+    shares = [f"{100 * half:.1f} % ({100 * far:.1f} %)" for half, far in each]
+    return (
+        "Inter-reflection was taken off the samples, in the median (and the 95th percentile) of each view: "
+        f"{', '.join(shares)}; the disk under the object is taken to reflect {about['support_reflectance']:g}."
+    )
 
 
 def _uncertain(about: dict[str, Any]) -> Iterator[str]:

@@ -132,6 +132,8 @@ class MeasuredRun:
     """Focal length and focus distance in mm, f-number."""
     base_from_support: Floats
     drift: Drift
+    direct_light_alone: bool
+    """Whether the cell is simulated without light from surface to surface."""
 
     def power_of(self, frame: LightFrame) -> Floats:
         """[channels] power of the LED of a frame at its board's temperature and time; NaN where there is none."""
@@ -184,7 +186,15 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
         (lens.focal_length_mm, lens.focus_distance_mm, lens.f_number),
         base_from_support,
         _drift(by_kind.get("drift")),
+        run.simulated and _direct_light_alone(files.cell.rig),
     )
+
+
+def _direct_light_alone(rig: Rig) -> bool:
+    """By the settings of the simulated world, as docs/reference/rig.md has them."""
+    world = {} if rig.world is None else rig.world.settings
+    asked = world.get("interreflection")
+    return world.get("shading") == "flat" if asked is None else asked is False
 
 
 def emission_of(record: Record) -> Emission:

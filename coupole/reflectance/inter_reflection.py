@@ -1,0 +1,316 @@
+"""Light that comes from one part of the object to another, estimated from its mesh and samples, and taken off
+them.
+
+A sample of reflectance counts all light of its triangle as the LED's own. In a fold a part of it came by way of
+other triangles. The object is cut into patches; their radiosity under each LED follows from the light that
+reaches them, the diffuse reflectance that their samples show, and how much of each other they see (Goral et al.
+1984). Rays from each triangle then gather what arrives. Samples of folds are too high, so the reflectance that is
+used is lowered by what was found, and the radiosity found again, until it settles. All reflection on the way is
+taken as diffuse.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, vstack
+
+from coupole.motion.occlusion import RAY_START_MM, blocked, ray_mesh
+from coupole.reflectance.extraction.lamp_sight import lit_on
+from coupole.reflectance.result_folder import complete
+from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples
+
+Floats = NDArray[np.float64]
+Said = Callable[[str, int, int], None]
+
+MOST_PATCHES = 4000
+_RAYS_OF_A_TRIANGLE = 128
+_POINTS = 4
+"""Triangles that stand for a patch."""
+_PASSES = 3
+_MOST_BOUNCES = 8
+_LEAST_COSINE = 0.2
+"""Of light in the samples that a triangle's diffuse reflectance is found by."""
+_MOST_REFLECTED = 0.95
+_SUPPORT_CELLS = 24
+_RAYS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The object's triangles, and those of the support it stands on if that reflects."""
+
+    rays: Any
+    centres_mm: Floats
+    """[m, 3]"""
+    normals: Floats
+    """[m, 3] unit, outward."""
+    areas_mm2: Floats
+    """[m]"""
+    patch: NDArray[np.int64]
+    """[m] number of a triangle's patch."""
+    corners_mm: Floats
+
+    @property
+    def patches(self) -> int:
+        return int(self.patch.max()) + 1
+
+
+def scene_of(corners_mm: Floats, *, support_z: tuple[Floats, Floats] | None = None) -> Scene:
+    """Of triangles [m, 3, 3]; `support_z` is a point of the support and its unit normal, if it reflects: a square
+    of three times the object's width comes to the scene."""
+    if support_z is not None:
+        corners_mm = np.concatenate([corners_mm, _support(corners_mm, *support_z)])
+    across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    twice = np.maximum(np.linalg.norm(across, axis=1), 1e-300)
+    centres, normals = corners_mm.mean(axis=1), across / twice[:, None]
+    patch = _patches(centres, normals)
+    return Scene(ray_mesh(corners_mm), centres, normals, 0.5 * twice, patch, corners_mm)
+
+
+def _support(corners_mm: Floats, point_mm: Floats, normal: Floats) -> Floats:
+    """[2 cells^2, 3, 3] triangles of the support."""
+    flat = corners_mm.reshape(-1, 3) - (corners_mm.reshape(-1, 3) - point_mm) @ normal[:, None] * normal
+    middle, half = flat.mean(axis=0), 1.5 * np.ptp(flat, axis=0).max()
+    first = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, 0]
+    second = np.cross(normal, first)
+    steps = np.linspace(-half, half, _SUPPORT_CELLS + 1)
+    grid = middle + steps[:, None, None] * first + steps[None, :, None] * second
+    a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
+    return np.stack([np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)]).reshape(-1, 3, 3)
+
+
+def _patches(centres_mm: Floats, normals: Floats) -> NDArray[np.int64]:
+    """Numbers of cells of a grid and of the sixth of all directions that a normal points to, as fine as there may
+    be patches."""
+    low, size = centres_mm.min(axis=0), float(np.ptp(centres_mm, axis=0).max())
+    axis = np.argmax(np.abs(normals), axis=1)
+    facing = 2 * axis + (np.take_along_axis(normals, axis[:, None], axis=1)[:, 0] > 0)
+    cells = 128.0
+    while True:
+        cell = np.floor((centres_mm - low) / max(size, 1e-9) * cells).astype(np.int64)
+        key = ((cell[:, 0] * 1024 + cell[:, 1]) * 1024 + cell[:, 2]) * 6 + facing
+        number = np.unique(key, return_inverse=True)[1]
+        if number.max() < MOST_PATCHES or cells < 2:
+            return number
+        cells *= 0.8
+
+
+def seen_from(scene: Scene, triangles: NDArray[np.int64], seed: int) -> csr_array:
+    """[n, patches] share of the half space over each of some triangles, weighted by the cosine, that a patch's
+    front fills: by rays from places spread over the triangle."""
+    random = np.random.default_rng(seed)
+    across = math.isqrt(_RAYS_OF_A_TRIANGLE // 2)
+    strata = np.stack(np.divmod(np.arange(2 * across * across), 2 * across), axis=-1)
+    step = max(1, _RAYS // len(strata))
+    starts = range(0, len(triangles), step)
+    seeds = [int(one) for one in random.integers(0, 2**31, len(starts))]
+
+    def part(first: int, seed: int) -> csr_array:
+        mine = triangles[first : first + step]
+        return _gathered(scene, mine, strata, np.random.default_rng(seed))
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        parts = list(pool.map(part, starts, seeds))
+    return vstack(parts, format="csr")
+
+
+def _gathered(
+    scene: Scene, mine: NDArray[np.int64], strata: NDArray[np.int64], random: np.random.Generator
+) -> csr_array:
+    """`seen_from` of some of the triangles, a ray in each cell of a square that is mapped to the half space."""
+    count, rays = len(mine), len(strata)
+    u = (strata + random.random((count, rays, 2))) / (strata.max(axis=0) + 1)
+    radius, phi = np.sqrt(u[..., 0]), 2 * np.pi * u[..., 1]
+    normals = scene.normals[mine]
+    first = np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normals, first)
+    x, y, z = radius * np.cos(phi), radius * np.sin(phi), np.sqrt(1 - u[..., 0])
+    ways = x[..., None] * first[:, None] + y[..., None] * second[:, None] + z[..., None] * normals[:, None]
+    shares = random.dirichlet((1.0, 1.0, 1.0), (count, rays))
+    places = np.einsum("nrc,nck->nrk", shares, scene.corners_mm[mine]) + RAY_START_MM * normals[:, None]
+    met = scene.rays.run(
+        np.ascontiguousarray(places.reshape(-1, 3), np.float32),
+        np.ascontiguousarray(ways.reshape(-1, 3), np.float32),
+        query="INTERSECT",
+        output=1,
+    )
+    hit = np.asarray(met["primID"], dtype=np.int64).reshape(count, rays)
+    front = (hit >= 0) & (np.einsum("nrk,nrk->nr", ways, scene.normals[hit]) < 0)
+    row, ray = np.nonzero(front)
+    data = np.full(len(row), 1.0 / rays, np.float32)
+    return csr_array((data, (row, scene.patch[hit[row, ray]])), shape=(count, scene.patches))
+
+
+def points_of(scene: Scene) -> NDArray[np.int64]:
+    """[points, patches] triangles that stand for each patch, any of it."""
+    order = np.lexsort((np.random.default_rng(3).random(len(scene.patch)), scene.patch))
+    first = np.searchsorted(scene.patch[order], np.arange(scene.patches))
+    number = np.bincount(scene.patch)
+    return np.stack([order[first + point * number // _POINTS] for point in range(_POINTS)])
+
+
+def direct_irradiance(scene: Scene, led_mm: Floats, led_normals: Floats, *, paper: bool) -> NDArray[np.float32]:
+    """[patches, leds] E / Phi, m^-2, that reaches patches straight from LEDs: the mean of some of their
+    triangles."""
+    found = np.zeros((scene.patches, len(led_mm)), np.float32)
+    for at in points_of(scene):
+        centres, normals = scene.centres_mm[at], scene.normals[at]
+        cosine = _cosines(centres, normals, led_mm)
+        light = lit_on(centres, led_mm, led_normals, paper) * np.maximum(cosine, 0.0)
+        patch, led = np.nonzero(light > 0)
+        starts = (centres + RAY_START_MM * normals)[patch]
+        for part in range(0, len(patch), _RAYS):
+            some = slice(part, part + _RAYS)
+            light[patch[some], led[some]] *= ~blocked(scene.rays, starts[some], led_mm[led[some]])
+        found += (light / _POINTS).astype(np.float32)
+    return found
+
+
+def _cosines(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:
+    """[n, leds] of incidence."""
+    ways = led_mm[None] - centres_mm[:, None]
+    cosines: Floats = np.einsum("nlk,nk->nl", ways, normals) / np.linalg.norm(ways, axis=2)
+    return cosines
+
+
+def radiosity(
+    seen: csr_array, direct: NDArray[np.float32], shown: Floats, passes: int = _PASSES
+) -> NDArray[np.float32]:
+    """[channels, patches, leds] exitance of patches for a power of 1. `shown` [patches, channels] is the
+    reflectance that counts all light as direct; patches that no LED reaches keep it."""
+    found = []
+    for one in shown.T:
+        reflectance = one.copy()
+        for _ in range(passes):
+            exitance = reflectance[:, None].astype(np.float32) * direct
+            for _ in range(_MOST_BOUNCES):
+                indirect = seen @ exitance
+                exitance = reflectance[:, None].astype(np.float32) * (direct + indirect)
+            reached = direct.sum(axis=1)
+            share = np.where(reached > 0, reached / np.maximum(reached + indirect.sum(axis=1), 1e-30), 1.0)
+            reflectance = one * share
+        found.append(exitance)
+    return np.stack(found)
+
+
+def subtract(
+    result: RunResult,
+    *,
+    paper: bool,
+    support_reflectance: float = 0.0,
+    say: Said = lambda step, done, of: None,
+) -> None:
+    """Take inter-reflection off the samples of views that still have it; each view's file is whole, before or
+    after. Raises OSError."""
+    missing = [view for view in result.views if view.inter_reflection is None]
+    if not missing:
+        return
+    corners = result.corners_mm.astype(np.float64)
+    pose = result.base_from_support
+    support = (pose[:3, 3], pose[:3, 2]) if support_reflectance > 0 else None
+    scene = scene_of(corners, support_z=support)
+    shown = _shown(result, scene, len(corners), support_reflectance)
+    say("inter-reflection", 1, 2 + len(missing))
+    points = points_of(scene)
+    seen = sum(seen_from(scene, at, seed) for seed, at in enumerate(points)) * (1.0 / len(points))
+    say("inter-reflection", 2, 2 + len(missing))
+    for number, view in enumerate(missing):
+        _subtract_view(result, view, scene, seen, shown, paper)
+        say("inter-reflection", 3 + number, 2 + len(missing))
+
+
+def _shown(result: RunResult, scene: Scene, count: int, support_reflectance: float) -> Floats:
+    """[patches, channels] reflectance by the samples, the mean of a patch's triangles; of those that no view shows
+    that of all; the support has its own."""
+    channels = result.channels
+    sums, weights = np.zeros((scene.patches, channels)), np.zeros(scene.patches)
+    every = []
+    for view in result.views:
+        diffuse = _diffuse(result, view)
+        known = np.isfinite(diffuse).all(axis=1)
+        mine, areas = scene.patch[view.triangles[known]], scene.areas_mm2[view.triangles[known]]
+        np.add.at(sums, mine, areas[:, None] * diffuse[known])
+        np.add.at(weights, mine, areas)
+        every.append(diffuse[known])
+    usual = np.median(np.concatenate(every), axis=0)
+    with np.errstate(invalid="ignore"):
+        shown = np.where(weights[:, None] > 0, sums / weights[:, None], usual)
+    shown = np.clip(np.pi * shown, 0.0, _MOST_REFLECTED)
+    shown[np.unique(scene.patch[count:])] = support_reflectance
+    return shown
+
+
+def _diffuse(result: RunResult, view: ViewSamples, most: int = 64) -> Floats:
+    """[n, channels] median of the samples of each triangle under some LEDs that do not graze."""
+    columns = np.zeros(len(view.leds), np.bool_)
+    columns[:: max(1, len(view.leds) // most)] = True
+    found = np.full((len(view.triangles), result.channels), np.nan)
+    for first in range(0, len(found), 8192):
+        rows = slice(first, min(first + 8192, len(found)))
+        samples = result.view_samples(view, rows, columns)
+        cosine = _cosines(samples.centres_mm, samples.normals, samples.led_mm)
+        values = np.where(cosine[..., None] > _LEAST_COSINE, samples.values / cosine[..., None], np.nan)
+        some = np.isfinite(values).any(axis=(1, 2))
+        found[rows][some] = np.nanmedian(values[some], axis=1)
+    return found
+
+
+def _subtract_view(
+    result: RunResult, view: ViewSamples, scene: Scene, seen: csr_array, shown: Floats, paper: bool
+) -> None:
+    direct = direct_irradiance(scene, view.led_mm, view.led_normals, paper=paper)
+    exitance = radiosity(seen, direct, shown)
+    gathers = seen_from(scene, view.triangles, _POINTS)
+    diffuse = _diffuse(result, view)
+
+    def write(part: Path) -> None:
+        shutil.copyfile(view.path, part)
+        shares = []
+        with h5py.File(part, "r+") as file:
+            for first in range(0, len(view.triangles), 4096):
+                rows = slice(first, min(first + 4096, len(view.triangles)))
+                f = file["f"][rows]
+                off = _off(view, scene, gathers[rows], exitance, diffuse[rows], rows, paper)
+                share = (off / f)[:: 1 + len(f) // 512]
+                shares.append(share[np.isfinite(share)])
+                f -= off
+                file["f"][rows] = f
+            every = np.concatenate(shares)
+            file.attrs[INTER_REFLECTION] = np.quantile(every, [0.5, 0.95]) if len(every) else [0.0, 0.0]
+
+    complete(view.path, write)
+
+
+def _off(
+    view: ViewSamples,
+    scene: Scene,
+    gathers: csr_array,
+    exitance: NDArray[np.float32],
+    diffuse: Floats,
+    rows: slice,
+    paper: bool,
+) -> NDArray[np.float32]:
+    """[n, leds, channels] what to take off f of triangles: their diffuse reflectance times indirect over
+    direct."""
+    mine = view.triangles[rows]
+    centres, normals = scene.centres_mm[mine], scene.normals[mine]
+    arriving = lit_on(centres, view.led_mm, view.led_normals, paper) * _cosines(centres, normals, view.led_mm)
+    indirect = np.stack([gathers @ one for one in exitance], axis=-1)
+    reached = arriving > 0
+    total = np.where(reached, arriving, 0.0).sum(axis=1)[:, None]
+    of_direct = total / np.maximum(total + np.where(reached[..., None], indirect, 0.0).sum(axis=1), 1e-30)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = (np.nan_to_num(diffuse) * of_direct)[:, None] * indirect / arriving[..., None]
+    return np.where(reached[..., None], off, 0.0).astype(np.float32)

@@ -1,0 +1,68 @@
+"""Writing the files of a result of runs, as `run_result` reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.material_uncertainty import MaterialUncertainty
+from coupole.reflectance.run_result import FIELDS, LOWER, UNCERTAIN, SliceKind, ViewSamples
+from coupole.reflectance.slice_basis import COUNT, centres
+from coupole.reflectance.triangle_fit import TriangleMaterials
+
+
+def write_object(path: Path, corners_mm: NDArray[np.float64], base_from_support: NDArray[np.float64]) -> None:
+    """The mesh as it stood in the cell."""
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("corners_mm", data=corners_mm.astype(np.float32), track_times=False)
+        data.attrs["told"] = "[triangles, corners, 3] mm, base frame"
+        file.create_dataset("base_from_support", data=base_from_support, track_times=False)
+
+
+def write_materials(
+    path: Path,
+    parts: Sequence[TriangleMaterials],
+    uncertain: Sequence[MaterialUncertainty],
+    u_triangle: NDArray[np.float32],
+    u_shared: float,
+    triangles: NDArray[np.int64],
+) -> None:
+    """A fit of all triangles, from those of blocks; `u_triangle` [n] and `u_shared` are relative standard
+    uncertainties of kd and ks, of a triangle and of all."""
+    with h5py.File(path, "w") as file:
+        file.create_dataset("triangles", data=triangles, track_times=False).attrs["told"] = "numbers in the mesh"
+        for field, told in FIELDS.items():
+            values = np.concatenate([getattr(part, field) for part in parts]).astype(np.float32)
+            file.create_dataset(field, data=values, track_times=False).attrs["told"] = told
+        for field, told in UNCERTAIN.items():
+            values = np.concatenate([getattr(part, field) for part in uncertain]).astype(np.float32)
+            if field == "covariance":
+                values = values[:, *LOWER]
+            file.create_dataset(field, data=values, track_times=False).attrs["told"] = told
+        file.create_dataset("u_triangle", data=u_triangle, track_times=False).attrs["told"] = (
+            "relative standard uncertainty of kd and ks, that of the responses of the triangle's pixels"
+        )
+        file.create_dataset("u_shared", data=u_shared, track_times=False).attrs["told"] = (
+            "relative standard uncertainty of kd and ks, that of the power of all LEDs"
+        )
+
+
+def begin_slices(file: h5py.File, kind: SliceKind, view: ViewSamples, channels: int) -> h5py.Dataset:
+    """Describe a fit of a view in a new file; where its coefficients [triangles, channels, COUNT] go."""
+    shape = (len(view.triangles), channels, COUNT)
+    data = file.create_dataset("coefficients", shape, np.float32, fillvalue=np.nan, track_times=False)
+    data.attrs["told"] = "[triangles of the view, channels, coefficients] 1/sr; NaN where too few samples are"
+    data.attrs["basis"] = (
+        "real spherical harmonics, orthonormal, degrees 0 to 9, order by order"
+        if kind.basis.harmonic
+        else "-r to each of `centres`, then 1, x, y, z"
+    )
+    data.attrs["frame"] = "z the mesh's normal, x towards the camera along the surface"
+    data.attrs["added_to"] = kind.over or ""
+    if not kind.basis.harmonic:
+        file.create_dataset("centres", data=centres(), track_times=False)
+    return data

@@ -42,6 +42,8 @@ _MOST_BOUNCES = 8
 _LEAST_COSINE = 0.2
 """Of light in the samples that a triangle's diffuse reflectance is found by."""
 _MOST_REFLECTED = 0.95
+MOST_SHARE = 0.5
+"""Of a sample; others are left out."""
 _SUPPORT_CELLS = 24
 _RAYS = 1_000_000
 
@@ -262,7 +264,7 @@ def _diffuse(result: RunResult, view: ViewSamples, most: int = 64) -> Floats:
         samples = result.view_samples(view, rows, columns)
         cosine = _cosines(samples.centres_mm, samples.normals, samples.led_mm)
         values = np.where(cosine[..., None] > _LEAST_COSINE, samples.values / cosine[..., None], np.nan)
-        some = np.isfinite(values).any(axis=(1, 2))
+        some = np.all(np.isfinite(values).any(axis=1), axis=1)
         found[rows][some] = np.nanmedian(values[some], axis=1)
     return found
 
@@ -279,14 +281,20 @@ def _subtract_view(
         shutil.copyfile(view.path, part)
         shares = []
         with h5py.File(part, "r+") as file:
+            told = "share of f that was inter-reflection, and was taken off"
+            kept = file.create_dataset(
+                INTER_REFLECTION, file["f"].shape, np.float16, chunks=file["f"].chunks, fillvalue=np.nan
+            )
+            kept.attrs["told"] = told
             for first in range(0, len(view.triangles), 4096):
                 rows = slice(first, min(first + 4096, len(view.triangles)))
                 f = file["f"][rows]
                 off = _off(view, scene, gathers[rows], exitance, diffuse[rows], rows, paper)
-                share = (off / f)[:: 1 + len(f) // 512]
-                shares.append(share[np.isfinite(share)])
-                f -= off
-                file["f"][rows] = f
+                share = off / f
+                some = share[:: 1 + len(f) // 512]
+                shares.append(some[np.isfinite(some)])
+                file["f"][rows] = np.where(share < MOST_SHARE, f - off, np.nan)
+                kept[rows] = share.astype(np.float16)
             every = np.concatenate(shares)
             file.attrs[INTER_REFLECTION] = np.quantile(every, [0.5, 0.95]) if len(every) else [0.0, 0.0]
 

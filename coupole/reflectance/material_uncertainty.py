@@ -38,6 +38,9 @@ GROUPS = 8
 """Of LEDs, of each view."""
 _LEAST_KS = 1e-3
 """Of kd: below it the logarithm's covariance would say nothing of the highlight that may be there."""
+_LEAST_KD = 1e-6
+_LEAST_KNOWN = 1e-2
+"""1 over the variance of the logarithm of a kd of which the samples say nothing."""
 _PART = 256
 
 
@@ -82,6 +85,7 @@ def covariances(
     order = np.flatnonzero(used)
     order = order[np.argsort(group[order], kind="stable")]
     grey = np.stack([materials.kd.mean(axis=1), materials.ks.mean(axis=1), materials.alpha], axis=1)
+    grey[:, 0] = np.maximum(grey[:, 0], _LEAST_KD)
     grey[:, 1] = np.maximum(grey[:, 1], _LEAST_KS * grey[:, 0])
     found = np.full((len(prior), UNKNOWNS, UNKNOWNS), np.nan)
     u_kd, u_ks = np.full(materials.kd.shape, np.nan), np.full(materials.kd.shape, np.nan)
@@ -146,6 +150,8 @@ def _fill(  # type: ignore[no-untyped-def]
         for tilt in range(2):
             bread[tilt, tilt] += held[triangle]
             meat[tilt, tilt] += held[triangle] * held[triangle] / prior[triangle]
+        bread[2, 2] += _LEAST_KNOWN
+        meat[2, 2] += _LEAST_KNOWN
         bread[3, 3] += USUAL / SPREAD_KS**2
         meat[3, 3] += USUAL / SPREAD_KS**2
         bread[4, 4] += USUAL
@@ -223,6 +229,7 @@ def _colours(  # type: ignore[no-untyped-def]
                 score[channels, i] += weight * row[i] * off / channels
     for channel in range(channels + 1):
         _add_square(score[channel], meat[channel])
+    bread[0, 0] += 1e-12
     bread[1, 1] += 1e-9 * bread[0, 0]
     inverse = np.linalg.inv(bread)
     mean = inverse @ meat[channels] @ inverse

@@ -1,7 +1,8 @@
 """What the fits of runs miss under LEDs that they have not seen, and what `result.json` says.
 
 They are compared with pictures, block by block of 2 x 2 pixels (seed 003, 6.3), and with the samples, which are
-means over triangles and have less noise.
+means over triangles and have less noise. Inter-reflection that was taken off the samples is taken off the
+pictures too.
 """
 
 from __future__ import annotations
@@ -122,8 +123,10 @@ def _check_view(
             covariance = result.material_covariances(name, places)
             relative = relative_uncertainty(some, result.materials(name).at(places), covariance)
             inside.append(_inside(made[name] / share, relative, some.values, result.view_noise(view, rows, held)))
+        direct = result.direct_shares(view, rows, held)[:, columns]
         for channel in range(result.channels):
             place, measured = frames.pairs(rows, channel)
+            measured *= direct[place, :, channel]
             pixels = {name: values[:, columns, channel][place] for name, values in made.items()}
             _compare(pixels, measured, check.pictures)
         say(f"check of {view.view}", rows.stop, len(view.triangles))

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.run_result import RunResult, ViewSamples
+from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples, u_inter_reflection
 from coupole.reflectance.sample_uncertainty import SOURCES, Places, Sources, bounds, drawn
 
 Floats = NDArray[np.float64]
@@ -83,6 +83,9 @@ def _picked(result: RunResult, view: ViewSamples, scan_noise_um: float, most: in
         noise = file["u_own"][::step][..., channel]
         own, shared = file["led_u_own"][:, channel], file["led_u_shared"][:, channel]
         response = file["u_response"][::step, channel]
+        indirect = np.zeros(noise.shape)
+        if view.inter_reflection is not None:
+            indirect = u_inter_reflection(file[INTER_REFLECTION][::step][..., channel])
         led_mm = float(file.attrs["led_u_mm"])
     known = np.flatnonzero(np.isfinite(noise))
     if len(known) > most:
@@ -94,6 +97,7 @@ def _picked(result: RunResult, view: ViewSamples, scan_noise_um: float, most: in
     sources = Sources(
         noise[triangle, led].astype(np.float64),
         response[triangle],
+        indirect[triangle, led],
         own[led],
         shared[led],
         scan_noise_um * same,

@@ -187,9 +187,10 @@ def _reconstructed(result: RunResult, path: Path, about: dict[str, Any]) -> Iter
     under = result.view_samples(view, rows, led)
     lit = lit_on(under.centres_mm, under.led_mm, view.led_normals[led], about["emission"] == "paper")
     share = (lit[..., None] * view.full_scales[led])[:, 0]
+    measured *= frames.picture(result.direct_shares(view, rows, led)[:, 0])
     shown = np.isfinite(measured).all(axis=2, keepdims=True)
     white = float(np.nanquantile(measured, 0.995)) if shown.any() else 1.0
-    yield f"<p>The frame under LED {one}, made by each fit, and how far each is off, white a tenth of that<br>"
+    yield f"<p>Direct light of LED {one} in the frame, made by each fit, and how far each is off, white 10 %<br>"
     yield figure("measured", display(_rgb(np.nan_to_num(measured)), white))
     for name in FITS:
         made = frames.picture(predicted(result, name, view, rows, under)[:, 0] * share)

@@ -97,6 +97,18 @@ def test_what_a_material_gives_is_as_uncertain_as_draws_of_it_tell() -> None:
     assert np.mean((ratio > 0.8) & (ratio < 1.25)) > 0.95
 
 
+def test_black_and_unseen_triangles_are_uncertain_not_errors() -> None:
+    samples, _ = noisy_case(1, leds=60)
+    used = np.ones(len(samples.led_mm), bool)
+    found = fit_triangles(samples, used, SCANNER_UM)
+    found.kd[0], found.ks[1], found.kd[2], found.ks[2] = 0.0, 0.0, 0.0, 0.0
+    found.alpha[3] = np.nan
+    uncertain = covariances(samples, used, found, SCANNER_UM, fitted_normals=True)
+    assert np.isnan(uncertain.covariance[3]).all()
+    assert np.isfinite(uncertain.covariance[:3]).all()
+    assert (uncertain.u_kd[[0, 2]] > 1).all()
+
+
 def test_groups_are_of_one_view_and_of_leds_side_by_side() -> None:
     samples, _ = noisy_case(2, leds=240)
     group = groups_of(samples)

@@ -148,3 +148,10 @@ def test_samples_whose_bounds_are_all_open_are_counted_and_no_error() -> None:
     some = percentiles(np.array([0.9, 0.5]), np.array([1.1, np.inf]))
     assert some["median"] == pytest.approx([-10.0, 10.0])
     assert some["unbounded_share"] == 0.5
+
+
+def test_a_sample_of_which_nothing_is_known_has_open_bounds() -> None:
+    places = placed(80.0)
+    low, high = bounds(places, sources(u_noise=2.0, vertex_um=300.0), 1.96)
+    assert (low == 0).all()
+    assert np.isinf(high).all()

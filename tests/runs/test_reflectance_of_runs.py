@@ -176,6 +176,30 @@ def test_brackets_are_merged(tmp_path: Path) -> None:
     assert 0.9 < np.mean(np.abs(z) < 1.96) < 0.99
 
 
+def test_light_from_fold_to_fold_is_taken_off(tmp_path: Path) -> None:
+    """Of a white stone whose folds light each other, in a cell that is simulated with that light."""
+    white = (0.8, 0.6, 0.3)
+    cell = shipped_cell(tmp_path, material={"diffuse": white}, interreflection=True)
+    cell.write(views=[cells.TOP], lights={"kind": "every", "every": 180})
+    assert cell.acquire().code == 0
+    f = {}
+    for name, options in (("with", ["--keep-inter-reflection"]), ("without", [])):
+        words = (cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / name, *options)
+        ended = cells.here("reflectance", "extract", *words, "--json")
+        assert ended.code == 0, ended.err
+        with h5py.File(tmp_path / name / "samples/top.h5") as file:
+            f[name] = file["f"][()] * np.pi / white
+            shares = file["inter_reflection"][()].astype(float) if name == "without" else None
+    median, most = ended.document["views"][0]["inter_reflection"]
+    assert 0.01 < median < 0.1 < most < 0.5
+    folds = (shares > 0.1) & (shares < 0.4)
+    assert folds.sum() > 1000
+    assert np.median(f["with"][folds]) > 1.15
+    assert np.median(f["without"][folds]) == pytest.approx(1.0, abs=0.05)
+    off = np.abs(f["without"] - 1) / (0.01 + 0.2 * shares / (1 - shares))
+    assert np.nanmean(off[folds] < 1.96) > 0.9
+
+
 def test_runs_of_one_object_are_fitted_together(made: Made, tmp_path: Path) -> None:
     first, _, alone = made
     material = {"diffuse": DIFFUSE, "f0": F0, "roughness": ROUGHNESS}
@@ -259,7 +283,7 @@ def noisy_samples(noisy: Path, clean: Path) -> tuple[np.ndarray, Places, Sources
         corners = file["corners_mm"][()].astype(float)[triangles[triangle]]
     same = np.ones(len(led))
     noise = u_own[triangle, led].astype(float)
-    sources = Sources(noise, u_response[triangle], u_led[led], u_leds[led], 30.0 * same, led_mm * same)
+    sources = Sources(noise, u_response[triangle], 0 * same, u_led[led], u_leds[led], 30.0 * same, led_mm * same)
     return truth / f[triangle, led], Places(corners, leds[led], axes[led]), sources
 
 

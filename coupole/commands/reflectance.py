@@ -96,6 +96,15 @@ IntensitiesOption = Annotated[
     Path | None,
     typer.Option("--intensities", help="One number or three (r g b) for each light; values are divided by them."),
 ]
+UncalibratedOption = Annotated[
+    bool,
+    typer.Option(
+        "--uncalibrated",
+        help="Of a run without calibrations: one view as pictures under lights at their nominal places; relative "
+        "values of single pixels.",
+    ),
+]
+ViewOption = Annotated[str | None, typer.Option("--view", help="Of --uncalibrated; the first without it.")]
 MaskOption = Annotated[Path | None, typer.Option("--mask", help="Picture that is black where nothing is fitted.")]
 LeaveOutOption = Annotated[
     str,
@@ -125,6 +134,8 @@ def from_runs_or_pictures(
     lights: LightsOption = None,
     intensities: IntensitiesOption = None,
     mask: MaskOption = None,
+    uncalibrated: UncalibratedOption = False,
+    view: ViewOption = None,
     leave_out: LeaveOutOption = "",
     as_json: JsonOption = False,
 ) -> None:
@@ -140,8 +151,12 @@ def from_runs_or_pictures(
             raise InputError("--out: expected the folder of the result")
         if bool(runs) == (pictures is not None):
             raise InputError("expected runs, or --pictures with --lights; see coupole reflectance from --help")
+        if (uncalibrated and (calibrations or len(runs or ()) != 1)) or (view and not uncalibrated):
+            raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
         with step_bars(console) as say:
-            if pictures is not None:
+            if uncalibrated and runs:
+                made = _of_uncalibrated(runs[0], view, _numbers(leave_out), out, say)
+            elif pictures is not None:
                 made = _of_pictures(pictures, lights, intensities, mask, _numbers(leave_out), out, say)
             else:
                 records, left_out = _records(calibrations or []), tuple(_numbers(leave_out))
@@ -178,6 +193,22 @@ def _of_pictures(
         raise InputError("--lights: expected the file of the lights' directions")
     given = read_pictures(pictures, lights, intensities=intensities, mask=mask)
     about = fit_pictures(given, out, left_out=left_out, say=say)
+    return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
+
+
+def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path, say: Said) -> Made:
+    from dataclasses import replace
+
+    from coupole.reflectance import uncalibrated
+    from coupole.reflectance.picture_job import fit_pictures
+    from coupole.reflectance.picture_set import read_pictures
+    from coupole.viewing import reflectance_page
+
+    folder = out.with_name(f"{out.name}-pictures")
+    uncalibrated.write_pictures(run, view, folder, say)
+    lights, intensities, mask = (folder / name for name in uncalibrated.FILES)
+    given = read_pictures(folder, lights, intensities=intensities, mask=mask)
+    about = fit_pictures(replace(given, uncalibrated_run=run.resolve().name), out, left_out=left_out, say=say)
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 

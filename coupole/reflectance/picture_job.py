@@ -84,6 +84,8 @@ def _fit_pictures(pictures: PictureSet, out: Path, left_out: Sequence[int], say:
         raise InputError(f"--leave-out: {len(lights)} lights are left; at least {FEWEST_LIGHTS} are needed")
     result = PictureResult(out)
     settings: dict[str, Any] = {"left_out": sorted(set(left_out)), "inputs": _inputs(pictures)}
+    if pictures.uncalibrated_run:
+        settings["uncalibrated_run"] = pictures.uncalibrated_run
     begin(out, settings)
     if not (out / SAMPLES).exists():
         _store(pictures, out / SAMPLES, say)

@@ -36,6 +36,8 @@ class PictureSet:
     """[h, w] what is fitted."""
     full_scale: int
     """Largest value that a file can hold."""
+    uncalibrated_run: str = ""
+    """The run that these are pictures of, with nominal lights; empty for others."""
 
     def __len__(self) -> int:
         return len(self.files)

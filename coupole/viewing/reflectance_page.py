@@ -43,6 +43,11 @@ def write(folder: Path) -> Path:
 
 def remarks(about: dict[str, Any]) -> Iterator[str]:
     """What its maker must know, one sentence each."""
+    if run := about.get("uncalibrated_run"):
+        yield (
+            f"of the run {run} without calibrations: values are relative, and lights stand where rig and LED "
+            "table have them as seen from one point; normals and materials are of single pixels"
+        )
     yield (
         f"{about['pixels']} pixels under {about['lights'] - len(about['left_out'])} lights; the materials leave "
         f"{100 * about['residual']:.1f} % (median, of square roots)"

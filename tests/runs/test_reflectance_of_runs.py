@@ -13,9 +13,13 @@ import pytest
 import trimesh
 from cells import CellFolder
 
+from coupole.calibration.light.frames import open_light_frames
+from coupole.reflectance.normal_fit import fit_materials
+from coupole.reflectance.picture_set import read_pictures
 from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.sample_uncertainty import Places, Sources, bounds
 from coupole.reflectance.triangle_fit import fit_triangles
+from coupole.reflectance.uncalibrated import FILES, write_pictures
 
 RECORDS = cells.REPO / "configs/calibrations"
 DIFFUSE, F0, ROUGHNESS = (0.5, 0.35, 0.2), (0.05, 0.05, 0.05), 0.3
@@ -153,6 +157,36 @@ def test_pictures_for_the_check_are_the_frames_and_fits_miss_little_more_than_no
     noise = document["mae_of_noise"]
     assert noise < document["mae"]["ggx_normal"] < 1.5 * noise
     assert document["mae_of_triangles"]["ggx_normal"] < document["mae"]["ggx_normal"]
+
+
+def test_without_calibrations_pixels_have_normals_by_nominal_lights(made: Made, tmp_path: Path) -> None:
+    cell, out, _ = made
+    write_pictures(cell.run_folder, "side", tmp_path, lambda step, done, of: None)
+    lights, intensities, mask = (tmp_path / name for name in FILES)
+    pictures = read_pictures(tmp_path, lights, intensities=intensities, mask=mask)
+    every = np.stack([pictures.raw_values(number)[::9, 1] for number in range(len(pictures))], axis=1) / 65535
+    values = every / pictures.intensities[:, 1]
+    found = np.full((*pictures.mask.shape, 3), np.nan)
+    rows, columns = (places[::9] for places in np.nonzero(pictures.mask))
+    found[rows, columns] = fit_materials(values, pictures.directions, np.array([0.0, 0.0, 1.0])).normals
+    with h5py.File(out / "samples/side.h5") as file:
+        seen, normals = file["seen"][()][::2, ::2], file["normals"][()]
+    frame = next(one for one in open_light_frames([cell.run_folder]).lit if one.view == "side")
+    truth = normals[seen] @ frame.base_from_camera[:3, :3] * (1, -1, -1)
+    known = (seen >= 0) & np.isfinite(found).all(axis=2)
+    assert known.sum() > 500
+    off = np.degrees(np.arccos(np.clip(np.sum(found * truth, axis=2)[known], -1, 1)))
+    assert np.median(off) < 5.0, np.median(off)  # lights near by are taken as far away
+
+
+@pytest.mark.full
+def test_without_calibrations_values_are_relative_and_it_is_said(made: Made, tmp_path: Path) -> None:
+    cell, _, _ = made
+    words = ("reflectance", cell.run_folder, "--uncalibrated", "--view", "side", "--out", tmp_path / "plain")
+    ended = cells.here(*words, "--json")
+    assert ended.code == 0, ended.err
+    assert ended.document["uncalibrated_run"] == cell.run_folder.name
+    assert "values are relative" in (tmp_path / "plain/report.html").read_text()
 
 
 def test_brackets_are_merged(tmp_path: Path) -> None:
@@ -333,6 +367,9 @@ def test_runs_without_what_is_needed_are_refused_with_the_remedy(made: Made, tmp
 
     assert "no calibration record of the kind hand-eye, leds, led-power" in refused(cell.run_folder)
     assert "expected runs, or --pictures" in refused()
+    uncalibrated = (cell.run_folder, "--uncalibrated")
+    assert "no --calibrations" in refused(*uncalibrated, "--calibrations", RECORDS)
+    assert "expected one of" in refused(*uncalibrated, "--view", "none")
     few = [word for kind in ("hand-eye", "leds") for word in ("--calibrations", RECORDS / f"{kind}.yaml")]
     assert "kind led-power is named" in refused(cell.run_folder, *few)
     records = ("--calibrations", RECORDS)

@@ -41,7 +41,10 @@ TYPICAL_PER_K = -0.003
 SAME_GAIN_DB = 0.01
 MOST_MOVED_MM = 0.1
 """Within a view; an arm comes back to a pose within less when a run is resumed."""
-_HOW = "name them with --calibrations, or make them: `coupole calibrate all --rig RIG`"
+_HOW = (
+    "name them with --calibrations, or make them: `coupole calibrate all --rig RIG`; --uncalibrated gives "
+    "relative values of single pixels without them"
+)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,120 @@
+"""Pictures of one view of a run without calibrations, for what is done with pictures under known lights.
+
+Of nominal places alone, by rig and LED table: directions to the LEDs are those of the point that the camera is
+focused on, their light is what the table says of it there. Values are relative, and each pixel stands for itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask, channels_of, open_light_frames
+from coupole.calibration.light.records import dark_signal
+from coupole.errors import InputError
+from coupole.geometry import apply, inverse
+from coupole.plan.reading import read_plan
+from coupole.reflectance.extraction.frames_for_check import block_offsets
+from coupole.reflectance.picture_set import FEWEST_LIGHTS, ORDER_FILE
+from coupole.reflectance.result_folder import complete
+from coupole.storage.durable import write_synced
+from coupole.storage.run import Run
+
+Said = Callable[[str, int, int], None]
+FILES = LIGHTS, INTENSITIES, MASK = "lights.txt", "intensities.txt", "mask.png"
+_MOST_CLIPPED = 1e-3
+_LEAST_SHARE = 0.02
+"""Of the range, that a pixel of the mask has under its brightest LED."""
+
+
+def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> None:
+    """Write pictures of a view of a run [h / 2, w / 2], 16 bit, linear, one pixel of each channel of a block, with
+    `filenames.txt`, lights, intensities and mask; what is there already is kept.
+
+    Raises InputError: no such view, too few LEDs; StorageError for damaged frames.
+    """
+    run = Run(folder)
+    files = read_plan(run.plan_path, run.rig_path)
+    frames = open_light_frames([folder])
+    chosen = _frames_of(folder, frames, view)
+    out.mkdir(parents=True, exist_ok=True)
+    leds = sorted(chosen)
+    shortest_us = min(frame.exposure_us for frame in chosen.values())
+    dark = dark_signal(frames, None)
+    brightest = np.zeros((frames.size_px[1] // 2, frames.size_px[0] // 2), np.uint16)
+    for number, led in enumerate(leds):
+        path = out / f"led{led:04d}.png"
+        if not path.exists():
+            picture = _picture(frames, chosen[led], dark(chosen[led]), shortest_us)
+            complete(path, partial(_write_png, picture))
+        read = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert read is not None
+        brightest = np.maximum(brightest, read.reshape(*brightest.shape, -1).max(axis=2))
+        say("pictures", number + 1, len(leds))
+    pose = chosen[leds[0]].base_from_camera
+    target_mm = pose[:3, 3] + files.cell.rig.lens.focus_distance_mm * pose[:3, 2]
+    rows = files.cell.leds.rows(leds)
+    towards = apply(inverse(pose), files.cell.leds.positions_mm[rows]) - apply(inverse(pose), target_mm)
+    towards *= (1.0, -1.0, -1.0)  # x right, y up, z to the camera
+    light = files.cell.leds.illuminance_lux(target_mm[None])[0, rows]
+    _write_rows(out / LIGHTS, towards / np.linalg.norm(towards, axis=1, keepdims=True))
+    _write_rows(out / INTENSITIES, np.repeat(light[:, None] / light.max(), 3, axis=1))
+    write_synced(out / ORDER_FILE, "".join(f"led{led:04d}.png\n" for led in leds))
+    mask = np.where(brightest > _LEAST_SHARE * 65535, np.uint8(255), np.uint8(0))
+    complete(out / MASK, partial(_write_png, mask))
+
+
+def _frames_of(folder: Path, frames: LightFrames, view: str | None) -> dict[int, LightFrame]:
+    """Of each LED the longest exposure that is hardly clipped, else the shortest."""
+    views = list(dict.fromkeys(frame.view for frame in frames.lit if frame.led is not None))
+    if not views:
+        raise InputError(f"{folder}: no proven frame under a single LED; acquire the plan first")
+    name = views[0] if view is None else view
+    if name not in views:
+        raise InputError(f"--view: expected one of {', '.join(views)}, got {name!r}")
+    found: dict[int, LightFrame] = {}
+    for frame in sorted(frames.lit, key=lambda frame: -frame.exposure_us):
+        if frame.view != name or frame.led is None:
+            continue
+        kept = found.get(frame.led)
+        if kept is None or _clipped(kept, frames.white_dn) > _MOST_CLIPPED:
+            found[frame.led] = frame
+    if len(found) < FEWEST_LIGHTS:
+        raise InputError(f"{folder}: {len(found)} LEDs lit the view {name}; at least {FEWEST_LIGHTS} are needed")
+    return found
+
+
+def _clipped(frame: LightFrame, white_dn: int) -> float:
+    return float(np.mean(frame.read() >= white_dn))
+
+
+def _picture(
+    frames: LightFrames, frame: LightFrame, dark: NDArray[np.float32], shortest_us: float
+) -> NDArray[np.uint16]:
+    """[h / 2, w / 2, 3], blue first as OpenCV writes it, or one channel."""
+    width, height = frames.size_px
+    channel = np.zeros((height, width), np.int8)
+    names = channels_of(frames.pattern)
+    for number, name in enumerate(names):
+        channel[channel_mask((height, width), frames.pattern, name)] = number
+    scale = 65535.0 * shortest_us / frame.exposure_us / (frames.white_dn - frames.black_dn)
+    linear = np.clip((frame.read() - dark) * scale, 0, 65535)
+    parts = [
+        linear[row::2, column::2][: height // 2, : width // 2]
+        for row, column in block_offsets(channel, len(names))
+    ]
+    picture: NDArray[np.uint16] = np.rint(np.stack(parts[::-1], axis=-1)).astype(np.uint16)
+    return picture
+
+
+def _write_png(picture: NDArray[np.integer], path: Path) -> None:
+    path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+
+
+def _write_rows(path: Path, rows: Sequence[Sequence[float]] | NDArray[np.float64]) -> None:
+    write_synced(path, "".join(" ".join(f"{value:.9g}" for value in row) + "\n" for row in rows))

@@ -20,7 +20,7 @@ from coupole.reflectance.run_result import (
     write_materials,
 )
 from coupole.reflectance.slice_fit import fit_slices, slice_values
-from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
+from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, fit_triangles, model_values
 from coupole.storage.disk_errors import disk_error
 
 TOGETHER = (("sh",), ("rbf", "ggx_rbf"))
@@ -53,13 +53,13 @@ def predicted(
     their lights are; NaN where the fit has nothing, the material alone where what it leaves was not fitted."""
     places = np.searchsorted(result.triangles, view.triangles[rows])
     if name == "clusters":
-        own = result.materials("ggx_normal").at(places)
+        own = _materials(result, "ggx_normal", places)
         return model_values(samples, result.clusters.at(own, samples.normals, places))
     kind = SLICES.get(name)
     material = name if kind is None else kind.over
     model = None
     if material is not None:
-        model = model_values(samples, result.materials(material).at(places))
+        model = model_values(samples, _materials(result, material, places))
     if kind is None:
         assert model is not None
         return model
@@ -67,6 +67,12 @@ def predicted(
     if model is not None:
         coefficients = np.nan_to_num(coefficients)
     return slice_values(samples, coefficients, kind.basis, model)
+
+
+def _materials(result: RunResult, name: str, places: NDArray[np.int64]) -> TriangleMaterials:
+    """Of triangles by their rising places."""
+    first = int(places[0])
+    return result.materials(name, slice(first, int(places[-1]) + 1)).at(places - first)
 
 
 def _fit_materials(

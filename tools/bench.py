@@ -211,6 +211,16 @@ def bench_render(rounds: int) -> None:
         line(**figure)
 
 
+def bench_reflectance(rounds: int) -> None:
+    """Frames to samples, fits and relit pictures, against the disk, BLAS, SciPy, Mitsuba and published figures. It
+    takes 12 GB of disk and some minutes; `--frames` makes it smaller."""
+    from bench_reflectance import figures
+
+    for figure in figures(ROOT, rounds, FRAMES_OF["reflectance"]):
+        line(**figure)
+
+
+FRAMES_OF = {"reflectance": 300}
 BENCHES: dict[str, Callable[[int], None]] = {
     "check": bench_check,
     "sequencing": bench_sequencing,
@@ -223,6 +233,7 @@ BENCHES: dict[str, Callable[[int], None]] = {
     "render": bench_render,
     "mesh": bench_mesh,
     "calibration": bench_calibration,
+    "reflectance": bench_reflectance,
 }
 
 
@@ -230,10 +241,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"which of {', '.join(BENCHES)}; all if none")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--frames", type=int, help="of `reflectance`; 300 without it")
     parser.add_argument("--json", action="store_true", help="accepted for uniformity: the lines are always JSON")
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(BENCHES):
         parser.error(f"expected some of {', '.join(BENCHES)}; found {', '.join(sorted(unknown))}")
+    FRAMES_OF["reflectance"] = arguments.frames or FRAMES_OF["reflectance"]
     for name in arguments.names or BENCHES:
         BENCHES[name](arguments.rounds)
 

@@ -25,6 +25,9 @@ def _routine(module: str, name: str, *kinds: Any) -> Any:
 
 
 _dsyrk = _routine("blas", "dsyrk", _CHAR, _CHAR, _INT, _INT, _DOUBLE, _DOUBLE, _INT, _DOUBLE, _DOUBLE, _INT)
+_dgemm = _routine(
+    "blas", "dgemm", _CHAR, _CHAR, _INT, _INT, _INT, _DOUBLE, _DOUBLE, _INT, _DOUBLE, _INT, _DOUBLE, _DOUBLE, _INT
+)
 _dpotrf = _routine("lapack", "dpotrf", _CHAR, _INT, _DOUBLE, _INT, _INT)
 _dpotrs = _routine("lapack", "dpotrs", _CHAR, _INT, _INT, _DOUBLE, _INT, _DOUBLE, _INT, _INT)
 
@@ -36,13 +39,25 @@ def one_thread() -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def gram(rows, product):  # type: ignore[no-untyped-def]
-    """Into `product` [n, n], rows^T rows of `rows` [samples, n]: the half that `factorise` reads."""
-    upper, plain = np.array([85], np.uint8), np.array([78], np.uint8)  # U and N
-    sizes = np.array([rows.shape[1], rows.shape[0]], np.intc)
+    """Into `product` [n, n], rows rows^T of `rows` [n, samples]: the half that `factorise` reads."""
+    upper, turned = np.array([85], np.uint8), np.array([84], np.uint8)  # U and T
+    sizes = np.array([rows.shape[0], rows.shape[1]], np.intc)
     factors = np.array([1.0, 0.0])
     _dsyrk(
-        upper.ctypes, plain.ctypes, sizes.ctypes, sizes[1:].ctypes, factors.ctypes, rows.ctypes, sizes.ctypes,
+        upper.ctypes, turned.ctypes, sizes.ctypes, sizes[1:].ctypes, factors.ctypes, rows.ctypes, sizes[1:].ctypes,
         factors[1:].ctypes, product.ctypes, sizes.ctypes,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def sums(rows, values, right):  # type: ignore[no-untyped-def]
+    """Into `right` [m, n], values rows^T of `values` [m, samples] and `rows` [n, samples]."""
+    turned, plain = np.array([84], np.uint8), np.array([78], np.uint8)  # T and N
+    sizes = np.array([len(rows), len(values), rows.shape[1]], np.intc)
+    factors = np.array([1.0, 0.0])
+    _dgemm(
+        turned.ctypes, plain.ctypes, sizes.ctypes, sizes[1:].ctypes, sizes[2:].ctypes, factors.ctypes, rows.ctypes,
+        sizes[2:].ctypes, values.ctypes, sizes[2:].ctypes, factors[1:].ctypes, right.ctypes, sizes.ctypes,
     )  # fmt: skip
 
 
@@ -60,9 +75,9 @@ def factorise(product, penalty, factor):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def solve(factor, right):  # type: ignore[no-untyped-def]
-    """In place: the solution for `right` [n], by what `factorise` left."""
+    """In place: the solutions for `right` [m, n], by what `factorise` left."""
     upper = np.array([85], np.uint8)
-    sizes = np.array([len(right), 1, 0], np.intc)
+    sizes = np.array([len(factor), len(right), 0], np.intc)
     _dpotrs(
         upper.ctypes, sizes.ctypes, sizes[1:].ctypes, factor.ctypes, sizes.ctypes, right.ctypes, sizes.ctypes,
         sizes[2:].ctypes,

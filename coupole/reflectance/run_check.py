@@ -121,7 +121,7 @@ def _check_view(
         for name, inside in check.inside.items():
             places = np.searchsorted(result.triangles, view.triangles[rows])
             covariance = result.material_covariances(name, places)
-            relative = relative_uncertainty(some, result.materials(name).at(places), covariance)
+            relative = relative_uncertainty(some, result.materials(name, places), covariance)
             inside.append(_inside(made[name] / share, relative, some.values, result.view_noise(view, rows, held)))
         direct = result.direct_shares(view, rows, held)[:, columns]
         for channel in range(result.channels):

@@ -48,13 +48,13 @@ def predicted(
     their lights are; NaN where the fit has nothing, the material alone where what it leaves was not fitted."""
     places = np.searchsorted(result.triangles, view.triangles[rows])
     if name == "clusters":
-        own = result.materials("ggx_normal").at(places)
+        own = result.materials("ggx_normal", places)
         return model_values(samples, result.clusters.at(own, samples.normals, places))
     kind = SLICES.get(name)
     material = name if kind is None else kind.over
     model = None
     if material is not None:
-        model = model_values(samples, result.materials(material).at(places))
+        model = model_values(samples, result.materials(material, places))
     if kind is None:
         assert model is not None
         return model

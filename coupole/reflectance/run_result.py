@@ -44,6 +44,8 @@ FITS = (*MATERIALS, *SLICES)
 CLUSTERS = "fits/clusters.h5"
 FRAMES = "samples/frames"
 """Folder of the pictures that the fits are compared with."""
+Block = slice | NDArray[np.int64]
+"""Places of triangles; numbers rise."""
 INTER_REFLECTION = "inter_reflection"
 """Attribute of a file of samples that it was taken from."""
 U_OF_INTER_REFLECTION = 0.2
@@ -218,7 +220,7 @@ class RunResult:
         """Those of some rows of a view's file, under some of its LEDs [leds]."""
         columns = np.arange(len(view.leds)) if leds is None else np.flatnonzero(leds)
         with h5py.File(view.path, "r") as file:
-            values = file["f"][rows] if leds is None else file["f"][rows, columns]
+            values = (file["f"][rows] if leds is None else file["f"][rows, columns]).astype(np.float32)
             centres, normals = file["centres_mm"][rows], file["normals"][rows]
         _times_cosine(values, centres, normals, view.led_mm[columns])
         return TriangleSamples(
@@ -283,17 +285,15 @@ class RunResult:
     def slices_path(self, name: str, view: ViewSamples) -> Path:
         return self.folder / "fits" / name / view.path.name
 
-    def materials(self, name: str, block: slice = slice(None)) -> TriangleMaterials:
+    def materials(self, name: str, block: Block = slice(None)) -> TriangleMaterials:
         """A fit by its name in `MATERIALS`."""
         with h5py.File(self.materials_path(name), "r") as file:
-            return TriangleMaterials(*(file[field][block].astype(np.float64) for field in FIELDS))
+            return TriangleMaterials(*(_read(file[field], block) for field in FIELDS))
 
-    def material_covariances(
-        self, name: str, block: slice | NDArray[np.int64] = slice(None)
-    ) -> NDArray[np.float64]:
+    def material_covariances(self, name: str, block: Block = slice(None)) -> NDArray[np.float64]:
         """[n, 5, 5] of a fit by its name in `MATERIALS`, as `material_uncertainty.covariances` gives them."""
         with h5py.File(self.materials_path(name), "r") as file:
-            lower = file["covariance"][()][block].astype(np.float64)
+            lower = _read(file["covariance"], block)
         found = np.empty((len(lower), UNKNOWNS, UNKNOWNS))
         found[:, *LOWER] = lower
         found[:, *LOWER[::-1]] = lower
@@ -317,6 +317,16 @@ class RunResult:
         with h5py.File(self.slices_path(name, view), "r") as file:
             found: NDArray[np.float32] = file["coefficients"][rows]
             return found
+
+
+def _read(data: h5py.Dataset, block: Block) -> NDArray[np.float64]:
+    """Rows; h5py takes rising numbers one by one."""
+    if isinstance(block, slice):
+        return np.asarray(data[block], np.float64)
+    if not len(block):
+        return np.empty((0, *data.shape[1:]))
+    first = int(block[0])
+    return np.asarray(data[first : int(block[-1]) + 1][block - first], np.float64)
 
 
 def u_inter_reflection(share: NDArray[np.float16]) -> NDArray[np.float64]:

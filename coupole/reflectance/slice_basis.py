@@ -93,41 +93,50 @@ def _recurrence() -> tuple[Floats, Floats]:
 
 
 _A, _B = _recurrence()
+_DIAGONAL = np.array([1.0, *(math.sqrt((2.0 * m + 1.0) / (2.0 * m)) for m in range(1, _DEGREES))])
+"""Of P(m, m), over P(m - 1, m - 1)."""
 _CENTRES = centres()
 
 
 @numba.njit(cache=True, nogil=True)
-def functions(harmonic, direction, row):  # type: ignore[no-untyped-def]
-    """The values of a basis in a direction [3], into `row` [COUNT]."""
+def functions(harmonic, x, y, z, rows):  # type: ignore[no-untyped-def]
+    """The values of a basis in directions x, y, z [n], into `rows` [COUNT, n]."""
     if harmonic:
-        _harmonics(direction[0], direction[1], direction[2], row)
+        _harmonics(x, y, z, rows)
     else:
-        _radial(direction[0], direction[1], direction[2], row)
+        _radial(x, y, z, rows)
 
 
 @numba.njit(cache=True, nogil=True)
-def _harmonics(x, y, z, row):  # type: ignore[no-untyped-def]
-    """Y(l, m) at place l (l + 1) + m: sqrt 2 P(l, |m|) times Re or Im of (x + iy)^|m|."""
-    p_mm, cosine, sine = math.sqrt(0.25 / math.pi), 1.0, 0.0
+def _harmonics(x, y, z, rows):  # type: ignore[no-untyped-def]
+    """Y(l, m) in row l (l + 1) + m: sqrt 2 P(l, |m|) times Re or Im of (x + iy)^|m|."""
+    cosine, sine = np.ones(len(x)), np.zeros(len(x))
+    before, now = np.empty(len(x)), np.empty(len(x))
+    p_mm = math.sqrt(0.25 / math.pi)
     for m in range(_DEGREES):
-        if m > 0:
-            p_mm *= math.sqrt((2.0 * m + 1.0) / (2.0 * m))
-            cosine, sine = x * cosine - y * sine, x * sine + y * cosine
-        double = math.sqrt(2.0) if m > 0 else 1.0
-        before, now = 0.0, p_mm
+        p_mm *= _DIAGONAL[m]
+        if m == 1:
+            cosine, sine = math.sqrt(2.0) * x, math.sqrt(2.0) * y
+        for n in range(len(x) if m > 1 else 0):
+            cosine[n], sine[n] = x[n] * cosine[n] - y[n] * sine[n], x[n] * sine[n] + y[n] * cosine[n]
+        before[:], now[:] = 0.0, p_mm
         for degree in range(m, _DEGREES):
-            if degree > m:
-                before, now = now, _A[degree, m] * (z * now - _B[degree, m] * before)
+            a, b = _A[degree, m], _B[degree, m]
+            for n in range(len(x) if degree > m else 0):
+                before[n], now[n] = now[n], a * (z[n] * now[n] - b * before[n])
             middle = degree * (degree + 1)
-            row[middle + m] = double * now * cosine
-            if m > 0:
-                row[middle - m] = double * now * sine
+            for n in range(len(x) if m > 0 else 0):
+                rows[middle - m, n] = now[n] * sine[n]
+            for n in range(len(x)):
+                rows[middle + m, n] = now[n] * cosine[n]
 
 
 @numba.njit(cache=True, nogil=True)
-def _radial(x, y, z, row):  # type: ignore[no-untyped-def]
+def _radial(x, y, z, rows):  # type: ignore[no-untyped-def]
     count = len(_CENTRES)
-    for n in range(count):
-        dx, dy, dz = x - _CENTRES[n, 0], y - _CENTRES[n, 1], z - _CENTRES[n, 2]
-        row[n] = -math.sqrt(dx * dx + dy * dy + dz * dz)
-    row[count], row[count + 1], row[count + 2], row[count + 3] = 1.0, x, y, z
+    for k in range(count):
+        cx, cy, cz = _CENTRES[k]
+        for n in range(len(x)):
+            dx, dy, dz = x[n] - cx, y[n] - cy, z[n] - cz
+            rows[k, n] = -math.sqrt(dx * dx + dy * dy + dz * dz)
+    rows[count], rows[count + 1], rows[count + 2], rows[count + 3] = 1.0, x, y, z

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.least_squares import factorise, gram, one_thread, solve
+from coupole.reflectance.least_squares import factorise, gram, one_thread, solve, sums
 from coupole.reflectance.slice_basis import COUNT, Basis, functions
 from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 
@@ -84,82 +84,67 @@ def _frame(normal, centre_mm, camera_mm, frame):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _local(frame, centre_mm, led_mm, direction):  # type: ignore[no-untyped-def]
-    """Into `direction` [3] that of the LED in a slice's frame."""
-    d0, d1, d2 = led_mm[0] - centre_mm[0], led_mm[1] - centre_mm[1], led_mm[2] - centre_mm[2]
-    length = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-    for k in range(3):
-        direction[k] = (frame[k, 0] * d0 + frame[k, 1] * d1 + frame[k, 2] * d2) / length
+def _directions(frame, centre_mm, led_mm, which, x, y, z):  # type: ignore[no-untyped-def]
+    """Of the LEDs `which` [n], in a slice's frame; LEDs below the surface get z = 0. How many are above it."""
+    above = 0
+    for n in range(len(which)):
+        led = led_mm[which[n]]
+        d0, d1, d2 = led[0] - centre_mm[0], led[1] - centre_mm[1], led[2] - centre_mm[2]
+        inverse = 1.0 / math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+        x[n] = (frame[0, 0] * d0 + frame[0, 1] * d1 + frame[0, 2] * d2) * inverse
+        y[n] = (frame[1, 0] * d0 + frame[1, 1] * d1 + frame[1, 2] * d2) * inverse
+        z[n] = max(0.0, (frame[2, 0] * d0 + frame[2, 1] * d1 + frame[2, 2] * d2) * inverse)
+        above += z[n] > 0.0
+    return above
 
 
 @numba.njit(cache=True, nogil=True)
 def _fit_part(  # type: ignore[no-untyped-def]
     values, left, led_mm, camera_mm, centres_mm, normals, used, harmonic, penalties, found
 ):
+    """Channels with the same samples share their matrix."""
     count, _, channels = values.shape
-    whole, rows, which = np.empty((len(used), COUNT)), np.empty((len(used), COUNT)), np.empty(len(used), np.int64)
-    product, factor, right = np.zeros((COUNT, COUNT)), np.empty((COUNT, COUNT)), np.empty(COUNT)
-    factors, there = np.empty((len(left), COUNT, COUNT)), np.zeros(len(left), np.bool_)
+    memory, which = np.empty(COUNT * len(used)), np.empty(len(used), np.int64)
+    wanted, xyz = np.empty(channels * len(used)), np.empty((3, len(used)))
+    product, factor = np.zeros((COUNT, COUNT)), np.empty((COUNT, COUNT))
+    right, frame = np.empty((channels, COUNT)), np.empty((3, 3))
     for triangle in range(count):
-        _functions_of(
-            values[triangle], used, led_mm, camera_mm, centres_mm[triangle], normals[triangle], harmonic, whole
-        )
-        n = 0
-        for channel in range(channels):
-            if channel == 0 or not _same(values[triangle], used, channel):
-                n = _gather(values[triangle, :, channel], used, whole, rows, which)
-                if n >= FEWEST:
-                    gram(rows[:n], product)
-                    for fit in range(len(left)):
-                        there[fit] = factorise(product, penalties[fit], factor)
-                        factors[fit] = factor
-            if n < FEWEST:
+        _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
+        end = 0
+        while end < channels:
+            first, end = end, end + 1
+            while end < channels and _same(values[triangle], used, end):
+                end += 1
+            n = _known(values[triangle, :, first], used, which)
+            x, y, z = xyz[0, :n], xyz[1, :n], xyz[2, :n]
+            if n < FEWEST or _directions(frame, centres_mm[triangle], led_mm, which[:n], x, y, z) < FEWEST:
                 continue
-            for fit in range(len(left)):
-                right[:] = 0.0
-                for number in range(n):
-                    value = left[fit, triangle, which[number], channel]
-                    for k in range(COUNT):
-                        right[k] += rows[number, k] * value
-                if there[fit]:
-                    solve(factors[fit], right)
-                    found[fit, triangle, channel] = right
-
-
-@numba.njit(cache=True, nogil=True)
-def _functions_of(values, used, led_mm, camera_mm, centre_mm, normal, harmonic, whole):  # type: ignore[no-untyped-def]
-    """Into `whole` [used, COUNT] a triangle's functions times the cosine; a row without sample begins with 0."""
-    frame, direction = np.empty((3, 3)), np.empty(3)
-    _frame(normal, centre_mm, camera_mm, frame)
-    for number in range(len(used)):
-        whole[number, 0] = 0.0
-        if _any_known(values[used[number]]):
-            _local(frame, centre_mm, led_mm[used[number]], direction)
-            if direction[2] > 0.0:
-                functions(harmonic, direction, whole[number])
-                for k in range(COUNT):
-                    whole[number, k] *= direction[2]
-
-
-@numba.njit(cache=True, nogil=True)
-def _gather(values, used, whole, rows, which):  # type: ignore[no-untyped-def]
-    """Rows and numbers of the samples of a channel that are there; how many."""
-    n = 0
-    for number in range(len(used)):
-        if whole[number, 0] != 0.0 and not math.isnan(values[used[number]]):
+            rows = memory[: COUNT * n].reshape(COUNT, n)
+            functions(harmonic, x, y, z, rows)
             for k in range(COUNT):
-                rows[n, k] = whole[number, k]
-            which[n] = used[number]
+                for number in range(n):
+                    rows[k, number] *= z[number]
+            gram(rows, product)
+            mine = wanted[: (end - first) * n].reshape(end - first, n)
+            for fit in range(len(left)):
+                for number in range(n):
+                    for channel in range(first, end):
+                        mine[channel - first, number] = left[fit, triangle, which[number], channel]
+                if factorise(product, penalties[fit], factor):
+                    sums(rows, mine, right[: end - first])
+                    solve(factor, right[: end - first])
+                    found[fit, triangle, first:end] = right[: end - first]
+
+
+@numba.njit(cache=True, nogil=True)
+def _known(values, used, which):  # type: ignore[no-untyped-def]
+    """Into `which` those of the samples `used` that a channel has; how many."""
+    n = 0
+    for sample in used:
+        if not math.isnan(values[sample]):
+            which[n] = sample
             n += 1
     return n
-
-
-@numba.njit(cache=True, nogil=True)
-def _any_known(values):  # type: ignore[no-untyped-def]
-    known = False
-    for value in values:
-        known |= not math.isnan(value)
-    return known
 
 
 @numba.njit(cache=True, nogil=True)
@@ -174,14 +159,15 @@ def _same(values, used, channel):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _add_part(coefficients, led_mm, camera_mm, centres_mm, normals, harmonic, made):  # type: ignore[no-untyped-def]
     count, samples, channels = made.shape
-    frame, direction, row = np.empty((3, 3)), np.empty(3), np.empty(COUNT)
+    frame, which = np.empty((3, 3)), np.arange(samples)
+    x, y, z, rows = np.empty(samples), np.empty(samples), np.empty(samples), np.empty((COUNT, samples))
     for triangle in range(count):
         _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
-        for sample in range(samples):
-            _local(frame, centres_mm[triangle], led_mm[sample], direction)
-            functions(harmonic, direction, row)
-            for channel in range(channels):
+        _directions(frame, centres_mm[triangle], led_mm, which, x, y, z)
+        functions(harmonic, x, y, z, rows)
+        for channel in range(channels):
+            for sample in range(samples):
                 total = 0.0
                 for k in range(COUNT):
-                    total += coefficients[triangle, channel, k] * row[k]
-                made[triangle, sample, channel] += max(direction[2], 0.0) * total
+                    total += coefficients[triangle, channel, k] * rows[k, sample]
+                made[triangle, sample, channel] += z[sample] * total

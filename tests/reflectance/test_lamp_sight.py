@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from test_seen_surface import sheet
 
 from coupole.calibration.light.irradiance import irradiance_per_flux
 from coupole.calibration.light.tile_views import Positions
-from coupole.motion.occlusion import ray_mesh
+from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.extraction.lamp_sight import (
     AWAY,
     PENUMBRA,
     REACHED,
     SHADED,
+    Facets,
     lamp_codes,
     lit_on,
     neighbours_of,
@@ -47,7 +50,9 @@ def test_shadow_and_penumbra_are_where_the_ball_throws_them() -> None:
     sides = neighbours_of(rows.reshape(-1, 3).astype(np.uint32))
     towards = -LEDS_MM / np.linalg.norm(LEDS_MM, axis=1, keepdims=True)
     leds = Positions(np.arange(4), LEDS_MM, towards)
-    codes = lamp_codes(ray_mesh(np.concatenate([flat, ball])), centres, normals, sides, leds)
+    mesh, facets = PacketMesh(np.concatenate([flat, ball])), Facets(centres, normals, sides)
+    with ThreadPoolExecutor(2) as pool:
+        codes = lamp_codes(mesh, facets, leds, pool).T
     assert (codes[:, 3] == AWAY).all()  # below the sheet
     for led in range(3):
         off_mm = distance_to_axis_mm(centres, LEDS_MM[led])

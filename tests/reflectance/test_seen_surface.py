@@ -8,8 +8,8 @@ import pytest
 
 from coupole.calibration.optics import Intrinsics
 from coupole.geometry import look_at
-from coupole.motion.occlusion import ray_mesh
-from coupole.reflectance.extraction.seen_surface import directions_of_rows, seen_surface
+from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.extraction.seen_surface import SeenSurface, directions_of_rows, seen_surface
 
 SIZE_PX = (160, 120)
 LENS = Intrinsics(fx=260.0, fy=261.0, cx=81.0, cy=58.0, k1=-0.12, k2=0.05, p1=1e-3, p2=-2e-3)
@@ -33,12 +33,21 @@ def pixels_of(corners_mm: np.ndarray, base_from_camera: np.ndarray) -> np.ndarra
     return found.reshape(*corners_mm.shape[:-1], 2)
 
 
+def surface_of(
+    corners_mm: np.ndarray, base_from_camera: np.ndarray, blur: tuple[float, float, float, float] | None = None
+) -> SeenSurface:
+    normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return seen_surface(PacketMesh(corners_mm), normals, LENS, base_from_camera, SIZE_PX, blur=blur)
+
+
 def test_each_pixel_lies_in_the_picture_of_the_triangle_that_it_sees() -> None:
     corners, base_from_camera = sheet(24, 90.0), look_at([0, 0, 0], 250.0, 30.0, 60.0)
-    seen = seen_surface(ray_mesh(corners), corners, LENS, base_from_camera, SIZE_PX)
-    assert len(seen.rows) > 2000
-    polygons = pixels_of(corners[seen.triangles[seen.triangle]], base_from_camera)
-    away = np.stack([seen.columns, seen.rows], axis=-1)[:, None] - polygons
+    seen = surface_of(corners, base_from_camera)
+    rows, columns = np.nonzero(seen.places >= 0)
+    assert seen.pixels == len(rows) > 2000
+    polygons = pixels_of(corners[seen.triangles[seen.places[rows, columns]]], base_from_camera)
+    away = np.stack([columns, rows], axis=-1)[:, None] - polygons
     sides = np.roll(polygons, -1, axis=1) - polygons
     length = np.linalg.norm(sides, axis=-1)
     inside_px = (sides[..., 0] * away[..., 1] - sides[..., 1] * away[..., 0]) / length
@@ -51,21 +60,19 @@ def test_silhouettes_are_left_out() -> None:
     above = sheet(4, 20.0) + np.array([0.0, 0.0, 40.0])
     raised = np.concatenate([corners, above])
     base_from_camera = look_at([0, 0, 0], 250.0, 0.0, 80.0)
-    seen = seen_surface(ray_mesh(raised), raised, LENS, base_from_camera, SIZE_PX)
-    upper = seen.triangles[seen.triangle] >= len(corners)
-    picture = np.zeros(SIZE_PX[::-1], int)
-    picture[seen.rows, seen.columns] = 1 + upper
+    seen = surface_of(raised, base_from_camera)
+    upper = seen.triangles[seen.places] >= len(corners)
+    picture = np.where(seen.places >= 0, 1 + upper, 0)
     assert (picture == 2).sum() > 100
     assert not (picture[:, :-1] * picture[:, 1:] == 2).any(), "both sheets side by side"
 
 
 def test_what_is_out_of_focus_is_left_out() -> None:
     corners, base_from_camera = sheet(24, 90.0), look_at([0, 0, 0], 250.0, 0.0, 80.0)
-    scene = ray_mesh(corners)
-    sharp = seen_surface(scene, corners, LENS, base_from_camera, SIZE_PX, blur=(35.0, 250.0, 8.0, 2.0))
-    assert len(sharp.rows) > 2000
-    near = seen_surface(scene, corners, LENS, base_from_camera, SIZE_PX, blur=(35.0, 120.0, 1.4, 2.0))
-    assert len(near.rows) == 0
+    sharp = surface_of(corners, base_from_camera, (35.0, 250.0, 8.0, 2.0))
+    assert sharp.pixels > 2000
+    near = surface_of(corners, base_from_camera, (35.0, 120.0, 1.4, 2.0))
+    assert near.pixels == 0
 
 
 @pytest.mark.parametrize("rows", [(0, 120), (40, 57), (119, 120)])

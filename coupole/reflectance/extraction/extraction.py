@@ -1,35 +1,37 @@
-"""One pass over a run's frames: samples of reflectance of every triangle under every LED, view by view, on disk.
-
-f = S / (P E/Phi cos_i): mean signal S of a triangle's pixels (DN/s over the flat field, dark and response taken
-out) over the irradiance that the LED's power P (DN/s m^2 sr) throws on it (seed 003, Eqs. 1 to 3). The mean over a
-triangle stands for the paper's prefilter of 0.1 degree: neighbouring LEDs are degrees apart.
-"""
+"""Samples of reflectance of every triangle under every LED, view by view, on disk: one pass over the frames."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from coupole.calibration.light.frames import LightFrame
 from coupole.calibration.light.tile_views import Positions
 from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.motion import occlusion
-from coupole.reflectance.extraction.lamp_sight import AWAY, PENUMBRA, REACHED, SHADED, lamp_codes, lit_by
-from coupole.reflectance.extraction.lamp_sight import neighbours_of as sides_of
+from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.extraction.lamp_sight import (
+    AWAY,
+    PENUMBRA,
+    REACHED,
+    SHADED,
+    Facets,
+    lamp_codes,
+    neighbours_of,
+)
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
 from coupole.reflectance.extraction.seen_surface import SeenSurface, seen_surface
+from coupole.reflectance.extraction.view_samples import BLOCK, ViewPass
 from coupole.reflectance.result_folder import complete
 
 Floats = NDArray[np.float64]
@@ -37,10 +39,6 @@ Floats = NDArray[np.float64]
 BY_CELL = PENUMBRA + 1
 """Code of a triangle and an LED that arm, camera or tool may hide from each other."""
 CODES = {"reached": REACHED, "away": AWAY, "shaded": SHADED, "penumbra": PENUMBRA, "hidden by the cell": BY_CELL}
-BLOCK = 4096
-"""Triangles in a chunk on disk."""
-_BATCH_BYTES = 256_000_000
-"""Of samples in memory before they are written."""
 MOST_BLUR_PX = 2.0
 """Diameter of the circle of confusion."""
 Say = Callable[[str, int, int], None]
@@ -50,128 +48,139 @@ Say = Callable[[str, int, int], None]
 class Geometry:
     """The object's triangles as all views share them."""
 
-    scene: Any
-    """For rays."""
-    centres_mm: Floats
-    normals: Floats
-    """[triangles, 3] unit, outward."""
-    sides: NDArray[np.int64]
-    """[triangles, 3] neighbours."""
+    mesh: PacketMesh
+    facets: Facets
+
+    def of(self, triangles: NDArray[np.int64]) -> Facets:
+        """What a view sees of them: its triangles by their rising numbers."""
+        place = np.full(len(self.facets.centres_mm), -1)
+        place[triangles] = np.arange(len(triangles))
+        sides = self.facets.neighbours[triangles]
+        sides = np.where(sides >= 0, place[sides], -1)
+        return Facets(self.facets.centres_mm[triangles], self.facets.normals[triangles], sides)
 
 
 def geometry_of(measured: MeasuredRun) -> Geometry:
     corners = measured.corners_mm
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    scene = occlusion.ray_mesh(corners)
-    return Geometry(scene, corners.mean(axis=1), normals, sides_of(measured.triangles))
+    return Geometry(PacketMesh(corners), Facets(corners.mean(axis=1), normals, neighbours_of(measured.triangles)))
 
 
 def extract_view(
-    measured: MeasuredRun, geometry: Geometry, radiometry: Radiometry, view: MeasuredView, path: Path, say: Say
+    measured: MeasuredRun,
+    geometry: Geometry,
+    radiometry: Radiometry,
+    view: MeasuredView,
+    path: Path,
+    say: Say,
+    *,
+    threads: int | None = None,
 ) -> dict[str, Any]:
     """Write a view's samples to an HDF5 file, whole or not at all; what the report says of them."""
+    threads = threads or len(os.sched_getaffinity(0))
+    work, surface = view_pass(measured, geometry, radiometry, view, threads)
+    codes_of = shadows_of(work, geometry)
+    used, of_code = 0, np.zeros(len(CODES), np.int64)
+
+    def write(part: Path) -> None:
+        nonlocal used
+        with h5py.File(part, "w") as file:
+            _write_head(file, work, surface)
+            data = _begin_samples(file, work)
+            done = 0
+            for some in work.samples(codes_of, threads):
+                data["codes"][some.rows, some.leds] = some.codes.T
+                data["f"][some.rows, some.leds], data["u_own"][some.rows, some.leds] = some.f, some.u_own
+                used += int(np.count_nonzero(np.isfinite(some.f)))
+                of_code[:] += np.bincount(some.codes.ravel(), minlength=len(CODES))
+                if some.rows.stop == len(surface.triangles):
+                    done += sum(len(view.by_led[int(led)]) for led in work.leds[some.leds])
+                    say(f"samples of {view.name}", done, len(view.frames))
+
+    complete(path, write)
+    return {
+        "view": view.name,
+        "pixels": surface.pixels,
+        "triangles": len(surface.triangles),
+        "leds": len(work.leds),
+        "samples": used,
+        "share_by_code": {name: float(of_code[code] / of_code.sum()) for name, code in CODES.items()},
+    }
+
+
+def view_pass(
+    measured: MeasuredRun, geometry: Geometry, radiometry: Radiometry, view: MeasuredView, threads: int
+) -> tuple[ViewPass, SeenSurface]:
+    """What a view sees, ready for its frames. Raises InputError if it sees nothing of the mesh."""
     focal_mm, focus_mm, f_number = measured.optics
     surface = seen_surface(
-        geometry.scene,
-        measured.corners_mm,
+        geometry.mesh,
+        geometry.facets.normals,
         measured.lens,
         view.base_from_camera,
         measured.frames.size_px,
         blur=(focal_mm, focus_mm, f_number, MOST_BLUR_PX),
+        threads=threads,
     )
-    if not len(surface.rows):
+    if not len(surface.triangles):
         raise InputError(
             f"{measured.run.folder}: no pixel of the view {view.name} shows the mesh: do mesh and hand-eye "
             "belong to this run, and is the object in focus?"
         )
     reader = SignalReader(radiometry, surface)
-    leds = np.array(list(view.by_led), np.int64)
-    codes = _codes(measured, geometry, view, surface, leds)
-    used = 0
-
-    def write(part: Path) -> None:
-        nonlocal used
-        with h5py.File(part, "w") as file:
-            _write_head(file, measured, geometry, view, surface, reader, leds, codes)
-            used = _write_samples(file, measured, geometry, view, surface, reader, leds, codes, say)
-
-    complete(path, write)
-    share = {name: float(np.mean(codes == code)) for name, code in CODES.items()}
-    return {
-        "view": view.name,
-        "pixels": len(surface.rows),
-        "triangles": len(surface.triangles),
-        "leds": len(leds),
-        "samples": used,
-        "share_by_code": share,
-    }
+    return ViewPass(measured, view, geometry.of(surface.triangles), reader), surface
 
 
-def _codes(
-    measured: MeasuredRun,
-    geometry: Geometry,
-    view: MeasuredView,
-    surface: SeenSurface,
-    leds: NDArray[np.int64],
-) -> NDArray[np.uint8]:
-    """[triangles of the view, leds] codes: what the object hides, and what the cell may hide."""
-    mine = surface.triangles
-    place = np.full(len(geometry.centres_mm), -1)
-    place[mine] = np.arange(len(mine))
-    sides = geometry.sides[mine]
-    sides = np.where(sides >= 0, place[sides], -1)
-    centres_mm, led_normals = measured.leds.of(leds)
-    positions = Positions(leds, centres_mm, led_normals)
-    codes = lamp_codes(geometry.scene, geometry.centres_mm[mine], geometry.normals[mine], sides, positions)
-    hidden = _hidden_by_cell(measured, view, geometry.centres_mm[mine], leds)
-    codes[(codes == REACHED) & hidden] = BY_CELL
-    return codes
+def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor], NDArray[np.uint8]]:
+    """A function that gives the codes [leds, triangles] of some of the view's LEDs: what object and cell hide."""
+    hidden = _hidden_by_cell(work)
+
+    def codes_of(part: slice, pool: Executor) -> NDArray[np.uint8]:
+        leds = work.leds[part]
+        codes = lamp_codes(geometry.mesh, work.facets, Positions(leds, *work.measured.leds.of(leds)), pool)
+        if hidden is not None:
+            codes[(codes == REACHED) & hidden(leds)] = BY_CELL
+        return codes
+
+    return codes_of
 
 
-def _hidden_by_cell(
-    measured: MeasuredRun, view: MeasuredView, centres_mm: Floats, leds: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """[triangles, leds] what the run says that arm or tool hide from the nearest patch of the object."""
-    with h5py.File(measured.run.view_path(view.name), "r") as file:
+def _hidden_by_cell(work: ViewPass) -> Callable[[NDArray[np.int64]], NDArray[np.bool_]] | None:
+    """A function of some LEDs, [leds, triangles] what the run says that arm or tool hide from the nearest patch of
+    the object; None if it says nothing."""
+    measured = work.measured
+    with h5py.File(measured.run.view_path(work.view.name), "r") as file:
         if "entry/shadow/codes" not in file:
-            return np.zeros((len(centres_mm), len(leds)), np.bool_)
+            return None
         shadow = {name: file[f"entry/shadow/{name}"][()] for name in ("codes", "leds", "points_mm")}
     points_mm = apply(measured.base_from_support, shadow["points_mm"])
-    patch = cKDTree(points_mm).query(centres_mm)[1]
+    patch = cKDTree(points_mm).query(work.facets.centres_mm)[1]
     column = {int(led): n for n, led in enumerate(shadow["leds"])}
-    codes = shadow["codes"][:, [column[int(led)] for led in leds]]
-    by_cell = (codes == occlusion.BY_ARM) | (codes == occlusion.BY_TOOL)
-    found: NDArray[np.bool_] = by_cell[patch]
-    return found
+    by_cell = (shadow["codes"] == occlusion.BY_ARM) | (shadow["codes"] == occlusion.BY_TOOL)
+
+    def hidden(leds: NDArray[np.int64]) -> NDArray[np.bool_]:
+        found: NDArray[np.bool_] = by_cell.T[[column[int(led)] for led in leds]][:, patch]
+        return found
+
+    return hidden
 
 
-def _write_head(
-    file: h5py.File,
-    measured: MeasuredRun,
-    geometry: Geometry,
-    view: MeasuredView,
-    surface: SeenSurface,
-    reader: SignalReader,
-    leds: NDArray[np.int64],
-    codes: NDArray[np.uint8],
-) -> None:
+def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
+    measured, view, leds = work.measured, work.view, work.leds
     file.attrs["view"] = view.name
     file.attrs["channels"] = "".join(measured.channels)
     file.attrs["simulated"] = measured.run.simulated
     file.attrs["frame"] = "base of the robot"
     file.attrs["led_u_mm"] = measured.led_u_mm  # of each coordinate of an LED's place
-    width, height = measured.frames.size_px
-    seen = np.full((height, width), -1, np.int32)
-    seen[surface.rows, surface.columns] = surface.triangle
-    file.create_dataset("seen", data=seen, compression="gzip", compression_opts=1, track_times=False)
+    file.create_dataset("seen", data=surface.places, compression="gzip", compression_opts=1, track_times=False)
     file["seen"].attrs["told"] = "[h, w] place in `triangles` of what a pixel sees, -1 where it is not used"
     _dataset(file, "triangles", surface.triangles, "numbers of the mesh's triangles, from 0")
-    _dataset(file, "pixels", reader.pixels, "pixels of each channel on each triangle")
+    _dataset(file, "pixels", work.reader.pixels, "pixels of each channel on each triangle")
     told = "relative standard uncertainty that a triangle's samples share, of pixels' own responses"
-    _dataset(file, "u_response", reader.u_response, told)
-    _dataset(file, "centres_mm", geometry.centres_mm[surface.triangles], "of the triangles, mm, base frame")
-    _dataset(file, "normals", geometry.normals[surface.triangles], "of the triangles, unit, base frame")
+    _dataset(file, "u_response", work.reader.u_response, told)
+    _dataset(file, "centres_mm", work.facets.centres_mm, "of the triangles, mm, base frame")
+    _dataset(file, "normals", work.facets.normals, "of the triangles, unit, base frame")
     _dataset(file, "camera_mm", view.base_from_camera[:3, 3], "projection centre, mm, base frame")
     _dataset(file, "leds", leds, "numbers of the LEDs")
     centres_mm, normals = measured.leds.of(leds)
@@ -182,8 +191,6 @@ def _write_head(
     _dataset(file, "led_u_shared", powers.u_shared, "relative, of what all LEDs share")
     scales = np.stack([_dn_share(measured, view, int(led)) for led in leds])
     _dataset(file, "full_scales", scales, "of the camera that f cos_i E/Phi of 1 gives in the longest exposure")
-    told = ", ".join(f"{code} {name}" for name, code in CODES.items())
-    _dataset(file, "codes", codes, f"of a triangle and an LED: {told}", chunks=(BLOCK, len(leds)))
 
 
 def _dn_share(measured: MeasuredRun, view: MeasuredView, led: int) -> Floats:
@@ -194,106 +201,22 @@ def _dn_share(measured: MeasuredRun, view: MeasuredView, led: int) -> Floats:
     return share
 
 
-def _dataset(
-    file: h5py.File, name: str, values: NDArray[Any], told: str, chunks: tuple[int, ...] | None = None
-) -> None:
-    if chunks is not None:
-        chunks = tuple(min(size, length) for size, length in zip(chunks, values.shape, strict=True))
-    file.create_dataset(name, data=values, chunks=chunks, track_times=False).attrs["told"] = told
+def _dataset(file: h5py.File, name: str, values: NDArray[Any], told: str) -> None:
+    file.create_dataset(name, data=values, track_times=False).attrs["told"] = told
 
 
-def _write_samples(
-    file: h5py.File,
-    measured: MeasuredRun,
-    geometry: Geometry,
-    view: MeasuredView,
-    surface: SeenSurface,
-    reader: SignalReader,
-    leds: NDArray[np.int64],
-    codes: NDArray[np.uint8],
-    say: Say,
-) -> int:
-    """`f` and `u_own` [triangles, leds, channels], batch by batch of LEDs in the order of the frames' file; the
-    number of samples that can be used."""
-    count, channels = reader.pixels.shape
-    batch = int(np.clip(_BATCH_BYTES // (8 * max(1, count * channels)), 1, len(leds)))
-    shape, chunks = (count, len(leds), channels), (min(BLOCK, count), batch, channels)
-    told = {"f": "reflectance, 1/sr; NaN where there is none", "u_own": "relative standard uncertainty, of noise"}
-    data = {
-        name: file.create_dataset(name, shape, np.float32, chunks=chunks, fillvalue=np.nan, track_times=False)
-        for name in told
+def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:
+    """`f`, `u_own` [triangles, leds, channels] and `codes` [triangles, leds], in chunks as they come."""
+    (count, channels), leds = work.reader.pixels.shape, len(work.leds)
+    codes = ", ".join(f"{code} {name}" for name, code in CODES.items())
+    kinds: dict[str, tuple[Any, tuple[int, ...], str]] = {
+        "f": (np.float16, (count, leds, channels), "reflectance, 1/sr; NaN where there is none"),
+        "u_own": (np.float16, (count, leds, channels), "relative standard uncertainty, of noise"),
+        "codes": (np.uint8, (count, leds), f"of a triangle and an LED: {codes}"),
     }
-    for name, text in told.items():
-        data[name].attrs["told"] = text
-    mine = surface.triangles
-    centres_mm, normals = geometry.centres_mm[mine], geometry.normals[mine]
-    led_mm, led_normals = measured.leds.of(leds)
-
-    def extract(column: int, f: NDArray[np.float32], u: NDArray[np.float32]) -> int:
-        frames = view.by_led[int(leds[column])]
-        signal, u_signal = _merged(reader, frames)
-        _reflectance(
-            signal, u_signal, centres_mm, normals, led_mm[column], led_normals[column],
-            measured.power_of(frames[0]), measured.emission == "paper", codes[:, column], f, u,
-        )  # fmt: skip
-        return len(frames)
-
-    used = done = 0
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        for first in range(0, len(leds), batch):
-            part = slice(first, min(first + batch, len(leds)))
-            f = np.full((count, part.stop - first, channels), np.nan, np.float32)
-            u = np.full(f.shape, np.nan, np.float32)
-            columns = range(part.stop - first)
-            each = pool.map(lambda n: extract(first + n, f[:, n], u[:, n]), columns)  # noqa: B023  taken below
-            for frames in each:
-                done += frames
-                say(f"samples of {view.name}", done, len(view.frames))
-            used += int(np.isfinite(f).sum())
-            data["f"][:, part], data["u_own"][:, part] = f, u
-    return used
-
-
-def _merged(reader: SignalReader, frames: list[LightFrame]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Signal and its relative uncertainty of all exposures under one LED, weighted by their variances; by their
-    times where noise is not known."""
-    read = [reader.means(frame) for frame in frames]
-    if len(read) == 1:
-        return read[0].signal, read[0].u_signal
-    signals = np.stack([one.signal for one in read]).astype(np.float64)
-    absolute = signals * np.stack([one.u_signal for one in read])
-    times = np.array([frame.exposure_us for frame in frames])[:, None, None]
-    weights = np.where(np.isnan(absolute).all(), np.broadcast_to(times, signals.shape), absolute**-2.0)
-    weights = np.where(np.isfinite(signals) & np.isfinite(weights), weights, 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        total = weights.sum(axis=0)
-        signal = np.sum(weights * np.nan_to_num(signals), axis=0) / total
-        relative = total**-0.5 / signal if np.isfinite(absolute).any() else np.full(signal.shape, np.nan)
-    return signal.astype(np.float32), relative.astype(np.float32)
-
-
-@numba.njit(cache=True, nogil=True)
-def _reflectance(  # type: ignore[no-untyped-def]
-    signal, u_signal, centres, normals, led_centre, led_normal, power, paper, codes, f, u
-):
-    towards = np.empty(3)
-    for triangle in range(len(signal)):
-        if codes[triangle] != REACHED:
-            continue
-        lit = lit_by(centres[triangle], led_centre, led_normal, paper, towards)
-        cosine = 0.0
-        for k in range(3):
-            cosine += towards[k] * normals[triangle, k]
-        for channel in range(signal.shape[1]):
-            if power[channel] > 0.0:
-                f[triangle, channel] = signal[triangle, channel] / (power[channel] * lit * cosine)
-                if not np.isnan(f[triangle, channel]):
-                    u[triangle, channel] = u_signal[triangle, channel]
-
-
-def blocks(path: Path) -> Iterator[slice]:
-    """Of the triangles of a file of samples, as they are to be read."""
-    with h5py.File(path, "r") as file:
-        count = len(file["triangles"])
-    for first in range(0, count, BLOCK):
-        yield slice(first, min(first + BLOCK, count))
+    data = {}
+    for name, (kind, shape, told) in kinds.items():
+        chunks = (min(BLOCK, count), min(work.together, leds), channels)[: len(shape)]
+        data[name] = file.create_dataset(name, shape, kind, chunks=chunks, track_times=False)
+        data[name].attrs["told"] = told
+    return data

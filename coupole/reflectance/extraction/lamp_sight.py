@@ -5,9 +5,9 @@ From a triangle's centre rays go to the centres of all LEDs, and near the edges 
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
@@ -15,80 +15,89 @@ from numpy.typing import NDArray
 
 from coupole.calibration.light.irradiance import LED_SIDE_MM, led_corners_mm
 from coupole.calibration.light.tile_views import Positions
-from coupole.motion.occlusion import RAY_START_MM, blocked
+from coupole.motion.occlusion import RAY_START_MM
+from coupole.motion.packet_rays import PacketMesh
 
 Floats = NDArray[np.float64]
 
 REACHED, AWAY, SHADED, PENUMBRA = range(4)
 """Codes of a triangle and an LED; AWAY: below `MOST_INCIDENCE_DEG`, or behind the LED."""
 MOST_INCIDENCE_DEG = 89.0
-_RAYS = 1_000_000
-_LEDS = 64
-"""Traced together."""
 _MOST_RINGS = 8
 
 
-def lamp_codes(
-    scene: Any, centres_mm: Floats, normals: Floats, neighbours: NDArray[np.int64], leds: Positions
-) -> NDArray[np.uint8]:
-    """[triangles, leds] codes for centres and unit normals [triangles, 3]; `neighbours` [triangles, 3] are places
-    in these arrays, or -1."""
-    codes = np.empty((len(centres_mm), len(leds.ids)), np.uint8)
-    _away(centres_mm, normals, leds.centres_mm, leds.normals, np.cos(np.radians(MOST_INCIDENCE_DEG)), codes)
-    starts_mm = centres_mm + RAY_START_MM * normals
-    step = max(1, _RAYS // max(1, len(centres_mm)))
+@dataclass(frozen=True)
+class Facets:
+    """Triangles of an object that a view sees."""
 
-    def shade(first: int) -> None:
-        part = codes[:, first : first + step]
-        triangle, led = np.nonzero(part == REACHED)
-        hidden = blocked(scene, starts_mm[triangle], leds.centres_mm[first + led])
-        part[triangle[hidden], led[hidden]] = SHADED
+    centres_mm: Floats
+    """[n, 3]"""
+    normals: Floats
+    """[n, 3] unit, outward."""
+    neighbours: NDArray[np.int64]
+    """[n, 3] places in these arrays, or -1."""
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(shade, range(0, codes.shape[1], step)))
-    _penumbra(scene, starts_mm, neighbours, leds, codes)
+    @cached_property
+    def ray_starts_mm(self) -> NDArray[np.float32]:
+        """[n, 3]"""
+        starts: NDArray[np.float32] = (self.centres_mm + RAY_START_MM * self.normals).astype(np.float32)
+        return starts
+
+
+def lamp_codes(mesh: PacketMesh, facets: Facets, leds: Positions, pool: Executor) -> NDArray[np.uint8]:
+    """[leds, triangles] codes, LED by LED in the threads of a pool; `mesh` is what throws shadows."""
+    facets.ray_starts_mm  # noqa: B018  made once, before threads want it
+    rows = pool.map(lambda led: _codes_of_led(mesh, facets, leds, led), range(len(leds.ids)))
+    return np.stack(list(rows))
+
+
+def _codes_of_led(mesh: PacketMesh, facets: Facets, leds: Positions, led: int) -> NDArray[np.uint8]:
+    """[triangles]: shadow of the LED's centre, then triangles beside it, which its edge may cross, then ring by
+    ring what only a part of the LED reaches, as long as there is some."""
+    centre_mm, normal = leds.centres_mm[led], leds.normals[led]
+    codes = np.empty(len(facets.centres_mm), np.uint8)
+    _away(facets.centres_mm, facets.normals, centre_mm, normal, np.cos(np.radians(MOST_INCIDENCE_DEG)), codes)
+    starts_mm, lit = facets.ray_starts_mm, np.flatnonzero(codes == REACHED)
+    shaded = lit[mesh.blocked(starts_mm, lit, centre_mm)]
+    codes[shaded] = SHADED
+    edge = _darken_beside(shaded, facets.neighbours, codes)
+    corners_mm = led_corners_mm(centre_mm[None], normal[None], LED_SIDE_MM)[0]
+    for _ in range(_MOST_RINGS):
+        asked = _darken_beside(edge, facets.neighbours, codes)
+        partly = np.zeros(len(asked), np.bool_)
+        for corner_mm in corners_mm:
+            partly |= mesh.blocked(starts_mm, asked, corner_mm)
+        codes[asked[~partly]] = REACHED
+        edge = asked[partly]
+        if not len(edge):
+            break
     return codes
 
 
-def _penumbra(
-    scene: Any, starts_mm: Floats, neighbours: NDArray[np.int64], leds: Positions, codes: NDArray[np.uint8]
-) -> None:
-    """Mark triangles beside a shadow, which its edge may cross, and what only a part of the LED reaches: ring by
-    ring from the shadow, as long as there is some."""
-    corners_mm = led_corners_mm(leds.centres_mm, leds.normals, LED_SIDE_MM)
-    for first in range(0, codes.shape[1], _LEDS):
-        part = codes[:, first : first + _LEDS]
-        part[_beside(part == SHADED, neighbours) & (part == REACHED)] = PENUMBRA
-        for _ in range(_MOST_RINGS):
-            triangle, led = np.nonzero(_beside(part == PENUMBRA, neighbours) & (part == REACHED))
-            partly = np.zeros(len(triangle), np.bool_)
-            for corner in range(4):
-                partly |= blocked(scene, starts_mm[triangle], corners_mm[first + led, corner])
-            part[triangle[partly], led[partly]] = PENUMBRA
-            if not partly.any():
-                break
-
-
-def _beside(marked: NDArray[np.bool_], neighbours: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[triangles, leds] True where a neighbour is marked."""
-    found = np.zeros(marked.shape, np.bool_)
-    for side in range(3):
-        beside = neighbours[:, side]
-        found |= marked[beside] & (beside >= 0)[:, None]
-    return found
+@numba.njit(cache=True, nogil=True)
+def _darken_beside(triangles, neighbours, codes):  # type: ignore[no-untyped-def]
+    """Give the lit neighbours of some triangles the code of a penumbra; which they are."""
+    found = np.empty(3 * len(triangles), np.int64)
+    count = 0
+    for triangle in triangles:
+        for beside in neighbours[triangle]:
+            if beside >= 0 and codes[beside] == REACHED:
+                codes[beside] = PENUMBRA
+                found[count] = beside
+                count += 1
+    return found[:count]
 
 
 @numba.njit(cache=True, nogil=True)
-def _away(centres, normals, led_centres, led_normals, least_cosine, codes):  # type: ignore[no-untyped-def]
+def _away(centres, normals, led_centre, led_normal, least_cosine, codes):  # type: ignore[no-untyped-def]
     for triangle in range(len(centres)):
-        for led in range(len(led_centres)):
-            x = led_centres[led, 0] - centres[triangle, 0]
-            y = led_centres[led, 1] - centres[triangle, 1]
-            z = led_centres[led, 2] - centres[triangle, 2]
-            distance = np.sqrt(x * x + y * y + z * z)
-            facing = (x * normals[triangle, 0] + y * normals[triangle, 1] + z * normals[triangle, 2]) / distance
-            from_led = -(x * led_normals[led, 0] + y * led_normals[led, 1] + z * led_normals[led, 2])
-            codes[triangle, led] = REACHED if facing > least_cosine and from_led > 0.0 else AWAY
+        x = led_centre[0] - centres[triangle, 0]
+        y = led_centre[1] - centres[triangle, 1]
+        z = led_centre[2] - centres[triangle, 2]
+        distance = np.sqrt(x * x + y * y + z * z)
+        facing = (x * normals[triangle, 0] + y * normals[triangle, 1] + z * normals[triangle, 2]) / distance
+        from_led = -(x * led_normal[0] + y * led_normal[1] + z * led_normal[2])
+        codes[triangle] = REACHED if facing > least_cosine and from_led > 0.0 else AWAY
 
 
 @numba.njit(cache=True, nogil=True)
@@ -101,12 +110,12 @@ def lit_by(centre, led_centre, led_normal, paper, towards):  # type: ignore[no-u
     for k in range(3):
         towards[k] = led_centre[k] - centre[k]
     square = towards[0] * towards[0] + towards[1] * towards[1] + towards[2] * towards[2]
-    distance = np.sqrt(square)
+    inverse = 1.0 / np.sqrt(square)
     cosine = 0.0
     for k in range(3):
-        towards[k] /= distance
+        towards[k] *= inverse
         cosine -= towards[k] * led_normal[k]
-    lit = max(cosine, 0.0) / (np.pi * square * 1e-6)
+    lit = max(cosine, 0.0) * inverse * inverse * (1e6 / np.pi)
     return lit * cosine if paper else lit
 
 

@@ -7,20 +7,22 @@ focus.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.multi_view import unproject
 from coupole.calibration.optics import Intrinsics
+from coupole.motion.packet_rays import PacketMesh
 
 Floats = NDArray[np.float64]
 
 _GRID_PX = 8
 """Directions are computed for every eighth pixel, and interpolated: distortion bends them by less than 0.01 px."""
-_ROWS = 256
+_ROWS = 128
 """Traced together."""
 _MOST_STEP = 5.0
 """Of the surface from pixel to pixel, over that of the plane that the pixel sees: beyond it is a silhouette."""
@@ -30,65 +32,102 @@ _LEAST_COSINE = 0.1
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """Pixels of one view that show the object, in the order of rows."""
+    """What the pixels of one view show of the object."""
 
-    rows: NDArray[np.int32]
-    columns: NDArray[np.int32]
-    triangle: NDArray[np.int32]
-    """[pixels] place in `triangles`."""
+    places: NDArray[np.int32]
+    """[h, w] place in `triangles` of what a pixel sees, -1 where it is not used."""
     triangles: NDArray[np.int64]
     """Rising numbers of the triangles that the pixels see."""
 
+    @property
+    def pixels(self) -> int:
+        return int(np.count_nonzero(self.places >= 0))
+
 
 def seen_surface(
-    scene: Any,
-    corners_mm: Floats,
+    mesh: PacketMesh,
+    normals: Floats,
     lens: Intrinsics,
     base_from_camera: Floats,
     size_px: tuple[int, int],
     *,
     blur: tuple[float, float, float, float] | None = None,
+    threads: int = 1,
 ) -> SeenSurface:
-    """Pixels and triangles [n, 3, 3] of a view; `scene` is their `ray_mesh`.
+    """Pixels and triangles of a view; `normals` [n, 3] are the mesh's.
 
     `blur` is focal length and focus distance in mm, f-number, and the largest circle of confusion in px; None
     leaves out nothing for its focus.
     """
     width, height = size_px
-    hit = np.full((height, width), -1, np.int64)
-    places = np.full((height, width, 3), np.nan, np.float32)
-    for first in range(0, height, _ROWS):
+    hit = np.full((height, width), -1, np.int32)
+    far = np.full((height, width), np.nan, np.float32)
+    ways = np.empty((height, width, 3), np.float32)
+    eye_mm, axis = base_from_camera[:3, 3], base_from_camera[:3, 2]
+
+    def trace(first: int) -> None:
         rows = slice(first, min(first + _ROWS, height))
-        hit[rows], places[rows] = _trace(scene, lens, base_from_camera, width, rows.start, rows.stop)
-    normals = _normals(corners_mm)
-    away = base_from_camera[:3, 3] - places
-    distance_mm = np.linalg.norm(away, axis=-1)
-    cosine = np.einsum("hwk,hwk->hw", away, normals[hit].astype(np.float32)) / distance_mm
-    depth_mm = -(away @ base_from_camera[:3, 2].astype(np.float32))
-    used = (hit >= 0) & (cosine > _LEAST_COSINE) & _inside(places, depth_mm / lens.fx / np.maximum(cosine, 0.1))
-    if blur is not None:
-        focal_mm, focus_mm, f_number, most_px = blur
-        pitch_mm = focal_mm * focus_mm / (focus_mm - focal_mm) / lens.fx
-        circle_mm = focal_mm**2 / (f_number * (focus_mm - focal_mm)) * np.abs(depth_mm - focus_mm) / depth_mm
-        used &= circle_mm <= most_px * pitch_mm
-    row, column = np.nonzero(used)
-    triangles, triangle = np.unique(hit[used], return_inverse=True)
-    return SeenSurface(row.astype(np.int32), column.astype(np.int32), triangle.astype(np.int32), triangles)
+        _turned(directions_of_rows(lens, width, rows.start, rows.stop), base_from_camera, ways[rows])
+        met, distance = mesh.first_met(eye_mm, ways[rows].reshape(-1, 3))
+        hit[rows], far[rows] = met.reshape(-1, width), distance.reshape(-1, width)
+
+    optics = _circle(lens, *blur) if blur is not None else (0.0, 1.0, np.inf)
+    used = np.zeros((height, width), np.bool_)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(trace, range(0, height, _ROWS)))
+        bands = range(1, height - 1, _ROWS)
+        list(pool.map(lambda row: _judge(hit, far, ways, normals, axis, lens.fx, *optics, row, used), bands))
+    seen = np.zeros(len(normals), np.bool_)
+    seen[hit[used]] = True
+    place = np.cumsum(seen, dtype=np.int32) - 1
+    hit[~used] = -1
+    hit[used] = place[hit[used]]
+    return SeenSurface(hit, np.flatnonzero(seen))
 
 
-def _trace(
-    scene: Any, lens: Intrinsics, base_from_camera: Floats, width: int, first: int, end: int
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """[rows, width] numbers of the triangles that rows of pixels see, -1 for none; [rows, width, 3] where, mm."""
-    directions = directions_of_rows(lens, width, first, end) @ base_from_camera[:3, :3].T
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    ways = directions.reshape(-1, 3).astype(np.float32)
-    starts = np.broadcast_to(base_from_camera[:3, 3].astype(np.float32), ways.shape)
-    met = scene.run(np.ascontiguousarray(starts), ways, query="INTERSECT", output=1)
-    shape = directions.shape[:2]
-    number = np.asarray(met["primID"], dtype=np.int64).reshape(shape)
-    distance = np.where(number >= 0, np.asarray(met["tfar"]).reshape(shape), np.nan)
-    return number, (base_from_camera[:3, 3] + distance[..., None] * directions).astype(np.float32)
+def _circle(
+    lens: Intrinsics, focal_mm: float, focus_mm: float, f_number: float, most_px: float
+) -> tuple[float, float, float]:
+    """Diameter of the circle of confusion of what is infinitely far, the distance that is sharp, and the largest
+    diameter that is used, mm."""
+    pitch_mm = focal_mm * focus_mm / (focus_mm - focal_mm) / lens.fx
+    return focal_mm**2 / (f_number * (focus_mm - focal_mm)), focus_mm, most_px * pitch_mm
+
+
+@numba.njit(cache=True, nogil=True)
+def _turned(directions, base_from_camera, ways):  # type: ignore[no-untyped-def]
+    """Into `ways` [rows, width, 3] the directions as unit vectors of the base frame."""
+    for row in range(ways.shape[0]):
+        for column in range(ways.shape[1]):
+            x, y, z = directions[row, column]
+            length = np.sqrt(x * x + y * y + z * z)
+            for k in range(3):
+                turned = base_from_camera[k, 0] * x + base_from_camera[k, 1] * y + base_from_camera[k, 2] * z
+                ways[row, column, k] = turned / length
+
+
+@numba.njit(cache=True, nogil=True)
+def _judge(hit, far, ways, normals, axis, fx, infinite_mm, focus_mm, most_mm, first, used):  # type: ignore[no-untyped-def]
+    """Mark the pixels of a band of rows that are not at a silhouette, not seen at a grazing angle, and sharp."""
+    for row in range(first, min(first + _ROWS, hit.shape[0] - 1)):
+        for column in range(1, hit.shape[1] - 1):
+            if hit[row, column] < 0:
+                continue
+            way, normal, distance = ways[row, column], normals[hit[row, column]], far[row, column]
+            cosine = -(way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2])
+            depth_mm = distance * (way[0] * axis[0] + way[1] * axis[1] + way[2] * axis[2])
+            circle_mm = infinite_mm * abs(depth_mm - focus_mm) / depth_mm
+            if not cosine > _LEAST_COSINE or circle_mm > most_mm:
+                continue
+            most_step_mm = _MOST_STEP * depth_mm / fx / cosine
+            alone = False
+            for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                beside, away = ways[row + down, column + right], far[row + down, column + right]
+                square = 0.0
+                for k in range(3):
+                    square += (distance * way[k] - away * beside[k]) ** 2
+                alone |= not square <= most_step_mm * most_step_mm  # also if the ray beside it met nothing
+            used[row, column] = not alone
 
 
 def directions_of_rows(lens: Intrinsics, width: int, first: int, end: int) -> Floats:
@@ -107,24 +146,3 @@ def directions_of_rows(lens: Intrinsics, width: int, first: int, end: int) -> Fl
     high = np.minimum(low + 1, len(rows) - 1)
     xy = across[low] * (1 - share) + across[high] * share
     return np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
-
-
-def _normals(corners_mm: Floats) -> Floats:
-    normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
-    result: Floats = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    return result
-
-
-def _inside(places: NDArray[np.float32], step_mm: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """[h, w] True where all four neighbours see a place [h, w, 3] within `_MOST_STEP` of the expected step."""
-    inside = np.ones(step_mm.shape, np.bool_)
-    inside[[0, -1]] = inside[:, [0, -1]] = False
-    for axis in (0, 1):
-        far = np.linalg.norm(np.diff(places, axis=axis), axis=-1)
-        ahead = [slice(None)] * 2
-        behind = [slice(None)] * 2
-        ahead[axis], behind[axis] = slice(None, -1), slice(1, None)
-        with np.errstate(invalid="ignore"):
-            inside[tuple(ahead)] &= far <= _MOST_STEP * step_mm[tuple(ahead)]
-            inside[tuple(behind)] &= far <= _MOST_STEP * step_mm[tuple(behind)]
-    return inside

@@ -1,0 +1,190 @@
+"""Rays by packets of 16, called from compiled code: for hundreds of millions of them.
+
+embreex has the library Embree 4 in it, but gives it one ray after the other. Its C functions are found through the
+extension module that is linked to it (https://github.com/RenderKit/embree, the manual's API reference).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from coupole.errors import CoupoleError
+
+_TRIANGLES, _INDEX, _VERTEX, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
+_COMPACT, _ROBUST = 1 << 1, 1 << 2
+_COHERENT, _EVERY_FEATURE = 1 << 16, 0xFFFFFFFF
+_ARGUMENTS = np.array([_EVERY_FEATURE << 32 | _COHERENT, 0, 0, 0, 0, 0], np.uint64)
+LANES = 16
+_FAR, _MASK, _FLAGS, _NUMBER, _GEOMETRY = 8, 9, 11, 17, 18
+"""Rows of a packet, after the origin (0 to 2), the nearest distance (3) and the way (4 to 6)."""
+_ROWS = 24
+_NONE = 0xFFFFFFFF
+
+
+@dataclass
+class PacketMesh:
+    """Triangles [n, 3, 3] in Embree's tree, exact at edges: no ray slips through between two of them."""
+
+    corners_mm: NDArray[Any]
+    scene: np.uint64 = field(init=False)
+    """For `blocked16` in compiled code."""
+
+    def __post_init__(self) -> None:
+        """Raises CoupoleError if Embree has too little memory."""
+        call, count = _library(), len(self.corners_mm)
+        self._padded = np.zeros(9 * count + 4, np.float32)  # Embree reads 16 bytes for the last corner's 12
+        self._padded[: 9 * count] = self.corners_mm.reshape(-1)
+        self._indices = np.arange(3 * count, dtype=np.uint32)
+        self._device = call.rtcNewDevice(b"")
+        tree = call.rtcNewScene(self._device)
+        self.scene = np.uint64(tree)
+        call.rtcSetSceneFlags(tree, _COMPACT | _ROBUST)
+        geometry = call.rtcNewGeometry(self._device, _TRIANGLES)
+        set_buffer = call.rtcSetSharedGeometryBuffer
+        set_buffer(geometry, _VERTEX, 0, _FLOAT3, self._padded.ctypes.data, 0, 12, 3 * count)
+        set_buffer(geometry, _INDEX, 0, _UINT3, self._indices.ctypes.data, 0, 12, count)
+        call.rtcCommitGeometry(geometry)
+        call.rtcAttachGeometry(tree, geometry)
+        call.rtcReleaseGeometry(geometry)
+        call.rtcCommitScene(tree)
+        if error := call.rtcGetDeviceError(self._device):
+            raise CoupoleError(
+                f"expected Embree to build its tree of {count} triangles, got its error {error}. If memory is "
+                "short, close other programs, or take a coarser mesh"
+            )
+
+    def __del__(self) -> None:
+        if hasattr(self, "scene"):
+            _library().rtcReleaseScene(int(self.scene))
+            _library().rtcReleaseDevice(self._device)
+
+    def first_met(
+        self, start_mm: NDArray[np.float64], ways: NDArray[np.float32]
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """Numbers of the triangles that rays from one place along `ways` [n, 3] meet first, -1 for none, and how
+        far, in lengths of the ways, NaN for none."""
+        number, distance = np.empty(len(ways), np.int32), np.empty(len(ways), np.float32)
+        _first_met(_address("rtcIntersect16"), self.scene, start_mm, ways, _ARGUMENTS, number, distance)
+        return number, distance
+
+    def blocked(
+        self, starts_mm: NDArray[np.float32], asked: NDArray[np.int64], end_mm: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """[asked] True where a triangle lies between a start, by its row in `starts_mm` [n, 3], and the end."""
+        found = np.empty(len(asked), np.bool_)
+        _blocked(blocked16(), self.scene, starts_mm, asked, end_mm, _ARGUMENTS, found)
+        return found
+
+
+def blocked16() -> np.uint64:
+    """Address of the function that tells which rays of a packet are blocked."""
+    return _address("rtcOccluded16")
+
+
+@cache
+def _library() -> Any:
+    """The C functions with their types."""
+    import embreex.rtcore_scene as linked_to_embree
+
+    library = ctypes.CDLL(linked_to_embree.__file__)
+    pointer, number, size = ctypes.c_void_p, ctypes.c_uint, ctypes.c_size_t
+    kinds: dict[str, tuple[Any, ...]] = {
+        "rtcNewDevice": (pointer, ctypes.c_char_p),
+        "rtcGetDeviceError": (number, pointer),
+        "rtcReleaseDevice": (None, pointer),
+        "rtcNewScene": (pointer, pointer),
+        "rtcSetSceneFlags": (None, pointer, number),
+        "rtcCommitScene": (None, pointer),
+        "rtcReleaseScene": (None, pointer),
+        "rtcNewGeometry": (pointer, pointer, number),
+        "rtcSetSharedGeometryBuffer": (None, pointer, number, number, number, pointer, size, size, size),
+        "rtcCommitGeometry": (None, pointer),
+        "rtcAttachGeometry": (number, pointer, pointer),
+        "rtcReleaseGeometry": (None, pointer),
+    }
+    for name, (result, *arguments) in kinds.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    return library
+
+
+def _address(name: str) -> np.uint64:
+    return np.uint64(ctypes.cast(getattr(_library(), name), ctypes.c_void_p).value or 0)
+
+
+def _call(_context, _address, _valid, _scene, _rays, _arguments):  # type: ignore[no-untyped-def]
+    """A function of Embree for packets; its address is an argument, so that what calls it can be cached."""
+
+    def generate(context, builder, _signature, values):  # type: ignore[no-untyped-def]
+        word = ir.IntType(64)
+        kind = ir.FunctionType(ir.VoidType(), [word] * 4)
+        builder.call(builder.inttoptr(values[0], kind.as_pointer()), values[1:])
+        return context.get_dummy_value()
+
+    return types.void(types.uint64, types.uint64, types.uint64, types.uint64, types.uint64), generate
+
+
+_call_embree: Any = intrinsic(_call)
+
+
+@numba.njit(cache=True, nogil=True)
+def _packet():  # type: ignore[no-untyped-def]
+    """Rows of a packet of rays and hits, as float32 and as uint32, and its lanes' mask, aligned to 64 bytes."""
+    memory = np.zeros((_ROWS + 1) * LANES + LANES, np.float32)
+    skip = np.int64((-np.int64(memory.ctypes.data) // 4) % LANES)
+    rows = memory[skip : skip + (_ROWS + 1) * LANES].reshape(_ROWS + 1, LANES)
+    return rows[:_ROWS], rows[:_ROWS].view(np.uint32), rows[_ROWS].view(np.int32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _trace(function, scene, rays, words, valid, lanes, far, arguments):  # type: ignore[no-untyped-def]
+    for lane in range(LANES):
+        valid[lane] = -1 if lane < lanes else 0
+        rays[3, lane], rays[_FAR, lane] = 0.0, far
+        words[_MASK, lane], words[_FLAGS, lane], words[_GEOMETRY, lane] = _NONE, 0, _NONE
+    _call_embree(
+        function,
+        np.uint64(valid.ctypes.data),
+        scene,
+        np.uint64(rays.ctypes.data),
+        np.uint64(arguments.ctypes.data),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _blocked(function, scene, starts, asked, end, arguments, found):  # type: ignore[no-untyped-def]
+    rays, words, valid = _packet()
+    for first in range(0, len(asked), LANES):
+        lanes = min(LANES, len(asked) - first)
+        for lane in range(lanes):
+            start = starts[asked[first + lane]]
+            for k in range(3):
+                rays[k, lane], rays[4 + k, lane] = start[k], np.float32(end[k] - start[k])
+        _trace(function, scene, rays, words, valid, lanes, np.float32(1.0), arguments)
+        for lane in range(lanes):
+            found[first + lane] = rays[_FAR, lane] < 0.0  # minus infinity for a ray that met something
+
+
+@numba.njit(cache=True, nogil=True)
+def _first_met(function, scene, start, ways, arguments, number, distance):  # type: ignore[no-untyped-def]
+    rays, words, valid = _packet()
+    for first in range(0, len(ways), LANES):
+        lanes = min(LANES, len(ways) - first)
+        for lane in range(lanes):
+            for k in range(3):
+                rays[k, lane], rays[4 + k, lane] = np.float32(start[k]), ways[first + lane, k]
+        _trace(function, scene, rays, words, valid, lanes, np.float32(np.inf), arguments)
+        for lane in range(lanes):
+            met = words[_GEOMETRY, lane] != _NONE
+            number[first + lane] = np.int32(words[_NUMBER, lane]) if met else -1
+            distance[first + lane] = rays[_FAR, lane] if met else np.nan

@@ -1,0 +1,146 @@
+"""A run of full-size frames for the benchmark of reflectance: a relief in the demo's dome, seen from above.
+
+Frames are rendered by the simulator, one for each LED, and written by the store of real runs with their journal.
+What calibrations would tell is known here without any record: lens, poses and places of the LEDs are the
+simulator's own, powers are equal, noise is that of a usual sensor.
+"""
+
+from __future__ import annotations
+
+import mmap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench_render import (
+    FULL,
+    SENSOR_WIDTH_MM,
+    WORKING_DISTANCE_MM,
+    camera_pose,
+    photographer,
+    relief,
+    render_leds,
+)
+
+TRIANGLES = 1_150_000
+"""Of the relief; about a million are seen."""
+LIFT_MM = 6.0
+"""Above the dome's support; the camera is as much higher."""
+VIEW, MESH, DARK_FRAMES = "top", "relief.ply", 2
+EXPOSURE_US = 8000
+POWER = 1.2e7
+"""Of every LED and channel, DN s^-1 m^2 sr."""
+NOISE = (6.0, 0.4)
+"""Variance in the dark, DN^2, and gain, DN/e."""
+
+
+def make_run(root: Path, folder: Path, frames: int) -> Any:
+    """A run with frames under `frames` LEDs, spread over the dome, and some in the dark."""
+    import trimesh
+
+    from coupole.acquisition.recorder import RunRecorder
+    from coupole.devices import ArmState, FrameFormat
+    from coupole.plan.shot_id import ShotId
+    from coupole.storage.journal_events import SessionStarted, SessionStopped, ViewBegun
+    from coupole.storage.run import Run
+    from coupole.storage.run_inputs import Inputs
+
+    vertices, faces = relief(TRIANGLES)
+    trimesh.Trimesh(vertices + np.array([0, 0, LIFT_MM]), faces, process=False).export(folder / MESH)
+    by, pose = photographer(root, folder / MESH, FULL)
+    support = pose @ np.linalg.inv(camera_pose())
+    pose[:3, 3] -= LIFT_MM * pose[:3, 2]
+    leds = _spread(by.leds.ids, frames)
+    labels = [*(f"led{led:04d}/e0" for led in leds), *(f"dark{n}/e0" for n in range(DARK_FRAMES))]
+    inputs = Inputs(root / "configs/plans/demo.yaml", root / "configs/rigs/sim.yaml", ())
+    about = {"views": [VIEW], "labels": labels, "simulated": True, "object": None}
+    run = Run.create(folder / "runs", "bench", inputs, about)
+    recorder = RunRecorder(run, {"sample": "relief", "simulated": True, **_lens(by)})
+    recorder.note(SessionStarted(simulated=True))
+    recorder.note(ViewBegun(view=VIEW))
+    arm = ArmState((0, 0, 0, 0, 0, 0), pose, 1, moving=False)
+    recorder.begin_view(VIEW, len(labels), FrameFormat(FULL[1], FULL[0], 12, "GBRG", 64, 4095), arm, pose, {})
+    pixels = np.frombuffer(mmap.mmap(-1, 2 * FULL[0] * FULL[1]), np.uint16).reshape(FULL[1], FULL[0])
+    for number, label in enumerate(labels):
+        led = int(leds[number]) if number < frames else None
+        if led is None:
+            pixels[:] = 64
+        else:
+            render_leds(by, pose, pixels, range(led, led + 1))
+        _keep(recorder, pixels, number, ShotId.parse(f"{VIEW}/{label}"), led)
+    recorder.end_view()
+    recorder.note(SessionStopped(outcome="done"))
+    recorder.close()
+    places = {"ids": leds, "centres_mm": by.leds.positions_mm[_rows(by, leds)]}
+    np.savez(folder / "leds.npz", **places, normals=by.leds.normals[_rows(by, leds)], support=support)
+    return run
+
+
+def _spread(ids: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    chosen: NDArray[np.int64] = np.sort(ids)[np.linspace(0, len(ids) - 1, count).astype(int)].astype(np.int64)
+    return chosen
+
+
+def _rows(by: Any, leds: NDArray[np.int64]) -> list[int]:
+    row = {int(led): n for n, led in enumerate(by.leds.ids)}
+    return [row[int(led)] for led in leds]
+
+
+def _lens(by: Any) -> dict[str, float]:
+    return {
+        "pixel_pitch_um": SENSOR_WIDTH_MM / FULL[0] * 1e3,
+        "focal_length_mm": by._camera.focal_length_mm,
+        "focus_distance_mm": WORKING_DISTANCE_MM,
+        "f_number": by._camera.f_number,
+    }
+
+
+def _keep(recorder: Any, pixels: NDArray[np.uint16], number: int, shot: Any, led: int | None) -> None:
+    from coupole.devices import Frame
+
+    slot = recorder.put(Frame(number, 1000 * number, pixels), EXPOSURE_US)
+    recorder.prove(
+        slot, shot, {"led": 65535 if led is None else led, "step": number, "t_trigger_ns": 1000 * number}
+    )
+    recorder.commit(now=number % 16 == 0)
+
+
+def read_run(folder: Path) -> tuple[Any, Any]:
+    """The run as extraction takes it (`MeasuredRun`), and its radiometry."""
+    from coupole.calibration.light.frames import channels_of, open_light_frames
+    from coupole.calibration.light.tile_views import Positions
+    from coupole.calibration.optics import Intrinsics
+    from coupole.geometry import apply
+    from coupole.reflectance.extraction.measured_run import Drift, MeasuredRun, MeasuredView, Powers
+    from coupole.reflectance.extraction.radiance import Radiometry
+    from coupole.scan.mesh_files import read_mesh
+    from coupole.storage.run import Run
+
+    known = np.load(folder / "leds.npz")
+    frames = open_light_frames([next((folder / "runs").iterdir())])
+    run, shape, count = Run(next((folder / "runs").iterdir())), read_mesh(folder / MESH), len(known["ids"])
+    focal_px, (width, height) = frames.focal_px, FULL
+    equal = np.ones((count, len(channels_of(frames.pattern))))
+    about = frames.about
+    measured = MeasuredRun(
+        run,
+        frames,
+        (MeasuredView(VIEW, frames.lit[0].base_from_flange, frames.lit),),
+        Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2),
+        apply(known["support"], shape.vertices)[shape.triangles],
+        shape.triangles,
+        Positions(known["ids"], known["centres_mm"], known["normals"]),
+        Powers(known["ids"], POWER * equal, np.full(count, 25.0), 0.01 * equal, 0.01 * equal),
+        "lambertian",
+        {},
+        0.3,
+        folder / MESH,
+        (about.focal_length_mm or 0.0, about.focus_distance_mm or 0.0, about.f_number or 0.0),
+        known["support"],
+        Drift(),
+    )
+    radiometry = Radiometry(measured)
+    radiometry.noise[:] = NOISE
+    return measured, radiometry

@@ -35,3 +35,13 @@ def lobe(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
     by_alpha = value * (2.0 / alpha - 4.0 * alpha * nh * nh / t)
     by_alpha -= value / s * alpha * (nl * (1.0 - nv * nv) / b + nv * (1.0 - nl * nl) / a)
     return value, by_nl, by_nv, by_nh, by_alpha
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def shine(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
+    """D V alone, for pictures."""
+    alpha2 = alpha * alpha
+    t = nh * nh * (alpha2 - 1.0) + 1.0
+    a = math.sqrt(alpha2 + (1.0 - alpha2) * nl * nl)
+    b = math.sqrt(alpha2 + (1.0 - alpha2) * nv * nv)
+    return 0.5 * alpha2 / (math.pi * t * t * (nl * b + nv * a))

@@ -125,6 +125,10 @@ def test_under_an_edge_half_of_a_rectangle_is_hidden_and_beside_it_none_or_all(t
     assert between.sum() > 1000
     slope = np.polyfit(x[between], share[between], 1)
     np.testing.assert_allclose(np.polyval(slope, 0.0), 0.5, atol=0.02)
+    shiny = scene_of_view(write_result(tmp_path / "shiny", corners, GLOSSY, camera_mm=(250.0, -100.0, 60.0)))
+    highlights = shown(shiny, light)
+    assert (highlights[x < -reach - 0.3] == 0).all()
+    assert (highlights[x > reach + 0.3] > 0).all()
 
 
 def test_under_a_uniform_environment_radiance_is_albedo(plane: RelitScene, tmp_path: Path) -> None:
@@ -160,19 +164,38 @@ def test_an_led_gives_shares_of_the_cameras_range(plane: RelitScene) -> None:
     np.testing.assert_allclose(shown(plane, LedLight(number=cases.LED)), wanted, rtol=1e-4)
 
 
+def reached_and_traced(scene: RelitScene, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[pixels] codes, and whether a ray from each pixel says that it is lit."""
+    surface, seen = scene.surface, scene.surface.seen >= 0
+    way = unit(scene.result.base_from_support[:3, :3] @ towards)
+    codes = reached(scene.rays, surface, Beam(False, way, -way, 0, np.ones(3)))[seen]
+    normals = surface.normals[surface.seen[seen]]
+    starts = surface.places_mm[seen] + 0.1 * normals
+    return codes, ~blocked(scene.rays, starts, starts + 3000.0 * way) & (normals @ way > 0)
+
+
 @pytest.mark.parametrize("towards", [(1.0, 0.4, 0.35), (-0.3, 1.0, 0.2)])
 def test_shadows_are_those_of_a_ray_for_each_pixel(
     relief: RelitScene, towards: tuple[float, float, float]
 ) -> None:
-    surface = relief.surface
-    way = unit(relief.result.base_from_support[:3, :3] @ np.array(towards))
-    codes = reached(relief.rays, surface, Beam(False, way, -way, 0, np.ones(3)))
-    seen = surface.seen >= 0
-    normals = surface.normals[surface.seen[seen]]
-    starts = surface.places_mm[seen] + 0.1 * normals
-    lit = ~blocked(relief.rays, starts, starts + 3000.0 * way) & (normals @ way > 0)
+    codes, lit = reached_and_traced(relief, np.array(towards))
     assert 0.05 < lit.mean() < 0.95
-    assert np.mean((codes[seen] == LIT) != lit) < 2e-4
+    assert np.mean((codes == LIT) != lit) < 2e-4
+
+
+def test_thin_shadows_are_followed_along_their_edges(tmp_path: Path) -> None:
+    """Of slanted wires outside the picture, two pixels wide: few of the rays from every fourth pixel meet them."""
+    corners = [sheet(np.zeros((40, 40)), 60.0)]
+    for number in range(6):
+        turn = np.radians(12.0 + 3.0 * number)
+        across, along = np.array([np.cos(turn), np.sin(turn), 0]), np.array([-np.sin(turn), np.cos(turn), 0])
+        wire = sheet(np.zeros((2, 2)), 1.0)
+        middle = np.array([8.0 * number + 60.0, 0.0, 60.0])
+        corners.append(wire[..., :1] * 0.35 * across + wire[..., 1:2] * 60.0 * along + middle)
+    scene = scene_of_view(write_result(tmp_path / "result", np.concatenate(corners), WHITE))
+    codes, lit = reached_and_traced(scene, unit(np.array([80.0, 0.0, 60.0])))
+    assert 0.01 < np.mean(~lit) < 0.1
+    assert np.count_nonzero((codes == LIT) != lit) < 0.02 * np.count_nonzero(~lit)
 
 
 def test_a_camera_anywhere_sees_what_it_looks_at(relief: RelitScene) -> None:

@@ -106,6 +106,7 @@ def test_white_of_a_video_is_its_brightest_thousandth_without_a_number(folder: P
         ),
         (["--direction", "0,0,1", "--from", "0,0,300", "--look-at", "0,0,300"], "another place than --from"),
         (["--direction", "0,0,1", "--from", "0,0,1"], "give --field-of-view"),
+        (["--direction", "0,0,1", "--from", "0,0,-300"], "no pixel of this camera"),  # from behind
         (["--direction", "0,0,1", "--look-at", "0,0,0"], "--look-at: belongs to a camera anywhere"),
         (["--direction", "0,0,1", "--from", "0,0,300", "--size", "9"], "--size: expected WIDTHxHEIGHT"),
         (["--direction", "0,0,1", "--turn", "5"], "ends in .mp4"),

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.motion.occlusion import RAY_START_MM, blocked
-from coupole.reflectance.ggx import shine
+from coupole.reflectance.ggx import drawn, reflected, shine
 from coupole.reflectance.new_light.beams import Beam, Emitter
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 from coupole.reflectance.new_light.shadow_edges import DISTANT_MM, LIT, Codes
@@ -149,7 +149,7 @@ def _add_beam(  # type: ignore[no-untyped-def]
                 lobe = shine(nl, nv, nh, alpha)
                 if lobe_rays > 0 and density > 0.0 and _shines(coats[triangle]):
                     mine = density / reach
-                    reach *= mine / (mine + lobe_rays * _drawn(nv, nh, alpha))
+                    reach *= mine / (mine + lobe_rays * drawn(nv, nh, alpha))
             for channel in range(channels):
                 value = coats[triangle, 4 + channel] + coats[triangle, 4 + channels + channel] * lobe
                 picture[row, column, channel] += strength[channel] * reach * nl * value
@@ -178,15 +178,6 @@ def _shines(coat):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _drawn(nv, nh, alpha):  # type: ignore[no-untyped-def]
-    """How often a ray that is drawn from a lobe takes a direction, per sr: Heitz, Sampling the GGX distribution of
-    visible normals (2018), eq. 17."""
-    alpha2 = alpha * alpha
-    t = nh * nh * (alpha2 - 1.0) + 1.0
-    return 0.5 * alpha2 / (math.pi * t * t * (nv + math.sqrt(alpha2 + (1.0 - alpha2) * nv * nv)))
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mirror(  # type: ignore[no-untyped-def]
     pixels, first_row, seen, places_mm, camera_mm, faces, coats, near, axes, centre_mm,
     halves_mm, radiance, density, ray, lobe_rays, gains, ways_mm
@@ -209,7 +200,7 @@ def _mirror(  # type: ignore[no-untyped-def]
         if not nv > 0.0:
             continue
         first, second = _two_numbers(first_row + row, column, ray)
-        nh = _reflected(normal, v0, v1, v2, nv, coat[3], first, second, way)
+        nh = reflected(normal, v0, v1, v2, nv, coat[3], first, second, way)
         nl = normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]
         face = faces[triangle]
         if not nl > 0.0 or not way[0] * face[0] + way[1] * face[1] + way[2] * face[2] > 0.0:
@@ -221,7 +212,7 @@ def _mirror(  # type: ignore[no-untyped-def]
         if not far_mm > 0.0:
             continue
         lobe = shine(nl, nv, nh, coat[3])
-        share = nl / (among + lobe_rays * _drawn(nv, nh, coat[3]))
+        share = nl / (among + lobe_rays * drawn(nv, nh, coat[3]))
         for channel in range(channels):
             value = coat[4 + channel] + coat[4 + channels + channel] * lobe
             gains[pixel, channel] = radiance[x, y, channel] * value * share
@@ -241,39 +232,6 @@ def _two_numbers(row, column, ray):  # type: ignore[no-untyped-def]
     first = (float(seed & np.uint32(0xFFFF)) + 0.5) / 65536.0
     second = (float((seed >> np.uint32(16)) & np.uint32(0xFFFF)) + 0.5) / 65536.0
     return (first + ray * _R2[0]) % 1.0, (second + ray * _R2[1]) % 1.0
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _reflected(normal, v0, v1, v2, nv, alpha, first, second, way):  # type: ignore[no-untyped-def]
-    """Into `way` [3] the view mirrored at a normal that GGX's lobe shows; the cosine of that normal. Heitz 2018,
-    Sampling the GGX distribution of visible normals, listing 1."""
-    x, y, z = normal[0], normal[1], normal[2]
-    if abs(z) < 0.9:
-        length = math.sqrt(x * x + y * y)
-        t0, t1, t2 = -y / length, x / length, 0.0
-    else:
-        length = math.sqrt(y * y + z * z)
-        t0, t1, t2 = 0.0, -z / length, y / length
-    b0, b1, b2 = y * t2 - z * t1, z * t0 - x * t2, x * t1 - y * t0
-    e0, e1 = alpha * (v0 * t0 + v1 * t1 + v2 * t2), alpha * (v0 * b0 + v1 * b1 + v2 * b2)
-    length = math.sqrt(e0 * e0 + e1 * e1 + nv * nv)
-    e0, e1, e2 = e0 / length, e1 / length, nv / length
-    across = math.sqrt(e0 * e0 + e1 * e1)
-    u0, u1 = (-e1 / across, e0 / across) if across > 1e-9 else (1.0, 0.0)
-    w0, w1, w2 = -e2 * u1, e2 * u0, e0 * u1 - e1 * u0
-    radius, angle = math.sqrt(first), 2.0 * math.pi * second
-    p = radius * math.cos(angle)
-    lean = 0.5 * (1.0 + e2)
-    q = (1.0 - lean) * math.sqrt(1.0 - p * p) + lean * radius * math.sin(angle)
-    up = math.sqrt(max(0.0, 1.0 - p * p - q * q))
-    m0, m1 = alpha * (p * u0 + q * w0 + up * e0), alpha * (p * u1 + q * w1 + up * e1)
-    m2 = max(1e-6, q * w2 + up * e2)
-    length = math.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
-    m0, m1, m2 = m0 / length, m1 / length, m2 / length
-    h0, h1, h2 = m0 * t0 + m1 * b0 + m2 * x, m0 * t1 + m1 * b1 + m2 * y, m0 * t2 + m1 * b2 + m2 * z
-    vh = v0 * h0 + v1 * h1 + v2 * h2
-    way[0], way[1], way[2] = 2.0 * vh * h0 - v0, 2.0 * vh * h1 - v1, 2.0 * vh * h2 - v2
-    return m2
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -73,6 +73,7 @@ def write_result(
     corners_mm: np.ndarray,
     coat: Coat | None = None,
     camera_mm: tuple[float, float, float] = (60.0, -120.0, 330.0),
+    channels: slice = slice(0, 3),
 ) -> RunResult:
     """A folder with one view, `top`, of triangles [n, 3, 3] in the support frame."""
     coat = coat or Coat()
@@ -94,10 +95,10 @@ def write_result(
         file["camera_mm"], file["leds"] = pose[:3, 3], np.array([LED])
         file["led_positions_mm"] = led_mm[None]
         file["led_normals"] = unit(moved(BASE_FROM_SUPPORT, LED_TARGET_MM) - led_mm)[None]
-        file["full_scales"] = FULL_SCALE[None]
-        file["f"] = np.full((len(mine), 1, 3), np.nan, np.float32)
+        file["full_scales"] = FULL_SCALE[None, channels]
+        file["f"] = np.full((len(mine), 1, len(FULL_SCALE[channels])), np.nan, np.float32)
     count = len(mine)
-    same = [np.tile(values, (count, 1)) for values in (coat.kd, coat.ks)]
+    same = [np.tile(values[channels], (count, 1)) for values in (coat.kd, coat.ks)]
     materials = TriangleMaterials(normals[mine], *same, np.full(count, coat.alpha), np.zeros(count))
     for name in ("ggx", "ggx_normal"):
         write_materials(folder / f"fits/{name}.h5", [materials], mine)

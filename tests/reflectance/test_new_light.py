@@ -88,6 +88,22 @@ def test_lights_that_are_named_together_are_summed(relief: RelitScene) -> None:
     np.testing.assert_allclose(both, shown(relief, one) + shown(relief, other), rtol=1e-5, atol=1e-6)
 
 
+def test_a_sensor_without_filter_has_the_green_of_all_lights(tmp_path: Path) -> None:
+    corners = waves(30)
+    grey = scene_of_view(write_result(tmp_path / "grey", corners, GLOSSY, channels=slice(1, 2)))
+    colour = scene_of_view(write_result(tmp_path / "colour", corners, GLOSSY))
+    sky = np.random.default_rng(3).uniform(0, 1, (1, 1, 3)) * np.ones((8, 16, 3))
+    lights = (
+        LedLight(number=cases.LED),
+        AreaLight(at_mm=(0, 0, 90), normal=(0, 0, -1), width_mm=30, strength=(9, 5, 3)),
+        EnvironmentLight(file=write_exr(tmp_path / "sky.exr", sky)),
+    )
+    for light in lights:
+        found, wanted = grey.picture([light], 16), colour.picture([light], 16)
+        assert found.shape[2] == 1
+        np.testing.assert_allclose(found[..., 0], wanted[..., 1], rtol=1e-4, atol=1e-6)
+
+
 def parallel_rectangle(points: np.ndarray, half_x: float, half_y: float, height: float) -> np.ndarray:
     """[n] form factor of a rectangle over the origin: the sum of four that have a corner over the point (Howell, A
     catalog of radiation heat transfer configuration factors, B-4)."""

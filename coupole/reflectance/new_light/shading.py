@@ -83,18 +83,17 @@ def add_mirrored(
         if not len(row):
             return
         pixels = np.stack([row, column], axis=1)
-        gains = np.empty((len(pixels), part.shape[2]), np.float32)
-        ways_mm = np.empty((len(pixels), 3), np.float32)
         starts_mm = places_mm[row, column] + RAY_START_MM * surface.normals[seen[row, column]]
-        sums = np.zeros(gains.shape, np.float32)
+        met, ways_mm = np.empty(len(pixels), np.int64), np.empty((len(pixels), 3))
+        gains, sums = np.empty((len(pixels), part.shape[2])), np.zeros((len(pixels), part.shape[2]), np.float32)
         for ray in range(lobe_rays):
-            _mirror(
+            count = _mirror(
                 pixels, rows.start, seen, places_mm, surface.camera_mm, surface.normals, coats, *of_emitter, ray,
-                lobe_rays, gains, ways_mm,
+                lobe_rays, met, gains, ways_mm,
             )  # fmt: skip
-            met = np.flatnonzero(gains.any(axis=1))
-            free = met[~blocked(rays, starts_mm[met], starts_mm[met] + ways_mm[met])]
-            sums[free] += gains[free]
+            starts = starts_mm[met[:count]]
+            free = ~blocked(rays, starts, starts + ways_mm[:count])
+            sums[met[:count][free]] += gains[:count][free]
         part[row, column] += sums
 
     in_strips(len(picture), add)
@@ -180,14 +179,13 @@ def _shines(coat):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mirror(  # type: ignore[no-untyped-def]
     pixels, first_row, seen, places_mm, camera_mm, faces, coats, near, axes, centre_mm,
-    halves_mm, radiance, density, ray, lobe_rays, gains, ways_mm
+    halves_mm, radiance, density, ray, lobe_rays, met, gains, ways_mm
 ):  # fmt: skip
-    """Of the ray of this number from each of the pixels [n, 2]: into `gains` what it brings from an emitter, into
-    `ways_mm` how it gets there."""
-    way, channels = np.empty(3), gains.shape[1]
+    """Of the ray of this number from each of the pixels [n, 2], how many point at a bright part of an emitter:
+    into `met` which, into `gains` what they bring if nothing is in their way, into `ways_mm` how they get there."""
+    way, channels, count = np.empty(3), gains.shape[1], 0
     for pixel in range(len(pixels)):
         row, column = pixels[pixel]
-        gains[pixel] = 0.0
         triangle = seen[row, column]
         coat = coats[triangle]
         if coat[3] == 0.0 or not _shines(coat):
@@ -209,15 +207,18 @@ def _mirror(  # type: ignore[no-untyped-def]
             far_mm, among, x, y = _on_area(place, way, axes, centre_mm, halves_mm, density)
         else:
             far_mm, among, x, y = _in_environment(way, axes, radiance, density)
-        if not far_mm > 0.0:
+        if not among > 0.0:
             continue
         lobe = shine(nl, nv, nh, coat[3])
         share = nl / (among + lobe_rays * drawn(nv, nh, coat[3]))
         for channel in range(channels):
             value = coat[4 + channel] + coat[4 + channels + channel] * lobe
-            gains[pixel, channel] = radiance[x, y, channel] * value * share
+            gains[count, channel] = radiance[x, y, channel] * value * share
         for k in range(3):
-            ways_mm[pixel, k] = far_mm * way[k]
+            ways_mm[count, k] = far_mm * way[k]
+        met[count] = pixel
+        count += 1
+    return count
 
 
 @numba.njit(cache=True, nogil=True)
@@ -236,7 +237,7 @@ def _two_numbers(row, column, ray):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _on_area(place, way, axes, centre_mm, halves_mm, density):  # type: ignore[no-untyped-def]
-    """Distance to the area along a direction, 0 if it is not met from its bright side; beams per sr there; its
+    """Distance to the area along a direction; beams per sr there, 0 if it is not met from its bright side; its
     pixel."""
     above, slope = 0.0, 0.0
     for k in range(3):

@@ -13,6 +13,7 @@ from coupole.errors import CoupoleError
 PlanPath = Annotated[Path, typer.Argument(help="The plan (YAML).", show_default=False)]
 RigOption = Annotated[Path | None, typer.Option("--rig", help="Another rig than the plan names.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
+ResultArgument = Annotated[Path, typer.Argument(help="Folder of a result.", show_default=False)]
 RunPath = Annotated[Path, typer.Argument(help="The run's folder.", show_default=False)]
 
 

@@ -8,6 +8,8 @@ with the normal n, the half vector h of l and v, GGX's distribution
 D = alpha^2 / (pi ((n h)^2 (alpha^2 - 1) + 1)^2) (Walter et al. 2007, eq. 33) and the height-correlated Smith term
 V = G / (4 (n l) (n v)) = 1 / (2 (n l) B + 2 (n v) A), A^2 = alpha^2 + (1 - alpha^2) (n l)^2, B the same of n v
 (Heitz 2014, eq. 99). The Fresnel term is part of ks.
+
+Rays are drawn from the lobe as Heitz has it, Sampling the GGX distribution of visible normals (2018).
 """
 
 from __future__ import annotations
@@ -69,3 +71,54 @@ def root_by_unknowns(normal, t1, t2, light, half, nv, v1, v2, kd, ks, alpha, row
     row[3] = to_root * nl * ks * value
     row[4] = to_root * nl * ks * by_alpha * alpha
     return root
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def shine(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
+    """D V alone, for pictures."""
+    alpha2 = alpha * alpha
+    t = nh * nh * (alpha2 - 1.0) + 1.0
+    a = math.sqrt(alpha2 + (1.0 - alpha2) * nl * nl)
+    b = math.sqrt(alpha2 + (1.0 - alpha2) * nv * nv)
+    return 0.5 * alpha2 / (math.pi * t * t * (nl * b + nv * a))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def drawn(nv, nh, alpha):  # type: ignore[no-untyped-def]
+    """How often a ray that is drawn from a lobe takes a direction, per sr (Heitz 2018, eq. 17)."""
+    alpha2 = alpha * alpha
+    t = nh * nh * (alpha2 - 1.0) + 1.0
+    return 0.5 * alpha2 / (math.pi * t * t * (nv + math.sqrt(alpha2 + (1.0 - alpha2) * nv * nv)))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def reflected(normal, v0, v1, v2, nv, alpha, first, second, way):  # type: ignore[no-untyped-def]
+    """Into `way` [3] the view (unit, nv to the normal) mirrored at a normal that it sees, chosen by two numbers
+    from 0 to 1; the cosine of that normal (Heitz 2018, listing 1)."""
+    x, y, z = normal[0], normal[1], normal[2]
+    if abs(z) < 0.9:
+        length = math.sqrt(x * x + y * y)
+        t0, t1, t2 = -y / length, x / length, 0.0
+    else:
+        length = math.sqrt(y * y + z * z)
+        t0, t1, t2 = 0.0, -z / length, y / length
+    b0, b1, b2 = y * t2 - z * t1, z * t0 - x * t2, x * t1 - y * t0
+    e0, e1 = alpha * (v0 * t0 + v1 * t1 + v2 * t2), alpha * (v0 * b0 + v1 * b1 + v2 * b2)
+    length = math.sqrt(e0 * e0 + e1 * e1 + nv * nv)
+    e0, e1, e2 = e0 / length, e1 / length, nv / length
+    across = math.sqrt(e0 * e0 + e1 * e1)
+    u0, u1 = (-e1 / across, e0 / across) if across > 1e-9 else (1.0, 0.0)
+    w0, w1, w2 = -e2 * u1, e2 * u0, e0 * u1 - e1 * u0
+    radius, angle = math.sqrt(first), 2.0 * math.pi * second
+    p = radius * math.cos(angle)
+    lean = 0.5 * (1.0 + e2)
+    q = (1.0 - lean) * math.sqrt(1.0 - p * p) + lean * radius * math.sin(angle)
+    up = math.sqrt(max(0.0, 1.0 - p * p - q * q))
+    m0, m1 = alpha * (p * u0 + q * w0 + up * e0), alpha * (p * u1 + q * w1 + up * e1)
+    m2 = max(1e-6, q * w2 + up * e2)
+    length = math.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
+    m0, m1, m2 = m0 / length, m1 / length, m2 / length
+    h0, h1, h2 = m0 * t0 + m1 * b0 + m2 * x, m0 * t1 + m1 * b1 + m2 * y, m0 * t2 + m1 * b2 + m2 * z
+    vh = v0 * h0 + v1 * h1 + v2 * h2
+    way[0], way[1], way[2] = 2.0 * vh * h0 - v0, 2.0 * vh * h1 - v1, 2.0 * vh * h2 - v2
+    return m2

@@ -10,11 +10,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.errors import InputError
 from coupole.reflectance import learned_correction as learned
 from coupole.reflectance import light_interpolation
 from coupole.reflectance.learned_correction import MARGIN_PX, Network, Strip
 from coupole.reflectance.light_gains import SUSPECT, gain_between
 from coupole.reflectance.light_interpolation import KERNELS, left_without
+from coupole.reflectance.new_light.environment import OF_PICTURES, read_environment
+from coupole.reflectance.new_light.light_kinds import AnyLight, DistantLight, EnvironmentLight
 from coupole.reflectance.picture_result import INTERPOLATION, PictureResult, opened
 
 Floats = NDArray[np.float32]
@@ -140,6 +143,38 @@ def relit(result: PictureResult, interpolation: Interpolation, direction: NDArra
         made = np.zeros((below - above, result.mask.shape[1], 3), np.float32)
         made[strip.mask] = gain * learned.corrected(strip, sight, interpolation.network)
         picture[top:bottom] = made[top - above : bottom - above]
+    return picture
+
+
+def relit_by(
+    result: PictureResult,
+    interpolation: Interpolation,
+    lights: Sequence[AnyLight],
+    samples: int,
+    *,
+    say: Callable[[int, int], None] = lambda done, of: None,
+) -> Floats:
+    """The same under several lights, with `samples` directions of each environment; of these, what is behind the
+    object gives none. Raises InputError for lights that have places: pictures tell no distances."""
+    beams: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    for light in lights:
+        match light:
+            case DistantLight():
+                beams.append((np.array(light.towards), light.rgb))
+            case EnvironmentLight():
+                environment = read_environment(light.file, OF_PICTURES, light.rgb, light.turn_deg)
+                ways, radiances, densities = environment.sample(samples)
+                strengths = radiances / (np.pi * densities[:, None])
+                beams += [(way, rgb) for way, rgb in zip(ways, strengths, strict=True) if way[2] > 0.0]
+            case _:
+                raise InputError(
+                    f"a light of the kind {light.kind}: a result of pictures has no distances, so its lights are "
+                    "distant; expected direction or environment"
+                )
+    picture = np.zeros((*result.mask.shape, 3), np.float32)
+    for number, (way, rgb) in enumerate(beams):
+        picture += relit(result, interpolation, way) * rgb.astype(np.float32)
+        say(number + 1, len(beams))
     return picture
 
 

@@ -1,101 +1,188 @@
-"""Views of a run under a distant light that was not there, from a fit to its triangles."""
+"""Views of a run under lights that were not there, from a fit to its triangles."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
 
-import h5py
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from coupole.motion.occlusion import RAY_START_MM
-from coupole.motion.packet_rays import PacketMesh
-from coupole.reflectance.run_fits import predicted
-from coupole.reflectance.run_result import FITS, SLICES, RunResult, read_about
-from coupole.reflectance.triangle_fit import TriangleSamples
+from coupole.motion.occlusion import ray_mesh
+from coupole.reflectance.new_light.beams import Beam, Lighting, lighting_of
+from coupole.reflectance.new_light.light_kinds import AnyLight
+from coupole.reflectance.new_light.pictured_surface import FreeCamera, Surface, surface_from, surface_of_view
+from coupole.reflectance.new_light.shading import (
+    MIRROR_SHARE,
+    Coats,
+    Picture,
+    add_beam,
+    add_mirrored,
+    add_values,
+    coats_of,
+)
+from coupole.reflectance.new_light.shadow_edges import reached
+from coupole.reflectance.run_result import FITS, MATERIALS, SLICES, RunResult, ViewSamples, read_about
+from coupole.reflectance.slice_fit import slice_values
+from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
 
-FAR_MM = 1e5
-"""From where a distant light shines."""
-_BLOCK, _ROWS = 1 << 16, 256
-"""Triangles, and rows of the picture, that a thread makes together."""
+Say = Callable[[int, int], None]
+SAMPLES = 256
+"""Beams of an area or an environment."""
+CLUSTERED = "clusters"
+ANYWHERE = (*MATERIALS, CLUSTERED)
+"""Fits that hold from everywhere; the others hold for the view that they were fitted to."""
+_FAR_MM = 1e5
+"""Where distant light is for a slice."""
+_TRIANGLES = 1 << 13
 
 
-def best_fit(result: RunResult) -> str:
+def best_fit(result: RunResult, among: Sequence[str] = FITS) -> str:
     """The one that missed least under the LEDs kept for the check; GGX with its normal if none were."""
-    known = {name: mae for name, mae in read_about(result.folder)["mae"].items() if mae is not None}
-    return min(known, key=known.__getitem__, default="ggx_normal")
+    known = read_about(result.folder)["mae"].items()
+    missed = {name: mae for name, mae in known if mae is not None and name in among}
+    return min(missed, key=missed.__getitem__, default="ggx_normal")
 
 
-def relit_view(
-    result: RunResult, direction: NDArray[np.float64], view: str | None = None, fit: str | None = None
-) -> NDArray[np.float32]:
-    """[h, w, channels] as `RelitView.under` gives it. Raises InputError for a view or a fit that is not there."""
-    return RelitView(result, view, fit).under(direction)
+@dataclass(frozen=True)
+class Slices:
+    """A fit to one view by itself."""
+
+    name: str
+    coefficients: NDArray[np.float32]
+    under: TriangleMaterials | None
+    """What they are added to."""
 
 
-class RelitView:
-    """A view of a result, ready for light from many directions.
+@dataclass(frozen=True)
+class RelitScene:
+    """A picture's surface and what it is made of; any lights can be put on it."""
 
-    The view is the first one unless it is named, the fit that of `FITS` which missed least under the LEDs that
-    were kept for the check. Raises InputError for a view or a fit that is not there.
-    """
+    result: RunResult
+    fit: str
+    surface: Surface
+    reflecting: Coats | Slices
+    """Of the surface's triangles."""
+    views: tuple[ViewSamples, ...]
+    """In the order in which LEDs are looked for."""
+    rays: Any
+    """The mesh's `ray_mesh`."""
 
-    def __init__(self, result: RunResult, view: str | None = None, fit: str | None = None) -> None:
-        names = [one.view for one in result.views]
-        if view is not None and view not in names:
-            raise InputError(f"--view: expected one of {', '.join(names)}; got {view!r}")
-        if fit is not None and fit not in (known := (*FITS, "clusters")):
-            raise InputError(f"--fit: expected one of {', '.join(known)}; got {fit!r}")
-        self._result, self._fit = result, fit or best_fit(result)
-        self._view = result.views[0 if view is None else names.index(view)]
-        if self._fit in SLICES and not result.slices_path(self._fit, self._view).exists():
-            raise InputError(
-                f"{result.folder}: has no fit {self._fit}; `coupole reflectance fit {result.folder}` makes it"
-            )
-        with h5py.File(self._view.path, "r") as file:
-            self._seen, self._centres = file["seen"][()], file["centres_mm"][()]
-            self._normals = file["normals"][()]
-        self._starts = (self._centres + RAY_START_MM * self._normals).astype(np.float32)
-        self._mesh = PacketMesh(result.corners_mm)
+    def picture(
+        self, lights: Sequence[AnyLight], samples: int = SAMPLES, *, say: Say = lambda done, of: None
+    ) -> NDArray[np.float32]:
+        """[h, w, channels] radiance, linear, in the unit of `coupole.reflectance.new_light.light_kinds`; 0 where
+        no triangle with a material is seen. Light from surface to surface is not in it.
 
-    def under(self, direction: NDArray[np.float64]) -> NDArray[np.float32]:
-        """[h, w, channels] radiance, linear, under a light from `direction` [3] in the support frame; 1 is a white
-        diffuser that faces the light. 0 in shadow, and where no triangle with a material is seen."""
-        towards = self._result.base_from_support[:3, :3] @ (direction / np.linalg.norm(direction))
-        values = np.zeros((len(self._centres), self._result.channels), np.float32)
-        picture = np.zeros((*self._seen.shape, values.shape[1]), np.float32)
-        blocks = [slice(first, min(first + _BLOCK, len(values))) for first in range(0, len(values), _BLOCK)]
-        bands = [slice(first, first + _ROWS) for first in range(0, len(picture), _ROWS)]
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            list(pool.map(lambda rows: self._light(rows, towards, values[rows]), blocks))
-            list(pool.map(lambda rows: _paint(self._seen[rows], values, picture[rows]), bands))
+        `samples` of each area and environment. Raises InputError for a light that the result does not have.
+        """
+        paper = read_about(self.result.folder).get("emission") == "paper"
+        base_from_support, channels = self.result.base_from_support, self.result.channels
+        lighting = lighting_of(lights, self.views, base_from_support, channels, samples, paper=paper)
+        picture = np.zeros((*self.surface.seen.shape, channels), np.float32)
+        if isinstance(self.reflecting, Slices):
+            self._by_slices(picture, lighting, self.reflecting, say)
+        else:
+            self._by_materials(picture, lighting, self.reflecting, max(1, samples // MIRROR_SHARE), say)
         return picture
 
-    def _light(self, rows: slice, towards: NDArray[np.float64], values: NDArray[np.float32]) -> None:
-        """Fill the values [b, channels] of some of the view's triangles."""
-        centres, normals = self._centres[rows], self._normals[rows]
-        light_mm = self._centres.mean(axis=0) + FAR_MM * towards
-        light = TriangleSamples(
-            np.zeros((len(centres), 1, values.shape[1]), np.float32),
-            light_mm[None],
-            np.zeros(1, np.int64),
-            self._view.camera_mm[None],
-            centres,
-            normals,
-            np.ones(len(centres)),
+    def _by_materials(self, picture: Picture, lighting: Lighting, coats: Coats, lobe_rays: int, say: Say) -> None:
+        work = len(lighting.beams) + len(lighting.emitters)
+        for number, beam in enumerate(lighting.beams):
+            add_beam(picture, self.surface, coats, reached(self.rays, self.surface, beam), beam, lobe_rays)
+            say(number + 1, work)
+        for number, emitter in enumerate(lighting.emitters):
+            add_mirrored(picture, self.surface, coats, self.rays, emitter, lobe_rays)
+            say(len(lighting.beams) + number + 1, work)
+
+    def _by_slices(self, picture: Picture, lighting: Lighting, slices: Slices, say: Say) -> None:
+        for number, beam in enumerate(lighting.beams):
+            values = self._slice_values(slices, beam)
+            add_values(picture, self.surface, values, reached(self.rays, self.surface, beam), beam)
+            say(number + 1, len(lighting.beams))
+
+    def _slice_values(self, slices: Slices, beam: Beam) -> NDArray[np.float32]:
+        """[triangles, channels] f cos_i, 1/sr, at the triangles' centres."""
+        centres_mm = self.surface.centres_mm
+        place_mm = beam.place if beam.near else centres_mm.mean(axis=0) + _FAR_MM * beam.place
+        values = np.zeros((len(centres_mm), self.result.channels), np.float32)
+
+        def of(first: int) -> None:
+            part = slice(first, first + _TRIANGLES)
+            count = len(centres_mm[part])
+            light = TriangleSamples(
+                np.zeros((count, 1, values.shape[1]), np.float32),
+                place_mm[None],
+                np.zeros(1, np.int64),
+                self.surface.camera_mm[None],
+                centres_mm[part],
+                self.surface.normals[part],
+                np.ones(count),
+            )
+            under = None
+            if slices.under is not None:
+                under = model_values(light, slices.under.at(np.arange(first, first + count)))
+            made = slice_values(light, slices.coefficients[part], SLICES[slices.name].basis, under)
+            values[part] = np.nan_to_num(made[:, 0])
+
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            list(pool.map(of, range(0, len(centres_mm), _TRIANGLES)))
+        return values
+
+
+def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = None) -> RelitScene:
+    """A measured view: the first one unless it is named; the fit that missed least under the LEDs that were kept
+    for the check unless it is named. Raises InputError for a view or a fit that is not there."""
+    names = [one.view for one in result.views]
+    if view is not None and view not in names:
+        raise InputError(f"--view: expected one of {', '.join(names)}; got {view!r}")
+    _refuse_unknown(fit)
+    mine = result.views[0 if view is None else names.index(view)]
+    name = fit or best_fit(result)
+    surface = surface_of_view(result, mine)
+    order = (mine, *(one for one in result.views if one is not mine))
+    rays = ray_mesh(result.corners_mm.astype(np.float64))
+    if name in ANYWHERE:
+        return RelitScene(result, name, surface, coats_of(_materials(result, name, surface)), order, rays)
+    if not result.slices_path(name, mine).exists():
+        raise InputError(f"{result.folder}: has no fit {name}; `coupole reflectance fit {result.folder}` makes it")
+    over, coefficients = SLICES[name].over, result.slices(name, mine)
+    slices = Slices(name, coefficients, None)
+    if over is not None:
+        slices = Slices(name, np.nan_to_num(coefficients), _materials(result, over, surface))
+    return RelitScene(result, name, surface, slices, order, rays)
+
+
+def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) -> RelitScene:
+    """What a camera anywhere sees. Raises InputError for a fit that does not hold there, or one that is not there;
+    if the camera sees nothing."""
+    _refuse_unknown(fit)
+    if fit is not None and fit not in ANYWHERE:
+        raise InputError(
+            f"--fit: {fit} holds for the view that it was fitted to; with --from expected {', '.join(ANYWHERE)}"
         )
-        made = predicted(self._result, self._fit, self._view, rows, light)[:, 0]
-        lit = np.flatnonzero(normals @ towards > 0.0)
-        lit = lit[~self._mesh.blocked(self._starts[rows], lit, light_mm)]
-        values[lit] = np.pi * np.nan_to_num(made[lit])
+    name = fit or best_fit(result, MATERIALS)
+    rays = ray_mesh(result.corners_mm.astype(np.float64))
+    surface = surface_from(result, rays, camera)
+    return RelitScene(result, name, surface, coats_of(_materials(result, name, surface)), result.views, rays)
 
 
-@numba.njit(cache=True, nogil=True)
-def _paint(seen, values, picture):  # type: ignore[no-untyped-def]
-    for row in range(seen.shape[0]):
-        for column in range(seen.shape[1]):
-            if seen[row, column] >= 0:
-                picture[row, column] = values[seen[row, column]]
+def _refuse_unknown(fit: str | None) -> None:
+    if fit is not None and fit not in (known := (*FITS, CLUSTERED)):
+        raise InputError(f"--fit: expected one of {', '.join(known)}; got {fit!r}")
+
+
+def _materials(result: RunResult, name: str, surface: Surface) -> TriangleMaterials:
+    """Of the surface's triangles. Raises InputError if there are none."""
+    places = np.searchsorted(result.triangles, surface.triangles)
+    own = "ggx_normal" if name == CLUSTERED else name
+    if not result.materials_path(own).exists():
+        raise InputError(f"{result.folder}: has no fit {own}; `coupole reflectance fit {result.folder}` makes it")
+    materials = result.materials(own, places)
+    if name == CLUSTERED:
+        materials = result.clusters.at(materials, surface.normals, places)
+    return materials

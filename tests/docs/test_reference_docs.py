@@ -10,11 +10,15 @@ import pytest
 from places import REPO
 
 from coupole.plan import arm_description, plan, rig
+from coupole.reflectance.new_light import light_kinds
 
 REFERENCE = REPO / "docs" / "reference"
 
 
-@pytest.mark.parametrize(("module", "page"), [(plan, "plan.md"), (rig, "rig.md"), (arm_description, "robot.md")])
+@pytest.mark.parametrize(
+    ("module", "page"),
+    [(plan, "plan.md"), (rig, "rig.md"), (arm_description, "robot.md"), (light_kinds, "lights.md")],
+)
 def test_the_reference_names_every_key(module: ModuleType, page: str) -> None:
     text = (REFERENCE / page).read_text(encoding="utf-8")
     models = [

@@ -165,6 +165,31 @@ def test_lights_that_cannot_be_left_out_are_refused(
     assert message in ended.document["error"]
 
 
+def test_an_environment_with_one_sun_is_that_direction(made: Made, tmp_path: Path) -> None:
+    """Up is y, the middle z, and x to the left of it: the sun stands 30 degrees to x and 20 degrees up."""
+    out = made[1]
+    sky = np.zeros((360, 720, 3), np.float32)
+    sky[139:141, 299:301] = (40.0, 80.0, 120.0)
+    OpenEXR.File({}, {"RGB": sky}).write(str(tmp_path / "sky.exr"))
+    turn, up = np.radians([30.0, 20.0])
+    direction = f"{np.cos(up) * np.sin(turn)},{np.sin(up)},{np.cos(up) * np.cos(turn)}"
+    pictures = []
+    for light in (("--direction", direction), ("--environment", str(tmp_path / "sky.exr"), "--samples", "8")):
+        ended = cells.here("reflectance", "relight", out, *light, "--to", tmp_path / "a.npy")
+        assert ended.code == 0, ended.err
+        pictures.append(np.load(tmp_path / "a.npy"))
+    solid_angle = 4 * np.radians(0.5) ** 2 * np.cos(up)
+    wanted = pictures[0] * np.array([40.0, 80.0, 120.0]) * solid_angle / np.pi
+    np.testing.assert_allclose(pictures[1].mean(axis=(0, 1)), wanted.mean(axis=(0, 1)), rtol=0.01)
+    assert np.abs(pictures[1] - wanted).mean() < 0.02 * wanted.mean()
+
+
+def test_lights_that_have_places_are_refused_for_pictures(made: Made, tmp_path: Path) -> None:
+    ended = cells.here("reflectance", "relight", made[1], "--light-at", "0,0,300", "--to", tmp_path / "a.npy")
+    assert ended.code == 2
+    assert "a result of pictures has no distances" in ended.err
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

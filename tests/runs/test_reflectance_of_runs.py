@@ -9,6 +9,7 @@ from typing import Any
 import cells
 import h5py
 import numpy as np
+import OpenEXR
 import pytest
 import trimesh
 from cells import CellFolder
@@ -411,6 +412,43 @@ def test_a_frame_that_is_not_the_one_that_was_proven_is_refused(made: Made, tmp_
     assert ended.code == 6
     assert "top/led0480/e0 is not what was proven" in " ".join(ended.err.split())
     assert not list((tmp_path / "result/samples").glob("top*"))
+
+
+@pytest.mark.parametrize("view", ["top", "side"])
+def test_under_an_led_kept_for_the_check_a_view_looks_as_it_was_photographed(made: Made, view: str) -> None:
+    """In shares of the camera's range, pixel by pixel of the frame itself."""
+    cell, out, document = made
+    led, to = document["left_out"][1], out / "led.npy"
+    with h5py.File(cell.run_folder / f"views/{view}.h5") as file:
+        number = int(np.flatnonzero(file["entry/instrument/detector/frames"]["led"] == led)[0])
+        raw = file["entry/instrument/detector/data"][number].astype(float)
+    with h5py.File(RECORDS / "flat-field.h5") as file:
+        share = (raw - cells.BLACK_DN) / (4095 - cells.BLACK_DN) / file["g"][()]
+    for fit in ("ggx_normal", "ggx_rbf"):
+        options = ("--led", led, "--view", view, "--fit", fit, "--to", to)
+        ended = cells.here("reflectance", "relight", out, *map(str, options))
+        assert ended.code == 0, ended.err
+        picture = np.load(to)
+        for channel, row, column in ((1, 0, 0), (2, 0, 1), (0, 1, 0)):  # GBRG
+            relit, taken = picture[row::2, column::2, channel], share[row::2, column::2]
+            seen = relit > 0.05
+            assert seen.mean() > 0.05
+            assert np.median(taken[seen] / relit[seen]) == pytest.approx(1.0, abs=0.015)
+            assert np.abs(relit - taken)[seen].mean() < 0.009  # of range; noise of one pixel is 0.006
+
+
+def test_slices_show_an_environment_as_materials_do(made: Made) -> None:
+    out = made[1]
+    OpenEXR.File({}, {"RGB": np.ones((8, 16, 3), np.float32)}).write(str(out / "white.exr"))
+    pictures = []
+    for fit in ("ggx_normal", "ggx_rbf"):
+        options = ("--environment", out / "white.exr", "--fit", fit, "--samples", 48, "--to", out / "white.npy")
+        ended = cells.here("reflectance", "relight", out, *map(str, options))
+        assert ended.code == 0, ended.err
+        pictures.append(np.load(out / "white.npy"))
+    seen = (pictures[0] > 0) & (pictures[1] > 0)
+    assert seen.mean() > 0.1
+    assert np.median(pictures[1][seen] / pictures[0][seen]) == pytest.approx(1.0, abs=0.03)
 
 
 def test_a_view_is_relit_with_its_shadows(made: Made) -> None:

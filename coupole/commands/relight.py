@@ -1,0 +1,294 @@
+"""The command `coupole reflectance relight`: pictures and videos of a result under new lights."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coupole.commands.common import JsonOption, ResultArgument, fail
+from coupole.errors import CoupoleError, InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from coupole.reflectance.new_light.light_kinds import AnyLight
+    from coupole.reflectance.new_light.pictured_surface import FreeCamera
+
+Say = Callable[[int, int], None]
+PEAK_QUANTILE = 0.999
+_LOOKED_AT = 8
+"""Pictures of a video that its white is found by."""
+
+
+@dataclass(frozen=True)
+class Relit:
+    """A result that lights can be put on."""
+
+    picture: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]]
+    """[h, w, 3] of lights."""
+    about: dict[str, Any]
+    """What `--json` and a video's comment say of it."""
+
+
+Several = list[str] | None
+
+
+def _option(name: str, help_text: str, **limits: Any) -> Any:
+    return typer.Option(name, help=help_text, show_default=False, **limits)
+
+
+ToOption = Annotated[
+    Path,
+    _option("--to", "picture.npy or .exr: float32, linear; .png: 16 bit, linear; with --turn video.mp4: sRGB."),
+]
+DirectionOption = Annotated[
+    Several,
+    _option(
+        "--direction",
+        "To the light. Of pictures: x right, y up, z to the camera; of runs: in the support frame, z up.",
+    ),
+]
+LedOption = Annotated[
+    list[int] | None, _option("--led", "An LED of the run, in shares of the camera's range.", min=0)
+]
+LightAtOption = Annotated[Several, _option("--light-at", "X,Y,Z of a point light, mm; white is 1 at 1 m.")]
+AreaOption = Annotated[
+    Several,
+    _option(
+        "--area",
+        "X,Y,Z,NX,NY,NZ,WIDTH[,HEIGHT]: centre, normal and sides of a soft light, mm; its radiance is 1.",
+    ),
+]
+EnvironmentOption = Annotated[
+    list[Path] | None,
+    _option(
+        "--environment",
+        "Light from everywhere: .exr or .hdr, latitude and longitude. Its top is up: z of runs, y of pictures; "
+        "its middle is x of runs, z of pictures.",
+    ),
+]
+LightsOption = Annotated[Path | None, _option("--lights", "A file (YAML) of lights with strengths.")]
+SamplesOption = Annotated[int, typer.Option("--samples", min=1, max=65536, help="Of each area and environment.")]
+ViewOption = Annotated[str | None, typer.Option("--view", help="Of a result of runs; the first without it.")]
+FromOption = Annotated[str | None, _option("--from", "X,Y,Z of a camera anywhere, mm, in place of --view.")]
+LookAtOption = Annotated[str | None, _option("--look-at", "X,Y,Z that it looks at; the object without it.")]
+SizeOption = Annotated[str | None, _option("--size", "Its WIDTHxHEIGHT; 1024x768 without it.")]
+FieldOption = Annotated[
+    float | None,
+    _option("--field-of-view", "Its degrees across; as the object needs without it.", min=0.01, max=170.0),
+]
+FitOption = Annotated[
+    str | None,
+    typer.Option(
+        "--fit",
+        help="Of a result of runs: ggx, ggx_normal, sh, rbf, ggx_rbf or clusters; without it the one that "
+        "missed least in the check.",
+    ),
+]
+TurnOption = Annotated[
+    int | None, _option("--turn", "Frames of a video in which the lights turn once about z.", min=2, max=100_000)
+]
+WhiteOption = Annotated[
+    float | None, _option("--white", "Of a video: shown as white; its 99.9 % quantile without it.", min=1e-9)
+]
+
+
+def relight(
+    result: ResultArgument,
+    to: ToOption,
+    direction: DirectionOption = None,
+    led: LedOption = None,
+    light_at: LightAtOption = None,
+    area: AreaOption = None,
+    environment: EnvironmentOption = None,
+    lights: LightsOption = None,
+    samples: SamplesOption = 256,
+    view: ViewOption = None,
+    from_: FromOption = None,
+    look_at: LookAtOption = None,
+    size: SizeOption = None,
+    field_of_view: FieldOption = None,
+    fit: FitOption = None,
+    turn: TurnOption = None,
+    white: WhiteOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make the picture that lights which were not there would give. Lights that are named together are summed."""
+    from coupole.viewing.terminal import make_console, step_bars
+
+    console = make_console(quiet=as_json)
+    try:
+        _refuse_target(to, turn, white)
+        wanted = _lights(direction or [], led or [], light_at or [], area or [], environment or [], lights)
+        camera = _camera(from_, look_at, size, field_of_view)
+        with step_bars(console) as bars:
+            relit = _open(result, view, fit, camera, samples)
+            said = _write(relit, wanted, to, turn, white, bars)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    if "white" in said:
+        console.print(f"white is {said['white']:.4g}")
+    if as_json:
+        print(json.dumps(said))
+
+
+def _lights(
+    directions: Sequence[str],
+    leds: Sequence[int],
+    points: Sequence[str],
+    areas: Sequence[str],
+    environments: Sequence[Path],
+    file: Path | None,
+) -> list[AnyLight]:
+    from coupole.reflectance.new_light import light_kinds as kinds
+
+    found: list[AnyLight] = [] if file is None else kinds.read_lights(file)
+    found += [kinds.DistantLight(towards=kinds.way_of(one, "--direction")) for one in directions]
+    found += [kinds.LedLight(number=one) for one in leds]
+    found += [kinds.PointLight(at_mm=kinds.place_of(one, "--light-at")) for one in points]
+    found += [kinds.area_of(one) for one in areas]
+    found += [kinds.EnvironmentLight(file=one) for one in environments]
+    if not found:
+        raise InputError(
+            "expected a light: --direction, --led, --light-at, --area, --environment, or --lights with a file"
+        )
+    return found
+
+
+def _refuse_target(to: Path, turn: int | None, white: float | None) -> None:
+    from coupole.exchange import picture_files, video_files
+
+    if turn is None:
+        picture_files.refuse_unknown(to)
+        if white is not None:
+            raise InputError("--white: belongs to a video (--turn); pictures are linear and hold all values")
+    else:
+        video_files.refuse_unknown(to)
+
+
+def _camera(
+    from_: str | None, look_at: str | None, size: str | None, field_of_view: float | None
+) -> FreeCamera | None:
+    import numpy as np
+
+    from coupole.reflectance.new_light.light_kinds import place_of
+    from coupole.reflectance.new_light.pictured_surface import FreeCamera
+
+    if from_ is None:
+        for option, value in (("--look-at", look_at), ("--size", size), ("--field-of-view", field_of_view)):
+            if value is not None:
+                raise InputError(f"{option}: belongs to a camera anywhere; give its place with --from")
+        return None
+    aim = None if look_at is None else np.array(place_of(look_at, "--look-at"))
+    return FreeCamera(np.array(place_of(from_, "--from")), aim, _size_px(size or "1024x768"), field_of_view)
+
+
+def _size_px(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isascii() and width.isdigit() and height.isascii() and height.isdigit()):
+        raise InputError(f"--size: expected WIDTHxHEIGHT, got {text!r}")
+    if not (2 <= int(width) <= 32768 and 2 <= int(height) <= 32768):
+        raise InputError(f"--size: expected 2 to 32768 pixels each way, got {text!r}")
+    return int(width), int(height)
+
+
+def _open(result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int) -> Relit:
+    from coupole.reflectance import run_result
+
+    if (result / run_result.OBJECT).exists():
+        return _of_runs(result, view, fit, camera, samples)
+    given = (("--view", view), ("--fit", fit), ("--from", camera))
+    for option, value in given:
+        if value is not None:
+            raise InputError(f"{option}: a result of pictures has one view and one way to relight it")
+    return _of_pictures(result, samples)
+
+
+def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int) -> Relit:
+    import numpy as np
+
+    from coupole.reflectance import run_relighting, run_result
+
+    if camera is not None and view is not None:
+        raise InputError("--view: a camera anywhere (--from) is no view of the run; give one of the two")
+    simulated = bool(run_result.read_about(result)["simulated"])
+    folder = run_result.RunResult(result)
+    if camera is None:
+        scene = run_relighting.scene_of_view(folder, view, fit)
+    else:
+        scene = run_relighting.scene_from(folder, camera, fit)
+
+    def picture(lights: Sequence[AnyLight], say: Say) -> NDArray[np.float32]:
+        made = scene.picture(lights, samples, say=say)
+        return made if made.shape[2] == 3 else np.repeat(made, 3, axis=2)
+
+    return Relit(picture, {"fit": scene.fit, "simulated": simulated})
+
+
+def _of_pictures(result: Path, samples: int) -> Relit:
+    from coupole.reflectance import picture_result, relighting
+
+    made = picture_result.PictureResult(result)
+    made.about  # noqa: B018  refuses what is no result
+    interpolation = relighting.read_interpolation(result)
+
+    def picture(lights: Sequence[AnyLight], say: Say) -> NDArray[np.float32]:
+        return relighting.relit_by(made, interpolation, lights, samples, say=say)
+
+    return Relit(picture, {})
+
+
+def _write(
+    relit: Relit,
+    lights: Sequence[AnyLight],
+    to: Path,
+    turn: int | None,
+    white: float | None,
+    bars: Callable[[str, int, int], None],
+) -> dict[str, Any]:
+    """Make and write the picture or the video; what `--json` says."""
+    if turn is None:
+        from coupole.exchange.picture_files import write_picture
+
+        write_picture(to, relit.picture(lights, lambda done, of: bars("light", done, of)))
+        return {"picture": str(to.resolve()), **relit.about}
+    import numpy as np
+
+    from coupole.exchange.video_files import write_video
+    from coupole.reflectance.new_light.light_kinds import turned
+
+    def frame(number: int) -> NDArray[np.float32]:
+        angle_deg = 360.0 * number / turn
+        return relit.picture([turned(light, angle_deg) for light in lights], lambda done, of: None)
+
+    if white is None:
+        numbers = sorted({number * turn // _LOOKED_AT for number in range(_LOOKED_AT)})
+        peaks = []
+        for done, number in enumerate(numbers):
+            peaks.append(np.quantile(_bright(frame(number)), PEAK_QUANTILE))
+            bars("exposure", done + 1, len(numbers))
+        white = float(np.mean(peaks)) or 1.0
+
+    def frames() -> Iterator[NDArray[np.float32]]:
+        for number in range(turn):
+            yield frame(number)
+            bars("frames", number + 1, turn)
+
+    marked = "of a simulated object" if relit.about.get("simulated") else "of a measured object"
+    write_video(
+        to, frames(), white=white, about=f"computed by coupole reflectance relight, {marked}; white {white:.4g}"
+    )
+    return {"video": str(to.resolve()), "frames": turn, "white": white, **relit.about}
+
+
+def _bright(picture: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values of the pixels that are not dark."""
+    lit = picture[picture.max(axis=2) > 0.0]
+    return lit if len(lit) else picture.reshape(-1, 3)

@@ -1,0 +1,1 @@
+"""Views of a measured object under lights that were not there."""

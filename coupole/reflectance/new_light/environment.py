@@ -1,0 +1,122 @@
+"""Light from all directions, as a picture of latitude and longitude.
+
+The top row is up. The middle column is the frame's middle direction, and what is left in the picture is to the
+left for one who looks there with up above. For results of runs up is z and the middle x, so that left is y; for
+results of pictures up is y and the middle z, towards the camera, so that left is x. Within a pixel radiance is
+constant.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+
+Floats = NDArray[np.float64]
+
+OF_RUNS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+"""Rows: middle, left, up, in the support frame."""
+OF_PICTURES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Radiance by direction."""
+
+    radiance: NDArray[np.float32]
+    """[h, w, channels]"""
+    axes: Floats
+    """[3, 3] rows: middle, left, up."""
+
+    def turned(self, angle_deg: float) -> Environment:
+        """About up, from the middle to the left."""
+        cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+        turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        return replace(self, axes=turn @ self.axes)
+
+    def solid_angles(self) -> Floats:
+        """[h] of a pixel in each row, sr."""
+        height, width = self.radiance.shape[:2]
+        heights = np.cos(np.linspace(0.0, math.pi, height + 1))
+        angles: Floats = (heights[:-1] - heights[1:]) * 2.0 * math.pi / width
+        return angles
+
+    def total(self) -> float:
+        """Integral of the colours' mean over all directions."""
+        mean = self.radiance.mean(axis=2, dtype=np.float64)
+        return float(np.sum(mean * self.solid_angles()[:, None]))
+
+    def sample(self, count: int) -> tuple[Floats, Floats, Floats]:
+        """Directions [count, 3] as dense as radiance is high, their radiances [count, channels], and how many of
+        them lie in a steradian there [count]. They are the same at each call.
+
+        Rows and columns are chosen by their cumulated light from a lattice of golden sections.
+        """
+        mean = self.radiance.mean(axis=2, dtype=np.float64)
+        light = mean * self.solid_angles()[:, None]
+        by_row = np.append(0.0, np.cumsum(light.sum(axis=1)))
+        number = np.arange(count)
+        across = (number * _GOLDEN + 0.5) % 1.0
+        row, down = _placed(by_row, (number + 0.5) / count)
+        column, right = np.empty(count, np.int64), np.empty(count)
+        for one in np.unique(row):
+            here = row == one
+            column[here], right[here] = _placed(np.append(0.0, np.cumsum(light[one])), across[here])
+        height, width = mean.shape
+        edges = np.cos(np.linspace(0.0, math.pi, height + 1))
+        up = edges[row] + down * (edges[row + 1] - edges[row])
+        azimuth = 2.0 * math.pi * (0.5 - (column + right) / width)
+        level = np.sqrt(np.maximum(1.0 - up * up, 0.0))
+        local = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up], axis=1)
+        density = count * mean[row, column] / by_row[-1]
+        return local @ self.axes, self.radiance[row, column].astype(np.float64), density
+
+
+def _placed(cumulated: Floats, shares: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Which part of a growing sum shares of it fall into, and how far into it."""
+    at = shares * cumulated[-1]
+    part = np.clip(np.searchsorted(cumulated, at, side="right") - 1, 0, len(cumulated) - 2)
+    within = (at - cumulated[part]) / np.maximum(cumulated[part + 1] - cumulated[part], 1e-300)
+    return part.astype(np.int64), np.clip(within, 0.0, 1.0)
+
+
+def read_environment(path: Path, axes: Floats, strength: Floats, turn_deg: float = 0.0) -> Environment:
+    """A file in OpenEXR or Radiance format, times a strength [3]. Raises InputError if it cannot be read, is not
+    twice as wide as high, or holds what no light is."""
+    radiance = _read(path)
+    if radiance.ndim != 3 or radiance.shape[2] < 3 or radiance.shape[1] != 2 * radiance.shape[0]:
+        raise InputError(f"{path}: expected three colours, twice as wide as high; got {radiance.shape}")
+    radiance = radiance[..., :3] * strength.astype(np.float32)
+    if not np.all(np.isfinite(radiance)) or radiance.min() < 0.0 or not radiance.any():
+        raise InputError(f"{path}: expected finite values, none below 0 and some above; repair it or name another")
+    return Environment(radiance, axes).turned(turn_deg)
+
+
+def _read(path: Path) -> NDArray[np.float32]:
+    """[h, w, channels] red first."""
+    if path.suffix.lower() not in {".exr", ".hdr"}:
+        raise InputError(f"{path}: expected an environment in a file .exr or .hdr")
+    if path.suffix.lower() == ".hdr":
+        found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if found is None:
+            raise InputError(f"{path}: expected a Radiance file that can be read")
+        return np.ascontiguousarray(found[..., ::-1], np.float32)
+    try:
+        with OpenEXR.File(str(path)) as file:
+            channels = {name: np.asarray(one.pixels) for name, one in file.channels().items()}
+    except (OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"{path}: expected an OpenEXR file that can be read: {error}") from error
+    for name in ("RGB", "RGBA"):
+        if name in channels:
+            return channels[name][..., :3].astype(np.float32)
+    if not {"R", "G", "B"} <= set(channels):
+        raise InputError(f"{path}: expected channels R, G and B; got {', '.join(channels)}")
+    return np.stack([channels[name] for name in "RGB"], axis=2).astype(np.float32)

@@ -1,0 +1,176 @@
+"""Lights that a user names: on the command line, or in a file of several.
+
+Places are in mm and directions without length, in the support frame for results of runs (z up), in that of the
+pictures for results of pictures. A strength is one number or three (r, g, b). Strength 1 is, in a picture whose 1
+is a white diffuser in full light:
+
+=============  ====================================================================================
+`direction`    a white diffuser that faces the light is 1
+`point`        the same at 1 m
+`area`         a surface of radiance 1: a white diffuser is 1 if nothing else is in its sky
+`environment`  the file's values are radiances, in the same unit
+`led`          the LED as it was in the run: values are shares of the camera's range
+=============  ====================================================================================
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field
+
+from coupole.errors import InputError
+from coupole.plan import yamlfile
+from coupole.plan.plan import FilePath, Length, Model, Vector
+
+Floats = NDArray[np.float64]
+
+
+def _with_length(vector: Vector) -> Vector:
+    if math.hypot(*vector) < 1e-9:
+        raise ValueError("a vector that is not all 0")
+    return vector
+
+
+Way = Annotated[Vector, AfterValidator(_with_length)]
+MOST_MM = 20_000.0
+"""Of a coordinate or side: more than any cell has."""
+Factor = Annotated[float, Field(ge=0.0, le=1e9)]
+
+
+class Light(Model):
+    """What all lights have."""
+
+    strength: Factor | tuple[Factor, Factor, Factor] = 1.0
+
+    @property
+    def rgb(self) -> Floats:
+        """[3]"""
+        return np.broadcast_to(np.asarray(self.strength, np.float64), 3).copy()
+
+
+class DistantLight(Light):
+    kind: Literal["direction"] = "direction"
+    towards: Way
+    """The light."""
+
+
+class LedLight(Light):
+    kind: Literal["led"] = "led"
+    number: Annotated[int, Field(ge=0)]
+
+
+class PointLight(Light):
+    kind: Literal["point"] = "point"
+    at_mm: Vector
+
+
+class AreaLight(Light):
+    """A rectangle that radiates by Lambert's law to one side; its width lies level."""
+
+    kind: Literal["area"] = "area"
+    at_mm: Vector
+    """Of its centre."""
+    normal: Way
+    width_mm: Length
+    height_mm: Length | None = None
+    """Its width without it."""
+
+
+class EnvironmentLight(Light):
+    """A picture of all directions; coupole.reflectance.new_light.environment tells which is where."""
+
+    kind: Literal["environment"] = "environment"
+    file: FilePath
+    turn_deg: float = 0.0
+    """About up, from the middle of the picture to its left."""
+
+
+AnyLight = Annotated[
+    DistantLight | LedLight | PointLight | AreaLight | EnvironmentLight, Field(discriminator="kind")
+]
+
+
+class LightsFile(Model):
+    lights: Annotated[tuple[AnyLight, ...], Field(min_length=1, max_length=1000)]
+
+
+def read_lights(path: Path) -> list[AnyLight]:
+    """Those of a file. Raises InputError with file:line:column."""
+    document = yamlfile.read(path)
+    lights = document.validate(LightsFile).lights
+    return [
+        light.model_copy(update={"file": document.resolve(light.file)})
+        if isinstance(light, EnvironmentLight)
+        else light
+        for light in lights
+    ]
+
+
+def numbers_of(text: str, counts: Sequence[int], option: str, form: str) -> list[float]:
+    """Numbers with commas between. Raises InputError if they are not so many, or none."""
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in counts or not all(math.isfinite(number) for number in numbers):
+        raise InputError(f"{option}: expected {form}; got {text!r}")
+    return numbers
+
+
+def way_of(text: str, option: str) -> Vector:
+    """A direction of any length. Raises InputError."""
+    form = "X,Y,Z, not all 0"
+    x, y, z = numbers_of(text, (3,), option, form)
+    length = math.hypot(x, y, z)
+    if length < 1e-9:
+        raise InputError(f"{option}: expected {form}; got {text!r}")
+    return x / length, y / length, z / length
+
+
+def place_of(text: str, option: str) -> Vector:
+    """A place in mm. Raises InputError."""
+    form = f"X,Y,Z in mm, each within {MOST_MM:g}"
+    x, y, z = numbers_of(text, (3,), option, form)
+    if max(abs(x), abs(y), abs(z)) > MOST_MM:
+        raise InputError(f"{option}: expected {form}; got {text!r}")
+    return x, y, z
+
+
+def area_of(text: str) -> AreaLight:
+    """A rectangle from the words of the option `--area`. Raises InputError."""
+    form = "X,Y,Z,NX,NY,NZ,WIDTH or X,Y,Z,NX,NY,NZ,WIDTH,HEIGHT in mm, the normal not all 0, sides above 0"
+    numbers = numbers_of(text, (7, 8), "--area", form)
+    at_mm = place_of(",".join(map(str, numbers[:3])), "--area")
+    length = math.hypot(*numbers[3:6])
+    if length < 1e-9 or not all(0.0 < side <= MOST_MM for side in numbers[6:]):
+        raise InputError(f"--area: expected {form}; got {text!r}")
+    x, y, z = (number / length for number in numbers[3:6])
+    return AreaLight(at_mm=at_mm, normal=(x, y, z), width_mm=numbers[6], height_mm=numbers[-1])
+
+
+def turned(light: AnyLight, angle_deg: float) -> AnyLight:
+    """A light turned about the z axis, from x to y; an environment about its own up. Raises InputError for an LED,
+    which has its place."""
+    cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+
+    def turn(vector: Vector) -> Vector:
+        x, y, z = vector
+        return cosine * x - sine * y, sine * x + cosine * y, z
+
+    match light:
+        case DistantLight():
+            return light.model_copy(update={"towards": turn(light.towards)})
+        case PointLight():
+            return light.model_copy(update={"at_mm": turn(light.at_mm)})
+        case AreaLight():
+            return light.model_copy(update={"at_mm": turn(light.at_mm), "normal": turn(light.normal)})
+        case EnvironmentLight():
+            return light.model_copy(update={"turn_deg": light.turn_deg + angle_deg})
+        case LedLight():
+            raise InputError("--turn: an LED stays where it is; name a light of another kind")

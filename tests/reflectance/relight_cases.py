@@ -1,0 +1,114 @@
+"""Result folders of runs whose materials are known, made without a run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import OpenEXR
+
+from coupole.calibration.optics import Intrinsics
+from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.extraction.seen_surface import seen_surface
+from coupole.reflectance.material_uncertainty import MaterialUncertainty
+from coupole.reflectance.run_result import OBJECT, SCHEMA, RunResult
+from coupole.reflectance.run_result_files import write_materials, write_object
+from coupole.reflectance.triangle_fit import TriangleMaterials
+
+BASE_FROM_SUPPORT = np.array(
+    [[0.0, 1.0, 0.0, 500.0], [1.0, 0.0, 0.0, 20.0], [0.0, 0.0, -1.0, 300.0], [0, 0, 0, 1.0]]
+)
+"""As in cells whose arm hangs: z of the support is the base's -z."""
+LENS = Intrinsics(1500.0, 1500.0, 118.0, 92.0, k1=-0.4, k2=0.6)
+SIZE_PX = (240, 180)
+LED = 7
+LED_MM, LED_TARGET_MM = np.array([200.0, -150.0, 400.0]), np.zeros(3)
+"""Support frame."""
+FULL_SCALE = np.array([0.8, 0.5, 0.3])
+
+
+@dataclass(frozen=True)
+class Coat:
+    """GGX of all triangles."""
+
+    kd: tuple[float, float, float] = (0.2, 0.15, 0.1)
+    ks: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    alpha: float = 0.3
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def moved(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def sheet(heights_mm: np.ndarray, side_mm: float) -> np.ndarray:
+    """[triangles, 3, 3] of a grid [n, n] of heights, z up, about the origin."""
+    line = np.linspace(-side_mm / 2, side_mm / 2, len(heights_mm))
+    points = np.stack([*np.meshgrid(line, line), heights_mm], axis=-1)
+    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
+    return np.concatenate([np.stack([a, b, c], 2).reshape(-1, 3, 3), np.stack([a, c, d], 2).reshape(-1, 3, 3)])
+
+
+def waves(count: int = 60, side_mm: float = 60.0) -> np.ndarray:
+    line = np.linspace(-side_mm / 2, side_mm / 2, count)
+    x, y = np.meshgrid(line, line)
+    return sheet(2.0 * np.sin(x / 4.0) * np.cos(y / 5.0) + 4.0 * np.exp(-(x**2 + y**2) / 30.0), side_mm)
+
+
+def camera_pose(at_mm: np.ndarray, look_at_mm: np.ndarray) -> np.ndarray:
+    """[4, 4] support_from_camera, z forward, y down."""
+    forward = unit(look_at_mm - at_mm)
+    right = unit(np.cross(forward, [0.02, 1.0, 0.1]))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([right, np.cross(forward, right), forward], axis=1), at_mm
+    return pose
+
+
+def write_result(
+    folder: Path,
+    corners_mm: np.ndarray,
+    coat: Coat | None = None,
+    camera_mm: tuple[float, float, float] = (60.0, -120.0, 330.0),
+    channels: slice = slice(0, 3),
+) -> RunResult:
+    """A folder with one view, `top`, of triangles [n, 3, 3] in the support frame."""
+    coat = coat or Coat()
+    corners = moved(BASE_FROM_SUPPORT, corners_mm)
+    normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    for name in ("samples", "fits"):
+        (folder / name).mkdir(parents=True)
+    write_object(folder / OBJECT, corners, BASE_FROM_SUPPORT)
+    pose = BASE_FROM_SUPPORT @ camera_pose(np.array(camera_mm), np.zeros(3))
+    surface = seen_surface(PacketMesh(corners), normals, LENS, pose, SIZE_PX)
+    seen, mine = surface.places, surface.triangles
+    led_mm = moved(BASE_FROM_SUPPORT, LED_MM)
+    with h5py.File(folder / "samples/top.h5", "w") as file:
+        file.attrs["view"] = "top"
+        file["seen"], file["triangles"] = seen, mine
+        file["centres_mm"], file["normals"] = corners.mean(axis=1)[mine], normals[mine]
+        file["camera_mm"], file["leds"] = pose[:3, 3], np.array([LED])
+        file["led_positions_mm"] = led_mm[None]
+        file["led_normals"] = unit(moved(BASE_FROM_SUPPORT, LED_TARGET_MM) - led_mm)[None]
+        file["full_scales"] = FULL_SCALE[None, channels]
+        file["f"] = np.full((len(mine), 1, len(FULL_SCALE[channels])), np.nan, np.float32)
+    count = len(mine)
+    same = [np.tile(values[channels], (count, 1)) for values in (coat.kd, coat.ks)]
+    materials = TriangleMaterials(normals[mine], *same, np.full(count, coat.alpha), np.zeros(count))
+    certain = MaterialUncertainty(np.zeros((count, 5, 5)), *np.zeros((2, *materials.kd.shape)))
+    for name in ("ggx", "ggx_normal"):
+        write_materials(folder / f"fits/{name}.h5", [materials], [certain], np.zeros(count), 0.0, mine)
+    about = {"schema": SCHEMA, "mae": {"ggx": 0.1, "ggx_normal": 0.2}, "emission": "lambertian", "simulated": True}
+    (folder / "result.json").write_text(json.dumps(about))
+    return RunResult(folder)
+
+
+def write_exr(path: Path, radiance: np.ndarray) -> Path:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"RGB": np.ascontiguousarray(radiance, np.float32)}).write(str(path))
+    return path

@@ -1,7 +1,7 @@
 """Speed and memory of the simulated dome's renderer, against Open3D, Embree and Mitsuba.
 
-Scenes are reliefs that fill the frame, in the demo's dome. Peers that are not installed are left out:
-`pip install open3d mitsuba`.
+Scenes are reliefs that fill the frame, 10 mm above the support in the demo's dome. Peers that are not installed
+are left out: `pip install open3d mitsuba`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,16 @@ FULL, SMALL = (4096, 3072), (1024, 768)
 SENSOR_WIDTH_MM = 22.528
 WORKING_DISTANCE_MM = 334.0
 SIMULATED_CAMERA_PER_S = 25.0
+RAISED_MM = 10.0
 _LEDS_OF_A_ROUND = 12
+_PIXEL_LEDS_OF_A_ROUND = 4
 
 
 def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
     """All figures of the renderer."""
     yield from gbuffer_figures(rounds)
     yield from frame_figures(root, rounds)
+    yield from pixel_figures(root, rounds)
     yield memory_figure(root)
 
 
@@ -141,8 +144,9 @@ def ray_tracers(
 # -- frames -----------------------------------------------------------------------------------------------
 
 
-def photographer(root: Path, mesh: Path, size: tuple[int, int]) -> Any:
-    """The demo's dome around one mesh, and the flange pose that looks straight down at it."""
+def photographer(root: Path, mesh: Path, size: tuple[int, int], **settings: Any) -> Any:
+    """The demo's dome around one mesh, and the flange pose that looks straight down at it; `settings` are those of
+    the world, `flat` if they do not say."""
     from coupole.preflight.job import read_job
     from coupole.preflight.simulated_world import world_config
     from sim.optics.photographer import Photographer
@@ -150,7 +154,10 @@ def photographer(root: Path, mesh: Path, size: tuple[int, int]) -> Any:
 
     job = read_job(root / "configs/plans/demo.yaml")
     told = world_config(job.cell, job, job.cell.rig.sensor)
-    told["scene"]["objects"] = [{"path": mesh, "unit": "mm", "support_from_object": np.eye(4).tolist()}]
+    raised = np.eye(4)
+    raised[2, 3] = RAISED_MM
+    told["scene"]["objects"] = [{"path": mesh, "unit": "mm", "support_from_object": raised.tolist()}]
+    told["settings"] |= {"shading": "flat", **settings}
     told["camera"] |= {
         "width_px": size[0],
         "height_px": size[1],
@@ -159,7 +166,7 @@ def photographer(root: Path, mesh: Path, size: tuple[int, int]) -> Any:
         "flange_from_camera": np.eye(4).tolist(),
     }
     config = Config.model_validate(told)
-    pose = np.array(config.scene.base_from_support) @ camera_pose()
+    pose = np.array(config.scene.base_from_support) @ raised @ camera_pose()
     return Photographer(config.scene, config.photographed, config.settings), pose
 
 
@@ -209,6 +216,64 @@ def frame_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
                 "ratio": value / SIMULATED_CAMERA_PER_S if peer_s is None else value * peer_s,
                 "peer_value": round(SIMULATED_CAMERA_PER_S if peer_s is None else 1.0 / peer_s, 4),
             }
+
+
+def pixel_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+    """Frames per second at full size with light and shadow on each pixel, each under another LED: the light alone,
+    with blur, and with interreflection too, against Mitsuba's and against one radiance for each triangle. Then the
+    time of blur alone, against a second."""
+    from sim.optics.blur import through
+    from sim.optics.sensor import electrons
+
+    ways = {
+        "flat": {"shading": "flat"},
+        "pixel_direct": {
+            "shading": "pixel",
+            "interreflection": False,
+            "camera": {"kind": "memory", "blur": False},
+        },
+        "pixel_direct_blurred": {"shading": "pixel", "interreflection": False},
+        "pixel": {"shading": "pixel"},
+    }
+    out = np.zeros((FULL[1], FULL[0]), np.uint16)
+    with tempfile.TemporaryDirectory() as folder:
+        mesh = Path(folder) / "mesh.ply"
+        write_relief(mesh, 1_400_000)
+        made = {name: photographer(root, mesh, FULL, **settings) for name, settings in ways.items()}
+        peer = mitsuba_frame(mesh, made["flat"][0])
+    times: dict[str, list[float]] = {name: [] for name in (*made, "mitsuba")}
+    for turn in range(1 + rounds):
+        leds = range(1 + turn * _PIXEL_LEDS_OF_A_ROUND, 1 + (turn + 1) * _PIXEL_LEDS_OF_A_ROUND)
+        for name, (by, pose) in made.items():
+            if turn == 0:
+                render_leds(by, pose, out, range(1))  # rasterises, and prepares what a pose needs
+            start_s = time.perf_counter()
+            render_leds(by, pose, out, leds)
+            times[name].append((time.perf_counter() - start_s) / len(leds))
+        if peer is not None:
+            start_s = time.perf_counter()
+            peer(turn)
+            times["mitsuba"].append(time.perf_counter() - start_s)
+    frame_s = {name: statistics.median(each[1:]) for name, each in times.items() if each}
+    for name in list(ways)[1:]:
+        for rival in ("mitsuba", "flat"):
+            if rival in frame_s:
+                yield {
+                    "name": f"frames_{FULL[0]}x{FULL[1]}_1.4_M_triangles_{name}",
+                    "value": 1.0 / frame_s[name],
+                    "unit": "1/s",
+                    "peer": "mitsuba_scalar_rgb_1_sample" if rival == "mitsuba" else rival,
+                    "ratio": frame_s[rival] / frame_s[name],
+                    "peer_value": round(1.0 / frame_s[rival], 4),
+                }
+    by, pose = made["pixel_direct"]
+    look = by._look_from(pose)
+    image = electrons(look.view.site, by._led(look, 500), by._falloff, electrons_per_radiance=1.0)
+    disk_px, channels = by._disk_px(look), by.sensor.channels()
+    blur_s = times_s(
+        {"ours": lambda: through(by._objective, image, disk_px, channels, pixel_pitch_um=5.5)}, max(rounds, 3)
+    )["ours"]
+    yield {"name": "blur_4096x3072", "value": blur_s, "unit": "s", "peer": "limit_1_s", "ratio": 1.0 / blur_s}
 
 
 def mitsuba_frame(mesh: Path, by: Any) -> Callable[[int], None] | None:

@@ -141,7 +141,7 @@ def make(piece: Piece) -> Path:
         rig = YAML(typ="safe").load(ROOT / "configs/rigs/sim.yaml")
         rig["sensor"] = _SENSOR
         rig["dome"]["leds"] = str(ROOT / "configs/domes/coupole.csv")
-        rig["world"] = {"serves": "always", "settings": {"seed": 1, "things": [piece.thing]}}
+        rig["world"] = {"serves": "always", "settings": {"seed": 1, "shading": "flat", "things": [piece.thing]}}
         view = {
             "kind": "look_at",
             "name": kind.replace("_", "-"),

@@ -24,6 +24,8 @@ from sim.optics.sensor_model import SensorModel
 
 _RESPONSE, _DARK, _PIXELS, _ROWS = range(4)
 """Kinds of noise derived from one seed."""
+_BLOCK = 4
+"""Side of the blocks of pixels in which sites are numbered (`sim.render.pixel_sites`)."""
 
 
 @dataclass(frozen=True)
@@ -195,18 +197,20 @@ def _collect_all(mean_e, site, radiance, falloff, electrons):  # type: ignore[no
     height, width, _ = mean_e.shape
     k = len(site) // height
     share = np.float32(electrons / (k * k))
-    for row in numba.prange(height):
-        for col in range(width):
-            red, green, blue = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-            for y in range(row * k, row * k + k):
-                for x in range(col * k, col * k + k):
-                    place = site[y, x]
-                    if place >= 0:
-                        red, green = red + radiance[place, 0], green + radiance[place, 1]
-                        blue += radiance[place, 2]
-            scale = falloff[row, col] * share
-            mean_e[row, col, 0], mean_e[row, col, 1] = red * scale, green * scale
-            mean_e[row, col, 2] = blue * scale
+    # In blocks, as sites are numbered, so that each is read while it is near.
+    for band in numba.prange(-(-height // _BLOCK)):
+        for block in range(0, width, _BLOCK):
+            for row in range(band * _BLOCK, min(height, (band + 1) * _BLOCK)):
+                for col in range(block, min(width, block + _BLOCK)):
+                    red, green, blue = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+                    for part in range(k * k):
+                        place = site[row * k + part // k, col * k + part % k]
+                        if place >= 0:
+                            red, green = red + radiance[place, 0], green + radiance[place, 1]
+                            blue += radiance[place, 2]
+                    scale = falloff[row, col] * share
+                    mean_e[row, col, 0], mean_e[row, col, 1] = red * scale, green * scale
+                    mean_e[row, col, 2] = blue * scale
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)

@@ -1,7 +1,7 @@
-"""Shadows of moving bodies: capsules between the lights and the visible triangles.
+"""Shadows of moving bodies: capsules between the lights and the sites of a view.
 
-Tested exactly, one segment from each triangle's centroid to the light's centre: for a few bodies this is faster
-than building a new tree for each pose.
+Tested exactly, one segment from each site to the light's centre: for a few bodies this is faster than building a new
+tree for each pose.
 """
 
 from __future__ import annotations
@@ -10,21 +10,23 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+_CHUNK = 256
+"""Sites that are tested together for what may hide the light from any of them."""
+
 
 def cast(
     radiance: NDArray[np.float32],
-    centroids_mm: NDArray[np.float32],
+    points_mm: NDArray[np.float32],
     capsules_mm: NDArray[np.float64],
     light_mm: NDArray[np.float64],
 ) -> None:
-    """Set `radiance` [n, 3] to 0 where a capsule of [m, 7] (two ends, radius) hides the light from a centroid."""
-    if len(centroids_mm) == 0 or len(capsules_mm) == 0:
-        return
-    low, high = centroids_mm.min(axis=0).astype(np.float64), centroids_mm.max(axis=0).astype(np.float64)
-    middle, reach = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-    near = [c for c in capsules_mm if distance_mm(middle, light_mm, c[:3], c[3:6]) < c[6] + reach]
-    if near:
-        _cast(radiance, centroids_mm, np.array(near), light_mm)
+    """Set `radiance` [n, 3] to 0 where a capsule of [m, 7] (two ends, radius) hides the light from a point [n, 3].
+
+    Neighbours in the list should be neighbours in space: each few hundred are tested against the capsules near
+    them.
+    """
+    if len(points_mm) > 0 and len(capsules_mm) > 0:
+        _cast(radiance, points_mm, capsules_mm, light_mm)
 
 
 def warm_up() -> None:
@@ -61,15 +63,34 @@ def distance_mm(a, b, c, d):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _cast(radiance, centroids, capsules, light):  # type: ignore[no-untyped-def]
-    chunk = 4096
-    for part in numba.prange(-(-len(centroids) // chunk)):
+def _cast(radiance, points, capsules, light):  # type: ignore[no-untyped-def]
+    for part in numba.prange(-(-len(points) // _CHUNK)):
+        first, last = part * _CHUNK, min(len(points), (part + 1) * _CHUNK)
+        near = _near(points[first:last], capsules, light)
         at = np.empty(3)
-        for i in range(part * chunk, min(len(centroids), (part + 1) * chunk)):
+        for i in range(first, last if len(near) else first):
             if radiance[i, 0] == 0.0 and radiance[i, 1] == 0.0 and radiance[i, 2] == 0.0:
                 continue
-            at[0], at[1], at[2] = centroids[i, 0], centroids[i, 1], centroids[i, 2]
-            for k in range(len(capsules)):
+            at[0], at[1], at[2] = points[i, 0], points[i, 1], points[i, 2]
+            for k in near:
                 if distance_mm(at, light, capsules[k, :3], capsules[k, 3:6]) < capsules[k, 6]:
                     radiance[i, :] = 0.0
                     break
+
+
+@numba.njit(cache=True, nogil=True)
+def _near(points, capsules, light):  # type: ignore[no-untyped-def]
+    """Numbers of the capsules that may hide the light from any of a few points, by a ball around these."""
+    middle, reach = np.empty(3), 0.0
+    for k in range(3):
+        low, high = np.float64(points[:, k].min()), np.float64(points[:, k].max())
+        middle[k] = 0.5 * (low + high)
+        reach += 0.25 * (high - low) ** 2
+    reach = np.sqrt(reach)
+    kept = np.empty(len(capsules), np.int64)
+    count = 0
+    for k in range(len(capsules)):
+        if distance_mm(middle, light, capsules[k, :3], capsules[k, 3:6]) < capsules[k, 6] + reach:
+            kept[count] = k
+            count += 1
+    return kept[:count]

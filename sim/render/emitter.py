@@ -123,11 +123,9 @@ def per_lumen(px, py, pz, nx, ny, nz, led, shares, work):  # type: ignore[no-unt
     half2 = led[6] * led[6] + led[7] * led[7] + led[8] * led[8]
     distance2 = tx * tx + ty * ty + tz * tz
     height = tx * nx + ty * ny + tz * nz
-    # Twice the height of the highest corner above the centre: half of it is enough to be above the horizon.
-    reach = 2.0 * abs(led[6] * nx + led[7] * ny + led[8] * nz) + 2.0 * abs(
-        led[9] * nx + led[10] * ny + led[11] * nz
-    )
-    if distance2 < 4.0 * half2 * FAR_SIDES * FAR_SIDES or height < reach:
+    # From the centre to the highest corner; near the horizon the points need some room.
+    reach = abs(led[6] * nx + led[7] * ny + led[8] * nz) + abs(led[9] * nx + led[10] * ny + led[11] * nz)
+    if distance2 < 4.0 * half2 * FAR_SIDES * FAR_SIDES or height < 2.0 * reach:
         exact = _polygon(tx, ty, tz, nx, ny, nz, led, work) / (8.0 * np.pi * half2) * 1e6
         if total > 0.0:
             for k in range(4):

@@ -22,7 +22,7 @@ from sim.render.embree import OFFSET_MM, Obstacles, centroid_and_normal
 from sim.render.emitter import Emitter, irradiance
 from sim.scene.scene import Scene
 
-POINTS = 4
+POINTS = 2
 """Points on each side of a patch where its light is computed."""
 PATCHES_OF_A_MATERIAL = 1000
 """Their size follows from the area of all triangles of a material divided by this number."""

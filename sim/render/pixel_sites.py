@@ -2,6 +2,9 @@
 
 A pixel's k x k rays that meet one triangle share a site, the mean of their points on it: light on a triangle
 varies little within a pixel, while its edges are resolved by all rays.
+
+Sites are numbered block by block of 4 x 4 pixels, in rows of blocks: shadow rays of 16 neighbours in both
+directions take nearly the same way through the tree (a quarter faster than along rows).
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from coupole.geometry import Transform
 from sim.render.lens import Sight, rook_shifts_px
 
 _LEAST_SLOPE = 1e-6
+_BLOCK = 4
 
 
 def pixel_sites(
@@ -25,12 +29,12 @@ def pixel_sites(
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Points [sites, 3] in the base frame, mm, and the row of each one's triangle [sites].
 
-    `triangle` [h k, w k], the row seen by each ray or -1, is replaced by the rows of the sites, which are counted
-    along the rows of the image. `centroids_mm` and `normals` [seen, 3] give the triangles' planes.
+    `triangle` [h k, w k], the row seen by each ray or -1, is replaced by the rows of the sites. `centroids_mm` and
+    `normals` [seen, 3] give the triangles' planes.
     """
     lens = sight.lens
     k = lens.samples
-    first = np.zeros(lens.height_px // k + 1, np.int64)
+    first = np.zeros(-(-lens.height_px // (_BLOCK * k)) + 1, np.int64)
     _count(triangle, k, first)
     first = np.cumsum(first)
     points, of_triangle = np.empty((int(first[-1]), 3), np.float32), np.empty(int(first[-1]), np.int32)
@@ -65,11 +69,12 @@ def _is_first(triangle, k, row, col):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _count(triangle, k, counts):  # type: ignore[no-untyped-def]
-    """Number of sites of each row of pixels, in the place after it."""
+    """Number of sites of each row of blocks, in the place after it."""
+    height, width = triangle.shape
     for line in numba.prange(len(counts) - 1):
         count = 0
-        for row in range(line * k, line * k + k):
-            for col in range(triangle.shape[1]):
+        for row in range(line * _BLOCK * k, min(height, (line + 1) * _BLOCK * k)):
+            for col in range(width):
                 if triangle[row, col] >= 0 and (k == 1 or _is_first(triangle, k, row, col)):
                     count += 1
         counts[line + 1] = count
@@ -79,31 +84,39 @@ def _count(triangle, k, counts):  # type: ignore[no-untyped-def]
 def _fill(  # type: ignore[no-untyped-def]
     triangle, k, first, centroids, normals, pose, centre, rooks, shift, points, of_triangle
 ):
+    height, width = triangle.shape
     for line in numba.prange(len(first) - 1):
-        site = first[line]
-        rays, met = np.empty((k * k, 3)), np.empty(k * k, np.int64)
-        for left in range(0, triangle.shape[1], k):
-            for part in range(k * k):
-                row, col = line * k + part // k, left + part % k
-                met[part] = triangle[row, col]
-                x, y = (col - centre[0]) * centre[2], (row - centre[1]) * centre[2]
-                if shift is not None:
-                    x, y = x + shift[0, row, col], y + shift[1, row, col]
-                else:
-                    x, y = x + rooks[row], y - rooks[col]
-                for i in range(3):
-                    rays[part, i] = pose[i, 0] * x + pose[i, 1] * y + pose[i, 2]
-            for part in range(k * k):
-                if met[part] < 0:
-                    continue
-                seen = met[part]
-                _mean_point(rays, met, seen, centroids, normals, pose, points[site])
-                of_triangle[site] = seen
-                for other in range(part, k * k):
-                    if met[other] == seen:
-                        triangle[line * k + other // k, left + other % k] = site
-                        met[other] = -1
-                site += 1
+        site, rays, met = first[line], np.empty((k * k, 3)), np.empty(k * k, np.int64)
+        for block in range(0, width, _BLOCK * k):
+            for top in range(line * _BLOCK * k, min(height, (line + 1) * _BLOCK * k), k):
+                for left in range(block, min(width, block + _BLOCK * k), k):
+                    _look_through(triangle, k, top, left, pose, centre, rooks, shift, rays, met)
+                    for part in range(k * k):
+                        if met[part] >= 0:
+                            seen = met[part]
+                            _mean_point(rays, met, seen, centroids, normals, pose, points[site])
+                            of_triangle[site] = seen
+                            for other in range(part, k * k):
+                                if met[other] == seen:
+                                    triangle[top + other // k, left + other % k] = site
+                                    met[other] = -1
+                            site += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _look_through(triangle, k, top, left, pose, centre, rooks, shift, rays, met):  # type: ignore[no-untyped-def]
+    """Fill `rays` [k k, 3] with a pixel's rays in the base frame, of length 1 along the axis, and `met` [k k] with
+    the triangles that they meet."""
+    for part in range(k * k):
+        row, col = top + part // k, left + part % k
+        met[part] = triangle[row, col]
+        x, y = (col - centre[0]) * centre[2], (row - centre[1]) * centre[2]
+        if shift is not None:
+            x, y = x + shift[0, row, col], y + shift[1, row, col]
+        else:
+            x, y = x + rooks[row], y - rooks[col]
+        for i in range(3):
+            rays[part, i] = pose[i, 0] * x + pose[i, 1] * y + pose[i, 2]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -109,6 +109,17 @@ def test_pixels_of_different_depths_are_blurred_each_by_its_own() -> None:
         assert spread_px(image[:, 61 * k : 61 * (k + 1)]) == pytest.approx((expected, expected), rel=0.03)
 
 
+def test_defocus_and_diffraction_are_added_in_variance_at_every_depth() -> None:
+    disk_px = np.full((61, 183), 0.4, np.float32)
+    disk_px[:, 61:122], disk_px[:, 122:] = 0.9, 1.6
+    lens = Objective(f_number=22.0)
+    image = np.repeat(np.tile(point(), (1, 3))[..., None], 3, axis=2)
+    soft = blur.through(lens, image, disk_px, GREEN, pixel_pitch_um=PITCH_UM)
+    for k, disk in enumerate((0.4, 0.9, 1.6)):
+        expected = np.hypot(disk, diffraction_px(lens, 0.54, PITCH_UM))
+        assert spread_px(soft[:, 61 * k : 61 * (k + 1)]) == pytest.approx((expected, expected), rel=0.03)
+
+
 def test_an_even_image_stays_as_it_is_whatever_the_depths() -> None:
     depth_mm = np.random.default_rng(1).uniform(250.0, 450.0, (40, 50)).astype(np.float32)
     depth_mm[:5] = np.inf

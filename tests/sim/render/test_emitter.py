@@ -38,10 +38,11 @@ def test_view_factor_at_7_mm_is_that_of_the_closed_form() -> None:
     assert irradiance(DOWN, [0, 0, -7.0], UP)[0] * area_m2 == pytest.approx(0.2394564705, rel=1e-9)
 
 
-def test_an_emitter_sunk_to_half_below_the_horizon_gives_what_its_upper_half_gives() -> None:
+@pytest.mark.parametrize("distance_mm", [20.0, 1000.0])
+def test_an_emitter_sunk_to_half_below_the_horizon_gives_what_its_upper_half_gives(distance_mm: float) -> None:
     whole = square((0, 0, 0), (1, 0, 0), side_mm=7.0, flux_lm=1.0)
     upper = Emitter(np.array([0, 0, 1.75]), whole.normal, whole.half_u_mm, whole.half_v_mm / 2, 0.5)
-    point_mm = np.array([20.0, 0.0, 0.0])
+    point_mm = np.array([distance_mm, 0.0, 0.0])
     expected = by_quadrature(upper, point_mm, np.array(UP), 12)
     assert irradiance(whole, point_mm, UP)[0] == pytest.approx(expected, rel=1e-9)
 

@@ -91,6 +91,13 @@ def test_an_open_plane_has_no_light_but_the_direct_one() -> None:
     assert not radiance.any()
 
 
+def test_light_on_a_sheet_does_not_reach_what_is_behind_it() -> None:
+    floor, sheet = rectangle(50.0, 50.0, 4, 4), rectangle(500.0, 500.0, 20, 20, z_mm=50.0)
+    scene = scene_of(np.concatenate([floor, sheet]), Material("white", (0.9, 0.9, 0.9)))
+    emitter = square([0.0, 0.0, 900.0], [0.0, 0.0, -1.0], side_mm=7.0, flux_lm=1800.0)
+    assert not reflected(scene, np.arange(len(floor)), emitter, bounces=4, rays=128).any()
+
+
 def test_a_dark_floor_is_lit_by_its_wall_from_strip_to_strip_as_by_a_lambertian_strip() -> None:
     """A wall in x = 0 that a far light meets squarely, and small floor triangles at several distances from it."""
     wall = 100.0 * np.array([[[0, -5, 0], [0, 5, 0], [0, 5, 1]], [[0, -5, 0], [0, 5, 1], [0, -5, 1]]], float)

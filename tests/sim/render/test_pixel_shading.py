@@ -55,6 +55,19 @@ def test_sites_are_where_the_pixels_rays_meet_the_surface(samples: int, distorti
     assert np.abs(found - expected)[one_triangle].max() < (0.02 if samples > 1 else 1e-3)
 
 
+@pytest.mark.parametrize("distortion", [(0.0,) * 5, BENT])
+def test_a_site_of_several_rays_lies_within_its_triangle(distortion: tuple[float, ...]) -> None:
+    corners = relief(150.0, 12, 6.0)
+    view = Viewer(scene_of(corners), Lens(80, 60, 125.0, distortion), 3, "pixel").look(ABOVE)  # type: ignore[arg-type]
+    assert len(view.points_mm) > 1.1 * (view.site[::3, ::3] >= 0).sum()  # pixels on edges have several
+    a, b, c = corners[(view.sides >> 1)[view.triangle]].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    area = np.einsum("ij,ij->i", normal, normal)
+    for one, other in ((a, b), (b, c), (c, a)):
+        share = np.einsum("ij,ij->i", np.cross(other - one, view.points_mm - one), normal) / area
+        assert share.min() > -1e-3
+
+
 def test_light_falls_off_smoothly_over_one_large_triangle() -> None:
     """A matt plane of two triangles: each pixel has E rho / pi of its own place, as of a far Lambertian point."""
     scene = scene_of(quad((0.0, 0.0, 0.0), 300.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 
 import cv2
@@ -43,11 +44,16 @@ def random_corners(count: int) -> list[tuple[Floats, float, float]]:
     ]
 
 
+@cache
+def six_corners(blur_px: float) -> list[tuple[Floats, Floats]]:
+    """Places and pictures."""
+    return [(corner, drawn(corner, *angles, blur_px=blur_px)) for corner, *angles in random_corners(6)]
+
+
 @pytest.mark.parametrize("known", [ALL, GREEN, ~GREEN], ids=["grey", "green", "greens-turned"])
 @pytest.mark.parametrize("blur_px", [0.0, 0.6, 1.5])
 def test_a_corner_is_found_to_a_few_thousandths_of_a_pixel(known: NDArray[np.bool_], blur_px: float) -> None:
-    for corner, first_deg, between_deg in random_corners(6):
-        image = drawn(corner, first_deg, between_deg, blur_px=blur_px)
+    for corner, image in six_corners(blur_px):
         hidden = np.where(np.tile(known, (SIZE_PX, SIZE_PX))[:SIZE_PX, :SIZE_PX], image, 9.0)
         found = fit_corners(hidden, known, np.array([[20.0, 20.0]]), RADIUS_PX)
         assert found.fits.all()

@@ -25,7 +25,9 @@ def tools(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         sys.modules.pop(name, None)
 
 
-@pytest.mark.parametrize(("arm", "plans"), [("kr10", 10), ("ur5e", 20), ("ur10e", 10)])
+@pytest.mark.parametrize(
+    ("arm", "plans"), [("kr10", 10), pytest.param("ur5e", 20, marks=pytest.mark.full), ("ur10e", 10)]
+)
 def test_random_plans_that_pass_touch_nothing(arm: str, plans: int, scale: Callable[[int, int], int]) -> None:
     """Of fewer plans than these, too few pass to say anything."""
     import replay_plans

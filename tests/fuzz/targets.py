@@ -2,7 +2,8 @@
 
 To add a kind, add a line to `TARGETS`. `seeds` gives real files as bytes; `read` gets the path of a mutated one
 (named as `file` says, in a folder that holds a copy of `configs/`) and returns, or raises an error of
-`coupole.errors` whose message names the file. What a run keeps is in `fuzz.kept`, lights are in `fuzz.lit`, wires are in `fuzz.wires`.
+`coupole.errors` whose message names the file. What a run keeps is in `fuzz.kept`, lights are in `fuzz.lit`, wires
+in `fuzz.wires`.
 """
 
 from __future__ import annotations

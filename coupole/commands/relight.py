@@ -128,6 +128,7 @@ def relight(
         wanted = _lights(direction or [], led or [], light_at or [], area or [], environment or [], lights)
         camera = _camera(from_, look_at, size, field_of_view)
         with step_bars(console) as bars:
+            bars("read", 0, 1)
             relit = _open(result, view, fit, camera, samples)
             said = _write(relit, wanted, to, turn, white, bars)
     except CoupoleError as error:

@@ -22,20 +22,26 @@ def refuse_unknown(path: Path) -> None:
 
 
 def write_picture(path: Path, picture: NDArray[np.float32]) -> None:
-    """Write [h, w, 3] red, green, blue. PNG has 16 bit, linear, and holds 0 to 1 alone; the others hold all of it.
+    """Write [h, w, 3] red, green, blue, whole or not at all. PNG has 16 bit, linear, and holds 0 to 1 alone; the
+    others hold all of it.
 
     Raises InputError for another kind of file, StorageError if it cannot be written.
     """
     refuse_unknown(path)
+    part = path.with_name(f".{path.name}.part")
     try:
         match path.suffix.lower():
             case ".npy":
-                np.save(path, picture)
+                with part.open("wb") as file:
+                    np.save(file, picture)
             case ".exr":
                 header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-                OpenEXR.File(header, {"RGB": np.ascontiguousarray(picture)}).write(str(path))
+                OpenEXR.File(header, {"RGB": np.ascontiguousarray(picture)}).write(str(part))
             case _:
                 scaled = np.rint(np.clip(picture, 0.0, 1.0) * _PNG_WHITE).astype(np.uint16)
-                path.write_bytes(cv2.imencode(".png", scaled[..., ::-1])[1].tobytes())
+                part.write_bytes(cv2.imencode(".png", scaled[..., ::-1])[1].tobytes())
+        part.replace(path)
     except (OSError, RuntimeError) as error:
         raise StorageError(f"{path}: {error}") from error
+    finally:
+        part.unlink(missing_ok=True)

@@ -2,7 +2,8 @@
 
 To add a kind, add a line to `TARGETS`. `seeds` gives real files as bytes; `read` gets the path of a mutated one
 (named as `file` says, in a folder that holds a copy of `configs/`) and returns, or raises an error of
-`coupole.errors` whose message names the file. What a run keeps is in `fuzz.kept`, wires are in `fuzz.wires`.
+`coupole.errors` whose message names the file. What a run keeps is in `fuzz.kept`, lights are in `fuzz.lit`, wires
+in `fuzz.wires`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fuzz.kept import KEPT
+from fuzz.lit import LIT
 from fuzz.target import Target
 from fuzz.wires import WIRES
 from places import REPO
@@ -122,6 +124,7 @@ TARGETS = (
     Target("mesh-stl", "objects/case.stl", mesh("stl"), check_mesh),
     Target("mesh-stl-ascii", "objects/case.stl", mesh("stl", encoding="ascii"), check_mesh),
     Target("mesh-obj", "objects/case.obj", mesh("obj"), check_mesh),
+    *LIT,
     *KEPT,
     *WIRES,
 )

@@ -22,8 +22,8 @@ BASE_FROM_SUPPORT = np.array(
     [[0.0, 1.0, 0.0, 500.0], [1.0, 0.0, 0.0, 20.0], [0.0, 0.0, -1.0, 300.0], [0, 0, 0, 1.0]]
 )
 """As in cells whose arm hangs: z of the support is the base's -z."""
-LENS = Intrinsics(1500.0, 1500.0, 118.0, 92.0, k1=-0.4, k2=0.6)
-SIZE_PX = (240, 180)
+LENS = Intrinsics(1000.0, 1000.0, 78.0, 61.0, k1=-4.0, k2=20.0)
+SIZE_PX = (160, 120)
 LED = 7
 LED_MM, LED_TARGET_MM = np.array([200.0, -150.0, 400.0]), np.zeros(3)
 """Support frame."""

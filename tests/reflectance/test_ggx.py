@@ -48,19 +48,19 @@ def test_pictures_are_made_with_the_same_lobe() -> None:
 
 @pytest.mark.parametrize("alpha", [0.3, 0.8])
 def test_rays_from_a_lobe_go_where_their_density_says(alpha: float) -> None:
-    """Sums of directions of 40,000 rays, and the integral of the density over a fine grid of all directions."""
+    """Sums of directions of 15,000 rays, and the integral of the density over a fine grid of all directions."""
     normal, view = unit(25, 80), unit(75, 120)
     nv = float(normal @ view)
-    ways = np.empty((40_000, 3))
+    ways = np.empty((15_000, 3))
     numbers = np.random.default_rng(7).uniform(size=(len(ways), 2))
     for way, (first, second) in zip(ways, numbers, strict=True):
         cosine = reflected(normal, *view, nv, alpha, first, second, way)
         half = (way + view) / np.linalg.norm(way + view)
         assert cosine == pytest.approx(half @ normal, abs=1e-6)
-    theta, phi = np.meshgrid((np.arange(300) + 0.5) / 300 * np.pi, np.arange(600) / 600 * 2 * np.pi)
+    theta, phi = np.meshgrid((np.arange(150) + 0.5) / 150 * np.pi, np.arange(300) / 300 * 2 * np.pi)
     grid = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
     nh = (grid + view) @ normal / np.linalg.norm(grid + view, axis=-1)
     density = np.array([drawn(nv, one, alpha) if one > 0 else 0.0 for one in nh.ravel()]).reshape(nh.shape)
-    density *= np.sin(theta) * (np.pi / 300) * (2 * np.pi / 600)
+    density *= np.sin(theta) * (np.pi / 150) * (2 * np.pi / 300)
     assert density.sum() == pytest.approx(1.0, abs=0.002)
-    np.testing.assert_allclose(ways.mean(axis=0), np.einsum("tp,tpk->k", density, grid), atol=0.012)
+    np.testing.assert_allclose(ways.mean(axis=0), np.einsum("tp,tpk->k", density, grid), atol=0.02)

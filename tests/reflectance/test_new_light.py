@@ -56,7 +56,7 @@ def shown(scene: RelitScene, *lights: AnyLight, samples: int = 256) -> np.ndarra
 
 
 def test_pixels_of_a_view_see_the_place_that_its_lens_shows_there(relief: RelitScene) -> None:
-    """The result does not keep the lens, whose distortion here is 3 px at the corners."""
+    """The result does not keep the lens, whose distortion here is up to 4 px."""
     seen = relief.surface.seen >= 0
     pose = cases.camera_pose(np.array((60.0, -120.0, 330.0)), np.zeros(3))
     local = (places(relief) - pose[:3, 3]) @ pose[:3, :3]
@@ -207,7 +207,7 @@ def test_thin_shadows_are_followed_along_their_edges(tmp_path: Path) -> None:
         across, along = np.array([np.cos(turn), np.sin(turn), 0]), np.array([-np.sin(turn), np.cos(turn), 0])
         wire = sheet(np.zeros((2, 2)), 1.0)
         middle = np.array([8.0 * number + 60.0, 0.0, 60.0])
-        corners.append(wire[..., :1] * 0.35 * across + wire[..., 1:2] * 60.0 * along + middle)
+        corners.append(wire[..., :1] * 0.6 * across + wire[..., 1:2] * 60.0 * along + middle)
     scene = scene_of_view(write_result(tmp_path / "result", np.concatenate(corners), WHITE))
     codes, lit = reached_and_traced(scene, unit(np.array([80.0, 0.0, 60.0])))
     assert 0.01 < np.mean(~lit) < 0.1

@@ -442,7 +442,7 @@ def test_slices_show_an_environment_as_materials_do(made: Made) -> None:
     OpenEXR.File({}, {"RGB": np.ones((8, 16, 3), np.float32)}).write(str(out / "white.exr"))
     pictures = []
     for fit in ("ggx_normal", "ggx_rbf"):
-        options = ("--environment", out / "white.exr", "--fit", fit, "--samples", 48, "--to", out / "white.npy")
+        options = ("--environment", out / "white.exr", "--fit", fit, "--samples", 24, "--to", out / "white.npy")
         ended = cells.here("reflectance", "relight", out, *map(str, options))
         assert ended.code == 0, ended.err
         pictures.append(np.load(out / "white.npy"))

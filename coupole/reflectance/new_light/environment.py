@@ -105,7 +105,10 @@ def _read(path: Path) -> NDArray[np.float32]:
     if path.suffix.lower() not in {".exr", ".hdr"}:
         raise InputError(f"{path}: expected an environment in a file .exr or .hdr")
     if path.suffix.lower() == ".hdr":
-        found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        try:
+            found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        except cv2.error:  # more pixels than OpenCV takes
+            found = None
         if found is None:
             raise InputError(f"{path}: expected a Radiance file that can be read")
         return np.ascontiguousarray(found[..., ::-1], np.float32)

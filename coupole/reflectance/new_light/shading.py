@@ -181,8 +181,8 @@ def _mirror(  # type: ignore[no-untyped-def]
     pixels, first_row, seen, places_mm, camera_mm, faces, coats, near, axes, centre_mm,
     halves_mm, radiance, density, ray, lobe_rays, met, gains, ways_mm
 ):  # fmt: skip
-    """Of the ray of this number from each of the pixels [n, 2], how many point at a bright part of an emitter:
-    into `met` which, into `gains` what they bring if nothing hides it, into `ways_mm` how they get there."""
+    """How many of the rays of this number from pixels [n, 2] point at a bright part of an emitter: into `met`
+    which, into `gains` what they bring if nothing is in their way, into `ways_mm` how they get there."""
     way, channels, count = np.empty(3), gains.shape[1], 0
     for pixel in range(len(pixels)):
         row, column = pixels[pixel]

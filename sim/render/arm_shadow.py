@@ -1,7 +1,7 @@
 """Shadows of moving bodies: capsules between the lights and the sites of a view.
 
-Tested exactly, one segment from each site to the light's centre: for a few bodies this is faster than building a new
-tree for each pose.
+Tested exactly, one segment from each site to the light's centre: for a few bodies this is faster than building a
+new tree for each pose.
 """
 
 from __future__ import annotations

@@ -7,13 +7,12 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 Rgb = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class Layer:
+class Layer(BaseModel):
     """Detail of a surface that is finer than its triangles: a field of waves through space, cut by the surface.
 
     They are `WAVES` plane waves of one period, in evenly distributed directions with random phases. Their mean
@@ -21,7 +20,7 @@ class Layer:
     or, with a long period, normals that deviate from the mesh. Heights cast no shadows.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid")
     WAVES: ClassVar[int] = 8
 
     period_mm: Annotated[float, Field(gt=0)]
@@ -42,7 +41,7 @@ class Layer:
         angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(self.WAVES)
         ring = np.sqrt(1.0 - height * height)
         ways = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
-        ways = Rotation.random(random_state=random).apply(ways)
+        ways = Rotation.from_quat(random.standard_normal(4)).apply(ways)
         per_mm = 2.0 * np.pi / self.period_mm
         # The slope's square is half of the amplitudes' squares times per_mm^2, two thirds of it along the surface.
         height_mm = np.tan(np.radians(self.slope_deg)) / per_mm / np.sqrt(self.WAVES / 3.0)

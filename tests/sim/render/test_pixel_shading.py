@@ -174,7 +174,7 @@ def detailed(*detail: Layer, turned: bool = False) -> tuple[Scene, View]:
 
 
 def test_a_texture_has_the_mean_reflectance_of_its_material_and_the_spread_that_was_asked_for() -> None:
-    scene, view = detailed(Layer(5.0, texture=0.4))
+    scene, view = detailed(Layer(period_mm=5.0, texture=0.4))
     assert view.fine is not None
     assert view.fine.texture.mean() == pytest.approx(1.0, abs=0.005)
     assert view.fine.texture.std() == pytest.approx(0.25 * 0.4, rel=0.05)
@@ -186,7 +186,7 @@ def test_a_texture_has_the_mean_reflectance_of_its_material_and_the_spread_that_
 
 
 def test_detail_of_a_period_repeats_no_faster_than_that() -> None:
-    _, view = detailed(Layer(12.0, texture=0.3))
+    _, view = detailed(Layer(period_mm=12.0, texture=0.3))
     assert view.fine is not None
     spectrum = np.abs(np.fft.rfft2(view.fine.texture[view.site] - 1.0)) ** 2
     per_mm = np.hypot(np.fft.fftfreq(120, 330.0 / 250.0)[:, None], np.fft.rfftfreq(160, 330.0 / 250.0))
@@ -195,7 +195,7 @@ def test_detail_of_a_period_repeats_no_faster_than_that() -> None:
 
 
 def test_bumps_have_the_slope_that_was_asked_for() -> None:
-    _, view = detailed(Layer(6.0, slope_deg=10.0))
+    _, view = detailed(Layer(period_mm=6.0, slope_deg=10.0))
     assert view.fine is not None
     assert np.linalg.norm(view.fine.normals, axis=1) == pytest.approx(1.0, abs=1e-6)
     slopes = view.fine.normals[:, :2] / view.fine.normals[:, 2:]
@@ -205,7 +205,7 @@ def test_bumps_have_the_slope_that_was_asked_for() -> None:
 
 def test_normals_are_those_of_the_height_whose_texture_is_seen() -> None:
     """Texture and height are the same waves: slopes are differences of the texture from pixel to pixel, scaled."""
-    _, view = detailed(Layer(40.0, texture=0.4, slope_deg=6.0))
+    _, view = detailed(Layer(period_mm=40.0, texture=0.4, slope_deg=6.0))
     assert view.fine is not None
     texture, places = view.fine.texture[view.site].astype(float), view.points_mm[view.site].astype(float)
     slopes = (view.fine.normals[:, :2] / view.fine.normals[:, 2:])[view.site].astype(float)
@@ -217,7 +217,9 @@ def test_normals_are_those_of_the_height_whose_texture_is_seen() -> None:
 
 
 def test_bumps_seen_from_behind_are_dents() -> None:
-    front, back = (detailed(Layer(20.0, slope_deg=8.0), turned=turned)[1].fine for turned in (False, True))
+    front, back = (
+        detailed(Layer(period_mm=20.0, slope_deg=8.0), turned=turned)[1].fine for turned in (False, True)
+    )
     assert front is not None
     assert back is not None
     assert back.normals[:, 2] == pytest.approx(front.normals[:, 2], abs=1e-6)
@@ -228,7 +230,7 @@ def test_detail_is_where_the_object_is_and_goes_with_it() -> None:
     from sim.scene.scene import build_scene
     from sim.scene.surface import Surface
 
-    material = Material("grey", (0.5, 0.5, 0.5), detail=(Layer(15.0, texture=0.4, slope_deg=5.0),))
+    material = Material("grey", (0.5, 0.5, 0.5), detail=(Layer(period_mm=15.0, texture=0.4, slope_deg=5.0),))
     plane = Surface(quad((0.0, 0.0, 0.0), 300.0), (material,), np.zeros(2, np.int32))
     turn = camera_above(0.0, 30.0) @ np.diag([1.0, -1.0, -1.0, 1.0])
     turn[:3, 3] = [40.0, -25.0, 10.0]
@@ -248,5 +250,5 @@ def test_a_texture_that_would_reflect_more_than_all_light_is_refused(tmp_path: P
     trimesh.Trimesh(quad((0, 0, 0), 5.0).reshape(-1, 3), np.arange(6).reshape(-1, 3), process=False).export(path)
     white = Material("white", (0.9, 0.9, 0.9))
     with pytest.raises(InputError, match=r"white\.ply: expected textures .* 0\.90 .* found changes of 0\.2 "):
-        load_surface(path, "mm", white, (Layer(1.0, texture=0.2),))
-    assert load_surface(path, "mm", white, (Layer(1.0, texture=0.1),)).materials[0].detail
+        load_surface(path, "mm", white, (Layer(period_mm=1.0, texture=0.2),))
+    assert load_surface(path, "mm", white, (Layer(period_mm=1.0, texture=0.1),)).materials[0].detail

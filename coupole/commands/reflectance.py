@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from coupole.reflectance.run_job import RunRequest
+
 Said = Callable[[str, int, int], None]
 Made = tuple[dict[str, Any], list[str], Path]
 """What `result.json` says, remarks, the report."""
@@ -64,6 +66,10 @@ NoiseOption = Annotated[
 MemoryOption = Annotated[
     str, typer.Option("--memory", help="For the samples that are fitted together: 500MB, 4GB.")
 ]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask cluster that does the job: tcp://HOST:8786."),
+]
 PicturesOption = Annotated[
     Path | None,
     typer.Option(
@@ -107,6 +113,7 @@ def from_runs_or_pictures(
     calibrations: RecordsOption = None,
     scan_noise_um: NoiseOption = 30.0,
     memory: MemoryOption = "2GB",
+    scheduler: SchedulerOption = None,
     pictures: PicturesOption = None,
     lights: LightsOption = None,
     intensities: IntensitiesOption = None,
@@ -118,6 +125,7 @@ def from_runs_or_pictures(
 
     A job that was stopped goes on where it was when it is given again.
     """
+    from coupole.reflectance.run_job import RunRequest
     from coupole.viewing.terminal import make_console, step_bars
 
     console = make_console(quiet=as_json)
@@ -132,7 +140,8 @@ def from_runs_or_pictures(
             else:
                 records = _records(calibrations or [])
                 left_out = tuple(_numbers(leave_out))
-                made = _of_runs(runs or [], mesh, records, left_out, scan_noise_um, _bytes(memory), out, say)
+                request = RunRequest(tuple(runs or []), mesh, records, left_out, scan_noise_um, _bytes(memory))
+                made = _of_runs(request, out, scheduler, say)
     except CoupoleError as error:
         fail_with(error, as_json=as_json)
         raise
@@ -164,21 +173,11 @@ def _of_pictures(
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 
-def _of_runs(
-    runs: list[Path],
-    mesh: Path | None,
-    records: tuple[Path, ...],
-    left_out: tuple[int, ...],
-    scan_noise_um: float,
-    memory_bytes: int,
-    out: Path,
-    say: Said,
-) -> Made:
-    from coupole.reflectance.run_job import RunRequest, reflectance_of
+def _of_runs(request: RunRequest, out: Path, scheduler: str | None, say: Said) -> Made:
+    from coupole.reflectance.run_job import reflectance_of
     from coupole.viewing import run_reflectance_page
 
-    request = RunRequest(tuple(runs), mesh, records, left_out, scan_noise_um, memory_bytes)
-    about = reflectance_of(request, out, say=say)
+    about = reflectance_of(request, out, scheduler=scheduler, say=say)
     return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)
 
 
@@ -226,6 +225,7 @@ def extract(
     calibrations: RecordsOption = None,
     scan_noise_um: NoiseOption = 30.0,
     leave_out: LeaveOutOption = "",
+    scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """The first step alone: samples of reflectance of each triangle under each LED, from proven frames."""
@@ -235,21 +235,27 @@ def extract(
         from coupole.reflectance.run_result import RunResult
 
         records, left_out = _records(calibrations or []), tuple(_numbers(leave_out))
-        extract_runs(RunRequest(tuple(runs), mesh, records, left_out, scan_noise_um), out, say=say)
+        request = RunRequest(tuple(runs), mesh, records, left_out, scan_noise_um)
+        extract_runs(request, out, scheduler=scheduler, say=say)
         return {"views": RunResult(out).summaries}
 
     _do(step, as_json=as_json)
 
 
 @reflectance_app.command()
-def fit(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOption = False) -> None:
+def fit(
+    result: ResultArgument,
+    memory: MemoryOption = "2GB",
+    scheduler: SchedulerOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """The second step alone: materials of each triangle, and the slice of reflectance that each view has seen."""
 
     def step(say: Said) -> dict[str, Any]:
         from coupole.reflectance.run_fits import fit_result
         from coupole.reflectance.run_result import FITS
 
-        fit_result(result, _bytes(memory), say=say)
+        fit_result(result, _bytes(memory), scheduler=scheduler, say=say)
         return {"fits": FITS}
 
     _do(step, as_json=as_json)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
+from uuid import uuid4
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.result_folder import complete, in_the_making, read_settings
+from coupole.reflectance.block_work import Said, Workshop, silent, workshop
+from coupole.reflectance.result_folder import SETTINGS, clear_remains, complete, in_the_making, read_settings
 from coupole.reflectance.run_result import (
     MATERIALS,
     SLICES,
@@ -22,26 +26,43 @@ from coupole.reflectance.run_result import (
 from coupole.reflectance.slice_fit import fit_slices, slice_values
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, fit_triangles, model_values
 from coupole.storage.disk_errors import disk_error
+from coupole.storage.durable import make_folder
 
 TOGETHER = (("sh",), ("rbf", "ggx_rbf"))
 """Names in `SLICES` that share their functions, fitted in one pass."""
-Said = Callable[[str, int, int], None]
 
 
-def fit_result(out: Path, memory_bytes: int, *, say: Said = lambda step, done, of: None) -> None:
-    """Make the fits that a result lacks. Raises InputError if its samples are not all there, StorageError."""
+@dataclass(frozen=True)
+class _Job:
+    """What all blocks of a job share."""
+
+    folder: Path
+    token: str
+    """Of this job alone."""
+    left_out: list[int]
+    memory_bytes: int
+
+
+def fit_result(out: Path, memory_bytes: int, *, scheduler: str | None = None, say: Said = silent) -> None:
+    """Make the fits that a result lacks, in the workers of a `scheduler` if one is named. Raises InputError if its
+    samples are not all there, or for the scheduler as `workshop`; StorageError."""
     settings = read_settings(out)
-    result = RunResult(out)
+    result = RunResult(out.resolve())
     result.refuse_unfinished(settings["view_names"])
+    job = _Job(result.folder, uuid4().hex, settings["left_out"], memory_bytes)
     try:
-        for name in MATERIALS:
-            if not result.materials_path(name).exists():
-                noise_um = settings["scan_noise_um"] if name == "ggx_normal" else None
-                _fit_materials(result, name, noise_um, settings["left_out"], memory_bytes, say)
-        for names in TOGETHER:
-            for view in result.views:
-                if not all(result.slices_path(name, view).exists() for name in names):
-                    _fit_slices(result, names, view, settings["left_out"], memory_bytes, say)
+        with workshop(scheduler) as shop:
+            shop.refuse_blind(result.folder, SETTINGS)
+            clear_remains(out)
+            for name in MATERIALS:
+                if not result.materials_path(name).exists():
+                    noise_um = settings["scan_noise_um"] if name == "ggx_normal" else None
+                    _fit_materials(result, job, name, noise_um, shop, say)
+            for names in TOGETHER:
+                for number, view in enumerate(result.views):
+                    if not all(result.slices_path(name, view).exists() for name in names):
+                        _fit_slices(result, job, names, number, shop, say)
+            shop.everywhere(_opened.cache_clear)
     except OSError as error:
         raise disk_error(out, error) from error
 
@@ -76,34 +97,50 @@ def _materials(result: RunResult, name: str, places: NDArray[np.int64]) -> Trian
 
 
 def _fit_materials(
-    result: RunResult, name: str, noise_um: float | None, left_out: list[int], memory_bytes: int, say: Said
+    result: RunResult, job: _Job, name: str, noise_um: float | None, shop: Workshop, say: Said
 ) -> None:
-    parts = []
-    for block in result.blocks(memory_bytes):
-        used = ~np.isin(result.along_samples(block, "leds"), left_out)
-        parts.append(fit_triangles(result.samples(block), used, noise_um))
+    parts, blocks = [], list(result.blocks(job.memory_bytes, shop.most_rows))
+    fit = partial(_materials_block, job, noise_um, shop.threads)
+    for block, part in zip(blocks, shop.map(fit, blocks), strict=True):
+        parts.append(part)
         say(f"fit {name}", block.stop, len(result.triangles))
     complete(result.materials_path(name), lambda path: write_materials(path, parts, result.triangles))
 
 
+def _materials_block(job: _Job, noise_um: float | None, threads: int | None, block: slice) -> TriangleMaterials:
+    result = _opened(job.folder, job.token)
+    used = ~np.isin(result.along_samples(block, "leds"), job.left_out)
+    return fit_triangles(result.samples(block), used, noise_um, threads=threads)
+
+
 def _fit_slices(
-    result: RunResult, names: Sequence[str], view: ViewSamples, left_out: list[int], memory_bytes: int, say: Said
+    result: RunResult, job: _Job, names: Sequence[str], number: int, shop: Workshop, say: Said
 ) -> None:
-    used = ~np.isin(view.leds, left_out)
+    view = result.views[number]
+    blocks = list(result.view_blocks(view, job.memory_bytes, shop.most_rows))
+    fit = partial(_slices_block, job, names, number, shop.threads)
     with ExitStack() as files:
         coefficients = []
         for name in names:
             path = result.slices_path(name, view)
-            path.parent.mkdir(exist_ok=True)
+            make_folder(path.parent)
             part = files.enter_context(in_the_making(path))
             file = files.enter_context(h5py.File(part, "w"))
             coefficients.append(begin_slices(file, SLICES[name], view, result.channels))
-        for rows in result.view_blocks(view, memory_bytes):
-            samples = result.view_samples(view, rows)
-            fits = [(SLICES[name].basis, _under(result, name, view, rows, samples)) for name in names]
-            for data, found in zip(coefficients, fit_slices(samples, used, *fits), strict=True):
+        for rows, fits in zip(blocks, shop.map(fit, blocks), strict=True):
+            for data, found in zip(coefficients, fits, strict=True):
                 data[rows] = found
             say(f"fit {', '.join(names)} of {view.view}", rows.stop, len(view.triangles))
+
+
+def _slices_block(
+    job: _Job, names: Sequence[str], number: int, threads: int | None, rows: slice
+) -> list[NDArray[np.float32]]:
+    result = _opened(job.folder, job.token)
+    view = result.views[number]
+    samples = result.view_samples(view, rows)
+    fits = [(SLICES[name].basis, _under(result, name, view, rows, samples)) for name in names]
+    return fit_slices(samples, ~np.isin(view.leds, job.left_out), *fits, threads=threads)
 
 
 def _under(
@@ -112,3 +149,9 @@ def _under(
     """What the material gives that a fit is added to."""
     over = SLICES[name].over
     return None if over is None else predicted(result, over, view, rows, samples)
+
+
+@lru_cache(maxsize=1)
+def _opened(folder: Path, _token: str) -> RunResult:
+    """A result as it is during one job, once in each process."""
+    return RunResult(folder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -14,6 +14,9 @@ from coupole.commands.common import JsonOption, ResultArgument
 from coupole.commands.common import fail as fail_with
 from coupole.commands.relight import relight
 from coupole.errors import CoupoleError, InputError
+
+if TYPE_CHECKING:
+    from coupole.reflectance.run_job import RunRequest
 
 Said = Callable[[str, int, int], None]
 Made = tuple[dict[str, Any], list[str], Path]
@@ -73,6 +76,10 @@ KeepOption = Annotated[
 MemoryOption = Annotated[
     str, typer.Option("--memory", help="For the samples that are fitted together: 500MB, 4GB.")
 ]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask cluster that does the job: tcp://HOST:8786."),
+]
 PicturesOption = Annotated[
     Path | None,
     typer.Option(
@@ -127,6 +134,7 @@ def from_runs_or_pictures(
     support_reflectance: SupportOption = 0.0,
     keep_inter_reflection: KeepOption = False,
     memory: MemoryOption = "2GB",
+    scheduler: SchedulerOption = None,
     pictures: PicturesOption = None,
     lights: LightsOption = None,
     intensities: IntensitiesOption = None,
@@ -140,6 +148,7 @@ def from_runs_or_pictures(
 
     A job that was stopped goes on where it was when it is given again.
     """
+    from coupole.reflectance.run_job import RunRequest
     from coupole.viewing.terminal import make_console, step_bars
 
     console = make_console(quiet=as_json)
@@ -157,11 +166,11 @@ def from_runs_or_pictures(
                 made = _of_pictures(pictures, lights, intensities, mask, _numbers(leave_out), out, say)
             else:
                 records, left_out = _records(calibrations or []), tuple(_numbers(leave_out))
-                made = _of_runs(
-                    out, say, runs=tuple(runs or ()), mesh=mesh, calibrations=records, left_out=left_out,
-                    scan_noise_um=scan_noise_um, memory_bytes=_bytes(memory),
-                    support_reflectance=support_reflectance, keep_inter_reflection=keep_inter_reflection,
+                request = RunRequest(
+                    tuple(runs or ()), mesh, records, left_out, scan_noise_um, _bytes(memory), support_reflectance,
+                    keep_inter_reflection,
                 )  # fmt: skip
+                made = _of_runs(request, out, scheduler, say)
     except CoupoleError as error:
         fail_with(error, as_json=as_json)
         raise
@@ -209,11 +218,11 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 
-def _of_runs(out: Path, say: Said, **request: Any) -> Made:
-    from coupole.reflectance.run_job import RunRequest, reflectance_of
+def _of_runs(request: RunRequest, out: Path, scheduler: str | None, say: Said) -> Made:
+    from coupole.reflectance.run_job import reflectance_of
     from coupole.viewing import run_reflectance_page
 
-    about = reflectance_of(RunRequest(**request), out, say=say)
+    about = reflectance_of(request, out, scheduler=scheduler, say=say)
     return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)
 
 
@@ -260,6 +269,7 @@ def extract(
     support_reflectance: SupportOption = 0.0,
     keep_inter_reflection: KeepOption = False,
     leave_out: LeaveOutOption = "",
+    scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """The first step alone: samples of reflectance of each triangle under each LED, from proven frames."""
@@ -273,21 +283,26 @@ def extract(
             tuple(runs), mesh, records, left_out, scan_noise_um,
             support_reflectance=support_reflectance, keep_inter_reflection=keep_inter_reflection,
         )  # fmt: skip
-        extract_runs(request, out, say=say)
+        extract_runs(request, out, scheduler=scheduler, say=say)
         return {"views": RunResult(out).summaries}
 
     _do(step, as_json=as_json)
 
 
 @reflectance_app.command()
-def fit(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOption = False) -> None:
+def fit(
+    result: ResultArgument,
+    memory: MemoryOption = "2GB",
+    scheduler: SchedulerOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """The second step alone: materials of each triangle, and the slice of reflectance that each view has seen."""
 
     def step(say: Said) -> dict[str, Any]:
         from coupole.reflectance.run_fits import fit_result
         from coupole.reflectance.run_result import FITS
 
-        fit_result(result, _bytes(memory), say=say)
+        fit_result(result, _bytes(memory), scheduler=scheduler, say=say)
         return {"fits": FITS}
 
     _do(step, as_json=as_json)

@@ -8,26 +8,29 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from coupole.errors import InputError
-from coupole.storage.durable import sync_folder
+from coupole.storage.durable import make_folder, sync_folder
 
 SETTINGS = "settings.json"
 
 
 def begin(out: Path, settings: dict[str, Any]) -> None:
-    """Make the folder; refuse one that was begun with other input or settings."""
+    """Make the folder, or go on with it; refuse one that was begun with other input or settings."""
     path = out / SETTINGS
     text = json.dumps(settings) + "\n"
     if path.exists():
         if path.read_text(encoding="utf-8") != text:
             raise InputError(f"{out} holds the result of other input or settings: name another folder with --out")
-        return
-    if out.exists() and any(out.iterdir()):
+    elif out.exists() and any(one.suffix != ".part" for one in out.iterdir()):
         raise InputError(f"{out} is not empty, and holds no result: name another folder with --out")
+    else:
+        make_folder(out)
+        complete(path, lambda part: part.write_text(text, encoding="utf-8"))
+    clear_remains(out)
     for name in ("samples", "fits"):
-        (out / name).mkdir(parents=True, exist_ok=True)
-    complete(path, lambda part: part.write_text(text, encoding="utf-8"))
+        make_folder(out / name)
 
 
 def read_settings(out: Path) -> dict[str, Any]:
@@ -42,6 +45,12 @@ def read_settings(out: Path) -> dict[str, Any]:
     return settings
 
 
+def clear_remains(out: Path) -> None:
+    """Remove what writers that were killed have left."""
+    for part in out.rglob("*.part"):
+        part.unlink(missing_ok=True)
+
+
 def complete(path: Path, write: Callable[[Path], Any]) -> None:
     """Have a file written beside its place, then put there: it is whole or not there, also after a crash."""
     with in_the_making(path) as part:
@@ -50,8 +59,9 @@ def complete(path: Path, write: Callable[[Path], Any]) -> None:
 
 @contextmanager
 def in_the_making(path: Path) -> Iterator[Path]:
-    """Where to write a file that is put in its place, whole, when all has gone well."""
-    part = path.with_name(path.name + ".part")
+    """Where to write a file that is put in its place, whole, when all has gone well. The name is used once: a
+    writer that is believed dead disturbs no other."""
+    part = path.with_name(f"{path.name}.{uuid4().hex}.part")
     path.parent.mkdir(exist_ok=True)
     try:
         yield part

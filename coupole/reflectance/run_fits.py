@@ -2,41 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from uuid import uuid4
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.material_uncertainty import covariances
-from coupole.reflectance.result_folder import complete, in_the_making, read_settings
+from coupole.reflectance.block_work import Said, Workshop, silent, workshop
+from coupole.reflectance.material_uncertainty import MaterialUncertainty, covariances
+from coupole.reflectance.result_folder import SETTINGS, clear_remains, complete, in_the_making, read_settings
 from coupole.reflectance.run_result import MATERIALS, SLICES, RunResult, ViewSamples
 from coupole.reflectance.run_result_files import begin_slices, write_materials
 from coupole.reflectance.slice_fit import fit_slices, slice_values
-from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
+from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, fit_triangles, model_values
 from coupole.storage.disk_errors import disk_error
+from coupole.storage.durable import make_folder
 
 TOGETHER = (("sh",), ("rbf", "ggx_rbf"))
 """Names in `SLICES` that share their functions, fitted in one pass."""
-Said = Callable[[str, int, int], None]
 
 
-def fit_result(out: Path, memory_bytes: int, *, say: Said = lambda step, done, of: None) -> None:
-    """Make the fits that a result lacks. Raises InputError if its samples are not all there, StorageError."""
+@dataclass(frozen=True)
+class _Job:
+    """What all blocks of a job share."""
+
+    folder: Path
+    token: str
+    """Of this job alone."""
+    left_out: list[int]
+    memory_bytes: int
+    noise_um: float
+    """Of the mesh's vertices."""
+
+
+def fit_result(out: Path, memory_bytes: int, *, scheduler: str | None = None, say: Said = silent) -> None:
+    """Make the fits that a result lacks, in the workers of a `scheduler` if one is named. Raises InputError if its
+    samples are not all there, or for the scheduler as `workshop`; StorageError."""
     settings = read_settings(out)
-    result = RunResult(out)
+    result = RunResult(out.resolve())
     result.refuse_unfinished(settings)
+    job = _Job(result.folder, uuid4().hex, settings["left_out"], memory_bytes, settings["scan_noise_um"])
     try:
-        for name in MATERIALS:
-            if not result.materials_path(name).exists():
-                _fit_materials(result, name, settings, memory_bytes, say)
-        for names in TOGETHER:
-            for view in result.views:
-                if not all(result.slices_path(name, view).exists() for name in names):
-                    _fit_slices(result, names, view, settings["left_out"], memory_bytes, say)
+        with workshop(scheduler) as shop:
+            shop.refuse_blind(result.folder, SETTINGS)
+            clear_remains(out)
+            for name in MATERIALS:
+                if not result.materials_path(name).exists():
+                    _fit_materials(result, job, name, shop, say)
+            for names in TOGETHER:
+                for number, view in enumerate(result.views):
+                    if not all(result.slices_path(name, view).exists() for name in names):
+                        _fit_slices(result, job, names, number, shop, say)
+            shop.everywhere(_opened.cache_clear)
     except OSError as error:
         raise disk_error(out, error) from error
 
@@ -64,16 +86,16 @@ def predicted(
     return slice_values(samples, coefficients, kind.basis, model)
 
 
-def _fit_materials(result: RunResult, name: str, settings: dict[str, Any], memory_bytes: int, say: Said) -> None:
-    parts, uncertain = [], []
-    noise_um, fitted_normals = settings["scan_noise_um"], name == "ggx_normal"
-    for block in result.blocks(memory_bytes):
-        used = ~np.isin(result.along_samples(block, "leds"), settings["left_out"])
-        samples = result.samples(block)
-        parts.append(fit_triangles(samples, used, noise_um if fitted_normals else None))
-        uncertain.append(covariances(samples, used, parts[-1], noise_um, fitted_normals=fitted_normals))
+def _fit_materials(result: RunResult, job: _Job, name: str, shop: Workshop, say: Said) -> None:
+    parts: list[TriangleMaterials] = []
+    uncertain: list[MaterialUncertainty] = []
+    blocks = list(result.blocks(job.memory_bytes, shop.most_rows))
+    fit = partial(_materials_block, job, name == "ggx_normal", shop.threads)
+    for block, (materials, one) in zip(blocks, shop.map(fit, blocks), strict=True):
+        parts.append(materials)
+        uncertain.append(one)
         say(f"fit {name}", block.stop, len(result.triangles))
-    u_triangle = np.concatenate([result.u_triangles(block) for block in result.blocks(memory_bytes)])
+    u_triangle = np.concatenate([result.u_triangles(block) for block in blocks])
 
     def write(path: Path) -> None:
         write_materials(path, parts, uncertain, u_triangle, result.u_shared, result.triangles)
@@ -81,23 +103,44 @@ def _fit_materials(result: RunResult, name: str, settings: dict[str, Any], memor
     complete(result.materials_path(name), write)
 
 
+def _materials_block(
+    job: _Job, fitted_normals: bool, threads: int | None, block: slice
+) -> tuple[TriangleMaterials, MaterialUncertainty]:
+    result = _opened(job.folder, job.token)
+    used = ~np.isin(result.along_samples(block, "leds"), job.left_out)
+    samples = result.samples(block)
+    found = fit_triangles(samples, used, job.noise_um if fitted_normals else None, threads=threads)
+    return found, covariances(samples, used, found, job.noise_um, fitted_normals=fitted_normals, threads=threads)
+
+
 def _fit_slices(
-    result: RunResult, names: Sequence[str], view: ViewSamples, left_out: list[int], memory_bytes: int, say: Said
+    result: RunResult, job: _Job, names: Sequence[str], number: int, shop: Workshop, say: Said
 ) -> None:
-    used = ~np.isin(view.leds, left_out)
+    view = result.views[number]
+    blocks = list(result.view_blocks(view, job.memory_bytes, shop.most_rows))
+    fit = partial(_slices_block, job, names, number, shop.threads)
     with ExitStack() as files:
         coefficients = []
         for name in names:
             path = result.slices_path(name, view)
+            make_folder(path.parent)
             part = files.enter_context(in_the_making(path))
             file = files.enter_context(h5py.File(part, "w"))
             coefficients.append(begin_slices(file, SLICES[name], view, result.channels))
-        for rows in result.view_blocks(view, memory_bytes):
-            samples = result.view_samples(view, rows)
-            fits = [(SLICES[name].basis, _under(result, name, view, rows, samples)) for name in names]
-            for data, found in zip(coefficients, fit_slices(samples, used, *fits), strict=True):
+        for rows, fits in zip(blocks, shop.map(fit, blocks), strict=True):
+            for data, found in zip(coefficients, fits, strict=True):
                 data[rows] = found
             say(f"fit {', '.join(names)} of {view.view}", rows.stop, len(view.triangles))
+
+
+def _slices_block(
+    job: _Job, names: Sequence[str], number: int, threads: int | None, rows: slice
+) -> list[NDArray[np.float32]]:
+    result = _opened(job.folder, job.token)
+    view = result.views[number]
+    samples = result.view_samples(view, rows)
+    fits = [(SLICES[name].basis, _under(result, name, view, rows, samples)) for name in names]
+    return fit_slices(samples, ~np.isin(view.leds, job.left_out), *fits, threads=threads)
 
 
 def _under(
@@ -106,3 +149,9 @@ def _under(
     """What the material gives that a fit is added to."""
     over = SLICES[name].over
     return None if over is None else predicted(result, over, view, rows, samples)
+
+
+@lru_cache(maxsize=1)
+def _opened(folder: Path, _token: str) -> RunResult:
+    """A result as it is during one job, once in each process."""
+    return RunResult(folder)

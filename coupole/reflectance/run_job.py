@@ -8,29 +8,31 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
 from coupole.errors import InputError
-from coupole.reflectance.extraction.extraction import extract_view, geometry_of
+from coupole.reflectance.block_work import Said, Workshop, silent, workshop
+from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of
 from coupole.reflectance.extraction.frames_for_check import write_frames
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView, read_measured_run
 from coupole.reflectance.extraction.radiance import Radiometry
 from coupole.reflectance.inter_reflection import subtract
-from coupole.reflectance.result_folder import begin, complete, read_settings
+from coupole.reflectance.result_folder import SETTINGS, begin, complete, read_settings
 from coupole.reflectance.run_check import check_result
 from coupole.reflectance.run_fits import fit_result
 from coupole.reflectance.run_result import FRAMES, OBJECT, RunResult
 from coupole.reflectance.run_result_files import write_object
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256, write_synced
+from coupole.storage.run_json import RUN_JSON
 
-Said = Callable[[str, int, int], None]
 HELD_OUT_EVERY, HELD_OUT_FIRST = 12, 4
 """Of the LEDs, if none are named: they are kept for the check."""
 
@@ -52,36 +54,42 @@ class RunRequest:
     """Do not take it off the samples."""
 
 
-def reflectance_of(request: RunRequest, out: Path, *, say: Said = lambda step, done, of: None) -> dict[str, Any]:
-    """Make the result, or what of it is missing; returns what `result.json` says.
+def reflectance_of(
+    request: RunRequest, out: Path, *, scheduler: str | None = None, say: Said = silent
+) -> dict[str, Any]:
+    """Make the result, or what of it is missing, in the workers of a `scheduler` if one is named; returns what
+    `result.json` says.
 
     Raises InputError: runs without calibrations, of different objects or cameras, records that do not belong to
-    them, a folder that holds another result; StorageError if a frame is damaged or the disk takes nothing.
+    them, a folder that holds another result, a scheduler that does not answer or whose workers do not see the
+    folder; StorageError if a frame is damaged or the disk takes nothing.
     """
     begun_s = time.monotonic()
-    extract_runs(request, out, say=say)
-    fit_result(out, request.memory_bytes, say=say)
+    extract_runs(request, out, scheduler=scheduler, say=say)
+    fit_result(out, request.memory_bytes, scheduler=scheduler, say=say)
     return check_result(out, request.memory_bytes, begun_s=begun_s, say=say)
 
 
-def extract_runs(request: RunRequest, out: Path, *, say: Said = lambda step, done, of: None) -> None:
+def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None, say: Said = silent) -> None:
     """The samples of all views. Raises as `reflectance_of`."""
-    measured_runs = [read_measured_run(run, request.mesh, request.calibrations) for run in request.runs]
+    token = uuid4().hex
+    measured_runs = [_measured(token, run, request.mesh, request.calibrations) for run in request.runs]
     _refuse_different(measured_runs)
     try:
-        begin(out, _settings(request, measured_runs))
-        first = measured_runs[0]
-        complete(out / OBJECT, lambda path: write_object(path, first.corners_mm, first.base_from_support))
-        _extract(measured_runs, out, read_settings(out)["left_out"], say)
-        if read_settings(out)["subtracted"]:
-            subtract(
-                RunResult(out),
-                paper=first.emission == "paper",
-                support_reflectance=request.support_reflectance,
-                say=say,
-            )
+        with workshop(scheduler) as shop:
+            begin(out, _settings(request, measured_runs))
+            first = measured_runs[0]
+            complete(out / OBJECT, lambda path: write_object(path, first.corners_mm, first.base_from_support))
+            shop.refuse_blind(out.resolve(), SETTINGS)
+            _extract(request, token, measured_runs, out.resolve(), shop, say)
+        settings = read_settings(out)
+        if settings["subtracted"]:
+            support = settings["support_reflectance"]
+            subtract(RunResult(out), paper=settings["emission"] == "paper", support_reflectance=support, say=say)
     except OSError as error:
         raise disk_error(out, error) from error
+    finally:
+        _forget()
 
 
 def _refuse_different(measured_runs: Sequence[MeasuredRun]) -> None:
@@ -116,19 +124,67 @@ def _settings(request: RunRequest, measured_runs: Sequence[MeasuredRun]) -> dict
     }
 
 
-def _extract(measured_runs: Sequence[MeasuredRun], out: Path, left_out: Sequence[int], say: Said) -> None:
-    """Of all views samples, frames for the check, and what the report says."""
-    for measured in measured_runs:
-        prepared = None
-        for view in measured.views:
-            name = _name(measured_runs, measured, view)
-            path, summary = out / "samples" / f"{name}.h5", out / "samples" / f"{name}.json"
-            if not summary.exists():
-                geometry, radiometry = prepared = prepared or (geometry_of(measured), Radiometry(measured))
-                found = extract_view(measured, geometry, radiometry, view, path, say)
-                frames = out / FRAMES / f"{name}.h5"
-                complete(frames, partial(write_frames, radiometry, view, path, left_out))
-                write_synced(summary, json.dumps(found))
+@dataclass(frozen=True)
+class _View:
+    """A block of extraction: one view's samples, a file."""
+
+    run: Path
+    view: str
+    path: Path
+    left_out: tuple[int, ...]
+
+
+def _extract(
+    request: RunRequest, token: str, measured_runs: Sequence[MeasuredRun], out: Path, shop: Workshop, say: Said
+) -> None:
+    """Samples of all views, and what the report says of each."""
+    left_out = tuple(read_settings(out)["left_out"])
+    left = [
+        _View(run.resolve(), view.name, out / "samples" / f"{_name(measured_runs, measured, view)}.h5", left_out)
+        for run, measured in zip(request.runs, measured_runs, strict=True)
+        for view in measured.views
+    ]
+    left = [one for one in left if not one.path.with_suffix(".json").exists()]
+    mesh = request.mesh and request.mesh.resolve()
+    records = tuple(path.resolve() for path in request.calibrations)
+    for one in left:
+        shop.refuse_blind(one.run, RUN_JSON)
+    extract = partial(_extract_one, token, mesh, records, shop.threads, shop.heard(say))
+    for number, (one, found) in enumerate(zip(left, shop.map(extract, left), strict=True), start=1):
+        write_synced(one.path.with_suffix(".json"), json.dumps(found))
+        say("views", number, len(left))
+    shop.everywhere(_forget)
+
+
+def _extract_one(
+    token: str, mesh: Path | None, records: tuple[Path, ...], threads: int | None, say: Said, one: _View
+) -> dict[str, Any]:
+    """Write the files of a view's samples and frames for the check; what the report says of them."""
+    measured, geometry, radiometry = _prepared(token, one.run, mesh, records)
+    view = next(view for view in measured.views if view.name == one.view)
+    found = extract_view(measured, geometry, radiometry, view, one.path, say, threads=threads)
+    frames = one.path.parents[1] / FRAMES / one.path.name
+    complete(frames, partial(write_frames, radiometry, view, one.path, one.left_out))
+    return found
+
+
+@lru_cache(maxsize=1)
+def _prepared(
+    token: str, run: Path, mesh: Path | None, records: tuple[Path, ...]
+) -> tuple[MeasuredRun, Geometry, Radiometry]:
+    """What all views of a run share, once in each process and job (`token`)."""
+    measured = _measured(token, run, mesh, records)
+    return measured, geometry_of(measured), Radiometry(measured)
+
+
+@lru_cache(maxsize=16)
+def _measured(_token: str, run: Path, mesh: Path | None, records: tuple[Path, ...]) -> MeasuredRun:
+    return read_measured_run(run, mesh, records)
+
+
+def _forget() -> None:
+    _prepared.cache_clear()
+    _measured.cache_clear()
 
 
 def _name(measured_runs: Sequence[MeasuredRun], measured: MeasuredRun, view: MeasuredView) -> str:

@@ -50,6 +50,7 @@ INTER_REFLECTION = "inter_reflection"
 """Attribute of a file of samples that it was taken from."""
 U_OF_INTER_REFLECTION = 0.2
 """Relative standard uncertainty of what is taken off. Of a simulated relief of white stone it was 0.15 to 0.19."""
+MOST_ROWS = 1 << 16
 LOWER = np.tril_indices(UNKNOWNS)
 _HEAD = ("triangles", "camera_mm", "leds", "led_positions_mm", "led_normals", "full_scales")
 FIELDS = {
@@ -182,13 +183,13 @@ class RunResult:
         """All that any view sees, rising."""
         return np.unique(np.concatenate([view.triangles for view in self.views]))
 
-    def blocks(self, budget_bytes: int) -> Iterator[slice]:
-        """Places in `triangles` that are processed together within a budget of memory."""
-        return _parts(len(self.triangles), sum(len(view.leds) for view in self.views), budget_bytes)
+    def blocks(self, budget_bytes: int, most: int = MOST_ROWS) -> Iterator[slice]:
+        """Places in `triangles` that are processed together within a budget of memory, `most` of them."""
+        return _parts(len(self.triangles), sum(len(view.leds) for view in self.views), budget_bytes, most)
 
-    def view_blocks(self, view: ViewSamples, budget_bytes: int) -> Iterator[slice]:
+    def view_blocks(self, view: ViewSamples, budget_bytes: int, most: int = MOST_ROWS) -> Iterator[slice]:
         """The same of the rows of a view's file."""
-        return _parts(len(view.triangles), len(view.leds), budget_bytes)
+        return _parts(len(view.triangles), len(view.leds), budget_bytes, most)
 
     def samples(self, block: slice) -> TriangleSamples:
         """Those of the triangles of a block, in all views that see one of them."""
@@ -360,9 +361,9 @@ def read_about(folder: Path) -> dict[str, Any]:
     return about
 
 
-def _parts(count: int, samples: int, budget_bytes: int) -> Iterator[slice]:
+def _parts(count: int, samples: int, budget_bytes: int, most: int) -> Iterator[slice]:
     each = 64 * samples  # values, a model's, and what is copied between
-    step = int(np.clip(budget_bytes // max(1, each), 64, 1 << 16))
+    step = int(np.clip(budget_bytes // max(1, each), 64, most))
     for first in range(0, count, step):
         yield slice(first, min(first + step, count))
 

@@ -159,15 +159,17 @@ def _same(values, used, channel):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _add_part(coefficients, led_mm, camera_mm, centres_mm, normals, harmonic, made):  # type: ignore[no-untyped-def]
     count, samples, channels = made.shape
-    frame, which = np.empty((3, 3)), np.arange(samples)
+    frame, which, total = np.empty((3, 3)), np.arange(samples), np.empty(samples)
     x, y, z, rows = np.empty(samples), np.empty(samples), np.empty(samples), np.empty((COUNT, samples))
     for triangle in range(count):
         _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
         _directions(frame, centres_mm[triangle], led_mm, which, x, y, z)
         functions(harmonic, x, y, z, rows)
         for channel in range(channels):
+            total[:] = 0.0
+            for k in range(COUNT):
+                coefficient = coefficients[triangle, channel, k]
+                for sample in range(samples):
+                    total[sample] += coefficient * rows[k, sample]
             for sample in range(samples):
-                total = 0.0
-                for k in range(COUNT):
-                    total += coefficients[triangle, channel, k] * rows[k, sample]
-                made[triangle, sample, channel] += z[sample] * total
+                made[triangle, sample, channel] += z[sample] * total[sample]

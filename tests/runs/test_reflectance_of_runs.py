@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +15,12 @@ import OpenEXR
 import pytest
 import trimesh
 from cells import CellFolder
+from dask_cluster import cluster
 
 from coupole.calibration.light.frames import open_light_frames
 from coupole.reflectance.normal_fit import fit_materials
 from coupole.reflectance.picture_set import read_pictures
+from coupole.reflectance.run_job import RunRequest, reflectance_of
 from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.sample_uncertainty import Places, Sources, bounds
 from coupole.reflectance.triangle_fit import fit_triangles
@@ -338,6 +342,36 @@ def test_a_job_that_was_stopped_goes_on_and_another_is_refused(made: Made) -> No
     assert other.code == 2
     assert "name another folder" in other.err
     assert "normals of the mesh" in (out / "report.html").read_text()
+
+
+def same_datasets(one: Path, other: Path) -> None:
+    """Every HDF5 file of both folders, to the bit."""
+    names = {str(path.relative_to(one)) for path in one.rglob("*.h5")}
+    assert {str(path.relative_to(other)) for path in other.rglob("*.h5")} == names
+    for name in names:
+        with h5py.File(one / name) as mine, h5py.File(other / name) as its:
+            assert set(mine) == set(its)
+            for key in mine:
+                assert mine[key][()].tobytes() == its[key][()].tobytes(), (name, key)
+
+
+@pytest.mark.full
+def test_two_workers_of_which_one_is_killed_give_the_same_result(made: Made, tmp_path: Path) -> None:
+    """To the bit: killed while it extracts, when it may have begun a file, and another one while it fits."""
+    cell, alone, document = made
+    out = tmp_path / "result"
+    with cluster(tmp_path, 3) as (address, workers), ThreadPoolExecutor(1) as pool:
+        request = RunRequest((cell.run_folder,), calibrations=tuple(sorted(RECORDS.glob("*.yaml"))))
+        job = pool.submit(reflectance_of, request, out, scheduler=address)
+        for worker, sign in zip(workers, ("samples/*.part", "fits/*.h5"), strict=False):
+            while not list(out.glob(sign)):
+                assert not job.done(), job.result()
+                time.sleep(0.01)
+            worker.kill()
+        about = job.result()
+    assert about["mae"] == document["mae"]
+    same_datasets(alone, out)
+    assert not list(out.rglob("*.part"))
 
 
 def test_ablation_tells_what_fewer_leds_angles_and_coefficients_cost(made: Made) -> None:

@@ -71,7 +71,7 @@ class ViewPass:
     @property
     def together(self) -> int:
         """LEDs whose frames are read together."""
-        return max(1, _FRAMES // max(map(len, self.view.by_led.values())))
+        return min(len(self.leds), max(1, _FRAMES // max(map(len, self.view.by_led.values()))))
 
     def samples(self, codes_of: Callable[[slice, Executor], NDArray[np.uint8]], threads: int) -> Iterator[Samples]:
         """All samples; `codes_of` gives the codes of some LEDs [leds, triangles], with the threads of a pool."""

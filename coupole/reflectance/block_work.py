@@ -1,0 +1,168 @@
+"""Whole blocks of work, here or by the workers of a cluster (dask.distributed).
+
+A block is a function of few arguments and what it is done for, with a result that is small or is a file. Workers
+share the file system of the result with whoever asks them. What a worker that died was doing, another does again.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+from coupole.errors import InputError
+from coupole.reflectance.run_result import MOST_ROWS
+
+Block = TypeVar("Block")
+Done = TypeVar("Done")
+Said = Callable[[str, int, int], None]
+_ANSWERS_S = 10.0
+_AHEAD = 3
+"""Blocks for each thread of the workers that are asked for before their results are taken."""
+_MISSING = "--scheduler: dask.distributed is not installed here; `pip install 'coupole[cluster]'` adds it"
+
+
+def silent(step: str, done: int, of: int) -> None:
+    """Tell nobody."""
+
+
+class Workshop(Protocol):
+    """Where blocks are done."""
+
+    threads: int | None
+    """That a block may use; None for as many as there are cores."""
+    most_rows: int
+    """Triangles of a block."""
+
+    def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
+        """Results in the order of the blocks."""
+        ...
+
+    def everywhere(self, function: Callable[[], Any]) -> None:
+        """Call a function in each process that does blocks."""
+        ...
+
+    def heard(self, say: Said) -> Said:
+        """What a block can tell while it is done."""
+        ...
+
+    def refuse_blind(self, folder: Path, witness: str) -> None:
+        """Raises InputError if a worker does not see a folder as it is here, by the content of one of its files,
+        or has another version of Coupole."""
+        ...
+
+
+class Here:
+    """In this process, one block after the other."""
+
+    threads: int | None = None
+    most_rows = MOST_ROWS
+
+    def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
+        return map(function, blocks)
+
+    def everywhere(self, function: Callable[[], Any]) -> None:
+        function()
+
+    def heard(self, say: Said) -> Said:
+        return say
+
+    def refuse_blind(self, folder: Path, witness: str) -> None:
+        pass
+
+
+class Cluster:
+    """In the workers of a scheduler, a block in each of their threads."""
+
+    threads: int | None = 1
+    most_rows = 1 << 12
+
+    def __init__(self, client: Any, address: str) -> None:
+        self._client, self._address = client, address
+
+    def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
+        asked: deque[Any] = deque()
+        ahead = _AHEAD * max(1, sum(self._client.nthreads().values()))
+        for block in blocks:
+            asked.append(self._client.submit(_done_alone, function, block, pure=False))
+            if len(asked) == ahead:
+                yield self._result(asked.popleft())
+        while asked:
+            yield self._result(asked.popleft())
+
+    def _result(self, future: Any) -> Any:
+        from dask.distributed import CancelledError, KilledWorker
+        from distributed.comm.core import CommClosedError
+
+        try:
+            return future.result()
+        except KilledWorker as error:
+            raise InputError(
+                f"--scheduler: {error.allowed_failures + 1} workers died of the same block: give them more memory "
+                "or fewer threads (`--nthreads 1`)"
+            ) from error
+        except (CancelledError, CommClosedError) as error:
+            raise InputError(
+                f"--scheduler: the scheduler {self._address} is gone; start it, and give this command again: what "
+                "is done is kept"
+            ) from error
+
+    def everywhere(self, function: Callable[[], Any]) -> None:
+        self._client.run(function)
+
+    def heard(self, say: Said) -> Said:
+        return silent
+
+    def refuse_blind(self, folder: Path, witness: str) -> None:
+        mine = _seen_from_here(folder / witness)
+        for worker, seen in self._client.run(_seen_from_here, folder / witness).items():
+            if seen[1] != mine[1]:
+                raise InputError(f"--scheduler: the worker {worker} has Coupole {seen[1]}, here is {mine[1]}")
+            if seen != mine:
+                raise InputError(
+                    f"--scheduler: the worker {worker} does not see {folder} as it is here: put runs, records and "
+                    "result on a file system that all machines have under the same path"
+                )
+
+
+def _seen_from_here(witness: Path) -> tuple[str | None, str]:
+    try:
+        return witness.read_text(encoding="utf-8"), version("coupole")
+    except OSError:
+        return None, version("coupole")
+
+
+def _done_alone(function: Callable[[Block], Done], block: Block) -> Done:
+    """In a worker: BLAS must not take threads that others work with."""
+    threadpool_limits(1, user_api="blas")
+    return function(block)
+
+
+@contextmanager
+def workshop(scheduler: str | None) -> Iterator[Workshop]:
+    """This process, or the workers of a scheduler by its address. Raises InputError if it does not answer, or has
+    no workers."""
+    if scheduler is None:
+        yield Here()
+        return
+    try:
+        from dask.distributed import Client
+    except ImportError as error:
+        raise InputError(_MISSING) from error
+    try:
+        client: Any = Client(scheduler, timeout=_ANSWERS_S, set_as_default=False)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"--scheduler: no scheduler answers at {scheduler}; `dask scheduler` starts one and tells its address"
+        ) from error
+    with client:
+        if not client.nthreads():
+            raise InputError(
+                f"--scheduler: {scheduler} has no workers; `dask worker {scheduler} --nthreads 1` starts one"
+            )
+        yield Cluster(client, scheduler)

@@ -176,7 +176,8 @@ def _read_direct(path: Path, size: int) -> None:
 
 
 def _result(folder: Path) -> Any:
-    from coupole.reflectance.run_result import OBJECT, RunResult, write_object
+    from coupole.reflectance.run_result import OBJECT, RunResult
+    from coupole.reflectance.run_result_files import write_object
 
     measured, _ = read_run(folder)
     write_object(folder / OBJECT, measured.corners_mm, measured.base_from_support)
@@ -337,26 +338,33 @@ def _relit(root: Path, folder: Path, samples: Any, rounds: int) -> Iterator[dict
     has one sample for each pixel, and its scene loaded."""
     from bench_measured_run import MESH
     from bench_render import FULL, mitsuba_frame, photographer
-    from coupole.reflectance.run_relighting import RelitView
-    from coupole.reflectance.run_result import write_materials
+    from coupole.reflectance.material_uncertainty import MaterialUncertainty
+    from coupole.reflectance.new_light.light_kinds import DistantLight
+    from coupole.reflectance.run_relighting import scene_of_view
+    from coupole.reflectance.run_result_files import write_materials
     from coupole.reflectance.triangle_fit import fit_triangles
 
     result = _result(folder)
     found = fit_triangles(samples, np.ones(samples.values.shape[1], np.bool_), 30.0)
     (folder / "fits").mkdir(exist_ok=True)
     whole = found.at(np.arange(len(result.triangles)) % _FITTED)
-    write_materials(result.materials_path("ggx_normal"), [whole], result.triangles)
+    count = len(result.triangles)
+    certain = MaterialUncertainty(np.zeros((count, 5, 5)), *np.zeros((2, *whole.kd.shape)))
+    nothing = np.zeros(count, np.float32)
+    write_materials(result.materials_path("ggx_normal"), [whole], [certain], nothing, 0.0, result.triangles)
     by, _ = photographer(root, folder / MESH, FULL)
     mitsuba = mitsuba_frame(folder / MESH, by)
-    ready = RelitView(result, fit="ggx_normal")
+    ready = scene_of_view(result, fit="ggx_normal")
     directions = iter(np.random.default_rng(0).normal(0, 0.4, (100, 3)) + np.array([0, 0, 1]))
-    works: dict[str, Callable[[], Any]] = {"ours": lambda: ready.under(next(directions))}
+    works: dict[str, Callable[[], Any]] = {
+        "ours": lambda: ready.picture([DistantLight(towards=tuple(next(directions)))])
+    }
     if mitsuba is not None:
         works["mitsuba"] = lambda: mitsuba(0)
     for work in works.values():
         work()
     seconds = _medians(works, rounds)
-    first_s = _timed(lambda: RelitView(result, fit="ggx_normal"))
+    first_s = _timed(lambda: scene_of_view(result, fit="ggx_normal"))
     more = {"triangles": len(result.triangles), "view_ready_s": round(first_s, 3)}
     tenth_s = seconds.get("mitsuba", float("nan")) / 10
     yield _figure("relit_frame_12mp", seconds["ours"], "s", "mitsuba_10_times", tenth_s / seconds["ours"], **more)

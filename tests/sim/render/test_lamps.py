@@ -120,9 +120,10 @@ def test_the_pieces_of_a_panel_give_the_lux_that_was_asked_for() -> None:
     assert total == pytest.approx(250.0, rel=1e-9)
 
 
-def test_a_panel_casts_a_soft_shadow(tmp_path: Path) -> None:
+@pytest.mark.parametrize("shading", ["flat", "pixel"])
+def test_a_panel_casts_a_soft_shadow(shading: str, tmp_path: Path) -> None:
     """Where LED 9's shadow has a hard edge, that of a panel of 600 mm at its place has a wide one."""
-    world = {"panels": [{"centre_mm": (0.0, -900.0, 900.0), "side_mm": 600.0}]}
+    world = {"panels": [{"centre_mm": (0.0, -900.0, 900.0), "side_mm": 600.0}], "shading": shading}
     by = photographer(tmp_path, world)
     profiles = [taken(by, ABOVE, 0.4, **lit)[0:47, 60:68].mean(axis=1) for lit in ({"led": 9}, {"panel": 1})]
     steps = [np.abs(np.diff(profile)).max() / np.ptp(profile) for profile in profiles]

@@ -218,7 +218,7 @@ def test_brackets_are_merged(tmp_path: Path) -> None:
 def test_light_from_fold_to_fold_is_taken_off(tmp_path: Path) -> None:
     """Of a white stone whose folds light each other, in a cell that is simulated with that light."""
     white = (0.8, 0.6, 0.3)
-    cell = shipped_cell(tmp_path, material={"diffuse": white}, interreflection=True)
+    cell = shipped_cell(tmp_path, material={"diffuse": white}, shading="pixel")
     cell.write(views=[cells.TOP], lights={"kind": "every", "every": 180})
     assert cell.acquire().code == 0
     f = {}

@@ -59,6 +59,7 @@ class RelitView:
             self._seen, self._centres = file["seen"][()], file["centres_mm"][()]
             self._normals = file["normals"][()]
         self._starts = (self._centres + RAY_START_MM * self._normals).astype(np.float32)
+        self._middle_mm = self._centres.mean(axis=0)
         self._mesh = PacketMesh(result.corners_mm)
 
     def under(self, direction: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -77,7 +78,7 @@ class RelitView:
     def _light(self, rows: slice, towards: NDArray[np.float64], values: NDArray[np.float32]) -> None:
         """Fill the values [b, channels] of some of the view's triangles."""
         centres, normals = self._centres[rows], self._normals[rows]
-        light_mm = self._centres.mean(axis=0) + FAR_MM * towards
+        light_mm = self._middle_mm + FAR_MM * towards
         light = TriangleSamples(
             np.zeros((len(centres), 1, values.shape[1]), np.float32),
             light_mm[None],

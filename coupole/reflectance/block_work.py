@@ -152,9 +152,11 @@ def workshop(scheduler: str | None) -> Iterator[Workshop]:
         return
     try:
         from dask.distributed import Client
+        from distributed.comm.addressing import get_address_host_port
     except ImportError as error:
         raise InputError(_MISSING) from error
     try:
+        get_address_host_port(scheduler)  # of another, the client waits for itself when the program ends
         client: Any = Client(scheduler, timeout=_ANSWERS_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
         raise InputError(

@@ -169,7 +169,7 @@ def test_an_arm_pushed_in_a_burst_that_springs_back_has_just_that_burst_taken_ag
     joining.write(views=[TOP, SIDE], lights=MORE_LIGHTS, order="as_written")
     first_edge = 270 + 12  # of the second view
     edge = first_edge + 100
-    with joining.world({"kind": "nudge_arm", "deg": 0.05, "seconds": 0.5, "at_edge": edge}):
+    with joining.world({"kind": "nudge_arm", "deg": 0.05, "seconds": 1.0, "at_edge": edge}):
         ended = joining.acquire()
     run = joining.run_folder
     assert ended.code == 0, ended.err

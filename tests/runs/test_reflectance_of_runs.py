@@ -169,17 +169,17 @@ def test_without_calibrations_pixels_have_normals_by_nominal_lights(made: Made, 
     write_pictures(cell.run_folder, "side", tmp_path, lambda step, done, of: None)
     lights, intensities, mask = (tmp_path / name for name in FILES)
     pictures = read_pictures(tmp_path, lights, intensities=intensities, mask=mask)
-    every = np.stack([pictures.raw_values(number)[::9, 1] for number in range(len(pictures))], axis=1) / 65535
+    every = np.stack([pictures.raw_values(number)[::27, 1] for number in range(len(pictures))], axis=1) / 65535
     values = every / pictures.intensities[:, 1]
     found = np.full((*pictures.mask.shape, 3), np.nan)
-    rows, columns = (places[::9] for places in np.nonzero(pictures.mask))
+    rows, columns = (places[::27] for places in np.nonzero(pictures.mask))
     found[rows, columns] = fit_materials(values, pictures.directions, np.array([0.0, 0.0, 1.0])).normals
     with h5py.File(out / "samples/side.h5") as file:
         seen, normals = file["seen"][()][::2, ::2], file["normals"][()]
     frame = next(one for one in open_light_frames([cell.run_folder]).lit if one.view == "side")
     truth = normals[seen] @ frame.base_from_camera[:3, :3] * (1, -1, -1)
     known = (seen >= 0) & np.isfinite(found).all(axis=2)
-    assert known.sum() > 500
+    assert known.sum() > 150
     off = np.degrees(np.arccos(np.clip(np.sum(found * truth, axis=2)[known], -1, 1)))
     assert np.median(off) < 5.0, np.median(off)  # lights near by are taken as far away
 

@@ -211,7 +211,10 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
     from coupole.viewing import reflectance_page
 
     folder = out.with_name(f"{out.name}-pictures")
-    uncalibrated.write_pictures(run, view, folder, say)
+    leds = uncalibrated.write_pictures(run, view, folder, say)
+    if wrong := sorted(set(left_out) - set(leds)):
+        raise InputError(f"--leave-out: no frame under LED {wrong[0]} in this view")
+    left_out = [leds.index(led) for led in left_out]
     lights, intensities, mask = (folder / name for name in uncalibrated.FILES)
     given = read_pictures(folder, lights, intensities=intensities, mask=mask)
     about = fit_pictures(replace(given, uncalibrated_run=run.resolve().name), out, left_out=left_out, say=say)

@@ -28,7 +28,8 @@ from scipy.sparse import csr_array, vstack
 from coupole.motion.occlusion import RAY_START_MM, blocked, ray_mesh
 from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.result_folder import complete
-from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples
+from coupole.reflectance.run_result import AS_MEASURED, INTER_REFLECTION, SAMPLES, RunResult, ViewSamples
+from coupole.reflectance.triangle_fit import TriangleSamples
 
 Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
@@ -71,12 +72,14 @@ class Scene:
 def scene_of(corners_mm: Floats, *, support_z: tuple[Floats, Floats] | None = None) -> Scene:
     """Of triangles [m, 3, 3]; `support_z` is a point of the support and its unit normal, if it reflects: a square
     of three times the object's width comes to the scene."""
+    count = len(corners_mm)
     if support_z is not None:
         corners_mm = np.concatenate([corners_mm, _support(corners_mm, *support_z)])
     across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     twice = np.maximum(np.linalg.norm(across, axis=1), 1e-300)
     centres, normals = corners_mm.mean(axis=1), across / twice[:, None]
-    patch = _patches(centres, normals)
+    of_support = np.arange(len(centres)) >= count
+    patch = _patches(centres, normals, of_support)
     return Scene(ray_mesh(corners_mm), centres, normals, 0.5 * twice, patch, corners_mm)
 
 
@@ -92,7 +95,7 @@ def _support(corners_mm: Floats, point_mm: Floats, normal: Floats) -> Floats:
     return np.stack([np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)]).reshape(-1, 3, 3)
 
 
-def _patches(centres_mm: Floats, normals: Floats) -> NDArray[np.int64]:
+def _patches(centres_mm: Floats, normals: Floats, of_support: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Numbers of cells of a grid and of the sixth of all directions that a normal points to, as fine as there may
     be patches."""
     low, size = centres_mm.min(axis=0), float(np.ptp(centres_mm, axis=0).max())
@@ -101,7 +104,7 @@ def _patches(centres_mm: Floats, normals: Floats) -> NDArray[np.int64]:
     cells = 128.0
     while True:
         cell = np.floor((centres_mm - low) / max(size, 1e-9) * cells).astype(np.int64)
-        key = ((cell[:, 0] * 1024 + cell[:, 1]) * 1024 + cell[:, 2]) * 6 + facing
+        key = ((cell[:, 0] * 1024 + cell[:, 1]) * 1024 + cell[:, 2]) * 12 + 6 * of_support + facing
         number = np.unique(key, return_inverse=True)[1]
         if number.max() < MOST_PATCHES or cells < 2:
             return number
@@ -157,9 +160,10 @@ def _gathered(
 
 def points_of(scene: Scene) -> NDArray[np.int64]:
     """[points, patches] triangles that stand for each patch, any of it."""
-    order = np.lexsort((np.random.default_rng(3).random(len(scene.patch)), scene.patch))
+    flat = scene.areas_mm2 < 1e-9 * scene.areas_mm2.max()  # has no normal
+    order = np.lexsort((np.random.default_rng(3).random(len(scene.patch)), flat, scene.patch))
     first = np.searchsorted(scene.patch[order], np.arange(scene.patches))
-    number = np.bincount(scene.patch)
+    number = np.maximum(np.bincount(scene.patch[~flat], minlength=scene.patches), 1)
     return np.stack([order[first + point * number // _POINTS] for point in range(_POINTS)])
 
 
@@ -201,7 +205,8 @@ def radiosity(
                 indirect = seen @ exitance
                 exitance = reflectance[:, None].astype(np.float32) * (direct + indirect)
             reached = direct.sum(axis=1)
-            share = np.where(reached > 0, reached / np.maximum(reached + indirect.sum(axis=1), 1e-30), 1.0)
+            beside = np.where(direct > 0, indirect, 0.0).sum(axis=1)  # of the LEDs that samples are of
+            share = np.where(reached > 0, reached / np.maximum(reached + beside, 1e-30), 1.0)
             reflectance = one * share
         found.append(exitance)
     return np.stack(found)
@@ -223,29 +228,52 @@ def subtract(
     pose = result.base_from_support
     support = (pose[:3, 3], pose[:3, 2]) if support_reflectance > 0 else None
     scene = scene_of(corners, support_z=support)
-    shown = _shown(result, scene, len(corners), support_reflectance)
+    shown, diffuse = _as_measured(result, scene, len(corners), support_reflectance)
     say("inter-reflection", 1, 2 + len(missing))
     points = points_of(scene)
     seen = sum(seen_from(scene, at, seed) for seed, at in enumerate(points)) * (1.0 / len(points))
     say("inter-reflection", 2, 2 + len(missing))
     for number, view in enumerate(missing):
-        _subtract_view(result, view, scene, seen, shown, paper)
+        _subtract_view(view, scene, seen, shown, diffuse[view.path.stem], paper)
         say("inter-reflection", 3 + number, 2 + len(missing))
 
 
-def _shown(result: RunResult, scene: Scene, count: int, support_reflectance: float) -> Floats:
+def _as_measured(
+    result: RunResult, scene: Scene, count: int, support_reflectance: float
+) -> tuple[Floats, dict[str, Floats]]:
+    """Reflectance of patches and triangles, by `_shown` and `_diffuse`, before anything was taken off: kept in a
+    file, by which a job that was stopped goes on."""
+    path = result.folder / AS_MEASURED
+    if not path.exists():
+        diffuse = {view.path.stem: _diffuse(result, view) for view in result.views}
+        shown = _shown(result, diffuse, scene, count, support_reflectance)
+
+        def write(part: Path) -> None:
+            with h5py.File(part, "w") as file:
+                file["shown"] = shown
+                for name, values in diffuse.items():
+                    file[f"diffuse/{name}"] = values
+
+        complete(path, write)
+    with h5py.File(path, "r") as file:
+        return file["shown"][()], {name: values[()] for name, values in file["diffuse"].items()}
+
+
+def _shown(
+    result: RunResult, diffuse: dict[str, Floats], scene: Scene, count: int, support_reflectance: float
+) -> Floats:
     """[patches, channels] reflectance by the samples, the mean of a patch's triangles; of those that no view shows
     that of all; the support has its own."""
     channels = result.channels
     sums, weights = np.zeros((scene.patches, channels)), np.zeros(scene.patches)
     every = []
     for view in result.views:
-        diffuse = _diffuse(result, view)
-        known = np.isfinite(diffuse).all(axis=1)
+        values = diffuse[view.path.stem]
+        known = np.isfinite(values).all(axis=1)
         mine, areas = scene.patch[view.triangles[known]], scene.areas_mm2[view.triangles[known]]
-        np.add.at(sums, mine, areas[:, None] * diffuse[known])
+        np.add.at(sums, mine, areas[:, None] * values[known])
         np.add.at(weights, mine, areas)
-        every.append(diffuse[known])
+        every.append(values[known])
     usual = np.median(np.concatenate(every), axis=0)
     with np.errstate(invalid="ignore"):
         shown = np.where(weights[:, None] > 0, sums / weights[:, None], usual)
@@ -255,31 +283,39 @@ def _shown(result: RunResult, scene: Scene, count: int, support_reflectance: flo
 
 
 def _diffuse(result: RunResult, view: ViewSamples, most: int = 64) -> Floats:
-    """[n, channels] median of the samples of each triangle under some LEDs that do not graze."""
-    columns = np.zeros(len(view.leds), np.bool_)
-    columns[:: max(1, len(view.leds) // most)] = True
+    """[n, channels] median of the samples of each triangle under some LEDs that do not graze, or under all where
+    those reach it not."""
+    some_leds = np.zeros(len(view.leds), np.bool_)
+    some_leds[:: max(1, len(view.leds) // most)] = True
     found = np.full((len(view.triangles), result.channels), np.nan)
     for first in range(0, len(found), 8192):
         rows = slice(first, min(first + 8192, len(found)))
-        samples = result.view_samples(view, rows, columns)
-        cosine = _cosines(samples.centres_mm, samples.normals, samples.led_mm)
-        values = np.where(cosine[..., None] > _LEAST_COSINE, samples.values / cosine[..., None], np.nan)
-        some = np.all(np.isfinite(values).any(axis=1), axis=1)
-        found[rows][some] = np.nanmedian(values[some], axis=1)
+        for columns in (some_leds, ~some_leds):
+            if np.isnan(found[rows]).any():
+                _fill_medians(found[rows], result.view_samples(view, rows, columns))
     return found
 
 
+def _fill_medians(found: Floats, samples: TriangleSamples) -> None:
+    """Into those of `found` [n, channels] that are NaN."""
+    cosine = _cosines(samples.centres_mm, samples.normals, samples.led_mm)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.where(cosine[..., None] > _LEAST_COSINE, samples.values / cosine[..., None], np.nan)
+    missing = np.isnan(found).any(axis=1) & np.all(np.isfinite(values).any(axis=1), axis=1)
+    found[missing] = np.nanmedian(values[missing], axis=1)
+
+
 def _subtract_view(
-    result: RunResult, view: ViewSamples, scene: Scene, seen: csr_array, shown: Floats, paper: bool
+    view: ViewSamples, scene: Scene, seen: csr_array, shown: Floats, diffuse: Floats, paper: bool
 ) -> None:
     direct = direct_irradiance(scene, view.led_mm, view.led_normals, paper=paper)
     exitance = radiosity(seen, direct, shown)
     gathers = seen_from(scene, view.triangles, _POINTS)
-    diffuse = _diffuse(result, view)
+    diffuse = np.where(np.isfinite(diffuse), diffuse, shown[scene.patch[view.triangles]] / np.pi)
 
     def write(part: Path) -> None:
         shutil.copyfile(view.path, part)
-        shares = []
+        shares, used = [], 0
         with h5py.File(part, "r+") as file:
             told = "share of f that was inter-reflection, and was taken off"
             kept = file.create_dataset(
@@ -291,11 +327,14 @@ def _subtract_view(
                 f = file["f"][rows]
                 off = _off(view, scene, gathers[rows], exitance, diffuse[rows], rows, paper)
                 share = off / f
+                share[~(share < MOST_SHARE)] = np.nan
                 some = share[:: 1 + len(f) // 512]
                 shares.append(some[np.isfinite(some)])
-                file["f"][rows] = np.where(share < MOST_SHARE, f - off, np.nan)
+                file["f"][rows], file["u_own"][rows] = f * (1 - share), file["u_own"][rows] / (1 - share)
                 kept[rows] = share.astype(np.float16)
+                used += int(np.count_nonzero(np.isfinite(share)))
             every = np.concatenate(shares)
+            file.attrs[SAMPLES] = used
             file.attrs[INTER_REFLECTION] = np.quantile(every, [0.5, 0.95]) if len(every) else [0.0, 0.0]
 
     complete(view.path, write)

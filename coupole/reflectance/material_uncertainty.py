@@ -35,6 +35,8 @@ from coupole.reflectance.triangle_fit import (
 Floats = NDArray[np.float64]
 
 GROUPS = 8
+_FEWEST_GROUPS = 6
+"""Fewer say too little of what they share: single samples are counted too."""
 """Of LEDs, of each view."""
 _LEAST_KS = 1e-3
 """Of kd: below it the logarithm's covariance would say nothing of the highlight that may be there."""
@@ -55,17 +57,19 @@ class MaterialUncertainty:
     u_ks: Floats
 
 
-def groups_of(samples: TriangleSamples) -> NDArray[np.int64]:
-    """[samples] numbers of groups of neighbouring LEDs, view by view: about those, spread evenly, that are
-    nearest to them as seen from the triangles' middle."""
-    middle = samples.centres_mm.mean(axis=0)
-    ways = samples.led_mm - middle
+def groups_of(samples: TriangleSamples, middle_mm: Floats) -> NDArray[np.int64]:
+    """[samples] numbers of groups of neighbouring LEDs of each view: those that are nearest to some that are
+    spread evenly, as seen from the object's middle."""
+    ways = samples.led_mm - middle_mm
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    chosen, nearest = [0], np.full(len(ways), -np.inf)
-    for _ in range(min(GROUPS, len(ways))):
-        nearest = np.maximum(nearest, ways @ ways[chosen[-1]])
-        chosen.append(int(np.argmin(nearest)))
-    group: NDArray[np.int64] = np.argmax(ways @ ways[chosen[:-1]].T, axis=1) + GROUPS * samples.view_of
+    group = np.empty(len(ways), np.int64)
+    for view in np.unique(samples.view_of):
+        mine = np.flatnonzero(samples.view_of == view)
+        chosen, nearest = [0], np.full(len(mine), -np.inf)
+        for _ in range(min(GROUPS, len(mine))):
+            nearest = np.maximum(nearest, ways[mine] @ ways[mine[chosen[-1]]])
+            chosen.append(int(np.argmin(nearest)))
+        group[mine] = np.argmax(ways[mine] @ ways[mine[chosen[:-1]]].T, axis=1) + GROUPS * view
     return group
 
 
@@ -76,12 +80,14 @@ def covariances(
     noise_um: float,
     *,
     fitted_normals: bool,
+    middle_mm: Floats,
     threads: int | None = None,
 ) -> MaterialUncertainty:
-    """Of materials that were fitted to the samples `used` [samples]; `noise_um` is that of the mesh's vertices."""
+    """Of materials that were fitted to the samples `used` [samples]; `noise_um` is that of the mesh's vertices,
+    `middle_mm` the middle of the object."""
     prior = prior_stiffness(samples.areas_mm2, noise_um)
     held = prior if fitted_normals else np.full(len(prior), HELD)
-    group = groups_of(samples)
+    group = groups_of(samples, middle_mm)
     order = np.flatnonzero(used)
     order = order[np.argsort(group[order], kind="stable")]
     grey = np.stack([materials.kd.mean(axis=1), materials.ks.mean(axis=1), materials.alpha], axis=1)
@@ -170,6 +176,7 @@ def _sums(roots, good, lights, half, views, view_of, group, normal, grey, bread,
     scale = CAUCHY * math.sqrt(grey[0])
     t1, t2 = tangents(normal[0], normal[1], normal[2])
     row, score = np.empty(UNKNOWNS), np.zeros(UNKNOWNS)
+    single = np.zeros((UNKNOWNS, UNKNOWNS))
     groups, before = 0, -1
     for number in range(len(good)):
         sample = good[number]
@@ -188,7 +195,10 @@ def _sums(roots, good, lights, half, views, view_of, group, normal, grey, bread,
             score[i] += weight * off * row[i] / scale
             for j in range(UNKNOWNS):
                 bread[i, j] += bend * row[i] * row[j]
+                single[i, j] += (weight * off / scale) ** 2 * row[i] * row[j]
     _add_square(score, meat)
+    if groups < _FEWEST_GROUPS:
+        meat += single
     few = groups / max(groups - 1.0, 1.0) * (len(good) - 1.0) / max(len(good) - UNKNOWNS, 1.0)
     for i in range(UNKNOWNS):
         for j in range(UNKNOWNS):
@@ -204,7 +214,9 @@ def _colours(  # type: ignore[no-untyped-def]
     channels = len(kd)
     bread, meat = np.zeros((2, 2)), np.zeros((channels + 1, 2, 2))
     score, row = np.zeros((channels + 1, 2)), np.empty(2)
-    before = -1
+    single = np.zeros((channels + 1, 2, 2))
+    off, part = np.empty(channels + 1), np.empty(2)
+    groups, before = 0, -1
     for number in range(len(good)):
         sample = good[number]
         light, view = lights[sample], views[view_of[sample]]
@@ -216,19 +228,25 @@ def _colours(  # type: ignore[no-untyped-def]
         row[0], row[1] = nl, nl * lobe(nl, nv, nh, grey[2])[0]
         weight = colour_weight(row[0] * grey[0] + row[1] * grey[1], own[sample], grey[0])
         if group[sample] != before:
-            before = group[sample]
+            groups, before = groups + 1, group[sample]
             for channel in range(channels + 1):
                 _add_square(score[channel], meat[channel])
             score[:] = 0.0
+        off[channels] = 0.0
+        for channel in range(channels):
+            off[channel] = own[sample, channel] - row[0] * kd[channel] - row[1] * ks[channel]
+            off[channels] += off[channel] / channels
         for i in range(2):
             for j in range(2):
                 bread[i, j] += weight * row[i] * row[j]
-            for channel in range(channels):
-                off = own[sample, channel] - row[0] * kd[channel] - row[1] * ks[channel]
-                score[channel, i] += weight * row[i] * off
-                score[channels, i] += weight * row[i] * off / channels
+        for channel in range(channels + 1):
+            part[:] = weight * off[channel] * row
+            score[channel] += part
+            _add_square(part, single[channel])
     for channel in range(channels + 1):
         _add_square(score[channel], meat[channel])
+    if groups < _FEWEST_GROUPS:
+        meat += single
     bread[0, 0] += 1e-12
     bread[1, 1] += 1e-9 * bread[0, 0]
     inverse = np.linalg.inv(bread)

@@ -163,6 +163,8 @@ def relit_by(
                 beams.append((np.array(light.towards), light.rgb))
             case EnvironmentLight():
                 environment = read_environment(light.file, OF_PICTURES, light.rgb, light.turn_deg)
+                if not environment.radiance.any():
+                    continue
                 ways, radiances, densities = environment.sample(samples)
                 strengths = radiances / (np.pi * densities[:, None])
                 beams += [(way, rgb) for way, rgb in zip(ways, strengths, strict=True) if way[2] > 0.0]

@@ -42,6 +42,8 @@ def read_settings(out: Path) -> dict[str, Any]:
             raise ValueError
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: expected the settings of a result of runs") from error
+    if "subtracted" not in settings:
+        raise InputError(f"{path}: was begun by an earlier version; make the result anew, with another --out")
     return settings
 
 
@@ -51,14 +53,15 @@ def clear_remains(out: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def complete(path: Path, write: Callable[[Path], Any]) -> None:
-    """Have a file written beside its place, then put there: it is whole or not there, also after a crash."""
-    with in_the_making(path) as part:
+def complete(path: Path, write: Callable[[Path], Any], *, unless: Path | None = None) -> None:
+    """Have a file written beside its place, then put there: it is whole or not there, also after a crash. Nothing
+    is put there if `unless` exists by then: another has done it meanwhile."""
+    with in_the_making(path, unless) as part:
         write(part)
 
 
 @contextmanager
-def in_the_making(path: Path) -> Iterator[Path]:
+def in_the_making(path: Path, unless: Path | None = None) -> Iterator[Path]:
     """Where to write a file that is put in its place, whole, when all has gone well. The name is used once: a
     writer that is believed dead disturbs no other."""
     part = path.with_name(f"{path.name}.{uuid4().hex}.part")
@@ -67,7 +70,8 @@ def in_the_making(path: Path) -> Iterator[Path]:
         yield part
         with part.open("rb") as file:
             os.fsync(file.fileno())
-        part.replace(path)
+        if unless is None or not unless.exists():
+            part.replace(path)
     finally:
         part.unlink(missing_ok=True)
     sync_folder(path.parent)

@@ -32,6 +32,8 @@ from coupole.storage.durable import write_synced
 
 Said = Callable[[str, int, int], None]
 PEAK_QUANTILE = 0.999
+_LEVELS, _LEVELS_OF_RANGE = 1 << 17, 1 << 16
+"""Of a histogram of shares of the camera's range, up to twice of it."""
 
 
 @dataclass
@@ -41,25 +43,18 @@ class _Missed:
     absolute: float = 0.0
     square: float = 0.0
     count: int = 0
-    measured: list[NDArray[np.float32]] = field(default_factory=list)
 
-    def add(self, made: NDArray[np.float64], measured: NDArray[np.float64]) -> None:
-        off = made - measured
+    def add(self, off: NDArray[np.float64]) -> None:
         self.absolute += float(np.abs(off).sum())
         self.square += float(np.sum(off**2))
         self.count += off.size
-        self.measured.append(measured[::16].astype(np.float32))
 
     @property
     def mae(self) -> float | None:
         return self.absolute / self.count if self.count else None
 
-    @property
-    def psnr_db(self) -> float | None:
-        if not self.count:
-            return None
-        peak = float(np.quantile(np.concatenate(self.measured), PEAK_QUANTILE))
-        return float(10 * np.log10(peak**2 / max(self.square / self.count, 1e-30)))
+    def psnr_db(self, peak: float) -> float | None:
+        return float(10 * np.log10(peak**2 / max(self.square / self.count, 1e-30))) if self.count else None
 
 
 @dataclass
@@ -70,8 +65,16 @@ class _Check:
     triangles: dict[str, _Missed] = field(default_factory=lambda: {name: _Missed() for name in FITS})
     noise: list[float] = field(default_factory=list)
     """Mean absolute error of the pictures by noise, of each."""
-    inside: dict[str, list[NDArray[np.bool_]]] = field(default_factory=lambda: {name: [] for name in MATERIALS})
-    """Of triangles' samples, whether they lie in the interval of what the material gives."""
+    levels: NDArray[np.int64] = field(default_factory=lambda: np.zeros(_LEVELS, np.int64))
+    """How many values of the pictures there are at each level."""
+    inside: dict[str, list[int]] = field(default_factory=lambda: {name: [0, 0] for name in MATERIALS})
+    """Of triangles' samples, how many lie in the interval of what the material gives, and of how many."""
+
+    @property
+    def peak(self) -> float:
+        """Of the pictures, by which PSNR is told."""
+        upper = np.searchsorted(np.cumsum(self.levels), PEAK_QUANTILE * self.levels.sum())
+        return float(upper + 0.5) / _LEVELS_OF_RANGE
 
 
 def check_result(
@@ -122,13 +125,17 @@ def _check_view(
             places = np.searchsorted(result.triangles, view.triangles[rows])
             covariance = result.material_covariances(name, places)
             relative = relative_uncertainty(some, result.materials(name, places), covariance)
-            inside.append(_inside(made[name] / share, relative, some.values, result.view_noise(view, rows, held)))
+            found = _inside(made[name] / share, relative, some.values, result.view_noise(view, rows, held))
+            inside[0] += int(np.count_nonzero(found))
+            inside[1] += found.size
         direct = result.direct_shares(view, rows, held)[:, columns]
         for channel in range(result.channels):
             place, measured = frames.pairs(rows, channel)
             measured *= direct[place, :, channel]
             pixels = {name: values[:, columns, channel][place] for name, values in made.items()}
-            _compare(pixels, measured, check.pictures)
+            compared = _compare(pixels, measured, check.pictures)
+            level = np.clip(compared * _LEVELS_OF_RANGE, 0, _LEVELS - 1).astype(np.int64)
+            check.levels += np.bincount(level, minlength=_LEVELS)
         say(f"check of {view.view}", rows.stop, len(view.triangles))
 
 
@@ -150,12 +157,15 @@ def _inside(
 
 def _compare(
     made: dict[str, NDArray[np.float64]], measured: NDArray[np.floating], missed: dict[str, _Missed]
-) -> None:
+) -> NDArray[np.floating]:
+    """Add what fits miss where all have something; the measured values there."""
     known = np.isfinite(measured)
     for values in made.values():
         known &= np.isfinite(values)
     for name, values in made.items():
-        missed[name].add(values[known], measured[known])
+        missed[name].add(values[known] - measured[known])
+    found: NDArray[np.floating] = measured[known]
+    return found
 
 
 def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | None:
@@ -166,20 +176,17 @@ def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | 
     return {"coverage": uncertainty["interval"]["coverage"], "low": low, "high": high}
 
 
-def _share(inside: list[NDArray[np.bool_]]) -> float | None:
-    every = np.concatenate(inside)
-    return float(every.mean()) if len(every) else None
-
-
 def _typical(result: RunResult, name: str) -> dict[str, float | None]:
     """Medians of standard uncertainties of a material; of kd and ks with what all samples of a triangle, and all
-    triangles, share."""
+    triangles, share. None for those that are not known."""
     variances = np.einsum("nii->ni", result.material_covariances(name)).copy()
     variances[:, 2:4] += (result.u_triangles(slice(None)) ** 2 + result.u_shared**2)[:, None]
-    known = np.sqrt(variances[np.isfinite(variances).all(axis=1)])
+    known = np.sqrt(variances)
     tilt = np.degrees(np.hypot(known[:, 0], known[:, 1]))
-    percent = {f"{key}_percent": _median(100 * known[:, 2 + n]) for n, key in enumerate(("kd", "ks", "alpha"))}
-    return {"normal_deg": _median(tilt), **percent}
+    columns = {"normal_deg": tilt} | {
+        f"{key}_percent": 100 * known[:, 2 + n] for n, key in enumerate(("kd", "ks", "alpha"))
+    }
+    return {key: _median(values[np.isfinite(values)]) for key, values in columns.items()}
 
 
 def _median(values: NDArray[np.float64]) -> float | None:
@@ -206,11 +213,11 @@ def _about(
         "samples": sum(view["samples"] for view in views),
         "residual": {name: _median(values[np.isfinite(values)]) for name, values in left.items()},
         "mae": {name: missed.mae for name, missed in check.pictures.items()},
-        "held_out_psnr_db": {name: missed.psnr_db for name, missed in check.pictures.items()},
+        "held_out_psnr_db": {name: missed.psnr_db(check.peak) for name, missed in check.pictures.items()},
         "mae_of_triangles": {name: missed.mae for name, missed in check.triangles.items()},
-        "held_out_inside": {name: _share(inside) for name, inside in check.inside.items()},
+        "held_out_inside": {name: n / of if of else None for name, (n, of) in check.inside.items()},
         "material_uncertainty": {name: _typical(result, name) for name in MATERIALS},
-        "mae_of_noise": float(np.mean(check.noise)) if np.isfinite(check.noise).any() else None,
+        "mae_of_noise": float(np.nanmean(check.noise)) if np.isfinite(check.noise).any() else None,
         "median_interval_percent": _interval_percent(uncertainty),
         "uncertainty_percent": uncertainty,
         "seconds": round(seconds, 3),

@@ -110,7 +110,15 @@ def _materials_block(
     used = ~np.isin(result.along_samples(block, "leds"), job.left_out)
     samples = result.samples(block)
     found = fit_triangles(samples, used, job.noise_um if fitted_normals else None, threads=threads)
-    return found, covariances(samples, used, found, job.noise_um, fitted_normals=fitted_normals, threads=threads)
+    return found, covariances(
+        samples,
+        used,
+        found,
+        job.noise_um,
+        fitted_normals=fitted_normals,
+        middle_mm=result.middle_mm,
+        threads=threads,
+    )
 
 
 def _fit_slices(

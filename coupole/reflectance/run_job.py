@@ -94,6 +94,9 @@ def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None
 
 def _refuse_different(measured_runs: Sequence[MeasuredRun]) -> None:
     first = measured_runs[0]
+    names = [measured.run.folder.name for measured in measured_runs]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"{twice}: two runs have this name; rename the folder of one, or name each run once")
     for other in measured_runs[1:]:
         if not np.array_equal(first.corners_mm, other.corners_mm):
             raise InputError(
@@ -164,7 +167,7 @@ def _extract_one(
     view = next(view for view in measured.views if view.name == one.view)
     found = extract_view(measured, geometry, radiometry, view, one.path, say, threads=threads)
     frames = one.path.parents[1] / FRAMES / one.path.name
-    complete(frames, partial(write_frames, radiometry, view, one.path, one.left_out))
+    complete(frames, partial(write_frames, radiometry, view, one.path, one.left_out, threads))
     return found
 
 

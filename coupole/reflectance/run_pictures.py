@@ -29,7 +29,8 @@ class CheckFrames:
         `share` [blocks, leds]."""
         order, places = self._sorted[channel]
         first, end = np.searchsorted(places, [rows.start, rows.stop])
-        flat = self.share.reshape(len(self.leds), -1, self.share.shape[3])
+        leds, height, width, channels = self.share.shape
+        flat = self.share.reshape(leds, height * width, channels)
         return places[first:end] - rows.start, flat[:, order[first:end], channel].T.astype(np.float32)
 
     def picture(self, values: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -48,6 +48,10 @@ Block = slice | NDArray[np.int64]
 """Places of triangles; numbers rise."""
 INTER_REFLECTION = "inter_reflection"
 """Attribute of a file of samples that it was taken from."""
+SAMPLES = "samples"
+"""Attribute too: how many are left."""
+AS_MEASURED = "as_measured.h5"
+"""Reflectance before that, from the folder."""
 U_OF_INTER_REFLECTION = 0.2
 """Relative standard uncertainty of what is taken off. Of a simulated relief of white stone it was 0.15 to 0.19."""
 MOST_ROWS = 1 << 16
@@ -76,6 +80,8 @@ class ViewSamples:
     view: str
     inter_reflection: tuple[float, float] | None
     """Median and 95th percentile of its share that was taken off f; None if nothing was."""
+    samples_left: int | None
+    """Samples that can be used after that."""
     triangles: NDArray[np.int64]
     camera_mm: NDArray[np.float64]
     leds: NDArray[np.int64]
@@ -137,6 +143,12 @@ class RunResult:
         areas: NDArray[np.float64] = 0.5 * np.linalg.norm(across, axis=1)
         return areas
 
+    @cached_property
+    def middle_mm(self) -> NDArray[np.float64]:
+        """Of the triangles that any view sees."""
+        middle: NDArray[np.float64] = self.corners_mm[self.triangles].mean(axis=(0, 1), dtype=np.float64)
+        return middle
+
     @property
     def files(self) -> list[Path]:
         return sorted((self.folder / "samples").glob("*.h5"))
@@ -156,7 +168,11 @@ class RunResult:
         files = sorted((self.folder / "samples").glob("*.json"))
         told = [json.loads(path.read_text(encoding="utf-8")) for path in files]
         return [
-            {**summary, INTER_REFLECTION: view.inter_reflection}
+            {
+                **summary,
+                INTER_REFLECTION: view.inter_reflection,
+                SAMPLES: summary[SAMPLES] if view.samples_left is None else view.samples_left,
+            }
             for summary, view in zip(told, self.views, strict=True)
         ]
 
@@ -272,7 +288,7 @@ class RunResult:
     def u_shared(self) -> float:
         """Relative standard uncertainty that all samples share."""
         files = (h5py.File(view.path, "r") for view in self.views)
-        return float(np.mean([np.mean(file["led_u_shared"][()]) for file in files]))
+        return float(np.nanmean([np.nanmean(file["led_u_shared"][()]) for file in files]))
 
     def along_samples(self, block: slice, name: str) -> NDArray[Any]:
         """[samples, ...] what each sample of `samples(block)` has by its LED: `leds`, `led_normals`,
@@ -344,6 +360,7 @@ def read_view_samples(path: Path) -> ViewSamples:
             path,
             str(file.attrs["view"]),
             None if share is None else (float(share[0]), float(share[1])),
+            None if share is None else int(file.attrs[SAMPLES]),
             *(file[name][()] for name in _HEAD),
         )
 

@@ -6,6 +6,7 @@ focused on, their light is what the table says of it there. Values are relative,
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -27,16 +28,17 @@ from coupole.storage.run import Run
 
 Said = Callable[[str, int, int], None]
 FILES = LIGHTS, INTENSITIES, MASK = "lights.txt", "intensities.txt", "mask.png"
+ABOUT = "pictures.json"
 _MOST_CLIPPED = 1e-3
 _LEAST_SHARE = 0.02
 """Of the range, that a pixel of the mask has under its brightest LED."""
 
 
-def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> None:
+def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> list[int]:
     """Write pictures of a view of a run [h / 2, w / 2], 16 bit, linear, one pixel of each channel of a block, with
-    `filenames.txt`, lights, intensities and mask; what is there already is kept.
+    `filenames.txt`, lights, intensities and mask; what is there already is kept. The LEDs in their order.
 
-    Raises InputError: no such view, too few LEDs; StorageError for damaged frames.
+    Raises InputError: no such view, too few LEDs, a folder with other pictures; StorageError for damaged frames.
     """
     run = Run(folder)
     files = read_plan(run.plan_path, run.rig_path)
@@ -45,6 +47,8 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> None
     out.mkdir(parents=True, exist_ok=True)
     leds = sorted(chosen)
     shortest_us = min(frame.exposure_us for frame in chosen.values())
+    about = {"view": chosen[leds[0]].view, "frames": [str(chosen[led].shot) for led in leds], "run": frames.inputs}
+    _refuse_others(out / ABOUT, json.dumps(about) + "\n")
     dark = dark_signal(frames, None)
     brightest = np.zeros((frames.size_px[1] // 2, frames.size_px[0] // 2), np.uint16)
     for number, led in enumerate(leds):
@@ -67,6 +71,13 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> None
     write_synced(out / ORDER_FILE, "".join(f"led{led:04d}.png\n" for led in leds))
     mask = np.where(brightest > _LEAST_SHARE * 65535, np.uint8(255), np.uint8(0))
     complete(out / MASK, partial(_write_png, mask))
+    return leds
+
+
+def _refuse_others(path: Path, text: str) -> None:
+    if path.exists() and path.read_text(encoding="utf-8") != text:
+        raise InputError(f"{path.parent} holds pictures of another run or view: remove it, or name another --out")
+    write_synced(path, text)
 
 
 def _frames_of(folder: Path, frames: LightFrames, view: str | None) -> dict[int, LightFrame]:

@@ -144,7 +144,8 @@ def _material_uncertainty(about: dict[str, Any]) -> Iterator[str]:
     for name, known in about["material_uncertainty"].items():
         if known["normal_deg"] is not None:
             yield f"<tr><th>{TOLD[name]}<td>{known['normal_deg']:.2f}"
-            yield "".join(f"<td>{known[f'{field}_percent']:.1f} %" for field in ("kd", "ks", "alpha"))
+            each = (known[f"{field}_percent"] for field in ("kd", "ks", "alpha"))
+            yield "".join("<td>" if percent is None else f"<td>{percent:.1f} %" for percent in each)
             inside = about["held_out_inside"][name]
             yield "<td>" if inside is None else f"<td>{100 * inside:.1f} %"
     yield "</table><p>Fewer than 95 % inside: the material misses something that neighbouring LEDs do not share."

@@ -238,7 +238,13 @@ class LedBox:
             self._scpi.ask("*CLS", 0)
         except DeviceTimeout:
             self._clock.sleep(_BLOCK_TIMEOUT_S - REPLY_MARGIN_S)
-        (text,) = self._scpi.ask("*RST;*CLS;*IDN?", 1)
+        try:
+            (text,) = self._scpi.ask("*RST;*CLS;*IDN?", 1)
+        except DeviceError as error:
+            if type(error) not in (DeviceTimeout, DeviceError):
+                raise
+            self._clock.sleep(_BLOCK_TIMEOUT_S - REPLY_MARGIN_S)
+            (text,) = self._scpi.ask("*RST;*CLS;*IDN?", 1)  # the first may have met an answer that was late
         fields = str(text).split(",")
         if len(fields) != 4:
             self._scpi.unexpected("four fields in the answer to *IDN?", repr(text))

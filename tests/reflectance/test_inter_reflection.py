@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import h5py
 import numpy as np
 import pytest
 import trimesh
 
-from coupole.reflectance.inter_reflection import direct_irradiance, points_of, radiosity, scene_of, seen_from
+from coupole.reflectance.inter_reflection import (
+    direct_irradiance,
+    points_of,
+    radiosity,
+    scene_of,
+    seen_from,
+    subtract,
+)
+from coupole.reflectance.run_result import OBJECT, RunResult
+from coupole.reflectance.run_result_files import write_object
 
 LED_MM = np.array([[0.0, 0.0, 60.0]])
 DOWN = np.array([[0.0, 0.0, -1.0]])
@@ -56,3 +68,67 @@ def _split(triangle: np.ndarray, times: int) -> np.ndarray:
             [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
         )
     return parts
+
+
+def folded(folder: Path) -> RunResult:
+    """Samples of a floor and a wall of reflectance 0.5 in two views, all light taken for direct."""
+    square = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0]]], float) * 100
+    floor = np.concatenate([_split(triangle, 3) for triangle in square])
+    corners = np.concatenate([floor, floor[:, :, [2, 1, 0]][:, ::-1]])
+    (folder / "samples").mkdir(parents=True)
+    write_object(folder / OBJECT, corners, np.eye(4))
+    random = np.random.default_rng(4)
+    ways = random.normal(size=(24, 3))
+    leds = 700 * np.abs(ways) / np.linalg.norm(ways, axis=1, keepdims=True)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = across / np.linalg.norm(across, axis=1, keepdims=True)
+    for number, view in enumerate(("first", "second")):
+        mine = np.arange(number, len(corners), 2)
+        with h5py.File(folder / f"samples/{view}.h5", "w") as file:
+            file.attrs["view"] = view
+            file["triangles"], file["leds"] = mine, np.arange(len(leds))
+            file["centres_mm"], file["normals"] = corners.mean(axis=1)[mine], normals[mine]
+            file["camera_mm"], file["full_scales"] = np.array([300.0, 300, 600]), np.ones((len(leds), 1))
+            file["led_positions_mm"] = leds
+            file["led_normals"] = -leds / np.linalg.norm(leds, axis=1, keepdims=True)
+            shape = (len(mine), len(leds), 1)
+            f = random.uniform(0.9, 1.1, shape) * 0.5 / np.pi * 1.2
+            for name, values in (("f", f), ("u_own", np.full(shape, 0.01))):
+                file.create_dataset(name, data=values.astype(np.float16), chunks=(16, 8, 1))
+    return RunResult(folder)
+
+
+def test_killed_between_two_views_it_goes_on_to_the_same(tmp_path: Path) -> None:
+    subtract(folded(tmp_path / "whole"), paper=False)
+
+    def killed(step: str, done: int, of: int) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        subtract(folded(tmp_path / "killed"), paper=False, say=killed)
+    views = RunResult(tmp_path / "killed").views
+    assert [view.inter_reflection is None for view in views] == [False, True]
+    subtract(RunResult(tmp_path / "killed"), paper=False)
+    for view in ("first", "second"):
+        one, other = (h5py.File(tmp_path / name / f"samples/{view}.h5") for name in ("whole", "killed"))
+        for name in ("f", "u_own", "inter_reflection"):
+            np.testing.assert_array_equal(one[name][()], other[name][()])
+    share = h5py.File(tmp_path / "whole/samples/first.h5")["inter_reflection"][()].astype(float)
+    assert 0.02 < np.nanmedian(share) < 0.2
+
+
+def test_what_is_left_out_has_no_share_and_noise_grows_with_what_was_taken_off(tmp_path: Path) -> None:
+    result = folded(tmp_path)
+    with h5py.File(tmp_path / "samples/first.h5", "r+") as file:
+        file["f"][:40] *= np.float16(0.02)  # far less than arrives from the wall
+    subtract(result, paper=False)
+    with h5py.File(tmp_path / "samples/first.h5") as file:
+        f, u_own, share = (file[name][()].astype(float) for name in ("f", "u_own", "inter_reflection"))
+        assert np.isnan(f[:40]).any()
+        assert (np.isnan(f) == np.isnan(share)).all()
+        assert (np.isnan(f) == np.isnan(u_own)).all()
+        known = np.isfinite(f)
+        assert share[known].max() < 0.5
+        np.testing.assert_allclose(u_own[known] * (1 - share[known]), 0.01, rtol=2e-3)
+        assert int(file.attrs["samples"]) == known.sum()

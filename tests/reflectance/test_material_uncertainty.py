@@ -36,7 +36,7 @@ def test_normals_lie_in_their_intervals_though_the_material_is_another() -> None
         samples, truth = noisy_case(2, noise=noise, leds=240)
         used = np.ones(len(samples.led_mm), bool)
         materials = fit_triangles(samples, used, SCANNER_UM)
-        uncertain = covariances(samples, used, materials, SCANNER_UM, fitted_normals=True)
+        uncertain = covariances(samples, used, materials, SCANNER_UM, fitted_normals=True, middle_mm=np.zeros(3))
         sd = np.sqrt(np.einsum("nii->ni", uncertain.covariance)[:, :2])
         inside.append(np.mean(np.abs(tilts(materials, truth)) < 1.96 * sd))
     assert 0.88 < min(inside) < max(inside) < 1.0, inside
@@ -49,7 +49,7 @@ def test_materials_lie_in_their_intervals() -> None:
     used = np.ones(len(samples.led_mm), bool)
     noisy = made_by(samples, real, 0.03, 4)
     found = fit_triangles(noisy, used, SCANNER_UM)
-    uncertain = covariances(noisy, used, found, SCANNER_UM, fitted_normals=True)
+    uncertain = covariances(noisy, used, found, SCANNER_UM, fitted_normals=True, middle_mm=np.zeros(3))
     sd = np.sqrt(np.einsum("nii->ni", uncertain.covariance))
     for off, u in (
         (tilts(found, truth), sd[:, :2]),
@@ -68,7 +68,7 @@ def test_normals_that_are_held_make_materials_less_certain_as_their_turns_do() -
     used = np.ones(len(samples.led_mm), bool)
     made = made_by(samples, TriangleMaterials(truth, *alike, np.zeros(COUNT)), 1e-3, 6)
     found = fit_triangles(made, used, None)
-    uncertain = covariances(made, used, found, SCANNER_UM, fitted_normals=False)
+    uncertain = covariances(made, used, found, SCANNER_UM, fitted_normals=False, middle_mm=np.zeros(3))
     off = np.log(found.kd.mean(axis=1) / alike[0].mean(axis=1))
     z = off / np.sqrt(uncertain.covariance[:, 2, 2])
     assert 0.6 < np.sqrt(np.mean(z**2)) < 1.5
@@ -78,7 +78,7 @@ def test_what_a_material_gives_is_as_uncertain_as_draws_of_it_tell() -> None:
     samples, _ = noisy_case(1, leds=60)
     used = np.ones(len(samples.led_mm), bool)
     found = fit_triangles(samples, used, SCANNER_UM)
-    uncertain = covariances(samples, used, found, SCANNER_UM, fitted_normals=True)
+    uncertain = covariances(samples, used, found, SCANNER_UM, fitted_normals=True, middle_mm=np.zeros(3))
     covariance = 1e-4 * uncertain.covariance  # small enough to be linear
     random = np.random.default_rng(9)
     along = np.array([tangents(*normal) for normal in found.normals])
@@ -103,7 +103,7 @@ def test_black_and_unseen_triangles_are_uncertain_not_errors() -> None:
     found = fit_triangles(samples, used, SCANNER_UM)
     found.kd[0], found.ks[1], found.kd[2], found.ks[2] = 0.0, 0.0, 0.0, 0.0
     found.alpha[3] = np.nan
-    uncertain = covariances(samples, used, found, SCANNER_UM, fitted_normals=True)
+    uncertain = covariances(samples, used, found, SCANNER_UM, fitted_normals=True, middle_mm=np.zeros(3))
     assert np.isnan(uncertain.covariance[3]).all()
     assert np.isfinite(uncertain.covariance[:3]).all()
     assert (uncertain.u_kd[[0, 2]] > 1).all()
@@ -111,10 +111,36 @@ def test_black_and_unseen_triangles_are_uncertain_not_errors() -> None:
 
 def test_groups_are_of_one_view_and_of_leds_side_by_side() -> None:
     samples, _ = noisy_case(2, leds=240)
-    group = groups_of(samples)
+    group = groups_of(samples, np.zeros(3))
     assert len(np.unique(group)) == 16
     for number in np.unique(group):
         mine = group == number
         assert len(np.unique(samples.view_of[mine])) == 1
         ways = unit(samples.led_mm[mine])
         assert (ways @ unit(ways.mean(axis=0))).min() > np.cos(np.radians(50))
+
+
+def test_uncertainties_do_not_depend_on_what_else_is_in_a_block() -> None:
+    samples, _ = noisy_case(2, leds=240)
+    used = np.ones(len(samples.led_mm), bool)
+    found = fit_triangles(samples, used, SCANNER_UM)
+    some = np.arange(10, 30)
+
+    def of(block: TriangleSamples, materials: TriangleMaterials) -> np.ndarray:
+        uncertain = covariances(block, used, materials, SCANNER_UM, fitted_normals=True, middle_mm=np.zeros(3))
+        return uncertain.covariance
+
+    np.testing.assert_array_equal(of(samples, found)[some], of(samples.of_triangles(some), found.at(some)))
+
+
+def test_triangles_lit_from_one_side_are_as_uncertain_as_their_errors() -> None:
+    """Few groups of LEDs say too little of what they share."""
+    samples, truth = noisy_case(1, leds=1000)
+    kd = np.tile([0.12, 0.1, 0.06], (COUNT, 1))
+    real = TriangleMaterials(truth, kd, 0.3 * kd, np.full(COUNT, 0.25), np.zeros(COUNT))
+    used = samples.led_mm @ unit(np.array([1.0, 0.2, 0.8])) > 800
+    noisy = made_by(samples, real, 0.03, 8)
+    found = fit_triangles(noisy, used, SCANNER_UM)
+    uncertain = covariances(noisy, used, found, SCANNER_UM, fitted_normals=True, middle_mm=np.zeros(3))
+    sd = np.sqrt(np.einsum("nii->ni", uncertain.covariance)[:, :2])
+    assert np.mean(np.abs(tilts(found, truth)) < 1.96 * sd) > 0.9

@@ -10,8 +10,9 @@ import pytest
 from relight_cases import write_exr
 
 from coupole.errors import InputError
+from coupole.reflectance.new_light.beams import lighting_of
 from coupole.reflectance.new_light.environment import OF_RUNS, Environment, read_environment
-from coupole.reflectance.new_light.light_kinds import EnvironmentLight, read_lights
+from coupole.reflectance.new_light.light_kinds import AreaLight, EnvironmentLight, read_lights, turned
 
 LIGHTS = """\
 lights:
@@ -102,3 +103,21 @@ def test_directions_are_drawn_as_often_as_light_comes_from_them() -> None:
     ]
     sums = (ways * (radiances.mean(axis=1) / densities)[:, None]).sum(axis=0)
     np.testing.assert_allclose([*sums, environment.total()], wanted, atol=0.01)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, -1.0), (0.0, 0.6, -0.8)])
+def test_an_area_turns_with_its_width(normal: tuple[float, float, float]) -> None:
+    light = AreaLight(at_mm=(100, 0, 500), normal=normal, width_mm=300, height_mm=50)
+    beams = [
+        np.stack([beam.place for beam in lighting_of([one], (), np.eye(4), 3, 16, paper=False).beams])
+        for one in (light, turned(light, 90.0))
+    ]
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    np.testing.assert_allclose(beams[1], beams[0] @ quarter.T, atol=1e-9)
+
+
+def test_an_environment_without_light_of_the_sensors_colours_is_dark(tmp_path: Path) -> None:
+    path = write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3)))
+    for strength in (0.0, (1.0, 0.0, 0.0)):
+        light = EnvironmentLight(file=path, strength=strength)
+        assert lighting_of([light], (), np.eye(4), 1, 16, paper=False).beams == ()

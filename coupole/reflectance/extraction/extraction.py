@@ -87,6 +87,7 @@ def extract_view(
         nonlocal used
         with h5py.File(part, "w") as file:
             _write_head(file, work, surface)
+            file.attrs["view"] = path.stem
             data = _begin_samples(file, work)
             done = 0
             for some in work.samples(codes_of, threads):
@@ -98,9 +99,9 @@ def extract_view(
                     done += sum(len(view.by_led[int(led)]) for led in work.leds[some.leds])
                     say(f"samples of {view.name}", done, len(view.frames))
 
-    complete(path, write)
+    complete(path, write, unless=path.with_suffix(".json"))
     return {
-        "view": view.name,
+        "view": path.stem,
         "pixels": surface.pixels,
         "triangles": len(surface.triangles),
         "leds": len(work.leds),
@@ -168,7 +169,6 @@ def _hidden_by_cell(work: ViewPass) -> Callable[[NDArray[np.int64]], NDArray[np.
 
 def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
     measured, view, leds = work.measured, work.view, work.leds
-    file.attrs["view"] = view.name
     file.attrs["channels"] = "".join(measured.channels)
     file.attrs["simulated"] = measured.run.simulated
     file.attrs["frame"] = "base of the robot"

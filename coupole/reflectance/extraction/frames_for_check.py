@@ -26,7 +26,12 @@ MOST_FRAMES = 12
 
 
 def write_frames(
-    radiometry: Radiometry, view: MeasuredView, samples: Path, left_out: Sequence[int], to: Path
+    radiometry: Radiometry,
+    view: MeasuredView,
+    samples: Path,
+    left_out: Sequence[int],
+    threads: int | None,
+    to: Path,
 ) -> None:
     """Write the pictures of some of the LEDs `left_out`, the longest exposure of each. `samples` is the view's
     file; a block has a value where all its pixels see triangles that the LED reaches, unclipped. Raises
@@ -34,16 +39,17 @@ def write_frames(
     leds = [led for led in view.by_led if led in set(left_out)]
     leds = leds[:: -(-len(leds) // MOST_FRAMES)] if leds else []
     with h5py.File(samples, "r") as file:
-        seen, codes, of_led = file["seen"][()], file["codes"][()], list(file["leds"][()])
+        of_led = list(file["leds"][()])
+        seen, codes = file["seen"][()], file["codes"][:, np.isin(of_led, leds)]
     offsets = block_offsets(radiometry.channel, radiometry.channels)
     height, width = seen.shape
 
     def picture(led: int) -> tuple[NDArray[np.float16], float]:
         frame = max(view.by_led[led], key=lambda frame: frame.exposure_us)
-        reached = np.append(codes[:, of_led.index(led)] == REACHED, False)  # the last one: what is not seen
+        reached = np.append(codes[:, leds.index(led)] == REACHED, False)  # the last one: what is not seen
         return _picture(radiometry, frame, seen, reached, offsets)
 
-    with h5py.File(to, "w") as file, ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with h5py.File(to, "w") as file, ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         shape = (len(leds), height // 2, width // 2, radiometry.channels)
         data = file.create_dataset("share", shape, np.float16, track_times=False)
         data.attrs["told"] = "[leds, h / 2, w / 2, channels] of the camera's range; NaN where there is none"

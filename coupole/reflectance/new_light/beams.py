@@ -109,8 +109,9 @@ def lighting_of(
                 beams += _beams_of_area(area, samples)
             case EnvironmentLight():
                 found = _environment(light, turn, channels, samples)
-                emitters.append(found[0])
-                beams += found[1]
+                if found is not None:
+                    emitters.append(found[0])
+                    beams += found[1]
     return Lighting(tuple(beams), tuple(emitters))
 
 
@@ -126,9 +127,11 @@ def _led(light: LedLight, views: Sequence[ViewSamples], strength: Floats, paper:
 
 
 def _area(light: AreaLight, base_from_support: Floats, strength: Floats, samples: int) -> Emitter:
-    """Its width lies level: across the normal and z; along x if the normal is z."""
+    """Its width lies as `across` tells, or level: across the normal and z, along x if the normal is z."""
     normal = np.array(light.normal) / np.linalg.norm(light.normal)
     across = np.cross([0.0, 0.0, 1.0], normal)
+    if light.across is not None:
+        across = np.array(light.across) - np.dot(light.across, normal) * normal
     across = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(across) < 1e-6 else across / np.linalg.norm(across)
     axes = np.stack([across, np.cross(normal, across), normal]) @ base_from_support[:3, :3].T
     halves_mm = np.array([light.width_mm, light.height_mm or light.width_mm]) / 2.0
@@ -150,10 +153,15 @@ def _beams_of_area(area: Emitter, samples: int) -> list[Beam]:
     ]
 
 
-def _environment(light: EnvironmentLight, turn: Floats, channels: int, samples: int) -> tuple[Emitter, list[Beam]]:
+def _environment(
+    light: EnvironmentLight, turn: Floats, channels: int, samples: int
+) -> tuple[Emitter, list[Beam]] | None:
+    """None if nothing of it is light of these channels."""
     environment = read_environment(light.file, OF_RUNS @ turn.T, light.rgb, light.turn_deg)
     if channels == 1:
         environment = replace(environment, radiance=environment.radiance[..., 1:2])
+    if not environment.radiance.any():
+        return None
     directions, radiances, densities = environment.sample(samples)
     beams = [
         Beam(False, direction, -direction, 0, radiance / density, float(density))

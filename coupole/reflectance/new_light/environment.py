@@ -94,10 +94,10 @@ def read_environment(path: Path, axes: Floats, strength: Floats, turn_deg: float
     radiance = _read(path)
     if radiance.ndim != 3 or radiance.shape[2] < 3 or radiance.shape[1] != 2 * radiance.shape[0]:
         raise InputError(f"{path}: expected three colours, twice as wide as high; got {radiance.shape}")
-    radiance = radiance[..., :3] * strength.astype(np.float32)
+    radiance = radiance[..., :3]
     if not np.all(np.isfinite(radiance)) or radiance.min() < 0.0 or not radiance.any():
         raise InputError(f"{path}: expected finite values, none below 0 and some above; repair it or name another")
-    return Environment(radiance, axes).turned(turn_deg)
+    return Environment(radiance * strength.astype(np.float32), axes).turned(turn_deg)
 
 
 def _read(path: Path) -> NDArray[np.float32]:

@@ -70,13 +70,19 @@ class PointLight(Light):
     at_mm: Vector
 
 
+_LEVEL = (1.0, 0.0, 0.0)
+"""Of the width, where the normal is z."""
+
+
 class AreaLight(Light):
-    """A rectangle that radiates by Lambert's law to one side; its width lies level."""
+    """A rectangle that radiates by Lambert's law to one side; its width lies level unless `across` is given."""
 
     kind: Literal["area"] = "area"
     at_mm: Vector
     """Of its centre."""
     normal: Way
+    across: Way | None = None
+    """Of the width; what of it is across the normal counts."""
     width_mm: Length
     height_mm: Length | None = None
     """Its width without it."""
@@ -169,7 +175,9 @@ def turned(light: AnyLight, angle_deg: float) -> AnyLight:
         case PointLight():
             return light.model_copy(update={"at_mm": turn(light.at_mm)})
         case AreaLight():
-            return light.model_copy(update={"at_mm": turn(light.at_mm), "normal": turn(light.normal)})
+            across = turn(light.across or _LEVEL) if light.across or not any(light.normal[:2]) else None
+            turned_area = {"at_mm": turn(light.at_mm), "normal": turn(light.normal), "across": across}
+            return light.model_copy(update=turned_area)
         case EnvironmentLight():
             return light.model_copy(update={"turn_deg": light.turn_deg + angle_deg})
         case LedLight():

@@ -146,8 +146,7 @@ class RunResult:
     @cached_property
     def middle_mm(self) -> NDArray[np.float64]:
         """Of the triangles that any view sees."""
-        middle: NDArray[np.float64] = self.corners_mm[self.triangles].mean(axis=(0, 1), dtype=np.float64)
-        return middle
+        return np.asarray(self.corners_mm[self.triangles].mean(axis=(0, 1), dtype=np.float64))
 
     @property
     def files(self) -> list[Path]:
@@ -255,10 +254,10 @@ class RunResult:
         inter-reflection that was taken off."""
         columns = np.flatnonzero(leds)
         with h5py.File(view.path, "r") as file:
-            noise: NDArray[np.float64] = np.hypot(file["u_own"][rows, columns], file["led_u_own"][columns])
+            noise = np.hypot(file["u_own"][rows, columns], file["led_u_own"][columns])
             if view.inter_reflection is not None:
                 noise = np.hypot(noise, u_inter_reflection(file[INTER_REFLECTION][rows, columns]))
-            return noise
+            return np.asarray(noise, np.float64)
 
     def direct_shares(self, view: ViewSamples, rows: slice, leds: NDArray[np.bool_]) -> NDArray[np.float32]:
         """[n, leds, channels] share of a triangle's light that came straight from the LED; NaN where there is no
@@ -267,8 +266,7 @@ class RunResult:
         if view.inter_reflection is None:
             return np.ones((rows.stop - rows.start, len(columns), self.channels), np.float32)
         with h5py.File(view.path, "r") as file:
-            shares: NDArray[np.float32] = 1.0 - file[INTER_REFLECTION][rows, columns].astype(np.float32)
-            return shares
+            return np.asarray(1.0 - file[INTER_REFLECTION][rows, columns], np.float32)
 
     def u_triangles(self, block: slice) -> NDArray[np.float32]:
         """[n] relative standard uncertainty, mean of channels, that samples of a triangle share by the responses
@@ -332,8 +330,7 @@ class RunResult:
     def slices(self, name: str, view: ViewSamples, rows: slice = slice(None)) -> NDArray[np.float32]:
         """[n, channels, coefficients] of rows of a view's file, by a fit's name in `SLICES`."""
         with h5py.File(self.slices_path(name, view), "r") as file:
-            found: NDArray[np.float32] = file["coefficients"][rows]
-            return found
+            return np.asarray(file["coefficients"][rows], np.float32)
 
 
 def _read(data: h5py.Dataset, block: Block) -> NDArray[np.float64]:
@@ -349,8 +346,7 @@ def _read(data: h5py.Dataset, block: Block) -> NDArray[np.float64]:
 def u_inter_reflection(share: NDArray[np.float16]) -> NDArray[np.float64]:
     """Relative standard uncertainty of samples from which inter-reflection was taken off, by its share."""
     known = share.astype(np.float64)
-    found: NDArray[np.float64] = U_OF_INTER_REFLECTION * known / np.maximum(1.0 - known, 0.1)
-    return found
+    return np.asarray(U_OF_INTER_REFLECTION * known / (1.0 - known))
 
 
 def read_view_samples(path: Path) -> ViewSamples:

@@ -39,6 +39,8 @@ Floats = NDArray[np.float64]
 BY_CELL = PENUMBRA + 1
 """Code of a triangle and an LED that arm, camera or tool may hide from each other."""
 CODES = {"reached": REACHED, "away": AWAY, "shaded": SHADED, "penumbra": PENUMBRA, "hidden by the cell": BY_CELL}
+_PATCHES_BESIDE = 9
+"""A patch and those around it."""
 MOST_BLUR_PX = 2.0
 """Diameter of the circle of confusion."""
 Say = Callable[[str, int, int], None]
@@ -149,16 +151,19 @@ def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor]
 
 def _hidden_by_cell(work: ViewPass) -> Callable[[NDArray[np.int64]], NDArray[np.bool_]] | None:
     """A function of some LEDs, [leds, triangles] what the run says that arm or tool hide from the nearest patch of
-    the object; None if it says nothing."""
+    the object or one beside it, since edges of their shadows lie between patches; None if it says nothing."""
     measured = work.measured
     with h5py.File(measured.run.view_path(work.view.name), "r") as file:
         if "entry/shadow/codes" not in file:
             return None
         shadow = {name: file[f"entry/shadow/{name}"][()] for name in ("codes", "leds", "points_mm")}
     points_mm = apply(measured.base_from_support, shadow["points_mm"])
-    patch = cKDTree(points_mm).query(work.facets.centres_mm)[1]
+    patches = cKDTree(points_mm)
+    patch = patches.query(work.facets.centres_mm)[1]
     column = {int(led): n for n, led in enumerate(shadow["leds"])}
     by_cell = (shadow["codes"] == occlusion.BY_ARM) | (shadow["codes"] == occlusion.BY_TOOL)
+    beside = patches.query(points_mm, k=min(_PATCHES_BESIDE, len(points_mm)))[1].reshape(len(points_mm), -1)
+    by_cell = by_cell[beside].any(axis=1)
 
     def hidden(leds: NDArray[np.int64]) -> NDArray[np.bool_]:
         found: NDArray[np.bool_] = by_cell.T[[column[int(led)] for led in leds]][:, patch]

@@ -8,10 +8,12 @@ pictures too.
 from __future__ import annotations
 
 import json
+import os
 import resource
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -27,6 +29,7 @@ from coupole.reflectance.run_fits import predicted
 from coupole.reflectance.run_pictures import read_check_frames
 from coupole.reflectance.run_result import ABOUT, FITS, MATERIALS, SCHEMA, RunResult, ViewSamples
 from coupole.reflectance.run_uncertainty import QUANTILE, uncertainty_of
+from coupole.reflectance.triangle_fit import TriangleSamples
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import write_synced
 
@@ -119,13 +122,14 @@ def _check_view(
         some = result.view_samples(view, rows, held)
         lit = lit_on(some.centres_mm, some.led_mm, view.led_normals[held], settings["emission"] == "paper")
         share = lit[..., None] * view.full_scales[held]
-        made = {name: predicted(result, name, view, rows, some) * share for name in FITS}
+        made = _made(result, view, rows, some, share)
         _compare(made, some.values * share, check.triangles)
+        noise = result.view_noise(view, rows, held)
+        places = np.searchsorted(result.triangles, view.triangles[rows])
         for name, inside in check.inside.items():
-            places = np.searchsorted(result.triangles, view.triangles[rows])
             covariance = result.material_covariances(name, places)
             relative = relative_uncertainty(some, result.materials(name, places), covariance)
-            found = _inside(made[name] / share, relative, some.values, result.view_noise(view, rows, held))
+            found = _inside(made[name] / share, relative, some.values, noise)
             inside[0] += int(np.count_nonzero(found))
             inside[1] += found.size
         direct = result.direct_shares(view, rows, held)[:, columns]
@@ -137,6 +141,18 @@ def _check_view(
             level = np.clip(compared * _LEVELS_OF_RANGE, 0, _LEVELS - 1).astype(np.int64)
             check.levels += np.bincount(level, minlength=_LEVELS)
         say(f"check of {view.view}", rows.stop, len(view.triangles))
+
+
+def _made(
+    result: RunResult, view: ViewSamples, rows: slice, samples: TriangleSamples, share: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """What all fits make of some samples, in shares of the camera's range."""
+
+    def of(name: str) -> NDArray[np.float64]:
+        return predicted(result, name, view, rows, samples) * share
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return dict(zip(FITS, pool.map(of, FITS), strict=True))
 
 
 def _inside(

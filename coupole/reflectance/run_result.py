@@ -236,7 +236,7 @@ class RunResult:
         """Those of some rows of a view's file, under some of its LEDs [leds]."""
         columns = np.arange(len(view.leds)) if leds is None else np.flatnonzero(leds)
         with h5py.File(view.path, "r") as file:
-            values = (file["f"][rows] if leds is None else file["f"][rows, columns]).astype(np.float32)
+            values = (file["f"][rows] if leds is None else file["f"][rows][:, columns]).astype(np.float32)
             centres, normals = file["centres_mm"][rows], file["normals"][rows]
         _times_cosine(values, centres, normals, view.led_mm[columns])
         return TriangleSamples(
@@ -254,9 +254,9 @@ class RunResult:
         inter-reflection that was taken off."""
         columns = np.flatnonzero(leds)
         with h5py.File(view.path, "r") as file:
-            noise = np.hypot(file["u_own"][rows, columns], file["led_u_own"][columns])
+            noise = np.hypot(file["u_own"][rows][:, columns], file["led_u_own"][columns])
             if view.inter_reflection is not None:
-                noise = np.hypot(noise, u_inter_reflection(file[INTER_REFLECTION][rows, columns]))
+                noise = np.hypot(noise, u_inter_reflection(file[INTER_REFLECTION][rows][:, columns]))
             return np.asarray(noise, np.float64)
 
     def direct_shares(self, view: ViewSamples, rows: slice, leds: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -266,7 +266,7 @@ class RunResult:
         if view.inter_reflection is None:
             return np.ones((rows.stop - rows.start, len(columns), self.channels), np.float32)
         with h5py.File(view.path, "r") as file:
-            return np.asarray(1.0 - file[INTER_REFLECTION][rows, columns], np.float32)
+            return np.asarray(1.0 - file[INTER_REFLECTION][rows][:, columns], np.float32)
 
     def u_triangles(self, block: slice) -> NDArray[np.float32]:
         """[n] relative standard uncertainty, mean of channels, that samples of a triangle share by the responses

@@ -22,7 +22,7 @@ from sim.world.clock import ClockWriter, SharedClock
 from sim.world.lighting import Lighting
 from sim.world.reactor import Reactor
 
-SPEED = 8.0
+SPEED = 4.0
 TEXT_SPEED = 4.0
 """Slower: its driver's own thread, on a busy machine, is what ends its lights."""
 

@@ -233,7 +233,8 @@ class LedBox:
             raise no_port(settings.name, settings.port, error) from error
 
     def _greet(self) -> Identity:
-        """Clear what an earlier program left in box and line, and read the box's identity."""
+        """Clear what an earlier program left in box and line, and read the box's identity: once more if the answer
+        to an earlier message comes late, in its place."""
         try:
             self._scpi.ask("*CLS", 0)
         except DeviceTimeout:
@@ -244,7 +245,7 @@ class LedBox:
             if type(error) not in (DeviceTimeout, DeviceError):
                 raise
             self._clock.sleep(_BLOCK_TIMEOUT_S - REPLY_MARGIN_S)
-            (text,) = self._scpi.ask("*RST;*CLS;*IDN?", 1)  # the first may have met an answer that was late
+            (text,) = self._scpi.ask("*RST;*CLS;*IDN?", 1)
         fields = str(text).split(",")
         if len(fields) != 4:
             self._scpi.unexpected("four fields in the answer to *IDN?", repr(text))

@@ -33,7 +33,7 @@ from coupole.preflight.simulated_world import world_config
 from sim.world.client import World
 
 BLACK_DN = 64
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 """How long a test waits for what must come; only a broken program lets it run out."""
 
 TOP = {

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from distributed import Client
 from places import REPO
 
 _BEGINS_S = 60.0
@@ -20,6 +19,8 @@ _BEGINS_S = 60.0
 @contextmanager
 def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """The scheduler's address, and the processes of its workers, of one thread each; all end with the context."""
+    from distributed import Client  # here, as it takes a second to import and few tests need it
+
     told, log = folder / "scheduler.json", (folder / "dask.log").open("wb")
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO / 'tests/reflectance'}"}
 

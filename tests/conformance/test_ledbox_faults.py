@@ -251,6 +251,23 @@ def test_garbage_on_the_line_does_not_keep_the_driver_out(world: LedBoxWorld) ->
         assert box.identify().vendor == "Coupole"
 
 
+def test_a_late_answer_to_the_first_message_does_not_keep_the_driver_out(world: LedBoxWorld) -> None:
+    """It comes in place of the answer to the second."""
+    link, held = world.box._link, []
+    send = link.send
+
+    def hold_the_first(data: bytes) -> bool:
+        held.append(data)
+        if len(held) == 1:
+            return True
+        return bool(send(held[0] + data)) if len(held) == 2 else bool(send(data))
+
+    world.do(lambda: setattr(link, "send", hold_the_first))
+    with opened(world) as box:
+        assert box.identify().vendor == "Coupole"
+    assert len(held) > 2
+
+
 def test_a_dark_step_is_no_step_of_an_led(box: LedBox, world: LedBoxWorld) -> None:
     steps = table(3)
     steps["led"][1] = NO_LED

@@ -16,6 +16,8 @@ correlation k = n_1 n_2 of the edges' normals, the terms up to k^3 of the tetrac
 from __future__ import annotations
 
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +38,8 @@ _LEAST_SIGMA_PX = 0.05
 _THIN = 0.01
 """Least width of a box: an edge along the pixels' rows."""
 _SECTORS = 64
+_PART = 16
+"""Corners that a thread fits at a time."""
 
 
 @dataclass(frozen=True)
@@ -63,14 +67,17 @@ def fit_corners(image: NDArray[Any], known: NDArray[np.bool_], rough: Floats, ra
     """
     values = np.ascontiguousarray(image, dtype=np.float32)
     found = np.full((len(rough), _UNKNOWNS), np.nan)
-    _fit_all(values, np.ascontiguousarray(known), np.ascontiguousarray(rough, dtype=np.float64), radius_px, found)
+    mask, starts = np.ascontiguousarray(known), np.ascontiguousarray(rough, dtype=np.float64)
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        parts = (slice(first, first + _PART) for first in range(0, len(starts), _PART))
+        list(pool.map(lambda part: _fit_all(values, mask, starts[part], radius_px, found[part]), parts))
     fits = np.isfinite(found[:, _X])
     return Corners(np.where(fits[:, None], found[:, :2], rough), fits, found[:, _SIGMA].copy())
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _fit_all(image, known, rough, radius, found):  # type: ignore[no-untyped-def]
-    for n in numba.prange(len(rough)):
+    for n in range(len(rough)):
         unknowns = np.zeros(_UNKNOWNS)
         unknowns[_X], unknowns[_Y] = rough[n]
         if not _start(image, known, radius, unknowns):

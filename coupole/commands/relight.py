@@ -34,6 +34,8 @@ class Relit:
     """[h, w, 3] of lights."""
     about: dict[str, Any]
     """What `--json` and a video's comment say of it."""
+    uncertainty: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]] | None = None
+    """[h, w, 3] standard uncertainty of the picture of lights, if it can be stated."""
 
 
 Several = list[str] | None
@@ -91,6 +93,13 @@ FitOption = Annotated[
         "missed least in the check.",
     ),
 ]
+UncertaintyOption = Annotated[
+    Path | None,
+    _option(
+        "--uncertainty",
+        "Of a result of runs: write the picture's standard uncertainty (68 %) too; .npy, .exr or .png, as --to.",
+    ),
+]
 TurnOption = Annotated[
     int | None, _option("--turn", "Frames of a video in which the lights turn once about z.", min=2, max=100_000)
 ]
@@ -115,6 +124,7 @@ def relight(
     size: SizeOption = None,
     field_of_view: FieldOption = None,
     fit: FitOption = None,
+    uncertainty: UncertaintyOption = None,
     turn: TurnOption = None,
     white: WhiteOption = None,
     as_json: JsonOption = False,
@@ -124,13 +134,15 @@ def relight(
 
     console = make_console(quiet=as_json)
     try:
-        _refuse_target(to, turn, white)
+        _refuse_target(to, uncertainty, turn, white)
         wanted = _lights(direction or [], led or [], light_at or [], area or [], environment or [], lights)
         camera = _camera(from_, look_at, size, field_of_view)
         with step_bars(console) as bars:
             bars("read", 0, 1)
-            relit = _open(result, view, fit, camera, samples)
+            relit = _open(result, view, fit, camera, samples, uncertain=uncertainty is not None)
             said = _write(relit, wanted, to, turn, white, bars)
+            if uncertainty is not None:
+                said |= _write_uncertainty(relit, wanted, uncertainty, bars)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -163,9 +175,13 @@ def _lights(
     return found
 
 
-def _refuse_target(to: Path, turn: int | None, white: float | None) -> None:
+def _refuse_target(to: Path, uncertainty: Path | None, turn: int | None, white: float | None) -> None:
     from coupole.exchange import picture_files, video_files
 
+    if uncertainty is not None:
+        picture_files.refuse_unknown(uncertainty)
+        if turn is not None:
+            raise InputError("--uncertainty: belongs to a picture, not to a video (--turn)")
     if turn is None:
         picture_files.refuse_unknown(to)
         if white is not None:
@@ -200,12 +216,16 @@ def _size_px(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _open(result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int) -> Relit:
-    from coupole.reflectance import run_result
+def _open(
+    result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int, *, uncertain: bool
+) -> Relit:
+    from coupole.reflectance import run_relighting, run_result
 
     if (result / run_result.OBJECT).exists():
+        if uncertain and fit is None:
+            fit = run_relighting.best_fit(run_result.RunResult(result), run_result.MATERIALS)
         return _of_runs(result, view, fit, camera, samples)
-    given = (("--view", view), ("--fit", fit), ("--from", camera))
+    given = (("--view", view), ("--fit", fit), ("--from", camera), ("--uncertainty", uncertain or None))
     for option, value in given:
         if value is not None:
             raise InputError(f"{option}: a result of pictures has one view and one way to relight it")
@@ -213,9 +233,7 @@ def _open(result: Path, view: str | None, fit: str | None, camera: FreeCamera | 
 
 
 def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int) -> Relit:
-    import numpy as np
-
-    from coupole.reflectance import run_relighting, run_result
+    from coupole.reflectance import relit_uncertainty, run_relighting, run_result
 
     if camera is not None and view is not None:
         raise InputError("--view: a camera anywhere (--from) is no view of the run; give one of the two")
@@ -226,11 +244,14 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
     else:
         scene = run_relighting.scene_from(folder, camera, fit)
 
-    def picture(lights: Sequence[AnyLight], say: Say) -> NDArray[np.float32]:
-        made = scene.picture(lights, samples, say=say)
+    def of_three(made: NDArray[np.float32]) -> NDArray[np.float32]:
         return made if made.shape[2] == 3 else np.repeat(made, 3, axis=2)
 
-    return Relit(picture, {"fit": scene.fit, "simulated": simulated})
+    return Relit(
+        lambda lights, say: of_three(scene.picture(lights, samples, say=say)),
+        {"fit": scene.fit, "simulated": simulated},
+        lambda lights, say: of_three(relit_uncertainty.uncertainty_of_picture(scene, lights, samples, say=say)),
+    )
 
 
 def _of_pictures(result: Path, samples: int) -> Relit:
@@ -287,6 +308,17 @@ def _write(
         to, frames(), white=white, about=f"computed by coupole reflectance relight, {marked}; white {white:.4g}"
     )
     return {"video": str(to.resolve()), "frames": turn, "white": white, **relit.about}
+
+
+def _write_uncertainty(
+    relit: Relit, lights: Sequence[AnyLight], to: Path, bars: Callable[[str, int, int], None]
+) -> dict[str, Any]:
+    """Make and write the uncertainty of the picture; what `--json` says of it."""
+    from coupole.exchange.picture_files import write_picture
+
+    assert relit.uncertainty is not None
+    write_picture(to, relit.uncertainty(lights, lambda done, of: bars("uncertainty", done, of)))
+    return {"uncertainty": str(to.resolve())}
 
 
 def _bright(picture: NDArray[np.float32]) -> NDArray[np.float32]:

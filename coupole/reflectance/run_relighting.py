@@ -147,13 +147,13 @@ def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = 
     order = (mine, *(one for one in result.views if one is not mine))
     rays = ray_mesh(result.corners_mm.astype(np.float64))
     if name in ANYWHERE:
-        return RelitScene(result, name, surface, coats_of(_materials(result, name, surface)), order, rays)
+        return RelitScene(result, name, surface, coats_of(materials_of(result, name, surface)), order, rays)
     if not result.slices_path(name, mine).exists():
         raise InputError(f"{result.folder}: has no fit {name}; `coupole reflectance fit {result.folder}` makes it")
     over, coefficients = SLICES[name].over, result.slices(name, mine)
     slices = Slices(name, coefficients, None)
     if over is not None:
-        slices = Slices(name, np.nan_to_num(coefficients), _materials(result, over, surface))
+        slices = Slices(name, np.nan_to_num(coefficients), materials_of(result, over, surface))
     return RelitScene(result, name, surface, slices, order, rays)
 
 
@@ -168,7 +168,7 @@ def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) ->
     name = fit or best_fit(result, MATERIALS)
     rays = ray_mesh(result.corners_mm.astype(np.float64))
     surface = surface_from(result, rays, camera)
-    return RelitScene(result, name, surface, coats_of(_materials(result, name, surface)), result.views, rays)
+    return RelitScene(result, name, surface, coats_of(materials_of(result, name, surface)), result.views, rays)
 
 
 def _refuse_unknown(fit: str | None) -> None:
@@ -176,7 +176,7 @@ def _refuse_unknown(fit: str | None) -> None:
         raise InputError(f"--fit: expected one of {', '.join(known)}; got {fit!r}")
 
 
-def _materials(result: RunResult, name: str, surface: Surface) -> TriangleMaterials:
+def materials_of(result: RunResult, name: str, surface: Surface) -> TriangleMaterials:
     """Of the surface's triangles. Raises InputError if there are none."""
     places = np.searchsorted(result.triangles, surface.triangles)
     own = "ggx_normal" if name == CLUSTERED else name

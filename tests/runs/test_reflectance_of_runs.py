@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,37 +17,23 @@ import pytest
 import trimesh
 from cells import CellFolder
 from dask_cluster import cluster
+from reflectance_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, SIDE, shipped_cell, unit, walter
 
 from coupole.calibration.light.frames import open_light_frames
+from coupole.reflectance import ggx
+from coupole.reflectance.new_light.light_kinds import DistantLight
+from coupole.reflectance.new_light.shading import coats_of
 from coupole.reflectance.normal_fit import fit_materials
 from coupole.reflectance.picture_set import read_pictures
+from coupole.reflectance.relit_uncertainty import uncertainty_of_picture
 from coupole.reflectance.run_job import RunRequest, reflectance_of
+from coupole.reflectance.run_relighting import materials_of, scene_of_view
 from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.sample_uncertainty import Places, Sources, bounds
 from coupole.reflectance.triangle_fit import fit_triangles
 from coupole.reflectance.uncalibrated import FILES, write_pictures
 
-RECORDS = cells.REPO / "configs/calibrations"
-DIFFUSE, F0, ROUGHNESS = (0.5, 0.35, 0.2), (0.05, 0.05, 0.05), 0.3
-SIDE = {**cells.TOP, "name": "side", "azimuth_deg": -60, "elevation_deg": 55}
 Made = tuple[CellFolder, Path, dict[str, Any]]
-
-
-def shipped_cell(folder: Path, **world: Any) -> CellFolder:
-    """A cell with the camera of `sim.yaml`, for which the records hold, and a quarter of its relief: a high dome
-    with lower ones around it."""
-    cell = CellFolder(folder, speed=10.0)
-    relief = trimesh.load(cell.plan_data["object"]["mesh"], process=False)
-    x, y, _ = relief.triangles_center.T
-    relief.update_faces((x > 10) & (y > -20))
-    relief.remove_unreferenced_vertices()
-    relief.export(folder / "relief.ply")
-    cell.plan_data["object"]["mesh"] = str(folder / "relief.ply")
-    shipped = {"width_px": 512, "height_px": 384, "pixel_pitch_um": 44.0}
-    cell.rig_data["sensor"] |= shipped
-    cell.world_settings.update(white_at_us=8000, **world)
-    cell.write(views=[cells.TOP, SIDE], lights={"kind": "every", "every": 24}, darks_per_view=2)
-    return cell
 
 
 @pytest.fixture(scope="module")
@@ -58,28 +45,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", out, "--json")
     assert ended.code == 0, ended.err
     return cell, out, ended.document
-
-
-def walter(normals: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """[..., 3] reflectance of the relief: Walter et al. 2007, Smith's G of each direction, Schlick's F."""
-    half = light + view
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    nl, nv, nh = (np.sum(normals * v, axis=-1) for v in (light, view, half))
-    vh = np.sum(view * half, axis=-1)
-    a2 = ROUGHNESS**2
-
-    def masked(cosine: np.ndarray) -> np.ndarray:
-        return 2 / (1 + np.sqrt(1 + a2 * (1 / cosine**2 - 1)))
-
-    d = a2 / (np.pi * (nh**2 * (a2 - 1) + 1) ** 2)
-    fresnel = np.array(F0) + (1 - np.array(F0)) * (1 - vh[..., None]) ** 5
-    lobe = (d * masked(nl) * masked(nv) / (4 * nl * nv))[..., None] * fresnel
-    result: np.ndarray = np.array(DIFFUSE) / np.pi + lobe
-    return result
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 @pytest.mark.parametrize("view", ["top", "side"])
@@ -192,51 +157,6 @@ def test_without_calibrations_values_are_relative_and_it_is_said(made: Made, tmp
     assert ended.code == 0, ended.err
     assert ended.document["uncalibrated_run"] == cell.run_folder.name
     assert "values are relative" in (tmp_path / "plain/report.html").read_text()
-
-
-def test_brackets_are_merged(tmp_path: Path) -> None:
-    """Some pixels are saturated in the longer exposure, some lost in the noise of the shorter. Six LEDs are enough
-    for samples, and too few for a material."""
-    cell = shipped_cell(tmp_path)
-    exposures = {"kind": "bracket", "exposures_us": [1000, 16_000]}
-    cell.write(views=[cells.TOP], lights={"kind": "every", "every": 180}, exposure=exposures)
-    assert cell.acquire().code == 0
-    out = tmp_path / "result"
-    ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", out, "--json")
-    assert ended.code == 0, ended.err
-    assert ended.document["not_fitted"] == ended.document["triangles"]
-    assert set(ended.document["mae"].values()) == {None}
-    with h5py.File(out / "samples/top.h5") as file:
-        f, u_own, reached = file["f"][()], file["u_own"][()], file["codes"][()] == 0
-    stone = np.array([0.62, 0.55, 0.42]) / np.pi  # of objects for which no rig gives a material
-    np.testing.assert_allclose(np.nanmedian(f, axis=(0, 1)), stone, rtol=0.01)
-    assert np.isfinite(f[reached]).mean() > 0.9
-    z = ((f / stone - 1) / np.hypot(u_own, 0.006))[np.isfinite(f)]
-    assert 0.9 < np.mean(np.abs(z) < 1.96) < 0.99
-
-
-def test_light_from_fold_to_fold_is_taken_off(tmp_path: Path) -> None:
-    """Of a white stone whose folds light each other, in a cell that is simulated with that light."""
-    white = (0.8, 0.6, 0.3)
-    cell = shipped_cell(tmp_path, material={"diffuse": white}, shading="pixel")
-    cell.write(views=[cells.TOP], lights={"kind": "every", "every": 180})
-    assert cell.acquire().code == 0
-    f = {}
-    for name, options in (("with", ["--keep-inter-reflection"]), ("without", [])):
-        words = (cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / name, *options)
-        ended = cells.here("reflectance", "extract", *words, "--json")
-        assert ended.code == 0, ended.err
-        with h5py.File(tmp_path / name / "samples/top.h5") as file:
-            f[name] = file["f"][()] * np.pi / white
-            shares = file["inter_reflection"][()].astype(float) if name == "without" else None
-    median, most = ended.document["views"][0]["inter_reflection"]
-    assert 0.01 < median < 0.1 < most < 0.5
-    folds = (shares > 0.1) & (shares < 0.4)
-    assert folds.sum() > 1000
-    assert np.median(f["with"][folds]) > 1.15
-    assert np.median(f["without"][folds]) == pytest.approx(1.0, abs=0.05)
-    off = np.abs(f["without"] - 1) / (0.01 + 0.2 * shares / (1 - shares))
-    assert np.nanmean(off[folds] < 1.96) > 0.9
 
 
 def test_runs_of_one_object_are_fitted_together(made: Made, tmp_path: Path) -> None:
@@ -426,15 +346,6 @@ def test_records_of_another_camera_are_refused(made: Made, tmp_path: Path) -> No
     assert "frames of 512 x 384 pixels" in " ".join(ended.err.split())
 
 
-def test_powers_for_another_gain_are_refused(tmp_path: Path) -> None:
-    cell = shipped_cell(tmp_path)
-    cell.write(views=[cells.TOP], lights={"kind": "every", "every": 360}, gain_db=6.0)
-    assert cell.acquire().code == 0
-    ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / "result")
-    assert ended.code == 2
-    assert "holds for a gain of 0 dB; the run has 6 dB" in " ".join(ended.err.split())
-
-
 def test_a_frame_that_is_not_the_one_that_was_proven_is_refused(made: Made, tmp_path: Path) -> None:
     cell, _, _ = made
     run = shutil.copytree(cell.run_folder, tmp_path / "run")
@@ -520,6 +431,80 @@ def test_a_view_is_relit_with_its_shadows(made: Made) -> None:
     wrong = cells.here("reflectance", "relight", out, "--direction", "0,0,1", "--fit", "none", "--to", to)
     assert wrong.code == 2
     assert "expected one of ggx, ggx_normal, sh, rbf, ggx_rbf, clusters" in " ".join(wrong.err.split())
+
+
+def test_a_relit_picture_holds_the_truth_within_its_uncertainty(made: Made, tmp_path: Path) -> None:
+    """In a direction in which no LED stands; for the truth, Walter's formula at the triangles' centres."""
+    out = made[1]
+    to, u_to = tmp_path / "relit.npy", tmp_path / "u.npy"
+    words = ("reflectance", "relight", out, "--direction", "0.6,0.3,1", "--view", "side", "--fit", "ggx_normal")
+    ended = cells.here(*words, "--to", to, "--uncertainty", u_to, "--json")
+    assert ended.code == 0, ended.err
+    assert ended.document["uncertainty"] == str(u_to)
+    picture, u = np.load(to), np.load(u_to)
+    with h5py.File(out / "samples/side.h5") as file:
+        seen, normals, centres = file["seen"][()], file["normals"][()], file["centres_mm"][()]
+        camera = file["camera_mm"][()]
+    towards = unit(np.array([0.6, -0.3, -1.0]))
+    cosine = normals @ towards
+    truth = np.pi * walter(normals, towards[None], unit(camera - centres)) * cosine[:, None]
+    lit = (picture[..., 1] > 0) & (cosine[seen] > 0.2) & (seen >= 0)
+    assert lit.sum() > 1000
+    off = (picture[lit] - truth[seen[lit]]) / u[lit]
+    assert 0.9 < np.mean(np.abs(off) < 1.96) <= 1.0
+    assert np.median(u[lit] / picture[lit]) < 0.02
+    assert (u[seen < 0] == 0).all()
+
+
+def test_uncertainty_of_a_relit_picture_is_the_spread_of_pictures_of_drawn_materials(made: Made) -> None:
+    scene = scene_of_view(RunResult(made[1]), "top", "ggx_normal")
+    lights = [DistantLight(towards=(0.2, 0.5, 1.0))]
+    u = uncertainty_of_picture(scene, lights)
+    places = np.searchsorted(scene.result.triangles, scene.surface.triangles)
+    covariance = scene.result.material_covariances("ggx_normal", places)
+    own = materials_of(scene.result, "ggx_normal", scene.surface)
+    with h5py.File(made[1] / "fits/ggx_normal.h5") as file:
+        widths = [file[name][()][places] for name in ("u_kd", "u_ks")]
+        common = np.hypot(file["u_triangle"][()][places], file["u_shared"][()])[scene.surface.seen]
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    generator, pictures = np.random.default_rng(3), []
+    roots, shorter = np.linalg.cholesky(covariance[known]), 0.25  # drawn at a quarter, where pictures are linear
+    tangents = np.array([ggx.tangents.py_func(*normal) for normal in own.normals])
+    for _ in range(60):
+        drawn = np.zeros((len(known), 5))
+        drawn[known] = shorter * np.einsum("nij,nj->ni", roots, generator.normal(size=(known.sum(), 5)))
+        by_sigma = drawn[:, 2:4] / np.sqrt(np.einsum("nii->ni", covariance)[:, 2:4])
+        normals = own.normals + np.einsum("nk,nkj->nj", drawn[:, :2], tangents)
+        moved = replace(
+            own,
+            normals=unit(normals),
+            kd=own.kd * (1 + widths[0] * by_sigma[:, :1]),
+            ks=own.ks * (1 + widths[1] * by_sigma[:, 1:]),
+            alpha=own.alpha * np.exp(drawn[:, 4]),
+        )
+        pictures.append(replace(scene, reflecting=coats_of(moved)).picture(lights))
+    spread = np.std(pictures, axis=0) / shorter
+    shown = (np.mean(pictures, axis=0) > 0.02) & np.isfinite(u)
+    assert shown.sum() > 3000
+    stated = np.sqrt(u**2 - (common[..., None] * np.mean(pictures, axis=0)) ** 2)
+    assert np.median(spread[shown] / stated[shown]) == pytest.approx(1.0, abs=0.05)
+    assert np.quantile(spread[shown] / stated[shown], 0.05) > 0.8
+    assert np.quantile(spread[shown] / stated[shown], 0.95) < 1.3
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [(("--fit", "sh"), "sh has none; choose --fit ggx or ggx_normal"), (("--turn", "4"), "not to a video")],
+)
+def test_uncertainty_that_cannot_be_stated_is_refused(
+    made: Made, tmp_path: Path, words: tuple[str, ...], why: str
+) -> None:
+    to = tmp_path / ("relit.mp4" if "--turn" in words else "relit.npy")
+    options = ("--direction", "0,0,1", "--to", to, "--uncertainty", tmp_path / "u.npy", *words)
+    ended = cells.here("reflectance", "relight", made[1], *options)
+    assert ended.code == 2
+    assert why in " ".join(ended.err.split())
+    assert not (tmp_path / "u.npy").exists()
 
 
 def test_clusters_are_a_few_materials_for_all_and_fill_what_has_too_few_samples(made: Made) -> None:

@@ -1,0 +1,104 @@
+"""Uncertainty of relit pictures, from that of the materials they are made of."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import h5py
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.reflectance.ggx import UNKNOWNS, tangents
+from coupole.reflectance.new_light.light_kinds import AnyLight
+from coupole.reflectance.new_light.shading import coats_of
+from coupole.reflectance.run_relighting import SAMPLES, RelitScene, Say, materials_of
+from coupole.reflectance.run_result import MATERIALS
+from coupole.reflectance.triangle_fit import TriangleMaterials
+
+Floats = NDArray[np.float64]
+_LONGEST_STEP = 0.02
+"""Of tilts (rad) and alpha's logarithm, to both sides: small enough for a derivative, large enough for float32. In
+kd and ks pictures are linear."""
+_NOT_LINEAR = (0, 1, 4)
+_LEAST_ALPHA, _MOST_ALPHA = 1e-3, 1.0
+
+
+def uncertainty_of_picture(
+    scene: RelitScene, lights: Sequence[AnyLight], samples: int = SAMPLES, *, say: Say = lambda done, of: None
+) -> NDArray[np.float32]:
+    """[h, w, channels] standard uncertainty (68 %) of `scene.picture(lights, samples)`, in its unit: linear, by
+    what normal, kd, ks and roughness of each triangle may be off, by the responses of its pixels and by the power
+    of all LEDs. 0 where no material is seen, NaN where its uncertainty is not known. It does not hold what the fit
+    cannot show (another lobe than GGX, light from surface to surface), nor any error of the lights asked for.
+
+    The picture is made again with materials moved along each independent part of their covariance, which takes
+    eleven times as long as the picture alone. Raises InputError for a fit that has no covariance.
+    """
+    if scene.fit not in MATERIALS:
+        raise InputError(f"--uncertainty: {scene.fit} has none; choose --fit {' or '.join(MATERIALS)}")
+    materials = materials_of(scene.result, scene.fit, scene.surface)
+    covariance, wider, common = _uncertain(scene)
+    scales, vectors = np.linalg.eigh(np.nan_to_num(covariance))
+    roots = vectors * np.sqrt(np.maximum(scales, 0.0))[:, None]
+    count = 2 * UNKNOWNS + 1
+
+    def picture(reflecting: TriangleMaterials, number: int) -> NDArray[np.float32]:
+        made = dataclasses.replace(scene, reflecting=coats_of(reflecting)).picture(lights, samples)
+        say(number + 1, count)
+        return made
+
+    straight = picture(materials, 0)
+    seen = scene.surface.seen
+    square = (straight * np.append(common, 0.0)[seen][..., None]) ** 2  # -1, for nothing, takes the last
+    for part in range(UNKNOWNS):
+        deviation = roots[:, :, part]
+        shorter = _LONGEST_STEP / np.maximum(np.abs(deviation[:, _NOT_LINEAR]).max(axis=1), _LONGEST_STEP)
+        up, down = (
+            picture(_moved(materials, wider, sign * shorter[:, None] * deviation), 1 + 2 * part + (sign > 0))
+            for sign in (-1.0, 1.0)
+        )
+        square += ((up - down) / (2.0 * np.append(shorter, 1.0)[seen][..., None])) ** 2
+    known = np.append(np.isfinite(covariance).all(axis=(1, 2)), True)[seen]
+    found = np.where(known[..., None] | (straight == 0.0), np.sqrt(square), np.nan)
+    return found.astype(np.float32)
+
+
+def _uncertain(scene: RelitScene) -> tuple[Floats, Floats, Floats]:
+    """Of the surface's triangles: covariance [n, 5, 5] of tilts and logarithms; [n, 2, channels] uncertainty of
+    each channel's kd, and ks, as a multiple of that of their mean; relative uncertainty [n] that all light from a
+    triangle has."""
+    places = np.searchsorted(scene.result.triangles, scene.surface.triangles)
+    covariance = scene.result.material_covariances(scene.fit, places)
+    of_means = np.sqrt(np.einsum("nii->ni", covariance)[:, 2:4, None])
+    with h5py.File(scene.result.materials_path(scene.fit), "r") as file:
+        of_channels = np.stack([file["u_kd"][()], file["u_ks"][()]], axis=1)[places]
+        common = np.hypot(file["u_triangle"][()][places], file["u_shared"][()])
+    return covariance, np.nan_to_num(of_channels / np.maximum(of_means, 1e-12)), common
+
+
+def _moved(materials: TriangleMaterials, wider: Floats, step: Floats) -> TriangleMaterials:
+    """Materials whose tilts and logarithms have moved by a small step [n, 5]. Channels move together, each as far
+    as its own uncertainty is `wider` [n, 2, channels] (of kd, of ks) than that of their mean."""
+    return dataclasses.replace(
+        materials,
+        normals=_turned(materials.normals, step[:, :2]),
+        kd=materials.kd * (1.0 + step[:, 2:3] * wider[:, 0]),
+        ks=materials.ks * (1.0 + step[:, 3:4] * wider[:, 1]),
+        alpha=np.clip(materials.alpha * np.exp(step[:, 4]), _LEAST_ALPHA, _MOST_ALPHA),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _turned(normals, tilts):  # type: ignore[no-untyped-def]
+    found = np.empty_like(normals)
+    for n in range(len(normals)):
+        t1, t2 = tangents(normals[n, 0], normals[n, 1], normals[n, 2])
+        square = 0.0
+        for k in range(3):
+            found[n, k] = normals[n, k] + tilts[n, 0] * t1[k] + tilts[n, 1] * t2[k]
+            square += found[n, k] ** 2
+        found[n] /= np.sqrt(square)
+    return found

@@ -1,0 +1,54 @@
+"""A glossy relief in a cell for which the shipped records hold, for tests of its reflectance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cells
+import numpy as np
+import trimesh
+from cells import CellFolder
+
+RECORDS = cells.REPO / "configs/calibrations"
+DIFFUSE, F0, ROUGHNESS = (0.5, 0.35, 0.2), (0.05, 0.05, 0.05), 0.3
+SIDE = {**cells.TOP, "name": "side", "azimuth_deg": -60, "elevation_deg": 55}
+
+
+def shipped_cell(folder: Path, **world: Any) -> CellFolder:
+    """A cell with the camera of `sim.yaml`, for which the records hold, and a quarter of its relief: a high dome
+    with lower ones around it."""
+    cell = CellFolder(folder, speed=10.0)
+    relief = trimesh.load(cell.plan_data["object"]["mesh"], process=False)
+    x, y, _ = relief.triangles_center.T
+    relief.update_faces((x > 10) & (y > -20))
+    relief.remove_unreferenced_vertices()
+    relief.export(folder / "relief.ply")
+    cell.plan_data["object"]["mesh"] = str(folder / "relief.ply")
+    shipped = {"width_px": 512, "height_px": 384, "pixel_pitch_um": 44.0}
+    cell.rig_data["sensor"] |= shipped
+    cell.world_settings.update(white_at_us=8000, **world)
+    cell.write(views=[cells.TOP, SIDE], lights={"kind": "every", "every": 24}, darks_per_view=2)
+    return cell
+
+
+def walter(normals: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """[..., 3] reflectance of the relief: Walter et al. 2007, Smith's G of each direction, Schlick's F."""
+    half = light + view
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    nl, nv, nh = (np.sum(normals * v, axis=-1) for v in (light, view, half))
+    vh = np.sum(view * half, axis=-1)
+    a2 = ROUGHNESS**2
+
+    def masked(cosine: np.ndarray) -> np.ndarray:
+        return 2 / (1 + np.sqrt(1 + a2 * (1 / cosine**2 - 1)))
+
+    d = a2 / (np.pi * (nh**2 * (a2 - 1) + 1) ** 2)
+    fresnel = np.array(F0) + (1 - np.array(F0)) * (1 - vh[..., None]) ** 5
+    lobe = (d * masked(nl) * masked(nv) / (4 * nl * nv))[..., None] * fresnel
+    result: np.ndarray = np.array(DIFFUSE) / np.pi + lobe
+    return result
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -1,0 +1,65 @@
+"""`coupole reflectance RUN` on runs unlike the usual one: brackets, folds that light each other, another gain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cells
+import h5py
+import numpy as np
+import pytest
+from reflectance_cells import RECORDS, shipped_cell
+
+
+def test_brackets_are_merged(tmp_path: Path) -> None:
+    """Some pixels are saturated in the longer exposure, some lost in the noise of the shorter. Six LEDs are enough
+    for samples, and too few for a material."""
+    cell = shipped_cell(tmp_path)
+    exposures = {"kind": "bracket", "exposures_us": [1000, 16_000]}
+    cell.write(views=[cells.TOP], lights={"kind": "every", "every": 180}, exposure=exposures)
+    assert cell.acquire().code == 0
+    out = tmp_path / "result"
+    ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", out, "--json")
+    assert ended.code == 0, ended.err
+    assert ended.document["not_fitted"] == ended.document["triangles"]
+    assert set(ended.document["mae"].values()) == {None}
+    with h5py.File(out / "samples/top.h5") as file:
+        f, u_own, reached = file["f"][()], file["u_own"][()], file["codes"][()] == 0
+    stone = np.array([0.62, 0.55, 0.42]) / np.pi  # of objects for which no rig gives a material
+    np.testing.assert_allclose(np.nanmedian(f, axis=(0, 1)), stone, rtol=0.01)
+    assert np.isfinite(f[reached]).mean() > 0.9
+    z = ((f / stone - 1) / np.hypot(u_own, 0.006))[np.isfinite(f)]
+    assert 0.9 < np.mean(np.abs(z) < 1.96) < 0.99
+
+
+def test_light_from_fold_to_fold_is_taken_off(tmp_path: Path) -> None:
+    """Of a white stone whose folds light each other, in a cell that is simulated with that light."""
+    white = (0.8, 0.6, 0.3)
+    cell = shipped_cell(tmp_path, material={"diffuse": white}, shading="pixel")
+    cell.write(views=[cells.TOP], lights={"kind": "every", "every": 180})
+    assert cell.acquire().code == 0
+    f = {}
+    for name, options in (("with", ["--keep-inter-reflection"]), ("without", [])):
+        words = (cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / name, *options)
+        ended = cells.here("reflectance", "extract", *words, "--json")
+        assert ended.code == 0, ended.err
+        with h5py.File(tmp_path / name / "samples/top.h5") as file:
+            f[name] = file["f"][()] * np.pi / white
+            shares = file["inter_reflection"][()].astype(float) if name == "without" else None
+    median, most = ended.document["views"][0]["inter_reflection"]
+    assert 0.01 < median < 0.1 < most < 0.5
+    folds = (shares > 0.1) & (shares < 0.4)
+    assert folds.sum() > 1000
+    assert np.median(f["with"][folds]) > 1.15
+    assert np.median(f["without"][folds]) == pytest.approx(1.0, abs=0.05)
+    off = np.abs(f["without"] - 1) / (0.01 + 0.2 * shares / (1 - shares))
+    assert np.nanmean(off[folds] < 1.96) > 0.9
+
+
+def test_powers_for_another_gain_are_refused(tmp_path: Path) -> None:
+    cell = shipped_cell(tmp_path)
+    cell.write(views=[cells.TOP], lights={"kind": "every", "every": 360}, gain_db=6.0)
+    assert cell.acquire().code == 0
+    ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / "result")
+    assert ended.code == 2
+    assert "holds for a gain of 0 dB; the run has 6 dB" in " ".join(ended.err.split())

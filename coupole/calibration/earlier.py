@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from coupole.calibration.record import Kind, Record, read_record
@@ -10,6 +11,10 @@ from coupole.calibration.sources import About
 from coupole.errors import InputError
 
 _SAME_FIGURE = 1e-3
+SHAPE_SIGNAL = ("response", "flat-field")
+"""Kinds of records that say how signal follows from DN."""
+READ_WITH = "read_with."
+"""Begins the names of a powers' record's figures that say with which of them it was made: 1, or 0."""
 
 
 def read_earlier(path: Path, kind: Kind, about: About, size_px: tuple[int, int]) -> Record:
@@ -33,6 +38,32 @@ def read_accepted(path: Path, kind: Kind) -> Record:
         why = "; ".join(f"{one.what} is {one.found:.3g} {one.unit}, at most {one.limit:.3g}" for one in missed)
         raise InputError(f"{path}: not accepted: {why}. Calibrate anew, or allow more with --limit there")
     return record
+
+
+def refuse_lacking(path: Path, record: Record, given: Collection[str]) -> None:
+    """Raise InputError if a record of LEDs' powers was made with a response or a flat field and none is among the
+    kinds `given`: frames must be read as those were that the powers come from."""
+    for kind in SHAPE_SIGNAL:
+        told = record.fixed.get(READ_WITH + kind)
+        beside = _made_with(path, record, kind)
+        if (told or (told is None and beside)) and kind not in given:
+            raise InputError(
+                f"{path}: was made with a {kind} record; without one frames would be read otherwise, and all that "
+                f"is found would be off. Name {beside or 'it'} too"
+            )
+
+
+def _made_with(path: Path, record: Record, kind: str) -> Path | None:
+    """A record of a kind that another was made with, if it lies beside it."""
+    used = {line.sha256 for line in record.inputs if "/" not in line.name}
+    for beside in sorted(path.parent.glob("*.yaml")):
+        if hashlib.sha256(beside.read_bytes()).hexdigest() in used:
+            try:
+                if read_record(beside).kind == kind:
+                    return beside
+            except InputError:  # no record, such as a tile's description
+                continue
+    return None
 
 
 def refuse_same_images(path: Path, record: Record, inputs: Sequence[tuple[str, str]]) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cells
 import h5py
 import numpy as np
 import pytest
+from cells import CellFolder
 from reflectance_cells import RECORDS, shipped_cell
 
 
@@ -63,3 +65,65 @@ def test_powers_for_another_gain_are_refused(tmp_path: Path) -> None:
     ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / "result")
     assert ended.code == 2
     assert "holds for a gain of 0 dB; the run has 6 dB" in " ".join(ended.err.split())
+
+
+TILE_MM = (-30.0, -40.0)
+"""Where the reference tile lies beside the relief."""
+MADE_WITH = {name: RECORDS / f"{name}.yaml" for name in ("flat-field", "response", "leds", "hand-eye", "camera")}
+
+
+@pytest.fixture(scope="module")
+def aged(tmp_path_factory: pytest.TempPathFactory) -> CellFolder:
+    """A run with LEDs that have shone for 6000 hours and are 10 K warmer than at their calibration, the tile in
+    view."""
+    tile = {"kind": "spectralon_tile", "translation_mm": [*TILE_MM, 0.0]}
+    cell = shipped_cell(tmp_path_factory.mktemp("aged"), things=[tile])
+    cell.world_settings.update(leds={"hours_shone": 6000.0}, ledbox={"ambient_c": 35.0})
+    cell.write(views=[cells.TOP], lights={"kind": "every", "every": 30})
+    assert cell.acquire().code == 0
+    return cell
+
+
+def drift_of(cell: CellFolder, without: str = "") -> cells.Ended:
+    tile = cell.folder / "tile.yaml"
+    place = {"translation_mm": [*TILE_MM, 10.0]}
+    tile.write_text(json.dumps({"schema_version": 1, "minnaert": 1.0, "support_from_tile": place}))
+    words: list[str | Path] = ["--rig", cell.folder / "rig.yaml", "--tile", tile, "--led-power"]
+    words += [RECORDS / "led-power.yaml", "--out", cell.folder, "--name", without or "drift"]
+    for name, path in MADE_WITH.items():
+        if name != without:
+            words += ["--flat" if name == "flat-field" else f"--{name}", path]
+    return cells.here("calibrate", "drift", cell.run_folder, *words)
+
+
+def test_leds_that_are_old_and_warm_are_corrected_by_the_runs_own_drift(aged: CellFolder, tmp_path: Path) -> None:
+    """Without its record only the usual loss of light with warmth is known."""
+    assert (ended := drift_of(aged)).code == 0, ended.err
+    ratio = {}
+    for name, records in (("without", [RECORDS]), ("with", [RECORDS, aged.folder / "drift.yaml"])):
+        words = [word for path in records for word in ("--calibrations", path)]
+        ended = cells.here("reflectance", "extract", aged.run_folder, *words, "--out", tmp_path / name)
+        assert ended.code == 0, ended.err
+        with h5py.File(tmp_path / name / "samples/top.h5") as file:
+            stone = np.array([0.62, 0.55, 0.42]) / np.pi
+            ratio[name] = np.nanmedian(file["f"][()].astype(float), axis=(0, 1)) / stone
+    np.testing.assert_allclose(ratio["without"], 0.7 ** (6000 / 50_000), atol=0.012)
+    np.testing.assert_allclose(ratio["with"], 1.0, atol=0.012)
+
+
+@pytest.mark.parametrize("kind", ["flat-field", "response"])
+def test_frames_are_not_read_otherwise_than_those_that_powers_come_from(
+    aged: CellFolder, tmp_path: Path, kind: str
+) -> None:
+    ended = drift_of(aged, without=kind)
+    assert ended.code == 2
+    assert f"led-power.yaml: was made with a {kind} record" in " ".join(ended.err.split())
+    words = [
+        word
+        for name in ("led-power", *MADE_WITH)
+        if name != kind
+        for word in ("--calibrations", RECORDS / f"{name}.yaml")
+    ]
+    ended = cells.here("reflectance", aged.run_folder, *words, "--out", tmp_path / "result")
+    assert ended.code == 2
+    assert f"{kind}.yaml too" in " ".join(ended.err.split())

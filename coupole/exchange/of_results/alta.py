@@ -1,0 +1,97 @@
+"""Text for ALTA (Belcour, Barla, Pacanowski 2013 on): samples of triangles as they were measured, with bounds.
+
+A file for each channel, as ALTA reads bounds of the first value alone.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from coupole.exchange.of_results.material_tables import chosen_triangles
+from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface
+from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples, u_inter_reflection
+from coupole.reflectance.sample_uncertainty import Places, Sources, bounds
+from coupole.storage.durable import write_synced
+
+_QUANTILE = 1.959964
+"""Of 95 %."""
+
+
+def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
+    """`triangleN_red.alta` and so on (`_grey` of a sensor without filter): theta_l, theta_v cos dphi, theta_v sin
+    dphi (rad, about the mesh's normal), f (1/sr), its lower and upper bound at 95 %; an open upper bound is the
+    largest that float32 can hold."""
+    result, paths = surface.result, []
+    scan_noise_um = float(surface.about["scan_noise_um"])
+    channels = ("red", "green", "blue") if result.channels == 3 else ("grey",)
+    for triangle in chosen_triangles(surface):
+        parts = [
+            _samples(result, view, int(np.searchsorted(view.triangles, triangle)), scan_noise_um)
+            for view in result.views
+            if triangle in view.triangles
+        ]
+        for number, channel in enumerate(channels):
+            lines = np.concatenate([part[:, number] for part in parts])
+            lines = lines[np.isfinite(lines[:, 3])]
+            head = [
+                f'#SAMPLE "triangle {triangle}, {channel}"',
+                f'#ORIGIN "{surface.remark}"',
+                "#DIM 3 1",
+                "#PARAM_IN ISOTROPIC_TL_TV_PROJ_DPHI",
+                "#PARAM_OUT INV_STERADIAN",
+                "#VS 2",
+            ]
+            text = ["\t".join(f"{value:.7g}" for value in line) for line in lines]
+            paths.append(folder / f"triangle{triangle}_{channel}.alta")
+            write_synced(paths[-1], "\n".join([*head, *text]) + "\n")
+    return paths
+
+
+def _samples(result: RunResult, view: ViewSamples, row: int, scan_noise_um: float) -> Floats:
+    """[leds, channels, 6] the columns of the file, of a triangle in a view; NaN where there is no sample."""
+    with h5py.File(view.path, "r") as file:
+        f, u_noise = file["f"][row].astype(np.float64), file["u_own"][row].astype(np.float64)
+        own, shared, response = file["led_u_own"][()], file["led_u_shared"][()], file["u_response"][row]
+        indirect = np.zeros(f.shape)
+        if view.inter_reflection is not None:
+            indirect = u_inter_reflection(file[INTER_REFLECTION][row])
+        led_mm, normal = float(file.attrs["led_u_mm"]), file["normals"][row]
+    corners = result.corners_mm[view.triangles[row]].astype(np.float64)
+    count, same = len(view.leds), np.ones(len(view.leds))
+    places = Places(np.broadcast_to(corners, (count, 3, 3)), view.led_mm, view.led_normals)
+    lines = np.empty((count, f.shape[1], 6))
+    lines[:, :, :3] = _angles(view, corners.mean(axis=0), normal)[:, None]
+    for channel in range(f.shape[1]):
+        sources = Sources(
+            u_noise[:, channel],
+            response[channel] * same,
+            indirect[:, channel],
+            own[:, channel],
+            shared[:, channel],
+            scan_noise_um * same,
+            led_mm * same,
+        )
+        low, high = bounds(places, sources, _QUANTILE)
+        value = f[:, channel]
+        most = np.finfo(np.float32).max
+        lines[:, channel, 3:] = np.stack([value, value * low, np.minimum(value * high, most)], axis=1)
+    return lines
+
+
+def _angles(view: ViewSamples, centre_mm: Floats, normal: Floats) -> Floats:
+    """[leds, 3] theta_l, theta_v cos dphi, theta_v sin dphi."""
+
+    def polar(places_mm: Floats) -> tuple[Floats, Floats]:
+        ways = places_mm - centre_mm
+        ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+        cosine = ways @ normal
+        return np.arccos(np.clip(cosine, -1.0, 1.0)), ways - cosine[..., None] * normal
+
+    theta_l, along_l = polar(view.led_mm)
+    theta_v, along_v = polar(view.camera_mm[None])
+    sine = np.cross(along_l, along_v) @ normal
+    dphi = np.arctan2(sine, np.sum(along_l * along_v, axis=1))
+    return np.stack([theta_l, theta_v * np.cos(dphi), theta_v * np.sin(dphi)], axis=1)

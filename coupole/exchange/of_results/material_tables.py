@@ -1,0 +1,80 @@
+"""Single materials of a result, and what their GGX gives in any pair of directions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface
+from coupole.reflectance.ggx import lobe
+from coupole.reflectance.run_result import CLUSTERS
+
+_MOST = 64
+"""Files that nobody has asked for by name."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """Of one triangle, or of a cluster of triangles."""
+
+    name: str
+    kd: Floats
+    """[3] 1/sr"""
+    ks: Floats
+    alpha: float
+
+    def reflectance(self, ways_in: Floats, ways_out: Floats) -> Floats:
+        """[n, 3] f, 1/sr, of unit directions [n, 3] to the light and to the viewer, z the normal; 0 from below."""
+        values = np.zeros(len(ways_in))
+        _lobes(np.ascontiguousarray(ways_in), np.ascontiguousarray(ways_out), self.alpha, values)
+        above = (ways_in[:, 2] > 0.0) & (ways_out[:, 2] > 0.0)
+        found: Floats = np.where(above[:, None], self.kd + values[:, None] * self.ks, 0.0)
+        return found
+
+
+def materials_of(surface: MeasuredSurface) -> Iterator[Material]:
+    """Those of the chosen triangles, else those of all clusters. Raises InputError if a triangle has none, or if
+    nothing is chosen and there are no clusters, or too many."""
+    chosen_triangles(surface, optional=True)
+    for number in surface.chosen:
+        yield Material(f"triangle{number}", surface.kd[number], surface.ks[number], float(surface.alpha[number]))
+    if surface.chosen:
+        return
+    folder = surface.result.folder
+    how = "name triangles with --triangle"
+    if not (folder / CLUSTERS).exists():
+        raise InputError(f"{folder}: has no clusters; {how}, or find some: `coupole reflectance cluster {folder}`")
+    clusters = surface.result.clusters
+    if len(clusters.alpha) > _MOST:
+        raise InputError(
+            f"{folder}: has {len(clusters.alpha)} clusters, a file each; {how}, or make {_MOST} at most"
+        )
+    for number in range(len(clusters.alpha)):
+        kd, ks = (np.broadcast_to(values[number], 3) for values in (clusters.kd, clusters.ks))
+        yield Material(f"cluster{number}", kd, ks, float(clusters.alpha[number]))
+
+
+def chosen_triangles(surface: MeasuredSurface, *, optional: bool = False) -> NDArray[np.int64]:
+    """Raises InputError for one that is not there or has no material, or if none is named."""
+    if not surface.chosen and not optional:
+        raise InputError("--triangle: expected the numbers of triangles whose samples are wanted")
+    for number in surface.chosen:
+        if number >= len(surface.triangles):
+            raise InputError(f"--triangle {number}: the mesh has {len(surface.triangles)}, counted from 0")
+        if not surface.known[number]:
+            raise InputError(f"--triangle {number}: has no material; no view, or too few lights, have seen it")
+    return np.array(surface.chosen, np.int64)
+
+
+@numba.njit(cache=True, nogil=True)
+def _lobes(ways_in, ways_out, alpha, values):  # type: ignore[no-untyped-def]
+    for n in range(len(values)):
+        nl, nv = ways_in[n, 2], ways_out[n, 2]
+        if nl > 0.0 and nv > 0.0:
+            half = ways_in[n] + ways_out[n]
+            values[n] = lobe(nl, nv, half[2] / np.sqrt(np.sum(half * half)), alpha)[0]

@@ -1,0 +1,121 @@
+"""What exporters take of a result of runs: the whole mesh, and for each triangle what is known of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.geometry import apply, inverse
+from coupole.reflectance.run_relighting import best_fit
+from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MeasuredSurface:
+    """Places and directions are in the support frame (z up, mm). Values are NaN where no material is known."""
+
+    result: RunResult
+    fit: str
+    """The materials are those of this fit, one of `run_result.MATERIALS`."""
+    about: dict[str, Any]
+    """result.json"""
+    vertices_mm: Floats
+    """[v, 3]"""
+    triangles: NDArray[np.int64]
+    """[n, 3] rows of the vertices; all of the mesh."""
+    normals: Floats
+    """[n, 3] as fitted; the mesh's where no material is known."""
+    kd: Floats
+    """[n, 3] red, green, blue; 1/sr. f = kd + ks D V, GGX's D and the height-correlated V of `ggx`."""
+    ks: Floats
+    """[n, 3]"""
+    alpha: Floats
+    """[n] GGX's roughness."""
+    uncertain: dict[str, Floats]
+    """[n] standard uncertainties, all parts together: `u_kd`, `u_ks`, `u_alpha` relative (the channels' mean),
+    `u_normal` rad."""
+    chosen: tuple[int, ...] = ()
+    """Triangles that are asked for by name."""
+
+    @cached_property
+    def known(self) -> NDArray[np.bool_]:
+        """[n] triangles that have a material."""
+        return np.isfinite(self.alpha) & np.isfinite(self.kd).all(axis=1)
+
+    @property
+    def remark(self) -> str:
+        """What every file says of itself."""
+        kind = "simulated" if self.about.get("simulated") else "measured"
+        version, runs = self.about["software"]["coupole"], ", ".join(sorted(self.about["runs"]))
+        return f"{kind} with Coupole {version}; fit {self.fit} of {runs}"
+
+
+def read_surface(folder: Path, fit: str | None = None, chosen: tuple[int, ...] = ()) -> MeasuredSurface:
+    """Of a whole result, with the material fit that missed least unless it is named. Raises InputError if there is
+    no such fit."""
+    about = read_about(folder)
+    result = RunResult(folder)
+    name = fit or best_fit(result, MATERIALS)
+    if name not in MATERIALS:
+        raise InputError(f"--fit: expected {' or '.join(MATERIALS)}, which hold from everywhere; got {name}")
+    path = result.materials_path(name)
+    if not path.exists():
+        raise InputError(f"{folder}: has no fit {name}; `coupole reflectance fit {folder}` makes it")
+    support_from_base = inverse(result.base_from_support)
+    vertices, number = np.unique(result.corners_mm.reshape(-1, 3), axis=0, return_inverse=True)
+    vertices_mm = apply(support_from_base, vertices.astype(np.float64))
+    triangles = number.reshape(-1, 3)
+    corners = vertices_mm[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    found = result.materials(name)
+    fitted = np.isfinite(found.alpha)
+    normals[result.triangles[fitted]] = found.normals[fitted] @ support_from_base[:3, :3].T
+
+    def everywhere(values: Floats) -> Floats:
+        whole = np.full((len(triangles), *values.shape[1:]), np.nan)
+        whole[result.triangles] = values
+        return whole
+
+    with h5py.File(path, "r") as file:
+        lower, same = file["covariance"][()], np.hypot(file["u_triangle"][()], file["u_shared"][()])
+        u_kd, u_ks = (np.sqrt(np.mean(file[key][()] ** 2, axis=1) + same**2) for key in ("u_kd", "u_ks"))
+    uncertain = {
+        "u_kd": u_kd,
+        "u_ks": u_ks,
+        "u_alpha": np.sqrt(lower[:, 14]),
+        "u_normal": np.sqrt(lower[:, 0] + lower[:, 2]),
+    }
+    return MeasuredSurface(
+        result,
+        name,
+        about,
+        vertices_mm,
+        triangles,
+        normals,
+        everywhere(_three(found.kd)),
+        everywhere(_three(found.ks)),
+        everywhere(found.alpha),
+        {key: everywhere(values.astype(np.float64)) for key, values in uncertain.items()},
+        chosen,
+    )
+
+
+def srgb(linear: Floats) -> Floats:
+    """IEC 61966-2-1, of values that are cut to 0..1."""
+    cut = np.clip(linear, 0.0, 1.0)
+    found: Floats = np.where(cut <= 0.0031308, 12.92 * cut, 1.055 * np.maximum(cut, 1e-12) ** (1 / 2.4) - 0.055)
+    return found
+
+
+def _three(values: Floats) -> Floats:
+    return values if values.shape[1] == 3 else np.repeat(values, 3, axis=1)

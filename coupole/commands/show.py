@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from coupole.commands.common import JsonOption, fail
 from coupole.errors import CoupoleError, InputError
 
-SourceArgument = Annotated[Path, typer.Argument(help="Folder of a result of runs.", show_default=False)]
+if TYPE_CHECKING:
+    from coupole.exchange.look.look_blocks import Look
+
+SourceArgument = Annotated[
+    Path, typer.Argument(help="Folder of a result of runs or of pictures.", show_default=False)
+]
 OutOption = Annotated[Path, typer.Option("--out", help="The page, FILE.html.", show_default=False)]
 
 
 def show(source: SourceArgument, out: OutOption, as_json: JsonOption = False) -> None:
     """Make a page to look at a measured object: turn it, light it anew, measure it, see how well it is known."""
-    from coupole.exchange.look.look_of_runs import look_of_result
     from coupole.exchange.look.look_page import write_page
     from coupole.viewing.terminal import make_console, step_bars
 
@@ -29,7 +33,7 @@ def show(source: SourceArgument, out: OutOption, as_json: JsonOption = False) ->
             )
         with step_bars(console) as bars:
             bars("read", 0, 2)
-            look = look_of_result(source)
+            look = _look(source)
             bars("write", 1, 2)
             files = write_page(look, source.resolve().name, out)
             bars("write", 2, 2)
@@ -42,3 +46,16 @@ def show(source: SourceArgument, out: OutOption, as_json: JsonOption = False) ->
         print(json.dumps(said))
     else:
         console.print(f"{files[0]}: {size_bytes / 1e6:.1f} MB in {len(files)} files; open it in a browser")
+
+
+def _look(source: Path) -> Look:
+    """By what the folder holds."""
+    from coupole.exchange.look.look_of_pictures import look_of_pictures
+    from coupole.exchange.look.look_of_runs import look_of_result
+    from coupole.reflectance import picture_result, run_result
+
+    if (source / picture_result.SAMPLES).exists():
+        return look_of_pictures(source)
+    if (source / run_result.OBJECT).exists():
+        return look_of_result(source)
+    raise InputError(f"{source}: holds no result; `coupole reflectance {source} --out FOLDER` makes one of a run")

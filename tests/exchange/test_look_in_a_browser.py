@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import math
 import re
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from typing import Any
 
 import cells
 import colour
+import h5py
 import numpy as np
 import pytest
 from browser import Browser, needs_chromium
@@ -197,7 +199,7 @@ def test_keys_alone_turn_light_measure_and_note(page: Page, folder: Path) -> Non
     page.open(folder / "look.html")
     page.focus("picture")
     page.keys(Keys.ARROW_RIGHT)
-    assert page.run("coupole.state.camera.azimuth") == pytest.approx(-94)
+    assert page.run("coupole.state.camera.azimuth") == pytest.approx(-94.2)
     ActionChains(page.driver).key_down(Keys.SHIFT).send_keys(Keys.ARROW_UP).key_up(Keys.SHIFT).perform()
     page.keys("m", Keys.ARROW_LEFT, Keys.ARROW_LEFT, "+", "m", "n")
     assert "distance" in page.browser.text("#status") or "note" in page.browser.text("#status")
@@ -352,3 +354,39 @@ def test_data_beside_the_page_are_loaded_by_script_tags_and_missed_if_gone(page:
     page.browser.open(f"file://{tmp_path / 'look.html'}")
     told = cells.wait_until(lambda: page.browser.text("#status").replace("Reading…", ""), "what is missing")
     assert "(kd): keep its .data folder beside it" in told
+
+
+def test_a_flat_picture_has_the_radiance_of_each_pixel_where_it_lies(page: Page, tmp_path: Path) -> None:
+    mask = np.ones((6, 8), bool)
+    mask[0, 0] = False
+    normal = np.tile([0.0, 0.6, 0.8], (47, 1))
+    normal[-1] = [0.6, 0.0, 0.8]  # the lower right pixel
+    kd = np.tile([0.5, 0.25, 0.125], (47, 1))
+    write_pictures(tmp_path / "result", mask, normal, kd)
+    ended = cells.here("show", tmp_path / "result", "--out", tmp_path / "look.html")
+    assert ended.code == 0, ended.err
+    page.open(tmp_path / "look.html")
+    page.small()
+    camera = "{target: [4, 3, 0], azimuth: -90, height: 90, distance: 3 / Math.tan(Math.PI / 15)}"
+    page.run(f"coupole.state = {{camera: {camera}, lights: [{{...coupole.state.lights[0], softness: 0}}]}}")
+    page.run("coupole.setLight(0.6, 0, 0.8)")
+    picture = page.picture(1)
+    side = HEIGHT // 6
+    assert picture[side // 2, side // 2, 3] == 0.0
+    np.testing.assert_allclose(
+        picture[side // 2, 5 * side + 9, :3], np.array([0.5, 0.25, 0.125]) * 0.64, rtol=1e-3
+    )
+    np.testing.assert_allclose(picture[5 * side + 9, 7 * side + 9, :3], [0.5, 0.25, 0.125], rtol=1e-3)
+    assert "Pictures of an object" in page.browser.text("#banner")
+
+
+def write_pictures(folder: Path, mask: np.ndarray, normal: np.ndarray, kd: np.ndarray) -> None:
+    """A result of pictures with known materials of the mask's pixels, without highlights."""
+    (folder / "samples").mkdir(parents=True)
+    (folder / "fits").mkdir()
+    (folder / "result.json").write_text(json.dumps({"schema": "coupole-reflectance-pictures/1"}))
+    with h5py.File(folder / "samples/pictures.h5", "w") as file:
+        file["mask"], file["directions"] = mask, np.eye(3)
+    with h5py.File(folder / "fits/materials.h5", "w") as file:
+        file["normal"], file["kd"], file["ks"] = normal, kd, np.zeros_like(kd)
+        file["alpha"], file["residual"] = np.full(len(kd), 0.5), np.zeros(len(kd))

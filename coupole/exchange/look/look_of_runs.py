@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from coupole.exchange.look.look_blocks import Block, block_of, log_coded, octahedral
+from coupole.exchange.look.look_blocks import Look, block_of, halves, log_coded, octahedral
 from coupole.geometry import apply, inverse
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
@@ -20,18 +20,6 @@ Floats = NDArray[np.float64]
 
 PLACES = 65535
 """Steps of a coordinate along the longest side of the object."""
-_LARGEST_HALF = 65504.0
-
-
-@dataclass(frozen=True)
-class Look:
-    """What a page shows."""
-
-    about: dict[str, Any]
-    """What its scripts know of it; docs/reference/page.md."""
-    blocks: tuple[Block, ...]
-    errors: dict[str, str] = field(default_factory=dict)
-    """What is lost by writing numbers short, by the name of a quantity."""
 
 
 def look_of_result(folder: Path) -> Look:
@@ -54,9 +42,9 @@ def look_of_result(folder: Path) -> Look:
         block_of("places", places),
         block_of("triangles", triangles),
         block_of("normals", _spread(octahedral(turned), at, count)),
-        block_of("kd", _spread(_halves(_three(materials.kd[mine])), at, count)),
-        block_of("ks", _spread(_halves(_three(materials.ks[mine])), at, count)),
-        block_of("gloss", _spread(_halves(_pair(materials.alpha, materials.residual)[mine]), at, count)),
+        block_of("kd", _spread(halves(_three(materials.kd[mine])), at, count)),
+        block_of("ks", _spread(halves(_three(materials.ks[mine])), at, count)),
+        block_of("gloss", _spread(halves(_pair(materials.alpha, materials.residual)[mine]), at, count)),
         block_of("uncertainty", _spread(_uncertainty(path)[mine], at, count)),
     ]
     about = {
@@ -64,9 +52,17 @@ def look_of_result(folder: Path) -> Look:
         "fit": fit,
         "simulated": bool(known.get("simulated")),
         "software": known.get("software", {}),
-        "views": [view.view for view in result.views],
         "triangles": count,
         "measured": len(at),
+        "irradiance": math.pi,
+        "unit": "1/sr",
+        "told": {
+            "Object": "simulated" if known.get("simulated") else "measured",
+            "Triangles": f"{count:,}, {len(at):,} with a material",
+            "Views": ", ".join(view.view for view in result.views),
+            "Light": "straight from lamps, with shadows; none from surface to surface. White is the radiance that "
+            "is shown as white; a white diffuser that faces a light of strength 1 has 1.",
+        },
         "origin_mm": origin_mm.tolist(),
         "step_mm": step_mm,
     }
@@ -113,10 +109,6 @@ def _three(values: Floats) -> Floats:
 
 def _pair(one: Floats, other: Floats) -> Floats:
     return np.stack([one, other], axis=1)
-
-
-def _halves(values: Floats) -> NDArray[np.float16]:
-    return np.clip(np.nan_to_num(values), 0.0, _LARGEST_HALF).astype(np.float16)
 
 
 def _spread(values: NDArray[Any], at: NDArray[np.int64], count: int) -> NDArray[Any]:

@@ -13,8 +13,7 @@ from importlib import resources
 from pathlib import Path
 
 from coupole.errors import InputError, StorageError
-from coupole.exchange.look.look_blocks import Block
-from coupole.exchange.look.look_of_runs import Look
+from coupole.exchange.look.look_blocks import Block, Look
 from coupole.storage.durable import make_folder, write_synced
 
 MOST_BYTES = 25_000_000

@@ -3,10 +3,11 @@
 const FIELD_DEG = 24;
 const MARGIN = 1.25;
 
-/** Where the camera begins: all corners of the object's box are seen, from a side and from above. */
-function startCamera(corners, width, height, azimuth = -90, elevation = 50) {
+/** Where the camera begins: all corners of the object's box are seen, from a height above the
+ * support, degrees. */
+function startCamera(corners, width, height, above) {
   const target = times(corners.reduce(add), 1 / corners.length);
-  const camera = { target, azimuth, height: elevation, distance: 1 };
+  const camera = { target, azimuth: -90, height: above, distance: 1 };
   const { right, up, back } = axesOf(camera), [halfWidth, halfHeight] = halvesOf(width, height);
   const needed = corners.map((corner) => {
     const way = minus(corner, target);

@@ -21,6 +21,7 @@ uniform int quantity;
 uniform float relief;
 uniform float share;  // of this sample in the mean
 uniform vec3 eye_mm;
+uniform bool flat_one;  // a measured picture: seen from far above, without shadows
 uniform mat3 view_from_object;
 
 uniform int lights;
@@ -39,8 +40,8 @@ struct Material {
 };
 
 vec3 normal_of(int triangle) {
-  vec2 flat_one = vec2(texelFetch(normals, cell(triangle), 0).xy) / 65535.0 * 2.0 - 1.0;
-  vec3 normal = vec3(flat_one, 1.0 - abs(flat_one.x) - abs(flat_one.y));
+  vec2 square = vec2(texelFetch(normals, cell(triangle), 0).xy) / 65535.0 * 2.0 - 1.0;
+  vec3 normal = vec3(square, 1.0 - abs(square.x) - abs(square.y));
   vec2 folded = (1.0 - abs(normal.yx)) * vec2(normal.x >= 0.0 ? 1.0 : -1.0, normal.y >= 0.0 ? 1.0 : -1.0);
   normal.xy = normal.z < 0.0 ? folded : normal.xy;
   return normalize(normal);
@@ -80,7 +81,7 @@ float reaching(int light, vec3 at_mm) {
 
 // What comes from a place of a material, under all lights.
 vec3 radiance(Material material, vec3 at_mm, vec3 face) {
-  vec3 view = normalize(eye_mm - at_mm);
+  vec3 view = flat_one ? vec3(0.0, 0.0, 1.0) : normalize(eye_mm - at_mm);
   float nv = dot(material.normal, view);
   vec3 sum = vec3(0.0);
   for (int light = 0; light < lights; light++) {
@@ -91,7 +92,8 @@ vec3 radiance(Material material, vec3 at_mm, vec3 face) {
     if (nv > 0.0 && mode != DIFFUSE) {
       value += material.ks * lobe(nl, nv, dot(material.normal, normalize(way + view)), material.alpha);
     }
-    sum += irradiances[light] * nl * value * reaching(light, at_mm + face * offset_mm[light]);
+    float share = flat_one ? 1.0 : reaching(light, at_mm + face * offset_mm[light]);
+    sum += irradiances[light] * nl * value * share;
   }
   return sum;
 }
@@ -123,7 +125,7 @@ vec4 looked_at(int triangle, vec3 at_mm) {
     return code == 0u ? vec4(0.0) : vec4(vec3(1e-4 * pow(1e5, (float(code) - 1.0) / 254.0)), 1.0);
   }
   if (mode > UNCERTAINTY) return vec4(vec3(shine.y), 1.0);
-  return vec4(radiance(material, at_mm, face_of(triangle)), 1.0);
+  return vec4(radiance(material, at_mm, flat_one ? material.normal : face_of(triangle)), 1.0);
 }
 
 void main() {

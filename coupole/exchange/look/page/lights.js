@@ -1,4 +1,5 @@
-// Lights as the shaders take them. A white diffuser that faces a light of strength 1 is 1.
+// Lights as the shaders take them. Of a mesh, a white diffuser that faces a light of strength 1 is 1; of measured
+// pictures, strength 1 is that of their lights.
 
 const toLinear = (value) => value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
 const toShown = (value) => value <= 0.0031308 ? 12.92 * value : 1.055 * value ** (1 / 2.4) - 0.055;
@@ -28,12 +29,12 @@ function warmth(kelvin) {
 
 const NEUTRAL_KELVIN = 6500;
 
-/** Irradiance by channel of a light on what faces it: pi for strength 1 and neutral colour. */
-function irradiance(light) {
+/** Irradiance by channel of a light on what faces it, `whole` for strength 1 and neutral colour. */
+function irradiance(light, whole) {
   const colour = [1, 3, 5].map((at) => toLinear(parseInt(light.colour.slice(at, at + 2), 16) / 255));
   const neutral = warmth(NEUTRAL_KELVIN), warm = warmth(light.kelvin);
   const tint = light.kelvin === NEUTRAL_KELVIN ? [1, 1, 1] : warm.map((value, k) => value / neutral[k]);
-  return colour.map((value, k) => Math.PI * light.strength * value * tint[k]);
+  return colour.map((value, k) => whole * light.strength * value * tint[k]);
 }
 
 /** A direction within a light's disk, whose radius is its softness, degrees: sample k, the first its middle. */

@@ -22,12 +22,17 @@ class App {
     new Pointer(this, this.canvas, byId("sphere"));
     this.listen();
     this.tellAbout();
+    if (about.picture_px) {
+      byId("tools").querySelector("[data-tool=turn]").textContent = "Move";
+      byId("mode").querySelector("[value=uncertainty]").remove();
+    }
     if (!this.state.white) this.fitWhite();
     this.changed("light");
   }
 
   startCamera() {
-    return startCamera(this.renderer.corners, this.canvas.width, this.canvas.height);
+    const above = this.about.picture_px ? 90 : 50;
+    return startCamera(this.renderer.corners, this.canvas.width, this.canvas.height, above);
   }
 
   listen() {
@@ -113,7 +118,13 @@ class App {
 
   // -- camera and light ------------------------------------------------------------------------------------------
 
-  turn(azimuth, height) {
+  /** Go round the object by pixels that the pointer went; a measured picture moves instead. */
+  turn(x, y) {
+    if (this.about.picture_px) {
+      this.move(x, y);
+      return;
+    }
+    const azimuth = -x * TURN_DEG_PER_PX, height = y * TURN_DEG_PER_PX;
     this.state.camera = turned(this.state.camera, azimuth, height);
     this.changed("light");
   }
@@ -253,13 +264,9 @@ class App {
 
   tellAbout() {
     const { about } = this, told = {
-      Object: about.simulated ? "simulated" : "measured",
-      Triangles: `${about.triangles.toLocaleString("en")}, ${about.measured.toLocaleString("en")} with a material`,
-      Views: about.views.join(", "),
+      ...about.told,
       Fit: about.fit,
       "Written short": Object.entries(about.errors).map(([name, error]) => `${name}: ${error}`).join("; "),
-      Light: "straight from lamps, with shadows; none from surface to surface. White is the radiance that is "
-        + "shown as white; a white diffuser that faces a light of strength 1 has 1.",
       Software: Object.entries(about.software).map(([name, version]) => `${name} ${version}`).join(", "),
     };
     const list = document.createElement("dl");

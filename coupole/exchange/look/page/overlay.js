@@ -2,15 +2,18 @@
 
 const BAR_PX = 140;
 
-/** A round length, mm, that is at most `BAR_PX` long where the camera looks, and how long that is. */
+/** A round length that is at most `BAR_PX` long where the camera looks, and how long that is. */
 function scaleBar(camera, shorter) {
-  const mm = 2 * halfField * camera.distance / shorter;
-  const most = BAR_PX * mm, power = 10 ** Math.floor(Math.log10(most));
+  const unit = 2 * halfField * camera.distance / shorter;
+  const most = BAR_PX * unit, power = 10 ** Math.floor(Math.log10(most));
   const size = power * [5, 2, 1].find((factor) => factor * power <= most);
-  return { size, pixels: size / mm };
+  return { size, pixels: size / unit };
 }
 
-const lengthText = (mm) => mm < 1 ? `${Number((1000 * mm).toPrecision(3))} µm` : `${Number(mm.toPrecision(4))} mm`;
+function lengthText(size) {
+  if (ABOUT.picture_px) return `${Number(size.toPrecision(4))} px`;
+  return size < 1 ? `${Number((1000 * size).toPrecision(3))} µm` : `${Number(size.toPrecision(4))} mm`;
+}
 
 function drawScale(element, camera, shorter) {
   const { size, pixels } = scaleBar(camera, shorter);
@@ -47,7 +50,8 @@ function legendOf(mode, quantity) {
 
 /** What has to be said of the picture, wherever it is seen. */
 function bannerOf(about, state) {
-  const told = [about.simulated ? "Simulated object" : "Measured object"];
+  const kinds = { true: "Simulated object", false: "Measured object", null: "Pictures of an object" };
+  const told = [kinds[about.simulated]];
   if (["relit", "diffuse", "specular", "unsharp"].includes(state.mode)) {
     told.push(`light computed from a fit (${about.fit})`);
     if (state.sky > 0 || state.lights.some((light) => light.kelvin !== NEUTRAL_KELVIN)) {

@@ -31,7 +31,7 @@ function plotOf(material, view) {
     ${[-60, 0, 60].map((light) => `<text x="${x(light)}" y="${PLOT.height - 16}" text-anchor="middle">${
       light}°</text>`).join("")}
     <line class="mirror" x1="${x(view)}" x2="${x(view)}" y1="${PLOT.top}" y2="${PLOT.height - PLOT.bottom}"/>
-    <polygon class="band" points="${band.join(" ")}"/>
+    ${material.uncertainty.kd === null ? "" : `<polygon class="band" points="${band.join(" ")}"/>`}
     ${curves.map((values, k) => `<polyline stroke="${CHANNELS[k]}" points="${line(values).join(" ")}"/>`).join("")}
     <text x="${(PLOT.left + PLOT.width) / 2}" y="${PLOT.height - 3}" text-anchor="middle">angle of the light</text>
   </svg>`;
@@ -43,16 +43,19 @@ const three = (values) => values.map((value) => value.toPrecision(3)).join(" / "
 
 /** What is told of a point, as markup. */
 function toldOf(triangle, place, material, view) {
-  const at = `Triangle ${triangle} at ${place.map((value) => value.toFixed(2)).join(", ")} mm`;
+  const at = ABOUT.picture_px
+    ? `Pixel ${triangle % ABOUT.picture_px[0]}, ${Math.floor(triangle / ABOUT.picture_px[0])}`
+    : `Triangle ${triangle} at ${place.map((value) => value.toFixed(2)).join(", ")} mm`;
   if (!material) return `<p>${at}: was seen in too few frames; it has no material.</p>`;
   const { kd, ks, normal, roughness } = material.uncertainty;
+  const bounds = kd === null ? "How well it is known was not found out." : "Band: 95 % of their mean.";
   const angle = normal === null ? "unknown" : `${degrees(normal).toPrecision(2)}°`;
   const row = (name, value, u) => `<tr><th scope="row">${name}</th><td>${value}</td><td>± ${u}</td></tr>`;
   return `<p>${at}</p>${plotOf(material, view)}
-    <p class="small">1/sr; red, green, blue. Band: 95 % of their mean. Dotted: where the camera is mirrored. Drawn
-    from the fitted coefficients and their uncertainty; this page holds no samples.</p>
+    <p class="small">${ABOUT.unit}; red, green, blue. ${bounds} Dotted: where the camera is mirrored. Drawn from
+    the fitted coefficients; this page holds no samples.</p>
     <table><tbody>
-    ${row("Diffuse kd, 1/sr", three(material.kd), percent(kd))}
+    ${row("Diffuse kd", three(material.kd), percent(kd))}
     ${row("Highlight ks", three(material.ks), percent(ks))}
     ${row("Roughness α", material.alpha.toPrecision(3), percent(roughness))}
     ${row("Normal", material.normal.map((value) => value.toFixed(3)).join(", "), angle)}

@@ -1,7 +1,7 @@
 // Mouse, fingers and keys in the picture and on the sphere of lights.
 
 const CLICK_PX = 5;
-const KEY_DEG = 4;
+const KEY_PX = 14;
 const TURN_DEG_PER_PX = 0.3;
 
 class Pointer {
@@ -54,7 +54,7 @@ class Pointer {
     const { app } = this;
     if (event.buttons & 2 || event.altKey) app.move(x, y);
     else if (app.tool === "light" || event.shiftKey) app.dragLight(x, y);
-    else app.turn(-x * TURN_DEG_PER_PX, y * TURN_DEG_PER_PX);
+    else app.turn(x, y);
   }
 
   up(event) {
@@ -70,7 +70,7 @@ class Pointer {
     if (event.ctrlKey || event.metaKey) return;
     if (way && event.shiftKey) app.dragLight(way[0] * 12, way[1] * 12);
     else if (way && event.altKey) app.move(way[0] * 20, way[1] * 20);
-    else if (way) app.turn(-way[0] * KEY_DEG, way[1] * KEY_DEG);
+    else if (way) app.turn(way[0] * KEY_PX, way[1] * KEY_PX);
     else if (event.key === "+" || event.key === "=") app.zoom(0.9);
     else if (event.key === "-") app.zoom(1 / 0.9);
     else if (event.key === "0") app.whole();

@@ -111,10 +111,10 @@ class Renderer {
   /** Lights of this sample. */
   beamsOf(state) {
     const beams = state.lights.map((light, number) => ({
-      way: sampledDirection(light, this.samples, number), irradiance: irradiance(light),
+      way: sampledDirection(light, this.samples, number), irradiance: irradiance(light, this.about.irradiance),
     }));
     if (state.sky > 0) {
-      const { way, irradiance: sky } = sampledSky(state.sky, this.samples);
+      const { way, irradiance: sky } = sampledSky(state.sky * this.about.irradiance / Math.PI, this.samples);
       beams.push({ way, irradiance: sky });
     }
     return beams.map((beam) => ({ ...beam, shadow: this.shadowMatrix(beam.way) }));
@@ -141,15 +141,16 @@ class Renderer {
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.depths.frames[layer]);
       gl.clear(gl.DEPTH_BUFFER_BIT);
       gl.uniformMatrix4fv(at("clip_from_object"), false, beam.shadow);
-      gl.drawArrays(gl.TRIANGLES, 0, 3 * this.triangles);
+      if (!this.about.picture_px) gl.drawArrays(gl.TRIANGLES, 0, 3 * this.triangles);
       this.drawnShadows[layer] = String(beam.way);
     });
   }
 
   drawSurface(camera) {
     const gl = this.gl, [x, y] = evenly(this.samples);
-    const { places, triangles } = this.textures;
-    const at = this.use("surface", { places, triangles });
+    const { places, triangles, gloss } = this.textures;
+    const at = this.use("surface", { places, triangles, gloss });
+    gl.uniform2iv(at("picture_px"), this.about.picture_px ?? [0, 0]);
     const clip = clipOf(camera, this.width, this.height, this.middle, this.radius, [x - 0.5, y - 0.5]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.targets.seen.frame);
     gl.viewport(0, 0, this.width, this.height);
@@ -170,6 +171,7 @@ class Renderer {
     gl.uniform1f(at("relief"), state.relief);
     gl.uniform1f(at("share"), 1 / (this.samples + 1));
     gl.uniform3fv(at("eye_mm"), place);
+    gl.uniform1i(at("flat_one"), this.about.picture_px ? 1 : 0);
     gl.uniformMatrix3fv(at("view_from_object"), false, [0, 1, 2].flatMap((k) => [right[k], up[k], back[k]]));
     gl.uniform1i(at("lights"), beams.length);
     gl.uniform3fv(at("ways"), beams.flatMap((beam) => beam.way));

@@ -15,6 +15,7 @@ from coupole.commands.commissioning import commission
 from coupole.commands.dose_ledger import dose
 from coupole.commands.reflectance import reflectance_app
 from coupole.commands.render_scene import render
+from coupole.commands.show import show
 from coupole.commands.uncertainty import budget
 from coupole.errors import CoupoleError, InputError, Interrupted
 
@@ -44,6 +45,7 @@ for command in (
     keeping.scan,
     dose,
     render,
+    show,
     budget,
     planning.schema,
 ):

@@ -2,74 +2,20 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cells
 import pytest
+from browser import Browser, needs_chromium
 from cells import CellFolder
-from selenium import webdriver
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.remote.webelement import WebElement
 from test_live import live
 
-CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-QUIET = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--window-size=1280,1000",
-)
-"""No screen, and no word to anybody but the page's own server."""
-
-pytestmark = pytest.mark.skipif(
-    not (CHROMIUM and DRIVER), reason="Chromium and its driver are not installed (see tools/bootstrap.sh)"
-)
-
-
-class Browser:
-    """One window."""
-
-    def __init__(self) -> None:
-        options = webdriver.ChromeOptions()
-        for option in QUIET:
-            options.add_argument(option)
-        options.binary_location = CHROMIUM or ""
-        options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-        self.driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
-        self.driver.set_page_load_timeout(cells.PATIENCE_S)
-
-    def open(self, url: str) -> None:
-        self.driver.get("about:blank")  # the page before asks its server no more
-        self.driver.get_log("browser")
-        self.driver.get(url)
-
-    def at(self, selector: str) -> WebElement:
-        found: WebElement = cells.wait_until(
-            lambda: next(iter(self.driver.find_elements(By.CSS_SELECTOR, selector)), None), selector
-        )
-        return found
-
-    def text(self, selector: str) -> str:
-        return str(self.at(selector).text)
-
-    def run(self, script: str) -> Any:
-        return self.driver.execute_script(f"return {script}")
-
-    def troubles(self) -> list[str]:
-        """What the page wrote to the console as an error: failed scripts and missing pictures."""
-        return [line["message"] for line in self.driver.get_log("browser") if line["level"] == "SEVERE"]
+pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,85 @@
+"""Arrays of numbers as text that a page carries and its scripts read (`page/blocks.js`).
+
+Bytes of equal significance are put together (rows of first bytes, rows of second bytes, ...), as neighbouring
+numbers share their higher bytes; then zlib, then base64.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+TYPES = ("uint8", "uint16", "uint32", "float16", "float32")
+LOG_LEAST, LOG_STEPS = 1e-4, 254
+"""Of `log_coded`: what 1 stands for, and steps from there to its `LOG_RATIO`-fold."""
+LOG_RATIO = 1e5
+_LARGEST_HALF = 65504.0
+
+
+@dataclass(frozen=True)
+class Block:
+    """A named array, and how the text that stands for it is read."""
+
+    name: str
+    text: str
+    dtype: str
+    shape: tuple[int, ...]
+
+    @property
+    def script(self) -> str:
+        """What a script tag has to say for the page to have it."""
+        about = json.dumps({"name": self.name, "dtype": self.dtype, "shape": self.shape})
+        return f'coupoleBlock({about},"{self.text}");\n'
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a page shows."""
+
+    about: dict[str, Any]
+    """What its scripts know of it; docs/reference/page.md."""
+    blocks: tuple[Block, ...]
+    errors: dict[str, str] = field(default_factory=dict)
+    """What is lost by writing numbers short, by the name of a quantity."""
+
+
+def block_of(name: str, values: NDArray[Any]) -> Block:
+    """Values of one of `TYPES`."""
+    if values.dtype.name not in TYPES:
+        raise ValueError(f"{name}: a page reads {', '.join(TYPES)}, not {values.dtype.name}")
+    small = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("<")))
+    rows = small.reshape(-1).view(np.uint8).reshape(-1, values.dtype.itemsize).T
+    packed = zlib.compress(np.ascontiguousarray(rows).tobytes(), 9)
+    return Block(name, base64.b64encode(packed).decode("ascii"), values.dtype.name, values.shape)
+
+
+def log_coded(values: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Values from 1e-4 to 10 in steps of 4.6 %, so at most 2.3 % off: 1 to 255; 0 where there is none. What is
+    outside is put to the nearer end."""
+    known = np.isfinite(values)
+    inside = np.clip(np.where(known, values, LOG_LEAST), LOG_LEAST, LOG_LEAST * LOG_RATIO)
+    codes = 1.0 + np.rint(np.log(inside / LOG_LEAST) / np.log(LOG_RATIO) * LOG_STEPS)
+    return np.where(known, codes, 0.0).astype(np.uint8)
+
+
+def octahedral(normals: NDArray[np.float64]) -> NDArray[np.uint16]:
+    """[n, 2] of unit vectors [n, 3]: the octahedron's faces unfolded into a square (Meyer et al., On
+    floating-point normal vectors, 2010); at most 0.004 degrees off. Vectors that are not finite become z."""
+    known = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, [0.0, 0.0, 1.0])
+    known = known / np.abs(known).sum(axis=1, keepdims=True)
+    flat = known[:, :2]
+    sign = np.where(flat >= 0.0, 1.0, -1.0)
+    flat = np.where(known[:, 2:] < 0.0, (1.0 - np.abs(flat[:, ::-1])) * sign, flat)
+    codes: NDArray[np.uint16] = np.rint((flat * 0.5 + 0.5) * 65535.0).astype(np.uint16)
+    return codes
+
+
+def halves(values: NDArray[np.float64]) -> NDArray[np.float16]:
+    """Values of 0 and more, at most 0.05 % off; 0 where there is none."""
+    return np.clip(np.nan_to_num(values), 0.0, _LARGEST_HALF).astype(np.float16)

@@ -1,0 +1,118 @@
+"""What a page shows of a result of runs: the mesh, and for each triangle its material and how well it is known."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.exchange.look.look_blocks import Look, block_of, halves, log_coded, octahedral
+from coupole.geometry import apply, inverse
+from coupole.reflectance.run_relighting import best_fit
+from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
+
+Floats = NDArray[np.float64]
+
+PLACES = 65535
+"""Steps of a coordinate along the longest side of the object."""
+
+
+def look_of_result(folder: Path) -> Look:
+    """Of a whole result. Raises InputError if it is none, or has no material."""
+    known = read_about(folder)
+    result = RunResult(folder)
+    fit = best_fit(result, MATERIALS)
+    path = result.materials_path(fit)
+    if not path.exists():
+        raise InputError(f"{folder}: has no fit {fit}; `coupole reflectance fit {folder}` makes it")
+    support_from_base = inverse(result.base_from_support)
+    corners_mm = apply(support_from_base, result.corners_mm.reshape(-1, 3).astype(np.float64))
+    places, triangles, origin_mm, step_mm = welded(corners_mm)
+    count = len(triangles)
+    materials = result.materials(fit)
+    finite = np.isfinite(materials.alpha) & np.isfinite(materials.kd).all(axis=1)
+    at, mine = result.triangles[finite], finite.nonzero()[0]
+    turned = materials.normals[mine] @ support_from_base[:3, :3].T
+    blocks = [
+        block_of("places", places),
+        block_of("triangles", triangles),
+        block_of("normals", _spread(octahedral(turned), at, count)),
+        block_of("kd", _spread(halves(_three(materials.kd[mine])), at, count)),
+        block_of("ks", _spread(halves(_three(materials.ks[mine])), at, count)),
+        block_of("gloss", _spread(halves(_pair(materials.alpha, materials.residual)[mine]), at, count)),
+        block_of("uncertainty", _spread(_uncertainty(path)[mine], at, count)),
+    ]
+    about = {
+        "kind": "mesh",
+        "fit": fit,
+        "simulated": bool(known.get("simulated")),
+        "software": known.get("software", {}),
+        "triangles": count,
+        "measured": len(at),
+        "irradiance": math.pi,
+        "unit": "1/sr",
+        "told": {
+            "Object": "simulated" if known.get("simulated") else "measured",
+            "Triangles": f"{count:,}, {len(at):,} with a material",
+            "Views": ", ".join(view.view for view in result.views),
+            "Light": "straight from lamps, with shadows; none from surface to surface. White is the radiance that "
+            "is shown as white; a white diffuser that faces a light of strength 1 has 1.",
+        },
+        "origin_mm": origin_mm.tolist(),
+        "step_mm": step_mm,
+    }
+    errors = {
+        "places": f"{0.5e3 * step_mm:.2g} um in each coordinate",
+        "normals": "0.004 degrees",
+        "kd, ks, roughness": "0.05 %",
+        "uncertainties": "2.3 % of their value",
+    }
+    return Look(about, tuple(blocks), errors)
+
+
+def welded(corners_mm: Floats) -> tuple[NDArray[np.uint16], NDArray[np.uint32], Floats, float]:
+    """Of corners [3 n, 3] of triangles: places [m, 3] in steps from an origin, without what is there twice, in the
+    order of their first use; triangles [n, 3] as numbers of places; [3] origin and step, mm."""
+    origin_mm = corners_mm.min(axis=0)
+    step_mm = max(float(np.ptp(corners_mm, axis=0).max()), 1e-6) / PLACES
+    steps = np.rint((corners_mm - origin_mm) / step_mm).astype(np.uint64)
+    keys = steps[:, 0] << np.uint64(32) | steps[:, 1] << np.uint64(16) | steps[:, 2]
+    _, first, number = np.unique(keys, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), np.uint32)
+    rank[order] = np.arange(len(order), dtype=np.uint32)
+    places = steps[first[order]].astype(np.uint16)
+    return places, rank[number.reshape(-1)].reshape(-1, 3), origin_mm, step_mm
+
+
+def _uncertainty(path: Path) -> NDArray[np.uint8]:
+    """[n, 4] of kd, ks (relative, the channels' mean, all their sources), the normal's angle (rad) and alpha
+    (relative), standard. Raises InputError if there are none."""
+    with h5py.File(path, "r") as file:
+        if "covariance" not in file:
+            raise InputError(f"{path}: has no uncertainty, an earlier version made it; make the result anew")
+        lower, same = file["covariance"][()], np.hypot(file["u_triangle"][()], float(file["u_shared"][()]))
+        u_kd, u_ks = (np.sqrt(np.mean(file[name][()] ** 2, axis=1) + same**2) for name in ("u_kd", "u_ks"))
+    u_normal, u_alpha = np.sqrt(lower[:, 0] + lower[:, 2]), np.sqrt(lower[:, 14])
+    return log_coded(np.stack([u_kd, u_ks, u_normal, u_alpha], axis=1).astype(np.float64))
+
+
+def _three(values: Floats) -> Floats:
+    """[n, 3] of [n, channels]; one channel is grey."""
+    return values if values.shape[1] == 3 else np.repeat(values, 3, axis=1)
+
+
+def _pair(one: Floats, other: Floats) -> Floats:
+    return np.stack([one, other], axis=1)
+
+
+def _spread(values: NDArray[Any], at: NDArray[np.int64], count: int) -> NDArray[Any]:
+    """[count, ...] 0 but where triangles have values."""
+    all_of_them = np.zeros((count, *values.shape[1:]), values.dtype)
+    all_of_them[at] = values
+    return all_of_them

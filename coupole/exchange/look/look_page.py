@@ -1,0 +1,120 @@
+"""The page itself: its scripts, shaders and style, and what it shows, in one HTML file.
+
+What makes the file larger than `MOST_BYTES` is put beside it, into `NAME.data/`, as scripts that the page asks for
+by script tags: a page that is opened from a disk may load nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from html import escape
+from importlib import resources
+from pathlib import Path
+
+from coupole.errors import InputError, StorageError
+from coupole.exchange.look.look_blocks import Block, Look
+from coupole.storage.durable import make_folder, write_synced
+
+MOST_BYTES = 25_000_000
+"""Of a page that stands alone."""
+SCRIPTS = (
+    "vectors.js",
+    "blocks.js",
+    "state.js",
+    "camera.js",
+    "lights.js",
+    "programs.js",
+    "renderer.js",
+    "material.js",
+    "plot.js",
+    "sphere.js",
+    "overlay.js",
+    "controls.js",
+    "pointer.js",
+    "main.js",
+)
+"""In the order in which they are read."""
+SHADERS = (
+    "common.glsl",
+    "surface.vert",
+    "surface.frag",
+    "shadow.frag",
+    "screen.vert",
+    "light.frag",
+    "show.frag",
+)
+
+
+def write_page(look: Look, title: str, path: Path, most_bytes: int = MOST_BYTES) -> list[Path]:
+    """Write the page; the files that it needs, itself first.
+
+    Raises InputError if its name does not end in .html, or if there is a folder of its data that is not one;
+    StorageError if it cannot be written.
+    """
+    if path.suffix.lower() != ".html":
+        raise InputError(f"--out {path}: expected a name that ends in .html")
+    data = path.with_suffix(".data")
+    inside, beside = _shared_out(look.blocks, most_bytes)
+    try:
+        make_folder(path.parent)
+        _clear(data)
+        written = [path]
+        for block in beside:
+            make_folder(data)
+            written.append(data / f"{block.name}.js")
+            write_synced(written[-1], block.script)
+        write_synced(path, page_text(look, title, inside, [f"{data.name}/{block.name}.js" for block in beside]))
+    except OSError as error:
+        raise StorageError(f"{path}: {error.strerror or error}. Choose another place, or free space.") from error
+    return written
+
+
+def page_text(look: Look, title: str, inside: list[Block], beside: list[str]) -> str:
+    """The HTML; `beside` are the scripts that it asks for, relative to it."""
+    shaders = {name: _part(name) for name in SHADERS}
+    about = {**look.about, "title": title, "errors": look.errors, "blocks": [block.name for block in look.blocks]}
+    scripts = "\n".join(_part(name) for name in SCRIPTS)
+    tags = [f"<script>{block.script}</script>\n" for block in inside]
+    tags += [f'<script src="{escape(name, quote=True)}"></script>\n' for name in beside]
+    parts = {
+        "TITLE": escape(title),
+        "STYLE": _part("page.css"),
+        "ABOUT": _in_script(about),
+        "SHADERS": _in_script(shaders),
+        "SCRIPTS": scripts,
+        "BLOCKS": "".join(tags),
+    }
+    page = _part("page.html")
+    for name, text in parts.items():
+        page = page.replace(f"%{name}%", text)
+    return page
+
+
+def _shared_out(blocks: tuple[Block, ...], most_bytes: int) -> tuple[list[Block], list[Block]]:
+    """Those that go into the page, and those that go beside it: none, or all."""
+    if sum(len(block.text) for block in blocks) + _own_bytes() <= most_bytes:
+        return list(blocks), []
+    return [], list(blocks)
+
+
+def _own_bytes() -> int:
+    return sum(len(_part(name)) for name in ("page.html", "page.css", *SCRIPTS, *SHADERS)) + 4096
+
+
+def _clear(data: Path) -> None:
+    """Remove the data of an earlier page. Raises InputError if the folder holds anything else."""
+    if not data.exists():
+        return
+    if not data.is_dir() or any(one.suffix != ".js" for one in data.iterdir()):
+        raise InputError(f"{data}: holds something else than a page's data; name another page with --out")
+    shutil.rmtree(data)
+
+
+def _part(name: str) -> str:
+    return (resources.files(__package__) / "page" / name).read_text(encoding="utf-8")
+
+
+def _in_script(value: object) -> str:
+    """JSON that may stand in a script element."""
+    return json.dumps(value, ensure_ascii=False).replace("<", "\\u003c")

@@ -1,0 +1,41 @@
+// Arrays that the page carries as text: base64 of zlib of bytes that are sorted by their significance.
+
+const TYPES = {
+  uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, float16: Uint16Array, float32: Float32Array,
+};
+
+/** The numbers of a block; float16 as the 16 bits that they are. */
+async function unpacked({ about, text }) {
+  const packed = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const rows = new Uint8Array(await new Response(stream).arrayBuffer());
+  const Kind = TYPES[about.dtype];
+  const size = Kind.BYTES_PER_ELEMENT, count = rows.length / size;
+  const bytes = new Uint8Array(rows.length);
+  for (let byte = 0; byte < size; byte++) {
+    const row = rows.subarray(byte * count, (byte + 1) * count);
+    for (let k = 0; k < count; k++) bytes[k * size + byte] = row[k];
+  }
+  return new Kind(bytes.buffer);
+}
+
+/** All blocks by their names; raises an error that names those that did not come. */
+async function readBlocks(names) {
+  const missing = names.filter((name) => !(name in coupoleBlocks));
+  if (missing.length) {
+    throw new Error(`The page's data are missing (${missing.join(", ")}): keep its .data folder beside it.`);
+  }
+  const arrays = {};
+  for (const name of names) {
+    arrays[name] = await unpacked(coupoleBlocks[name]);
+    delete coupoleBlocks[name];
+  }
+  return arrays;
+}
+
+/** The number that 16 bits stand for (IEEE 754 binary16). */
+function half(bits) {
+  const exponent = bits >> 10 & 31, share = bits & 1023;
+  const size = exponent ? (1 + share / 1024) * 2 ** (exponent - 15) : share * 2 ** -24;
+  return bits >> 15 ? -size : size;
+}

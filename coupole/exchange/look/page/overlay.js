@@ -1,0 +1,63 @@
+// What lies over the picture: scale bar, ruler, notes, legend.
+
+const BAR_PX = 140;
+
+/** A round length that is at most `BAR_PX` long where the camera looks, and how long that is. */
+function scaleBar(camera, shorter) {
+  const unit = 2 * halfField * camera.distance / shorter;
+  const most = BAR_PX * unit, power = 10 ** Math.floor(Math.log10(most));
+  const size = power * [5, 2, 1].find((factor) => factor * power <= most);
+  return { size, pixels: size / unit };
+}
+
+function lengthText(size) {
+  if (ABOUT.picture_px) return `${Number(size.toPrecision(4))} px`;
+  return size < 1 ? `${Number((1000 * size).toPrecision(3))} µm` : `${Number(size.toPrecision(4))} mm`;
+}
+
+function drawScale(element, camera, shorter) {
+  const { size, pixels } = scaleBar(camera, shorter);
+  element.style.width = `${pixels}px`;
+  element.textContent = lengthText(size);
+}
+
+/** Pins of notes and the ruler's line, as markup of an SVG whose unit is a pixel of the page. */
+function marksOf(camera, width, height, notes, ruler) {
+  const at = (place) => projected(camera, width, height, place);
+  const pins = notes.map((note, number) => {
+    const here = at(note.place);
+    return here && `<g transform="translate(${here[0]} ${here[1]})"><circle r="10"/><text y="4">${
+      number + 1}</text></g>`;
+  });
+  const ends = ruler.map(at);
+  const dots = ends.map((here) => here && `<circle class="end" cx="${here[0]}" cy="${here[1]}" r="4"/>`);
+  if (ends.length === 2 && ends[0] && ends[1]) {
+    const [[x, y], [u, v]] = ends;
+    dots.push(`<line x1="${x}" y1="${y}" x2="${u}" y2="${v}"/><text class="length" x="${(x + u) / 2}"
+      y="${(y + v) / 2 - 8}">${lengthText(length(minus(ruler[1], ruler[0])))}</text>`);
+  }
+  return [...pins, ...dots].filter(Boolean).join("");
+}
+
+function legendOf(mode, quantity) {
+  const { from, to, logarithmic, unit: told } = rangeOf(mode, quantity);
+  const factor = told === "%" ? 100 : told === "degrees" ? 180 / Math.PI : 1;
+  const middle = logarithmic ? Math.sqrt(from * to) : (from + to) / 2;
+  const [low, mid, high] = [from, middle, to].map((value) => Number((value * factor).toPrecision(2)));
+  return `<span class="ramp" style="background:linear-gradient(to right,${RAMP.join(",")})"></span>
+    <span class="ends"><span>${low}</span><span>${mid}</span><span>${high} ${told}</span></span>`;
+}
+
+/** What has to be said of the picture, wherever it is seen. */
+function bannerOf(about, state) {
+  const kinds = { true: "Simulated object", false: "Measured object", null: "Pictures of an object" };
+  const told = [kinds[about.simulated]];
+  if (["relit", "diffuse", "specular", "unsharp"].includes(state.mode)) {
+    told.push(`light computed from a fit (${about.fit})`);
+    if (state.sky > 0 || state.lights.some((light) => light.kelvin !== NEUTRAL_KELVIN)) {
+      told.push("colour of light and sky are hypotheses in RGB");
+    }
+  }
+  if (state.mode === "unsharp") told.push("relief exaggerated");
+  return told.join(" · ");
+}

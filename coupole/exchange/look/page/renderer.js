@@ -1,0 +1,245 @@
+// The picture: samples of lights and of a pixel's places, one after the other, and their mean.
+
+const SAMPLES = 64;
+const SHADOW_PX = 2048;
+const MODE_NUMBERS = {
+  relit: 0, diffuse: 1, specular: 2, unsharp: 3, normals: 4, roughness: 5, uncertainty: 6, residual: 7,
+};
+const RAMP = ["#2a2140", "#3b4f8f", "#2f8f8c", "#8fbf5a", "#f0c24b", "#fff4cf"];
+const TEXTURES = {
+  places: ["uint16", 3], triangles: ["uint32", 3], normals: ["uint16", 2], kd: ["float16", 3], ks: ["float16", 3],
+  gloss: ["float16", 2], uncertainty: ["uint8", 4],
+};
+
+/** How numbers of a mode are shown: by a ramp from and to, in steps or in ratios. */
+function rangeOf(mode, quantity) {
+  if (mode === "roughness") return { from: 0, to: 1, logarithmic: false, unit: "GGX alpha" };
+  if (mode === "residual") return { from: 0, to: 0.3, logarithmic: false, unit: "share of the square root of kd" };
+  if (quantity === "normal") return { from: radians(0.01), to: radians(10), logarithmic: true, unit: "degrees" };
+  return { from: 0.003, to: 3, logarithmic: true, unit: "%" };
+}
+
+class Renderer {
+  constructor(canvas, about, arrays) {
+    this.gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
+    if (!this.gl) throw new Error("This browser has no WebGL 2, which the picture needs.");
+    this.canvas = canvas;
+    this.about = about;
+    this.triangles = arrays.triangles.length / 3;
+    this.measure(arrays.places);
+    this.prepare(arrays);
+    this.samples = 0;
+    this.targets = null;
+    this.depths = null;
+    this.drawnShadows = [];
+  }
+
+  /** The box and the sphere that hold the object. */
+  measure(places) {
+    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+    for (let k = 0; k < places.length; k++) {
+      if (places[k] < low[k % 3]) low[k % 3] = places[k];
+      if (places[k] > high[k % 3]) high[k % 3] = places[k];
+    }
+    const { origin_mm: origin, step_mm: step } = this.about, ends = [low, high];
+    this.corners = [0, 1, 2, 3, 4, 5, 6, 7].map((number) => add(
+      origin, times([0, 1, 2].map((k) => ends[number >> k & 1][k]), step),
+    ));
+    this.middle = add(origin, times(add(low, high), step / 2));
+    this.radius = Math.max(length(minus(high, low)) * step / 2, 1e-6);
+  }
+
+  prepare(arrays) {
+    const gl = this.gl;
+    this.programs = {
+      surface: programOf(gl, "surface.vert", "surface.frag"),
+      shadow: programOf(gl, "surface.vert", "shadow.frag"),
+      light: programOf(gl, "screen.vert", "light.frag"),
+      show: programOf(gl, "screen.vert", "show.frag"),
+    };
+    this.textures = {};
+    for (const [name, [dtype, count]] of Object.entries(TEXTURES)) {
+      this.textures[name] = numbersTexture(gl, arrays[name], dtype, count);
+    }
+    gl.bindVertexArray(gl.createVertexArray());
+    gl.enable(gl.DEPTH_TEST);
+  }
+
+  use(name, textures) {
+    const gl = this.gl, program = this.programs[name];
+    gl.useProgram(program.program);
+    Object.entries(textures).forEach(([uniform, texture], number) => {
+      gl.activeTexture(gl.TEXTURE0 + number);
+      gl.bindTexture(uniform === "shadows" ? gl.TEXTURE_2D_ARRAY : gl.TEXTURE_2D, texture);
+      gl.uniform1i(program.at(uniform), number);
+    });
+    gl.uniform3fv(program.at("origin_mm"), this.about.origin_mm);
+    gl.uniform1f(program.at("step_mm"), this.about.step_mm);
+    return program.at;
+  }
+
+  /** Make room for a picture of the canvas's size. */
+  fit() {
+    const { width, height } = this.canvas;
+    if (this.targets && this.width === width && this.height === height) return;
+    if (this.targets) Object.values(this.targets).forEach((target) => target.free());
+    [this.width, this.height] = [width, height];
+    this.targets = {
+      seen: pictureTarget(this.gl, width, height, true),
+      mean: pictureTarget(this.gl, width, height, false),
+      other: pictureTarget(this.gl, width, height, false),
+    };
+    this.samples = 0;
+  }
+
+  /** Forget the samples: something has changed. */
+  restart() {
+    this.samples = 0;
+  }
+
+  /** Draw one more sample into the mean. */
+  sample(state) {
+    this.fit();
+    const beams = this.beamsOf(state);
+    this.drawShadows(beams);
+    this.drawSurface(state.camera);
+    this.drawLight(state, beams);
+    [this.targets.mean, this.targets.other] = [this.targets.other, this.targets.mean];
+    this.samples += 1;
+  }
+
+  /** Lights of this sample. */
+  beamsOf(state) {
+    const beams = state.lights.map((light, number) => ({
+      way: sampledDirection(light, this.samples, number), irradiance: irradiance(light, this.about.irradiance),
+    }));
+    if (state.sky > 0) {
+      const { way, irradiance: sky } = sampledSky(state.sky * this.about.irradiance / Math.PI, this.samples);
+      beams.push({ way, irradiance: sky });
+    }
+    return beams.map((beam) => ({ ...beam, shadow: this.shadowMatrix(beam.way) }));
+  }
+
+  shadowMatrix(way) {
+    const [right, up] = across(way), reach = this.radius * 1.01;
+    const from = lookingFrom(add(this.middle, times(way, 2 * reach)), right, up, way);
+    return product(orthographic(reach, reach, reach, 3 * reach), from);
+  }
+
+  drawShadows(beams) {
+    const gl = this.gl;
+    if (!this.depths || this.depths.layers < beams.length) {
+      this.depths?.free();
+      this.depths = depthLayers(gl, SHADOW_PX, beams.length);
+      this.drawnShadows = [];
+    }
+    const { places, triangles } = this.textures;
+    const at = this.use("shadow", { places, triangles });
+    gl.viewport(0, 0, SHADOW_PX, SHADOW_PX);
+    beams.forEach((beam, layer) => {
+      if (this.drawnShadows[layer] === String(beam.way)) return;
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.depths.frames[layer]);
+      gl.clear(gl.DEPTH_BUFFER_BIT);
+      gl.uniformMatrix4fv(at("clip_from_object"), false, beam.shadow);
+      if (!this.about.picture_px) gl.drawArrays(gl.TRIANGLES, 0, 3 * this.triangles);
+      this.drawnShadows[layer] = String(beam.way);
+    });
+  }
+
+  drawSurface(camera) {
+    const gl = this.gl, [x, y] = evenly(this.samples);
+    const { places, triangles, gloss } = this.textures;
+    const at = this.use("surface", { places, triangles, gloss });
+    gl.uniform2iv(at("picture_px"), this.about.picture_px ?? [0, 0]);
+    const clip = clipOf(camera, this.width, this.height, this.middle, this.radius, [x - 0.5, y - 0.5]);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.targets.seen.frame);
+    gl.viewport(0, 0, this.width, this.height);
+    gl.clearBufferuiv(gl.COLOR, 0, [0, 0, 0, 0]);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    gl.uniformMatrix4fv(at("clip_from_object"), false, clip);
+    gl.drawArrays(gl.TRIANGLES, 0, 3 * this.triangles);
+  }
+
+  drawLight(state, beams) {
+    const gl = this.gl, { seen, mean, other } = this.targets;
+    const at = this.use("light", {
+      ...this.textures, seen: seen.texture, before: mean.texture, shadows: this.depths.texture,
+    });
+    const { right, up, back, place } = axesOf(state.camera);
+    gl.uniform1i(at("mode"), MODE_NUMBERS[state.mode]);
+    gl.uniform1i(at("quantity"), Object.keys(UNCERTAIN).indexOf(state.quantity));
+    gl.uniform1f(at("relief"), state.relief);
+    gl.uniform1f(at("share"), 1 / (this.samples + 1));
+    gl.uniform3fv(at("eye_mm"), place);
+    gl.uniform1i(at("flat_one"), this.about.picture_px ? 1 : 0);
+    gl.uniformMatrix3fv(at("view_from_object"), false, [0, 1, 2].flatMap((k) => [right[k], up[k], back[k]]));
+    gl.uniform1i(at("lights"), beams.length);
+    gl.uniform3fv(at("ways"), beams.flatMap((beam) => beam.way));
+    gl.uniform3fv(at("irradiances"), beams.flatMap((beam) => beam.irradiance));
+    gl.uniformMatrix4fv(at("shadow_from_object"), false, beams.flatMap((beam) => [...beam.shadow]));
+    const texel = 2 * this.radius * 1.01 / SHADOW_PX;
+    gl.uniform1fv(at("offset_mm"), beams.map(() => 1.5 * texel));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, other.frame);
+    gl.disable(gl.DEPTH_TEST);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.enable(gl.DEPTH_TEST);
+  }
+
+  /** Put the mean on the screen. */
+  show(state, ground) {
+    const gl = this.gl, { seen, mean } = this.targets;
+    const at = this.use("show", { mean: mean.texture, seen: seen.texture });
+    const { from, to, logarithmic } = rangeOf(state.mode, state.quantity);
+    const number = ["roughness", "uncertainty", "residual"].includes(state.mode);
+    gl.uniform1i(at("kind"), state.mode === "normals" ? 1 : number ? 2 : 0);
+    gl.uniform1f(at("white"), state.white || 1);
+    gl.uniform2f(at("range"), from, to);
+    gl.uniform1i(at("logarithmic"), logarithmic ? 1 : 0);
+    gl.uniform3fv(at("ramp"), RAMP.flatMap((text) => channelsOf(text)));
+    gl.uniform3fv(at("ground"), channelsOf(ground));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, this.width, this.height);
+    gl.disable(gl.DEPTH_TEST);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.enable(gl.DEPTH_TEST);
+  }
+
+  /** Four floats for each pixel of a part of the mean: red, green, blue, and 1 where there is a material. Row by
+   * row from the top; x to the right, y down. */
+  read(x, y, width, height) {
+    return new Float32Array(this.readBits(this.targets.mean, x, y, width, height).buffer);
+  }
+
+  /** What a pixel sees: its place, mm, and the number of a triangle; null for none. */
+  seenAt(x, y) {
+    if (x < 0 || y < 0 || x >= this.width || y >= this.height) return null;
+    const found = this.readBits(this.targets.seen, x, y, 1, 1);
+    if (!found[3]) return null;
+    return { place: [...new Float32Array(found.buffer, 0, 3)], triangle: found[3] - 1 };
+  }
+
+  readBits(target, x, y, width, height) {
+    const gl = this.gl, found = new Uint32Array(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
+    gl.readPixels(x, this.height - y - height, width, height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, found);
+    const rows = new Uint32Array(found.length), row = 4 * width;
+    for (let k = 0; k < height; k++) rows.set(found.subarray(k * row, (k + 1) * row), (height - 1 - k) * row);
+    return rows;
+  }
+
+  /** 99.9 % quantile of the channels of pixels that are not dark. */
+  brightest() {
+    const picture = this.read(0, 0, this.width, this.height), found = [];
+    for (let k = 0; k < picture.length; k += 4) {
+      const rgb = picture.subarray(k, k + 3);
+      if (Math.max(...rgb) > 0) found.push(...rgb);
+    }
+    const sorted = Float32Array.from(found).sort();
+    return sorted.length ? sorted[Math.floor(0.999 * (sorted.length - 1))] : 1;
+  }
+}
+
+/** Red, green, blue from 0 to 1 of a colour in hexadecimal digits. */
+function channelsOf(text) {
+  return [1, 3, 5].map((at) => parseInt(text.slice(at, at + 2), 16) / 255);
+}

@@ -1,0 +1,64 @@
+// What a user has set: all of it goes into the address, and back.
+
+const MOST_LIGHTS = 10;
+const MODES = {
+  relit: "Relit", diffuse: "Diffuse only", specular: "Highlights only", unsharp: "Relief enhanced",
+  normals: "Normals", roughness: "Roughness", uncertainty: "Uncertainty", residual: "What the fit misses",
+};
+const UNCERTAIN = {
+  kd: "Diffuse colour", ks: "Highlight strength", normal: "Normal", roughness: "Roughness",
+};
+
+const startLight = () => ({
+  direction: unit([-0.45, -0.15, 0.85]), strength: 1, colour: "#ffffff", kelvin: 6500, softness: 1,
+});
+
+const startState = () => ({
+  mode: "relit", quantity: "kd", white: 0, relief: 1, sky: 0, chosen: 0, lights: [startLight()],
+  camera: null, notes: [],
+});
+
+const rounded = (key, value) => typeof value === "number" ? Number(value.toPrecision(5)) : value;
+
+/** The part of an address after #. */
+function addressOf(state) {
+  const bytes = new TextEncoder().encode(JSON.stringify(state, rounded));
+  return btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
+}
+
+const isNumber = (value, low, high) => Number.isFinite(value) && value >= low && value <= high;
+const isVector = (value) => Array.isArray(value) && value.length === 3 && value.every(Number.isFinite);
+
+function isLight(light) {
+  return isVector(light?.direction) && length(light.direction) > 1e-6 && isNumber(light.strength, 0, 100)
+    && /^#[0-9a-f]{6}$/.test(light.colour) && isNumber(light.kelvin, 1000, 20000)
+    && isNumber(light.softness, 0, 30);
+}
+
+function isCamera(camera) {
+  return camera === null || isVector(camera?.target) && isNumber(camera.azimuth, -1e6, 1e6)
+    && isNumber(camera.height, -90, 90) && isNumber(camera.distance, 1e-6, 1e6);
+}
+
+function isNote(note) {
+  return typeof note?.text === "string" && isVector(note.place) && isCamera(note.camera)
+    && Array.isArray(note.lights) && note.lights.length > 0 && note.lights.length <= MOST_LIGHTS
+    && note.lights.every(isLight);
+}
+
+/** The state of an address; null if it holds none, or one that does not fit this page. */
+function stateOf(address) {
+  let found;
+  try {
+    const letters = atob(address.replaceAll("-", "+").replaceAll("_", "/"));
+    found = JSON.parse(new TextDecoder().decode(Uint8Array.from(letters, (letter) => letter.charCodeAt(0))));
+  } catch {
+    return null;
+  }
+  const fits = found?.mode in MODES && found.quantity in UNCERTAIN && isNumber(found.white, 0, 1e9)
+    && isNumber(found.relief, 0, 10) && isNumber(found.sky, 0, 100) && isCamera(found.camera)
+    && Array.isArray(found.lights) && isNumber(found.lights.length, 1, MOST_LIGHTS) && found.lights.every(isLight)
+    && isNumber(found.chosen, 0, found.lights.length - 1) && Number.isInteger(found.chosen)
+    && Array.isArray(found.notes) && found.notes.every(isNote);
+  return fits ? { ...startState(), ...found } : null;
+}

@@ -1,0 +1,392 @@
+"""The page that `coupole show` makes, in a real browser, from disk and without a network."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cells
+import colour
+import h5py
+import numpy as np
+import pytest
+from browser import Browser, needs_chromium
+from relief_in_mitsuba import Mitsuba
+from relight_cases import Coat, sheet, waves, write_result
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+
+from coupole.exchange.look.look_of_runs import look_of_result
+from coupole.exchange.look.look_page import MOST_BYTES, write_page
+from coupole.reflectance.new_light.light_kinds import DistantLight
+from coupole.reflectance.new_light.pictured_surface import FreeCamera
+from coupole.reflectance.run_relighting import scene_from
+from coupole.reflectance.run_result import RunResult
+
+pytestmark = needs_chromium
+
+GLOSSY = Coat((0.05, 0.04, 0.03), (0.4, 0.3, 0.2), 0.15)
+FIELD_DEG = 24.0
+"""Of the page's camera, along the shorter side."""
+WIDTH, HEIGHT = 160, 120
+CONTROLS = "a[href], button, input, select, summary, canvas[tabindex]"
+
+
+class Page:
+    """The page in a window."""
+
+    def __init__(self, browser: Browser) -> None:
+        self.browser, self.driver = browser, browser.driver
+
+    def open(self, path: Path, address: str = "") -> None:
+        self.browser.open(f"file://{path}{address}")
+        cells.wait_until(lambda: self.run("Boolean(window.coupole?.readPixel)"), "the page's interface")
+        self.run("coupole.setSamples(1)")  # it rests after each change
+
+    def run(self, script: str) -> Any:
+        return self.browser.run(script)
+
+    def small(self) -> None:
+        """The picture has a size that is quick to draw."""
+        self.driver.execute_script(
+            f"document.getElementById('stage').style.cssText = 'width:{WIDTH}px; height:{HEIGHT}px'"
+        )
+        cells.wait_until(lambda: self.run("document.getElementById('picture').width") == WIDTH, "the size")
+
+    def look(self, azimuth: float, height: float, distance: float, softness: float = 0.0) -> FreeCamera:
+        """Put the camera somewhere, with one light; the same camera for others."""
+        camera = {"target": [0, 0, 0], "azimuth": azimuth, "height": height, "distance": distance}
+        light = f"{{...coupole.state.lights[0], softness: {softness}}}"
+        self.driver.execute_script(f"coupole.state = {{camera: {camera}, lights: [{light}], chosen: 0, sky: 0}}")
+        a, h = math.radians(azimuth), math.radians(height)
+        at = distance * np.array([math.cos(h) * math.cos(a), math.cos(h) * math.sin(a), math.sin(h)])
+        across = 2.0 * math.degrees(math.atan(math.tan(math.radians(FIELD_DEG / 2)) * WIDTH / HEIGHT))
+        return FreeCamera(at, np.zeros(3), (WIDTH, HEIGHT), across)
+
+    def picture(self, samples: int) -> np.ndarray:
+        """[h, w, 4] float32: linear red, green, blue, and how much of a pixel has a material."""
+        text = self.driver.execute_script(f"""
+            coupole.setSamples({samples});
+            const bytes = new Uint8Array(coupole.readPicture().rgba.buffer);
+            let letters = "";
+            for (let k = 0; k < bytes.length; k += 32768) {{
+              letters += String.fromCharCode(...bytes.subarray(k, k + 32768));
+            }}
+            return btoa(letters);""")
+        return np.frombuffer(base64.b64decode(text), np.float32).reshape(HEIGHT, WIDTH, 4)
+
+    def keys(self, *keys: str) -> None:
+        ActionChains(self.driver).send_keys(*keys).perform()
+
+    def focus(self, name: str) -> None:
+        self.driver.execute_script(f"document.getElementById('{name}').focus()")
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    browser = Browser()
+    browser.driver.set_window_size(840, 480)  # quick to draw, and wide enough for the panel beside the picture
+    browser.driver.set_network_conditions(offline=True, latency=0, throughput=0)
+    yield Page(browser)
+    browser.driver.quit()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`result` and its `look.html`."""
+    folder = tmp_path_factory.mktemp("look")
+    write_result(folder / "result", waves(), GLOSSY)
+    write_page(look_of_result(folder / "result"), "waves", folder / "look.html")
+    return folder
+
+
+def difference(picture: np.ndarray, other: np.ndarray, white: float) -> np.ndarray:
+    """CIEDE2000 of two linear pictures, shown as sRGB with a white."""
+    lab = [
+        colour.XYZ_to_Lab(
+            colour.sRGB_to_XYZ(colour.cctf_encoding(np.clip(one / white, 0.0, 1.0))), [0.3127, 0.329]
+        )
+        for one in (picture, other)
+    ]
+    found: np.ndarray = colour.delta_E(*lab, method="CIE 2000")
+    return found
+
+
+def test_the_page_opens_from_disk_without_a_network_and_loads_nothing(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    assert page.run("coupole.readPicture().rgba.some(value => value > 0)")
+    assert page.run("performance.getEntriesByType('resource').length") == 0
+    assert "Simulated object" in page.browser.text("#banner")
+    assert page.browser.text("#status") == ""
+    assert page.browser.troubles() == []
+
+
+MATERIALS = (
+    pytest.param(GLOSSY, id="glossy"),
+    pytest.param(Coat((0.1, 0.12, 0.2), (0.05, 0.05, 0.05), 0.08), id="sharp"),
+    pytest.param(Coat(), id="matte", marks=pytest.mark.full),
+    pytest.param(Coat(ks=(0.1, 0.1, 0.1)), id="satin", marks=pytest.mark.full),
+    pytest.param(Coat((0.02, 0.01, 0.005), (0.9, 0.7, 0.3), 0.4), id="metal", marks=pytest.mark.full),
+)
+
+
+@pytest.mark.parametrize("coat", MATERIALS)
+@pytest.mark.parametrize("way", [(-0.4, -0.3, 0.8), pytest.param((0.6, 0.3, 0.5), marks=pytest.mark.full)])
+def test_new_light_looks_as_in_an_independent_path_tracer(
+    page: Page, tmp_path: Path, coat: Coat, way: tuple[float, float, float]
+) -> None:
+    write_result(tmp_path / "result", waves(), coat)
+    write_page(look_of_result(tmp_path / "result"), "waves", tmp_path / "look.html")
+    page.open(tmp_path / "look.html")
+    page.small()
+    camera = page.look(-70.0, 50.0, 150.0)
+    page.run(f"coupole.setLight({', '.join(map(str, way))})")
+    mine = page.picture(16)
+    light = {"type": "directional", "direction": [-one for one in way], "irradiance": math.pi}
+    theirs = Mitsuba(tmp_path, camera, coat).render(light, 32)
+    whole = mine[..., 3] > 0.999
+    assert whole.mean() > 0.2
+    off = difference(mine[..., :3], theirs, float(np.quantile(theirs[whole], 0.999)))[whole]
+    assert off.mean() < 0.5
+    assert np.quantile(off, 0.95) < 1.5
+
+
+def test_a_light_gives_what_the_command_relight_gives_with_its_shadows(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    page.small()
+    camera = page.look(-70.0, 50.0, 150.0)
+    page.run("coupole.setLight(0.9, 0.3, 0.3)")
+    mine = page.picture(1)[..., :3]
+    scene = scene_from(RunResult(folder / "result"), camera, "ggx")
+    theirs = scene.picture([DistantLight(towards=(0.9, 0.3, 0.3))])
+    lit = mine.any(axis=2) | theirs.any(axis=2)
+    assert lit.mean() > 0.2
+    alike = np.isclose(mine, theirs, rtol=0.01, atol=1e-4).all(axis=2)
+    assert alike[lit].mean() > 0.95  # the others lie at edges of shadows and of the sheet
+
+
+def test_a_white_sheet_under_the_whole_sky_is_as_white_as_facing_a_lamp(page: Page, tmp_path: Path) -> None:
+    white = Coat(kd=(1 / np.pi,) * 3)
+    write_result(tmp_path / "result", sheet(np.zeros((12, 12)), 60.0), white, camera_mm=(0.0, 0.0, 330.0))
+    write_page(look_of_result(tmp_path / "result"), "sheet", tmp_path / "look.html")
+    page.open(tmp_path / "look.html")
+    page.small()
+    page.look(-90.0, 80.0, 150.0)
+    page.run("coupole.setLight(0, 0, 1)")
+    np.testing.assert_allclose(page.picture(1)[60, 80, :3], 1.0, rtol=1e-3)
+    page.run("coupole.state = {...coupole.state, lights: [{...coupole.state.lights[0], strength: 0}], sky: 1}")
+    np.testing.assert_allclose(page.picture(64)[60, 80, :3], 1.0, rtol=0.01)
+
+
+def test_dragging_the_light_moves_it_and_changes_the_picture(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    before, way = page.run("coupole.readPixel(260, 200)"), page.run("coupole.state.lights[0].direction")
+    page.browser.at("[data-tool=light]").click()
+    canvas = page.browser.at("#picture")
+    ActionChains(page.driver).drag_and_drop_by_offset(canvas, 60, 0).perform()
+    after = page.run("coupole.state.lights[0].direction")
+    assert after[0] > way[0] + 0.2
+    assert page.run("coupole.readPixel(260, 200)") != before
+
+
+def test_keys_alone_turn_light_measure_and_note(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    page.focus("picture")
+    page.keys(Keys.ARROW_RIGHT)
+    assert page.run("coupole.state.camera.azimuth") == pytest.approx(-94.2)
+    ActionChains(page.driver).key_down(Keys.SHIFT).send_keys(Keys.ARROW_UP).key_up(Keys.SHIFT).perform()
+    page.keys("m", Keys.ARROW_LEFT, Keys.ARROW_LEFT, "+", "m", "n")
+    assert "distance" in page.browser.text("#status") or "note" in page.browser.text("#status")
+    page.keys("a worn <edge>", Keys.ENTER)
+    assert page.browser.text("#notes li span") == "a worn <edge>"
+
+
+def test_tab_reaches_every_control(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    page.driver.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
+    shown = f"[...document.querySelectorAll('{CONTROLS}')].filter(one => one.checkVisibility() && !one.disabled)"
+    page.driver.execute_script(f"{shown}.forEach((one, k) => one.dataset.place = k)")
+    wanted = set(range(page.run(f"{shown}.length")))
+    reached = set()
+    for _ in range(len(wanted) + 2):
+        page.keys(Keys.TAB)
+        place = page.run("document.activeElement.dataset.place")
+        reached.add(None if place is None else int(place))
+    assert wanted - reached == set()
+
+
+def test_every_control_has_a_name(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    page.driver.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
+    controls = page.driver.find_elements(By.CSS_SELECTOR, CONTROLS)
+    nameless = [
+        one.get_attribute("outerHTML") for one in controls if one.is_displayed() and not one.accessible_name
+    ]
+    assert nameless == []
+
+
+def test_on_a_telephone_nothing_sticks_out_and_all_is_large_enough_to_touch(page: Page, folder: Path) -> None:
+    metrics = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    try:
+        page.open(folder / "look.html")
+        page.driver.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
+        assert page.run("document.documentElement.scrollWidth") <= 400
+        boxes = page.run(
+            f"[...document.querySelectorAll('{CONTROLS}')].filter(one => one.checkVisibility())"
+            ".map(one => [one.id || one.textContent, ...Object.values(one.getBoundingClientRect().toJSON())])"
+        )
+        outside = [name for name, x, _, width, *_ in boxes if x < 0 or x + width > 400]
+        assert outside == []
+        assert [name for name, _, _, width, height, *_ in boxes if width < 24 or height < 24] == []  # WCAG 2.5.8
+        tools, canvas = page.browser.at("#tools").rect, page.browser.at("#picture").rect
+        assert tools["y"] + tools["height"] <= canvas["y"] + canvas["height"]
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_all_words_stand_out_from_what_is_behind_them(page: Page, folder: Path) -> None:
+    """Contrast as WCAG 2.2 has it (1.4.3), 4.5 at least."""
+    page.open(folder / "look.html")
+    page.driver.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
+    pairs = page.run("""[...document.querySelectorAll('#panel *, #tools *, #banner')]
+        .filter(one => one.checkVisibility() && [...one.childNodes].some(node => node.nodeType === 3))
+        .map(one => {
+          let behind = one;
+          while (getComputedStyle(behind).backgroundColor === 'rgba(0, 0, 0, 0)') behind = behind.parentElement;
+          return [getComputedStyle(one).color, getComputedStyle(behind).backgroundColor, one.textContent];
+        })""")
+    assert len(pairs) > 30
+
+    def luminance(text: str) -> float:
+        red, green, blue = (int(one) / 255 for one in re.findall(r"\d+", text)[:3])
+        linear = [one / 12.92 if one <= 0.04045 else ((one + 0.055) / 1.055) ** 2.4 for one in (red, green, blue)]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    for front, behind, words in pairs:
+        low, high = sorted([luminance(front), luminance(behind)])
+        assert (high + 0.05) / (low + 0.05) >= 4.5, words
+
+
+def test_an_address_brings_back_view_light_and_notes(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    page.look(30.0, 40.0, 170.0, softness=2.0)
+    page.run("coupole.setLight(0.3, -0.2, 0.9)")
+    page.focus("picture")
+    page.keys("n")
+    page.keys("here", Keys.ENTER)
+    page.browser.at("#link").click()
+    left, address = page.run("coupole.state"), page.run("location.hash")
+    page.open(folder / "look.html", address)
+    found = page.run("coupole.state")
+    assert [note["text"] for note in found["notes"]] == ["here"]
+    assert found["camera"]["azimuth"] == 30.0
+    assert found["camera"]["distance"] == 170.0
+    assert found["lights"][0]["softness"] == 2.0
+    np.testing.assert_allclose(found["lights"][0]["direction"], left["lights"][0]["direction"], rtol=1e-4)
+
+
+def test_an_address_that_was_damaged_opens_the_page_as_it_begins(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html", "#eyJtb2RlIjoi")
+    assert page.run("coupole.state.mode") == "relit"
+    assert page.browser.troubles() == []
+
+
+def test_a_point_tells_its_material(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    page.focus("picture")
+    page.keys(Keys.ENTER)
+    told = page.browser.text("#point")
+    assert "0.0500 / 0.0400 / 0.0300" in told
+    assert "0.400 / 0.300 / 0.200" in told
+    assert "holds no samples" in told
+    assert page.driver.find_elements(By.CSS_SELECTOR, "#point svg polyline")
+
+
+def test_the_ruler_measures_what_the_object_measures(page: Page, tmp_path: Path) -> None:
+    flat = sheet(np.zeros((5, 5)), 60.0)
+    write_result(tmp_path / "result", flat, camera_mm=(0.0, 0.0, 330.0))
+    write_page(look_of_result(tmp_path / "result"), "sheet", tmp_path / "look.html")
+    page.open(tmp_path / "look.html")
+    page.look(-90.0, 89.0, 300.0)
+    page.browser.at("[data-tool=measure]").click()
+    canvas = page.browser.at("#picture")
+    for offset in (-60, 60):
+        ActionChains(page.driver).move_to_element_with_offset(canvas, offset, 0).click().perform()
+    shorter = min(canvas.size["width"], canvas.size["height"])
+    expected_mm = 120 * 2 * 300.0 * math.tan(math.radians(FIELD_DEG / 2)) / shorter
+    told_mm = float(re.findall(r"([\d.]+) mm", page.browser.text("#status"))[0])
+    assert told_mm == pytest.approx(expected_mm, rel=0.01)
+
+
+def test_a_pixel_tells_how_well_its_material_is_known(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    page.small()
+    page.look(-70.0, 50.0, 150.0)
+    page.run("coupole.state = {...coupole.state, mode: 'roughness'}")
+    values = page.picture(1)
+    assert values[60, 80, 0] == pytest.approx(GLOSSY.alpha, rel=1e-3)
+    page.run("coupole.state = {...coupole.state, mode: 'uncertainty'}")
+    assert page.picture(1)[60, 80, 0] == pytest.approx(1e-4, rel=0.03)  # 0 in the file, the least that is told
+
+
+def test_pixels_outside_of_the_picture_and_lights_without_direction_are_refused(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    for call in ("readPixel(-1, 5)", "readPixel(5, 1e6)", "readPixel(0.5, 5)", "setLight(0, 0, 0)", "setLight(1)"):
+        refused = f"try {{ coupole.{call}; }} catch (error) {{ return error.message; }}"
+        assert "expected" in page.driver.execute_script(refused), call
+
+
+def test_data_beside_the_page_are_loaded_by_script_tags_and_missed_if_gone(page: Page, tmp_path: Path) -> None:
+    write_result(tmp_path / "result", waves(16), GLOSSY)
+    files = write_page(look_of_result(tmp_path / "result"), "waves", tmp_path / "look.html", most_bytes=1000)
+    assert MOST_BYTES > 1000
+    page.open(tmp_path / "look.html")
+    assert page.run("coupole.readPicture().rgba.some(value => value > 0)")
+    assert page.browser.troubles() == []
+    next(file for file in files if file.name == "kd.js").unlink()
+    page.browser.open(f"file://{tmp_path / 'look.html'}")
+    told = cells.wait_until(lambda: page.browser.text("#status").replace("Reading…", ""), "what is missing")
+    assert "(kd): keep its .data folder beside it" in told
+
+
+def test_a_flat_picture_has_the_radiance_of_each_pixel_where_it_lies(page: Page, tmp_path: Path) -> None:
+    mask = np.ones((6, 8), bool)
+    mask[0, 0] = False
+    normal = np.tile([0.0, 0.6, 0.8], (47, 1))
+    normal[-1] = [0.6, 0.0, 0.8]  # the lower right pixel
+    kd = np.tile([0.5, 0.25, 0.125], (47, 1))
+    write_pictures(tmp_path / "result", mask, normal, kd)
+    ended = cells.here("show", tmp_path / "result", "--out", tmp_path / "look.html")
+    assert ended.code == 0, ended.err
+    page.open(tmp_path / "look.html")
+    page.small()
+    camera = "{target: [4, 3, 0], azimuth: -90, height: 90, distance: 3 / Math.tan(Math.PI / 15)}"
+    page.run(f"coupole.state = {{camera: {camera}, lights: [{{...coupole.state.lights[0], softness: 0}}]}}")
+    page.run("coupole.setLight(0.6, 0, 0.8)")
+    picture = page.picture(1)
+    side = HEIGHT // 6
+    assert picture[side // 2, side // 2, 3] == 0.0
+    np.testing.assert_allclose(
+        picture[side // 2, 5 * side + 9, :3], np.array([0.5, 0.25, 0.125]) * 0.64, rtol=1e-3
+    )
+    np.testing.assert_allclose(picture[5 * side + 9, 7 * side + 9, :3], [0.5, 0.25, 0.125], rtol=1e-3)
+    assert "Pictures of an object" in page.browser.text("#banner")
+
+
+def write_pictures(folder: Path, mask: np.ndarray, normal: np.ndarray, kd: np.ndarray) -> None:
+    """A result of pictures with known materials of the mask's pixels, without highlights."""
+    (folder / "samples").mkdir(parents=True)
+    (folder / "fits").mkdir()
+    (folder / "result.json").write_text(json.dumps({"schema": "coupole-reflectance-pictures/1"}))
+    with h5py.File(folder / "samples/pictures.h5", "w") as file:
+        file["mask"], file["directions"] = mask, np.eye(3)
+    with h5py.File(folder / "fits/materials.h5", "w") as file:
+        file["normal"], file["kd"], file["ks"] = normal, kd, np.zeros_like(kd)
+        file["alpha"], file["residual"] = np.full(len(kd), 0.5), np.zeros(len(kd))

@@ -1,0 +1,109 @@
+"""`coupole show`: which files it makes, what is in them, and what it refuses."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cells
+import h5py
+import numpy as np
+import pytest
+from relight_cases import waves, write_result
+
+from coupole.errors import InputError
+from coupole.exchange.look.look_blocks import block_of
+from coupole.exchange.look.look_of_runs import Look, welded
+from coupole.exchange.look.look_page import write_page
+
+
+def small(numbers: int = 30) -> Look:
+    values = np.random.default_rng(3).integers(0, 65536, numbers).astype(np.uint16)
+    return Look({"kind": "mesh"}, (block_of("places", values),))
+
+
+def test_corners_keep_their_triangle_and_move_by_less_than_half_a_step() -> None:
+    corners_mm = np.random.default_rng(2).uniform(-70.0, 130.0, (600, 3))
+    corners_mm[300:] = corners_mm[:300]  # every corner twice
+    places, triangles, origin_mm, step_mm = welded(corners_mm)
+    assert len(places) == 300
+    read = origin_mm + step_mm * places[triangles.reshape(-1)]
+    assert np.abs(read - corners_mm).max() <= 0.5001 * step_mm
+    assert step_mm == pytest.approx(200.0 / 65535, rel=0.02)
+
+
+def test_a_page_names_no_host(tmp_path: Path) -> None:
+    write_page(small(), "a vase", tmp_path / "look.html")
+    text = (tmp_path / "look.html").read_text()
+    assert not re.search(r"(?:https?:)?//[\w-]+\.\w", text)
+    assert "fetch(" not in text
+
+
+def test_a_title_cannot_become_part_of_the_page(tmp_path: Path) -> None:
+    write_page(small(), "</script><b>%BLOCKS%", tmp_path / "look.html")
+    text = (tmp_path / "look.html").read_text()
+    assert "</script><b>" not in text
+
+
+def test_what_is_too_large_for_one_file_lies_beside_it(tmp_path: Path) -> None:
+    files = write_page(small(9000), "a vase", tmp_path / "look.html", most_bytes=10_000)
+    assert [file.relative_to(tmp_path).as_posix() for file in files] == ["look.html", "look.data/places.js"]
+    assert '<script src="look.data/places.js">' in files[0].read_text()
+
+
+def test_a_smaller_page_removes_the_data_of_a_larger_one(tmp_path: Path) -> None:
+    write_page(small(9000), "a vase", tmp_path / "look.html", most_bytes=10_000)
+    write_page(small(), "a vase", tmp_path / "look.html")
+    assert [one.name for one in tmp_path.iterdir()] == ["look.html"]
+
+
+def test_a_folder_of_other_things_is_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "result").mkdir()
+    (tmp_path / "look.data").mkdir()
+    (tmp_path / "look.data/notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="something else than a page's data"):
+        write_page(small(), "a vase", tmp_path / "look.html")
+    assert (tmp_path / "look.data/notes.txt").read_text() == "mine"
+
+
+def test_what_is_no_result_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    ended = cells.here("show", tmp_path / "none", "--out", tmp_path / "look.html")
+    assert ended.code == 2
+    assert "coupole reflectance RUN --out FOLDER" in " ".join(ended.err.split())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("waves") / "a <wavy> sheet"
+    write_result(folder, waves(20))
+    return folder
+
+
+def test_the_command_tells_what_it_made(result: Path, tmp_path: Path) -> None:
+    ended = cells.here("show", result, "--out", tmp_path / "look.html", "--json")
+    assert ended.code == 0, ended.err
+    assert ended.document["bytes"] == (tmp_path / "look.html").stat().st_size
+    assert ended.document["about"]["triangles"] == 2 * 19**2
+    assert ended.document["about"]["simulated"] is True
+
+
+def test_a_page_of_another_name_is_refused(result: Path, tmp_path: Path) -> None:
+    ended = cells.here("show", result, "--out", tmp_path / "look.pdf")
+    assert ended.code == 2
+    assert "ends in .html" in ended.err
+
+
+def test_a_disk_that_takes_no_page_is_told_with_six(result: Path) -> None:
+    ended = cells.here("show", result, "--out", "/proc/look.html")
+    assert ended.code == 6
+    assert "/proc/look.html" in ended.err
+
+
+def test_a_result_without_uncertainty_is_refused(tmp_path: Path) -> None:
+    write_result(tmp_path / "old", waves(8))
+    with h5py.File(tmp_path / "old/fits/ggx.h5", "a") as file:
+        del file["covariance"]
+    ended = cells.here("show", tmp_path / "old", "--out", tmp_path / "look.html")
+    assert ended.code == 2
+    assert "make the result anew" in " ".join(ended.err.split())

@@ -103,7 +103,15 @@ def write_result(
     certain = MaterialUncertainty(np.zeros((count, 5, 5)), *np.zeros((2, *materials.kd.shape)))
     for name in ("ggx", "ggx_normal"):
         write_materials(folder / f"fits/{name}.h5", [materials], [certain], np.zeros(count), 0.0, mine)
-    about = {"schema": SCHEMA, "mae": {"ggx": 0.1, "ggx_normal": 0.2}, "emission": "lambertian", "simulated": True}
+    about = {
+        "schema": SCHEMA,
+        "software": {"coupole": "0.2.0"},
+        "runs": {"waves": {}},
+        "mae": {"ggx": 0.1, "ggx_normal": 0.2},
+        "emission": "lambertian",
+        "scan_noise_um": 30.0,
+        "simulated": True,
+    }
     (folder / "result.json").write_text(json.dumps(about))
     return RunResult(folder)
 

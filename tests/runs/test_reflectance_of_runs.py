@@ -507,6 +507,30 @@ def test_uncertainty_that_cannot_be_stated_is_refused(
     assert not (tmp_path / "u.npy").exists()
 
 
+def test_samples_are_exported_with_bounds_that_hold_the_truth(made: Made, tmp_path: Path) -> None:
+    """Read as ALTA has it: from theta_l and the projected theta_v alone the material's formula gives f."""
+    _, out, _ = made
+    with h5py.File(out / "samples/top.h5") as file:
+        many = np.isfinite(file["f"][()]).all(axis=2).sum(axis=1)
+        chosen = file["triangles"][()][np.argsort(many)[-20::4]]
+    options = [word for number in chosen for word in ("--triangle", str(number))]
+    ended = cells.here("export", out, "--to", "alta", *options, "--out", tmp_path)
+    assert ended.code == 0, ended.err
+    inside = []
+    for path in sorted(tmp_path.glob("*_green.alta")):
+        head = [line for line in path.read_text().splitlines() if line.startswith("#")]
+        assert {"#DIM 3 1", "#VS 2", "#PARAM_IN ISOTROPIC_TL_TV_PROJ_DPHI"} <= set(head)
+        theta_l, x, y, f, low, high = np.loadtxt(path).T
+        theta_v, dphi = np.hypot(x, y), np.arctan2(y, x)
+        light = np.stack([np.sin(theta_l), np.zeros(len(f)), np.cos(theta_l)], axis=1)
+        view = np.stack([np.sin(theta_v) * np.cos(dphi), np.sin(theta_v) * np.sin(dphi), np.cos(theta_v)], axis=1)
+        truth = walter(np.array([[0.0, 0.0, 1.0]]), light, view)[:, 1]
+        inside += ((low < truth) & (truth < high)).tolist()
+        assert np.median(f / truth) == pytest.approx(1.0, abs=0.03)
+    assert len(inside) > 300
+    assert np.mean(inside) > 0.9
+
+
 def test_clusters_are_a_few_materials_for_all_and_fill_what_has_too_few_samples(made: Made) -> None:
     _, out, document = made
     to = out / "clustered.npy"

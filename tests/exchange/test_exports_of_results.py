@@ -1,0 +1,189 @@
+"""`coupole export RESULT`, read by other people's readers, or by readers that are written here from a layout."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import cells
+import cv2
+import mitsuba
+import numpy as np
+import OpenEXR
+import pytest
+import trimesh
+from relight_cases import BASE_FROM_SUPPORT, Coat, moved, unit, waves, write_result
+
+from coupole.exchange.of_results.bsdf import encode as encode_bsdf
+from coupole.exchange.of_results.material_tables import Material
+from coupole.exchange.of_results.merl import SCALES
+from coupole.exchange.of_results.merl import encode as encode_merl
+from coupole.reflectance.run_result import RunResult
+
+COAT = Coat((0.2, 0.1, 0.05), (0.06, 0.05, 0.04), 0.36)
+GLOSSY = Material("glossy", np.array([0.2, 0.15, 0.1]), np.array([0.05, 0.04, 0.03]), 0.2)
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    return write_result(tmp_path_factory.mktemp("waves") / "result", waves(20), COAT)
+
+
+def exported(result: RunResult, to: str, folder: Path, *options: str) -> list[Path]:
+    ended = cells.here("export", result.folder, "--to", to, "--out", folder, *options, "--json")
+    assert ended.code == 0, ended.err
+    paths = sorted(folder.iterdir())
+    assert ended.document["files"] == len(paths)
+    return paths
+
+
+def walter(way_in: np.ndarray, way_out: np.ndarray, material: Material) -> np.ndarray:
+    """[n, 3] by Walter and others 2007 with Heitz's height-correlated shadowing (2014), from their Lambdas."""
+    half = unit(way_in + way_out)
+    alpha2 = material.alpha**2
+    cos2 = half[:, 2] ** 2
+    d = np.exp(-np.log(np.pi * alpha2 * cos2**2 * (1 + (1 / cos2 - 1) / alpha2) ** 2))
+
+    def lamb(ways: np.ndarray) -> np.ndarray:
+        result: np.ndarray = 0.5 * (np.sqrt(1 + alpha2 * (1 / ways[:, 2] ** 2 - 1)) - 1)
+        return result
+
+    lobe = d / ((1 + lamb(way_in) + lamb(way_out)) * 4 * way_in[:, 2] * way_out[:, 2])
+    found: np.ndarray = material.kd + lobe[:, None] * material.ks
+    return found
+
+
+def directions(count: int, least: float, seed: int) -> np.ndarray:
+    ways = unit(np.random.default_rng(seed).normal(size=(count, 3)))
+    ways[:, 2] = np.abs(ways[:, 2])
+    return ways[ways[:, 2] > least]
+
+
+def test_ply_has_the_mesh_and_each_triangles_material(result: RunResult, tmp_path: Path) -> None:
+    (path,) = exported(result, "ply", tmp_path)
+    mesh = trimesh.load(path, process=False)
+    places = np.asarray(mesh.triangles)
+    wanted = moved(np.linalg.inv(BASE_FROM_SUPPORT), result.corners_mm.reshape(-1, 3).astype(float))
+    np.testing.assert_allclose(places, wanted.reshape(-1, 3, 3), atol=1e-3)
+    faces = mesh.metadata["_ply_raw"]["face"]["data"]
+    seen = result.triangles
+    assert 0 < len(seen) < len(faces["alpha"])
+    np.testing.assert_allclose(np.ravel(faces["kd_g"])[seen], 0.1, rtol=1e-6)
+    np.testing.assert_allclose(np.ravel(faces["ks_b"])[seen], 0.04, rtol=1e-6)
+    assert np.isfinite(np.ravel(faces["alpha"])).sum() == len(seen)
+    assert b"comment simulated with Coupole" in path.read_bytes()[:200]
+
+
+def test_gltf_has_the_materials_in_its_textures(result: RunResult, tmp_path: Path) -> None:
+    (path,) = exported(result, "gltf", tmp_path)
+    (mesh,) = trimesh.load(path).geometry.values()
+    assert len(mesh.faces) == len(result.triangles)
+    normals = np.asarray(mesh.triangles_center)
+    assert np.ptp(normals, axis=0).max() < 0.07  # metres
+    data = path.read_bytes()
+    magic, version, size, length, kind = struct.unpack_from("<4sIIII", data)
+    assert (magic, version, size, kind) == (b"glTF", 2, len(data), 0x4E4F534A)
+    document = json.loads(data[20 : 20 + length])
+    (material,) = document["materials"]
+    specular = material["extensions"]["KHR_materials_specular"]
+
+    def texel(texture: int) -> np.ndarray:
+        view = document["bufferViews"][document["images"][document["textures"][texture]["source"]]["bufferView"]]
+        start = 20 + length + 8 + view["byteOffset"]
+        png = np.frombuffer(data[start : start + view["byteLength"]], np.uint8)
+        value: np.ndarray = cv2.imdecode(png, cv2.IMREAD_COLOR)[0, 0, ::-1] / 255.0
+        return value
+
+    def linear(code: np.ndarray) -> np.ndarray:
+        value: np.ndarray = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+        return value
+
+    np.testing.assert_allclose(linear(texel(0)), np.pi * np.array(COAT.kd), rtol=0.02)
+    assert texel(1)[1] ** 2 == pytest.approx(COAT.alpha, rel=0.01)
+    f0 = 0.04 * linear(texel(2)) * specular["specularColorFactor"]
+    np.testing.assert_allclose(f0, COAT.ks, rtol=0.02)
+
+
+def test_exr_has_what_each_pixel_of_a_view_shows(result: RunResult, tmp_path: Path) -> None:
+    (path,) = exported(result, "exr", tmp_path)
+    parts = {part.name(): part.channels for part in OpenEXR.File(str(path), separate_channels=True).parts}
+    assert set(parts) == {*("kd", "ks", "alpha", "normal", "place", "u_kd", "u_ks", "u_alpha", "u_normal")}
+    shown = np.isfinite(parts["alpha"]["Y"].pixels)
+    assert 0.2 < shown.mean() < 1.0
+    np.testing.assert_allclose(parts["kd"]["R"].pixels[shown], 0.2, rtol=1e-6)
+    height = parts["place"]["Z"].pixels[shown]
+    assert -2.5 < height.min() < height.max() < 6.5  # of the waves, support frame
+    assert np.isnan(parts["kd"]["G"].pixels[~shown]).all()
+
+
+def test_mitsuba_makes_of_the_bsdf_what_it_was_made_from(tmp_path: Path) -> None:
+    path = tmp_path / "glossy.bsdf"
+    path.write_bytes(encode_bsdf(GLOSSY))
+    mitsuba.set_variant("scalar_rgb")
+    bsdf = mitsuba.load_dict({"type": "measured", "filename": str(path)})
+    ways_in, ways_out = (directions(3000, 0.1, seed)[:2000] for seed in (1, 2))
+    interaction, context = mitsuba.SurfaceInteraction3f(), mitsuba.BSDFContext()
+    found = []
+    for way_in, way_out in zip(ways_in, ways_out, strict=True):
+        interaction.wi = mitsuba.Vector3f(*way_in)
+        found.append(np.array(bsdf.eval(context, interaction, mitsuba.Vector3f(*way_out))))
+    off = np.abs(np.array(found) / (walter(ways_in, ways_out, GLOSSY) * ways_out[:, 2:]) - 1.0)
+    assert np.median(off) < 5e-4
+    assert np.quantile(off, 0.95) < 3e-3
+
+
+def test_a_merl_table_is_read_as_its_reader_does() -> None:
+    """By angles of half vector and difference, as the database's own program has it."""
+    data = encode_merl(GLOSSY)
+    assert len(data) == 34_992_012
+    assert np.frombuffer(data, "<i4", 3).tolist() == [90, 90, 180]
+    table = np.frombuffer(data, "<f8", offset=12).reshape(3, 90, 90, 180)
+    ways_in, ways_out = (directions(1500, 0.25, seed)[:1000] for seed in (3, 4))
+    half = unit(ways_in + ways_out)
+    theta_h, phi_h = np.arccos(half[:, 2]), np.arctan2(half[:, 1], half[:, 0])
+    x = np.cos(-phi_h) * ways_in[:, 0] - np.sin(-phi_h) * ways_in[:, 1]
+    y = np.sin(-phi_h) * ways_in[:, 0] + np.cos(-phi_h) * ways_in[:, 1]
+    z = np.cos(-theta_h) * ways_in[:, 2] - np.sin(-theta_h) * x
+    x = np.sin(-theta_h) * ways_in[:, 2] + np.cos(-theta_h) * x
+    theta_d, phi_d = np.arccos(z), np.arctan2(y, x) % np.pi
+    at = (
+        np.sqrt(theta_h / (np.pi / 2)) * 90,
+        theta_d / (np.pi / 2) * 90,
+        phi_d / np.pi * 180,
+    )
+    rows = tuple(np.minimum(values.astype(int), most) for values, most in zip(at, (89, 89, 179), strict=True))
+    found = np.stack([table[channel][rows] * SCALES[channel] for channel in range(3)], axis=1)
+    off = np.abs(found / walter(ways_in, ways_out, GLOSSY) - 1.0)
+    assert np.median(off) < 0.01  # steps of two degrees
+    assert np.quantile(off, 0.95) < 0.08
+    assert (table[:, 89, 89, 0] == -1.0).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (("--to", "dng"), "expected one of ply, gltf, exr, bsdf, merl, alta for a result; found dng"),
+        (("--to", "ply", "--fit", "sh"), "expected ggx or ggx_normal"),
+        (("--to", "ply", "--views", "top"), "are for the frames of a run"),
+        (("--to", "bsdf"), "has no clusters; name triangles with --triangle"),
+        (("--to", "merl", "--triangle", "99999"), "the mesh has 722, counted from 0"),
+        (("--to", "alta"), "--triangle: expected the numbers of triangles"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(
+    result: RunResult, tmp_path: Path, options: tuple[str, ...], why: str
+) -> None:
+    ended = cells.here("export", result.folder, *options, "--out", tmp_path / "out")
+    assert ended.code == 2
+    assert why in " ".join(ended.err.split())
+
+
+def test_a_folder_with_files_is_left_alone(result: RunResult, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    ended = cells.here("export", result.folder, "--to", "ply", "--out", tmp_path)
+    assert ended.code == 2
+    assert "has files already" in ended.err
+    again = cells.here("export", result.folder, "--to", "ply", "--out", tmp_path, "--overwrite")
+    assert again.code == 0
+    assert (tmp_path / "mine.txt").exists()

@@ -10,7 +10,7 @@ import typer
 
 from coupole.commands.common import JsonOption, RunPath, fail
 from coupole.errors import ChecksumMismatch, CoupoleError, InputError, UnprovenError
-from coupole.exchange import FORMATS
+from coupole.exchange import FORMATS, RTI
 from coupole.exchange.of_results import FORMATS as OF_RESULTS
 
 if TYPE_CHECKING:
@@ -154,7 +154,9 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            "--to", help=f"Of runs: {', '.join(FORMATS)}. Of results: {', '.join(OF_RESULTS)}.", show_default=False
+            "--to",
+            help=f"Of runs: {', '.join((*FORMATS, RTI))}. Of results: {', '.join(OF_RESULTS)}.",
+            show_default=False,
         ),
     ],
     views: Annotated[
@@ -187,7 +189,10 @@ def export(
         else:
             if fit is not None or triangle:
                 raise InputError("--fit, --triangle: are for results of reflectance; this is a run")
-            files, size = _export_frames(source, to, folder, views or [], shots or [], overwrite, console)
+            if to == RTI:
+                files, size = _export_rti(source, folder, views or [], shots or [], console)
+            else:
+                files, size = _export_frames(source, to, folder, views or [], shots or [], overwrite, console)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -209,6 +214,19 @@ def _export_result(
 
     with console.status(f"writing {to}"):
         paths = export_result(source, to, folder, fit=fit, triangles=triangles, overwrite=overwrite)
+    return len(paths), sum(path.stat().st_size for path in paths)
+
+
+def _export_rti(
+    source: Path, folder: Path, views: list[str], shots: list[str], console: Console
+) -> tuple[int, int]:
+    from coupole.exchange.rti_pictures import export_rti
+    from coupole.viewing.terminal import step_bars
+
+    if shots:
+        raise InputError("--shots: are for single frames; of RTI all LEDs of a view are written")
+    with step_bars(console) as bars:
+        paths = export_rti(source, folder, views, say=bars)
     return len(paths), sum(path.stat().st_size for path in paths)
 
 

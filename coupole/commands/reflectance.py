@@ -211,7 +211,7 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
     from coupole.viewing import reflectance_page
 
     folder = out.with_name(f"{out.name}-pictures")
-    leds = uncalibrated.write_pictures(run, view, folder, say)
+    leds = uncalibrated.write_pictures(run, view, folder, say).leds
     if wrong := sorted(set(left_out) - set(leds)):
         raise InputError(f"--leave-out: no frame under LED {wrong[0]} in this view")
     left_out = [leds.index(led) for led in left_out]

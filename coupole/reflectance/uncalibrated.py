@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -34,9 +35,22 @@ _LEAST_SHARE = 0.02
 """Of the range, that a pixel of the mask has under its brightest LED."""
 
 
-def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> list[int]:
+@dataclass(frozen=True)
+class PicturedView:
+    """What the pictures of a view were taken with, of nominal places."""
+
+    leds: tuple[int, ...]
+    files: tuple[Path, ...]
+    lights_mm: NDArray[np.float64]
+    """[n, 3] LEDs from the point that the camera is focused on: x right, y up, z to the camera."""
+    width_mm: float
+    """Of what a row of pixels shows at that distance."""
+    simulated: bool
+
+
+def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> PicturedView:
     """Write pictures of a view of a run [h / 2, w / 2], 16 bit, linear, one pixel of each channel of a block, with
-    `filenames.txt`, lights, intensities and mask; what is there already is kept. The LEDs in their order.
+    `filenames.txt`, lights, intensities and mask; what is there already is kept.
 
     Raises InputError: no such view, too few LEDs, a folder with other pictures; StorageError for damaged frames.
     """
@@ -71,7 +85,12 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> list
     write_synced(out / ORDER_FILE, "".join(f"led{led:04d}.png\n" for led in leds))
     mask = np.where(brightest > _LEAST_SHARE * 65535, np.uint8(255), np.uint8(0))
     complete(out / MASK, partial(_write_png, mask))
-    return leds
+    rig = files.cell.rig
+    wide_mm = rig.sensor.width_px * rig.sensor.pixel_pitch_um * 1e-3
+    width_mm = wide_mm * rig.lens.focus_distance_mm / rig.lens.focal_length_mm
+    return PicturedView(
+        tuple(leds), tuple(out / f"led{led:04d}.png" for led in leds), towards, width_mm, run.simulated
+    )
 
 
 def _refuse_others(path: Path, text: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import cells
+import cv2
 import h5py
 import numpy as np
 import OpenEXR
@@ -147,6 +149,44 @@ def test_without_calibrations_pixels_have_normals_by_nominal_lights(made: Made, 
     assert known.sum() > 150
     off = np.degrees(np.arccos(np.clip(np.sum(found * truth, axis=2)[known], -1, 1)))
     assert np.median(off) < 5.0, np.median(off)  # lights near by are taken as far away
+
+
+def test_pictures_for_rti_show_the_object_under_the_lights_that_their_file_names(
+    made: Made, tmp_path: Path
+) -> None:
+    """Read as other programs do: by name, direction, and sRGB. Lambert's normals are near the mesh's."""
+    cell, out, _ = made
+    ended = cells.here("export", cell.run_folder, "--to", "lp", "--views", "top", "--out", tmp_path)
+    assert ended.code == 0, ended.err
+    count, *lines = (tmp_path / "top/top.lp").read_text().splitlines()
+    assert int(count) == len(lines) == 45
+    ways = np.array([line.split()[1:] for line in lines], float)
+    np.testing.assert_allclose(np.linalg.norm(ways, axis=1), 1.0, atol=1e-5)
+    codes = np.stack([cv2.imread(str(tmp_path / "top" / line.split()[0]))[::9, ::9, 1] for line in lines]) / 255.0
+    linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    dome = json.loads((tmp_path / "top/top.dome").read_text())
+    places = np.array(dome["positions3d"])
+    np.testing.assert_allclose(unit(places), ways, atol=1e-5)
+    lens = cell.rig_data["lens"]
+    wide_mm = 512 * 44e-3 * lens["focus_distance_mm"] / lens["focal_length_mm"]
+    assert dome["imageWidth"] == pytest.approx(wide_mm)
+    falling = (np.linalg.norm(places, axis=1) / 1000) ** 2
+    order = np.sort(linear, axis=0)
+    low, high = order[len(ways) // 3], order[-2]  # neither shadows nor highlights
+    with h5py.File(out / "samples/top.h5") as file:
+        seen, normals = file["seen"][()][::18, ::18], file["normals"][()]
+    frame = next(one for one in open_light_frames([cell.run_folder]).lit if one.view == "top")
+    truth = normals @ frame.base_from_camera[:3, :3] * (1, -1, -1)
+    off = []
+    for row, column in zip(*np.nonzero(seen >= 0), strict=True):
+        value = linear[:, row, column] * falling
+        used = (linear[:, row, column] > max(low[row, column], 0.02)) & (
+            linear[:, row, column] < high[row, column]
+        )
+        normal = unit(np.linalg.lstsq(ways[used], value[used], rcond=None)[0])
+        off.append(np.degrees(np.arccos(np.clip(normal @ truth[seen[row, column]], -1, 1))))
+    assert len(off) > 50
+    assert np.median(off) < 8.0
 
 
 @pytest.mark.full

@@ -1,0 +1,85 @@
+"""Pictures of a view under each LED with the LEDs' directions, as programs for RTI take them: `.lp`, and relight's
+`.dome` with the LEDs' places."""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.reflectance.uncalibrated import write_pictures
+from coupole.storage.durable import write_synced
+from coupole.storage.run import Run
+
+LINEAR = "linear"
+"""Folder of the pictures of 16 bit, with lights, intensities and mask, from which `--pictures` makes a result."""
+_WHITE_QUANTILE = 0.999
+"""Of the brightest value of each pixel under any LED: what is white."""
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+
+
+def export_rti(
+    folder: Path, out: Path, views: Sequence[str], *, say: Callable[[str, int, int], None]
+) -> list[Path]:
+    """Write `VIEW/` for each view of a run that matches one of the patterns: `led0417.jpg` and so on (8 bit, sRGB,
+    one white for all), `VIEW.lp`, `VIEW.dome`, and `linear/`. Nominal places of the LEDs; no calibration is used.
+
+    Raises InputError: no such view, too few LEDs, a folder with other pictures; StorageError for damaged frames.
+    """
+    run = Run(folder)
+    names = list(dict.fromkeys(shot.view for shot in run.proven()))
+    chosen = [name for name in names if not views or any(fnmatch.fnmatchcase(name, one) for one in views)]
+    if not chosen:
+        raise InputError(f"{folder}: no view matches; it has {', '.join(names)}")
+    paths: list[Path] = []
+    for view in chosen:
+        paths += _export_view(run, view, out / view, say)
+    return paths
+
+
+def _export_view(run: Run, view: str, out: Path, say: Callable[[str, int, int], None]) -> list[Path]:
+    taken = write_pictures(run.folder, view, out / LINEAR, lambda step, done, of: say(f"{view}: {step}", done, of))
+    brightest = _read(taken.files[0])
+    for source in taken.files:
+        brightest = np.maximum(brightest, _read(source))
+    codes = _srgb_codes(float(np.quantile(brightest.max(axis=2), _WHITE_QUANTILE)))
+    paths = []
+    for number, source in enumerate(taken.files):
+        paths.append(out / f"{source.stem}.jpg")
+        write_synced(paths[-1], cv2.imencode(".jpg", codes[_read(source)], _JPEG)[1].tobytes())
+        say(f"{view}: jpeg", number + 1, len(taken.files))
+    directions = taken.lights_mm / np.linalg.norm(taken.lights_mm, axis=1, keepdims=True)
+    lines = [f"{path.name} {x:.6f} {y:.6f} {z:.6f}" for path, (x, y, z) in zip(paths, directions, strict=True)]
+    write_synced(out / f"{view}.lp", "\n".join([str(len(lines)), *lines]) + "\n")
+    dome = {
+        "label": f"{run.folder.name} {view}",
+        "notes": f"Coupole, {'simulated' if taken.simulated else 'measured'}; nominal places of the LEDs",
+        "imageWidth": taken.width_mm,
+        "domeDiameter": 2.0 * float(np.linalg.norm(taken.lights_mm, axis=1).mean()),
+        "verticalOffset": 0.0,
+        "lightConfiguration": "lights3d",
+        "directions": directions.tolist(),
+        "positions3d": taken.lights_mm.tolist(),
+    }
+    write_synced(out / f"{view}.dome", json.dumps(dome, indent=1) + "\n")
+    return [*paths, out / f"{view}.lp", out / f"{view}.dome"]
+
+
+def _read(path: Path) -> NDArray[np.uint16]:
+    """[h, w, 3] or [h, w, 1], blue first."""
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    return np.atleast_3d(picture).astype(np.uint16)
+
+
+def _srgb_codes(white: float) -> NDArray[np.uint8]:
+    """[65536] 8-bit codes of linear values; `white` has 255 (IEC 61966-2-1)."""
+    share = np.clip(np.arange(1 << 16) / max(white, 1.0), 0.0, 1.0)
+    coded = np.where(share <= 0.0031308, 12.92 * share, 1.055 * np.maximum(share, 1e-12) ** (1 / 2.4) - 0.055)
+    return np.rint(255.0 * coded).astype(np.uint8)

@@ -153,7 +153,7 @@ def _matched(
 
 def _adjusted(unknowns: Unknowns, steps: Floats, matches: Matches) -> Adjusted[Floats]:
     """All steps from what the records say, by matches that were made after `steps`."""
-    lines = _lines(unknowns, steps, matches)
+    lines = match_lines(unknowns, steps, matches)
     lower = np.linalg.cholesky(unknowns.covariance)
     inverse = solve_triangular(lower, np.eye(unknowns.count), lower=True)
     everything = np.arange(unknowns.count)
@@ -174,7 +174,7 @@ def _adjusted(unknowns: Unknowns, steps: Floats, matches: Matches) -> Adjusted[F
     )
 
 
-def _lines(unknowns: Unknowns, steps: Floats, matches: Matches) -> list[Block]:
+def match_lines(unknowns: Unknowns, steps: Floats, matches: Matches) -> list[Block]:
     """Residuals and derivatives of the matches of each pair of views, whitened by their covariances."""
     views = range(len(unknowns.given.base_from_camera))
     lens, cameras = unknowns.lens_at(steps), unknowns.cameras_at(steps)

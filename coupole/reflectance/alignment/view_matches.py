@@ -142,14 +142,14 @@ def _match_pair(
 ) -> Matches:
     first, second = views[pair[0]], views[pair[1]]
     asked = np.flatnonzero(places.detail[:, pair[1]] > 0)
-    reach = np.ceil(search_mm * np.sqrt(places.detail[asked, pair[0]])).astype(np.int64)
-    shift, covariance = np.full((len(asked), 2), np.nan), np.zeros((len(asked), 2, 2))
-    _match(
-        first.picture, first.points_mm, half, places.blocks[asked], np.clip(reach, 2, MOST_REACH), second.picture,
-        second.points_mm, second.base_from_camera, second.lens.vector(), shift, covariance,
-    )  # fmt: skip
-    good = np.isfinite(shift[:, 0])
-    at, shift, covariance = asked[good], shift[good], covariance[good]
+    reach = np.ceil(search_mm * np.sqrt(places.detail[asked, pair[0]]))
+    made = [
+        _shift(first, second, places.blocks[place], half, min(max(int(blocks), 2), MOST_REACH))
+        for place, blocks in zip(asked, reach, strict=True)
+    ]
+    at = asked[[one is not None for one in made]]
+    shift = np.array([one[0] for one in made if one is not None]).reshape(-1, 2)
+    covariance = np.array([one[1] for one in made if one is not None]).reshape(-1, 2, 2)
     points, normals, blocks = places.points_mm[at], places.normals[at], places.blocks[at].astype(float)
     moved = _on_planes(first, blocks + shift, points, normals)
     found, computed = second.project(moved), second.project(points)
@@ -160,25 +160,27 @@ def _match_pair(
     return Matches(reference, other, blocks, points, normals, found, computed, covariance, moved - points)
 
 
-@numba.njit(cache=True, nogil=True)
-def _match(picture, points, half, middles, reach, other, other_points, pose, lens, shifts, covariances):  # type: ignore[no-untyped-def]
-    """Into `shifts` [n, 2] the shifts of windows around `middles` [n, 2], NaN where there is none."""
-    for number in range(len(middles)):
-        column, row = middles[number]
-        warped = _warped(points, row, column, half + reach[number] + _MARGIN, other, other_points, pose, lens)
-        template = picture[row - half : row + half + 1, column - half : column + half + 1]
-        shown = points[row - half : row + half + 1, column - half : column + half + 1, 0]
-        best, right, down = _best_shift(template, shown, warped, reach[number])
-        most = max(abs(right), abs(down))
-        if best < LEAST_CORRELATION or most >= reach[number]:  # at the border the true one may lie beyond
-            continue
-        good, x, y, covariance = _finer(template, shown, warped, reach[number], right, down)
-        half_trace = 0.5 * (covariance[0, 0] + covariance[1, 1])
-        apart = 0.5 * (covariance[0, 0] - covariance[1, 1])
-        worst = half_trace + np.sqrt(apart * apart + covariance[0, 1] * covariance[1, 0])
-        if good and worst < _WORST_U * _WORST_U:
-            shifts[number, 0], shifts[number, 1] = x, y
-            covariances[number] = covariance
+def _shift(
+    first: ViewSurface, second: ViewSurface, middle: NDArray[np.int64], half: int, reach: int
+) -> tuple[Floats, Floats] | None:
+    """[2] by how many blocks a window of the first view is shifted in the second, and its covariance [2, 2]; None
+    if they are too unlike, or too plain."""
+    column, row = map(int, middle)
+    window = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
+    template, shown = first.picture[window], first.points_mm[(*window, 0)]
+    lens = second.lens.vector()
+    warped = _warped(
+        first.points_mm, row, column, half + reach + _MARGIN, second.picture, second.points_mm,
+        second.base_from_camera, lens,
+    )  # fmt: skip
+    best, right, down = _best_shift(template, shown, warped, reach)
+    at_border = max(abs(right), abs(down)) >= reach  # the true one may lie beyond
+    if best < LEAST_CORRELATION or at_border:
+        return None
+    good, x, y, covariance = _finer(template, shown, warped, reach, right, down)
+    if not good or np.linalg.eigvalsh(covariance)[1] > _WORST_U**2:
+        return None
+    return np.array([x, y]), covariance
 
 
 @numba.njit(cache=True, nogil=True)

@@ -5,6 +5,7 @@ Errors are drawn from the uncertainties that records and options state, as a cel
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,16 +44,12 @@ def waves() -> trimesh.Trimesh:
     return trimesh.Trimesh(np.stack([x, y, z], axis=-1).reshape(-1, 3), faces, process=False)
 
 
-def textured_cell(folder: Path, *, width_px: int = 512, every: int = 120) -> CellFolder:
+def textured_cell(folder: Path, *, every: int = 120, views: Sequence[str] = tuple(VIEWS)) -> CellFolder:
     """The surface under every so many LEDs, from three sides, somewhat glossy."""
     cell = CellFolder(folder, speed=14.0)
     waves().export(folder / "waves.ply")
     cell.plan_data["object"]["mesh"] = str(folder / "waves.ply")
-    cell.rig_data["sensor"] |= {
-        "width_px": width_px,
-        "height_px": width_px * 3 // 4,
-        "pixel_pitch_um": 22528 / width_px,
-    }
+    cell.rig_data["sensor"] |= {"width_px": 512, "height_px": 384, "pixel_pitch_um": 44.0}
     cell.world_settings.update(
         white_at_us=8000,
         shading="pixel",
@@ -61,8 +58,9 @@ def textured_cell(folder: Path, *, width_px: int = 512, every: int = 120) -> Cel
         material={"diffuse": (0.45, 0.4, 0.35), "f0": (0.04,) * 3, "roughness": 0.35},
     )
     around = {**cells.TOP, "target_mm": TARGET_MM}
-    views = [{**around, "name": name, "azimuth_deg": a, "elevation_deg": e} for name, (a, e) in VIEWS.items()]
-    cell.write(views=views, lights={"kind": "every", "every": every}, darks_per_view=0)
+    directions = {name: VIEWS[name] for name in views}
+    poses = [{**around, "name": n, "azimuth_deg": a, "elevation_deg": e} for n, (a, e) in directions.items()]
+    cell.write(views=poses, lights={"kind": "every", "every": every}, darks_per_view=0)
     return cell
 
 

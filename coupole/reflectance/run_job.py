@@ -16,7 +16,7 @@ from typing import Any
 from uuid import uuid4
 
 from coupole.errors import InputError
-from coupole.reflectance.alignment.refined_geometry import REFINED, read_refined
+from coupole.reflectance.alignment.refined_geometry import read_refined, what_was_refined
 from coupole.reflectance.block_work import Said, Workshop, silent, workshop
 from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of
 from coupole.reflectance.extraction.frames_for_check import write_frames
@@ -114,7 +114,7 @@ def _settings(request: RunRequest, measured_runs: Sequence[MeasuredRun]) -> dict
         "runs": {m.run.folder.name: dict(m.frames.inputs) for m in measured_runs},
         "records": [{kind: sha256(path) for kind, path in m.records.items()} for m in measured_runs],
         "mesh": sha256(measured_runs[0].mesh_path),
-        "refined": None if request.refined is None else sha256(request.refined / REFINED),
+        "refined": None if request.refined is None else what_was_refined(request.refined),
         "emission": measured_runs[0].emission,
         "simulated": any(m.run.simulated for m in measured_runs),
         "channels": "".join(measured_runs[0].channels),

@@ -13,8 +13,7 @@ import h5py
 import numpy as np
 
 from coupole.errors import InputError, StorageError
-from coupole.reflectance.alignment.refine_job import ABOUT
-from coupole.reflectance.alignment.refined_geometry import REFINED
+from coupole.reflectance.alignment.refined_geometry import ABOUT, REFINED
 from coupole.storage.durable import write_synced
 from coupole.viewing.raw_preview import png
 from coupole.viewing.reflectance_page import STYLE

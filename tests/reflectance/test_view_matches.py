@@ -176,13 +176,19 @@ def test_the_covariance_of_poses_is_that_of_drawn_hand_eyes_and_arms() -> None:
     hand_eye[:3, :3], hand_eye[:3, 3] = Rotation.from_euler("x", 40, degrees=True).as_matrix(), [10, 20, 120]
     cameras = np.stack(CAMERAS)
     flanges = cameras @ np.linalg.inv(hand_eye)
-    prior = CameraPrior(LENS, (), hand_eye, np.diag([u_mm**2] * 3 + [u_rad**2] * 3))
+    by_zeros, u_deg = random.standard_normal((2, 6, 2)) * np.repeat([6.0, 0.02], 3)[:, None], 0.1
+    own = np.diag([u_mm**2] * 3 + [u_rad**2] * 3 + [u_deg**2] * 2)
+    prior = CameraPrior(LENS, (), hand_eye, own, axis_sensitivity=by_zeros)
     stated = camera_covariance(prior, cameras, arm)
     drawn = []
     for _ in range(4000):
         moved_eye = stepped(hand_eye, random.standard_normal(6) * np.repeat([u_mm, u_rad], 3))
         scatter = random.standard_normal((2, 6)) * np.repeat([0.2, np.radians(0.05)], 3)
-        there = [stepped(flange, step) @ moved_eye for flange, step in zip(flanges, scatter, strict=True)]
+        zeros = by_zeros @ (u_deg * random.standard_normal(2))
+        there = [
+            stepped(flange @ stepped(np.eye(4), zero), step) @ moved_eye
+            for flange, zero, step in zip(flanges, zeros, scatter, strict=True)
+        ]
         drawn.append(np.concatenate([difference(is_, at) for is_, at in zip(cameras, there, strict=True)]))
     seen = np.cov(np.array(drawn).T)
     scale = np.sqrt(np.diag(stated))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import cells
+import cv2
 import drawn_views
 import h5py
 import numpy as np
@@ -167,6 +168,55 @@ def test_what_pictures_cannot_tell_keeps_its_stated_uncertainty(made: Made) -> N
         assert left == pytest.approx(1 / information, rel=0.02)
 
 
+@pytest.mark.full
+def test_one_material_for_all_views_misses_less_with_what_was_refined(tmp_path: Path) -> None:
+    """Under LEDs that were kept for the check, nearly as little as with the true geometry."""
+    cell = drawn_views.textured_cell(tmp_path, every=40)
+    assert cell.acquire().code == 0
+    one = refined(cell, seed=5)
+    radiometry = [
+        word for kind in ("response", "flat-field") for word in ("--calibrations", RECORDS / f"{kind}.yaml")
+    ]
+    light = [word for kind in ("leds", "led-power") for word in ("--calibrations", RECORDS / f"{kind}.yaml")]
+    true = (cell.run_folder, "--calibrations", RECORDS / "hand-eye.yaml", *light)
+    mae, told = {}, {}
+    for name, words in (("given", one.words), ("refined", (*one.words, "--refined", one.out)), ("true", true)):
+        scan = ("--scan-noise-um", "100", "--out", tmp_path / name, "--json")
+        ended = cells.here("reflectance", *words, *radiometry, *scan)
+        assert ended.code == 0, ended.err
+        mae[name], told[name] = ended.document["mae"]["ggx_normal"], ended.document
+    assert mae["refined"] < 0.4 * mae["given"]
+    assert mae["refined"] < 1.3 * mae["true"]
+    assert told["refined"]["refined"]["disagreement"] == one.told["disagreement"]
+    assert "views were refined" in (tmp_path / "refined/report.html").read_text()
+    print(mae)
+
+
+@pytest.mark.full
+def test_views_of_two_runs_are_refined_together(made: Made, tmp_path: Path) -> None:
+    """Two of three views in one run, the third in another."""
+    folders = [tmp_path / name for name in ("one", "two")]
+    runs = []
+    for folder, views in zip(folders, (("top", "left"), ("right",)), strict=True):
+        folder.mkdir()
+        cell = drawn_views.textured_cell(folder, views=views)
+        assert cell.acquire().code == 0
+        runs.append(cell.run_folder.rename(cell.run_folder.with_name(f"run-{folder.name}")))
+    out = tmp_path / "refined"
+    ended = cells.here("reflectance", "refine", *runs, *made.words[1:], *STATED, "--out", out, "--json")
+    assert ended.code == 0, ended.err
+    assert {(one["run"], one["view"]) for one in ended.document["cameras"]} == {
+        ("run-one", "top"), ("run-one", "left"), ("run-two", "right"),
+    }  # fmt: skip
+    for key in ("median_mm", "matches"):
+        together, alone = (told["disagreement"]["after"][key] for told in (ended.document, made.told))
+        assert together == pytest.approx(alone, rel=0.1)
+    words = ("--refined", out, "--out", tmp_path / "result", "--json")
+    ended = cells.here("reflectance", "extract", *runs, *made.words[1:], *words)
+    assert ended.code == 0, ended.err
+    assert len(ended.document["views"]) == 3
+
+
 def test_the_page_shows_arrows_before_and_after(made: Made) -> None:
     page = (made.out / "report.html").read_text()
     assert page.count("<svg") == 2 * len(drawn_views.VIEWS)
@@ -180,9 +230,20 @@ def test_refined_geometry_is_what_samples_are_made_with(made: Made, tmp_path: Pa
     assert ended.code == 0, ended.err
     with h5py.File(made.out / "refined.h5") as file:
         views, poses, vertices = file["views"].asstr()[()], file["base_from_camera"][()], file["vertices_mm"][()]
+        fx, fy, cx, cy, *distortion = file["lens"][()]
     for (_, view), pose in zip(views, poses, strict=True):
         with h5py.File(tmp_path / f"result/samples/{view}.h5") as file:
             np.testing.assert_array_equal(file["camera_mm"][()], pose[:3, 3])
+            seen, centres = file["seen"][()], file["centres_mm"][()]
+        rows, columns = np.nonzero(seen >= 0)
+        count = np.bincount(seen[rows, columns])
+        mean = np.stack([np.bincount(seen[rows, columns], places) / count for places in (columns, rows)], axis=1)
+        turn = pose[:3, :3].T
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        pixels, _ = cv2.projectPoints(
+            centres, cv2.Rodrigues(turn)[0], -turn @ pose[:3, 3], matrix, np.array(distortion)
+        )
+        np.testing.assert_allclose(np.median(mean - pixels[:, 0], axis=0), 0.0, atol=0.06)
     with h5py.File(tmp_path / "result/object.h5") as file:
         corners = file["corners_mm"][()]
     np.testing.assert_allclose(corners, vertices[trimesh.load(made.drawn.mesh, process=False).faces], atol=1e-3)

@@ -21,7 +21,7 @@ from coupole.geometry import apply, inverse
 from coupole.plan.reading import read_plan
 from coupole.preflight.object_shape import MM_PER_UNIT
 from coupole.reflectance.alignment.matt_picture import Said, common_leds, matt_picture
-from coupole.reflectance.alignment.refined_geometry import REFINED, SCHEMA, write_refined
+from coupole.reflectance.alignment.refined_geometry import ABOUT, REFINED, SCHEMA, write_refined
 from coupole.reflectance.alignment.refinement import Refined, refine
 from coupole.reflectance.alignment.unknowns import STATED, Doubts, Given, camera_covariance, welded
 from coupole.reflectance.alignment.view_matches import Matches
@@ -32,7 +32,7 @@ from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import make_folder, sha256, write_synced
 
 Floats = NDArray[np.float64]
-ABOUT, MESH = "refined.json", "mesh.ply"
+MESH = "mesh.ply"
 
 
 @dataclass(frozen=True)

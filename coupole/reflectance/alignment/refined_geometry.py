@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,7 +19,7 @@ from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.storage.durable import sha256
 
 Floats = NDArray[np.float64]
-REFINED = "refined.h5"
+REFINED, ABOUT = "refined.h5", "refined.json"
 SCHEMA = "coupole-refinement/1"
 PREVIEW_PX = 640
 """Largest width of a view's picture in the file."""
@@ -87,6 +89,16 @@ def read_refined(folder: Path) -> RefinedGeometry:
             return RefinedGeometry(path, lens, poses, file["vertices_mm"][()], str(file.attrs["mesh_sha256"]))
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path}: expected the result of `coupole reflectance refine`: {error}") from error
+
+
+def what_was_refined(folder: Path) -> dict[str, Any]:
+    """What a result says of the refinement it was made with. Raises InputError if there is none."""
+    path = folder / ABOUT
+    try:
+        disagreement = json.loads(path.read_text(encoding="utf-8"))["disagreement"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: expected the result of `coupole reflectance refine`") from error
+    return {"sha256": sha256(folder / REFINED), "disagreement": disagreement}
 
 
 def write_refined(

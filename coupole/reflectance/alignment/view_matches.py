@@ -187,15 +187,15 @@ def _shift(
 def _warped(points, row, column, half, other, other_points, pose, lens):  # type: ignore[no-untyped-def]
     """[side, side] what the other view shows at the places of the first one's blocks; NaN where it does not."""
     side = 2 * half + 1
-    values = np.full((side, side), np.nan)
+    values, inside = np.full((side, side), np.nan), np.empty(3)
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = lens
     for j in range(side):
         for i in range(side):
             y, x = row - half + j, column - half + i
             if not (0 <= y < points.shape[0] and 0 <= x < points.shape[1]) or not np.isfinite(points[y, x, 0]):
                 continue
-            inside = np.zeros(3)
             for k in range(3):
+                inside[k] = 0.0
                 for m in range(3):
                     inside[k] += pose[m, k] * (points[y, x, m] - pose[m, 3])
             if inside[2] <= 0.0:

@@ -328,17 +328,25 @@ def cluster(
         int | None,
         typer.Option("--clusters", min=1, help="At most so many; without it one for 400 triangles, 16 to 1000."),
     ] = None,
+    degrees: Annotated[
+        int, typer.Option("--degrees", min=2, max=17, help="Of harmonics of pairs: 220 for 10, 969 for 17.")
+    ] = 10,
+    without_view: Annotated[
+        str | None, typer.Option("--without-view", help="Take no samples of a view, and be judged by it.")
+    ] = None,
     memory: MemoryOption = "2GB",
     as_json: JsonOption = False,
 ) -> None:
     """A few materials for all triangles, from the samples of all that look alike; triangles with too few samples
-    for a material borrow one."""
+    for a material borrow one. Beside each material, harmonics of pairs of directions, which suppose no model."""
 
     def step(say: Said) -> dict[str, Any]:
         from coupole.reflectance.run_clusters import cluster_result
         from coupole.viewing import cluster_page
 
-        told = cluster_result(result, clusters, _bytes(memory), say=say)
+        told = cluster_result(
+            result, clusters, _bytes(memory), degrees=degrees, without_view=without_view, say=say
+        )
         return {**told, "report": str(cluster_page.write(result, told))}
 
     _do(step, as_json=as_json)

@@ -5,12 +5,14 @@ Errors are drawn from the uncertainties that records and options state, as a cel
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cells
+import h5py
 import numpy as np
 import trimesh
 from cells import CellFolder
@@ -23,6 +25,8 @@ Floats = NDArray[np.float64]
 RECORDS = cells.REPO / "configs/calibrations"
 HAND_EYE_MM, HAND_EYE_DEG, FOCAL_PX, CENTRE_PX, K1 = 0.6, 0.12, 1.5, 1.0, 0.01
 """Standard uncertainties of the records."""
+ARM_MM, ARM_DEG = 0.2, 0.03
+"""Of the poses that the arm reports, from view to view."""
 MESH_MM, MESH_DEG, SHAPE_MM, SCALE_MM = 0.1, 0.02, 0.15, 20.0
 """Of the scan."""
 LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1")
@@ -68,16 +72,21 @@ def textured_cell(folder: Path, *, every: int = 120, views: Sequence[str] = tupl
 class Drawn:
     """What processing is given, and the truth."""
 
+    run: Path
+    """A copy whose poses are off."""
     hand_eye: Path
     mesh: Path
     true_lens: dict[str, float]
     flange_from_camera: Floats
 
 
-def draw(folder: Path, seed: int) -> Drawn:
-    """A hand-eye record for frames of 512 x 384, and a scan in the mesh's own frame."""
-    folder.mkdir(exist_ok=True)
+def draw(true_run: Path, folder: Path, seed: int) -> Drawn:
+    """A run whose arm reports poses that are off, a hand-eye record for frames of 512 x 384, and a scan in the
+    mesh's own frame."""
     random = np.random.default_rng(seed)
+    run = shutil.copytree(true_run, folder / true_run.name)
+    for path in sorted((run / "views").glob("*.h5")):
+        _misreport(path, random.standard_normal(6) * np.repeat([ARM_MM, np.radians(ARM_DEG)], 3))
     focal_px = 35.0 * 335.0 / 300.0 / 0.044
     true_lens = dict(zip(LENS, (focal_px, focal_px, 255.5, 191.5, 0.0), strict=True))
     u_lens = dict(zip(LENS, (FOCAL_PX, FOCAL_PX, CENTRE_PX, CENTRE_PX, K1), strict=True))
@@ -104,7 +113,18 @@ def draw(folder: Path, seed: int) -> Drawn:
     wrong = waves()
     wrong.vertices = _scanned(np.asarray(wrong.vertices), np.asarray(wrong.vertex_normals), random)
     wrong.export(folder / "scan.ply")
-    return Drawn(folder / "hand-eye.yaml", folder / "scan.ply", true_lens, true)
+    return Drawn(run, folder / "hand-eye.yaml", folder / "scan.ply", true_lens, true)
+
+
+def _misreport(view: Path, step: Floats) -> None:
+    """Move all poses of a view by a step (mm along the base's axes, rad about the flange's)."""
+    with h5py.File(view, "r+") as file:
+        poses = file["entry/instrument/robot/poses"]
+        table = poses[()]
+        used = table["base_from_flange"][:, 3, 3] == 1
+        table["base_from_flange"][used, :3, 3] += step[:3]
+        table["base_from_flange"][used, :3, :3] @= Rotation.from_rotvec(step[3:]).as_matrix()
+        poses[...] = table
 
 
 def _parameter(name: str, value: float | None, u: float) -> Parameter:

@@ -16,7 +16,7 @@ from typing import Any
 from uuid import uuid4
 
 from coupole.errors import InputError
-from coupole.reflectance.alignment.refined_geometry import read_refined, what_was_refined
+from coupole.reflectance.alignment.refined_geometry import ABOUT, read_refined, what_was_refined
 from coupole.reflectance.block_work import Said, Workshop, silent, workshop
 from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of
 from coupole.reflectance.extraction.frames_for_check import write_frames
@@ -147,6 +147,8 @@ def _extract(
     records = tuple(path.resolve() for path in request.calibrations)
     for one in left:
         shop.refuse_blind(one.run, RUN_JSON)
+    if refined is not None:
+        shop.refuse_blind(refined, ABOUT)
     extract = partial(_extract_one, token, mesh, records, refined, shop.threads, shop.heard(say))
     for number, (one, found) in enumerate(zip(left, shop.map(extract, left), strict=True), start=1):
         write_synced(one.path.with_suffix(".json"), json.dumps(found))

@@ -21,7 +21,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 Floats = NDArray[np.float64]
-STATED = ("--mesh-mm", "0.1", "--mesh-deg", "0.02", "--shape-mm", "0.15", "--scale-mm", "20", "--search-mm", "4")
+SHIFTS = ("--arm-mm", "0.2", "--mesh-mm", "0.1", "--shape-mm", "0.15", "--scale-mm", "20", "--search-mm", "4")
+STATED = (*SHIFTS, "--arm-deg", "0.03", "--mesh-deg", "0.02")
+"""As they are drawn."""
 CELLS = 20
 
 
@@ -47,13 +49,13 @@ class Made:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     cell = drawn_views.textured_cell(tmp_path_factory.mktemp("cell"))
     assert cell.acquire().code == 0
-    return refined(cell, seed=5)
+    return refined(cell, seed=101)
 
 
 def refined(cell: CellFolder, seed: int) -> Made:
     """With records and a scan that are drawn, and stated as they are drawn."""
-    drawn = drawn_views.draw(cell.folder / f"drawn{seed}", seed)
-    words: list[str | Path] = [cell.run_folder, "--mesh", drawn.mesh, "--calibrations", drawn.hand_eye]
+    drawn = drawn_views.draw(cell.run_folder, cell.folder / f"drawn{seed}", seed)
+    words: list[str | Path] = [drawn.run, "--mesh", drawn.mesh, "--calibrations", drawn.hand_eye]
     for kind in ("leds", "led-power"):
         words += ["--calibrations", RECORDS / f"{kind}.yaml"]
     out = cell.folder / f"refined{seed}"
@@ -73,8 +75,8 @@ def test_views_that_disagreed_by_more_than_a_millimetre_agree(made: Made) -> Non
 def test_poses_come_nearer_to_the_truth_and_lie_in_their_stated_regions(made: Made) -> None:
     before, after, squares = pose_errors(made)
     assert (squares < chi2.ppf(0.95, 6)).all()
-    assert np.linalg.norm(after[:, :3]) < 0.5 * np.linalg.norm(before[:, :3])
-    assert np.linalg.norm(after[:, 3:]) < 0.8 * np.linalg.norm(before[:, 3:])
+    assert np.linalg.norm(after[:, :3]) < 0.6 * np.linalg.norm(before[:, :3])
+    assert np.linalg.norm(after[:, 3:]) < 0.6 * np.linalg.norm(before[:, 3:])
 
 
 def pose_errors(made: Made) -> tuple[Floats, Floats, Floats]:
@@ -108,7 +110,7 @@ def lens_errors(made: Made) -> Floats:
 
 def test_the_mesh_comes_nearer_to_the_truth_and_lies_in_its_stated_intervals(made: Made) -> None:
     before, after, u_mm = mesh_errors(made)
-    assert np.linalg.norm(after) < 0.5 * np.linalg.norm(before)
+    assert np.linalg.norm(after) < 0.6 * np.linalg.norm(before)
     assert np.mean(np.abs(after) < 1.96 * u_mm) > 0.9
 
 
@@ -131,7 +133,7 @@ def mesh_errors(made: Made) -> tuple[Floats, Floats, Floats]:
 def test_in_drawn_cells_regions_hold_and_errors_shrink(made: Made) -> None:
     """Poses of one cell are wrong together, as their hand-eye is one: they count as one trial."""
     squares, lens, inside, poses, meshes, apart = [], [], [], [], [], []
-    for seed in range(100, 100 + CELLS):
+    for seed in range(200, 200 + CELLS):
         one = refined(made.cell, seed)
         before, after, own = pose_errors(one)
         squares.append(np.median(own))
@@ -146,13 +148,13 @@ def test_in_drawn_cells_regions_hold_and_errors_shrink(made: Made) -> None:
     )  # of 20 cells: fewer than 17 happen in 2 % of tries
     assert np.mean(np.abs(lens) < 1.96) > 0.88
     assert np.mean(inside) > 0.9
-    for errors, share in ((poses, 0.75), (meshes, 0.6)):
+    for errors, share in ((poses, 0.85), (meshes, 0.8)):
         whole = np.sqrt(np.mean(np.square(errors), axis=0))
         assert whole[1] < share * whole[0]
     before, after = np.transpose(apart)
     assert np.median(before) > 1.2
     assert after.max() < 0.2
-    print(np.round(apart, 3), np.round(squares, 1))
+    print(np.round(apart, 3), np.round(squares, 1), np.mean(inside))
 
 
 def test_what_pictures_cannot_tell_keeps_its_stated_uncertainty(made: Made) -> None:
@@ -173,7 +175,7 @@ def test_one_material_for_all_views_misses_less_with_what_was_refined(tmp_path: 
     """Under LEDs that were kept for the check, nearly as little as with the true geometry."""
     cell = drawn_views.textured_cell(tmp_path, every=40)
     assert cell.acquire().code == 0
-    one = refined(cell, seed=5)
+    one = refined(cell, seed=101)
     radiometry = [
         word for kind in ("response", "flat-field") for word in ("--calibrations", RECORDS / f"{kind}.yaml")
     ]

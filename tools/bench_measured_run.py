@@ -112,6 +112,7 @@ def read_run(folder: Path) -> tuple[Any, Any]:
     from coupole.calibration.light.frames import channels_of, open_light_frames
     from coupole.calibration.light.tile_views import Positions
     from coupole.calibration.optics import Intrinsics
+    from coupole.calibration.posed_camera import CameraPrior
     from coupole.geometry import apply
     from coupole.reflectance.extraction.measured_run import Drift, MeasuredRun, MeasuredView, Powers
     from coupole.reflectance.extraction.radiance import Radiometry
@@ -124,11 +125,12 @@ def read_run(folder: Path) -> tuple[Any, Any]:
     focal_px, (width, height) = frames.focal_px, FULL
     equal = np.ones((count, len(channels_of(frames.pattern))))
     about = frames.about
+    lens = Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
     measured = MeasuredRun(
         run,
         frames,
         (MeasuredView(VIEW, frames.lit[0].base_from_flange, frames.lit),),
-        Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2),
+        lens,
         apply(known["support"], shape.vertices)[shape.triangles],
         shape.triangles,
         Positions(known["ids"], known["centres_mm"], known["normals"]),
@@ -140,6 +142,8 @@ def read_run(folder: Path) -> tuple[Any, Any]:
         (about.focal_length_mm or 0.0, about.focus_distance_mm or 0.0, about.f_number or 0.0),
         known["support"],
         Drift(),
+        True,
+        CameraPrior(lens, (), np.eye(4), np.zeros((6, 6))),
     )
     radiometry = Radiometry(measured)
     radiometry.noise[:] = NOISE

@@ -14,6 +14,18 @@ PlanPath = Annotated[Path, typer.Argument(help="The plan (YAML).", show_default=
 RigOption = Annotated[Path | None, typer.Option("--rig", help="Another rig than the plan names.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
 ResultArgument = Annotated[Path, typer.Argument(help="Folder of a result.", show_default=False)]
+MeshOption = Annotated[
+    Path | None, typer.Option("--mesh", help="Mesh of the object; without it the one that the run names.")
+]
+RecordsOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--calibrations",
+        help="A record (hand-eye, leds, led-power; dark, response, flat-field, drift), or a folder of records; "
+        "again for more. Without it those that the run names.",
+        show_default=False,
+    ),
+]
 RunPath = Annotated[Path, typer.Argument(help="The run's folder.", show_default=False)]
 
 
@@ -27,3 +39,17 @@ def fail(error: CoupoleError, *, as_json: bool, found: dict[str, Any] | None = N
             "exit_code": error.exit_code,
         }
         print(json.dumps(document))
+
+
+def records_named(named: list[Path]) -> tuple[Path, ...]:
+    """Records, and those in folders that are named."""
+    from coupole.calibration.record import SEAL
+
+    found: list[Path] = []
+    for path in named:
+        if path.is_dir():
+            files = sorted(path.glob("*.yaml"))
+            found += [file for file in files if file.read_text(encoding="utf-8").startswith(SEAL)]
+        else:
+            found.append(path)
+    return tuple(found)

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from coupole.commands.common import JsonOption, ResultArgument
+from coupole.commands.common import JsonOption, MeshOption, RecordsOption, ResultArgument, records_named
 from coupole.commands.common import fail as fail_with
+from coupole.commands.refine import refine
 from coupole.commands.relight import relight
 from coupole.errors import CoupoleError, InputError
 
@@ -46,18 +47,6 @@ reflectance_app = typer.Typer(
 
 
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the result.", show_default=False)]
-MeshOption = Annotated[
-    Path | None, typer.Option("--mesh", help="Mesh of the object; without it the one that the run names.")
-]
-RecordsOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--calibrations",
-        help="A record (hand-eye, leds, led-power; dark, response, flat-field, drift), or a folder of records; "
-        "again for more. Without it those that the run names.",
-        show_default=False,
-    ),
-]
 NoiseOption = Annotated[
     float, typer.Option("--scan-noise-um", min=0.1, help="Standard uncertainty of the mesh's vertices.")
 ]
@@ -75,6 +64,10 @@ KeepOption = Annotated[
 ]
 MemoryOption = Annotated[
     str, typer.Option("--memory", help="For the samples that are fitted together: 500MB, 4GB.")
+]
+RefinedOption = Annotated[
+    Path | None,
+    typer.Option("--refined", help="Folder of `coupole reflectance refine`: its poses, lens and mesh hold."),
 ]
 SchedulerOption = Annotated[
     str | None,
@@ -133,6 +126,7 @@ def from_runs_or_pictures(
     scan_noise_um: NoiseOption = 30.0,
     support_reflectance: SupportOption = 0.0,
     keep_inter_reflection: KeepOption = False,
+    refined: RefinedOption = None,
     memory: MemoryOption = "2GB",
     scheduler: SchedulerOption = None,
     pictures: PicturesOption = None,
@@ -165,10 +159,10 @@ def from_runs_or_pictures(
             elif pictures is not None:
                 made = _of_pictures(pictures, lights, intensities, mask, _numbers(leave_out), out, say)
             else:
-                records, left_out = _records(calibrations or []), tuple(_numbers(leave_out))
+                records, left_out = records_named(calibrations or []), tuple(_numbers(leave_out))
                 request = RunRequest(
                     tuple(runs or ()), mesh, records, left_out, scan_noise_um, _bytes(memory), support_reflectance,
-                    keep_inter_reflection,
+                    keep_inter_reflection, refined,
                 )  # fmt: skip
                 made = _of_runs(request, out, scheduler, say)
     except CoupoleError as error:
@@ -229,20 +223,6 @@ def _of_runs(request: RunRequest, out: Path, scheduler: str | None, say: Said) -
     return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)
 
 
-def _records(named: list[Path]) -> tuple[Path, ...]:
-    """Records, and those in folders that are named."""
-    from coupole.calibration.record import SEAL
-
-    found: list[Path] = []
-    for path in named:
-        if path.is_dir():
-            files = sorted(path.glob("*.yaml"))
-            found += [file for file in files if file.read_text(encoding="utf-8").startswith(SEAL)]
-        else:
-            found.append(path)
-    return tuple(found)
-
-
 def _bytes(text: str) -> int:
     units = {"GB": 10**9, "MB": 10**6}
     try:
@@ -271,6 +251,7 @@ def extract(
     scan_noise_um: NoiseOption = 30.0,
     support_reflectance: SupportOption = 0.0,
     keep_inter_reflection: KeepOption = False,
+    refined: RefinedOption = None,
     leave_out: LeaveOutOption = "",
     scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
@@ -281,10 +262,11 @@ def extract(
         from coupole.reflectance.run_job import RunRequest, extract_runs
         from coupole.reflectance.run_result import RunResult
 
-        records, left_out = _records(calibrations or []), tuple(_numbers(leave_out))
+        records, left_out = records_named(calibrations or []), tuple(_numbers(leave_out))
         request = RunRequest(
             tuple(runs), mesh, records, left_out, scan_noise_um,
             support_reflectance=support_reflectance, keep_inter_reflection=keep_inter_reflection,
+            refined=refined,
         )  # fmt: skip
         extract_runs(request, out, scheduler=scheduler, say=say)
         return {"views": RunResult(out).summaries}
@@ -346,17 +328,25 @@ def cluster(
         int | None,
         typer.Option("--clusters", min=1, help="At most so many; without it one for 400 triangles, 16 to 1000."),
     ] = None,
+    degrees: Annotated[
+        int, typer.Option("--degrees", min=2, max=17, help="Of harmonics of pairs: 220 for 10, 969 for 17.")
+    ] = 10,
+    without_view: Annotated[
+        str | None, typer.Option("--without-view", help="Take no samples of a view, and be judged by it.")
+    ] = None,
     memory: MemoryOption = "2GB",
     as_json: JsonOption = False,
 ) -> None:
     """A few materials for all triangles, from the samples of all that look alike; triangles with too few samples
-    for a material borrow one."""
+    for a material borrow one. Beside each material, harmonics of pairs of directions, which suppose no model."""
 
     def step(say: Said) -> dict[str, Any]:
         from coupole.reflectance.run_clusters import cluster_result
         from coupole.viewing import cluster_page
 
-        told = cluster_result(result, clusters, _bytes(memory), say=say)
+        told = cluster_result(
+            result, clusters, _bytes(memory), degrees=degrees, without_view=without_view, say=say
+        )
         return {**told, "report": str(cluster_page.write(result, told))}
 
     _do(step, as_json=as_json)
@@ -378,4 +368,5 @@ def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool) -> None:
         print(f"report {told['report']}")
 
 
+reflectance_app.command()(refine)
 reflectance_app.command()(relight)

@@ -89,8 +89,8 @@ FitOption = Annotated[
     str | None,
     typer.Option(
         "--fit",
-        help="Of a result of runs: ggx, ggx_normal, sh, rbf, ggx_rbf or clusters; without it the one that "
-        "missed least in the check.",
+        help="Of a result of runs: ggx, ggx_normal, sh, rbf, ggx_rbf, clusters or harmonics; without it the one "
+        "that missed least in the check.",
     ),
 ]
 UncertaintyOption = Annotated[

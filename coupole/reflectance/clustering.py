@@ -134,7 +134,7 @@ def _looks(kd, ks, alpha, off_cos, found):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _axes(normal, axes):  # type: ignore[no-untyped-def]
+def axes_about(normal, axes):  # type: ignore[no-untyped-def]
     """Rows x, y, z of a frame about a normal (Duff et al. 2017)."""
     x, y, z = normal
     sign = 1.0 if z >= 0.0 else -1.0
@@ -146,7 +146,7 @@ def _axes(normal, axes):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _turned(axes, place, target, direction):  # type: ignore[no-untyped-def]
+def turned_to(axes, place, target, direction):  # type: ignore[no-untyped-def]
     d0, d1, d2 = target[0] - place[0], target[1] - place[1], target[2] - place[2]
     length = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
     for k in range(3):
@@ -162,7 +162,7 @@ def _pool(  # type: ignore[no-untyped-def]
         number, taken = cluster[triangle], 0
         if number < 0:
             continue
-        _axes(normals[triangle], axes)
+        axes_about(normals[triangle], axes)
         for sample in order:
             place = counts[number]
             if taken == each[number] or place == pooled.shape[1]:
@@ -173,8 +173,8 @@ def _pool(  # type: ignore[no-untyped-def]
             if not known:
                 continue
             pooled[number, place] = values[triangle, sample]
-            _turned(axes, centres_mm[triangle], led_mm[sample], lights[number, place])
-            _turned(axes, centres_mm[triangle], cameras_mm[view_of[sample]], views[number, place])
+            turned_to(axes, centres_mm[triangle], led_mm[sample], lights[number, place])
+            turned_to(axes, centres_mm[triangle], cameras_mm[view_of[sample]], views[number, place])
             taken += 1
             counts[number] += 1
 
@@ -211,15 +211,15 @@ def _nearest(  # type: ignore[no-untyped-def]
     axes, light, view = np.empty((3, 3)), np.empty(3), np.empty(3)
     misses = np.empty(len(alpha))
     for triangle in range(len(values)):
-        _axes(normals[triangle], axes)
+        axes_about(normals[triangle], axes)
         misses[:] = 0.0
         count = 0
         for sample in used:
             value = values[triangle, sample]
             if np.isnan(value).all():
                 continue
-            _turned(axes, centres_mm[triangle], led_mm[sample], light)
-            _turned(axes, centres_mm[triangle], cameras_mm[view_of[sample]], view)
+            turned_to(axes, centres_mm[triangle], led_mm[sample], light)
+            turned_to(axes, centres_mm[triangle], cameras_mm[view_of[sample]], view)
             if light[2] <= 0.0 or view[2] <= 0.0:
                 continue
             count += 1

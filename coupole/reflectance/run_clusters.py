@@ -9,11 +9,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.reflectance.cluster_file import CLUSTERS, Clusters, write_clusters
 from coupole.reflectance.clustering import (
     clusters_of,
     empty_pool,
@@ -23,8 +23,9 @@ from coupole.reflectance.clustering import (
     pool_samples,
 )
 from coupole.reflectance.extraction.lamp_sight import lit_on
+from coupole.reflectance.pair_harmonics import USUAL_DEGREES, fit_pairs, pair_values
 from coupole.reflectance.result_folder import complete, read_settings
-from coupole.reflectance.run_result import CLUSTERS, FIELDS, Clusters, RunResult
+from coupole.reflectance.run_result import FIELDS, RunResult
 from coupole.reflectance.triangle_fit import TriangleMaterials, model_values
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import write_synced
@@ -39,13 +40,27 @@ _FROM = "ggx_normal"
 
 
 def cluster_result(
-    out: Path, count: int | None, memory_bytes: int, *, say: Said = lambda step, done, of: None
+    out: Path,
+    count: int | None,
+    memory_bytes: int,
+    *,
+    degrees: int = USUAL_DEGREES,
+    without_view: str | None = None,
+    say: Said = lambda step, done, of: None,
 ) -> dict[str, Any]:
-    """Find at most `count` materials for all triangles, write them, and say what is missed with them under the
-    LEDs that were left out. Raises InputError if samples or fits are not all there, StorageError."""
+    """Find at most `count` materials for all triangles, and harmonics of pairs of directions of so many `degrees`;
+    write them, and say what is missed with them under the LEDs that were left out. A view that is left out too
+    gives no samples and is judged by itself.
+
+    Raises InputError if samples or fits are not all there, or the view is none; StorageError.
+    """
     settings = read_settings(out)
     result = RunResult(out)
     result.refuse_unfinished(settings, fits=True)
+    if without_view is not None and without_view not in settings["view_names"]:
+        raise InputError(
+            f"--without-view: expected one of {', '.join(settings['view_names'])}; got {without_view}"
+        )
     materials = result.materials(_FROM)
     fitted = np.isfinite(materials.alpha)
     known = int(np.count_nonzero(fitted))
@@ -59,19 +74,26 @@ def cluster_result(
     random = np.random.default_rng(0)
     for block in result.blocks(memory_bytes):
         used = ~np.isin(result.along_samples(block, "leds"), settings["left_out"])
+        used &= result.along_samples(block, "names") != without_view
         samples, normals = result.samples(block), materials.normals[block]
         pool_samples(pool, samples, used, normals, cluster[block], members, random)
         say("pool samples", block.stop, len(fitted))
     pooled = fit_pool(pool, _medians(materials, cluster, len(members)))
+    harmonics = fit_pairs(pool, degrees)
     borrowed = _borrow(result, pooled, cluster, settings["left_out"], memory_bytes, say)
+    found = Clusters(
+        cluster.astype(np.int32), borrowed, pooled.kd, pooled.ks, pooled.alpha, pooled.residual, harmonics
+    )
     try:
-        complete(out / CLUSTERS, lambda path: _write(path, pooled, cluster, borrowed, members))
+        complete(out / CLUSTERS, lambda path: write_clusters(path, found, members))
         told = {
             "clusters": len(members),
             "triangles": int(np.count_nonzero(cluster >= 0)),
             "borrowed": int(np.count_nonzero(borrowed)),
             "without": int(np.count_nonzero(cluster < 0)),
-            **_missed(result, settings, memory_bytes, say),
+            "harmonics": harmonics.shape[1],
+            "without_view": without_view,
+            **_missed(result, settings, without_view, memory_bytes, say),
         }
         write_synced(out / ABOUT_CLUSTERS, json.dumps(told, indent=1) + "\n")
     except OSError as error:
@@ -113,14 +135,30 @@ def _borrow(
     return borrowed
 
 
-def _missed(result: RunResult, settings: dict[str, Any], memory_bytes: int, say: Said) -> dict[str, Any]:
-    """Mean absolute errors, shares of the camera's range, under the LEDs that were left out: of triangles with a
-    material of their own, by it and by their cluster's; of those that borrowed one."""
+def _missed(
+    result: RunResult, settings: dict[str, Any], without_view: str | None, memory_bytes: int, say: Said
+) -> dict[str, Any]:
+    """Mean absolute errors, shares of the camera's range, under the LEDs that were left out: of all views, and of
+    the view that was left out too."""
+    found = {"mae": _mae(result, settings, None, memory_bytes, say)}
+    if without_view is not None:
+        found["mae_of_view"] = _mae(result, settings, without_view, memory_bytes, say)
+    own, clustered = found["mae"]["own"], found["mae"]["clustered"]
+    return {**found, "mae_ratio": clustered / own if own and clustered else None}
+
+
+def _mae(
+    result: RunResult, settings: dict[str, Any], of_view: str | None, memory_bytes: int, say: Said
+) -> dict[str, float | None]:
+    """Of triangles with a material of their own, by it, by their cluster's, and by its harmonics; of those that
+    borrowed one."""
     clusters = result.clusters
-    sums = {"own": 0.0, "clustered": 0.0, "borrowed": 0.0}
+    sums = {"own": 0.0, "clustered": 0.0, "harmonics": 0.0, "borrowed": 0.0}
     counts = dict.fromkeys(sums, 0)
     for block in result.blocks(memory_bytes):
         held = np.isin(result.along_samples(block, "leds"), settings["left_out"])
+        if of_view is not None:
+            held &= result.along_samples(block, "names") == of_view
         samples = result.samples(block)
         some = replace(
             samples,
@@ -131,9 +169,12 @@ def _missed(result: RunResult, settings: dict[str, Any], memory_bytes: int, say:
         axes, paper = result.along_samples(block, "led_normals")[held], settings["emission"] == "paper"
         lit = lit_on(some.centres_mm, some.led_mm, axes, paper)
         share = lit[..., None] * result.along_samples(block, "full_scales")[held]
+        own = result.materials(_FROM, block)
+        number = np.where(clusters.borrowed[block], -1, clusters.cluster[block])
         by = {
-            "own": model_values(some, result.materials(_FROM, block)),
-            "clustered": model_values(some, clusters.at(result.materials(_FROM, block), some.normals, block)),
+            "own": model_values(some, own),
+            "clustered": model_values(some, clusters.at(own, some.normals, block)),
+            "harmonics": pair_values(some, own.normals, number, clusters.harmonics),
         }
         by["borrowed"] = np.where(clusters.borrowed[block][:, None, None], by["clustered"], np.nan)
         by["clustered"] = np.where(clusters.borrowed[block][:, None, None], np.nan, by["clustered"])
@@ -143,25 +184,4 @@ def _missed(result: RunResult, settings: dict[str, Any], memory_bytes: int, say:
             sums[name] += float(off[known].sum())
             counts[name] += int(np.count_nonzero(known))
         say("check of clusters", block.stop, len(result.triangles))
-    mae = {name: sums[name] / counts[name] if counts[name] else None for name in sums}
-    ratio = mae["clustered"] / mae["own"] if mae["own"] and mae["clustered"] else None
-    return {"mae": mae, "mae_ratio": ratio}
-
-
-def _write(
-    path: Path,
-    pooled: TriangleMaterials,
-    cluster: NDArray[np.int64],
-    borrowed: NDArray[np.bool_],
-    members: NDArray[np.int64],
-) -> None:
-    with h5py.File(path, "w") as file:
-        data: dict[str, tuple[NDArray[Any], str]] = {
-            "cluster": (cluster.astype(np.int32), "of the triangles of the fits; -1 for none"),
-            "borrowed": (borrowed, "whether a triangle has its cluster's material for want of samples"),
-            "members": (members, "triangles that a cluster was found by"),
-        }
-        for field in Clusters.OF_CLUSTERS:
-            data[field] = (getattr(pooled, field).astype(np.float32), f"of the clusters: {FIELDS[field]}")
-        for name, (values, told) in data.items():
-            file.create_dataset(name, data=values, track_times=False).attrs["told"] = told
+    return {name: sums[name] / counts[name] if counts[name] else None for name in sums}

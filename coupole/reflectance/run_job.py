@@ -15,13 +15,17 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-import numpy as np
-
 from coupole.errors import InputError
+from coupole.reflectance.alignment.refined_geometry import ABOUT, read_refined, what_was_refined
 from coupole.reflectance.block_work import Said, Workshop, silent, workshop
 from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of
 from coupole.reflectance.extraction.frames_for_check import write_frames
-from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView, read_measured_run
+from coupole.reflectance.extraction.measured_run import (
+    MeasuredRun,
+    MeasuredView,
+    read_measured_run,
+    refuse_different,
+)
 from coupole.reflectance.extraction.radiance import Radiometry
 from coupole.reflectance.inter_reflection import subtract
 from coupole.reflectance.result_folder import SETTINGS, begin, complete, read_settings
@@ -52,6 +56,8 @@ class RunRequest:
     """Of the disk, from which light comes to the object too."""
     keep_inter_reflection: bool = False
     """Do not take it off the samples."""
+    refined: Path | None = None
+    """Folder of `coupole reflectance refine`: its poses, lens and mesh hold instead of the records' and scan's."""
 
 
 def reflectance_of(
@@ -73,8 +79,10 @@ def reflectance_of(
 def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None, say: Said = silent) -> None:
     """The samples of all views. Raises as `reflectance_of`."""
     token = uuid4().hex
-    measured_runs = [_measured(token, run, request.mesh, request.calibrations) for run in request.runs]
-    _refuse_different(measured_runs)
+    measured_runs = [
+        _measured(token, run, request.mesh, request.calibrations, request.refined) for run in request.runs
+    ]
+    refuse_different(measured_runs)
     try:
         with workshop(scheduler) as shop:
             begin(out, _settings(request, measured_runs))
@@ -92,20 +100,6 @@ def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None
         _forget()
 
 
-def _refuse_different(measured_runs: Sequence[MeasuredRun]) -> None:
-    first = measured_runs[0]
-    names = [measured.run.folder.name for measured in measured_runs]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise InputError(f"{twice}: two runs have this name; rename the folder of one, or name each run once")
-    for other in measured_runs[1:]:
-        if not np.array_equal(first.corners_mm, other.corners_mm):
-            raise InputError(
-                f"{other.run.folder}: shows another object, or in another place, than {first.run.folder}"
-            )
-        if first.channels != other.channels:
-            raise InputError(f"{other.run.folder}: was taken with another sensor than {first.run.folder}")
-
-
 def _settings(request: RunRequest, measured_runs: Sequence[MeasuredRun]) -> dict[str, Any]:
     frames = [frame for m in measured_runs for view in m.views for frame in view.frames]
     leds = sorted({frame.led for frame in frames if frame.led is not None})
@@ -120,6 +114,7 @@ def _settings(request: RunRequest, measured_runs: Sequence[MeasuredRun]) -> dict
         "runs": {m.run.folder.name: dict(m.frames.inputs) for m in measured_runs},
         "records": [{kind: sha256(path) for kind, path in m.records.items()} for m in measured_runs],
         "mesh": sha256(measured_runs[0].mesh_path),
+        "refined": None if request.refined is None else what_was_refined(request.refined),
         "emission": measured_runs[0].emission,
         "simulated": any(m.run.simulated for m in measured_runs),
         "channels": "".join(measured_runs[0].channels),
@@ -148,11 +143,13 @@ def _extract(
         for view in measured.views
     ]
     left = [one for one in left if not one.path.with_suffix(".json").exists()]
-    mesh = request.mesh and request.mesh.resolve()
+    mesh, refined = (path and path.resolve() for path in (request.mesh, request.refined))
     records = tuple(path.resolve() for path in request.calibrations)
     for one in left:
         shop.refuse_blind(one.run, RUN_JSON)
-    extract = partial(_extract_one, token, mesh, records, shop.threads, shop.heard(say))
+    if refined is not None:
+        shop.refuse_blind(refined, ABOUT)
+    extract = partial(_extract_one, token, mesh, records, refined, shop.threads, shop.heard(say))
     for number, (one, found) in enumerate(zip(left, shop.map(extract, left), strict=True), start=1):
         write_synced(one.path.with_suffix(".json"), json.dumps(found))
         say("views", number, len(left))
@@ -160,10 +157,16 @@ def _extract(
 
 
 def _extract_one(
-    token: str, mesh: Path | None, records: tuple[Path, ...], threads: int | None, say: Said, one: _View
+    token: str,
+    mesh: Path | None,
+    records: tuple[Path, ...],
+    refined: Path | None,
+    threads: int | None,
+    say: Said,
+    one: _View,
 ) -> dict[str, Any]:
     """Write the files of a view's samples and frames for the check; what the report says of them."""
-    measured, geometry, radiometry = _prepared(token, one.run, mesh, records)
+    measured, geometry, radiometry = _prepared(token, one.run, mesh, records, refined)
     view = next(view for view in measured.views if view.name == one.view)
     found = extract_view(measured, geometry, radiometry, view, one.path, say, threads=threads)
     frames = one.path.parents[1] / FRAMES / one.path.name
@@ -173,16 +176,19 @@ def _extract_one(
 
 @lru_cache(maxsize=1)
 def _prepared(
-    token: str, run: Path, mesh: Path | None, records: tuple[Path, ...]
+    token: str, run: Path, mesh: Path | None, records: tuple[Path, ...], refined: Path | None
 ) -> tuple[MeasuredRun, Geometry, Radiometry]:
     """What all views of a run share, once in each process and job (`token`)."""
-    measured = _measured(token, run, mesh, records)
+    measured = _measured(token, run, mesh, records, refined)
     return measured, geometry_of(measured), Radiometry(measured)
 
 
 @lru_cache(maxsize=16)
-def _measured(_token: str, run: Path, mesh: Path | None, records: tuple[Path, ...]) -> MeasuredRun:
-    return read_measured_run(run, mesh, records)
+def _measured(
+    _token: str, run: Path, mesh: Path | None, records: tuple[Path, ...], refined: Path | None
+) -> MeasuredRun:
+    measured = read_measured_run(run, mesh, records)
+    return measured if refined is None else read_refined(refined).of(measured)
 
 
 def _forget() -> None:

@@ -26,6 +26,7 @@ from coupole.reflectance.new_light.shading import (
     coats_of,
 )
 from coupole.reflectance.new_light.shadow_edges import reached
+from coupole.reflectance.pair_harmonics import pair_values
 from coupole.reflectance.run_result import FITS, MATERIALS, SLICES, RunResult, ViewSamples, read_about
 from coupole.reflectance.slice_fit import slice_values
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
@@ -34,7 +35,9 @@ Say = Callable[[int, int], None]
 SAMPLES = 256
 """Beams of an area or an environment."""
 CLUSTERED = "clusters"
-ANYWHERE = (*MATERIALS, CLUSTERED)
+HARMONICS = "harmonics"
+"""Of both directions, of clusters."""
+ANYWHERE = (*MATERIALS, CLUSTERED, HARMONICS)
 """Fits that hold from everywhere; the others hold for the view that they were fitted to."""
 _FAR_MM = 1e5
 """Where distant light is for a slice."""
@@ -59,13 +62,22 @@ class Slices:
 
 
 @dataclass(frozen=True)
+class Pairs:
+    """Harmonics of both directions, by the clusters of triangles."""
+
+    normals: NDArray[np.float64]
+    cluster: NDArray[np.int32]
+    coefficients: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
 class RelitScene:
     """A picture's surface and what it is made of; any lights can be put on it."""
 
     result: RunResult
     fit: str
     surface: Surface
-    reflecting: Coats | Slices
+    reflecting: Coats | Slices | Pairs
     """Of the surface's triangles."""
     views: tuple[ViewSamples, ...]
     """In the order in which LEDs are looked for."""
@@ -84,8 +96,8 @@ class RelitScene:
         base_from_support, channels = self.result.base_from_support, self.result.channels
         lighting = lighting_of(lights, self.views, base_from_support, channels, samples, paper=paper)
         picture = np.zeros((*self.surface.seen.shape, channels), np.float32)
-        if isinstance(self.reflecting, Slices):
-            self._by_slices(picture, lighting, self.reflecting, say)
+        if isinstance(self.reflecting, Slices | Pairs):
+            self._by_values(picture, lighting, self.reflecting, say)
         else:
             self._by_materials(picture, lighting, self.reflecting, max(1, samples // MIRROR_SHARE), say)
         return picture
@@ -99,13 +111,13 @@ class RelitScene:
             add_mirrored(picture, self.surface, coats, self.rays, emitter, lobe_rays)
             say(len(lighting.beams) + number + 1, work)
 
-    def _by_slices(self, picture: Picture, lighting: Lighting, slices: Slices, say: Say) -> None:
+    def _by_values(self, picture: Picture, lighting: Lighting, reflecting: Slices | Pairs, say: Say) -> None:
         for number, beam in enumerate(lighting.beams):
-            values = self._slice_values(slices, beam)
+            values = self._triangle_values(reflecting, beam)
             add_values(picture, self.surface, values, reached(self.rays, self.surface, beam), beam)
             say(number + 1, len(lighting.beams))
 
-    def _slice_values(self, slices: Slices, beam: Beam) -> NDArray[np.float32]:
+    def _triangle_values(self, reflecting: Slices | Pairs, beam: Beam) -> NDArray[np.float32]:
         """[triangles, channels] f cos_i, 1/sr, at the triangles' centres."""
         centres_mm = self.surface.centres_mm
         place_mm = beam.place if beam.near else centres_mm.mean(axis=0) + _FAR_MM * beam.place
@@ -123,15 +135,21 @@ class RelitScene:
                 self.surface.normals[part],
                 np.ones(count),
             )
-            under = None
-            if slices.under is not None:
-                under = model_values(light, slices.under.at(np.arange(first, first + count)))
-            made = slice_values(light, slices.coefficients[part], SLICES[slices.name].basis, under)
-            values[part] = np.nan_to_num(made[:, 0])
+            values[part] = np.nan_to_num(_values_of(reflecting, light, part)[:, 0])
 
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
             list(pool.map(of, range(0, len(centres_mm), _TRIANGLES)))
         return values
+
+
+def _values_of(reflecting: Slices | Pairs, light: TriangleSamples, part: slice) -> NDArray[np.float32]:
+    """[b, 1, channels] f cos_i of a part of the surface's triangles."""
+    if isinstance(reflecting, Pairs):
+        return pair_values(light, reflecting.normals[part], reflecting.cluster[part], reflecting.coefficients)
+    under = None
+    if reflecting.under is not None:
+        under = model_values(light, reflecting.under.at(np.arange(part.start, part.start + len(light.values))))
+    return slice_values(light, reflecting.coefficients[part], SLICES[reflecting.name].basis, under)
 
 
 def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = None) -> RelitScene:
@@ -147,7 +165,7 @@ def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = 
     order = (mine, *(one for one in result.views if one is not mine))
     rays = ray_mesh(result.corners_mm.astype(np.float64))
     if name in ANYWHERE:
-        return RelitScene(result, name, surface, coats_of(materials_of(result, name, surface)), order, rays)
+        return RelitScene(result, name, surface, _from_anywhere(result, name, surface), order, rays)
     if not result.slices_path(name, mine).exists():
         raise InputError(f"{result.folder}: has no fit {name}; `coupole reflectance fit {result.folder}` makes it")
     over, coefficients = SLICES[name].over, result.slices(name, mine)
@@ -168,12 +186,20 @@ def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) ->
     name = fit or best_fit(result, MATERIALS)
     rays = ray_mesh(result.corners_mm.astype(np.float64))
     surface = surface_from(result, rays, camera)
-    return RelitScene(result, name, surface, coats_of(materials_of(result, name, surface)), result.views, rays)
+    return RelitScene(result, name, surface, _from_anywhere(result, name, surface), result.views, rays)
 
 
 def _refuse_unknown(fit: str | None) -> None:
-    if fit is not None and fit not in (known := (*FITS, CLUSTERED)):
+    if fit is not None and fit not in (known := (*FITS, CLUSTERED, HARMONICS)):
         raise InputError(f"--fit: expected one of {', '.join(known)}; got {fit!r}")
+
+
+def _from_anywhere(result: RunResult, name: str, surface: Surface) -> Coats | Pairs:
+    if name != HARMONICS:
+        return coats_of(materials_of(result, name, surface))
+    normals = materials_of(result, CLUSTERED, surface).normals
+    places = np.searchsorted(result.triangles, surface.triangles)
+    return Pairs(normals, result.clusters.cluster[places], result.clusters.harmonics)
 
 
 def materials_of(result: RunResult, name: str, surface: Surface) -> TriangleMaterials:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import h5py
 import numba
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError, Problem
+from coupole.reflectance.cluster_file import Clusters, read_clusters
 from coupole.reflectance.ggx import UNKNOWNS
 from coupole.reflectance.slice_basis import HARMONICS, RADIAL, RESIDUAL, Basis
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples
@@ -41,7 +42,6 @@ SLICES = {
     "ggx_rbf": SliceKind(RESIDUAL, over="ggx_normal"),
 }
 FITS = (*MATERIALS, *SLICES)
-CLUSTERS = "fits/clusters.h5"
 FRAMES = "samples/frames"
 """Folder of the pictures that the fits are compared with."""
 Block = slice | NDArray[np.int64]
@@ -90,32 +90,10 @@ class ViewSamples:
     full_scales: NDArray[np.float64]
     """[leds, channels] of the camera, that f cos_i E/Phi of 1 gives."""
 
-
-@dataclass(frozen=True)
-class Clusters:
-    """Materials that many triangles share."""
-
-    OF_CLUSTERS: ClassVar = ("kd", "ks", "alpha", "residual")
-    cluster: NDArray[np.int32]
-    """[n] of all triangles of the fits; -1 for none."""
-    borrowed: NDArray[np.bool_]
-    """[n]"""
-    kd: NDArray[np.float64]
-    """[clusters, channels]"""
-    ks: NDArray[np.float64]
-    alpha: NDArray[np.float64]
-    residual: NDArray[np.float64]
-
-    def at(
-        self, own: TriangleMaterials, mesh_normals: NDArray[np.float64], block: slice | NDArray[np.int64]
-    ) -> TriangleMaterials:
-        """Of triangles by their places in `RunResult.triangles`, with the normals of their `own` materials, or
-        the mesh's where they borrow."""
-        number, borrowed = self.cluster[block], self.borrowed[block, None]
-        kd, ks, alpha, residual = (getattr(self, name)[number] for name in self.OF_CLUSTERS)
-        alpha[number < 0] = np.nan
-        normals = np.where(borrowed, mesh_normals, own.normals)
-        return TriangleMaterials(normals, kd, ks, alpha, residual)
+    @property
+    def names(self) -> NDArray[np.str_]:
+        """[leds] the view's own, for each."""
+        return np.full(len(self.leds), self.path.stem)
 
 
 @dataclass(frozen=True)
@@ -290,7 +268,7 @@ class RunResult:
 
     def along_samples(self, block: slice, name: str) -> NDArray[Any]:
         """[samples, ...] what each sample of `samples(block)` has by its LED: `leds`, `led_normals`,
-        `full_scales`."""
+        `full_scales`, and its view: `names`."""
         wanted = self.triangles[block]
         return np.concatenate([getattr(view, name) for view in self.views if _rows(view, wanted)])
 
@@ -317,15 +295,7 @@ class RunResult:
     @cached_property
     def clusters(self) -> Clusters:
         """Raises InputError if there are none."""
-        path = self.folder / CLUSTERS
-        if not path.exists():
-            raise InputError(f"{path}: is not there; `coupole reflectance cluster {self.folder}` makes it")
-        with h5py.File(path, "r") as file:
-            return Clusters(
-                file["cluster"][()],
-                file["borrowed"][()],
-                *(file[name][()].astype(np.float64) for name in Clusters.OF_CLUSTERS),
-            )
+        return read_clusters(self.folder)
 
     def slices(self, name: str, view: ViewSamples, rows: slice = slice(None)) -> NDArray[np.float32]:
         """[n, channels, coefficients] of rows of a view's file, by a fit's name in `SLICES`."""

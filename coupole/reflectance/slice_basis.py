@@ -82,19 +82,23 @@ def fewer(basis: Basis, count: int) -> Basis:
     return Basis(basis.harmonic, np.where(free, basis.penalty, _HELD))
 
 
-def _recurrence() -> tuple[Floats, Floats]:
-    """[_DEGREES, _DEGREES] a and b of P(l, m) = a (z P(l-1, m) - b P(l-2, m)), orthonormal."""
-    a, b = np.zeros((_DEGREES, _DEGREES)), np.zeros((_DEGREES, _DEGREES))
-    for l in range(1, _DEGREES):  # noqa: E741  degree and order have these names everywhere
+def recurrence(degrees: int) -> tuple[Floats, Floats]:
+    """[degrees, degrees] a and b of P(l, m) = a (z P(l-1, m) - b P(l-2, m)), orthonormal, without (x + iy)^m."""
+    a, b = np.zeros((degrees, degrees)), np.zeros((degrees, degrees))
+    for l in range(1, degrees):  # noqa: E741  degree and order have these names everywhere
         for m in range(l):
             a[l, m] = math.sqrt((4.0 * l * l - 1.0) / (l * l - m * m))
             b[l, m] = math.sqrt(((l - 1.0) ** 2 - m * m) / (4.0 * (l - 1.0) ** 2 - 1.0))
     return a, b
 
 
-_A, _B = _recurrence()
-_DIAGONAL = np.array([1.0, *(math.sqrt((2.0 * m + 1.0) / (2.0 * m)) for m in range(1, _DEGREES))])
-"""Of P(m, m), over P(m - 1, m - 1)."""
+def diagonal(degrees: int) -> Floats:
+    """[degrees] of P(m, m) over P(m - 1, m - 1)."""
+    return np.array([1.0, *(math.sqrt((2.0 * m + 1.0) / (2.0 * m)) for m in range(1, degrees))])
+
+
+_A, _B = recurrence(_DEGREES)
+_DIAGONAL = diagonal(_DEGREES)
 _CENTRES = centres()
 
 

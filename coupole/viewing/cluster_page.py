@@ -19,6 +19,7 @@ PAGE = "clusters.html"
 _TOLD = {
     "own": "triangles by their own material",
     "clustered": "the same by their cluster's",
+    "harmonics": "the same by its harmonics of both directions",
     "borrowed": "triangles that have their cluster's for want of samples",
 }
 
@@ -43,6 +44,11 @@ def _page(folder: Path, told: dict[str, Any]) -> Iterator[str]:
         mae = told["mae"][name]
         yield f"<tr><th>{text}<td>{'' if mae is None else f'{100 * mae:.3f}'}"
     yield "</table>"
+    if told["without_view"] is not None:
+        kinds = ((text, told["mae_of_view"][name]) for name, text in _TOLD.items())
+        each = (f"{text} {100 * mae:.3f} %" for text, mae in kinds if mae is not None)
+        yield f"<p>From the view {html.escape(told['without_view'])}, of which clusters had no samples: "
+        yield f"{', '.join(each)} (their own materials had them)."
     if told["mae_ratio"] is not None:
         yield f"<p>Ratio {told['mae_ratio']:.2f}; published: 1.7 (seed 003, figure 6, harmonics)."
     result = RunResult(folder)

@@ -470,7 +470,7 @@ def test_a_view_is_relit_with_its_shadows(made: Made) -> None:
     assert "expected one of side, top" in wrong.err
     wrong = cells.here("reflectance", "relight", out, "--direction", "0,0,1", "--fit", "none", "--to", to)
     assert wrong.code == 2
-    assert "expected one of ggx, ggx_normal, sh, rbf, ggx_rbf, clusters" in " ".join(wrong.err.split())
+    assert "expected one of ggx, ggx_normal, sh, rbf, ggx_rbf, clusters, harmonics" in " ".join(wrong.err.split())
 
 
 def test_a_relit_picture_holds_the_truth_within_its_uncertainty(made: Made, tmp_path: Path) -> None:
@@ -581,9 +581,14 @@ def test_clusters_are_a_few_materials_for_all_and_fill_what_has_too_few_samples(
     many = cells.here("reflectance", "cluster", out, "--clusters", "1000000")
     assert many.code == 2
     assert f"expected at most {document['triangles'] - document['not_fitted']}" in " ".join(many.err.split())
+    wrong = cells.here("reflectance", "cluster", out, "--without-view", "none")
+    assert wrong.code == 2
+    assert "expected one of side, top" in " ".join(wrong.err.split())
     ended = cells.here("reflectance", "cluster", out, "--json")
     assert ended.code == 0, ended.err
     told = ended.document
+    assert told["harmonics"] == 220
+    assert told["mae"]["harmonics"] < 1.3 * told["mae"]["clustered"]
     assert 16 <= told["clusters"] <= 40
     assert 0 < told["borrowed"] <= document["not_fitted"]
     assert told["triangles"] + told["without"] == document["triangles"]
@@ -592,12 +597,18 @@ def test_clusters_are_a_few_materials_for_all_and_fill_what_has_too_few_samples(
     with h5py.File(out / "fits/clusters.h5") as file:
         cluster, borrowed, alpha = file["cluster"][()], file["borrowed"][()], file["alpha"][()]
         np.testing.assert_allclose(np.median(file["kd"][()], axis=0) * np.pi, DIFFUSE, rtol=0.05)
+        assert file["harmonics"].shape == (told["clusters"], 220, 3)
         assert file["members"][()].sum() == (cluster >= 0).sum() - borrowed.sum()
     with h5py.File(out / "fits/ggx_normal.h5") as file:
         assert not np.isfinite(file["alpha"][()][borrowed]).any()
     assert cluster.max() == len(alpha) - 1
     assert cells.here(*relight, "--fit", "clusters").code == 0
     filled = np.load(to)
+    assert cells.here(*relight, "--fit", "harmonics").code == 0
+    by_harmonics = np.load(to)
+    both = (by_harmonics > 0.1) & (filled > 0.1)
+    assert both.mean() > 0.05
+    assert np.median(np.abs(by_harmonics / np.where(both, filled, 1.0) - 1)[both]) < 0.05
     assert cells.here(*relight, "--fit", "ggx_normal").code == 0
     assert np.count_nonzero(filled) > np.count_nonzero(np.load(to))
     assert "any colours" in (out / "clusters.html").read_text()

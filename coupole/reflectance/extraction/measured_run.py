@@ -137,6 +137,8 @@ class MeasuredRun:
     drift: Drift
     direct_light_alone: bool
     """Whether the cell is simulated without light from surface to surface."""
+    camera: CameraPrior
+    """Lens and hand-eye with their covariance; `axis_sensitivity` is that of `views`, in their order."""
 
     def power_of(self, frame: LightFrame) -> Floats:
         """[channels] power of the LED of a frame at its board's temperature and time; NaN where there is none."""
@@ -169,7 +171,7 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
     _refuse_other_gain(by_kind["led-power"], power_record, frames)
     refuse_lacking(by_kind["led-power"], power_record, by_kind)
     lens, leds = files.cell.rig.lens, calibrated_positions(by_kind["leds"])
-    views = _views(run, frames, hand_eye, files.cell.rig, prior)
+    views, prior = _views(run, frames, hand_eye, files.cell.rig, prior)
     _refuse_unknown_leds(by_kind["leds"], leds, views)
     shape = read_mesh(mesh_path)
     base_from_object = base_from_support @ files.plan.object.support_from_object.matrix()
@@ -191,6 +193,7 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
         base_from_support,
         _drift(by_kind.get("drift")),
         run.simulated and _direct_light_alone(files.cell.rig),
+        prior,
     )
 
 
@@ -222,6 +225,21 @@ def read_powers(path: Path, channels: Sequence[str]) -> Powers:
     shared = np.sqrt(np.maximum(whole**2 - own**2, 0.0))
     board_c = np.array([float(row["board_c"]) for row in rows])
     return Powers(np.array([int(row["id"]) for row in rows]), column("power"), board_c, own, shared)
+
+
+def refuse_different(measured_runs: Sequence[MeasuredRun]) -> None:
+    """Raises InputError for two runs of one name, and for runs of different objects or sensors."""
+    first = measured_runs[0]
+    names = [measured.run.folder.name for measured in measured_runs]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"{twice}: two runs have this name; rename the folder of one, or name each run once")
+    for other in measured_runs[1:]:
+        if not np.array_equal(first.corners_mm, other.corners_mm):
+            raise InputError(
+                f"{other.run.folder}: shows another object, or in another place, than {first.run.folder}"
+            )
+        if first.channels != other.channels:
+            raise InputError(f"{other.run.folder}: was taken with another sensor than {first.run.folder}")
 
 
 # -- helpers --------------------------------------------------------------------------------------------------
@@ -263,8 +281,8 @@ def _by_kind(paths: Sequence[Path]) -> dict[str, Path]:
 
 def _views(
     run: Run, frames: LightFrames, hand_eye: Path, rig: Rig, prior: CameraPrior
-) -> tuple[MeasuredView, ...]:
-    """Frames by view, with the camera's pose by the record."""
+) -> tuple[tuple[MeasuredView, ...], CameraPrior]:
+    """Frames by view, with the camera's pose by the record; and the record for these views."""
     lit: dict[str, list[LightFrame]] = {}
     for frame in frames.lit:
         if frame.led is not None:
@@ -281,10 +299,8 @@ def _views(
         calibrated = read_arm(hand_eye, arm.arm)
         base_from_flange, prior = calibrated_poses(base_from_flange, joints_deg, calibrated, prior)
     base_from_camera = base_from_flange @ prior.flange_from_camera
-    return tuple(
-        MeasuredView(name, pose, tuple(mine))
-        for (name, mine), pose in zip(lit.items(), base_from_camera, strict=True)
-    )
+    views = zip(lit.items(), base_from_camera, strict=True)
+    return tuple(MeasuredView(name, pose, tuple(mine)) for (name, mine), pose in views), prior
 
 
 def _only_pose(run: Run, view: str, frames: Sequence[LightFrame]) -> Floats:

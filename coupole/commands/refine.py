@@ -1,0 +1,63 @@
+"""The command `coupole reflectance refine`: poses, lens and mesh from what views disagree about."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coupole.commands.common import JsonOption, MeshOption, RecordsOption, fail, records_named
+from coupole.errors import CoupoleError
+
+
+def refine(
+    runs: Annotated[list[Path], typer.Argument(help="Runs of one object.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="Folder for what is found.", show_default=False)],
+    mesh: MeshOption = None,
+    calibrations: RecordsOption = None,
+    search_mm: Annotated[
+        float, typer.Option("--search-mm", min=0.1, max=20.0, help="The farthest that views may disagree.")
+    ] = 3.0,
+    arm_mm: Annotated[
+        float, typer.Option("--arm-mm", min=1e-4, help="Of the flange's position, from view to view.")
+    ] = 0.03,
+    arm_deg: Annotated[float, typer.Option("--arm-deg", min=1e-5, help="Of its orientation.")] = 0.003,
+    mesh_mm: Annotated[float, typer.Option("--mesh-mm", min=1e-4, help="Of the mesh's place in the cell.")] = 0.1,
+    mesh_deg: Annotated[float, typer.Option("--mesh-deg", min=1e-5, help="Of its orientation.")] = 0.02,
+    shape_mm: Annotated[
+        float, typer.Option("--shape-mm", min=1e-4, help="Of the mesh's surface along its normals.")
+    ] = 0.03,
+    scale_mm: Annotated[
+        float, typer.Option("--scale-mm", min=1.0, help="Over which the surface is off alike.")
+    ] = 20.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure how far apart views put the same spots of the surface, and refine poses, lens and mesh together
+    until they agree, within the uncertainties of records and scan.
+
+    `coupole reflectance RUN... --refined OUT` uses what was found.
+
+    The last options are standard uncertainties that no record states.
+    """
+    from coupole.reflectance.alignment.refine_job import RefineRequest, refine_runs
+    from coupole.reflectance.alignment.unknowns import Doubts
+    from coupole.viewing import refinement_page
+    from coupole.viewing.terminal import make_console, step_bars
+
+    doubts = Doubts(arm_mm, arm_deg, mesh_mm, mesh_deg, shape_mm, scale_mm)
+    request = RefineRequest(tuple(runs), mesh, records_named(calibrations or []), doubts, search_mm)
+    console = make_console(quiet=as_json)
+    try:
+        with step_bars(console) as say:
+            about = refine_runs(request, out, say)
+        page = refinement_page.write(out)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    for remark in refinement_page.remarks(about):
+        console.print(remark)
+    console.print(f"report {page}")
+    if as_json:
+        print(json.dumps({name: value for name, value in about.items() if name != "inputs"}))

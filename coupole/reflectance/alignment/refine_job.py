@@ -1,0 +1,192 @@
+"""`coupole reflectance refine`: from runs to a folder with refined poses, lens and mesh, and what was found."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.geometry import apply, inverse
+from coupole.plan.reading import read_plan
+from coupole.preflight.object_shape import MM_PER_UNIT
+from coupole.reflectance.alignment.matt_picture import Said, common_leds, matt_picture
+from coupole.reflectance.alignment.refined_geometry import ABOUT, REFINED, SCHEMA, write_refined
+from coupole.reflectance.alignment.refinement import Refined, refine
+from coupole.reflectance.alignment.unknowns import STATED, Doubts, Given, camera_covariance, welded
+from coupole.reflectance.alignment.view_matches import Matches
+from coupole.reflectance.extraction.measured_run import MeasuredRun, read_measured_run, refuse_different
+from coupole.reflectance.extraction.radiance import Radiometry
+from coupole.reflectance.result_folder import complete
+from coupole.storage.disk_errors import disk_error
+from coupole.storage.durable import make_folder, sha256, write_synced
+
+Floats = NDArray[np.float64]
+MESH = "mesh.ply"
+
+
+@dataclass(frozen=True)
+class RefineRequest:
+    """What its user wants."""
+
+    runs: tuple[Path, ...]
+    mesh: Path | None = None
+    calibrations: tuple[Path, ...] = ()
+    doubts: Doubts = STATED
+    search_mm: float = 3.0
+    """The farthest that views may disagree."""
+
+
+def refine_runs(request: RefineRequest, out: Path, say: Said) -> dict[str, Any]:
+    """Refine, and write the folder; what `refined.json` says.
+
+    Raises InputError: fewer than two views, records of different cameras, views without common LEDs or texture, a
+    folder that is not empty; StorageError if a frame is damaged or the disk takes nothing.
+    """
+    begun_s = time.monotonic()
+    if out.exists() and any(out.iterdir()):
+        raise InputError(f"{out} is not empty: name another folder with --out")
+    runs = [read_measured_run(run, request.mesh, request.calibrations) for run in request.runs]
+    refuse_different(runs)
+    _refuse_other_cameras(runs)
+    views = [(measured, view) for measured in runs for view in measured.views]
+    if len(views) < 2:
+        raise InputError(f"{request.runs[0]}: has one view; what views disagree about needs two or more")
+    leds = common_leds([view for _, view in views])
+    radiometry = {measured.run.folder: Radiometry(measured) for measured in runs}
+    pictures = [
+        matt_picture(measured, radiometry[measured.run.folder], view, leds, say) for measured, view in views
+    ]
+    given = given_by(runs, request.doubts)
+    threads = len(os.sched_getaffinity(0))
+    refined = refine(given, pictures, request.doubts, request.search_mm, threads, say)
+    names = [(measured.run.folder.name, view.name) for measured, view in views]
+    about = {**_about(refined, runs, names, leds, request), "seconds": round(time.monotonic() - begun_s, 3)}
+    try:
+        make_folder(out)
+        simulated = any(measured.run.simulated for measured in runs)
+        digest = sha256(runs[0].mesh_path)
+        complete(out / MESH, partial(_write_mesh, refined, runs[0]))
+        complete(
+            out / REFINED, lambda path: write_refined(path, refined, names, pictures, digest, simulated=simulated)
+        )
+        write_synced(out / ABOUT, json.dumps(about, indent=1) + "\n")
+    except OSError as error:
+        raise disk_error(out, error) from error
+    return about
+
+
+def given_by(runs: Sequence[MeasuredRun], doubts: Doubts) -> Given:
+    """Geometry of the runs of one camera and object, as records and scan have it."""
+    first, prior = runs[0], runs[0].camera
+    if prior.axis_sensitivity is not None:
+        each = [measured.camera.axis_sensitivity for measured in runs]
+        prior = replace(prior, axis_sensitivity=np.concatenate([one for one in each if one is not None]))
+    cameras = np.stack([view.base_from_camera for measured in runs for view in measured.views])
+    covariance = camera_covariance(prior, cameras, doubts)
+    vertices_mm = welded(first.corners_mm, first.triangles)
+    return Given(first.lens, prior.free, cameras, covariance, vertices_mm, first.triangles)
+
+
+def _refuse_other_cameras(measured_runs: Sequence[MeasuredRun]) -> None:
+    """Raises InputError for runs with different records of the camera."""
+    first = measured_runs[0]
+    for other in measured_runs[1:]:
+        if sha256(first.records["hand-eye"]) != sha256(other.records["hand-eye"]):
+            raise InputError(
+                f"{other.run.folder} and {first.run.folder} name different hand-eye records; one camera is "
+                "refined: name its record with --calibrations"
+            )
+
+
+def _write_mesh(refined: Refined, measured: MeasuredRun, path: Path) -> None:
+    """In the unit and frame of the mesh that was given."""
+    plan = read_plan(measured.run.plan_path, measured.run.rig_path).plan
+    assert plan.object is not None  # read_measured_run refuses runs without
+    base_from_object = measured.base_from_support @ plan.object.support_from_object.matrix()
+    vertices_mm = apply(inverse(base_from_object), refined.unknowns.vertices_at(refined.steps))
+    vertices = vertices_mm / MM_PER_UNIT[plan.object.mesh_unit]
+    mesh = trimesh.Trimesh(vertices, measured.triangles, process=False)
+    path.write_bytes(trimesh.exchange.ply.export_ply(mesh))
+
+
+def _about(
+    refined: Refined,
+    runs: Sequence[MeasuredRun],
+    names: Sequence[tuple[str, str]],
+    leds: Sequence[int],
+    request: RefineRequest,
+) -> dict[str, Any]:
+    unknowns, u = refined.unknowns, refined.uncertainties
+    stated = np.sqrt(np.diag(unknowns.covariance))
+    edge_mm = _mean_edge_mm(unknowns.given)
+    shape = refined.steps[unknowns.shape]
+    cameras = []
+    for number, name in enumerate(names):
+        mine = unknowns.camera(number)
+        moved = {"moved": refined.steps[mine], "u": u[mine], "stated_u": stated[mine]}
+        cameras.append({"run": name[0], "view": name[1]} | {key: _mm_deg(six) for key, six in moved.items()})
+    return {
+        "schema": SCHEMA,
+        "software": {name: version(name) for name in ("coupole", "numpy", "numba", "scipy")},
+        "simulated": any(measured.run.simulated for measured in runs),
+        "inputs": {m.run.folder.name: dict(m.frames.inputs) for m in runs},
+        "mesh_sha256": sha256(runs[0].mesh_path),
+        "leds": list(leds),
+        "search_mm": request.search_mm,
+        "disagreement": {
+            "before": _disagreement(refined.before, edge_mm),
+            "after": _disagreement(refined.after, edge_mm),
+        },
+        "lens": {
+            name: {"moved": float(refined.steps[i]), "u": float(u[i]), "stated_u": float(stated[i])}
+            for i, name in enumerate(unknowns.names[unknowns.lens])
+        },
+        "cameras": cameras,
+        "mesh": {
+            "moved": _mm_deg(refined.steps[unknowns.mesh]),
+            "u": _mm_deg(u[unknowns.mesh]),
+            "stated_u": _mm_deg(stated[unknowns.mesh]),
+            "shape_rms_mm": float(np.sqrt(np.mean(shape**2))),
+            "shape_median_u_mm": float(np.median(u[unknowns.shape])),
+            "shape_stated_u_mm": request.doubts.shape_mm,
+            "scale_mm": request.doubts.scale_mm,
+        },
+        "noise_factor": refined.noise_factor,
+        "rejected": refined.rejected,
+        "unknowns": unknowns.count,
+        "determined": refined.determined,
+        "chi2_of_steps": refined.chi2_of_steps,
+    }
+
+
+def _disagreement(matches: Matches, edge_mm: float) -> dict[str, float | int]:
+    apart_mm = matches.apart_mm
+    apart_px = 2 * np.linalg.norm(matches.found - matches.computed, axis=1)
+    return {
+        "matches": len(apart_mm),
+        "median_mm": float(np.median(apart_mm)),
+        "percentile_95_mm": float(np.percentile(apart_mm, 95)),
+        "median_px": float(np.median(apart_px)),
+        "median_edges": float(np.median(apart_mm)) / edge_mm,
+    }
+
+
+def _mean_edge_mm(given: Given) -> float:
+    corners = given.vertices_mm[given.triangles]
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
+
+
+def _mm_deg(six: Floats) -> list[float]:
+    """Steps or uncertainties in mm and degrees."""
+    return [*map(float, six[:3]), *map(float, np.degrees(six[3:]))]

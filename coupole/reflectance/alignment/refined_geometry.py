@@ -1,0 +1,147 @@
+"""The file of a refinement, `refined.h5`, and a run with its geometry."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.optics import NAMES, Intrinsics
+from coupole.errors import InputError
+from coupole.reflectance.alignment.refinement import Refined
+from coupole.reflectance.extraction.measured_run import MeasuredRun
+from coupole.storage.durable import sha256
+
+Floats = NDArray[np.float64]
+REFINED, ABOUT = "refined.h5", "refined.json"
+SCHEMA = "coupole-refinement/1"
+PREVIEW_PX = 640
+"""Largest width of a view's picture in the file."""
+TOLD = {
+    "lens": "fx, fy, cx, cy (px), k1, k2, p1, p2, k3",
+    "views": "run and view",
+    "base_from_camera": "[views, 4, 4] mm",
+    "vertices_mm": "[n, 3] of the mesh, in its order, base frame",
+    "vertex_u_mm": "[n] standard uncertainty along the normal",
+    "names": "of the unknowns, with units; cameras by their places in `views`",
+    "steps": "of the unknowns from what records and scan say",
+    "covariance": "of the steps",
+    "stated_covariance": "of the unknowns before the pictures counted, by records and scan",
+    "controls_mm": "[controls, 3] where `shape` is, base frame",
+}
+MATCH_FIELDS = {
+    "reference": "place in `views` of the one that sees the spot in the greatest detail",
+    "other": "of the one that is compared with it",
+    "blocks": "[n, 2] column and row of blocks of 2 x 2 pixels in the reference",
+    "points_mm": "where the reference puts the spot, base frame",
+    "shifts_mm": "from there to where the other puts it",
+}
+
+
+@dataclass(frozen=True)
+class RefinedGeometry:
+    """Poses, lens and mesh of a refinement."""
+
+    path: Path
+    lens: Intrinsics
+    base_from_camera: dict[tuple[str, str], Floats]
+    """By run and view."""
+    vertices_mm: Floats
+    mesh_sha256: str
+
+    def of(self, measured: MeasuredRun) -> MeasuredRun:
+        """A run with them. Raises InputError for a run, view or mesh that was not refined."""
+        if sha256(measured.mesh_path) != self.mesh_sha256:
+            raise InputError(
+                f"{self.path}: another mesh than {measured.mesh_path} was refined; name that with --mesh"
+            )
+        run = measured.run.folder.name
+        if absent := [view.name for view in measured.views if (run, view.name) not in self.base_from_camera]:
+            raise InputError(
+                f"{self.path}: holds no pose of the view {absent[0]} of {run}; `coupole reflectance refine` "
+                "with all runs that you name makes them"
+            )
+        views = tuple(
+            replace(view, base_from_camera=self.base_from_camera[run, view.name]) for view in measured.views
+        )
+        corners_mm = self.vertices_mm[measured.triangles]
+        return replace(measured, lens=self.lens, views=views, corners_mm=corners_mm)
+
+
+def read_refined(folder: Path) -> RefinedGeometry:
+    """Of a folder of `coupole reflectance refine`. Raises InputError if it holds none."""
+    path = folder / REFINED
+    if not path.exists():
+        raise InputError(f"{path}: is not there; `coupole reflectance refine RUN... --out {folder}` makes it")
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("schema") != SCHEMA:
+                raise InputError(f"{path}: expected {SCHEMA}; refine anew with this version")
+            views = [tuple(name) for name in file["views"].asstr()[()]]
+            lens = Intrinsics(**dict(zip(NAMES, map(float, file["lens"][()]), strict=True)))
+            poses = dict(zip(views, file["base_from_camera"][()], strict=True))
+            return RefinedGeometry(path, lens, poses, file["vertices_mm"][()], str(file.attrs["mesh_sha256"]))
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: expected the result of `coupole reflectance refine`: {error}") from error
+
+
+def what_was_refined(folder: Path) -> dict[str, Any]:
+    """What a result says of the refinement it was made with. Raises InputError if there is none."""
+    path = folder / ABOUT
+    try:
+        disagreement = json.loads(path.read_text(encoding="utf-8"))["disagreement"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: expected the result of `coupole reflectance refine`") from error
+    return {"sha256": sha256(folder / REFINED), "disagreement": disagreement}
+
+
+def write_refined(
+    path: Path,
+    refined: Refined,
+    views: Sequence[tuple[str, str]],
+    pictures: Sequence[NDArray[np.float32]],
+    mesh_sha256: str,
+    simulated: bool,
+) -> None:
+    """`views` are names of run and view."""
+    unknowns, steps = refined.unknowns, refined.steps
+    values = {
+        "lens": unknowns.lens_at(steps).vector(),
+        "base_from_camera": unknowns.cameras_at(steps),
+        "vertices_mm": unknowns.vertices_at(steps),
+        "vertex_u_mm": refined.vertex_u_mm(),
+        "steps": steps,
+        "covariance": refined.covariance,
+        "stated_covariance": unknowns.covariance,
+        "controls_mm": unknowns.controls_mm,
+    }
+    with h5py.File(path, "w") as file:
+        file.attrs.update(schema=SCHEMA, mesh_sha256=mesh_sha256, simulated=simulated)
+        for name, data in values.items():
+            file.create_dataset(name, data=data, track_times=False).attrs["told"] = TOLD[name]
+        text = h5py.string_dtype()
+        file.create_dataset("views", data=np.array(views, object), dtype=text, track_times=False)
+        file.create_dataset("names", data=np.array(unknowns.names, object), dtype=text, track_times=False)
+        for name in ("views", "names"):
+            file[name].attrs["told"] = TOLD[name]
+        for when, matches in (("before", refined.before), ("after", refined.after)):
+            for name, told in MATCH_FIELDS.items():
+                data = file.create_dataset(f"{when}/{name}", data=getattr(matches, name), track_times=False)
+                data.attrs["told"] = told
+        for number, picture in enumerate(pictures):
+            data = file.create_dataset(f"pictures/{number}", data=_preview(picture), track_times=False)
+            data.attrs["blocks"] = picture.shape
+            data.attrs["told"] = "what the view was compared by, scaled down; its height and width were `blocks`"
+
+
+def _preview(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
+    every = -(-picture.shape[1] // PREVIEW_PX)
+    small = picture[::every, ::every]
+    shown: NDArray[np.uint8] = (255 * np.clip(small / np.percentile(small, 99.5), 0, 1) ** 0.5).astype(np.uint8)
+    return shown

@@ -1,0 +1,235 @@
+"""Poses, lens and mesh from what views disagree about, held by what records and scan state.
+
+A match says at which block of a second view the spot appears that a first view shows at one of its blocks. By the
+geometry it appears where the first view's ray meets the surface. When the first camera takes a step a and the
+surface moves by s along its normal n, that place moves by dP, with J dP = -(d block / d a) a and n dP = s, where
+J = d block / d place of the first camera. Matches have variances of their own, and one factor on all of them that
+the adjustment estimates; gross errors are rejected (`calibration.adjustment`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from coupole.calibration import optics
+from coupole.calibration.adjustment import Adjusted, Block, Group, adjust
+from coupole.calibration.rotations import skew
+from coupole.errors import InputError
+from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.alignment.unknowns import Doubts, Given, Unknowns, control_points
+from coupole.reflectance.alignment.view_matches import Matches, match_views
+from coupole.reflectance.alignment.view_surface import ViewSurface, view_surface
+
+Floats = NDArray[np.float64]
+Said = Callable[[str, int, int], None]
+
+ROUNDS = 4
+SETTLED_MM = 0.005
+"""Change of the median disagreement from round to round below which matches are not made anew."""
+SEARCH_SHRINKS = 3.0
+LEAST_SEARCH_MM = 0.3
+FEWEST_MATCHES = 30
+MATCHES, STATED = "matches", "records and scan"
+_GROUPS = (Group(MATCHES, estimated=True, rejects=2), Group(STATED, estimated=False))
+_TOGETHER = 1 << 16
+"""Vertices."""
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Geometry that the pictures agree with, its covariance, and the matches before and after."""
+
+    unknowns: Unknowns
+    steps: Floats
+    """[count] from what records and scan say."""
+    covariance: Floats
+    """[count, count]"""
+    before: Matches
+    after: Matches
+    noise_factor: float
+    """Of the matches, over what noise and texture alone would leave."""
+    rejected: int
+    """Matches that did not count, in the last adjustment."""
+
+    @cached_property
+    def uncertainties(self) -> Floats:
+        """[count] standard uncertainties."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def chi2_of_steps(self) -> float:
+        """Square of the steps over the records' covariance: near `determined` if records and scan state their
+        uncertainties well."""
+        return float(self.steps @ np.linalg.solve(self.unknowns.covariance, self.steps))
+
+    def vertex_u_mm(self, chosen: NDArray[np.int64] | slice = slice(None)) -> Floats:
+        """[n] standard uncertainty of vertices along their normals."""
+        unknowns, surface = self.unknowns, slice(self.unknowns.mesh.start, self.unknowns.count)
+        vertices = unknowns.given.vertices_mm[chosen]
+        normals, covariance = unknowns.normals[chosen], self.covariance[surface, surface]
+        found = np.empty(len(vertices))
+        for first in range(0, len(vertices), _TOGETHER):
+            rows = slice(first, first + _TOGETHER)
+            by = unknowns.by_surface(vertices[rows], normals[rows])
+            found[rows] = np.sqrt(np.sum((by @ covariance) * by, axis=1))
+        return found
+
+    @property
+    def determined(self) -> float:
+        """How many of the unknowns the pictures determine, each by the share of its information that they gave."""
+        return self.unknowns.count - float(np.trace(np.linalg.solve(self.unknowns.covariance, self.covariance)))
+
+
+def refine(
+    given: Given,
+    pictures: list[NDArray[np.float32]],
+    doubts: Doubts,
+    search_mm: float,
+    threads: int,
+    say: Said,
+) -> Refined:
+    """Match the views, adjust, and match anew with what was found, until disagreement no longer falls.
+
+    Raises InputError if the views have too little in common.
+    """
+    unknowns = Unknowns(given, doubts, np.empty((0, 3)))
+    steps = np.zeros(unknowns.count)
+    matches = before = _matched(unknowns, steps, pictures, search_mm, threads, say)
+    unknowns = Unknowns(given, doubts, control_points(given.vertices_mm, doubts.scale_mm))
+    steps = np.zeros(unknowns.count)
+    for number in range(ROUNDS):
+        adjusted = _adjusted(unknowns, steps, matches)
+        say("rounds of refinement", number + 1, ROUNDS)
+        settled = float(np.median(matches.apart_mm))
+        search_mm = max(search_mm / SEARCH_SHRINKS, LEAST_SEARCH_MM)
+        steps = adjusted.state
+        matches = _matched(unknowns, steps, pictures, search_mm, threads, say)
+        if number and settled - float(np.median(matches.apart_mm)) < SETTLED_MM:
+            break
+    say("rounds of refinement", ROUNDS, ROUNDS)
+    component = adjusted.components[0]
+    return Refined(unknowns, steps, adjusted.covariance, before, matches, component.factor, component.rejected)
+
+
+def surfaces_of(
+    unknowns: Unknowns, steps: Floats, pictures: list[NDArray[np.float32]], threads: int
+) -> list[ViewSurface]:
+    """What all views show of the mesh, by the geometry after some steps."""
+    corners = unknowns.vertices_at(steps)[unknowns.given.triangles]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+    mesh, lens = PacketMesh(corners), unknowns.lens_at(steps)
+    cameras = unknowns.cameras_at(steps)
+    return [
+        view_surface(picture, mesh, normals, lens, camera, threads)
+        for picture, camera in zip(pictures, cameras, strict=True)
+    ]
+
+
+def _matched(
+    unknowns: Unknowns,
+    steps: Floats,
+    pictures: list[NDArray[np.float32]],
+    search_mm: float,
+    threads: int,
+    say: Said,
+) -> Matches:
+    found = match_views(surfaces_of(unknowns, steps, pictures, threads), search_mm, threads, say)
+    if len(found.blocks) < FEWEST_MATCHES:
+        raise InputError(
+            f"views are matched by what they show of the surface: expected {FEWEST_MATCHES} matches or more, "
+            f"found {len(found.blocks)}. Do views overlap, has the object texture, and is --search-mm as far as "
+            "they disagree?"
+        )
+    return found
+
+
+def _adjusted(unknowns: Unknowns, steps: Floats, matches: Matches) -> Adjusted[Floats]:
+    """All steps from what the records say, by matches that were made after `steps`."""
+    lines = match_lines(unknowns, steps, matches)
+    lower = np.linalg.cholesky(unknowns.covariance)
+    inverse = solve_triangular(lower, np.eye(unknowns.count), lower=True)
+    everything = np.arange(unknowns.count)
+
+    def evaluate(state: Floats) -> list[Block]:
+        moved = [
+            replace(one, residuals=one.residuals - one.jacobian @ (state - steps)[one.columns]) for one in lines
+        ]
+        return [*moved, Block(-inverse @ state, inverse, everything, 1)]
+
+    return adjust(
+        steps,
+        evaluate,
+        lambda state, change: state + change,
+        _GROUPS,
+        unknowns.count,
+        what="the refinement of views",
+    )
+
+
+def match_lines(unknowns: Unknowns, steps: Floats, matches: Matches) -> list[Block]:
+    """Residuals and derivatives of the matches of each pair of views, whitened by their covariances."""
+    views = range(len(unknowns.given.base_from_camera))
+    lens, cameras = unknowns.lens_at(steps), unknowns.cameras_at(steps)
+    surface = np.arange(unknowns.mesh.start, unknowns.count)
+    blocks = []
+    for a, b in product(views, repeat=2):
+        mine = matches.some((matches.reference == a) & (matches.other == b))
+        if not len(mine.blocks):
+            continue
+        first = _seen(cameras[a], lens, unknowns, mine.points_mm)
+        second = _seen(cameras[b], lens, unknowns, mine.points_mm)
+        # [n, 3, 3]: rows of the first view's derivatives by the place, and the normal
+        across = np.linalg.inv(np.concatenate([first.by_place, mine.normals[:, None]], axis=1))
+        along = across[:, :, 2:] @ unknowns.by_surface(mine.points_mm, mine.normals)[:, None]
+        by_place = second.by_place
+        carried = -by_place @ across[:, :, :2]
+        derivatives = np.concatenate(
+            [
+                second.by_lens + carried @ first.by_lens,
+                carried @ first.by_camera,
+                second.by_camera,
+                by_place @ along,
+            ],
+            axis=2,
+        )
+        columns = np.concatenate(
+            [np.r_[unknowns.lens], np.r_[unknowns.camera(a)], np.r_[unknowns.camera(b)], surface]
+        )
+        whitening = np.linalg.inv(np.linalg.cholesky(mine.covariance))
+        residuals = whitening @ (mine.found - mine.computed)[..., None]
+        blocks.append(
+            Block(residuals.reshape(-1), (whitening @ derivatives).reshape(-1, len(columns)), columns, 0)
+        )
+    return blocks
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Derivatives of the block at which a view sees places."""
+
+    by_place: Floats
+    """[n, 2, 3] per mm, base frame."""
+    by_lens: Floats
+    """[n, 2, free]"""
+    by_camera: Floats
+    """[n, 2, 6]"""
+
+
+def _seen(camera: Floats, lens: optics.Intrinsics, unknowns: Unknowns, points_mm: Floats) -> _Seen:
+    """`lens` is of pixels; a block is two of them."""
+    turn, place = camera[:3, :3], camera[:3, 3]
+    inside = (points_mm - place) @ turn
+    seen = optics.project(inside, lens.vector())
+    by_point = seen.by_point / 2
+    by_place = by_point @ turn.T
+    free = [optics.NAMES.index(name) for name in unknowns.given.free]
+    by_camera = np.concatenate([-by_place, by_point @ skew(inside)], axis=2)
+    return _Seen(by_place, seen.by_intrinsics[:, :, free] / 2, by_camera)

@@ -1,0 +1,214 @@
+"""What is refined: one vector of steps from what the records say, with its covariance before the pictures count.
+
+In this order: the lens's estimated parameters; six steps for each view's camera (mm along the base's axes, rad
+about the camera's, as `rotations.moved`); six of the whole mesh (mm along the base's axes, rad about axes through
+its middle); and the displacement of the surface along its normals at control points, mm.
+
+Hand-eye and axis zeros move all cameras together: their covariance is in that of the cameras' steps, beside the
+arm's own scatter in each view. The displacement is a Gaussian process over space: control points are correlated
+by exp(-r^2 / 2 scale^2), and between them it is what they predict (Rasmussen and Williams 2006, Eq. 2.25).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, cho_factor, cho_solve
+
+from coupole.calibration.optics import NAMES, Intrinsics
+from coupole.calibration.posed_camera import CameraPrior
+from coupole.calibration.rotations import moved, rotation, skew
+
+Floats = NDArray[np.float64]
+MOST_CONTROLS = 600
+_TOGETHER = 1 << 16
+"""Vertices."""
+_NUGGET = 1e-6
+"""Of a control point's variance, that it shares with no other: keeps the covariance's inverse exact."""
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """Standard uncertainties that no record states."""
+
+    arm_mm: float = 0.03
+    """Of the flange's position in each view, in each direction."""
+    arm_deg: float = 0.003
+    mesh_mm: float = 0.1
+    """Of the mesh's place in the base frame, in each direction."""
+    mesh_deg: float = 0.02
+    shape_mm: float = 0.03
+    """Of the surface along its normals, alike over `scale_mm`."""
+    scale_mm: float = 20.0
+
+
+STATED = Doubts()
+"""Unless a user states others."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """Geometry as records and scan have it."""
+
+    lens: Intrinsics
+    free: tuple[str, ...]
+    base_from_camera: Floats
+    """[views, 4, 4] mm."""
+    camera_covariance: Floats
+    """[free + 6 views, free + 6 views] of the lens and the cameras' steps."""
+    vertices_mm: Floats
+    """[n, 3] base frame."""
+    triangles: NDArray[np.uint32]
+
+
+def camera_covariance(prior: CameraPrior, base_from_camera: Floats, doubts: Doubts) -> Floats:
+    """[free + 6 views, free + 6 views] of lens and cameras' steps: hand-eye, axis zeros, the arm's scatter."""
+    lens, count = len(prior.free), len(base_from_camera)
+    flange_from_camera = prior.flange_from_camera
+    base_from_flange = base_from_camera @ np.linalg.inv(flange_from_camera)
+    by_flange = np.zeros((count, 6, 6))
+    by_flange[:, :3, :3] = np.eye(3)
+    by_flange[:, :3, 3:] = -base_from_flange[:, :3, :3] @ skew(flange_from_camera[:3, 3])
+    by_flange[:, 3:, 3:] = flange_from_camera[:3, :3].T
+    by_hand_eye = np.zeros((count, 6, 6))
+    by_hand_eye[:, :3, :3] = base_from_flange[:, :3, :3]
+    by_hand_eye[:, 3:, 3:] = np.eye(3)
+    by_record = np.concatenate([by_hand_eye, by_flange @ prior.by_axes(base_from_flange)], axis=2)
+    spread = block_diag(np.eye(lens), by_record.reshape(6 * count, -1))
+    own = np.diag(np.repeat([doubts.arm_mm**2, np.radians(doubts.arm_deg) ** 2], 3))
+    scatter = block_diag(np.zeros((lens, lens)), *(by_flange @ own @ np.swapaxes(by_flange, 1, 2)))
+    result: Floats = spread @ prior.covariance @ spread.T + scatter
+    return result
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """The vector of steps: its parts, its covariance before the pictures, and the geometry that it gives."""
+
+    given: Given
+    doubts: Doubts
+    controls_mm: Floats
+    """[controls, 3]"""
+
+    @property
+    def lens(self) -> slice:
+        return slice(0, len(self.given.free))
+
+    def camera(self, view: int) -> slice:
+        first = self.lens.stop + 6 * view
+        return slice(first, first + 6)
+
+    @property
+    def mesh(self) -> slice:
+        first = self.lens.stop + 6 * len(self.given.base_from_camera)
+        return slice(first, first + 6)
+
+    @property
+    def shape(self) -> slice:
+        return slice(self.mesh.stop, self.mesh.stop + len(self.controls_mm))
+
+    @property
+    def count(self) -> int:
+        return int(self.shape.stop)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """With units, in the vector's order."""
+        steps = ("x_mm", "y_mm", "z_mm", "rx_rad", "ry_rad", "rz_rad")
+        views = range(len(self.given.base_from_camera))
+        return (
+            *(name + "_px" * (name in NAMES[:4]) for name in self.given.free),
+            *(f"camera{view}.{step}" for view in views for step in steps),
+            *(f"mesh.{step}" for step in steps),
+            *(f"shape{control}_mm" for control in range(len(self.controls_mm))),
+        )
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """[count, count] by records and doubts."""
+        doubts = self.doubts
+        mesh = np.diag(np.repeat([doubts.mesh_mm**2, np.radians(doubts.mesh_deg) ** 2], 3))
+        return np.asarray(block_diag(self.given.camera_covariance, mesh, self._shape_covariance))
+
+    @cached_property
+    def middle_mm(self) -> Floats:
+        """[3] about which the mesh turns."""
+        return np.asarray(self.given.vertices_mm.mean(axis=0))
+
+    def lens_at(self, steps: Floats) -> Intrinsics:
+        values = {name: getattr(self.given.lens, name) for name in self.given.free}
+        return replace(self.given.lens, **{n: values[n] + float(steps[i]) for i, n in enumerate(values)})
+
+    def cameras_at(self, steps: Floats) -> Floats:
+        """[views, 4, 4] base_from_camera."""
+        return moved(self.given.base_from_camera, steps[self.lens.stop : self.mesh.start].reshape(-1, 6))
+
+    def vertices_at(self, steps: Floats) -> Floats:
+        """[n, 3] base frame."""
+        given, mesh = self.given, steps[self.mesh]
+        along = cho_solve(cho_factor(self._shape_covariance), steps[self.shape])
+        shaped = given.vertices_mm.copy()
+        for first in range(0, len(shaped), _TOGETHER):
+            rows = slice(first, first + _TOGETHER)
+            displaced_mm = self._kernel(given.vertices_mm[rows], self.controls_mm) @ along
+            shaped[rows] += displaced_mm[:, None] * self.normals[rows]
+        turned: Floats = (shaped - self.middle_mm) @ rotation(mesh[3:]).T + self.middle_mm + mesh[:3]
+        return turned
+
+    def by_surface(self, points_mm: Floats, normals: Floats) -> Floats:
+        """[n, 6 + controls] how far the surface moves along its normal at places, by steps of mesh and shape."""
+        arms = np.cross(points_mm - self.middle_mm, normals)
+        return np.concatenate([normals, arms, self.weights(points_mm)], axis=1)
+
+    def weights(self, points_mm: Floats) -> Floats:
+        """[n, controls] of the control points' displacements in that of a place."""
+        near = self._kernel(points_mm, self.controls_mm)
+        found: Floats = cho_solve(cho_factor(self._shape_covariance), near.T).T
+        return found
+
+    @cached_property
+    def normals(self) -> Floats:
+        """[n, 3] of the given vertices, by the areas of their triangles."""
+        return vertex_normals(self.given.vertices_mm, self.given.triangles)
+
+    @cached_property
+    def _shape_covariance(self) -> Floats:
+        each = self.doubts.shape_mm**2
+        return self._kernel(self.controls_mm, self.controls_mm) + _NUGGET * each * np.eye(len(self.controls_mm))
+
+    def _kernel(self, one_mm: Floats, other_mm: Floats) -> Floats:
+        square = np.sum(one_mm**2, axis=1)[:, None] + np.sum(other_mm**2, axis=1) - 2 * one_mm @ other_mm.T
+        found: Floats = self.doubts.shape_mm**2 * np.exp(-np.maximum(square, 0.0) / (2 * self.doubts.scale_mm**2))
+        return found
+
+
+def vertex_normals(vertices_mm: Floats, triangles: NDArray[np.uint32]) -> Floats:
+    """[n, 3] unit; means of the triangles', weighted by their areas."""
+    corners = vertices_mm[triangles]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    each = np.repeat(across, 3, axis=0)
+    count, corner = len(vertices_mm), triangles.reshape(-1)
+    total = np.stack([np.bincount(corner, each[:, k], count) for k in range(3)], axis=1)
+    result: Floats = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+    return result
+
+
+def control_points(points_mm: Floats, spacing_mm: float) -> Floats:
+    """Some of points [n, 3], each the farthest from those before it, until all others are within `spacing_mm` of
+    one, or there are `MOST_CONTROLS`."""
+    chosen = [int(np.argmin(np.sum((points_mm - points_mm.mean(axis=0)) ** 2, axis=1)))]
+    far = np.linalg.norm(points_mm - points_mm[chosen[0]], axis=1)
+    while far.max() > spacing_mm and len(chosen) < MOST_CONTROLS:
+        chosen.append(int(far.argmax()))
+        far = np.minimum(far, np.linalg.norm(points_mm - points_mm[chosen[-1]], axis=1))
+    return points_mm[chosen]
+
+
+def welded(corners_mm: Floats, triangles: NDArray[np.uint32]) -> Floats:
+    """[n, 3] vertices of triangles whose corners [m, 3, 3] are known."""
+    vertices = np.zeros((int(triangles.max()) + 1, 3))
+    vertices[triangles] = corners_mm
+    return vertices

@@ -1,0 +1,78 @@
+"""The file of materials that many triangles share, `fits/clusters.h5`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.reflectance.triangle_fit import TriangleMaterials
+
+CLUSTERS = "fits/clusters.h5"
+_TOLD = {
+    "cluster": "of the triangles of the fits; -1 for none",
+    "borrowed": "whether a triangle has its cluster's material for want of samples",
+    "kd": "of the clusters, 1/sr, by channel",
+    "ks": "of the clusters, by channel; f = kd + ks D V",
+    "alpha": "of the clusters, GGX's roughness",
+    "residual": "of the clusters: weighted rms of the square roots that are left, as a share of sqrt(kd)",
+    "harmonics": "[clusters, functions, channels] of pairs of directions, 1/sr",
+    "members": "triangles that a cluster was found by",
+}
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """Materials that many triangles share."""
+
+    OF_CLUSTERS: ClassVar = ("kd", "ks", "alpha", "residual")
+    cluster: NDArray[np.int32]
+    """[n] of all triangles of the fits; -1 for none."""
+    borrowed: NDArray[np.bool_]
+    """[n]"""
+    kd: NDArray[np.float64]
+    """[clusters, channels]"""
+    ks: NDArray[np.float64]
+    alpha: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    harmonics: NDArray[np.float32]
+    """[clusters, functions, channels] of `pair_harmonics`, 1/sr."""
+
+    def at(
+        self, own: TriangleMaterials, mesh_normals: NDArray[np.float64], block: slice | NDArray[np.int64]
+    ) -> TriangleMaterials:
+        """Of triangles by their places in `RunResult.triangles`, with the normals of their `own` materials, or
+        the mesh's where they borrow."""
+        number, borrowed = self.cluster[block], self.borrowed[block, None]
+        kd, ks, alpha, residual = (getattr(self, name)[number] for name in self.OF_CLUSTERS)
+        alpha[number < 0] = np.nan
+        normals = np.where(borrowed, mesh_normals, own.normals)
+        return TriangleMaterials(normals, kd, ks, alpha, residual)
+
+
+def read_clusters(folder: Path) -> Clusters:
+    """Of a result of runs. Raises InputError if there are none."""
+    path = folder / CLUSTERS
+    if not path.exists():
+        raise InputError(f"{path}: is not there; `coupole reflectance cluster {folder}` makes it")
+    with h5py.File(path, "r") as file:
+        if "harmonics" not in file:
+            raise InputError(
+                f"{path}: was made by an earlier version; `coupole reflectance cluster {folder}` anew"
+            )
+        kd, ks, alpha, residual = (file[name][()].astype(np.float64) for name in Clusters.OF_CLUSTERS)
+        return Clusters(file["cluster"][()], file["borrowed"][()], kd, ks, alpha, residual, file["harmonics"][()])
+
+
+def write_clusters(path: Path, clusters: Clusters, members: NDArray[np.int64]) -> None:
+    """`members` [clusters] is how many triangles a cluster was found by."""
+    with h5py.File(path, "w") as file:
+        for name, told in _TOLD.items():
+            values = members if name == "members" else getattr(clusters, name)
+            kept = values.astype(np.float32) if name in Clusters.OF_CLUSTERS else values
+            file.create_dataset(name, data=kept, track_times=False).attrs["told"] = told

@@ -133,7 +133,8 @@ def _draw_leds(folder: Path, random: np.random.Generator, scale: Scale) -> None:
     own = random.standard_normal((count, 3)) * np.sqrt(1.0 - shared)[:, None]
     centres = truth.positions_mm + np.einsum("nij,nj->ni", roots, own + np.sqrt(shared)[:, None] * for_all)
     boards, board = np.unique(truth.ids // 6, return_inverse=True)
-    turns = np.einsum("nij,nj->ni", np.linalg.cholesky(of_normals), random.standard_normal((len(boards), 2))[board])
+    of_boards = random.standard_normal((len(boards), 2))[board]
+    turns = np.einsum("nij,nj->ni", np.linalg.cholesky(of_normals), of_boards)
     about = np.einsum("nik,nk->ni", axes, turns)
     normals = Rotation.from_rotvec(about, degrees=True).apply(truth.normals)
     lines = [line for line in (SHIPPED / "leds.csv").read_text().splitlines() if line]

@@ -1,8 +1,8 @@
-"""Cells of the closed loop of reflectance: rendered runs, scans and records with errors drawn anew, and how the result
-compares with the simulator's truth.
+"""Cells of the closed loop of reflectance: rendered runs, scans and records with errors drawn anew, and how the
+result compares with the simulator's truth.
 
-Frames are rendered by `sim`, acquired and proven as in the real cell, and evaluated by `coupole.reflectance`. The truth
-is the simulator's own table of the material at the true triangles, LEDs and camera.
+Frames are rendered by `sim`, acquired and proven as in the real cell, and evaluated by `coupole.reflectance`. The
+truth is the simulator's own table of the material at the true triangles, LEDs and camera.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import cells  # noqa: E402
+
 from coupole.geometry import apply  # noqa: E402
 from coupole.reflectance.extraction.lamp_sight import lit_on  # noqa: E402
 from coupole.reflectance.ggx import tangents  # noqa: E402

@@ -45,6 +45,11 @@ PROOFS = (
     Proof("mutants", "95 % of single mistakes in critical code are noticed", "tools/mutants.py"),
     Proof("cells", "intervals of 100 random cells hold", "tools/prove_calibrations.py --cells 100"),
     Proof("cells-absolute", "the same with the arm's absolute errors", "tools/prove_calibrations.py --absolute"),
+    Proof(
+        "reflectance",
+        "45 cells of materials that the fit does not know: intervals, normals, fits, new views",
+        "tools/prove_reflectance.py",
+    ),
     Proof("paths", "500 random plans touch nothing, by python-fcl", "tools/replay_plans.py --plans 500 --seed 1"),
     Proof("conformance", "every driver against its contract", f"{_PYTEST} tests/conformance"),
     Proof(

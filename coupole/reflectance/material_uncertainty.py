@@ -23,6 +23,7 @@ from coupole.reflectance.ggx import UNKNOWNS, lobe, root_by_unknowns, tangents
 from coupole.reflectance.normal_fit import CAUCHY, SPREAD_KS, colour_weight
 from coupole.reflectance.triangle_fit import (
     HELD,
+    LEAST_KD,
     USUAL,
     TriangleMaterials,
     TriangleSamples,
@@ -40,7 +41,6 @@ _FEWEST_GROUPS = 6
 """Of LEDs, of each view."""
 _LEAST_KS = 1e-3
 """Of kd: below it the logarithm's covariance would say nothing of the highlight that may be there."""
-_LEAST_KD = 1e-6
 _LEAST_KNOWN = 1e-2
 """1 over the variance of the logarithm of a kd of which the samples say nothing."""
 _PART = 256
@@ -91,7 +91,7 @@ def covariances(
     order = np.flatnonzero(used)
     order = order[np.argsort(group[order], kind="stable")]
     grey = np.stack([materials.kd.mean(axis=1), materials.ks.mean(axis=1), materials.alpha], axis=1)
-    grey[:, 0] = np.maximum(grey[:, 0], _LEAST_KD)
+    grey[:, 0] = np.maximum(grey[:, 0], LEAST_KD)
     grey[:, 1] = np.maximum(grey[:, 1], _LEAST_KS * grey[:, 0])
     found = np.full((len(prior), UNKNOWNS, UNKNOWNS), np.nan)
     u_kd, u_ks = np.full(materials.kd.shape, np.nan), np.full(materials.kd.shape, np.nan)

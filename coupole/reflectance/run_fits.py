@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from uuid import uuid4
@@ -15,13 +15,23 @@ from numpy.typing import NDArray
 
 from coupole.reflectance.block_work import Said, Workshop, silent, workshop
 from coupole.reflectance.material_uncertainty import MaterialUncertainty, covariances
+from coupole.reflectance.model_bias import unbiased_normals
 from coupole.reflectance.result_folder import SETTINGS, clear_remains, complete, in_the_making, read_settings
 from coupole.reflectance.run_result import MATERIALS, SLICES, RunResult, ViewSamples
 from coupole.reflectance.run_result_files import begin_slices, write_materials
 from coupole.reflectance.slice_fit import fit_slices, slice_values
-from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, fit_triangles, model_values
+from coupole.reflectance.triangle_fit import (
+    TriangleMaterials,
+    TriangleSamples,
+    fit_triangles,
+    joined,
+    model_values,
+    recoloured,
+)
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import make_folder
+
+Floats = NDArray[np.float64]
 
 TOGETHER = (("sh",), ("rbf", "ggx_rbf"))
 """Names in `SLICES` that share their functions, fitted in one pass."""
@@ -91,10 +101,19 @@ def _fit_materials(result: RunResult, job: _Job, name: str, shop: Workshop, say:
     uncertain: list[MaterialUncertainty] = []
     blocks = list(result.blocks(job.memory_bytes, shop.most_rows))
     fit = partial(_materials_block, job, name == "ggx_normal", shop.threads)
-    for block, (materials, one) in zip(blocks, shop.map(fit, blocks), strict=True):
-        parts.append(materials)
-        uncertain.append(one)
+    for block, found in zip(blocks, shop.map(fit, blocks), strict=True):
+        parts.append(found)
         say(f"fit {name}", block.stop, len(result.triangles))
+    if name == "ggx_normal":
+        whole = joined(parts)
+        normals = unbiased_normals(whole, *_mesh(result), job.noise_um)
+        parts = [replace(part, normals=normals[block]) for part, block in zip(parts, blocks, strict=True)]
+    tasks = list(zip(blocks, parts, strict=True))
+    finish = partial(_uncertain_block, job, name == "ggx_normal", shop.threads)
+    for number, (block, (materials, one)) in enumerate(zip(blocks, shop.map(finish, tasks), strict=True)):
+        parts[number] = materials
+        uncertain.append(one)
+        say(f"uncertainty of {name}", block.stop, len(result.triangles))
     u_triangle = np.concatenate([result.u_triangles(block) for block in blocks])
 
     def write(path: Path) -> None:
@@ -103,17 +122,34 @@ def _fit_materials(result: RunResult, job: _Job, name: str, shop: Workshop, say:
     complete(result.materials_path(name), write)
 
 
-def _materials_block(
-    job: _Job, fitted_normals: bool, threads: int | None, block: slice
+def _mesh(result: RunResult) -> tuple[Floats, Floats, Floats]:
+    """Normals [n, 3], centres [n, 3] and areas [n] of the triangles of the fits."""
+    corners = result.corners_mm[result.triangles].astype(np.float64)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    twice = np.linalg.norm(across, axis=1)
+    return across / np.maximum(twice, 1e-300)[:, None], corners.mean(axis=1), 0.5 * twice
+
+
+def _materials_block(job: _Job, fitted_normals: bool, threads: int | None, block: slice) -> TriangleMaterials:
+    result = _opened(job.folder, job.token)
+    used = ~np.isin(result.along_samples(block, "leds"), job.left_out)
+    return fit_triangles(result.samples(block), used, job.noise_um if fitted_normals else None, threads=threads)
+
+
+def _uncertain_block(
+    job: _Job, fitted_normals: bool, threads: int | None, task: tuple[slice, TriangleMaterials]
 ) -> tuple[TriangleMaterials, MaterialUncertainty]:
+    """Materials of a block with the normals that they shall have: fitted ones without what they have in common."""
+    block, materials = task
     result = _opened(job.folder, job.token)
     used = ~np.isin(result.along_samples(block, "leds"), job.left_out)
     samples = result.samples(block)
-    found = fit_triangles(samples, used, job.noise_um if fitted_normals else None, threads=threads)
-    return found, covariances(
+    if fitted_normals:
+        materials = recoloured(samples, used, materials, materials.normals, threads=threads)
+    return materials, covariances(
         samples,
         used,
-        found,
+        materials,
         job.noise_um,
         fitted_normals=fitted_normals,
         middle_mm=result.middle_mm,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import h5py
@@ -31,9 +32,12 @@ def uncertainty_of(
 ) -> dict[str, Any] | None:
     """What `result.json` says of it; None without a record of the response, by which noise is known."""
     most = _TYPICAL // len(result.views)
-    picked = [_picked(result, view, scan_noise_um, most) for view in result.views]
-    places = Places(*(np.concatenate(part) for part in zip(*(_fields(p) for p, _ in picked), strict=True)))
-    sources = Sources(*(np.concatenate(part) for part in zip(*(_fields(s) for _, s in picked), strict=True)))
+    known = [
+        known_samples(result, view, result.channels // 2, scan_noise_um, most=most, of_triangles=_TRIANGLES)
+        for view in result.views
+    ]
+    places = Places(*_joined([one.places for one in known]))
+    sources = Sources(*_joined([one.sources for one in known]))
     if not len(sources.u_noise):
         return None
     random = np.random.default_rng(0)
@@ -71,16 +75,26 @@ def percentiles(low: Floats, high: Floats) -> dict[str, Any]:
     }
 
 
-def _fields(values: Places | Sources) -> list[Floats]:
-    return list(vars(values).values())
+@dataclass(frozen=True)
+class KnownSamples:
+    """Some samples of one channel of a view, and what is known of them."""
+
+    rows: NDArray[np.int64]
+    """[n] of the view's file."""
+    leds: NDArray[np.int64]
+    """[n] places in the view's LEDs."""
+    f: Floats
+    places: Places
+    sources: Sources
 
 
-def _picked(result: RunResult, view: ViewSamples, scan_noise_um: float, most: int) -> tuple[Places, Sources]:
-    """Some of a view's samples in the middle channel, spread over its triangles and LEDs."""
-    step = max(1, len(view.triangles) // _TRIANGLES)
+def known_samples(
+    result: RunResult, view: ViewSamples, channel: int, scan_noise_um: float, *, most: int, of_triangles: int
+) -> KnownSamples:
+    """At most `most` samples, of triangles that are spread over the view, about `of_triangles`."""
+    step = max(1, len(view.triangles) // of_triangles)
     with h5py.File(view.path, "r") as file:
-        channel = file["u_own"].shape[2] // 2
-        noise = file["u_own"][::step][..., channel]
+        values, noise = (file[name][::step][..., channel] for name in ("f", "u_own"))
         own, shared = file["led_u_own"][:, channel], file["led_u_shared"][:, channel]
         response = file["u_response"][::step, channel]
         indirect = np.zeros(noise.shape)
@@ -92,7 +106,6 @@ def _picked(result: RunResult, view: ViewSamples, scan_noise_um: float, most: in
         known = np.random.default_rng(2).choice(known, most, replace=False)
     triangle, led = np.unravel_index(known, noise.shape)
     corners = result.corners_mm[view.triangles[::step]].astype(np.float64)
-    places = Places(corners[triangle], view.led_mm[led], view.led_normals[led])
     same = np.ones(len(led))
     sources = Sources(
         noise[triangle, led].astype(np.float64),
@@ -103,4 +116,10 @@ def _picked(result: RunResult, view: ViewSamples, scan_noise_um: float, most: in
         scan_noise_um * same,
         led_mm * same,
     )
-    return places, sources
+    places = Places(corners[triangle], view.led_mm[led], view.led_normals[led])
+    return KnownSamples(triangle * step, led, values[triangle, led].astype(np.float64), places, sources)
+
+
+def _joined(parts: Sequence[Places] | Sequence[Sources]) -> list[Floats]:
+    """Their fields, one part after the other."""
+    return [np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.reflectance.least_squares import factorise, gram, one_thread, solve, sums
-from coupole.reflectance.slice_basis import COUNT, Basis, functions
+from coupole.reflectance.slice_basis import COUNT, LEAST_RESIDUAL, USUAL_LEFT, Basis, functions
 from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 
 _PART = 64
@@ -31,18 +31,20 @@ def fit_slices(
     """For each of some fits with the same functions, [b, channels, COUNT] coefficients; NaN for too few samples.
 
     From those `used` [samples] of one view's samples, or of what a model [b, samples, channels] leaves of them.
+    The more it leaves, the less are coefficients held.
     """
     count, _, channels = samples.values.shape
     found = np.full((len(fits), count, channels, COUNT), np.nan, np.float32)
     left = np.stack([samples.values if model is None else samples.values - model for _, model in fits])
     penalties = np.stack([basis.penalty for basis, _ in fits])
+    over = np.array([model is not None for _, model in fits])
     camera_mm, which = samples.cameras_mm[0], np.flatnonzero(used)
 
     def fit(first: int) -> None:
         part = slice(first, min(first + _PART, count))
         _fit_part(
             samples.values[part], left[:, part], samples.led_mm, camera_mm, samples.centres_mm[part],
-            samples.normals[part], which, fits[0][0].harmonic, penalties, found[:, part],
+            samples.normals[part], which, fits[0][0].harmonic, penalties, over, found[:, part],
         )  # fmt: skip
 
     with one_thread(), ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
@@ -100,14 +102,14 @@ def _directions(frame, centre_mm, led_mm, which, x, y, z):  # type: ignore[no-un
 
 @numba.njit(cache=True, nogil=True)
 def _fit_part(  # type: ignore[no-untyped-def]
-    values, left, led_mm, camera_mm, centres_mm, normals, used, harmonic, penalties, found
+    values, left, led_mm, camera_mm, centres_mm, normals, used, harmonic, penalties, over, found
 ):
     """Channels with the same samples share their matrix."""
     count, _, channels = values.shape
     memory, which = np.empty(COUNT * len(used)), np.empty(len(used), np.int64)
     wanted, xyz = np.empty(channels * len(used)), np.empty((3, len(used)))
     product, factor = np.zeros((COUNT, COUNT)), np.empty((COUNT, COUNT))
-    right, frame = np.empty((channels, COUNT)), np.empty((3, 3))
+    right, frame, held = np.empty((channels, COUNT)), np.empty((3, 3)), np.empty(COUNT)
     for triangle in range(count):
         _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
         end = 0
@@ -130,10 +132,25 @@ def _fit_part(  # type: ignore[no-untyped-def]
                 for number in range(n):
                     for channel in range(first, end):
                         mine[channel - first, number] = left[fit, triangle, which[number], channel]
-                if factorise(product, penalties[fit], factor):
+                held[:] = penalties[fit]
+                if over[fit]:
+                    held *= _held_by(mine, values[triangle], which[:n], first)
+                if factorise(product, held, factor):
                     sums(rows, mine, right[: end - first])
                     solve(factor, right[: end - first])
                     found[fit, triangle, first:end] = right[: end - first]
+
+
+@numba.njit(cache=True, nogil=True)
+def _held_by(left, values, which, first):  # type: ignore[no-untyped-def]
+    """Share of the usual ridge by which coefficients are held, by what is left [channels, n] of the samples
+    `which` [n] in the channels from `first`."""
+    remains, whole = 0.0, 0.0
+    for channel in range(len(left)):
+        for number in range(len(which)):
+            remains += left[channel, number] ** 2
+            whole += values[which[number], first + channel] ** 2
+    return min(1.0, max(LEAST_RESIDUAL, USUAL_LEFT * whole / max(remains, 1e-30)))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 
@@ -32,6 +33,8 @@ _STARTS = (0.08, 0.2, 0.45)
 _FIRST_KS = 0.02
 _TO_CHOOSE = 256
 """Samples, about, by which the best start is chosen."""
+LEAST_KD = 1e-6
+"""1/sr: of black, where a share of kd is asked for."""
 HELD = 1e9
 """Stiffness of a normal that is not fitted."""
 _PART = 256
@@ -79,6 +82,12 @@ class TriangleMaterials:
         return TriangleMaterials(*(getattr(self, field.name)[triangles] for field in fields(self)))
 
 
+def joined(parts: Sequence[TriangleMaterials]) -> TriangleMaterials:
+    """Of blocks, one after the other."""
+    names = [field.name for field in fields(TriangleMaterials)]
+    return TriangleMaterials(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
 def prior_stiffness(areas_mm2: Floats, noise_um: float) -> Floats:
     """1 over the variance, rad^2, of normals of triangles whose vertices are off by `noise_um` (standard)."""
     side2_mm2 = 4.0 * areas_mm2 / math.sqrt(3.0)
@@ -105,6 +114,31 @@ def fit_triangles(
         list(pool.map(fit, range(0, count, _PART)))
     kd, ks = found[:, 5 : 5 + channels], found[:, 5 + channels :]
     return TriangleMaterials(found[:, :3], kd, ks, found[:, 3], found[:, 4])
+
+
+def recoloured(
+    samples: TriangleSamples,
+    used: NDArray[np.bool_],
+    materials: TriangleMaterials,
+    normals: Floats,
+    *,
+    threads: int | None = None,
+) -> TriangleMaterials:
+    """Materials with other normals [b, 3]: kd and ks are fitted anew to the samples `used` [samples], roughness
+    and residual stay."""
+    kd, ks = materials.kd.copy(), materials.ks.copy()
+    grey = np.stack([np.maximum(kd.mean(axis=1), LEAST_KD), ks.mean(axis=1), materials.alpha], axis=1)
+
+    def fit(first: int) -> None:
+        part = slice(first, first + _PART)
+        _recolour(
+            samples.values[part], samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm[part],
+            normals[part], grey[part], np.flatnonzero(used), kd[part], ks[part],
+        )  # fmt: skip
+
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(fit, range(0, len(kd), _PART)))
+    return TriangleMaterials(normals, kd, ks, materials.alpha, materials.residual)
 
 
 def model_values(samples: TriangleSamples, materials: TriangleMaterials) -> NDArray[np.float32]:
@@ -140,6 +174,25 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
         grey = np.exp(chosen[3:6])
         colours_from(own, good[:n], found[triangle, :3], grey, lights, half, views, view_of, kd, ks)
         ks[:] = np.minimum(ks, MOST_KS)
+
+
+@numba.njit(cache=True, nogil=True)
+def _recolour(values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, used, kd, ks):  # type: ignore[no-untyped-def]
+    count, samples, channels = values.shape
+    lights, half, views = np.empty((samples, 3)), np.empty((samples, 3)), np.empty((len(cameras_mm), 3))
+    good, roots, own = np.empty(samples, np.int64), np.empty(samples), np.empty((samples, channels))
+    for triangle in range(count):
+        if not grey[triangle, 2] > 0.0:
+            continue
+        normal = normals[triangle]
+        n = gather(
+            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normal, used, own, good, roots,
+            lights, half, views,
+        )  # fmt: skip
+        colours_from(
+            own, good[:n], normal, grey[triangle], lights, half, views, view_of, kd[triangle], ks[triangle]
+        )
+        ks[triangle] = np.minimum(ks[triangle], MOST_KS)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -33,7 +33,7 @@ from sim.render.shadows import Shadows
 from sim.scene.scene import Scene, build_scene, load_surface, support_disk
 from sim.scene.surface import Material, Surface
 from sim.scene.things import placed
-from sim.world.config import CameraConfig, MeshConfig, SceneConfig, Settings
+from sim.world.config import CameraConfig, MaterialConfig, MeshConfig, SceneConfig, Settings, SpecimenConfig
 
 _POSE_TOLERANCE, _ARM_TOLERANCE_MM = 1e-6, 1e-3
 _SHADOW_BYTES = 512 << 20
@@ -248,12 +248,13 @@ class Photographer:
         return radiance
 
     def _shaded(self, look: Look, emitter: Emitter, row: int, emission: str = "") -> Radiance:
-        view, materials, emission = look.view, self._scene.materials, emission or self._emission
+        view, emission = look.view, emission or self._emission
+        matter = self._scene.materials, self._scene.tables
         if look.places is not None:
             reached = self._shadows.reached(row)
-            radiance = led_radiance(view, materials, emitter, emission, look.places, reached)
+            radiance = led_radiance(view, *matter, emitter, emission, look.places, reached)
         else:
-            radiance = led_radiance(view, materials, emitter, emission)
+            radiance = led_radiance(view, *matter, emitter, emission)
             self._obstacles.cast(radiance, view.points_mm, view.triangle, view.normals, emitter.centre_mm)
         arm_shadow.cast(radiance, view.points_mm, look.arm_mm, emitter.centre_mm)
         return radiance
@@ -330,6 +331,14 @@ def _reference_lux(emitters: list[Emitter], base_from_support: Transform) -> flo
 
 def _surface(mesh: MeshConfig, settings: Settings) -> Surface:
     given = mesh.material or settings.material
-    material = Material(mesh.path.stem, given.diffuse, given.f0, given.roughness) if given else None
+    match given:
+        case None:
+            material = None
+        case SpecimenConfig():
+            from sim.objects.specimens import specimen
+
+            material = specimen(given.specimen)
+        case MaterialConfig():
+            material = Material(mesh.path.stem, given.diffuse, given.f0, given.roughness)
     surface = load_surface(mesh.path, mesh.unit, material, settings.detail)
     return settings.stickers.on(surface) if settings.stickers else surface

@@ -1,10 +1,11 @@
 """Radiance of the sites of a view towards the camera under one LED, or under a panel.
 
 L = f E with f = diffuse / pi + D G F / (4 n.l n.v): Lambert and GGX with Smith's separable G (Walter et al. 2007,
-Eqs. 33 and 34) and Schlick's F, as in `surface.Material`. E is that of the whole square emitter; f is evaluated
-towards its centre if the lobe is wide, towards four Gauss points weighted by their light if the roughness is below
-`FINE_ROUGHNESS`. Below about 0.01, where the lobe is as narrow as the emitter's angular size (0.4 deg at 1 m),
-four points are too few. A side whose plane has the emitter's centre behind it is dark.
+Eqs. 33 and 34) and Schlick's F, as in `surface.Material`, or f from a material's table. E is that of the whole
+square emitter; f is evaluated towards its centre if it is a table's or the lobe is wide, towards four Gauss points
+weighted by their light if the roughness is below `FINE_ROUGHNESS`. Below about 0.01, where the lobe is as narrow
+as the emitter's angular size (0.4 deg at 1 m), four points are too few. A side whose plane has the emitter's
+centre behind it is dark.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from sim.render.camera_view import View
 from sim.render.emitter import Emitter, packed, per_lumen
+from sim.scene.brdf_table import look_up
 
 FINE_ROUGHNESS = 0.3
 _CHUNK = 2048
@@ -24,6 +26,7 @@ _GAUSS = 1.0 / np.sqrt(3.0)
 def led_radiance(
     view: View,
     materials: NDArray[np.float64],
+    tables: NDArray[np.float32],
     emitter: Emitter,
     emission: str,
     places: NDArray[np.int32] | None = None,
@@ -46,6 +49,7 @@ def led_radiance(
         None if view.fine is None else view.fine.texture,
         None if view.fine is None else view.fine.normals,
         materials,
+        tables,
         packed(emitter),
         emission == "paper",
         places,
@@ -80,6 +84,7 @@ def _shade(  # type: ignore[no-untyped-def]
     texture,
     turned,
     materials,
+    tables,
     led,
     paper,
     places,
@@ -107,11 +112,30 @@ def _shade(  # type: ignore[no-untyped-def]
             lux = led[12] * per_lumen(px, py, pz, nx, ny, nz, led, shares, work)
             if paper:
                 lux *= -(tx * led[3] + ty * led[4] + tz * led[5]) / np.sqrt(tx * tx + ty * ty + tz * tz)
+            surface = materials[material[seen]]
+            if surface[7] >= 0.0:
+                table = tables[int(surface[7])]
+                _shade_by_table(px, py, pz, tx, ty, tz, nx, ny, nz, eye, table, lux * factor, out[i])
+                for k in range(3):
+                    out[i, k] *= diffuse[seen, k] / surface[k]
+                continue
             for k in range(3):
                 out[i, k] = lux * factor * diffuse[seen, k] / np.pi
-            surface = materials[material[seen]]
             if surface[6] > 0.0 and lux > 0.0:
                 _add_gloss(px, py, pz, tx, ty, tz, nx, ny, nz, eye, surface, led, shares, lux, out[i])
+
+
+@numba.njit(cache=True, nogil=True)
+def _shade_by_table(px, py, pz, tx, ty, tz, nx, ny, nz, eye, table, lux, out):  # type: ignore[no-untyped-def]
+    """Into `out` [3] what a material's table makes of `lux` from (tx, ty, tz)."""
+    vx, vy, vz = eye[0] - px, eye[1] - py, eye[2] - pz
+    far, away = np.sqrt(tx * tx + ty * ty + tz * tz), np.sqrt(vx * vx + vy * vy + vz * vz)
+    vx, vy, vz = vx / away, vy / away, vz / away
+    if vx * nx + vy * ny + vz * nz <= 0.0:
+        return
+    look_up(table, nx, ny, nz, tx / far, ty / far, tz / far, vx, vy, vz, out)
+    for k in range(3):
+        out[k] *= lux
 
 
 @numba.njit(cache=True, nogil=True)

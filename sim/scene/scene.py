@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.geometry import Transform
+from sim.scene.brdf_table import NODES
 from sim.scene.surface import Layer, Material, Surface
 
 STONE = Material("warm stone", (0.62, 0.55, 0.42))
@@ -47,7 +48,10 @@ class Scene:
     material: NDArray[np.int32]
     """[triangles] row of `materials`."""
     materials: NDArray[np.float64]
-    """[materials, 7] red, green, blue diffuse reflectance; red, green, blue f0; roughness."""
+    """[materials, 8] red, green, blue diffuse reflectance; red, green, blue f0; roughness; row of `tables`
+    or -1."""
+    tables: NDArray[np.float32]
+    """[tables, theta_h, theta_d, phi_d, 3] of materials that have one (`sim.scene.brdf_table`)."""
     tint: NDArray[np.float32] | None
     """[triangles, 3] factor of the diffuse reflectance."""
     normals: NDArray[np.float32] | None
@@ -163,10 +167,20 @@ def build_scene(things: Sequence[tuple[Surface, Transform]]) -> Scene:
             own = surface.normals if surface.normals is not None else _flat_normals(surface.corners_mm)
             normals[part] = own @ base_from_surface[:3, :3].T
         first += count
-    table = np.array([[*m.diffuse, *m.f0, m.roughness] for m in materials], np.float64).reshape(-1, 7)
+    table, tables = _packed(materials)
     firsts = np.cumsum([0, *(len(own) for own in waves)])
     fine = Waves(np.concatenate(waves), firsts) if firsts[-1] else None
-    return Scene(corners, material, table, tint, normals, fine)
+    return Scene(corners, material, table, tables, tint, normals, fine)
+
+
+def _packed(materials: Sequence[Material]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """`materials` and `tables` of a scene."""
+    tables = [m.table for m in materials if m.table is not None]
+    rows = np.cumsum([m.table is not None for m in materials]) - 1
+    row_of = [-1 if m.table is None else row for m, row in zip(materials, rows, strict=True)]
+    table = np.array([[*m.diffuse, *m.f0, m.roughness, row] for m, row in zip(materials, row_of, strict=True)])
+    table = table.astype(np.float64).reshape(-1, 8)
+    return table, np.stack(tables) if tables else np.empty((0, *NODES, 3), np.float32)
 
 
 def _waves(material: Material, base_from_surface: Transform) -> NDArray[np.float64]:

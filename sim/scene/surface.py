@@ -55,7 +55,7 @@ class Material:
     """Lambert and GGX with Schlick's Fresnel, per channel of the camera after normalisation by Spectralon.
 
     f = diffuse / pi + D G F / (4 n.l n.v), with F = f0 + (1 - f0)(1 - h.v)^5; without the specular part if the
-    roughness is 0.
+    roughness is 0. With a table f is what that gives, and `diffuse` counts for light from surface to surface.
     """
 
     name: str
@@ -67,6 +67,8 @@ class Material:
     """GGX alpha (Walter et al. 2007)."""
     detail: tuple[Layer, ...] = ()
     """Finer than triangles; only seen where each pixel is shaded."""
+    table: NDArray[np.float32] | None = None
+    """[theta_h, theta_d, phi_d, 3] as in `sim.scene.brdf_table`, for materials of any other form."""
 
 
 @dataclass(frozen=True)

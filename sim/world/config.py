@@ -53,13 +53,19 @@ class MaterialConfig(_Model):
     roughness: Share = 0.0
 
 
+class SpecimenConfig(_Model):
+    """A material that is no sum of Lambert and GGX (`sim.objects.specimens`)."""
+
+    specimen: Literal["tabulated", "layered", "makie", "four-flux", "fabric"]
+
+
 class MeshConfig(_Model):
     """One object: its mesh and its pose on the support (row-major 4x4)."""
 
     path: Path
     unit: Literal["mm", "m", "um"]
     support_from_object: list[list[float]]
-    material: MaterialConfig | None = None
+    material: MaterialConfig | SpecimenConfig | None = None
     """Multiplied by the mesh's own colours; None: these alone, or warm stone for a mesh without colours."""
 
 
@@ -148,7 +154,7 @@ class Settings(_Model):
     """None: as `shading` has it."""
     arm_shadows: bool = True
     """Whether arm and tool block light."""
-    material: MaterialConfig | None = None
+    material: MaterialConfig | SpecimenConfig | None = None
     """Of the plan's object, multiplied by its mesh's own colours; None: these alone, or warm stone."""
     detail: tuple[Layer, ...] = ()
     """Of the plan's object: texture, bumps and turned normals that its mesh does not have."""

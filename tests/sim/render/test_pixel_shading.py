@@ -29,7 +29,7 @@ ABOVE = camera_above(330.0)
 def lit(scene: Scene, view: View, led_mm: NDArray[np.float64]) -> NDArray[np.float32]:
     """[sites, 3] radiance of a view's sites under one LED, shadows included."""
     emitter = square(led_mm, TOWARDS, side_mm=7.0, flux_lm=FLUX_LM)
-    radiance = led_radiance(view, scene.materials, emitter, "lambertian")
+    radiance = led_radiance(view, scene.materials, scene.tables, emitter, "lambertian")
     Obstacles(scene.corners_mm).cast(radiance, view.points_mm, view.triangle, view.normals, emitter.centre_mm)
     return radiance
 
@@ -86,6 +86,7 @@ def test_light_falls_off_smoothly_over_one_large_triangle() -> None:
         led_radiance(
             Viewer(scene, LENS).look(ABOVE),
             scene.materials,
+            scene.tables,
             square(led_mm, TOWARDS, side_mm=7.0, flux_lm=FLUX_LM),
             "lambertian",
         )[:, 1]

@@ -1,0 +1,80 @@
+"""What leans all fitted normals of a material alike, and is taken off them.
+
+A material that is not of the fit's form makes its normals lean, towards the cameras or away from them: the error
+that the fit would have in its form shows as a tilt. From single triangles it cannot be told, and their residuals
+do not show it. But errors of the scanner's vertices are independent of it, and of each other some millimetres
+away, so over many triangles the mean of what lies between fitted and scanned normals is the fit's error, which
+changes slowly with the direction in which the surface faces: a polynomial of second degree of that direction, for
+triangles that look alike. What is left after it is noise, as the covariance of the fit states it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from coupole.reflectance.clustering import clusters_of, looks
+from coupole.reflectance.least_squares import one_thread
+from coupole.reflectance.triangle_fit import TriangleMaterials, prior_stiffness
+
+Floats = NDArray[np.float64]
+
+FEWEST = 90
+"""Triangles of a material: ten for each coefficient."""
+_TOGETHER, _MOST_GROUPS = 1000, 8
+"""Triangles, at least, that share a polynomial, and polynomials."""
+_NEAREST = 50
+"""Triangles whose mean normal says in which direction the surface faces."""
+_USUAL_TILT = np.radians(3.0)
+"""Of fitted normals: it keeps large triangles, whose normals the scanner knows well, from deciding alone."""
+_CHUNK = 1 << 16
+
+
+def unbiased_normals(
+    materials: TriangleMaterials, mesh_normals: Floats, centres_mm: Floats, areas_mm2: Floats, noise_um: float
+) -> Floats:
+    """[n, 3] fitted normals without what they have in common against those of the mesh [n, 3]; as they are for too
+    few triangles. `noise_um` is that of the mesh's vertices."""
+    normals = materials.normals.copy()
+    known = np.flatnonzero(np.isfinite(materials.alpha))
+    if len(known) < FEWEST:
+        return normals
+    with one_thread():
+        faces = _facing(mesh_normals[known], centres_mm[known], areas_mm2[known])
+        group = clusters_of(looks(materials.at(known)), int(np.clip(len(known) // _TOGETHER, 1, _MOST_GROUPS)))
+        spread2 = 2.0 / prior_stiffness(areas_mm2[known], noise_um) + _USUAL_TILT**2
+        off = normals[known] - mesh_normals[known]
+        lean = np.zeros_like(off)
+        for number in np.unique(group):
+            mine = group == number
+            if np.count_nonzero(mine) >= FEWEST:
+                lean[mine] = _smooth(faces[mine], off[mine], 1.0 / spread2[mine])
+    lean -= np.sum(lean * normals[known], axis=1, keepdims=True) * normals[known]
+    normals[known] = _unit(normals[known] - lean)
+    return normals
+
+
+def _facing(normals: Floats, centres_mm: Floats, areas_mm2: Floats) -> Floats:
+    """[n, 3] mean normals of the nearest triangles: of one by itself the scanner's noise would be taken as the
+    direction that it depends on, and hence as the fit's error."""
+    tree, found = cKDTree(centres_mm), np.empty_like(normals)
+    for first in range(0, len(normals), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        near = tree.query(centres_mm[part], k=min(_NEAREST, len(normals)))[1]
+        found[part] = np.einsum("nk,nki->ni", areas_mm2[near], normals[near])
+    return _unit(found)
+
+
+def _smooth(faces: Floats, off: Floats, weights: Floats) -> Floats:
+    """[n, 3] polynomial of second degree of directions [n, 3] through `off` [n, 3], by weighted least squares."""
+    x, y, z = faces.T
+    terms = np.stack([np.ones_like(x), x, y, z, x * y, x * z, y * z, x * x - y * y, 3.0 * z * z - 1.0], axis=1)
+    root = np.sqrt(weights / weights.mean())[:, None]
+    found: Floats = terms @ np.linalg.lstsq(root * terms, root * off, rcond=None)[0]
+    return found
+
+
+def _unit(vectors: Floats) -> Floats:
+    found: Floats = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return found

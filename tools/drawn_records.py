@@ -1,0 +1,190 @@
+"""Calibration records of the simulated cell whose errors are drawn anew: the truth, and a draw from the covariance
+that the shipped records (`configs/calibrations`) state.
+
+Drawn are lens, hand-eye and axis zeros together, places and normals of the LEDs (with the part that neighbours
+share), and their powers: each LED's own error, and those of the tile that all share, by their sensitivities. The
+records of the flat field and of the response are the shipped ones, which hold their own errors.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from coupole.appearance.render.led_squares import Leds, read_leds
+from coupole.calibration.record import Record, content_sha256, read_record, write_record
+from coupole.geometry import abc_from_rotation
+from coupole.plan.reading import read_cell
+from sim.optics.sensor_model import SensorModel
+from sim.render.emitter import LED_SIDE_MM, irradiance_of_each, squares
+from sim.world.config import WHITE_SHARE
+
+ROOT = Path(__file__).resolve().parent.parent
+SHIPPED, RIG = ROOT / "configs/calibrations", ROOT / "configs/rigs/sim.yaml"
+KEPT = ("flat-field", "response")
+WHITE_AT_US = 8000
+CHANNELS = "RGB"
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Factors of what the shipped records state, for cells that are known worse or better."""
+
+    led_mm: float | None = None
+    """Standard uncertainty of each coordinate of an LED; None: as the record has it."""
+    led_normal_deg: float | None = None
+    camera_mm: float | None = None
+    """Of each coordinate of the camera in the flange's frame."""
+
+
+def draw_records(folder: Path, seed: int, scale: Scale | None = None) -> tuple[Path, ...]:
+    """Write records with errors of this seed to a new folder; their paths."""
+    folder.mkdir(parents=True)
+    scale = scale or Scale()
+    for kind in KEPT:
+        for path in SHIPPED.glob(f"{kind}.*"):
+            shutil.copy(path, folder)
+    random = np.random.default_rng((seed, 77))
+    _draw_hand_eye(folder, random, scale)
+    _draw_leds(folder, random, scale)
+    _draw_powers(folder, random)
+    return tuple(sorted(folder.glob("*.yaml")))
+
+
+def true_powers() -> Floats:
+    """[leds] of the simulated cell, DN s^-1 m^2 sr: alike in all channels."""
+    table, cell = true_leds(), read_cell(RIG)
+    base_from_support = cell.rig.support.base_from_support.matrix()
+    emitters = squares(table.positions_mm, table.normals, side_mm=LED_SIDE_MM, fluxes_lm=table.flux_lm)
+    white_lux = np.median(irradiance_of_each(emitters, base_from_support[:3, 3], base_from_support[:3, 2]))
+    white_dn = WHITE_SHARE * (SensorModel().white_dn - SensorModel().black_dn)
+    powers: Floats = table.flux_lm * white_dn * np.pi / (white_lux * WHITE_AT_US * 1e-6)
+    return powers
+
+
+def true_leds() -> Leds:
+    return read_leds(ROOT / "configs/domes/coupole.csv")
+
+
+def _draw_hand_eye(folder: Path, random: np.random.Generator, scale: Scale) -> None:
+    """Lens, hand-eye and axis zeros by their common covariance; what the record has besides them is not used."""
+    record, cell = read_record(SHIPPED / "hand-eye.yaml"), read_cell(RIG)
+    sensor, lens = cell.rig.sensor, cell.rig.lens
+    focal_px = 1e3 / sensor.pixel_pitch_um / (1.0 / lens.focal_length_mm - 1.0 / lens.focus_distance_mm)
+    truth = {"fx_px": focal_px, "fy_px": focal_px}
+    truth |= {"cx_px": 0.5 * (sensor.width_px - 1), "cy_px": 0.5 * (sensor.height_px - 1)}
+    covariance = record.covariance_matrix.copy()
+    names = [parameter.name for parameter in record.parameters]
+    steps = [names.index(f"flange_from_camera.{axis}_mm") for axis in "xyz"]
+    if scale.camera_mm is not None:
+        covariance[steps], covariance[:, steps] = 0.0, 0.0
+        covariance[steps, steps] = scale.camera_mm**2
+    values, vectors = np.linalg.eigh(covariance)
+    drawn = vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
+    errors = dict(zip(names, drawn, strict=True))
+    true_pose = cell.rig.flange_from_camera.matrix()
+    shift = np.array([errors[f"flange_from_camera.{axis}_mm"] for axis in "xyz"])
+    turn = np.array([errors[f"flange_from_camera.r{axis}_deg"] for axis in "xyz"])
+    turned = true_pose[:3, :3] @ Rotation.from_rotvec(turn, degrees=True).as_matrix()
+    content = _content(record)
+    place = (true_pose[:3, 3] + shift).tolist()
+    content["transforms"]["flange_from_camera"] = {
+        "translation_mm": place,
+        "abc_deg": list(map(float, abc_from_rotation(turned))),
+    }
+    known = dict(zip((f"flange_from_camera.{axis}_mm" for axis in "xyz"), place, strict=True))
+    for parameter, variance in zip(content["parameters"], np.diag(covariance), strict=True):
+        name = parameter["name"]
+        parameter["u"] = float(np.sqrt(variance))
+        if parameter["value"] is not None and not name.startswith("base_from_board"):
+            parameter["value"] = known.get(name, truth.get(name, 0.0) + float(errors[name]))
+    content["covariance"] = covariance.tolist()
+    write_record(folder / "hand-eye.yaml", _sealed(content))
+
+
+def _draw_leds(folder: Path, random: np.random.Generator, scale: Scale) -> None:
+    record, truth = read_record(SHIPPED / "leds.yaml"), true_leds()
+    with h5py.File(SHIPPED / "leds.h5", "r") as file:
+        of_centres, shared, of_normals, axes = (
+            file[name][()] for name in ("centre_covariance", "shared_part", "normal_covariance", "board_axes")
+        )
+    content = _content(record)
+    if scale.led_mm is not None:
+        of_centres, shared = np.broadcast_to(np.eye(3) * scale.led_mm**2, of_centres.shape), np.zeros(len(shared))
+        for parameter in content["parameters"]:
+            if parameter["name"] == "led_centre_median_u_mm":
+                parameter["value"] = scale.led_mm
+    if scale.led_normal_deg is not None:
+        of_normals = np.broadcast_to(np.eye(2) * scale.led_normal_deg**2, of_normals.shape)
+    roots, count = np.linalg.cholesky(of_centres), len(truth.ids)
+    for_all = random.standard_normal(3)
+    own = random.standard_normal((count, 3)) * np.sqrt(1.0 - shared)[:, None]
+    centres = truth.positions_mm + np.einsum("nij,nj->ni", roots, own + np.sqrt(shared)[:, None] * for_all)
+    boards, board = np.unique(truth.ids // 6, return_inverse=True)
+    of_boards = random.standard_normal((len(boards), 2))[board]
+    turns = np.einsum("nij,nj->ni", np.linalg.cholesky(of_normals), of_boards)
+    about = np.einsum("nik,nk->ni", axes, turns)
+    normals = Rotation.from_rotvec(about, degrees=True).apply(truth.normals)
+    lines = [line for line in (SHIPPED / "leds.csv").read_text().splitlines() if line]
+    head = lines[: next(n for n, line in enumerate(lines) if line.startswith("id,")) + 1]
+    rows = [line.split(",") for line in lines[len(head) :]]
+    for row, centre, normal in zip(rows, centres, normals, strict=True):
+        row[2:8] = [f"{value:.5f}" for value in centre] + [f"{value:.8f}" for value in normal]
+    text = "\n".join([*head, *(",".join(row) for row in rows)]) + "\n"
+    shutil.copy(SHIPPED / "leds.h5", folder)
+    _write_with_table(folder, "leds", content, text)
+
+
+def _draw_powers(folder: Path, random: np.random.Generator) -> None:
+    """The true powers, each LED's own error, and those of the tile by the table's sensitivities."""
+    record = read_record(SHIPPED / "led-power.yaml")
+    content, names = _content(record), [parameter.name for parameter in record.parameters]
+    text = (SHIPPED / "led-power.csv").read_text()
+    head, _, body = text.partition("\n")
+    table = list(csv.DictReader(io.StringIO(body)))
+    truth = dict(zip(map(int, true_leds().ids), true_powers(), strict=True))
+    for channel in CHANNELS:
+        columns = [name for name in table[0] if name.startswith("d_") and name.endswith(f"_{channel}")]
+        at = [names.index(f"{name[2:-2]}.{channel}") for name in columns]
+        covariance = record.covariance_matrix[np.ix_(at, at)]
+        values, vectors = np.linalg.eigh(covariance)
+        shared = vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
+        for row in table:
+            off = sum(float(row[name]) * error for name, error in zip(columns, shared, strict=True))
+            own = float(row[f"u_own_{channel}"]) * random.standard_normal()
+            row[f"power_{channel}"] = f"{truth[int(row['id'])] * np.exp(off + own):.9g}"
+    out = io.StringIO()
+    writer = csv.DictWriter(out, list(table[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    _write_with_table(folder, "led-power", content, f"{head}\n{out.getvalue()}")
+
+
+def _write_with_table(folder: Path, kind: str, content: dict[str, Any], text: str) -> None:
+    """A record with its CSV, of which the record keeps the checksum."""
+    (folder / f"{kind}.csv").write_text(text)
+    for file in content["files"]:
+        if file["name"] == f"{kind}.csv":
+            file["sha256"] = hashlib.sha256(text.encode()).hexdigest()
+    write_record(folder / f"{kind}.yaml", _sealed(content))
+
+
+def _sealed(content: dict[str, Any]) -> Record:
+    return Record.model_validate_json(json.dumps({**content, "sha256": content_sha256(content)}))
+
+
+def _content(record: Record) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(record.model_dump_json(exclude={"sha256"}))
+    return content

@@ -1,0 +1,258 @@
+"""Cells of the closed loop of reflectance: rendered runs, scans and records with errors drawn anew, and how the
+result compares with the simulator's truth.
+
+Frames are rendered by `sim`, acquired and proven as in the real cell, and evaluated by `coupole.reflectance`. The
+truth is the simulator's own table of the material at the true triangles, LEDs and camera.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numba
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+import cells  # noqa: E402
+
+from coupole.geometry import apply  # noqa: E402
+from coupole.reflectance.extraction.lamp_sight import lit_on  # noqa: E402
+from coupole.reflectance.ggx import tangents  # noqa: E402
+from coupole.reflectance.run_job import RunRequest, extract_runs, reflectance_of  # noqa: E402
+from coupole.reflectance.run_pictures import read_check_frames  # noqa: E402
+from coupole.reflectance.run_result import RunResult, ViewSamples  # noqa: E402
+from coupole.reflectance.run_uncertainty import QUANTILE, known_samples  # noqa: E402
+from coupole.reflectance.sample_uncertainty import bounds, tilt_covariance  # noqa: E402
+from coupole.reflectance.triangle_fit import model_values  # noqa: E402
+from drawn_records import Scale, draw_records, true_leds  # noqa: E402
+from sim.objects.specimens import specimen  # noqa: E402
+from sim.scene.brdf_table import look_up  # noqa: E402
+
+Floats = NDArray[np.float64]
+SCANS = ("normals", "independent", "correlated")
+"""Errors of the scanner: normals off by 2 degrees (rms), vertices by 30 um, the same correlated over 1 mm."""
+NORMALS_DEG, VERTICES_UM, CORRELATED_MM = 2.0, 30.0, 1.0
+OLD_VIEWS = (cells.TOP, {**cells.TOP, "name": "side", "azimuth_deg": -60, "elevation_deg": 55})
+NEW_VIEW = {**cells.TOP, "name": "third", "azimuth_deg": -130, "elevation_deg": 60}
+THIRDS_DEG = (0.0, 30.0, 60.0, 90.0)
+_SAMPLES = 20_000
+"""Of each view and channel, that are compared."""
+
+
+@dataclass(frozen=True)
+class Acquired:
+    """Runs of one material: two views, and one that the fit does not see."""
+
+    material: str
+    old: Path
+    new: Path
+    mesh: Path
+    """The true one."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A cell against the truth."""
+
+    inside: NDArray[np.int64]
+    """[channels, thirds of theta, 2] samples in their intervals, and all."""
+    scanned_deg: float
+    """Rms of the scan's normals off the truth."""
+    fitted_deg: float
+    normals_inside: tuple[int, int]
+    mae: dict[str, float]
+    old_view: float
+    """Mean error of GGX with normal, share of the range, under LEDs left out."""
+    new_view: float
+
+    def line(self) -> dict[str, Any]:
+        return {**vars(self), "inside": self.inside.tolist()}
+
+
+def acquire(folder: Path, material: str, *, every: int = 12, size_mm: float = 36.0) -> Acquired:
+    """Render and prove the runs of a material on a part of the shipped relief."""
+    mesh = _part_of_relief(folder, size_mm)
+    runs = []
+    for name, views, lights in (
+        ("old", OLD_VIEWS, {"kind": "every", "every": every}),
+        ("new", (NEW_VIEW,), {"kind": "every", "every": 12 * every}),
+    ):
+        (folder / name).mkdir()
+        cell = cells.CellFolder(folder / name, speed=10.0, write_now=False)
+        cell.plan_data["object"]["mesh"] = str(mesh)
+        cell.rig_data["sensor"] |= {"width_px": 512, "height_px": 384, "pixel_pitch_um": 44.0}
+        cell.world_settings.update(white_at_us=8000, material={"specimen": material}, shading="pixel")
+        cell.world_settings.update(interreflection=False)
+        cell.write(views=list(views), lights=lights, darks_per_view=2)
+        ended = cell.acquire()
+        if ended.code:
+            raise RuntimeError(f"{material}: {ended.err}")
+        runs.append(cell.run_folder)
+    return Acquired(material, *runs, mesh)
+
+
+def judge(acquired: Acquired, scan: str, seed: int, folder: Path, scale: Scale | None = None) -> Judged:
+    """Evaluate the runs of a material with errors of a seed."""
+    records = draw_records(folder / "records", seed, scale)
+    scanned, noise_um = _scan(folder, acquired.mesh, scan, seed)
+    request = RunRequest((acquired.old,), scanned, records, scan_noise_um=noise_um)
+    about = reflectance_of(request, folder / "old")
+    result, truth = RunResult(folder / "old"), Truth.of(acquired, folder / "old")
+    inside = sum(_inside(result, view, noise_um, truth) for view in result.views)
+    materials = result.materials("ggx_normal")
+    known = np.isfinite(materials.alpha)
+    true_normals = truth.normals[result.triangles]
+    fitted = materials.normals[known]
+    steps = np.array([tangents(*normal) for normal in fitted])
+    tilts = np.einsum("nki,ni->nk", steps, true_normals[known] - fitted)
+    spreads = np.sqrt(np.einsum("nii->ni", result.material_covariances("ggx_normal")[known])[:, :2])
+    held = np.abs(tilts) < QUANTILE * spreads
+    mine = _flat_normals(result.corners_mm[result.triangles].astype(float))
+    leds = tuple(_leds_of(acquired.new))
+    extract_runs(replace(request, runs=(acquired.new,), left_out=leds), folder / "new")
+    return Judged(
+        inside,
+        _off_deg(mine[known], true_normals[known]),
+        _off_deg(fitted, true_normals[known]),
+        (int(held.sum()), held.size),
+        {name: float(value) for name, value in about["mae"].items()},
+        float(about["mae"]["ggx_normal"]),
+        _new_view_error(result, RunResult(folder / "new")),
+    )
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the simulator knows, base frame."""
+
+    table: NDArray[np.float32]
+    corners_mm: Floats
+    normals: Floats
+    leds_mm: Floats
+    """[leds, 3] by their numbers."""
+    cameras_mm: dict[str, Floats]
+
+    @staticmethod
+    def of(acquired: Acquired, result: Path) -> Truth:
+        mesh = trimesh.load(acquired.mesh, process=False)
+        corners = apply(RunResult(result).base_from_support, mesh.vertices)[mesh.faces]
+        cameras = {}
+        for path in (acquired.old / "views").glob("*.h5"):
+            with h5py.File(path, "r") as file:
+                cameras[path.stem] = file["entry/instrument/robot/poses"]["base_from_camera"][0][:3, 3]
+        table = specimen(acquired.material).table
+        assert table is not None
+        return Truth(table, corners, _flat_normals(corners), true_leds().positions_mm, cameras)
+
+    def reflectance(self, view: str, triangles: NDArray[np.int64], leds: NDArray[np.int64]) -> Floats:
+        """[n, 3] of samples by their triangles and LEDs' numbers."""
+        centres, normals = self.corners_mm[triangles].mean(axis=1), self.normals[triangles]
+        lights, eyes = _unit(self.leds_mm[leds] - centres), _unit(self.cameras_mm[view] - centres)
+        values = np.full((len(leds), 3), np.nan)
+        _look_up_all(self.table, normals, lights, eyes, values)
+        return values
+
+
+def _inside(result: RunResult, view: ViewSamples, noise_um: float, truth: Truth) -> NDArray[np.int64]:
+    found = np.zeros((3, 3, 2), np.int64)
+    for channel in range(3):
+        known = known_samples(result, view, channel, noise_um, most=_SAMPLES, of_triangles=len(view.triangles))
+        triangles = view.triangles[known.rows]
+        true = truth.reflectance(view.view, triangles, view.leds[known.leds])[:, channel]
+        low, high = bounds(known.places, known.sources, QUANTILE)
+        ratio = true / known.f
+        centres = known.places.corners_mm.mean(axis=1)
+        cosine = np.sum(_unit(known.places.led_mm - centres) * _flat_normals(known.places.corners_mm), axis=1)
+        third = np.digitize(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))), THIRDS_DEG[1:3])
+        for number in range(3):
+            mine = (third == number) & np.isfinite(ratio)
+            found[channel, number] += [np.count_nonzero((ratio > low) & (ratio < high) & mine), mine.sum()]
+    return found
+
+
+def _new_view_error(fitted: RunResult, other: RunResult) -> float:
+    """Mean error of GGX with normal, share of the range, in pictures of a view that it was not fitted to."""
+    (view,) = other.views
+    places = np.searchsorted(fitted.triangles, view.triangles).clip(max=len(fitted.triangles) - 1)
+    same = fitted.triangles[places] == view.triangles
+    frames = read_check_frames(other, view)
+    rows = slice(0, len(view.triangles))
+    samples = other.view_samples(view, rows, np.isin(view.leds, frames.leds))
+    made = model_values(samples, fitted.materials("ggx_normal").at(places))
+    made[~same] = np.nan
+    lit = lit_on(samples.centres_mm, samples.led_mm, view.led_normals, False)
+    share = made * lit[..., None] * view.full_scales
+    off = []
+    for channel in range(3):
+        place, measured = frames.pairs(rows, channel)
+        both = share[place, :, channel] - measured
+        off.append(np.abs(both[np.isfinite(both)]))
+    return float(np.concatenate(off).mean())
+
+
+def _scan(folder: Path, mesh: Path, scan: str, seed: int) -> tuple[Path, float]:
+    """The mesh as a scanner with errors gives it, and the noise that is told of its vertices."""
+    found = trimesh.load(mesh, process=False)
+    random = np.random.default_rng((seed, SCANS.index(scan)))
+    noise_um = VERTICES_UM
+    if scan == "normals":
+        corners = np.asarray(found.vertices)[found.faces]
+        tilts = np.einsum("nii->n", tilt_covariance(corners, np.ones(len(corners))))
+        noise_um = float(np.radians(NORMALS_DEG) / np.sqrt(tilts.mean()))
+    drawn = random.standard_normal(found.vertices.shape)
+    if scan == "correlated":
+        apart = np.linalg.norm(found.vertices[:, None] - found.vertices[None], axis=2) / CORRELATED_MM
+        values, vectors = np.linalg.eigh(np.exp(-0.5 * apart**2))
+        drawn = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * drawn)
+    found.vertices = found.vertices + 1e-3 * noise_um * drawn
+    path = folder / "scan.ply"
+    found.export(path)
+    return path, noise_um
+
+
+def _part_of_relief(folder: Path, size_mm: float) -> Path:
+    """A square of the shipped relief, of about 0.7 mm2 a triangle."""
+    relief = trimesh.load(ROOT / "configs/objects/relief.ply", process=False)
+    x, y, _ = relief.triangles_center.T
+    relief.update_faces((x > 10) & (x < 10 + size_mm) & (np.abs(y) < 0.5 * size_mm))
+    relief.remove_unreferenced_vertices()
+    path = folder / "object.ply"
+    relief.export(path)
+    return path
+
+
+def _leds_of(run: Path) -> list[int]:
+    with h5py.File(next((run / "views").glob("*.h5")), "r") as file:
+        leds = file["entry/instrument/detector/frames"]["led"]
+    return [int(led) for led in np.unique(leds) if led != 65535]
+
+
+def _off_deg(found: Floats, truth: Floats) -> float:
+    """Root mean square."""
+    chord = np.linalg.norm(found - truth, axis=1)
+    return float(np.degrees(np.sqrt(np.mean((2.0 * np.arcsin(0.5 * chord)) ** 2))))
+
+
+def _flat_normals(corners_mm: Floats) -> Floats:
+    return _unit(np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]))
+
+
+def _unit(vectors: Floats) -> Floats:
+    found: Floats = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return found
+
+
+@numba.njit(cache=True)
+def _look_up_all(table, normals, lights, eyes, values):  # type: ignore[no-untyped-def]
+    for n in range(len(values)):
+        a, b, c = normals[n], lights[n], eyes[n]
+        if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] > 0.0 and a[0] * c[0] + a[1] * c[1] + a[2] * c[2] > 0.0:
+            look_up(table, a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2], values[n])

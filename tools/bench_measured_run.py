@@ -140,6 +140,7 @@ def read_run(folder: Path) -> tuple[Any, Any]:
         (about.focal_length_mm or 0.0, about.focus_distance_mm or 0.0, about.f_number or 0.0),
         known["support"],
         Drift(),
+        True,
     )
     radiometry = Radiometry(measured)
     radiometry.noise[:] = NOISE

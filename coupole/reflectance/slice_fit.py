@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.least_squares import factorise, gram, one_thread, solve, sums
+from coupole.reflectance.least_squares import factorise, gram, one_thread, solve, solve_by_samples, sums
 from coupole.reflectance.slice_basis import COUNT, Basis, functions
 from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 
@@ -106,7 +106,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
     count, _, channels = values.shape
     memory, which = np.empty(COUNT * len(used)), np.empty(len(used), np.int64)
     wanted, xyz = np.empty(channels * len(used)), np.empty((3, len(used)))
-    product, factor = np.zeros((COUNT, COUNT)), np.empty((COUNT, COUNT))
+    product, room = np.zeros((COUNT, COUNT)), np.empty(3 * COUNT * COUNT)
     right, frame = np.empty((channels, COUNT)), np.empty((3, 3))
     for triangle in range(count):
         _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
@@ -124,16 +124,29 @@ def _fit_part(  # type: ignore[no-untyped-def]
             for k in range(COUNT):
                 for number in range(n):
                     rows[k, number] *= z[number]
-            gram(rows, product)
+            if n >= COUNT:
+                gram(rows, product)
             mine = wanted[: (end - first) * n].reshape(end - first, n)
             for fit in range(len(left)):
                 for number in range(n):
                     for channel in range(first, end):
                         mine[channel - first, number] = left[fit, triangle, which[number], channel]
-                if factorise(product, penalties[fit], factor):
-                    sums(rows, mine, right[: end - first])
-                    solve(factor, right[: end - first])
+                if _solve(rows, product, penalties[fit], mine, room, right[: end - first]):
                     found[fit, triangle, first:end] = right[: end - first]
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve(rows, product, penalty, values, room, right):  # type: ignore[no-untyped-def]
+    """Into `right` the coefficients, the shorter way; whether there are some. `product` is of `gram` where samples
+    are as many as functions."""
+    if rows.shape[1] < COUNT:
+        return solve_by_samples(rows, penalty, values, room, right)
+    factor = room[: COUNT * COUNT].reshape(COUNT, COUNT)
+    if not factorise(product, penalty, factor):
+        return False
+    sums(rows, values, right)
+    solve(factor, right)
+    return True
 
 
 @numba.njit(cache=True, nogil=True)

@@ -6,7 +6,18 @@ import numba
 import numpy as np
 import pytest
 
-from coupole.reflectance.lanes import absolute, gathered, if_less, larger, loaded, root, store_halves
+from coupole.reflectance.lanes import (
+    absolute,
+    gathered,
+    if_less,
+    lanes,
+    larger,
+    loaded,
+    root,
+    store,
+    store_halves,
+    total,
+)
 
 
 @numba.njit
@@ -41,7 +52,7 @@ def test_halves_are_those_of_numpy() -> None:
 
 def test_lanes_are_reckoned_each_for_itself() -> None:
     numbers = np.random.default_rng(2).normal(0, 1, (2, 8)).astype(np.float32)
-    numbers[0, 3], numbers[1, 5] = np.nan, np.inf
+    numbers[0, 3], numbers[1, 5], numbers[1, 6] = np.nan, np.inf, numbers[0, 6]
     found = np.empty((3, 8), np.uint16)
     combined(numbers, found)
     one, other = numbers
@@ -52,6 +63,28 @@ def test_lanes_are_reckoned_each_for_itself() -> None:
             np.where(one < other, one + other, 7.0),
         ]
     np.testing.assert_array_equal(found.view(np.float16), np.array(wanted).astype(np.float16))
+
+
+@numba.njit
+def doubled(numbers, found):  # type: ignore[no-untyped-def]
+    made = lanes(3.0) / loaded(numbers, 1)
+    made -= 0.1
+    store(made, found, 2)
+    return total(made)
+
+
+def test_lanes_of_double_precision_round_as_doubles_do() -> None:
+    numbers, found = np.random.default_rng(4).uniform(1, 2, (2, 8)), np.zeros((3, 8))
+    summed = doubled(numbers, found)
+    np.testing.assert_array_equal(found[2], 3.0 / numbers[1] - 0.1)
+    assert not found[:2].any()
+    assert summed == pytest.approx(found[2].sum(), rel=1e-15)
+
+
+def test_lanes_of_two_precisions_are_not_mixed() -> None:
+    mixed = numba.njit(lambda one, other, found: store(loaded(one, 0) + loaded(other, 0), found, 0))
+    with pytest.raises(numba.errors.TypingError, match="expected lanes of one precision"):
+        mixed(np.zeros((1, 8)), np.zeros((1, 8), np.float32), np.zeros((1, 8)))
 
 
 def test_lanes_are_gathered_from_eight_rows() -> None:

@@ -341,6 +341,7 @@ def _relit(root: Path, folder: Path, samples: Any, rounds: int) -> Iterator[dict
     from coupole.reflectance.material_uncertainty import MaterialUncertainty
     from coupole.reflectance.new_light.light_kinds import DistantLight
     from coupole.reflectance.run_relighting import scene_of_view
+    from coupole.reflectance.run_result import ABOUT, SCHEMA
     from coupole.reflectance.run_result_files import write_materials
     from coupole.reflectance.triangle_fit import fit_triangles
 
@@ -352,6 +353,7 @@ def _relit(root: Path, folder: Path, samples: Any, rounds: int) -> Iterator[dict
     certain = MaterialUncertainty(np.zeros((count, 5, 5)), *np.zeros((2, *whole.kd.shape)))
     nothing = np.zeros(count, np.float32)
     write_materials(result.materials_path("ggx_normal"), [whole], [certain], nothing, 0.0, result.triangles)
+    (folder / ABOUT).write_text(json.dumps({"schema": SCHEMA, "emission": "lambertian"}))
     by, _ = photographer(root, folder / MESH, FULL)
     mitsuba = mitsuba_frame(folder / MESH, by)
     ready = scene_of_view(result, fit="ggx_normal")

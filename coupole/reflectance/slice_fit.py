@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.least_squares import factorise, gram, one_thread, solve, sums
+from coupole.reflectance.least_squares import factorise, gram, one_thread, solve, solve_by_samples, sums
 from coupole.reflectance.slice_basis import COUNT, LEAST_RESIDUAL, USUAL_LEFT, Basis, functions
 from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 
@@ -108,7 +108,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
     count, _, channels = values.shape
     memory, which = np.empty(COUNT * len(used)), np.empty(len(used), np.int64)
     wanted, xyz = np.empty(channels * len(used)), np.empty((3, len(used)))
-    product, factor = np.zeros((COUNT, COUNT)), np.empty((COUNT, COUNT))
+    product, room = np.zeros((COUNT, COUNT)), np.empty(3 * COUNT * COUNT)
     right, frame, held = np.empty((channels, COUNT)), np.empty((3, 3)), np.empty(COUNT)
     for triangle in range(count):
         _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
@@ -126,7 +126,8 @@ def _fit_part(  # type: ignore[no-untyped-def]
             for k in range(COUNT):
                 for number in range(n):
                     rows[k, number] *= z[number]
-            gram(rows, product)
+            if n >= COUNT:
+                gram(rows, product)
             mine = wanted[: (end - first) * n].reshape(end - first, n)
             for fit in range(len(left)):
                 for number in range(n):
@@ -135,9 +136,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
                 held[:] = penalties[fit]
                 if over[fit]:
                     held *= _held_by(mine, values[triangle], which[:n], first)
-                if factorise(product, held, factor):
-                    sums(rows, mine, right[: end - first])
-                    solve(factor, right[: end - first])
+                if _solve(rows, product, held, mine, room, right[: end - first]):
                     found[fit, triangle, first:end] = right[: end - first]
 
 
@@ -151,6 +150,20 @@ def _held_by(left, values, which, first):  # type: ignore[no-untyped-def]
             remains += left[channel, number] ** 2
             whole += values[which[number], first + channel] ** 2
     return min(1.0, max(LEAST_RESIDUAL, USUAL_LEFT * whole / max(remains, 1e-30)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve(rows, product, penalty, values, room, right):  # type: ignore[no-untyped-def]
+    """Into `right` the coefficients, the shorter way; whether there are some. `product` is of `gram` where samples
+    are as many as functions."""
+    if rows.shape[1] < COUNT:
+        return solve_by_samples(rows, penalty, values, room, right)
+    factor = room[: COUNT * COUNT].reshape(COUNT, COUNT)
+    if not factorise(product, penalty, factor):
+        return False
+    sums(rows, values, right)
+    solve(factor, right)
+    return True
 
 
 @numba.njit(cache=True, nogil=True)

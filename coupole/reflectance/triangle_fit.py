@@ -2,7 +2,8 @@
 
 The normal of the mesh is the prior of the fitted one, with the variance that noise of the scanner's vertices gives
 it: for a triangle of area A about that of an equilateral one, 2 s^2 / a^2 with a^2 = 4 A / sqrt 3 (a plane through
-three points, each off by s). The fit is that of `coupole.reflectance.normal_fit`.
+three points, each off by s). The fit is that of `coupole.reflectance.normal_fit`, reckoned by
+`coupole.reflectance.ggx_fit`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.reflectance.ggx import lobe
-from coupole.reflectance.normal_fit import colours_from, fit_from
+from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
+from coupole.reflectance.lanes import LANES
+from coupole.reflectance.normal_fit import colours_from
 
 Floats = NDArray[np.float64]
 
@@ -35,6 +38,8 @@ _TO_CHOOSE = 256
 """Samples, about, by which the best start is chosen."""
 LEAST_KD = 1e-6
 """1/sr: of black, where a share of kd is asked for."""
+_CHOSEN, _SETTLED = 1e-4, 1e-5
+"""A fit ends when a step gains less of the cost: of a start, and of the best one."""
 HELD = 1e9
 """Stiffness of a normal that is not fitted."""
 _PART = 256
@@ -157,7 +162,7 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
     lights, half = np.empty((samples, 3)), np.empty((samples, 3))
     views = np.empty((len(cameras_mm), 3))
     good, roots = np.empty(samples, np.int64), np.empty(samples)
-    own = np.empty((samples, channels))
+    own, packs = np.empty((samples, channels)), np.empty((samples // LANES + 1, ROWS, LANES))
     for triangle in range(count):
         normal, held = normals[triangle], stiffness[triangle]
         n = gather(
@@ -166,8 +171,9 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
         )  # fmt: skip
         if n < FEWEST:
             continue
-        chosen = _best_start(roots[:n], good[:n], lights, half, views, view_of, normal, held)
-        _, spread = fit_from(roots[:n], good[:n], lights, half, views, view_of, chosen, normal, held, USUAL)
+        chosen = _best_start(roots[:n], good[:n], lights, half, views, view_of, normal, held, packs)
+        count = pack(roots[:n], good[:n], lights, half, views, view_of, packs)
+        _, spread = fit_packs(packs[:count], views, chosen, normal, held, USUAL, _SETTLED)
         found[triangle, :3] = chosen[:3] if free else normal
         found[triangle, 3], found[triangle, 4] = math.exp(chosen[5]), spread
         kd, ks = found[triangle, 5 : 5 + channels], found[triangle, 5 + channels :]
@@ -225,16 +231,16 @@ def gather(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _best_start(roots, good, lights, half, views, view_of, normal, stiffness):  # type: ignore[no-untyped-def]
-    """Where the best of the starts ends, by some of the samples."""
+def _best_start(roots, good, lights, half, views, view_of, normal, stiffness, packs):  # type: ignore[no-untyped-def]
+    """Where the best of the starts ends, about, by some of the samples; `packs` is memory."""
     kd = _first_kd(roots, good, lights, normal)
     step = max(1, len(good) // _TO_CHOOSE)
-    few_roots, few = roots[::step].copy(), good[::step].copy()
+    count = pack(roots[::step], good[::step], lights, half, views, view_of, packs)
     unknowns, chosen, best = np.empty(6), np.empty(6), np.inf
     for alpha in _STARTS:
         unknowns[:3] = normal
         unknowns[3], unknowns[4], unknowns[5] = math.log(kd), math.log(_FIRST_KS * kd), math.log(alpha)
-        cost, _ = fit_from(few_roots, few, lights, half, views, view_of, unknowns, normal, stiffness, USUAL)
+        cost, _ = fit_packs(packs[:count], views, unknowns, normal, stiffness, USUAL, _CHOSEN)
         if cost < best:
             best = cost
             chosen[:] = unknowns

@@ -8,6 +8,7 @@ state: free, a frame not yet proven, or a proven shot with its checksum.
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
 from collections.abc import Iterator
@@ -179,6 +180,36 @@ def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
                 raise StorageError(f"{path}: ends within slot {slot}")
             return pixels_of(stored, layout)
     return read_frame(path, read_layout(path), slot)
+
+
+def read_frame_into(path: Path, layout: Layout, slot: int, pixels: NDArray[np.uint16]) -> None:
+    """As `read_frame`, into `pixels` [H, W], C order, of the caller: past the page cache where the file system,
+    the size of the frames and the memory's alignment (512 bytes) allow it. Raises StorageError."""
+    if layout.archived or layout.packed or not _read_direct(path, layout, slot, pixels):
+        pixels[:] = read_frame(path, layout, slot)
+
+
+def _read_direct(path: Path, layout: Layout, slot: int, pixels: NDArray[np.uint16]) -> bool:
+    """Whether the frame was read; not if the file is another one by now, ends early, or cannot be read so."""
+    if layout.frame_bytes % PAGE or layout.data_offset % PAGE:
+        return False
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_DIRECT)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # not supported by this file system
+            raise StorageError(f"{path}: {error.strerror}") from error
+        return False
+    try:
+        if os.fstat(fd).st_ino != layout.inode:
+            return False
+        memory = pixels.data.cast("B")
+        return os.preadv(fd, [memory], layout.data_offset + slot * layout.frame_bytes) == layout.frame_bytes
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            raise StorageError(f"{path}: slot {slot}: {error.strerror}") from error
+        return False
+    finally:
+        os.close(fd)
 
 
 def pixels_of(stored: bytes | mmap.mmap, layout: Layout) -> NDArray[np.uint16]:

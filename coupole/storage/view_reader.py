@@ -39,7 +39,14 @@ class View:
 
     def proven_pixels(self, frame: FrameProven) -> NDArray[np.uint16]:
         """[H, W], DN, of a frame of this file. Raises StorageError; ChecksumMismatch if not what was proven."""
-        pixels = self.pixels(frame.index)
+        return self._proven(frame, self.pixels(frame.index))
+
+    def read_proven_pixels(self, frame: FrameProven, pixels: NDArray[np.uint16]) -> None:
+        """The same into memory [H, W] of the caller, as `frame_file.read_frame_into`."""
+        frame_file.read_frame_into(self.path, self.layout, frame.index, pixels)
+        self._proven(frame, pixels)
+
+    def _proven(self, frame: FrameProven, pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
         if f"{frame_file.checksum(pixels):016x}" != frame.xxh3:
             raise ChecksumMismatch(f"{self.path}: {frame.shot} is not what was proven. See `coupole verify`.")
         return pixels

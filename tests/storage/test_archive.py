@@ -116,6 +116,9 @@ def test_archived_frames_are_read_bit_exact_by_the_store(archived: MadeRun) -> N
         path = archived.run.folder / frame.file
         pixels = frame_file.read_frame(path, frame_file.read_layout(path), frame.index)
         assert np.array_equal(pixels, archived.frames[str(shot)])
+        memory = np.empty_like(pixels)
+        frame_file.read_frame_into(path, frame_file.read_layout(path), frame.index, memory)
+        assert np.array_equal(memory, pixels)
 
 
 def contents(path: Path) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import mmap
+import os
 from pathlib import Path
 
 import h5py
@@ -10,7 +12,7 @@ import pytest
 import xxhash
 from view_files import DATA, FORMAT, FRAMES, METADATA, ODD, SLOTS, frame, write_view
 
-from coupole.devices import ArmState
+from coupole.devices import ArmState, FrameFormat
 from coupole.errors import StorageError
 from coupole.storage import frame_file
 from coupole.storage.frame_file_creation import create
@@ -144,6 +146,27 @@ def test_frames_written_after_reopening_overwrite_nothing_proven(tmp_path: Path)
     writer.close()
     assert slots == {0, 2, 3, 4, 5}
     assert np.array_equal(frame_file.read_frame(path, frame_file.read_layout(path), 1), frame(1))
+
+
+@pytest.mark.parametrize(("of", "begin"), [(FORMAT, 0), (FORMAT, 512), (FORMAT, 2), (ODD, 0)])
+def test_frames_are_read_into_memory_of_any_alignment(tmp_path: Path, of: FrameFormat, begin: int) -> None:
+    """FORMAT's frames can be read past the page cache, ODD's are no whole pages."""
+    path = tmp_path / "top.h5"
+    write_view(path, of=of)
+    memory = np.frombuffer(mmap.mmap(-1, of.frame_bytes + begin), np.uint16)[begin // 2 :]
+    pixels = memory.reshape(of.height_px, of.width_px)
+    for slot in range(3):
+        frame_file.read_frame_into(path, frame_file.read_layout(path), slot, pixels)
+        assert np.array_equal(pixels, frame(slot, of))
+
+
+def test_a_frame_behind_the_end_of_a_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "top.h5"
+    write_view(path)
+    layout = frame_file.read_layout(path)
+    os.truncate(path, layout.data_offset + layout.frame_bytes + 512)
+    with pytest.raises(StorageError, match="ends within slot 1"):
+        frame_file.read_frame_into(path, layout, 1, frame(0))
 
 
 def test_a_freed_slot_is_used_again(tmp_path: Path) -> None:

@@ -44,6 +44,8 @@ class LightFrame:
     """[H, W] DN."""
     joints_deg: Floats | None = None
     """[6] measured with the pose."""
+    read_into: Callable[[NDArray[np.uint16]], None] | None = None
+    """The same as `read` into memory [H, W], C order, if the frame's file can do that."""
 
     @property
     def view(self) -> str:
@@ -167,6 +169,7 @@ def _of_view(
                 np.array(poses[int(record["pose"])]["base_from_camera"], dtype=np.float64),
                 partial(file.proven_pixels, frame),
                 np.array(poses[int(record["pose"])]["joints_deg"], dtype=np.float64),
+                partial(file.read_proven_pixels, frame),
             )
         )
     optics = file.number("focal_length_mm"), file.number("focus_distance_mm"), file.number("pixel_pitch_um")

@@ -31,7 +31,7 @@ from coupole.reflectance.extraction.lamp_sight import (
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
 from coupole.reflectance.extraction.seen_surface import SeenSurface, seen_surface
-from coupole.reflectance.extraction.view_samples import BLOCK, ViewPass
+from coupole.reflectance.extraction.view_samples import BLOCK, Samples, ViewPass
 from coupole.reflectance.result_folder import complete
 
 Floats = NDArray[np.float64]
@@ -93,8 +93,8 @@ def extract_view(
             data = _begin_samples(file, work)
             done = 0
             for some in work.samples(codes_of, threads):
-                data["codes"][some.rows, some.leds] = some.codes.T
-                data["f"][some.rows, some.leds], data["u_own"][some.rows, some.leds] = some.f, some.u_own
+                for name, values in (("codes", some.codes), ("f", some.f), ("u_own", some.u_own)):
+                    _write_chunk(data[name], some, values)
                 used += int(np.count_nonzero(np.isfinite(some.f)))
                 of_code[:] += np.bincount(some.codes.ravel(), minlength=len(CODES))
                 if some.rows.stop == len(surface.triangles):
@@ -225,3 +225,11 @@ def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:
         data[name] = file.create_dataset(name, shape, kind, chunks=chunks, track_times=False)
         data[name].attrs["told"] = told
     return data
+
+
+def _write_chunk(data: h5py.Dataset, some: Samples, values: NDArray[Any]) -> None:
+    """Straight to its place in the file, but for the last LEDs and triangles, which are less than a chunk."""
+    if values.shape == data.chunks:
+        data.id.write_direct_chunk((some.rows.start, some.leds.start, 0)[: values.ndim], values.tobytes())
+    else:
+        data[some.rows, some.leds] = values

@@ -1,8 +1,9 @@
-"""From DN to linear signal per second over the flat field, and its means over the triangles that pixels see."""
+"""What turns DN into linear signal over the flat field, and which pixels each triangle has."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from coupole.calibration.earlier import read_earlier
 from coupole.calibration.light.frames import LightFrame, channel_mask
 from coupole.calibration.light.records import dark_signal, linearise, map_beside
-from coupole.reflectance.extraction.lamp_sight import REACHED
 from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.reflectance.extraction.seen_surface import SeenSurface
 
@@ -39,8 +39,32 @@ class Radiometry:
             self.u_pixel = np.full(self.channels, u_pixel)
 
 
+class PixelLists(NamedTuple):
+    """Pixels of one view in the order of triangles and channels, for compiled code."""
+
+    starts: NDArray[np.int64]
+    """[triangles channels + 1] of a triangle's channel in what follows."""
+    places: NDArray[np.int32]
+    """[pixels] in a frame, row by row."""
+    even: NDArray[np.float32]
+    """[pixels] 1 over the flat field."""
+
+
+class Response(NamedTuple):
+    """Of the camera's channels, for compiled code."""
+
+    curve: NDArray[np.float32]
+    """[channels, 2] of the square and the cube of a signal in DN."""
+    noise: NDArray[np.float32]
+    """[channels, 2] variance in the dark, DN^2, and gain, DN/e; NaN where it is not known."""
+    top_dn: np.float32
+    """Of the range that is used."""
+    least_dn: np.float32
+    """Above the dark, of a triangle's mean."""
+
+
 class SignalReader:
-    """Pixels of one view in the order of triangles and channels, and what they mean in its frames."""
+    """Pixels of one view by triangles and channels, and what they mean in its frames."""
 
     def __init__(self, radiometry: Radiometry, surface: SeenSurface) -> None:
         self._radiometry = radiometry
@@ -51,42 +75,31 @@ class SignalReader:
         with np.errstate(divide="ignore"):
             self.u_response = radiometry.u_pixel / np.sqrt(self.pixels)
             """[triangles, channels] relative standard uncertainty that all means share, of pixels' responses."""
-        self._starts = np.concatenate([[0], np.cumsum(self.pixels.ravel(), dtype=np.int64)])
-        """[triangles channels + 1] of a triangle's channel in what follows."""
-        self._places = np.empty(self._starts[-1], np.int32)
-        """[pixels] in a frame, row by row."""
-        _list(surface.places, radiometry.channel, self._starts[:-1].copy(), self._places)
-        self._flat = np.float32(1.0) / radiometry.flat.ravel()[self._places]
-        self._inverse = (1.0 / np.maximum(np.arange(self.pixels.max(initial=0) + 1), 1)).astype(np.float32)
+        starts = np.concatenate([[0], np.cumsum(self.pixels.ravel(), dtype=np.int64)])
+        places = np.empty(starts[-1], np.int32)
+        _list(surface.places, radiometry.channel, starts[:-1].copy(), places)
+        self.lists = PixelLists(starts, places, np.float32(1.0) / radiometry.flat.ravel()[places])
         scale = radiometry.curve[:, 2:]
-        self._curve = (radiometry.curve[:, :2] / np.hstack([scale, scale**2])).astype(np.float32)
-        self._noise = radiometry.noise.astype(np.float32)
-        self._dark: dict[float, NDArray[np.float32]] = {}
+        curve = radiometry.curve[:, :2] / np.hstack([scale, scale**2])
+        least_dn = RANGE_LEFT_OUT * (radiometry.white_dn - radiometry.black_dn)
+        self.response = Response(
+            curve.astype(np.float32),
+            radiometry.noise.astype(np.float32),
+            np.float32(radiometry.white_dn - least_dn),
+            np.float32(least_dn),
+        )
+        self.exposures: dict[float, int] = {}
+        """Rows of `darks`, by exposures in us."""
+        self.darks = np.empty((0, len(places)), np.float32)
+        """[exposures, pixels] what frames have without light, DN, in the order of the lists."""
 
-    def prepare(self, frame: LightFrame) -> None:
-        """What frames of its exposure need, before threads want it."""
-        if frame.exposure_us not in self._dark:
-            self._dark[frame.exposure_us] = self._radiometry.dark(frame).ravel()[self._places]
-
-    def means(
-        self, frame: LightFrame, pixels: NDArray[np.uint16], rows: slice, codes: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """[b, channels] mean signals of the triangles in `rows` that light has reached, DN/s over the flat field,
-        and their relative uncertainties, by noise.
-
-        NaN where no pixel is, where one is at the range's top, or the mean is at its bottom.
-        """
-        known, channels = self._radiometry, self._radiometry.channels
-        least = RANGE_LEFT_OUT * (known.white_dn - known.black_dn)
-        signal = np.full((rows.stop - rows.start, channels), np.nan, np.float32)
-        u_signal = np.full(signal.shape, np.nan, np.float32)
-        _means(
-            pixels.ravel(), self._dark[frame.exposure_us], self._places, self._flat,
-            self._starts[rows.start * channels : rows.stop * channels + 1],
-            self._inverse / np.float32(frame.exposure_us * 1e-6), self._curve, self._noise,
-            np.float32(known.white_dn - least), np.float32(least), codes, signal, u_signal,
-        )  # fmt: skip
-        return signal, u_signal
+    def prepare(self, frames: Sequence[LightFrame]) -> None:
+        """What frames of their exposures have without light."""
+        alike = {frame.exposure_us: frame for frame in frames}
+        self.exposures = {exposure_us: number for number, exposure_us in enumerate(alike)}
+        self.darks = np.empty((len(alike), len(self.lists.places)), np.float32)
+        for number, frame in enumerate(alike.values()):
+            np.take(self._radiometry.dark(frame).ravel(), self.lists.places, out=self.darks[number], mode="clip")
 
 
 def _response(measured: MeasuredRun) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -135,28 +148,3 @@ def _list(triangle, channel, next_place, places):  # type: ignore[no-untyped-def
                 mine = triangle[row, column] * channels + channel[row, column]
                 places[next_place[mine]] = row * width + column
                 next_place[mine] += 1
-
-
-@numba.njit(cache=True, nogil=True)
-def _means(raw, dark, places, flat, starts, inverse, curve, noise, top_dn, least_dn, codes, signals, u_signals):  # type: ignore[no-untyped-def]
-    """Means of linear signal over the flat field, and what variance noise gives them, in single precision: a few
-    values of 12 bits. `flat` is 1 over the field, `inverse` [n] 1 over n pixels and the time. A triangle with a
-    pixel at the range's top has no mean."""
-    none, one = np.float32(0.0), np.float32(1.0)
-    channels = signals.shape[1]
-    for triangle in range(len(signals)):
-        if codes[triangle] != REACHED:
-            continue
-        for c in range(channels):
-            first, end = starts[triangle * channels + c], starts[triangle * channels + c + 1]
-            total, above, variance, highest = none, none, none, none
-            for pixel in range(first, end):
-                dn = np.float32(raw[places[pixel]])
-                highest = max(highest, dn)
-                signal, even = dn - dark[pixel], flat[pixel]
-                above += signal
-                total += even * signal * (one + signal * (curve[c, 0] + signal * curve[c, 1]))
-                variance += even * even * (noise[c, 0] + noise[c, 1] * max(signal, none))
-            if end > first and highest < top_dn and above > least_dn * np.float32(end - first):
-                signals[triangle, c] = total * inverse[end - first]
-                u_signals[triangle, c] = np.sqrt(variance) / abs(total)

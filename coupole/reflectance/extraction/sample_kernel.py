@@ -1,0 +1,145 @@
+"""Samples of reflectance from the pixels of up to eight frames at once, in compiled code.
+
+The lists of pixels are read once for eight frames, whose sums are the lanes of a vector. Single precision is
+enough: directions of 1e-7, where float16 has steps of 5e-4.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.extraction.lamp_sight import REACHED
+from coupole.reflectance.lanes import (
+    absolute,
+    gathered,
+    if_less,
+    lanes,
+    larger,
+    loaded,
+    root,
+    store_halves,
+)
+
+Singles = NDArray[np.float32]
+
+MOST_F = 6e4
+"""1/sr: the most that float16 has is 65504."""
+NO_VALUE = 0x7E00
+"""NaN, as the bits of a float16."""
+_NAN = np.float32(np.nan)
+_SQUARE_MM = np.float32(1e6 / np.pi)
+
+
+class Shots(NamedTuple):
+    """Frames of up to eight LEDs, one lane each, in passes: one frame of each LED, all of one exposure."""
+
+    frames: NDArray[np.uint16]
+    """[slots, memory of a frame]"""
+    slots: NDArray[np.int64]
+    """[passes, 8]"""
+    there: NDArray[np.uint8]
+    """[passes, 8] 1 where there is such a frame; else the slot means nothing."""
+    times_s: Singles
+    """[passes] exposures."""
+    exposures: NDArray[np.int64]
+    """[passes] rows of the dark signals."""
+
+
+class Lamps(NamedTuple):
+    """The LEDs of the eight lanes."""
+
+    centres_mm: Singles
+    """[3, 8]"""
+    axes: Singles
+    """[3, 8]"""
+    powers: Singles
+    """[channels, 8] DN s^-1 m^2 sr; NaN where there is none."""
+    paper: bool
+    """Whether the emitter's cosine counts twice (seed 003, Eq. 2)."""
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normals, codes, f, u_own):  # type: ignore[no-untyped-def]
+    """Into `f` and `u_own` [b, leds, channels], bits of float16, the samples of b triangles from the `first` on
+    where `codes` [b, 8] say that light has reached them; `lists` are the view's PixelLists, `darks` [exposures,
+    pixels] what its frames have without light, `response` the camera's."""
+    bits = np.empty((2, 8), np.uint16)
+    for row in range(len(f)):
+        if REACHED not in codes[row]:
+            continue
+        per_irradiance = _per_irradiance(centres_mm[row], normals[row], lamps)
+        off = absolute(loaded(codes, row) - np.float32(REACHED))
+        per_irradiance = if_less(off, np.float32(0.5), per_irradiance, _NAN)
+        for channel in range(f.shape[2]):
+            own = (first + row) * f.shape[2] + channel
+            begin, end = lists.starts[own], lists.starts[own + 1]
+            signal, u_signal = _signal(begin, end, channel, lists, response, darks, shots)
+            value = signal * per_irradiance / loaded(lamps.powers, channel)
+            size = absolute(value)
+            store_halves(if_less(size, np.float32(MOST_F), value, _NAN), bits[0])
+            store_halves(if_less(size, np.float32(MOST_F), u_signal, _NAN), bits[1])
+            for led in range(f.shape[1]):
+                f[row, led, channel], u_own[row, led, channel] = bits[0, led], bits[1, led]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _per_irradiance(centre_mm, normal, lamps):  # type: ignore[no-untyped-def]
+    """1 over cos_i E / Phi (`lit_by` of lamp_sight) of the lamps."""
+    square, leaving, arriving = lanes(np.float32(0.0)), lanes(np.float32(0.0)), lanes(np.float32(0.0))
+    for k in range(3):
+        way = loaded(lamps.centres_mm, k) - np.float32(centre_mm[k])
+        square = square + way * way
+        leaving = leaving - way * loaded(lamps.axes, k)
+        arriving = arriving + way * np.float32(normal[k])
+    leaving = larger(leaving, np.float32(0.0))
+    lit = _SQUARE_MM * leaving * arriving / (square * square)
+    if lamps.paper:
+        lit = lit * leaving / root(square)
+    return np.float32(1.0) / lit
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _signal(begin, end, channel, lists, response, darks, shots):  # type: ignore[no-untyped-def]
+    """Mean of linear signal over the flat field, DN/s, and its relative uncertainty by noise. Passes are weighted
+    by their variances; by their times where noise is not known."""
+    total, weights = lanes(np.float32(0.0)), lanes(np.float32(0.0))
+    noisy = not np.isnan(response.noise[channel, 0])
+    for number in range(len(shots.slots)):
+        mean, variance = _mean(begin, end, channel, lists, response, darks, shots, number)
+        if len(shots.slots) == 1:
+            return mean, root(variance) / absolute(mean)
+        weight = np.float32(1.0) / variance if noisy else lanes(shots.times_s[number])
+        weights = weights + if_less(absolute(mean), np.float32(np.inf), weight, np.float32(0.0))
+        total = total + if_less(absolute(mean), np.float32(np.inf), weight * mean, np.float32(0.0))
+    mean = total / weights
+    u_mean = np.float32(1.0) / (root(weights) * absolute(mean)) if noisy else lanes(_NAN)
+    return mean, u_mean
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mean(begin, end, channel, lists, response, darks, shots, number):  # type: ignore[no-untyped-def]
+    """Of one pass, and its variance. NaN where no pixel is, where one is at the range's top, where the mean is at
+    its bottom."""
+    none, one = np.float32(0.0), np.float32(1.0)
+    square, cube = response.curve[channel, 0], response.curve[channel, 1]
+    in_dark, gain = response.noise[channel, 0], response.noise[channel, 1]
+    slots, dark = shots.slots[number], darks[shots.exposures[number]]
+    total, above, variance, highest = lanes(none), lanes(none), lanes(none), lanes(none)
+    for pixel in range(begin, end):
+        dn, even = gathered(shots.frames, slots, np.int64(lists.places[pixel])), lists.even[pixel]
+        highest = larger(highest, dn)
+        signal = dn - dark[pixel]
+        above = above + signal
+        total = total + even * signal * (one + signal * (square + signal * cube))
+        variance = variance + even * even * (in_dark + gain * larger(signal, none))
+    count = np.float32(end - begin)
+    mean = total * (one / (count * shots.times_s[number]))
+    mean = if_less(highest, response.top_dn, mean, _NAN)
+    mean = if_less(response.least_dn * count, above, mean, _NAN)
+    mean = if_less(np.float32(0.5), loaded(shots.there, number), mean, _NAN)
+    scale = one / (count * shots.times_s[number])
+    return mean, variance * (scale * scale)

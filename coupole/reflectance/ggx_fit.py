@@ -1,0 +1,169 @@
+"""The fit of `coupole.reflectance.normal_fit.fit_from` for eight samples at once: the same costs, steps and ends.
+
+A trial's derivatives are made with its cost, as most trials are taken. The logarithms of Cauchy's cost are one, of
+the product over some samples.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from coupole.reflectance.ggx import UNKNOWNS, tangents
+from coupole.reflectance.lanes import LANES, if_less, lanes, larger, loaded, root, store, total
+from coupole.reflectance.normal_fit import (
+    _MOST_STEPS,
+    _USUAL_ALPHA,
+    _USUAL_KS,
+    CAUCHY,
+    SPREAD_KS,
+    _least_cosine,
+    _move,
+    _solve,
+)
+
+ROWS = 11
+"""Of each pack of eight samples: the square root of the value, its light, half vector and view, and 1 where there
+is a sample."""
+_OFF = UNKNOWNS
+_TOGETHER = 4
+"""Packs whose product is taken, below what a double can hold: an error of 1e4 scales in each sample."""
+
+
+@numba.njit(cache=True, nogil=True)
+def pack(roots, good, lights, half, views, view_of, packs):  # type: ignore[no-untyped-def]
+    """Into `packs` [n, 11, 8] the samples `good`; how many packs they fill. For the others see `fit_from`."""
+    count = (len(good) + LANES - 1) // LANES
+    for number in range(count * LANES):
+        one = packs[number // LANES, :, number % LANES]
+        if number < len(good):
+            sample = good[number]
+            one[0], one[10] = roots[number], 1.0
+            for k in range(3):
+                one[1 + k], one[4 + k], one[7 + k] = lights[sample, k], half[sample, k], views[view_of[sample], k]
+        else:
+            one[:] = 0.0  # its light comes from nowhere
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def fit_packs(packs, views, unknowns, prior, stiffness, usual, settled):  # type: ignore[no-untyped-def]
+    """Levenberg-Marquardt from `unknowns` in place, until a step gains less than `settled` of the cost; cost and
+    weighted rms, as `fit_from` gives them."""
+    scale = CAUCHY * math.exp(0.5 * unknowns[3])
+    rows = np.empty((len(packs) * (UNKNOWNS + 1), LANES))
+    matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    new_matrix, new_right, trial = np.empty_like(matrix), np.empty_like(right), np.empty(6)
+    cost, spread = _equations(packs, unknowns, prior, stiffness, usual, scale, rows, matrix, right)
+    damping = 1e-2
+    for _ in range(_MOST_STEPS):
+        _move(unknowns, _solve(matrix, right, damping), trial)
+        moved, moved_spread = np.inf, 0.0
+        if _least_cosine(trial, views) > 0.02:
+            moved, moved_spread = _equations(
+                packs, trial, prior, stiffness, usual, scale, rows, new_matrix, new_right
+            )
+        if moved < cost:
+            gain = cost - moved
+            unknowns[:], matrix[:], right[:] = trial, new_matrix, new_right
+            damping = max(damping * 0.2, 1e-9)
+            cost, spread = moved, moved_spread
+            if gain < settled * (cost + gain):
+                break
+        else:
+            damping *= 6.0
+            if damping > 1e8:
+                break
+    return cost, spread / math.exp(0.5 * unknowns[3])
+
+
+@numba.njit(cache=True, nogil=True)
+def _equations(packs, unknowns, prior, stiffness, usual, scale, rows, matrix, right):  # type: ignore[no-untyped-def]
+    """Normal equations of a step, into `matrix` and `right`; Cauchy's cost and the weighted rms."""
+    t1, t2 = tangents(unknowns[0], unknowns[1], unknowns[2])
+    cost, spread = _residuals(packs, unknowns, t1, t2, scale, rows)
+    count = len(packs)
+    for i in range(UNKNOWNS):
+        for j in range(i + 1):
+            matrix[i, j] = _product(rows, i * count, j * count, count)
+        right[i] = -_product(rows, i * count, _OFF * count, count)
+    off0, off1, off2 = unknowns[0] - prior[0], unknowns[1] - prior[1], unknowns[2] - prior[2]
+    right[0] -= stiffness * (t1[0] * off0 + t1[1] * off1 + t1[2] * off2)
+    right[1] -= stiffness * (t2[0] * off0 + t2[1] * off1 + t2[2] * off2)
+    matrix[0, 0] += stiffness
+    matrix[1, 1] += stiffness
+    more_ks, more_alpha = (unknowns[4] - _USUAL_KS) / SPREAD_KS, unknowns[5] - _USUAL_ALPHA
+    right[3] -= usual * more_ks / SPREAD_KS
+    right[4] -= usual * more_alpha
+    matrix[3, 3] += usual / SPREAD_KS**2
+    matrix[4, 4] += usual
+    cost += stiffness * (off0 * off0 + off1 * off1 + off2 * off2)
+    return cost + usual * (more_alpha * more_alpha + more_ks * more_ks), spread
+
+
+@numba.njit(cache=True, nogil=True)
+def _product(rows, one, other, count):  # type: ignore[no-untyped-def]
+    found = lanes(0.0)
+    for n in range(count):
+        found += loaded(rows, one + n) * loaded(rows, other + n)
+    return total(found)
+
+
+@numba.njit(cache=True, nogil=True)
+def _dot(vector, values, first):  # type: ignore[no-untyped-def]
+    return (
+        vector[0] * loaded(values, first)
+        + vector[1] * loaded(values, first + 1)
+        + vector[2] * loaded(values, first + 2)
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _residuals(packs, unknowns, t1, t2, scale, rows):  # type: ignore[no-untyped-def]
+    """Into `rows` [6 packs, 8] the residuals' derivatives by the unknowns, then the residuals, times the square
+    root of the weight; sum of the logarithms, and weighted rms. The formulas are those of
+    `coupole.reflectance.ggx`."""
+    normal = (unknowns[0], unknowns[1], unknowns[2])
+    kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
+    alpha2, rest, count = alpha * alpha, 1.0 - alpha * alpha, len(packs)
+    squares, weights, product, logarithms = lanes(0.0), lanes(0.0), lanes(1.0), 0.0
+    eight = np.empty((1, LANES))
+    for n in range(count):
+        one = packs[n]
+        cosine, nh, nv = _dot(normal, one, 1), _dot(normal, one, 4), _dot(normal, one, 7)
+        nl, nv = larger(cosine, 1e-9), larger(nv, 1e-9)
+        t, a, b = 1.0 - nh * nh * rest, root(alpha2 + rest * nl * nl), root(alpha2 + rest * nv * nv)
+        s, ab = nl * b + nv * a, a * b
+        inverse = 1.0 / (t * s * ab)
+        by_t, by_s, by_ab = inverse * s * ab, inverse * t * ab, inverse * t * s
+        value = (0.5 / math.pi * alpha2) * by_t * by_t * by_s
+        shine, value_by_s = ks * value, value * by_s
+        made = root(nl * (kd + shine))
+        off = (if_less(0.0, cosine, made, 0.0) - loaded(one, 0)) / scale
+        weight = 1.0 / (1.0 + off * off)
+        share = root(weight)
+        factor = if_less(0.0, cosine, share * (0.5 / scale) / made, 0.0)
+        by_light = kd + shine - nl * ks * value_by_s * (b + nv * rest * nl * b * by_ab)
+        by_view = -1.0 * nl * ks * value_by_s * (a + nl * rest * nv * a * by_ab)
+        by_half = 4.0 * nl * nh * rest * by_t * shine
+        by_alpha = value * (2.0 - 4.0 * alpha2 * nh * nh * by_t) - alpha2 * value_by_s * (
+            nl * (1.0 - nv * nv) * a * by_ab + nv * (1.0 - nl * nl) * b * by_ab
+        )
+        for k, t12 in enumerate((t1, t2)):
+            tilt = by_light * _dot(t12, one, 1) + by_view * _dot(t12, one, 7) + by_half * _dot(t12, one, 4)
+            store(factor * tilt, rows, k * count + n)
+        store(factor * nl * kd, rows, 2 * count + n)
+        store(factor * nl * shine, rows, 3 * count + n)
+        store(factor * nl * ks * by_alpha, rows, 4 * count + n)
+        store(off * share, rows, _OFF * count + n)
+        squares += weight * off * off
+        weights += weight * loaded(one, 10)
+        product = product * (1.0 + off * off)
+        if n % _TOGETHER == _TOGETHER - 1 or n == count - 1:
+            store(product, eight, 0)
+            logarithms += math.log(eight[0, 0] * eight[0, 1] * eight[0, 2] * eight[0, 3])
+            logarithms += math.log(eight[0, 4] * eight[0, 5] * eight[0, 6] * eight[0, 7])
+            product = lanes(1.0)
+    return logarithms, scale * math.sqrt(total(squares) / total(weights))

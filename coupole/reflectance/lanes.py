@@ -1,0 +1,236 @@
+"""Eight numbers at once in compiled code: a vector of the processor as a type of numba.
+
+Numba leaves it to LLVM to find such vectors in loops, and it does not find those of loops that are short, branch,
+or read at places that a list names. Lanes are of single or double precision; +, -, * and / take them with each
+other and with numbers, rounding as single numbers do. They live in compiled code only: Python never gets one.
+"""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+from llvmlite import ir
+from numba import errors, types
+from numba.extending import intrinsic, models, overload, register_model
+
+LANES = 8
+_HALF, _INT = ir.HalfType(), ir.IntType(32)
+_NUMBERS = {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}
+
+
+class _Lanes(types.Type):
+    def __init__(self, number: Any) -> None:
+        super().__init__(f"Lanes({number})")
+        self.number = number
+
+
+_KINDS = {number: _Lanes(number) for number in _NUMBERS}
+
+
+def _vector(number: Any) -> Any:
+    return ir.VectorType(_NUMBERS[number], LANES)
+
+
+@register_model(_Lanes)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _vector(kind.number))  # type: ignore[no-untyped-call]
+
+
+def _kind(*given: Any) -> Any:
+    """Of what comes of these: that of the lanes among them."""
+    kinds = {kind for kind in given if isinstance(kind, _Lanes)}
+    if len(kinds) != 1:
+        raise errors.TypingError(f"expected lanes of one precision, got {', '.join(map(str, given))}")
+    return kinds.pop()
+
+
+def _compiled(kind_of: Any) -> Any:
+    """A function of compiled code alone; it takes the types of what it is given."""
+    return intrinsic(kind_of)
+
+
+def _spread(context: Any, builder: Any, number: Any, kind: Any, value: Any) -> Any:
+    """A number in all lanes; lanes as they are."""
+    if isinstance(kind, _Lanes):
+        return value
+    undefined = ir.Constant(_vector(number), ir.Undefined)
+    first = builder.insert_element(undefined, context.cast(builder, value, kind, number), _INT(0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES))
+
+
+def _made_of(build: Any) -> Any:
+    """A function of lanes and numbers, by what `build` makes of their vectors."""
+
+    def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
+        number, given = signature.return_type.number, zip(signature.args, values, strict=True)
+        return build(builder, *(_spread(context, builder, number, kind, value) for kind, value in given))
+
+    return generate
+
+
+def _operate(name: str) -> Any:
+    def kind_of(_context, left, right):  # type: ignore[no-untyped-def]
+        return _kind(left, right)(left, right), _made_of(lambda builder, a, b: getattr(builder, name)(a, b))
+
+    return _compiled(kind_of)
+
+
+def _give_operator(function: Any, made: Any) -> None:
+    @overload(function)
+    def choose(left, right):  # type: ignore[no-untyped-def]
+        if isinstance(left, _Lanes) or isinstance(right, _Lanes):
+            return lambda left, right: made(left, right)  # noqa: PLW0108  numba wants a function of Python
+        return None
+
+
+for _function, _in_place, _name in (
+    (operator.add, operator.iadd, "fadd"),
+    (operator.sub, operator.isub, "fsub"),
+    (operator.mul, operator.imul, "fmul"),
+    (operator.truediv, operator.itruediv, "fdiv"),
+):
+    _made = _operate(_name)
+    _give_operator(_function, _made)
+    _give_operator(_in_place, _made)
+
+
+@_compiled
+def lanes(_context, number):  # type: ignore[no-untyped-def]
+    """A number in all lanes, of its precision."""
+    kind = _KINDS[types.float32 if number == types.float32 else types.float64]
+    return kind(number), _made_of(lambda builder, value: value)
+
+
+@_compiled
+def larger(_context, left, right):  # type: ignore[no-untyped-def]
+    """Lane by lane the larger one; `right` where one is NaN."""
+
+    def build(builder, a, b):  # type: ignore[no-untyped-def]
+        return builder.select(builder.fcmp_ordered(">", a, b), a, b)
+
+    return _kind(left, right)(left, right), _made_of(build)
+
+
+@_compiled
+def if_less(_context, left, right, then, otherwise):  # type: ignore[no-untyped-def]
+    """`then` where `left` is less than `right`, else, also where one is NaN, `otherwise`."""
+
+    def build(builder, a, b, c, d):  # type: ignore[no-untyped-def]
+        return builder.select(builder.fcmp_ordered("<", a, b), c, d)
+
+    kind = _kind(left, right, then, otherwise)
+    return kind(left, right, then, otherwise), _made_of(build)
+
+
+def _math(name: str) -> Any:
+    def kind_of(_context, number):  # type: ignore[no-untyped-def]
+        def build(builder, value):  # type: ignore[no-untyped-def]
+            kind = ir.FunctionType(value.type, [value.type])
+            whole = f"llvm.{name}.v{LANES}f{number.number.bitwidth}"
+            known = builder.module.globals.get(whole)
+            return builder.call(known or ir.Function(builder.module, kind, whole), [value])
+
+        return number(number), _made_of(build)
+
+    return _compiled(kind_of)
+
+
+root, absolute = _math("sqrt"), _math("fabs")
+
+
+def _address(context: Any, builder: Any, kind: Any, array: Any, *places: Any) -> Any:
+    """Of an element of an array of any strides."""
+    made = context.make_array(kind)(context, builder, array)
+    address = builder.ptrtoint(made.data, ir.IntType(64))
+    for number, place in enumerate(places):
+        stride = builder.extract_value(made.strides, number)
+        address = builder.add(address, builder.mul(stride, place))
+    return address
+
+
+@_compiled
+def loaded(_context, array, row):  # type: ignore[no-untyped-def]
+    """The first eight numbers of a row of an array [n, 8 or more] in C order; integers in single precision."""
+    if array.layout != "C":
+        raise errors.TypingError(f"expected an array in C order, got the order {array.layout}")
+    found = _KINDS.get(array.dtype, _KINDS[types.float32])
+
+    def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
+        kind = signature.args[0].dtype
+        own = ir.VectorType(context.get_value_type(kind), LANES)
+        address = _address(context, builder, signature.args[0], *values)
+        vector = builder.load(builder.inttoptr(address, own.as_pointer()))
+        vector.align = kind.bitwidth // 8
+        return builder.uitofp(vector, _vector(types.float32)) if isinstance(kind, types.Integer) else vector
+
+    return found(array, types.intp), generate
+
+
+@_compiled
+def store(_context, numbers, array, row):  # type: ignore[no-untyped-def]
+    """Into the first eight numbers of a row of an array [n, 8 or more] in C order, of the lanes' precision."""
+    if array.layout != "C" or array.dtype != numbers.number:
+        raise errors.TypingError(f"expected an array of {numbers.number} in C order, got {array}")
+
+    def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
+        address = _address(context, builder, signature.args[1], *values[1:])
+        made = builder.store(values[0], builder.inttoptr(address, values[0].type.as_pointer()))
+        made.align = numbers.number.bitwidth // 8
+        return context.get_dummy_value()
+
+    return types.void(numbers, array, types.intp), generate
+
+
+@_compiled
+def total(_context, numbers):  # type: ignore[no-untyped-def]
+    """Sum of the lanes, by halves."""
+
+    def generate(_context, builder, _signature, values):  # type: ignore[no-untyped-def]
+        vector, count = values[0], LANES
+        while count > 1:
+            count //= 2
+            low, high = (
+                ir.Constant(ir.VectorType(_INT, count), [at + n for n in range(count)]) for at in (0, count)
+            )
+            undefined = ir.Constant(vector.type, ir.Undefined)
+            halves = (builder.shuffle_vector(vector, undefined, half) for half in (low, high))
+            vector = builder.fadd(*halves)
+        return builder.extract_element(vector, _INT(0))
+
+    return numbers.number(numbers), generate
+
+
+@_compiled
+def gathered(_context, arrays, rows, place):  # type: ignore[no-untyped-def]
+    """The numbers at a place of eight `rows` [8] of `arrays` [m, n], of unsigned integers."""
+
+    def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
+        frames, chosen, place = values
+        of_arrays, of_rows = signature.args[:2]
+        own = context.get_value_type(of_arrays.dtype)
+        vector = ir.Constant(ir.VectorType(own, LANES), ir.Undefined)
+        for lane in range(LANES):
+            where = _address(context, builder, of_rows, chosen, ir.IntType(64)(lane))
+            row = builder.load(builder.inttoptr(where, ir.IntType(64).as_pointer()))
+            address = _address(context, builder, of_arrays, frames, row, place)
+            number = builder.load(builder.inttoptr(address, own.as_pointer()))
+            vector = builder.insert_element(vector, number, _INT(lane))
+        return builder.uitofp(vector, _vector(types.float32))
+
+    return _KINDS[types.float32](arrays, rows, types.intp), generate
+
+
+@_compiled
+def store_halves(_context, numbers, bits):  # type: ignore[no-untyped-def]
+    """Into `bits` [8] of uint16 those of float16, each the nearest to its number."""
+
+    def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
+        halves = builder.fptrunc(values[0], ir.VectorType(_HALF, LANES))
+        address = _address(context, builder, signature.args[1], values[1])
+        store = builder.store(halves, builder.inttoptr(address, halves.type.as_pointer()))
+        store.align = 2
+        return context.get_dummy_value()
+
+    return types.void(numbers, bits), generate

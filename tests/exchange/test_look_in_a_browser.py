@@ -17,16 +17,17 @@ import numpy as np
 import pytest
 from browser import Browser, needs_chromium
 from relief_in_mitsuba import Mitsuba
-from relight_cases import Coat, sheet, waves, write_result
+from relight_cases import LED, Coat, sheet, waves, write_result
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.select import Select
 
 from coupole.exchange.look.look_of_runs import look_of_result
 from coupole.exchange.look.look_page import MOST_BYTES, write_page
-from coupole.reflectance.new_light.light_kinds import DistantLight
+from coupole.reflectance.new_light.light_kinds import DistantLight, LedLight
 from coupole.reflectance.new_light.pictured_surface import FreeCamera
-from coupole.reflectance.run_relighting import scene_from
+from coupole.reflectance.run_relighting import scene_from, scene_of_view
 from coupole.reflectance.run_result import RunResult
 
 pytestmark = needs_chromium
@@ -169,6 +170,38 @@ def test_a_light_gives_what_the_command_relight_gives_with_its_shadows(page: Pag
     assert lit.mean() > 0.2
     alike = np.isclose(mine, theirs, rtol=0.01, atol=1e-4).all(axis=2)
     assert alike[lit].mean() > 0.95  # the others lie at edges of shadows and of the sheet
+
+
+def with_frame(folder: Path) -> RunResult:
+    """A result whose view has a frame under its LED: what `relight --led` makes of it, every second pixel."""
+    result = write_result(folder, waves(), Coat(ks=(0.1, 0.1, 0.1)))
+    share = scene_of_view(result, "top", "ggx").picture([LedLight(number=LED)])[::2, ::2]
+    (folder / "samples/frames").mkdir()
+    with h5py.File(folder / "samples/frames/top.h5", "w") as file:
+        file["share"], file["leds"] = np.where(share > 0, share, np.nan).astype(np.float16)[None], [LED]
+    return result
+
+
+@pytest.mark.parametrize("most_bytes", [MOST_BYTES, 1000])
+def test_a_measured_frame_lies_on_the_object_as_the_fit_under_the_same_led(
+    page: Page, tmp_path: Path, most_bytes: int
+) -> None:
+    with_frame(tmp_path / "result")
+    write_page(look_of_result(tmp_path / "result"), "waves", tmp_path / "look.html", most_bytes)
+    page.open(tmp_path / "look.html")
+    page.small()
+    page.run("document.getElementById('frames-section').open = true")
+    Select(page.browser.at("#view")).select_by_visible_text("top")
+    page.run("coupole.state = {...coupole.state, split: 1}")
+    cells.wait_until(lambda: f"measured frame under LED {LED}" in page.browser.text("#banner"), "the frame")
+    measured = page.picture(1)
+    page.run("coupole.state = {...coupole.state, split: 0}")
+    fitted = page.picture(1)
+    both = (measured[..., 3] == 1) & fitted[..., :3].any(axis=2)
+    assert both.mean() > 0.2
+    ratio = measured[both][:, :3] / fitted[both][:, :3]
+    np.testing.assert_allclose(np.median(ratio, axis=0), 1.0, atol=0.01)
+    assert (np.abs(ratio - 1) < 0.1).mean() > 0.9  # the others lie at facets' edges: a frame's pixel is a wide one
 
 
 def test_a_white_sheet_under_the_whole_sky_is_as_white_as_facing_a_lamp(page: Page, tmp_path: Path) -> None:

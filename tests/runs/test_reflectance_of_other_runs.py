@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from cells import CellFolder
-from reflectance_cells import RECORDS, shipped_cell
+from relief_cells import RECORDS, shipped_cell
 
 
 def test_brackets_are_merged(tmp_path: Path) -> None:

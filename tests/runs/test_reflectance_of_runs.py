@@ -19,7 +19,7 @@ import pytest
 import trimesh
 from cells import CellFolder
 from dask_cluster import cluster
-from reflectance_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, SIDE, shipped_cell, unit, walter
+from relief_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, SIDE, shipped_cell, unit, walter
 
 from coupole.calibration.light.frames import open_light_frames
 from coupole.reflectance import ggx

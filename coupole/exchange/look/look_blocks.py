@@ -45,6 +45,8 @@ class Look:
     about: dict[str, Any]
     """What its scripts know of it; docs/reference/page.md."""
     blocks: tuple[Block, ...]
+    later: tuple[Block, ...] = ()
+    """Blocks that a page reads when they are asked for."""
     errors: dict[str, str] = field(default_factory=dict)
     """What is lost by writing numbers short, by the name of a quantity."""
 

@@ -50,6 +50,7 @@ def look_of_pictures(folder: Path) -> Look:
     shown = {
         "kind": "pictures",
         "picture_px": [width, height],
+        "views": [],
         "fit": "GGX of each pixel",
         "simulated": None,
         "software": about.get("software", {}),
@@ -64,4 +65,4 @@ def look_of_pictures(folder: Path) -> Look:
         },
     }
     errors = {"normals": "0.004 degrees", "kd, ks, roughness": "0.05 %"}
-    return Look(shown, blocks, errors)
+    return Look(shown, blocks, errors=errors)

@@ -27,6 +27,7 @@ SCRIPTS = (
     "programs.js",
     "renderer.js",
     "material.js",
+    "frames.js",
     "plot.js",
     "sphere.js",
     "overlay.js",
@@ -55,7 +56,8 @@ def write_page(look: Look, title: str, path: Path, most_bytes: int = MOST_BYTES)
     if path.suffix.lower() != ".html":
         raise InputError(f"--out {path}: expected a name that ends in .html")
     data = path.with_suffix(".data")
-    inside, beside = _shared_out(look.blocks, most_bytes)
+    blocks = (*look.blocks, *look.later)
+    inside, beside = _shared_out(blocks, most_bytes)
     try:
         make_folder(path.parent)
         _clear(data)
@@ -64,19 +66,20 @@ def write_page(look: Look, title: str, path: Path, most_bytes: int = MOST_BYTES)
             make_folder(data)
             written.append(data / f"{block.name}.js")
             write_synced(written[-1], block.script)
-        write_synced(path, page_text(look, title, inside, [f"{data.name}/{block.name}.js" for block in beside]))
+        write_synced(path, page_text(look, title, inside, data.name if beside else ""))
     except OSError as error:
         raise StorageError(f"{path}: {error.strerror or error}. Choose another place, or free space.") from error
     return written
 
 
-def page_text(look: Look, title: str, inside: list[Block], beside: list[str]) -> str:
-    """The HTML; `beside` are the scripts that it asks for, relative to it."""
+def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
+    """The HTML; `data` is the folder of what is not inside, empty if all is."""
     shaders = {name: _part(name) for name in SHADERS}
-    about = {**look.about, "title": title, "errors": look.errors, "blocks": [block.name for block in look.blocks]}
+    names = [block.name for block in look.blocks]
+    about = {**look.about, "title": title, "errors": look.errors, "blocks": names, "data": data}
     scripts = "\n".join(_part(name) for name in SCRIPTS)
     tags = [f"<script>{block.script}</script>\n" for block in inside]
-    tags += [f'<script src="{escape(name, quote=True)}"></script>\n' for name in beside]
+    tags += [f'<script src="{escape(f"{data}/{name}.js", quote=True)}"></script>\n' for name in names if data]
     parts = {
         "TITLE": escape(title),
         "STYLE": _part("page.css"),

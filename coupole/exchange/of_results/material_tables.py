@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface
+from coupole.reflectance.cluster_file import CLUSTERS
 from coupole.reflectance.ggx import lobe
-from coupole.reflectance.run_result import CLUSTERS
 
 _MOST = 64
 """Files that nobody has asked for by name."""

@@ -8,7 +8,7 @@ const MARGIN = 1.25;
 function startCamera(corners, width, height, above) {
   const target = times(corners.reduce(add), 1 / corners.length);
   const camera = { target, azimuth: -90, height: above, distance: 1 };
-  const { right, up, back } = axesOf(camera), [halfWidth, halfHeight] = halvesOf(width, height);
+  const { right, up, back } = axesOf(camera), [halfWidth, halfHeight] = halvesOf(camera, width, height);
   const needed = corners.map((corner) => {
     const way = minus(corner, target);
     const reach = Math.max(Math.abs(dot(way, right)) / halfWidth, Math.abs(dot(way, up)) / halfHeight);
@@ -26,11 +26,11 @@ function axesOf(camera) {
 }
 
 /** Half of what the picture's shorter side shows at distance 1. */
-const halfField = Math.tan(radians(FIELD_DEG / 2));
+const halfFieldOf = (camera) => Math.tan(radians((camera.field ?? FIELD_DEG) / 2));
 
 /** Halves of the picture at distance 1: width, height. */
-function halvesOf(width, height) {
-  const shorter = Math.min(width, height);
+function halvesOf(camera, width, height) {
+  const shorter = Math.min(width, height), halfField = halfFieldOf(camera);
   return [halfField * width / shorter, halfField * height / shorter];
 }
 
@@ -39,7 +39,7 @@ function clipOf(camera, width, height, middle, radius, shift) {
   const { right, up, back, place } = axesOf(camera);
   const distance = dot(minus(place, middle), back);
   const near = Math.max(distance - radius * 1.01, distance * 1e-3, radius * 1e-3);
-  const made = perspective(...halvesOf(width, height), near, Math.max(distance + radius * 1.01, near * 2));
+  const made = perspective(...halvesOf(camera, width, height), near, Math.max(distance + radius * 1.01, near * 2));
   made[8] = -2 * shift[0] / width;
   made[9] = -2 * shift[1] / height;
   return product(made, lookingFrom(place, right, up, back));
@@ -50,7 +50,7 @@ function projected(camera, width, height, place) {
   const { right, up, back, place: eye } = axesOf(camera);
   const way = minus(place, eye), depth = -dot(way, back);
   if (depth <= 0) return null;
-  const [halfWidth, halfHeight] = halvesOf(width, height);
+  const [halfWidth, halfHeight] = halvesOf(camera, width, height);
   return [
     (dot(way, right) / depth / halfWidth + 1) / 2 * width, (1 - dot(way, up) / depth / halfHeight) / 2 * height,
   ];
@@ -69,6 +69,6 @@ function zoomed(camera, factor, radius) {
 /** The camera moved so that the object follows pixels of a picture whose shorter side is given. */
 function moved(camera, x, y, shorter) {
   const { right, up } = axesOf(camera);
-  const scale = 2 * halfField * camera.distance / shorter;
+  const scale = 2 * halfFieldOf(camera) * camera.distance / shorter;
   return { ...camera, target: add(camera.target, add(times(right, -x * scale), times(up, y * scale))) };
 }

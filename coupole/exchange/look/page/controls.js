@@ -49,6 +49,13 @@ class Controls {
       if (input.valueAsNumber > 0) this.state.white = input.valueAsNumber;
       this.changed("screen");
     });
+    byId("view").append(new Option("None", ""), ...this.app.about.views.map(({ name }) => new Option(name, name)));
+    byId("frames-section").hidden = !this.app.about.views.length;
+    this.on("view", "change", (input) => this.app.compare(input.value));
+    this.on("split", "input", (input) => {
+      this.state.split = input.valueAsNumber;
+      this.changed("light");
+    });
     this.on("auto-white", "click", () => this.app.fitWhite());
   }
 
@@ -100,6 +107,9 @@ class Controls {
     byId("mode").value = state.mode;
     byId("quantity").value = state.quantity;
     byId("relief").value = state.relief;
+    byId("view").value = state.view;
+    byId("split").value = state.split;
+    byId("split").disabled = !state.view;
     byId("quantity-row").hidden = state.mode !== "uncertainty";
     byId("relief-row").hidden = state.mode !== "unsharp";
     byId("white-row").hidden = !isLit(state.mode);

@@ -30,6 +30,18 @@ uniform vec3 irradiances[MOST];
 uniform mat4 shadow_from_object[MOST];
 uniform float offset_mm[MOST];  // from a surface to where its shadow is looked for
 
+// An LED as it was in the run, in place of the lights; and the frame that the camera took under it.
+uniform bool led;
+uniform vec3 led_mm;
+uniform vec3 led_axis;
+uniform float led_exponent;
+uniform sampler2D measured;
+uniform float measured_peak;
+uniform float split_px;
+uniform vec3 view_mm;
+uniform mat3 view_from_way;
+uniform vec2 lens[21];
+
 out uvec4 mean;
 
 struct Material {
@@ -79,13 +91,41 @@ float reaching(int light, vec3 at_mm) {
   return found;
 }
 
+// 1/m^2, times a power of the cosine to the LED's axis.
+float led_reach(vec3 at_mm, vec3 way) {
+  vec3 apart = (led_mm - at_mm) * 1e-3;
+  return pow(max(-dot(way, led_axis), 0.0), led_exponent) / dot(apart, apart);
+}
+
+// What the measured frame has of a place: share of the camera's range.
+vec4 measured_at(vec3 at_mm) {
+  vec3 way = view_from_way * (at_mm - view_mm);
+  vec2 to = way.xy / way.z, at = vec2(0.0);
+  int number = 0;
+  float x = 1.0;
+  for (int i = 0; i <= 5; i++) {
+    float y = x;
+    for (int j = 0; j <= 5 - i; j++) {
+      at += lens[number++] * y;
+      y *= to.y;
+    }
+    x *= to.x;
+  }
+  if (any(lessThan(at, vec2(0.0))) || any(greaterThanEqual(at, vec2(1.0)))) return vec4(0.0);
+  vec3 code = texelFetch(measured, ivec2(at * vec2(textureSize(measured, 0))), 0).rgb * 255.0;
+  if (code.r == 0.0) return vec4(0.0);
+  vec3 shown = (code - 1.0) / 254.0;
+  vec3 linear = mix(shown / 12.92, pow((shown + 0.055) / 1.055, vec3(2.4)), step(0.04045, shown));
+  return vec4(measured_peak * linear, 1.0);
+}
+
 // What comes from a place of a material, under all lights.
 vec3 radiance(Material material, vec3 at_mm, vec3 face) {
   vec3 view = flat_one ? vec3(0.0, 0.0, 1.0) : normalize(eye_mm - at_mm);
   float nv = dot(material.normal, view);
   vec3 sum = vec3(0.0);
   for (int light = 0; light < lights; light++) {
-    vec3 way = ways[light];
+    vec3 way = led ? normalize(led_mm - at_mm) : ways[light];
     float nl = dot(material.normal, way);
     if (nl <= 0.0 || dot(face, way) <= 0.0) continue;
     vec3 value = mode == SPECULAR ? vec3(0.0) : material.kd;
@@ -93,6 +133,7 @@ vec3 radiance(Material material, vec3 at_mm, vec3 face) {
       value += material.ks * lobe(nl, nv, dot(material.normal, normalize(way + view)), material.alpha);
     }
     float share = flat_one ? 1.0 : reaching(light, at_mm + face * offset_mm[light]);
+    if (led) share *= led_reach(at_mm, way);
     sum += irradiances[light] * nl * value * share;
   }
   return sum;
@@ -112,6 +153,7 @@ vec3 in_relief(vec3 normal) {
 }
 
 vec4 looked_at(int triangle, vec3 at_mm) {
+  if (led && mode <= UNSHARP && gl_FragCoord.x < split_px) return measured_at(at_mm);
   vec2 shine = texelFetch(gloss, cell(triangle), 0).xy;
   if (shine.x == 0.0) return vec4(0.0);
   Material material = Material(

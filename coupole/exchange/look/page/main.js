@@ -49,11 +49,37 @@ class App {
     });
   }
 
+  /** Show a view's measured frame beside the fitted one; none for an empty name. */
+  compare(name) {
+    const view = viewOf(this.about, name), { width, height } = this.canvas;
+    this.state.view = view ? name : "";
+    this.state.camera = view ? cameraOf(view, this.renderer.corners, width, height) : this.startCamera();
+    this.changed("light");
+  }
+
+  banner() {
+    return bannerOf(this.about, this.state, this.renderer.frameOf(this.state));
+  }
+
+  /** Fetch the frame that is compared with, once. */
+  async bringFrame() {
+    const compared = this.renderer.frameOf(this.state);
+    if (!compared || compared.texture || this.coming === compared.frame.block) return;
+    this.coming = compared.frame.block;
+    try {
+      this.renderer.keepFrame(compared.frame, await laterBlock(this.about, compared.frame.block));
+      this.changed("light");
+    } catch (error) {
+      this.say(error.message);
+    }
+  }
+
   /** Something of the state is new: all, or only how the mean is shown ("screen"). */
   changed(what) {
     if (what !== "screen") this.renderer.restart();
     this.controls.show();
-    byId("banner").textContent = bannerOf(this.about, this.state);
+    this.bringFrame();
+    byId("banner").textContent = this.banner();
     drawSphere(byId("sphere"), this.state.camera, this.state.lights, this.state.chosen);
     this.showMarks();
     this.wanted = true;
@@ -124,23 +150,29 @@ class App {
       this.move(x, y);
       return;
     }
+    this.state.view = "";
     const azimuth = -x * TURN_DEG_PER_PX, height = y * TURN_DEG_PER_PX;
     this.state.camera = turned(this.state.camera, azimuth, height);
     this.changed("light");
   }
 
   zoom(factor) {
-    this.state.camera = zoomed(this.state.camera, factor, this.renderer.radius);
+    const { camera, view } = this.state;
+    this.state.camera = view
+      ? { ...camera, field: clamp(camera.field * factor, 0.2, 120) }
+      : zoomed(camera, factor, this.renderer.radius);
     this.changed("light");
   }
 
   move(x, y) {
     const shorter = Math.min(this.canvas.clientWidth, this.canvas.clientHeight);
+    this.state.view = "";
     this.state.camera = moved(this.state.camera, x, y, shorter);
     this.changed("light");
   }
 
   whole() {
+    this.state.view = "";
     this.state.camera = this.startCamera();
     this.changed("light");
   }
@@ -228,7 +260,7 @@ class App {
   pressedNote({ show, remove }) {
     if (show !== undefined) {
       const { camera, lights } = structuredClone(this.state.notes[show]);
-      Object.assign(this.state, { camera, lights, chosen: 0 });
+      Object.assign(this.state, { camera, lights, chosen: 0, view: "" });
       this.changed("light");
     } else if (remove !== undefined) {
       this.state.notes.splice(Number(remove), 1);
@@ -242,7 +274,8 @@ class App {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const pins = this.pinned ? [...this.state.notes, { place: this.pinned }] : this.state.notes;
     byId("marks").setAttribute("viewBox", `0 0 ${width} ${height}`);
-    byId("marks").innerHTML = marksOf(this.state.camera, width, height, pins, this.ruler);
+    byId("marks").innerHTML = marksOf(this.state.camera, width, height, pins, this.ruler)
+      + splitOf(this.state, width, height);
     drawScale(byId("scale"), this.state.camera, Math.min(width, height));
     byId("notes").replaceChildren(...this.state.notes.map((note, number) => {
       const line = document.createElement("li"), text = document.createElement("span");
@@ -292,7 +325,7 @@ class App {
     context.fillStyle = "#ece9e2";
     context.font = `${Math.round(13 * this.scale)}px sans-serif`;
     const white = isLit(this.state.mode) ? ` · white ${this.state.white.toPrecision(4)}` : "";
-    const words = `${this.about.title} · ${MODES[this.state.mode]}${white} · ${bannerOf(this.about, this.state)}`;
+    const words = `${this.about.title} · ${MODES[this.state.mode]}${white} · ${this.banner()}`;
     context.fillText(words, 8 * this.scale, height + line * 0.68, width - 16 * this.scale);
     made.toBlob((blob) => {
       const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob) });

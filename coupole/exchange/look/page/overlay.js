@@ -4,7 +4,7 @@ const BAR_PX = 140;
 
 /** A round length that is at most `BAR_PX` long where the camera looks, and how long that is. */
 function scaleBar(camera, shorter) {
-  const unit = 2 * halfField * camera.distance / shorter;
+  const unit = 2 * halfFieldOf(camera) * camera.distance / shorter;
   const most = BAR_PX * unit, power = 10 ** Math.floor(Math.log10(most));
   const size = power * [5, 2, 1].find((factor) => factor * power <= most);
   return { size, pixels: size / unit };
@@ -39,6 +39,12 @@ function marksOf(camera, width, height, notes, ruler) {
   return [...pins, ...dots].filter(Boolean).join("");
 }
 
+/** Where the measured frame ends and the fitted one begins, as markup. */
+function splitOf(state, width, height) {
+  const x = state.split * width;
+  return state.view && isLit(state.mode) ? `<line class="split" x1="${x}" x2="${x}" y1="0" y2="${height}"/>` : "";
+}
+
 function legendOf(mode, quantity) {
   const { from, to, logarithmic, unit: told } = rangeOf(mode, quantity);
   const factor = told === "%" ? 100 : told === "degrees" ? 180 / Math.PI : 1;
@@ -48,8 +54,8 @@ function legendOf(mode, quantity) {
     <span class="ends"><span>${low}</span><span>${mid}</span><span>${high} ${told}</span></span>`;
 }
 
-/** What has to be said of the picture, wherever it is seen. */
-function bannerOf(about, state) {
+/** What has to be said of the picture, wherever it is seen; `compared` is the measured frame in it. */
+function bannerOf(about, state, compared) {
   const kinds = { true: "Simulated object", false: "Measured object", null: "Pictures of an object" };
   const told = [kinds[about.simulated]];
   if (["relit", "diffuse", "specular", "unsharp"].includes(state.mode)) {
@@ -59,5 +65,6 @@ function bannerOf(about, state) {
     }
   }
   if (state.mode === "unsharp") told.push("relief exaggerated");
+  if (compared?.texture && isLit(state.mode)) told.push(`left: measured frame under LED ${compared.frame.led}`);
   return told.join(" · ");
 }

@@ -58,6 +58,14 @@ function numbersTexture(gl, numbers, dtype, count) {
   return texture;
 }
 
+/** A texture of a picture of bytes [height, width, 3]. */
+function bytesTexture(gl, bytes, width, height) {
+  const texture = plainTexture(gl, gl.TEXTURE_2D);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, width, height, 0, gl.RGB, gl.UNSIGNED_BYTE, bytes);
+  return texture;
+}
+
 /** A picture of four 32-bit integers for each pixel, to be drawn into; with a depth if it is asked. */
 function pictureTarget(gl, width, height, withDepth) {
   const texture = plainTexture(gl, gl.TEXTURE_2D);

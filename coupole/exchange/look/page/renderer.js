@@ -32,6 +32,19 @@ class Renderer {
     this.targets = null;
     this.depths = null;
     this.drawnShadows = [];
+    this.frames = {};
+  }
+
+  /** The measured frame that a state compares with, if it is at hand. */
+  frameOf(state) {
+    const view = viewOf(this.about, state.view);
+    if (!view) return null;
+    const frame = nearestFrame(view, this.middle, state.lights[state.chosen].direction);
+    return { view, frame, texture: this.frames[frame.block] };
+  }
+
+  keepFrame(frame, bytes) {
+    this.frames[frame.block] = bytesTexture(this.gl, bytes, ...frame.size_px);
   }
 
   /** The box and the sphere that hold the object. */
@@ -110,6 +123,8 @@ class Renderer {
 
   /** Lights of this sample. */
   beamsOf(state) {
+    const compared = this.frameOf(state);
+    if (compared) return [this.ledBeam(compared.frame)];
     const beams = state.lights.map((light, number) => ({
       way: sampledDirection(light, this.samples, number), irradiance: irradiance(light, this.about.irradiance),
     }));
@@ -117,7 +132,16 @@ class Renderer {
       const { way, irradiance: sky } = sampledSky(state.sky * this.about.irradiance / Math.PI, this.samples);
       beams.push({ way, irradiance: sky });
     }
-    return beams.map((beam) => ({ ...beam, shadow: this.shadowMatrix(beam.way) }));
+    return beams.map((beam) => ({ ...beam, place: null, shadow: this.shadowMatrix(beam.way) }));
+  }
+
+  ledBeam({ at_mm: place, strength }) {
+    const apart = minus(place, this.middle), way = unit(apart), distance = length(apart);
+    const [right, up] = across(way);
+    const reach = this.radius * 1.01, near = Math.max(distance - reach, distance * 0.01);
+    const half = reach / Math.sqrt(Math.max(distance ** 2 - reach ** 2, reach ** 2));
+    const clip = perspective(half, half, near, distance + reach);
+    return { way, irradiance: strength, place, shadow: product(clip, lookingFrom(place, right, up, way)) };
   }
 
   shadowMatrix(way) {
@@ -137,12 +161,12 @@ class Renderer {
     const at = this.use("shadow", { places, triangles });
     gl.viewport(0, 0, SHADOW_PX, SHADOW_PX);
     beams.forEach((beam, layer) => {
-      if (this.drawnShadows[layer] === String(beam.way)) return;
+      if (this.drawnShadows[layer] === String(beam.shadow)) return;
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.depths.frames[layer]);
       gl.clear(gl.DEPTH_BUFFER_BIT);
       gl.uniformMatrix4fv(at("clip_from_object"), false, beam.shadow);
       if (!this.about.picture_px) gl.drawArrays(gl.TRIANGLES, 0, 3 * this.triangles);
-      this.drawnShadows[layer] = String(beam.way);
+      this.drawnShadows[layer] = String(beam.shadow);
     });
   }
 
@@ -162,9 +186,12 @@ class Renderer {
 
   drawLight(state, beams) {
     const gl = this.gl, { seen, mean, other } = this.targets;
+    const compared = this.frameOf(state);
     const at = this.use("light", {
       ...this.textures, seen: seen.texture, before: mean.texture, shadows: this.depths.texture,
+      measured: compared?.texture ?? this.textures.kd,
     });
+    this.setLed(at, compared, state.split);
     const { right, up, back, place } = axesOf(state.camera);
     gl.uniform1i(at("mode"), MODE_NUMBERS[state.mode]);
     gl.uniform1i(at("quantity"), Object.keys(UNCERTAIN).indexOf(state.quantity));
@@ -185,6 +212,21 @@ class Renderer {
     gl.enable(gl.DEPTH_TEST);
   }
 
+  setLed(at, compared, split) {
+    const gl = this.gl;
+    gl.uniform1i(at("led"), compared ? 1 : 0);
+    if (!compared) return;
+    const { view, frame, texture } = compared;
+    gl.uniform3fv(at("led_mm"), frame.at_mm);
+    gl.uniform3fv(at("led_axis"), frame.axis);
+    gl.uniform1f(at("led_exponent"), this.about.led_exponent);
+    gl.uniform1f(at("measured_peak"), frame.peak);
+    gl.uniform1f(at("split_px"), texture ? split * this.width : 0);
+    gl.uniform3fv(at("view_mm"), view.camera_mm);
+    gl.uniformMatrix3fv(at("view_from_way"), false, [0, 1, 2].flatMap((k) => view.axes.map((axis) => axis[k])));
+    gl.uniform2fv(at("lens"), view.lens.flat());
+  }
+
   /** Put the mean on the screen. */
   show(state, ground) {
     const gl = this.gl, { seen, mean } = this.targets;
@@ -192,7 +234,7 @@ class Renderer {
     const { from, to, logarithmic } = rangeOf(state.mode, state.quantity);
     const number = ["roughness", "uncertainty", "residual"].includes(state.mode);
     gl.uniform1i(at("kind"), state.mode === "normals" ? 1 : number ? 2 : 0);
-    gl.uniform1f(at("white"), state.white || 1);
+    gl.uniform1f(at("white"), this.frameOf(state)?.frame.peak ?? (state.white || 1));
     gl.uniform2f(at("range"), from, to);
     gl.uniform1i(at("logarithmic"), logarithmic ? 1 : 0);
     gl.uniform3fv(at("ramp"), RAMP.flatMap((text) => channelsOf(text)));

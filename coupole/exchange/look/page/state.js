@@ -15,7 +15,7 @@ const startLight = () => ({
 
 const startState = () => ({
   mode: "relit", quantity: "kd", white: 0, relief: 1, sky: 0, chosen: 0, lights: [startLight()],
-  camera: null, notes: [],
+  camera: null, notes: [], view: "", split: 0.5,
 });
 
 const rounded = (key, value) => typeof value === "number" ? Number(value.toPrecision(5)) : value;
@@ -37,7 +37,8 @@ function isLight(light) {
 
 function isCamera(camera) {
   return camera === null || isVector(camera?.target) && isNumber(camera.azimuth, -1e6, 1e6)
-    && isNumber(camera.height, -90, 90) && isNumber(camera.distance, 1e-6, 1e6);
+    && isNumber(camera.height, -90, 90) && isNumber(camera.distance, 1e-6, 1e6)
+    && (camera.field === undefined || isNumber(camera.field, 0.01, 120));
 }
 
 function isNote(note) {
@@ -59,6 +60,7 @@ function stateOf(address) {
     && isNumber(found.relief, 0, 10) && isNumber(found.sky, 0, 100) && isCamera(found.camera)
     && Array.isArray(found.lights) && isNumber(found.lights.length, 1, MOST_LIGHTS) && found.lights.every(isLight)
     && isNumber(found.chosen, 0, found.lights.length - 1) && Number.isInteger(found.chosen)
-    && Array.isArray(found.notes) && found.notes.every(isNote);
+    && Array.isArray(found.notes) && found.notes.every(isNote)
+    && (!found.view || viewOf(ABOUT, found.view)) && (found.split === undefined || isNumber(found.split, 0, 1));
   return fits ? { ...startState(), ...found } : null;
 }

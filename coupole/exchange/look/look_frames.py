@@ -1,0 +1,101 @@
+"""Measured frames of a result of runs, for a page to show beside what the fit makes of the same LED.
+
+A frame lies on the object: the page finds a place's pixel by the polynomial that is fitted here, of what pixels of
+the view see.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.exchange.look.look_blocks import Block, block_of
+from coupole.geometry import apply
+from coupole.reflectance.new_light.pictured_surface import Surface, surface_of_view
+from coupole.reflectance.run_result import FRAMES, RunResult, ViewSamples
+
+Floats = NDArray[np.float64]
+
+MOST_PX = 640
+"""Of a frame's longer side."""
+DEGREE = 5
+_MOST_PLACES = 20_000
+_WHITE_QUANTILE = 0.999
+
+
+def frames_of_view(
+    result: RunResult, view: ViewSamples, support_from_base: Floats
+) -> tuple[dict[str, Any], list[Block]] | None:
+    """What the page knows of a view and its frames, and their pictures; None if the view has none."""
+    path = result.folder / FRAMES / view.path.name
+    if not path.exists():
+        return None
+    with h5py.File(path, "r") as file:
+        shares, leds = file["share"][()].astype(np.float32), file["leds"][()]
+    surface = surface_of_view(result, view)
+    axes, lens = _lens(surface)
+    turn = support_from_base[:3, :3]
+    frames, blocks = [], []
+    for share, led in zip(shares, leds, strict=True):
+        row = int(np.flatnonzero(view.leds == led)[0])
+        if not np.isfinite(share).any():
+            continue
+        picture, peak = _coded(share if share.shape[2] == 3 else np.repeat(share, 3, axis=2))
+        blocks.append(block_of(f"frame-{view.path.stem}-{led}", picture))
+        full_scale = np.broadcast_to(np.nan_to_num(view.full_scales[row]), 3) / math.pi
+        frames.append(
+            {
+                "led": int(led),
+                "block": blocks[-1].name,
+                "size_px": [picture.shape[1], picture.shape[0]],
+                "peak": peak,
+                "at_mm": apply(support_from_base, view.led_mm[row]).tolist(),
+                "axis": (turn @ view.led_normals[row]).tolist(),
+                "strength": full_scale.tolist(),
+            }
+        )
+    about = {
+        "name": view.view,
+        "camera_mm": apply(support_from_base, surface.camera_mm).tolist(),
+        "axes": (axes @ turn.T).tolist(),
+        "lens": lens.tolist(),
+        "frames": frames,
+    }
+    return (about, blocks) if frames else None
+
+
+def _lens(surface: Surface) -> tuple[Floats, Floats]:
+    """[3, 3] rows: axes of directions from the camera, the last forward; [21, 2] coefficients of x^i y^j (all j
+    of an i, then the next) that give column and row, as shares of the picture, of a direction's x and y where z
+    is 1."""
+    rows, columns = np.nonzero(surface.seen >= 0)
+    some = slice(None, None, max(1, len(rows) // _MOST_PLACES))
+    rows, columns = rows[some], columns[some]
+    ways = surface.places_mm[rows, columns].astype(np.float64) - surface.camera_mm
+    forward = ways.mean(axis=0) / np.linalg.norm(ways.mean(axis=0))
+    right = np.cross([0.0, 0.0, 1.0] if abs(forward[2]) < 0.9 else [1.0, 0.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(forward, right), forward])
+    local = ways @ axes.T
+    x, y = (local[:, :2] / local[:, 2:]).T
+    design = np.stack([x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=1)
+    scale = np.abs(design).max(axis=0)
+    height, width = surface.seen.shape
+    wanted = np.stack([(columns + 0.5) / width, (rows + 0.5) / height], axis=1)
+    found = np.linalg.lstsq(design / scale, wanted, rcond=None)[0]
+    return axes, found / scale[:, None]
+
+
+def _coded(share: NDArray[np.float32]) -> tuple[NDArray[np.uint8], float]:
+    """[h, w, 3] in sRGB's steps up to the peak that is returned, from 1; 0 where there is no value."""
+    step = math.ceil(max(share.shape[:2]) / MOST_PX)
+    small = share[::step, ::step]
+    known = np.asarray(np.isfinite(small).all(axis=2))
+    peak = max(float(np.quantile(small[known], _WHITE_QUANTILE)) if known.any() else 1.0, 1e-9)
+    linear = np.clip(np.where(known[..., None], small, 0.0) / peak, 0.0, 1.0)
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.where(known[..., None], 1.0 + np.rint(254.0 * shown), 0.0).astype(np.uint8), peak

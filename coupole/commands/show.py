@@ -49,13 +49,16 @@ def show(source: SourceArgument, out: OutOption, as_json: JsonOption = False) ->
 
 
 def _look(source: Path) -> Look:
-    """By what the folder holds."""
+    """By what the folder holds. Raises InputError if that is no whole result."""
     from coupole.exchange.look.look_of_pictures import look_of_pictures
     from coupole.exchange.look.look_of_runs import look_of_result
     from coupole.reflectance import picture_result, run_result
 
-    if (source / picture_result.SAMPLES).exists():
-        return look_of_pictures(source)
-    if (source / run_result.OBJECT).exists():
-        return look_of_result(source)
+    try:
+        if (source / picture_result.SAMPLES).exists():
+            return look_of_pictures(source)
+        if (source / run_result.OBJECT).exists():
+            return look_of_result(source)
+    except (OSError, KeyError) as error:
+        raise InputError(f"{source}: is damaged ({error}); make the result again into another folder") from error
     raise InputError(f"{source}: holds no result; `coupole reflectance {source} --out FOLDER` makes one of a run")

@@ -100,6 +100,15 @@ def test_a_disk_that_takes_no_page_is_told_with_six(result: Path) -> None:
     assert "/proc/look.html" in ended.err
 
 
+def test_a_damaged_result_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    write_result(tmp_path / "cut", waves(8))
+    fit = tmp_path / "cut/fits/ggx.h5"
+    fit.write_bytes(fit.read_bytes()[:600])
+    ended = cells.here("show", tmp_path / "cut", "--out", tmp_path / "look.html")
+    assert ended.code == 2
+    assert "make the result again" in " ".join(ended.err.split())
+
+
 def test_a_result_without_uncertainty_is_refused(tmp_path: Path) -> None:
     write_result(tmp_path / "old", waves(8))
     with h5py.File(tmp_path / "old/fits/ggx.h5", "a") as file:

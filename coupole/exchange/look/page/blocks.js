@@ -21,6 +21,7 @@ async function unpacked({ about, text }) {
 
 /** All blocks by their names; raises an error that names those that did not come. */
 async function readBlocks(names) {
+  if (!window.DecompressionStream) throw new Error("This page needs a browser of 2023 or later.");
   const missing = names.filter((name) => !(name in coupoleBlocks));
   if (missing.length) {
     throw new Error(`The page's data are missing (${missing.join(", ")}): keep its .data folder beside it.`);

@@ -38,6 +38,8 @@ class App {
   listen() {
     new ResizeObserver(() => this.resize()).observe(byId("stage"));
     window.addEventListener("hashchange", () => this.goTo(stateOf(location.hash.slice(1))));
+    for (const name of ["focus", "blur"]) this.canvas.addEventListener(name, () => this.showMarks());
+    this.canvas.addEventListener("webglcontextlost", () => this.say("The graphics failed: load the page again."));
     byId("tools").addEventListener("click", (event) => this.choose(event.target.dataset.tool));
     byId("reset").addEventListener("click", () => this.whole());
     byId("snapshot").addEventListener("click", () => this.snapshot());
@@ -275,7 +277,8 @@ class App {
     const pins = this.pinned ? [...this.state.notes, { place: this.pinned }] : this.state.notes;
     byId("marks").setAttribute("viewBox", `0 0 ${width} ${height}`);
     byId("marks").innerHTML = marksOf(this.state.camera, width, height, pins, this.ruler)
-      + splitOf(this.state, width, height);
+      + splitOf(this.state, width, height)
+      + (this.canvas.matches(":focus-visible") ? aimOf(width, height) : "");
     drawScale(byId("scale"), this.state.camera, Math.min(width, height));
     byId("notes").replaceChildren(...this.state.notes.map((note, number) => {
       const line = document.createElement("li"), text = document.createElement("span");

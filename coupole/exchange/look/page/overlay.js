@@ -39,6 +39,9 @@ function marksOf(camera, width, height, notes, ruler) {
   return [...pins, ...dots].filter(Boolean).join("");
 }
 
+/** A cross in the middle of the picture, where keys point to, as markup. */
+const aimOf = (width, height) => `<path class="aim" d="M${width / 2 - 9} ${height / 2}h18m-9 -9v18"/>`;
+
 /** Where the measured frame ends and the fitted one begins, as markup. */
 function splitOf(state, width, height) {
   const x = state.split * width;

@@ -102,5 +102,5 @@ function depthLayers(gl, size, layers) {
     gl.deleteTexture(texture);
     frames.forEach((frame) => gl.deleteFramebuffer(frame));
   };
-  return { texture, frames, layers, free };
+  return { texture, frames, layers, size, free };
 }

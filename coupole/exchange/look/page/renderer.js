@@ -1,7 +1,7 @@
 // The picture: samples of lights and of a pixel's places, one after the other, and their mean.
 
 const SAMPLES = 64;
-const SHADOW_PX = 2048;
+const SHADOW_PX = [512, 2048];  // least and most
 const MODE_NUMBERS = {
   relit: 0, diffuse: 1, specular: 2, unsharp: 3, normals: 4, roughness: 5, uncertainty: 6, residual: 7,
 };
@@ -152,14 +152,16 @@ class Renderer {
 
   drawShadows(beams) {
     const gl = this.gl;
-    if (!this.depths || this.depths.layers < beams.length) {
+    const wished = 2 ** Math.ceil(Math.log2(2 * Math.max(this.width, this.height)));
+    const size = clamp(wished, ...SHADOW_PX);
+    if (!this.depths || this.depths.layers < beams.length || this.depths.size !== size) {
       this.depths?.free();
-      this.depths = depthLayers(gl, SHADOW_PX, beams.length);
+      this.depths = depthLayers(gl, size, beams.length);
       this.drawnShadows = [];
     }
     const { places, triangles } = this.textures;
     const at = this.use("shadow", { places, triangles });
-    gl.viewport(0, 0, SHADOW_PX, SHADOW_PX);
+    gl.viewport(0, 0, size, size);
     beams.forEach((beam, layer) => {
       if (this.drawnShadows[layer] === String(beam.shadow)) return;
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.depths.frames[layer]);
@@ -204,7 +206,7 @@ class Renderer {
     gl.uniform3fv(at("ways"), beams.flatMap((beam) => beam.way));
     gl.uniform3fv(at("irradiances"), beams.flatMap((beam) => beam.irradiance));
     gl.uniformMatrix4fv(at("shadow_from_object"), false, beams.flatMap((beam) => [...beam.shadow]));
-    const texel = 2 * this.radius * 1.01 / SHADOW_PX;
+    const texel = 2 * this.radius * 1.01 / this.depths.size;
     gl.uniform1fv(at("offset_mm"), beams.map(() => 1.5 * texel));
     gl.bindFramebuffer(gl.FRAMEBUFFER, other.frame);
     gl.disable(gl.DEPTH_TEST);

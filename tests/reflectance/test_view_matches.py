@@ -212,3 +212,14 @@ def test_views_without_anything_in_common_are_refused() -> None:
     plain = [np.ones(SIZE[::-1], np.float32) for _ in CAMERAS]
     with pytest.raises(InputError, match="expected 30 matches or more, found 0"):
         refine(known.given, plain, known.doubts, 1.0, 1, lambda step, done, of: None)
+
+
+def test_control_points_are_a_scale_apart_and_an_object_too_large_for_them_is_refused() -> None:
+    x, y = np.meshgrid(np.arange(0.0, 1000.0, 10.0), np.arange(0.0, 1000.0, 10.0))
+    points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    chosen = control_points(points, 60.0)
+    between = np.linalg.norm(chosen[:, None] - chosen, axis=2) + 1e9 * np.eye(len(chosen))
+    nearest = np.linalg.norm(points[:, None] - chosen, axis=2).min(axis=1)
+    assert between.min() >= 60.0 >= nearest.max()
+    with pytest.raises(InputError, match=r"--scale-mm: expected [345]. or more"):
+        control_points(points, 20.0)

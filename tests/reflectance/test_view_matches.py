@@ -181,7 +181,7 @@ def test_the_covariance_of_poses_is_that_of_drawn_hand_eyes_and_arms() -> None:
     prior = CameraPrior(LENS, (), hand_eye, own, axis_sensitivity=by_zeros)
     stated = camera_covariance(prior, cameras, arm)
     drawn = []
-    for _ in range(4000):
+    for _ in range(1500):
         moved_eye = stepped(hand_eye, random.standard_normal(6) * np.repeat([u_mm, u_rad], 3))
         scatter = random.standard_normal((2, 6)) * np.repeat([0.2, np.radians(0.05)], 3)
         zeros = by_zeros @ (u_deg * random.standard_normal(2))
@@ -192,7 +192,7 @@ def test_the_covariance_of_poses_is_that_of_drawn_hand_eyes_and_arms() -> None:
         drawn.append(np.concatenate([difference(is_, at) for is_, at in zip(cameras, there, strict=True)]))
     seen = np.cov(np.array(drawn).T)
     scale = np.sqrt(np.diag(stated))
-    np.testing.assert_allclose(seen / np.outer(scale, scale), stated / np.outer(scale, scale), atol=0.08)
+    np.testing.assert_allclose(seen / np.outer(scale, scale), stated / np.outer(scale, scale), atol=0.12)
 
 
 def stepped(pose: Floats, step: Floats) -> Floats:

@@ -251,6 +251,7 @@ def test_refined_geometry_is_what_samples_are_made_with(made: Made, tmp_path: Pa
     np.testing.assert_allclose(corners, vertices[trimesh.load(made.drawn.mesh, process=False).faces], atol=1e-3)
 
 
+@pytest.mark.full
 def test_uncertainties_that_are_stated_too_small_are_told(made: Made, tmp_path: Path) -> None:
     """An arm that is off by ten times of what is taken without options, and a scan by five times."""
     good = [RECORDS / "hand-eye.yaml" if word == made.drawn.hand_eye else word for word in made.words]

@@ -181,7 +181,7 @@ def test_the_covariance_of_poses_is_that_of_drawn_hand_eyes_and_arms() -> None:
     prior = CameraPrior(LENS, (), hand_eye, own, axis_sensitivity=by_zeros)
     stated = camera_covariance(prior, cameras, arm)
     drawn = []
-    for _ in range(4000):
+    for _ in range(1500):
         moved_eye = stepped(hand_eye, random.standard_normal(6) * np.repeat([u_mm, u_rad], 3))
         scatter = random.standard_normal((2, 6)) * np.repeat([0.2, np.radians(0.05)], 3)
         zeros = by_zeros @ (u_deg * random.standard_normal(2))
@@ -192,7 +192,7 @@ def test_the_covariance_of_poses_is_that_of_drawn_hand_eyes_and_arms() -> None:
         drawn.append(np.concatenate([difference(is_, at) for is_, at in zip(cameras, there, strict=True)]))
     seen = np.cov(np.array(drawn).T)
     scale = np.sqrt(np.diag(stated))
-    np.testing.assert_allclose(seen / np.outer(scale, scale), stated / np.outer(scale, scale), atol=0.08)
+    np.testing.assert_allclose(seen / np.outer(scale, scale), stated / np.outer(scale, scale), atol=0.12)
 
 
 def stepped(pose: Floats, step: Floats) -> Floats:
@@ -212,3 +212,14 @@ def test_views_without_anything_in_common_are_refused() -> None:
     plain = [np.ones(SIZE[::-1], np.float32) for _ in CAMERAS]
     with pytest.raises(InputError, match="expected 30 matches or more, found 0"):
         refine(known.given, plain, known.doubts, 1.0, 1, lambda step, done, of: None)
+
+
+def test_control_points_are_a_scale_apart_and_an_object_too_large_for_them_is_refused() -> None:
+    x, y = np.meshgrid(np.arange(0.0, 1000.0, 10.0), np.arange(0.0, 1000.0, 10.0))
+    points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    chosen = control_points(points, 60.0)
+    between = np.linalg.norm(chosen[:, None] - chosen, axis=2) + 1e9 * np.eye(len(chosen))
+    nearest = np.linalg.norm(points[:, None] - chosen, axis=2).min(axis=1)
+    assert between.min() >= 60.0 >= nearest.max()
+    with pytest.raises(InputError, match=r"--scale-mm: expected [345]. or more"):
+        control_points(points, 20.0)

@@ -251,6 +251,17 @@ def test_refined_geometry_is_what_samples_are_made_with(made: Made, tmp_path: Pa
     np.testing.assert_allclose(corners, vertices[trimesh.load(made.drawn.mesh, process=False).faces], atol=1e-3)
 
 
+@pytest.mark.full
+def test_uncertainties_that_are_stated_too_small_are_told(made: Made, tmp_path: Path) -> None:
+    """An arm that is off by ten times of what is taken without options, and a scan by five times."""
+    good = [RECORDS / "hand-eye.yaml" if word == made.drawn.hand_eye else word for word in made.words]
+    ended = cells.here("reflectance", "refine", *good, "--out", tmp_path / "refined")
+    assert ended.code == 0, ended.err
+    said = " ".join((ended.out + ended.err).split())
+    assert "were moved farther than records, scan and options state" in said
+    assert "were moved farther" not in (made.out / "report.html").read_text()
+
+
 def test_what_does_not_fit_is_refused_with_the_remedy(made: Made, tmp_path: Path) -> None:
     def refused(*arguments: str | Path) -> str:
         ended = cells.here("reflectance", *arguments)

@@ -529,7 +529,7 @@ def test_uncertainty_of_a_relit_picture_is_the_spread_of_pictures_of_drawn_mater
     stated = np.sqrt(u**2 - (common[..., None] * np.mean(pictures, axis=0)) ** 2)
     assert np.median(spread[shown] / stated[shown]) == pytest.approx(1.0, abs=0.05)
     assert np.quantile(spread[shown] / stated[shown], 0.05) > 0.8
-    assert np.quantile(spread[shown] / stated[shown], 0.95) < 1.3
+    assert np.quantile(spread[shown] / stated[shown], 0.95) < 1.4  # of sixty draws
 
 
 @pytest.mark.parametrize(

@@ -97,13 +97,11 @@ def refine(
 ) -> Refined:
     """Match the views, adjust, and match anew with what was found, until disagreement no longer falls.
 
-    Raises InputError if the views have too little in common.
+    Raises InputError if the views have too little in common, or the object is too large for the field's scale.
     """
-    unknowns = Unknowns(given, doubts, np.empty((0, 3)))
-    steps = np.zeros(unknowns.count)
-    matches = before = _matched(unknowns, steps, pictures, search_mm, threads, say)
     unknowns = Unknowns(given, doubts, control_points(given.vertices_mm, doubts.scale_mm))
     steps = np.zeros(unknowns.count)
+    matches = before = _matched(unknowns, steps, pictures, search_mm, threads, say)
     for number in range(ROUNDS):
         adjusted = _adjusted(unknowns, steps, matches)
         say("rounds of refinement", number + 1, ROUNDS)

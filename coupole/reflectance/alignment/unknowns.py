@@ -21,6 +21,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.rotations import moved, rotation, skew
+from coupole.errors import InputError
 
 Floats = NDArray[np.float64]
 MOST_CONTROLS = 600
@@ -198,12 +199,17 @@ def vertex_normals(vertices_mm: Floats, triangles: NDArray[np.uint32]) -> Floats
 
 def control_points(points_mm: Floats, spacing_mm: float) -> Floats:
     """Some of points [n, 3], each the farthest from those before it, until all others are within `spacing_mm` of
-    one, or there are `MOST_CONTROLS`."""
+    one. Raises InputError if that takes more than `MOST_CONTROLS`."""
     chosen = [int(np.argmin(np.sum((points_mm - points_mm.mean(axis=0)) ** 2, axis=1)))]
     far = np.linalg.norm(points_mm - points_mm[chosen[0]], axis=1)
     while far.max() > spacing_mm and len(chosen) < MOST_CONTROLS:
         chosen.append(int(far.argmax()))
         far = np.minimum(far, np.linalg.norm(points_mm - points_mm[chosen[-1]], axis=1))
+    if far.max() > spacing_mm:
+        raise InputError(
+            f"--scale-mm: expected {np.ceil(far.max()):g} or more for an object of this size, got {spacing_mm:g}; "
+            f"the surface is refined at {MOST_CONTROLS} points at most"
+        )
     return points_mm[chosen]
 
 

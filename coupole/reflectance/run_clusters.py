@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,8 @@ from coupole.reflectance.clustering import (
     nearest_cluster,
     pool_samples,
 )
-from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.result_folder import complete, read_settings
+from coupole.reflectance.run_pictures import held_out
 from coupole.reflectance.run_result import CLUSTERS, FIELDS, Clusters, RunResult
 from coupole.reflectance.triangle_fit import TriangleMaterials, model_values
 from coupole.storage.disk_errors import disk_error
@@ -117,35 +116,35 @@ def _missed(result: RunResult, settings: dict[str, Any], memory_bytes: int, say:
     """Mean absolute errors, shares of the camera's range, under the LEDs that were left out: of triangles with a
     material of their own, by it and by their cluster's; of those that borrowed one."""
     clusters = result.clusters
-    sums = {"own": 0.0, "clustered": 0.0, "borrowed": 0.0}
-    counts = dict.fromkeys(sums, 0)
-    for block in result.blocks(memory_bytes):
-        held = np.isin(result.along_samples(block, "leds"), settings["left_out"])
-        samples = result.samples(block)
-        some = replace(
-            samples,
-            values=samples.values[:, held],
-            led_mm=samples.led_mm[held],
-            view_of=samples.view_of[held],
-        )
-        axes, paper = result.along_samples(block, "led_normals")[held], settings["emission"] == "paper"
-        lit = lit_on(some.centres_mm, some.led_mm, axes, paper)
-        share = lit[..., None] * result.along_samples(block, "full_scales")[held]
-        by = {
-            "own": model_values(some, result.materials(_FROM, block)),
-            "clustered": model_values(some, clusters.at(result.materials(_FROM, block), some.normals, block)),
-        }
-        by["borrowed"] = np.where(clusters.borrowed[block][:, None, None], by["clustered"], np.nan)
-        by["clustered"] = np.where(clusters.borrowed[block][:, None, None], np.nan, by["clustered"])
-        for name, made in by.items():
-            off = np.abs((made - some.values) * share)
-            known = np.isfinite(off)
-            sums[name] += float(off[known].sum())
-            counts[name] += int(np.count_nonzero(known))
-        say("check of clusters", block.stop, len(result.triangles))
-    mae = {name: sums[name] / counts[name] if counts[name] else None for name in sums}
+    names = ("own", "clustered", "borrowed")
+    pictures, triangles = ({name: [0.0, 0] for name in names} for _ in range(2))
+    for view in result.views:
+        for part in held_out(result, view, settings, memory_bytes):
+            own, borrowed = result.materials(_FROM, part.places), clusters.borrowed[part.places][:, None, None]
+            shared = model_values(part.samples, clusters.at(own, part.samples.normals, part.places)) * part.share
+            made = {
+                "own": model_values(part.samples, own) * part.share,
+                "clustered": np.where(borrowed, np.nan, shared),
+                "borrowed": np.where(borrowed, shared, np.nan),
+            }
+            for name, values in made.items():
+                _add(triangles[name], values - part.samples.values * part.share)
+                for channel, (_, measured) in enumerate(part.blocks):
+                    _add(pictures[name], part.pixels(values, channel) - measured)
+            say(f"check of clusters in {view.view}", part.rows.stop, len(view.triangles))
+    mae, of_triangles = (
+        {name: total / count if count else None for name, (total, count) in sums.items()}
+        for sums in (pictures, triangles)
+    )
     ratio = mae["clustered"] / mae["own"] if mae["own"] and mae["clustered"] else None
-    return {"mae": mae, "mae_ratio": ratio}
+    return {"mae": mae, "mae_of_triangles": of_triangles, "mae_ratio": ratio}
+
+
+def _add(sums: list[float], off: NDArray[np.floating]) -> None:
+    """To the sum of magnitudes, and their number."""
+    known = np.isfinite(off)
+    sums[0] += float(np.abs(off[known]).sum())
+    sums[1] += int(np.count_nonzero(known))
 
 
 def _write(

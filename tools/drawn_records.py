@@ -25,7 +25,9 @@ from scipy.spatial.transform import Rotation
 from coupole.appearance.render.led_squares import Leds, read_leds
 from coupole.calibration.record import Record, content_sha256, read_record, write_record
 from coupole.geometry import abc_from_rotation
+from coupole.plan.cell import Cell
 from coupole.plan.reading import read_cell
+from sim.optics.objective import Objective, vignetting
 from sim.optics.sensor_model import SensorModel
 from sim.render.emitter import LED_SIDE_MM, irradiance_of_each, squares
 from sim.world.config import WHITE_SHARE
@@ -35,18 +37,22 @@ SHIPPED, RIG = ROOT / "configs/calibrations", ROOT / "configs/rigs/sim.yaml"
 KEPT = ("flat-field", "response")
 WHITE_AT_US = 8000
 CHANNELS = "RGB"
+SHIPPED_SENSOR = SensorModel()
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Factors of what the shipped records state, for cells that are known worse or better."""
+    """What differs from the shipped records, for cells that are known worse or better, or have another camera."""
 
     led_mm: float | None = None
     """Standard uncertainty of each coordinate of an LED; None: as the record has it."""
     led_normal_deg: float | None = None
     camera_mm: float | None = None
     """Of each coordinate of the camera in the flange's frame."""
+    pitch_um: float = 44.0
+    """Of the pixels."""
+    sensor: SensorModel = SHIPPED_SENSOR
 
 
 def draw_records(folder: Path, seed: int, scale: Scale | None = None) -> tuple[Path, ...]:
@@ -57,6 +63,7 @@ def draw_records(folder: Path, seed: int, scale: Scale | None = None) -> tuple[P
         for path in SHIPPED.glob(f"{kind}.*"):
             shutil.copy(path, folder)
     random = np.random.default_rng((seed, 77))
+    _set_sensor(folder, scale)
     _draw_hand_eye(folder, random, scale)
     _draw_leds(folder, random, scale)
     _draw_powers(folder, random)
@@ -69,7 +76,7 @@ def true_powers() -> Floats:
     base_from_support = cell.rig.support.base_from_support.matrix()
     emitters = squares(table.positions_mm, table.normals, side_mm=LED_SIDE_MM, fluxes_lm=table.flux_lm)
     white_lux = np.median(irradiance_of_each(emitters, base_from_support[:3, 3], base_from_support[:3, 2]))
-    white_dn = WHITE_SHARE * (SensorModel().white_dn - SensorModel().black_dn)
+    white_dn = WHITE_SHARE * (SHIPPED_SENSOR.white_dn - SHIPPED_SENSOR.black_dn)
     powers: Floats = table.flux_lm * white_dn * np.pi / (white_lux * WHITE_AT_US * 1e-6)
     return powers
 
@@ -81,8 +88,8 @@ def true_leds() -> Leds:
 def _draw_hand_eye(folder: Path, random: np.random.Generator, scale: Scale) -> None:
     """Lens, hand-eye and axis zeros by their common covariance; what the record has besides them is not used."""
     record, cell = read_record(SHIPPED / "hand-eye.yaml"), read_cell(RIG)
-    sensor, lens = cell.rig.sensor, cell.rig.lens
-    focal_px = 1e3 / sensor.pixel_pitch_um / (1.0 / lens.focal_length_mm - 1.0 / lens.focus_distance_mm)
+    sensor = cell.rig.sensor
+    focal_px = 1e3 / scale.pitch_um * _image_mm(cell)
     truth = {"fx_px": focal_px, "fy_px": focal_px}
     truth |= {"cx_px": 0.5 * (sensor.width_px - 1), "cy_px": 0.5 * (sensor.height_px - 1)}
     covariance = record.covariance_matrix.copy()
@@ -112,6 +119,38 @@ def _draw_hand_eye(folder: Path, random: np.random.Generator, scale: Scale) -> N
             parameter["value"] = known.get(name, truth.get(name, 0.0) + float(errors[name]))
     content["covariance"] = covariance.tolist()
     write_record(folder / "hand-eye.yaml", _sealed(content))
+
+
+def _image_mm(cell: Cell) -> float:
+    """Distance of the image from the thin lens."""
+    lens = cell.rig.lens
+    return 1.0 / (1.0 / lens.focal_length_mm - 1.0 / lens.focus_distance_mm)
+
+
+def _set_sensor(folder: Path, scale: Scale) -> None:
+    """Noise of another sensor, and the lens's fall-off on pixels of another size: not drawn."""
+    cell, record = read_cell(RIG), read_record(SHIPPED / "response.yaml")
+    content, sensor = _content(record), scale.sensor
+    if sensor != SHIPPED_SENSOR:
+        for parameter in content["parameters"]:
+            name = parameter["name"].split(".")[0]
+            known = {
+                "dark_variance_dn2": (sensor.read_noise_e / sensor.electrons_per_dn) ** 2 + 1.0 / 12.0,
+                "gain_dn_per_e": 1.0 / sensor.electrons_per_dn,
+            }
+            parameter["value"] = known.get(name, parameter["value"])
+        write_record(folder / "response.yaml", _sealed(content))
+    if scale.pitch_um == cell.rig.sensor.pixel_pitch_um:
+        return
+    lens = cell.rig.lens
+    row, column = np.indices((cell.rig.sensor.height_px, cell.rig.sensor.width_px))
+    off = np.hypot(row - row.mean(), column - column.mean()) * scale.pitch_um * 1e-3 / _image_mm(cell)
+    with h5py.File(folder / "flat-field.h5", "r+") as file:
+        objective = Objective(lens.focal_length_mm, lens.focus_distance_mm, lens.f_number)
+        file["g"][...] = vignetting(objective, off)
+    content = _content(read_record(SHIPPED / "flat-field.yaml"))
+    content["files"][0]["sha256"] = hashlib.sha256((folder / "flat-field.h5").read_bytes()).hexdigest()
+    write_record(folder / "flat-field.yaml", _sealed(content))
 
 
 def _draw_leds(folder: Path, random: np.random.Generator, scale: Scale) -> None:

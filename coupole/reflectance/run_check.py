@@ -12,7 +12,7 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -22,11 +22,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.material_uncertainty import relative_uncertainty
 from coupole.reflectance.result_folder import read_settings
 from coupole.reflectance.run_fits import predicted
-from coupole.reflectance.run_pictures import read_check_frames
+from coupole.reflectance.run_pictures import held_out, read_check_frames
 from coupole.reflectance.run_result import ABOUT, FITS, MATERIALS, SCHEMA, RunResult, ViewSamples
 from coupole.reflectance.run_uncertainty import QUANTILE, uncertainty_of
 from coupole.reflectance.triangle_fit import TriangleSamples
@@ -47,7 +46,7 @@ class _Missed:
     square: float = 0.0
     count: int = 0
 
-    def add(self, off: NDArray[np.float64]) -> None:
+    def add(self, off: NDArray[np.floating]) -> None:
         self.absolute += float(np.abs(off).sum())
         self.square += float(np.sum(off**2))
         self.count += off.size
@@ -113,34 +112,24 @@ def _check_view(
 ) -> None:
     """Pictures and samples of a view, in shares of the camera's range, where every fit has something: all fits are
     compared by the same ones."""
-    held = np.isin(view.leds, settings["left_out"])
-    frames = read_check_frames(result, view)
-    column = {int(led): n for n, led in enumerate(view.leds[held])}
-    columns = [column[int(led)] for led in frames.leds]
-    check.noise += list(frames.noise)
-    for rows in result.view_blocks(view, memory_bytes):
-        some = result.view_samples(view, rows, held)
-        lit = lit_on(some.centres_mm, some.led_mm, view.led_normals[held], settings["emission"] == "paper")
-        share = lit[..., None] * view.full_scales[held]
-        made = _made(result, view, rows, some, share)
-        _compare(made, some.values * share, check.triangles)
-        noise = result.view_noise(view, rows, held)
-        places = np.searchsorted(result.triangles, view.triangles[rows])
+    check.noise += list(read_check_frames(result, view).noise)
+    for part in held_out(result, view, settings, memory_bytes):
+        some = part.samples
+        made = _made(result, view, part.rows, some, part.share)
+        _compare(made, some.values * part.share, check.triangles)
+        noise = result.view_noise(view, part.rows, np.isin(view.leds, settings["left_out"]))
         for name, inside in check.inside.items():
-            covariance = result.material_covariances(name, places)
-            relative = relative_uncertainty(some, result.materials(name, places), covariance)
-            found = _inside(made[name] / share, relative, some.values, noise)
+            covariance = result.material_covariances(name, part.places)
+            relative = relative_uncertainty(some, result.materials(name, part.places), covariance)
+            found = _inside(made[name] / part.share, relative, some.values, noise)
             inside[0] += int(np.count_nonzero(found))
             inside[1] += found.size
-        direct = result.direct_shares(view, rows, held)[:, columns]
-        for channel in range(result.channels):
-            place, measured = frames.pairs(rows, channel)
-            measured *= direct[place, :, channel]
-            pixels = {name: values[:, columns, channel][place] for name, values in made.items()}
+        for channel, (_, measured) in enumerate(part.blocks):
+            pixels = {name: part.pixels(values, channel) for name, values in made.items()}
             compared = _compare(pixels, measured, check.pictures)
             level = np.clip(compared * _LEVELS_OF_RANGE, 0, _LEVELS - 1).astype(np.int64)
             check.levels += np.bincount(level, minlength=_LEVELS)
-        say(f"check of {view.view}", rows.stop, len(view.triangles))
+        say(f"check of {view.view}", part.rows.stop, len(view.triangles))
 
 
 def _made(
@@ -172,7 +161,7 @@ def _inside(
 
 
 def _compare(
-    made: dict[str, NDArray[np.float64]], measured: NDArray[np.floating], missed: dict[str, _Missed]
+    made: Mapping[str, NDArray[np.floating]], measured: NDArray[np.floating], missed: dict[str, _Missed]
 ) -> NDArray[np.floating]:
     """Add what fits miss where all have something; the measured values there."""
     known = np.isfinite(measured)

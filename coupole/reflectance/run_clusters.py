@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,10 +21,10 @@ from coupole.reflectance.clustering import (
     nearest_cluster,
     pool_samples,
 )
-from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.pair_harmonics import USUAL_DEGREES, fit_pairs, pair_values
 from coupole.reflectance.result_folder import complete, read_settings
-from coupole.reflectance.run_result import FIELDS, RunResult
+from coupole.reflectance.run_pictures import held_out
+from coupole.reflectance.run_result import FIELDS, RunResult, ViewSamples
 from coupole.reflectance.triangle_fit import TriangleMaterials, model_values
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import write_synced
@@ -37,6 +36,8 @@ FEWEST_TO_BORROW = 4
 USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS = 400, 16, 1000
 """Of clusters whose number is not given: as the paper has them, and some for small objects."""
 _FROM = "ggx_normal"
+_WAYS = ("own", "clustered", "harmonics", "borrowed")
+"""To make what a triangle shows, each judged by itself."""
 
 
 def cluster_result(
@@ -140,48 +141,46 @@ def _missed(
 ) -> dict[str, Any]:
     """Mean absolute errors, shares of the camera's range, under the LEDs that were left out: of all views, and of
     the view that was left out too."""
-    found = {"mae": _mae(result, settings, None, memory_bytes, say)}
+    found: dict[str, Any] = _mae(result, settings, result.views, memory_bytes, say)
     if without_view is not None:
-        found["mae_of_view"] = _mae(result, settings, without_view, memory_bytes, say)
+        alone = [view for view in result.views if view.view == without_view]
+        found["mae_of_view"] = _mae(result, settings, alone, memory_bytes, say)["mae"]
     own, clustered = found["mae"]["own"], found["mae"]["clustered"]
     return {**found, "mae_ratio": clustered / own if own and clustered else None}
 
 
 def _mae(
-    result: RunResult, settings: dict[str, Any], of_view: str | None, memory_bytes: int, say: Said
-) -> dict[str, float | None]:
-    """Of triangles with a material of their own, by it, by their cluster's, and by its harmonics; of those that
-    borrowed one."""
+    result: RunResult, settings: dict[str, Any], views: Sequence[ViewSamples], memory_bytes: int, say: Said
+) -> dict[str, dict[str, float | None]]:
+    """Of pictures by blocks of pixels, and of means of triangles: of those with a material of their own by it, by
+    their cluster's, and by its harmonics; of those that borrowed one."""
     clusters = result.clusters
-    sums = {"own": 0.0, "clustered": 0.0, "harmonics": 0.0, "borrowed": 0.0}
-    counts = dict.fromkeys(sums, 0)
-    for block in result.blocks(memory_bytes):
-        held = np.isin(result.along_samples(block, "leds"), settings["left_out"])
-        if of_view is not None:
-            held &= result.along_samples(block, "names") == of_view
-        samples = result.samples(block)
-        some = replace(
-            samples,
-            values=samples.values[:, held],
-            led_mm=samples.led_mm[held],
-            view_of=samples.view_of[held],
-        )
-        axes, paper = result.along_samples(block, "led_normals")[held], settings["emission"] == "paper"
-        lit = lit_on(some.centres_mm, some.led_mm, axes, paper)
-        share = lit[..., None] * result.along_samples(block, "full_scales")[held]
-        own = result.materials(_FROM, block)
-        number = np.where(clusters.borrowed[block], -1, clusters.cluster[block])
-        by = {
-            "own": model_values(some, own),
-            "clustered": model_values(some, clusters.at(own, some.normals, block)),
-            "harmonics": pair_values(some, own.normals, number, clusters.harmonics),
-        }
-        by["borrowed"] = np.where(clusters.borrowed[block][:, None, None], by["clustered"], np.nan)
-        by["clustered"] = np.where(clusters.borrowed[block][:, None, None], np.nan, by["clustered"])
-        for name, made in by.items():
-            off = np.abs((made - some.values) * share)
-            known = np.isfinite(off)
-            sums[name] += float(off[known].sum())
-            counts[name] += int(np.count_nonzero(known))
-        say("check of clusters", block.stop, len(result.triangles))
-    return {name: sums[name] / counts[name] if counts[name] else None for name in sums}
+    pictures, triangles = ({name: [0.0, 0] for name in _WAYS} for _ in range(2))
+    for view in views:
+        for part in held_out(result, view, settings, memory_bytes):
+            own, borrowed = result.materials(_FROM, part.places), clusters.borrowed[part.places][:, None, None]
+            shared = model_values(part.samples, clusters.at(own, part.samples.normals, part.places)) * part.share
+            number = np.where(borrowed[:, 0, 0], -1, clusters.cluster[part.places])
+            made = {
+                "own": model_values(part.samples, own) * part.share,
+                "clustered": np.where(borrowed, np.nan, shared),
+                "harmonics": pair_values(part.samples, own.normals, number, clusters.harmonics) * part.share,
+                "borrowed": np.where(borrowed, shared, np.nan),
+            }
+            for name, values in made.items():
+                _add(triangles[name], values - part.samples.values * part.share)
+                for channel, (_, measured) in enumerate(part.blocks):
+                    _add(pictures[name], part.pixels(values, channel) - measured)
+            say(f"check of clusters in {view.view}", part.rows.stop, len(view.triangles))
+    mae, of_triangles = (
+        {name: total / count if count else None for name, (total, count) in sums.items()}
+        for sums in (pictures, triangles)
+    )
+    return {"mae": mae, "mae_of_triangles": of_triangles}
+
+
+def _add(sums: list[float], off: NDArray[np.floating]) -> None:
+    """To the sum of magnitudes, and their number."""
+    known = np.isfinite(off)
+    sums[0] += float(np.abs(off[known]).sum())
+    sums[1] += int(np.count_nonzero(known))

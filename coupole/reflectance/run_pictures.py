@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.run_result import FRAMES, RunResult, ViewSamples
+from coupole.reflectance.triangle_fit import TriangleSamples
 
 
 @dataclass(frozen=True)
@@ -57,3 +61,46 @@ def read_check_frames(result: RunResult, view: ViewSamples) -> CheckFrames:
     height, width = share.shape[1:3]
     triangle = np.stack([seen[row::2, column::2][:height, :width] for row, column in offsets])
     return CheckFrames(share, leds, noise, triangle)
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Some triangles of a view under the LEDs that were kept for the check: samples, and blocks of pictures."""
+
+    rows: slice
+    """Of the view's file."""
+    places: NDArray[np.int64]
+    """[n] in the triangles of the fits."""
+    samples: TriangleSamples
+    share: NDArray[np.float64]
+    """[n, leds, channels] of the camera's range that f cos_i of 1 gives."""
+    columns: list[int]
+    """Of the pictures' LEDs in those of the samples."""
+    blocks: tuple[tuple[NDArray[np.int64], NDArray[np.float32]], ...]
+    """By channel: the triangle [blocks] that each sees, and what was measured [blocks, pictures]."""
+
+    def pixels(self, values: NDArray[np.floating], channel: int) -> NDArray[np.floating]:
+        """[blocks, pictures] of values [n, leds, channels]."""
+        found: NDArray[np.floating] = values[:, self.columns, channel][self.blocks[channel][0]]
+        return found
+
+
+def held_out(
+    result: RunResult, view: ViewSamples, settings: dict[str, Any], memory_bytes: int
+) -> Iterator[HeldOut]:
+    """A view's triangles, block by block. Light from surface to surface is taken off the pictures, as off the
+    samples."""
+    held = np.isin(view.leds, settings["left_out"])
+    frames, column = read_check_frames(result, view), {int(led): n for n, led in enumerate(view.leds[held])}
+    columns = [column[int(led)] for led in frames.leds]
+    for rows in result.view_blocks(view, memory_bytes):
+        some = result.view_samples(view, rows, held)
+        lit = lit_on(some.centres_mm, some.led_mm, view.led_normals[held], settings["emission"] == "paper")
+        direct = result.direct_shares(view, rows, held)[:, columns]
+        blocks = []
+        for channel in range(result.channels):
+            place, measured = frames.pairs(rows, channel)
+            blocks.append((place, measured * direct[place, :, channel]))
+        places = np.searchsorted(result.triangles, view.triangles[rows])
+        share = lit[..., None] * view.full_scales[held]
+        yield HeldOut(rows, places, some, share, columns, tuple(blocks))

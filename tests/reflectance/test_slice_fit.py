@@ -146,3 +146,10 @@ def test_channels_with_other_samples_and_triangles_with_too_few(shiny: TriangleS
     for channel in range(3):
         alone = fit_slices(replace(shiny, values=values[..., [channel]]), ~HELD_OUT, (RADIAL, None))[0]
         np.testing.assert_allclose(alone[:, 0], found[:, channel], rtol=1e-5, atol=1e-7)
+
+
+def test_a_model_that_leaves_everything_holds_coefficients_no_more_than_none() -> None:
+    samples, _ = noisy_case(1)
+    used = np.ones(len(samples.led_mm), bool)
+    alone, of_the_rest = fit_slices(samples, used, (RADIAL, None), (RESIDUAL, np.zeros_like(samples.values)))
+    np.testing.assert_allclose(of_the_rest, alone, rtol=1e-5, atol=1e-5)

@@ -20,7 +20,7 @@ from sim.render.radiance import led_radiance
 
 LENS, TILTED = Lens(40, 30, 40.0), camera_above(330.0, 35.0)
 WEIGHTS = camera_weights(LedModel(), light.camera())
-SLOW = {"tabulated"}
+SLOW = {"tabulated", "four-flux"}
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

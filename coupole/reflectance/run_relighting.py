@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.motion.occlusion import ray_mesh
+from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.beams import Beam, Lighting, lighting_of
 from coupole.reflectance.new_light.light_kinds import AnyLight
 from coupole.reflectance.new_light.pictured_surface import FreeCamera, Surface, surface_from, surface_of_view
@@ -20,9 +21,10 @@ from coupole.reflectance.new_light.shading import (
     MIRROR_SHARE,
     Coats,
     Picture,
-    add_beam,
+    add_beams,
     add_mirrored,
     add_values,
+    alike,
     coats_of,
 )
 from coupole.reflectance.new_light.shadow_edges import reached
@@ -104,9 +106,14 @@ class RelitScene:
 
     def _by_materials(self, picture: Picture, lighting: Lighting, coats: Coats, lobe_rays: int, say: Say) -> None:
         work = len(lighting.beams) + len(lighting.emitters)
-        for number, beam in enumerate(lighting.beams):
-            add_beam(picture, self.surface, coats, reached(self.rays, self.surface, beam), beam, lobe_rays)
-            say(number + 1, work)
+        codes = np.zeros((LANES, *self.surface.seen.shape), np.uint8)
+        done = 0
+        for beams in alike(lighting.beams):
+            for lane, beam in enumerate(beams):
+                codes[lane] = reached(self.rays, self.surface, beam)
+                done += 1
+                say(done, work)
+            add_beams(picture, self.surface, coats, codes, beams, lobe_rays)
         for number, emitter in enumerate(lighting.emitters):
             add_mirrored(picture, self.surface, coats, self.rays, emitter, lobe_rays)
             say(len(lighting.beams) + number + 1, work)

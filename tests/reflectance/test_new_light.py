@@ -104,6 +104,14 @@ def test_a_sensor_without_filter_has_the_green_of_all_lights(tmp_path: Path) -> 
         np.testing.assert_allclose(found[..., 0], wanted[..., 1], rtol=1e-4, atol=1e-6)
 
 
+def test_beams_alone_show_an_area_that_is_smaller_than_the_lobe(tmp_path: Path) -> None:
+    """No rays are drawn for it: 256 beams against 2304."""
+    scene = scene_of_view(write_result(tmp_path / "result", sheet(np.zeros((20, 20)), 60.0), GLOSSY))
+    light = AreaLight(at_mm=(-40, 60, 250), normal=(0.1, -0.2, -1), width_mm=60)
+    few, many = shown(scene, light), shown(scene, light, samples=2304)
+    assert np.abs(few / many - 1).max() < 0.01
+
+
 def parallel_rectangle(points: np.ndarray, half_x: float, half_y: float, height: float) -> np.ndarray:
     """[n] form factor of a rectangle over the origin: the sum of four that have a corner over the point (Howell, A
     catalog of radiation heat transfer configuration factors, B-4)."""

@@ -3,12 +3,15 @@
 Emitters that have a size are seen by GGX in two ways at once: by their beams, and by rays that are drawn from each
 pixel's lobe and meet the emitter or not. Both are weighted by the balance heuristic (Veach, Robust Monte Carlo
 methods for light transport simulation, 1997, 9.2): a sharp lobe shows the emitter itself and not its beams, a
-rough one the beams and no noise.
+rough one the beams and no noise. No rays are drawn for an area that is not larger than the lobe: its beams are as
+close to each other in the lobe as in the area.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import groupby
 from typing import Any
 
 import numba
@@ -17,6 +20,7 @@ from numpy.typing import NDArray
 
 from coupole.motion.occlusion import RAY_START_MM, blocked
 from coupole.reflectance.ggx import drawn, reflected, shine
+from coupole.reflectance.lanes import LANES, absolute, gathered, if_less, lanes, larger, loaded, root, total
 from coupole.reflectance.new_light.beams import Beam, Emitter
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 from coupole.reflectance.new_light.shadow_edges import DISTANT_MM, LIT, Codes
@@ -40,14 +44,35 @@ def coats_of(materials: TriangleMaterials) -> Coats:
     return np.hstack([materials.normals, alpha, materials.kd, materials.ks]).astype(np.float32)
 
 
-def add_beam(picture: Picture, surface: Surface, coats: Coats, codes: Codes, beam: Beam, lobe_rays: int) -> None:
-    """Add what GGX materials of the surface's triangles make of a beam where `codes` say that it reaches; where
-    `lobe_rays` are drawn for its emitter, only its part."""
-    of_beam = beam.near, beam.place, beam.axis, beam.exponent, beam.strength, beam.density, lobe_rays
+def alike(beams: Iterable[Beam]) -> Iterator[list[Beam]]:
+    """Up to eight neighbouring beams of one kind, which are shaded together."""
+    for _, same in groupby(beams, key=lambda beam: (beam.near, beam.exponent, beam.density > 0.0)):
+        kept = list(same)
+        yield from (kept[first : first + LANES] for first in range(0, len(kept), LANES))
+
+
+def add_beams(
+    picture: Picture, surface: Surface, coats: Coats, codes: Codes, beams: Sequence[Beam], lobe_rays: int
+) -> None:
+    """Add what GGX materials of the surface's triangles make of some of the `alike` beams where `codes` [8, h, w]
+    say that they reach; where `lobe_rays` are drawn for their emitter, only their part."""
+
+    def across(of: Callable[[Beam], Floats]) -> NDArray[np.float32]:
+        """[..., 8]: one lane for each beam."""
+        made = np.stack([of(beam) for beam in beams], axis=1)
+        return np.pad(made, ((0, 0), (0, LANES - len(beams))), mode="edge").astype(np.float32, order="C")
+
+    strengths = across(lambda beam: beam.strength)
+    strengths[:, len(beams) :] = 0.0
+    of_beams = (
+        beams[0].near, beams[0].exponent, across(lambda beam: beam.place), across(lambda beam: beam.axis),
+        strengths, across(lambda beam: np.array([beam.density])), lobe_rays if beams[0].density > 0.0 else 0,
+    )  # fmt: skip
+    flat = codes.reshape(LANES, -1)
     in_strips(
         len(picture),
-        lambda rows: _add_beam(
-            surface.seen[rows], surface.places_mm[rows], codes[rows], surface.camera_mm, coats, *of_beam,
+        lambda rows: _add_beams(
+            rows.start, surface.seen[rows], surface.places_mm[rows], flat, surface.camera_mm, coats, *of_beams,
             picture[rows],
         ),
     )  # fmt: skip
@@ -79,7 +104,9 @@ def add_mirrored(
 
     def add(rows: slice) -> None:
         seen, places_mm, part = surface.seen[rows], surface.places_mm[rows], picture[rows]
-        row, column = np.nonzero(seen >= 0)
+        asking = np.zeros(seen.shape, np.bool_)
+        _asking(seen, places_mm, surface.camera_mm, coats, *of_emitter[:3], emitter.density, lobe_rays, asking)
+        row, column = np.nonzero(asking)
         if not len(row):
             return
         pixels = np.stack([row, column], axis=1)
@@ -117,41 +144,78 @@ def _towards(near, place, axis, exponent, x, y, z, way):  # type: ignore[no-unty
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_beam(  # type: ignore[no-untyped-def]
-    seen, places_mm, codes, camera_mm, coats, near, place, axis, exponent, strength, density,
+def _reach(near, exponent, places, axes, x, y, z):  # type: ignore[no-untyped-def]
+    """As `_towards`, of eight beams: three coordinates of their directions, and cos^k / d^2."""
+    dx, dy, dz = loaded(places, 0), loaded(places, 1), loaded(places, 2)
+    if not near:
+        return dx, dy, dz, lanes(np.float32(1.0))
+    dx, dy, dz = dx - x, dy - y, dz - z
+    inverse = np.float32(1.0) / root(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz, found = dx * inverse, dy * inverse, dz * inverse, np.float32(1e6) * inverse * inverse
+    for _ in range(exponent):
+        cosine = dx * loaded(axes, 0) + dy * loaded(axes, 1) + dz * loaded(axes, 2)
+        found = found * larger(np.float32(-1.0) * cosine, np.float32(0.0))
+    return dx, dy, dz, found
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_beams(  # type: ignore[no-untyped-def]
+    first_row, seen, places_mm, codes, camera_mm, coats, near, exponent, places, axes, strengths, densities,
     lobe_rays, picture
 ):  # fmt: skip
-    way = np.empty(3)
-    channels = picture.shape[2]
+    every, channels, half, none = np.arange(LANES), picture.shape[2], np.float32(0.5), np.float32(0.0)
     for row in range(seen.shape[0]):
         for column in range(seen.shape[1]):
-            if codes[row, column] != LIT:
-                continue
             triangle = seen[row, column]
-            alpha = coats[triangle, 3]
-            if alpha == 0.0:
+            if triangle < 0 or coats[triangle, 3] == none:
                 continue
-            x, y, z = places_mm[row, column, 0], places_mm[row, column, 1], places_mm[row, column, 2]
-            reach = _towards(near, place, axis, exponent, x, y, z, way)
-            n0, n1, n2 = coats[triangle, 0], coats[triangle, 1], coats[triangle, 2]
-            nl = n0 * way[0] + n1 * way[1] + n2 * way[2]
-            if not nl > 0.0:
+            lit = absolute(gathered(codes, every, (first_row + row) * seen.shape[1] + column) - np.float32(LIT))
+            if total(if_less(lit, half, np.float32(1.0), lit * none)) == none:
                 continue
-            v0, v1, v2 = camera_mm[0] - x, camera_mm[1] - y, camera_mm[2] - z
+            coat, place = coats[triangle], places_mm[row, column]
+            n0, n1, n2, alpha = coat[0], coat[1], coat[2], coat[3]
+            l0, l1, l2, reach = _reach(near, exponent, places, axes, place[0], place[1], place[2])
+            nl = larger(n0 * l0 + n1 * l1 + n2 * l2, none)
+            v0, v1, v2 = camera_mm[0] - place[0], camera_mm[1] - place[1], camera_mm[2] - place[2]
             length = 1.0 / math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
             v0, v1, v2 = v0 * length, v1 * length, v2 * length
-            nv = n0 * v0 + n1 * v1 + n2 * v2
-            lobe = 0.0
+            nv, lobe = n0 * v0 + n1 * v1 + n2 * v2, lanes(none)
             if nv > 0.0:
-                h0, h1, h2 = v0 + way[0], v1 + way[1], v2 + way[2]
-                nh = (nl + nv) / math.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
-                lobe = shine(nl, nv, nh, alpha)
-                if lobe_rays > 0 and density > 0.0 and _shines(coats[triangle]):
-                    mine = density / reach
-                    reach *= mine / (mine + lobe_rays * drawn(nv, nh, alpha))
+                d, b = _facets(n0, n1, n2, l0 + v0, l1 + v1, l2 + v2, nv, alpha)
+                alpha2 = alpha * alpha
+                lobe = d / (nl * b + nv * root(alpha2 + (np.float32(1.0) - alpha2) * nl * nl))
+                if lobe_rays > 0 and _shines(coat):
+                    mine = loaded(densities, 0)
+                    shared = reach * mine / (mine + reach * d * (lobe_rays / (nv + b)))
+                    if near:
+                        least = mine * _across(places, axes, place)
+                        peak = MIRROR_SHARE * lobe_rays * drawn(nv, 1.0, alpha)
+                        shared = if_less(least, lanes(np.float32(peak)), shared, reach)
+                    reach = shared
+            reach = if_less(lit, half, reach * nl, none)
             for channel in range(channels):
-                value = coats[triangle, 4 + channel] + coats[triangle, 4 + channels + channel] * lobe
-                picture[row, column, channel] += strength[channel] * reach * nl * value
+                light = reach * loaded(strengths, channel)
+                shining = coat[4 + channels + channel] * total(light * lobe)
+                picture[row, column, channel] += coat[4 + channel] * total(light) + shining
+
+
+@numba.njit(cache=True, nogil=True)
+def _across(places, axes, place):  # type: ignore[no-untyped-def]
+    """Squares of the distances, m^2, of a pixel's place from the planes of eight emitters."""
+    above = (loaded(places, 0) - place[0]) * loaded(axes, 0) + (loaded(places, 1) - place[1]) * loaded(axes, 1)
+    above = above + (loaded(places, 2) - place[2]) * loaded(axes, 2)
+    return np.float32(1e-6) * above * above
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _facets(n0, n1, n2, h0, h1, h2, nv, alpha):  # type: ignore[no-untyped-def]
+    """GGX's distribution over 2 for eight half vectors of any length, and the view's part of the masking. From
+    sines, since single precision has no cosine of a small angle."""
+    x, y, z = n1 * h2 - n2 * h1, n2 * h0 - n0 * h2, n0 * h1 - n1 * h0
+    sin2 = (x * x + y * y + z * z) / (h0 * h0 + h1 * h1 + h2 * h2)
+    alpha2 = alpha * alpha
+    t = alpha2 + (np.float32(1.0) - alpha2) * sin2
+    return (0.5 / math.pi * alpha2) / (t * t), math.sqrt(alpha2 + (1.0 - alpha2) * nv * nv)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -188,15 +252,11 @@ def _mirror(  # type: ignore[no-untyped-def]
         row, column = pixels[pixel]
         triangle = seen[row, column]
         coat = coats[triangle]
-        if coat[3] == 0.0 or not _shines(coat):
-            continue
         normal, place = coat[:3], places_mm[row, column]
         v0, v1, v2 = camera_mm[0] - place[0], camera_mm[1] - place[1], camera_mm[2] - place[2]
         length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
         v0, v1, v2 = v0 / length, v1 / length, v2 / length
         nv = normal[0] * v0 + normal[1] * v1 + normal[2] * v2
-        if not nv > 0.0:
-            continue
         first, second = _two_numbers(first_row + row, column, ray)
         nh = reflected(normal, v0, v1, v2, nv, coat[3], first, second, way)
         nl = normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]
@@ -219,6 +279,26 @@ def _mirror(  # type: ignore[no-untyped-def]
         met[count] = pixel
         count += 1
     return count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _asking(seen, places_mm, camera_mm, coats, near, axes, centre_mm, density, lobe_rays, asking):  # type: ignore[no-untyped-def]
+    """Mark the pixels for which rays are drawn. Not for an area that is at most as large as their lobe: the solid
+    angle that it could have at its distance, times how dense the lobe's rays can be, is at most 1."""
+    for row in range(seen.shape[0]):
+        for column in range(seen.shape[1]):
+            coat, place = coats[max(seen[row, column], 0)], places_mm[row, column]
+            if seen[row, column] < 0 or coat[3] == 0.0 or not _shines(coat):
+                continue
+            square, nv, above = 0.0, 0.0, 0.0
+            for k in range(3):
+                view = camera_mm[k] - place[k]
+                square += view * view
+                nv += coat[k] * view
+                above += (centre_mm[k] - place[k]) * axes[2, k]
+            nv /= math.sqrt(square)
+            peak = MIRROR_SHARE * lobe_rays * drawn(nv, 1.0, coat[3])
+            asking[row, column] = nv > 0.0 and not (near and density * above * above * 1e-6 >= peak)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -27,6 +27,10 @@ STATED = (*SHIFTS, "--arm-deg", "0.03", "--mesh-deg", "0.02")
 CELLS = 20
 
 
+LIGHT = ("leds", "led-power", "response", "flat-field")
+"""Kinds of records that are the shipped ones."""
+
+
 @dataclass(frozen=True)
 class Made:
     cell: CellFolder
@@ -56,7 +60,7 @@ def refined(cell: CellFolder, seed: int) -> Made:
     """With records and a scan that are drawn, and stated as they are drawn."""
     drawn = drawn_views.draw(cell.run_folder, cell.folder / f"drawn{seed}", seed)
     words: list[str | Path] = [drawn.run, "--mesh", drawn.mesh, "--calibrations", drawn.hand_eye]
-    for kind in ("leds", "led-power"):
+    for kind in LIGHT:
         words += ["--calibrations", RECORDS / f"{kind}.yaml"]
     out = cell.folder / f"refined{seed}"
     ended = cells.here("reflectance", "refine", *words, *STATED, "--out", out, "--json")
@@ -176,15 +180,12 @@ def test_one_material_for_all_views_misses_less_with_what_was_refined(tmp_path: 
     cell = drawn_views.textured_cell(tmp_path, every=40)
     assert cell.acquire().code == 0
     one = refined(cell, seed=101)
-    radiometry = [
-        word for kind in ("response", "flat-field") for word in ("--calibrations", RECORDS / f"{kind}.yaml")
-    ]
-    light = [word for kind in ("leds", "led-power") for word in ("--calibrations", RECORDS / f"{kind}.yaml")]
+    light = [word for kind in LIGHT for word in ("--calibrations", RECORDS / f"{kind}.yaml")]
     true = (cell.run_folder, "--calibrations", RECORDS / "hand-eye.yaml", *light)
     mae, told = {}, {}
     for name, words in (("given", one.words), ("refined", (*one.words, "--refined", one.out)), ("true", true)):
         scan = ("--scan-noise-um", "100", "--out", tmp_path / name, "--json")
-        ended = cells.here("reflectance", *words, *radiometry, *scan)
+        ended = cells.here("reflectance", *words, *scan)
         assert ended.code == 0, ended.err
         mae[name], told[name] = ended.document["mae"]["ggx_normal"], ended.document
     assert mae["refined"] < 0.4 * mae["given"]

@@ -33,9 +33,9 @@ def pytest_configure(config: pytest.Config) -> None:
         settings.load_profile("coupole at full scale")
 
 
-COMPILES_LONGEST = "tests/calibration/test_corner_fit.py"
-"""Its kernels take ten seconds to compile: it comes first, so that not every worker does that when others want
-them."""
+COMPILE_LONGEST = ("tests/calibration/test_corner_fit.py", "tests/runs/test_reflectance_of_other_runs.py")
+"""Their kernels take ten seconds and more to compile: they come first, so that not every worker does that when
+others want them."""
 
 
 WAITING = ("tests/runs/", "tests/faults/", "tests/conformance/")
@@ -64,7 +64,7 @@ def spread(items: list[pytest.Item]) -> list[pytest.Item]:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Order the tests, and leave out what is for `--full` alone."""
-    items[:] = sorted(spread(items), key=lambda item: not item.nodeid.startswith(COMPILES_LONGEST))
+    items[:] = sorted(spread(items), key=lambda item: not item.nodeid.startswith(COMPILE_LONGEST))
     if config.getoption("--full"):
         return
     left_out = [item for item in items if item.get_closest_marker("full")]

@@ -38,7 +38,6 @@ from reflectance_cells import SCANS, THIRDS_DEG, Judged, acquire, judge
 from sim.objects.specimens import SPECIMENS
 
 HELD, HALF, NEW_VIEW = (0.90, 0.99), 0.5, 1.5
-KEPT = Path(__file__).resolve().parents[1] / "runs/proofs/reflectance.jsonl"
 
 
 def main() -> int:
@@ -46,19 +45,19 @@ def main() -> int:
     parser.add_argument("--draws", type=int, default=3, help="cells of each material and kind of scan")
     parser.add_argument("--materials", nargs="+", choices=list(SPECIMENS), default=list(SPECIMENS))
     parser.add_argument("--every", type=int, default=12, help="LEDs are lit, of the dome's 1080")
-    parser.add_argument("--keep", type=Path, default=KEPT, help="file of finished cells")
+    parser.add_argument("--keep", type=Path, help="file of finished cells, which are not done again")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    arguments.keep.parent.mkdir(parents=True, exist_ok=True)
-    done = _kept(arguments.keep, arguments.every)
+    done = {} if arguments.keep is None else _kept(arguments.keep, arguments.every)
     wanted = [(m, scan, seed) for m in arguments.materials for scan in SCANS for seed in range(arguments.draws)]
     for material in arguments.materials:
         missing = [cell for cell in wanted if cell[0] == material and cell not in done]
         for cell, judged in _judged(material, missing, arguments.every):
             done[cell] = judged
-            line = {"cell": cell, "every": arguments.every, "judged": judged}
-            with arguments.keep.open("a") as file:
-                file.write(json.dumps(line) + "\n")
+            if arguments.keep is not None:
+                with arguments.keep.open("a") as file:
+                    line = {"cell": cell, "every": arguments.every, "judged": judged}
+                    file.write(json.dumps(line) + "\n")
             print(f"{' '.join(map(str, cell))}: done", file=sys.stderr, flush=True)
     verdicts = [verdict(m, [done[cell] for cell in wanted if cell[0] == m]) for m in arguments.materials]
     faults = [fault for one in verdicts for fault in one["faults"]] + _faults_of_all(verdicts)

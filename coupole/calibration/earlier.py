@@ -40,9 +40,9 @@ def read_accepted(path: Path, kind: Kind) -> Record:
     return record
 
 
-def refuse_lacking(path: Path, record: Record, given: Collection[str]) -> None:
+def refuse_read_otherwise(path: Path, record: Record, given: Collection[str]) -> None:
     """Raise InputError if a record of LEDs' powers was made with a response or a flat field and none is among the
-    kinds `given`: frames must be read as those were that the powers come from."""
+    kinds `given`, or the other way round: frames must be read as those were that the powers come from."""
     for kind in SHAPE_SIGNAL:
         told = record.fixed.get(READ_WITH + kind)
         beside = _made_with(path, record, kind)
@@ -50,6 +50,11 @@ def refuse_lacking(path: Path, record: Record, given: Collection[str]) -> None:
             raise InputError(
                 f"{path}: was made with a {kind} record; without one frames would be read otherwise, and all that "
                 f"is found would be off. Name {beside or 'it'} too"
+            )
+        if told == 0.0 and kind in given:
+            raise InputError(
+                f"{path}: was made without a {kind} record; with one frames would be read otherwise, and all that "
+                "is found would be off. Leave it out, or calibrate the LEDs' powers anew with it"
             )
 
 

@@ -186,11 +186,13 @@ def export(
             if views or shots:
                 raise InputError("--views, --shots: are for the frames of a run; this is a result")
             files, size = _export_result(source, to, folder, fit, tuple(triangle or ()), overwrite, console)
+        elif (source / "normals.npy").exists():
+            raise InputError(f"{source}: is a result of pictures, which has no surface; `coupole show` shows it")
         else:
             if fit is not None or triangle:
                 raise InputError("--fit, --triangle: are for results of reflectance; this is a run")
             if to == RTI:
-                files, size = _export_rti(source, folder, views or [], shots or [], console)
+                files, size = _export_rti(source, folder, views or [], shots or [], overwrite, console)
             else:
                 files, size = _export_frames(source, to, folder, views or [], shots or [], overwrite, console)
     except CoupoleError as error:
@@ -218,7 +220,7 @@ def _export_result(
 
 
 def _export_rti(
-    source: Path, folder: Path, views: list[str], shots: list[str], console: Console
+    source: Path, folder: Path, views: list[str], shots: list[str], overwrite: bool, console: Console
 ) -> tuple[int, int]:
     from coupole.exchange.rti_pictures import export_rti
     from coupole.viewing.terminal import step_bars
@@ -226,7 +228,7 @@ def _export_rti(
     if shots:
         raise InputError("--shots: are for single frames; of RTI all LEDs of a view are written")
     with step_bars(console) as bars:
-        paths = export_rti(source, folder, views, say=bars)
+        paths = export_rti(source, folder, views, overwrite=overwrite, say=bars)
     return len(paths), sum(path.stat().st_size for path in paths)
 
 

@@ -153,6 +153,8 @@ def from_runs_or_pictures(
             raise InputError("expected runs, or --pictures with --lights; see coupole reflectance from --help")
         if (uncalibrated and (calibrations or len(runs or ()) != 1)) or (view and not uncalibrated):
             raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
+        if refined is not None and (uncalibrated or pictures is not None):
+            raise InputError("--refined: is for calibrated runs")
         with step_bars(console) as say:
             if uncalibrated and runs:
                 made = _of_uncalibrated(runs[0], view, _numbers(leave_out), out, say)

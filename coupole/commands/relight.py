@@ -90,7 +90,7 @@ FitOption = Annotated[
     typer.Option(
         "--fit",
         help="Of a result of runs: ggx, ggx_normal, sh, rbf, ggx_rbf, clusters or harmonics; without it the one "
-        "that missed least in the check.",
+        "that missed least in the check (of the first two with --uncertainty).",
     ),
 ]
 UncertaintyOption = Annotated[
@@ -219,11 +219,12 @@ def _size_px(text: str) -> tuple[int, int]:
 def _open(
     result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int, *, uncertain: bool
 ) -> Relit:
-    from coupole.reflectance import run_relighting, run_result
+    from coupole.reflectance import relit_uncertainty, run_relighting, run_result
 
     if (result / run_result.OBJECT).exists():
-        if uncertain and fit is None:
-            fit = run_relighting.best_fit(run_result.RunResult(result), run_result.MATERIALS)
+        if uncertain:
+            fit = fit or run_relighting.best_fit(run_result.RunResult(result), run_result.MATERIALS)
+            relit_uncertainty.refuse_uncertain(run_result.RunResult(result), fit)
         return _of_runs(result, view, fit, camera, samples)
     given = (("--view", view), ("--fit", fit), ("--from", camera), ("--uncertainty", uncertain or None))
     for option, value in given:

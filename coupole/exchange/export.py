@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import fnmatch
 import importlib
 from collections.abc import Callable, Iterator
@@ -12,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from coupole.errors import DiskFull, InputError, StorageError
+from coupole.errors import InputError
 from coupole.exchange import FORMATS
 from coupole.exchange.exported_frame import Picture
+from coupole.exchange.target_folder import refuse_standing, writing_into
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 from coupole.storage.step_fields import STORED_NO_LED, board_temperature_c
@@ -54,22 +54,13 @@ def export_run(
     if not frames:
         raise InputError(f"{run.folder}: no proven frame matches; see `coupole status` for its views")
     paths = {str(frame.shot): folder / f"{str(frame.shot).replace('/', '_')}.{to}" for frame in frames}
-    standing = [path for path in paths.values() if path.exists()]
-    if standing and not overwrite:
-        raise InputError(
-            f"{standing[0]}: exists already ({len(standing)} such files). Choose another --out, or give "
-            "--overwrite."
-        )
+    if not overwrite:
+        refuse_standing(list(paths.values()))
     written = 0
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with writing_into(folder):
         for done, picture in enumerate(_pictures(run, frames), start=1):
             written += _write(paths[picture.about["shot"]], encode(picture))
             progress(done, len(frames))
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise DiskFull(f"{folder}: the disk is full. Free space on it, then export again.") from error
-        raise StorageError(f"{folder}: {error.strerror or error}. Check the disk, then export again.") from error
     return Exported(len(frames), written)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.exchange.target_folder import refuse_standing, writing_into
 from coupole.reflectance.uncalibrated import write_pictures
 from coupole.storage.durable import write_synced
 from coupole.storage.run import Run
@@ -25,21 +26,25 @@ _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMW
 
 
 def export_rti(
-    folder: Path, out: Path, views: Sequence[str], *, say: Callable[[str, int, int], None]
+    folder: Path, out: Path, views: Sequence[str], *, overwrite: bool, say: Callable[[str, int, int], None]
 ) -> list[Path]:
     """Write `VIEW/` for each view of a run that matches one of the patterns: `led0417.jpg` and so on (8 bit, sRGB,
     one white for all), `VIEW.lp`, `VIEW.dome`, and `linear/`. Nominal places of the LEDs; no calibration is used.
 
-    Raises InputError: no such view, too few LEDs, a folder with other pictures; StorageError for damaged frames.
+    Raises InputError: no such view, too few LEDs, a folder with other pictures, or with these (unless
+    `overwrite`); StorageError for damaged frames or a disk that cannot be written.
     """
     run = Run(folder)
     names = list(dict.fromkeys(shot.view for shot in run.proven()))
     chosen = [name for name in names if not views or any(fnmatch.fnmatchcase(name, one) for one in views)]
     if not chosen:
         raise InputError(f"{folder}: no view matches; it has {', '.join(names)}")
+    if not overwrite:
+        refuse_standing([out / view / f"{view}.lp" for view in chosen])
     paths: list[Path] = []
     for view in chosen:
-        paths += _export_view(run, view, out / view, say)
+        with writing_into(out / view):
+            paths += _export_view(run, view, out / view, say)
     return paths
 
 

@@ -15,7 +15,8 @@ from coupole.reflectance.ggx import UNKNOWNS, tangents
 from coupole.reflectance.new_light.light_kinds import AnyLight
 from coupole.reflectance.new_light.shading import coats_of
 from coupole.reflectance.run_relighting import SAMPLES, RelitScene, Say, materials_of
-from coupole.reflectance.run_result import MATERIALS
+from coupole.reflectance.run_result import MATERIALS, RunResult
+from coupole.reflectance.run_result_files import refuse_without_uncertainty
 from coupole.reflectance.triangle_fit import TriangleMaterials
 
 Floats = NDArray[np.float64]
@@ -23,7 +24,6 @@ _LONGEST_STEP = 0.02
 """Of tilts (rad) and alpha's logarithm, to both sides: small enough for a derivative, large enough for float32. In
 kd and ks pictures are linear."""
 _NOT_LINEAR = (0, 1, 4)
-_LEAST_ALPHA, _MOST_ALPHA = 1e-3, 1.0
 
 
 def uncertainty_of_picture(
@@ -37,8 +37,7 @@ def uncertainty_of_picture(
     The picture is made again with materials moved along each independent part of their covariance, which takes
     eleven times as long as the picture alone. Raises InputError for a fit that has no covariance.
     """
-    if scene.fit not in MATERIALS:
-        raise InputError(f"--uncertainty: {scene.fit} has none; choose --fit {' or '.join(MATERIALS)}")
+    refuse_uncertain(scene.result, scene.fit)
     materials = materials_of(scene.result, scene.fit, scene.surface)
     covariance, wider, common = _uncertain(scene)
     scales, vectors = np.linalg.eigh(np.nan_to_num(covariance))
@@ -66,6 +65,16 @@ def uncertainty_of_picture(
     return found.astype(np.float32)
 
 
+def refuse_uncertain(result: RunResult, fit: str) -> None:
+    """Raise InputError if the uncertainty of pictures by this fit is not known."""
+    if fit not in MATERIALS:
+        raise InputError(f"--uncertainty: {fit} has none; choose --fit {' or '.join(MATERIALS)}")
+    if not result.materials_path(fit).exists():
+        raise InputError(f"{result.folder}: has no fit {fit}; `coupole reflectance fit {result.folder}` makes it")
+    with h5py.File(result.materials_path(fit), "r") as file:
+        refuse_without_uncertainty(result.materials_path(fit), file)
+
+
 def _uncertain(scene: RelitScene) -> tuple[Floats, Floats, Floats]:
     """Of the surface's triangles: covariance [n, 5, 5] of tilts and logarithms; [n, 2, channels] uncertainty of
     each channel's kd, and ks, as a multiple of that of their mean; relative uncertainty [n] that all light from a
@@ -87,7 +96,7 @@ def _moved(materials: TriangleMaterials, wider: Floats, step: Floats) -> Triangl
         normals=_turned(materials.normals, step[:, :2]),
         kd=materials.kd * (1.0 + step[:, 2:3] * wider[:, 0]),
         ks=materials.ks * (1.0 + step[:, 3:4] * wider[:, 1]),
-        alpha=np.clip(materials.alpha * np.exp(step[:, 4]), _LEAST_ALPHA, _MOST_ALPHA),
+        alpha=materials.alpha * np.exp(step[:, 4]),
     )
 
 

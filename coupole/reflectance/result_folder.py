@@ -22,7 +22,9 @@ def begin(out: Path, settings: dict[str, Any]) -> None:
     text = json.dumps(settings) + "\n"
     if path.exists():
         if path.read_text(encoding="utf-8") != text:
-            raise InputError(f"{out} holds the result of other input or settings: name another folder with --out")
+            raise InputError(
+                f"{out} holds the result of other input, settings or version: name another folder with --out"
+            )
     elif out.exists() and any(one.suffix != ".part" for one in out.iterdir()):
         raise InputError(f"{out} is not empty, and holds no result: name another folder with --out")
     else:
@@ -42,7 +44,7 @@ def read_settings(out: Path) -> dict[str, Any]:
             raise ValueError
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: expected the settings of a result of runs") from error
-    if "subtracted" not in settings:
+    if not {"subtracted", "refined"} <= set(settings):
         raise InputError(f"{path}: was begun by an earlier version; make the result anew, with another --out")
     return settings
 

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.errors import InputError
 from coupole.reflectance.material_uncertainty import MaterialUncertainty
 from coupole.reflectance.run_result import FIELDS, LOWER, UNCERTAIN, SliceKind, ViewSamples
 from coupole.reflectance.slice_basis import COUNT, centres
@@ -66,3 +67,9 @@ def begin_slices(file: h5py.File, kind: SliceKind, view: ViewSamples, channels: 
     if not kind.basis.harmonic:
         file.create_dataset("centres", data=centres(), track_times=False)
     return data
+
+
+def refuse_without_uncertainty(path: Path, file: h5py.File) -> None:
+    """Raise InputError for a file of materials that an earlier version made."""
+    if "covariance" not in file:
+        raise InputError(f"{path}: has no uncertainty, an earlier version made it; make the result anew")

@@ -87,7 +87,7 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> Pict
     complete(out / MASK, partial(_write_png, mask))
     rig = files.cell.rig
     wide_mm = rig.sensor.width_px * rig.sensor.pixel_pitch_um * 1e-3
-    width_mm = wide_mm * rig.lens.focus_distance_mm / rig.lens.focal_length_mm
+    width_mm = wide_mm * (rig.lens.focus_distance_mm / rig.lens.focal_length_mm - 1.0)
     return PicturedView(
         tuple(leds), tuple(out / f"led{led:04d}.png" for led in leds), towards, width_mm, run.simulated
     )

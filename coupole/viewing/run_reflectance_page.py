@@ -58,7 +58,7 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
         yield "frames of a simulated cell"
     views = f"{len(about['views'])} view{'s' if len(about['views']) > 1 else ''}"
     yield f"{about['triangles']} triangles in {views}, {about['samples']} samples in all channels"
-    if refined := about["refined"]:
+    if refined := about.get("refined"):
         before, after = (refined["disagreement"][when]["median_mm"] for when in ("before", "after"))
         yield f"views were refined: they disagreed by {before:.3f} mm (median), and by {after:.3f} mm afterwards"
     if about["not_fitted"]:

@@ -169,6 +169,7 @@ def test_a_merl_table_is_read_as_its_reader_does() -> None:
         (("--to", "bsdf"), "has no clusters; name triangles with --triangle"),
         (("--to", "merl", "--triangle", "99999"), "the mesh has 722, counted from 0"),
         (("--to", "alta"), "--triangle: expected the numbers of triangles"),
+        (("--to", "ply", "--triangle", "3"), "--triangle: is for bsdf, merl, alta; ply has all triangles"),
     ],
 )
 def test_what_cannot_be_exported_is_refused(

@@ -158,6 +158,9 @@ def test_pictures_for_rti_show_the_object_under_the_lights_that_their_file_names
     cell, out, _ = made
     ended = cells.here("export", cell.run_folder, "--to", "lp", "--views", "top", "--out", tmp_path)
     assert ended.code == 0, ended.err
+    again = cells.here("export", cell.run_folder, "--to", "lp", "--views", "top", "--out", tmp_path)
+    assert again.code == 2
+    assert "top.lp: exists already" in again.err
     count, *lines = (tmp_path / "top/top.lp").read_text().splitlines()
     assert int(count) == len(lines) == 45
     ways = np.array([line.split()[1:] for line in lines], float)
@@ -168,8 +171,8 @@ def test_pictures_for_rti_show_the_object_under_the_lights_that_their_file_names
     places = np.array(dome["positions3d"])
     np.testing.assert_allclose(unit(places), ways, atol=1e-5)
     lens = cell.rig_data["lens"]
-    wide_mm = 512 * 44e-3 * lens["focus_distance_mm"] / lens["focal_length_mm"]
-    assert dome["imageWidth"] == pytest.approx(wide_mm)
+    image_mm = 1 / (1 / lens["focal_length_mm"] - 1 / lens["focus_distance_mm"])  # thin lens
+    assert dome["imageWidth"] == pytest.approx(512 * 44e-3 * lens["focus_distance_mm"] / image_mm)
     falling = (np.linalg.norm(places, axis=1) / 1000) ** 2
     order = np.sort(linear, axis=0)
     low, high = order[len(ways) // 3], order[-2]  # neither shadows nor highlights

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from coupole.calibration.acceptance import against_limits
-from coupole.calibration.earlier import read_accepted, refuse_lacking
+from coupole.calibration.earlier import read_accepted, refuse_read_otherwise
 from coupole.calibration.light.acceptance import DRIFT
 from coupole.calibration.light.drift import NAMES, Drift, Reading, fit_drift
 from coupole.calibration.light.drift_drawing import draw_drift
@@ -91,7 +91,7 @@ def drift_outcome(
     """
     powers = read_powers(led_power)
     read_with = {"response": setting.response, "flat-field": setting.flat}
-    refuse_lacking(
+    refuse_read_otherwise(
         led_power, read_accepted(led_power, "led-power"), [kind for kind, path in read_with.items() if path]
     )
     lit = [frame for frame in frames.lit if frame.led is not None]

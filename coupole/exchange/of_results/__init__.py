@@ -10,3 +10,5 @@ FORMATS = {
     "alta": "tables of materials as text for ALTA, with 95 % bounds",
 }
 """What each module gives, by its name, which is the format's."""
+OF_MATERIALS = ("bsdf", "merl", "alta")
+"""Formats of single materials, of triangles or clusters."""

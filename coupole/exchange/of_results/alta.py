@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from coupole.errors import InputError
 from coupole.exchange.of_results.material_tables import chosen_triangles
 from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface
 from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples, u_inter_reflection
@@ -36,6 +37,11 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
         for number, channel in enumerate(channels):
             lines = np.concatenate([part[:, number] for part in parts])
             lines = lines[np.isfinite(lines[:, 3])]
+            if np.isnan(lines).any():
+                raise InputError(
+                    f"{result.folder}: has no bounds, as no record of the response told its frames' noise; make "
+                    "it anew with one (`coupole calibrate response`)"
+                )
             head = [
                 f'#SAMPLE "triangle {triangle}, {channel}"',
                 f'#ORIGIN "{surface.remark}"',

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import importlib
 from pathlib import Path
 
-from coupole.errors import DiskFull, InputError, StorageError
-from coupole.exchange.of_results import FORMATS
+from coupole.errors import InputError
+from coupole.exchange.of_results import FORMATS, OF_MATERIALS
 from coupole.exchange.of_results.measured_surface import read_surface
+from coupole.exchange.target_folder import writing_into
 
 _HERE = "coupole.exchange.of_results"
 
@@ -20,7 +20,7 @@ def export_result(
     *,
     fit: str | None = None,
     triangles: tuple[int, ...] = (),
-    overwrite: bool,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Write a result in another format into `folder`; the files.
 
@@ -29,14 +29,11 @@ def export_result(
     """
     if to not in FORMATS:
         raise InputError(f"--to: expected one of {', '.join(FORMATS)} for a result; found {to}")
+    if triangles and to not in OF_MATERIALS:
+        raise InputError(f"--triangle: is for {', '.join(OF_MATERIALS)}; {to} has all triangles")
     surface = read_surface(result, fit, triangles)
     if not overwrite and folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: has files already. Choose another --out, or give --overwrite")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with writing_into(folder):
         written: list[Path] = importlib.import_module(f"{_HERE}.{to}").write(surface, folder)
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise DiskFull(f"{folder}: the disk is full. Free space on it, then export again.") from error
-        raise StorageError(f"{folder}: {error.strerror or error}. Check the disk, then export again.") from error
     return written

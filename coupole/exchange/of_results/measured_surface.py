@@ -15,6 +15,7 @@ from coupole.errors import InputError
 from coupole.geometry import apply, inverse
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
+from coupole.reflectance.run_result_files import refuse_without_uncertainty
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +54,7 @@ class MeasuredSurface:
 
     @property
     def remark(self) -> str:
-        """What every file says of itself."""
+        """What files say of themselves, where their format lets them."""
         kind = "simulated" if self.about.get("simulated") else "measured"
         version, runs = self.about["software"]["coupole"], ", ".join(sorted(self.about["runs"]))
         return f"{kind} with Coupole {version}; fit {self.fit} of {runs}"
@@ -87,6 +88,7 @@ def read_surface(folder: Path, fit: str | None = None, chosen: tuple[int, ...] =
         return whole
 
     with h5py.File(path, "r") as file:
+        refuse_without_uncertainty(path, file)
         lower, same = file["covariance"][()], np.hypot(file["u_triangle"][()], file["u_shared"][()])
         u_kd, u_ks = (np.sqrt(np.mean(file[key][()] ** 2, axis=1) + same**2) for key in ("u_kd", "u_ks"))
     uncertain = {

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.calibrated_arm import calibrated_poses, has_axis_zeros, read_arm
-from coupole.calibration.earlier import read_accepted, read_earlier, refuse_lacking
+from coupole.calibration.earlier import read_accepted, read_earlier, refuse_read_otherwise
 from coupole.calibration.light.frames import LightFrame, LightFrames, channels_of, open_light_frames
 from coupole.calibration.light.irradiance import Emission
 from coupole.calibration.light.led_power_tile import calibrated_positions
@@ -169,7 +169,7 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
     base_from_support = files.cell.rig.support.base_from_support.matrix()
     power_record = read_earlier(by_kind["led-power"], "led-power", frames.about, frames.size_px)
     _refuse_other_gain(by_kind["led-power"], power_record, frames)
-    refuse_lacking(by_kind["led-power"], power_record, by_kind)
+    refuse_read_otherwise(by_kind["led-power"], power_record, by_kind)
     lens, leds = files.cell.rig.lens, calibrated_positions(by_kind["leds"])
     views, prior = _views(run, frames, hand_eye, files.cell.rig, prior)
     _refuse_unknown_leds(by_kind["leds"], leds, views)

@@ -1,0 +1,31 @@
+"""The folder that an export writes into."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from coupole.errors import DiskFull, InputError, StorageError
+
+
+def refuse_standing(paths: Sequence[Path]) -> None:
+    """Raise InputError if one of the files that would be written is there already."""
+    if standing := [path for path in paths if path.exists()]:
+        raise InputError(
+            f"{standing[0]}: exists already ({len(standing)} such files). Choose another --out, or give "
+            "--overwrite."
+        )
+
+
+@contextmanager
+def writing_into(folder: Path) -> Iterator[None]:
+    """Make the folder; an operating system's error becomes DiskFull or StorageError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise DiskFull(f"{folder}: the disk is full. Free space on it, then export again.") from error
+        raise StorageError(f"{folder}: {error.strerror or error}. Check the disk, then export again.") from error

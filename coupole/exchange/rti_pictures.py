@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.exchange.srgb import srgb
 from coupole.exchange.target_folder import refuse_standing, writing_into
 from coupole.reflectance.uncalibrated import write_pictures
 from coupole.storage.durable import write_synced
@@ -84,7 +85,5 @@ def _read(path: Path) -> NDArray[np.uint16]:
 
 
 def _srgb_codes(white: float) -> NDArray[np.uint8]:
-    """[65536] 8-bit codes of linear values; `white` has 255 (IEC 61966-2-1)."""
-    share = np.clip(np.arange(1 << 16) / max(white, 1.0), 0.0, 1.0)
-    coded = np.where(share <= 0.0031308, 12.92 * share, 1.055 * np.maximum(share, 1e-12) ** (1 / 2.4) - 0.055)
-    return np.rint(255.0 * coded).astype(np.uint8)
+    """[65536] 8-bit codes of linear values; `white` has 255."""
+    return np.rint(255.0 * srgb(np.arange(1 << 16) / max(white, 1.0))).astype(np.uint8)

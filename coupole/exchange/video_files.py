@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError, StorageError
+from coupole.exchange.srgb import srgb
 from coupole.storage.durable import write_synced
 
 SUFFIX = ".mp4"
@@ -26,13 +27,6 @@ def refuse_unknown(path: Path) -> None:
     """Raise InputError if it is not the name of a video."""
     if path.suffix.lower() != SUFFIX:
         raise InputError(f"{path}: expected a name that ends in {SUFFIX}")
-
-
-def srgb(linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    """IEC 61966-2-1 encoded values, 0 to 1, of linear ones; what is outside is cut off."""
-    clipped = np.clip(linear, 0.0, 1.0)
-    encoded = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
-    return encoded.astype(np.float32)
 
 
 def write_video(path: Path, pictures: Iterable[NDArray[np.float32]], *, white: float, about: str) -> None:

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface, srgb
+from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface
+from coupole.exchange.srgb import srgb
 from coupole.storage.durable import write_synced
 
 _F0 = 0.04

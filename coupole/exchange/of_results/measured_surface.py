@@ -112,12 +112,5 @@ def read_surface(folder: Path, fit: str | None = None, chosen: tuple[int, ...] =
     )
 
 
-def srgb(linear: Floats) -> Floats:
-    """IEC 61966-2-1, of values that are cut to 0..1."""
-    cut = np.clip(linear, 0.0, 1.0)
-    found: Floats = np.where(cut <= 0.0031308, 12.92 * cut, 1.055 * np.maximum(cut, 1e-12) ** (1 / 2.4) - 0.055)
-    return found
-
-
 def _three(values: Floats) -> Floats:
     return values if values.shape[1] == 3 else np.repeat(values, 3, axis=1)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from coupole.exchange.of_results.measured_surface import MeasuredSurface, srgb
+from coupole.exchange.of_results.measured_surface import MeasuredSurface
+from coupole.exchange.srgb import srgb
 from coupole.storage.durable import write_synced
 
 _COLOURS = ("red", "green", "blue")

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coupole.exchange.look.look_blocks import LOG_LEAST, LOG_RATIO, LOG_STEPS, block_of, log_coded, octahedral
+from coupole.exchange.look.look_blocks import (
+    LOG_LEAST,
+    LOG_RATIO,
+    LOG_STEPS,
+    block_of,
+    halves,
+    log_coded,
+    octahedral,
+)
 
 
 @given(st.floats(1e-4, 10.0))
@@ -33,6 +41,11 @@ def test_normals_turn_by_less_than_a_250th_of_a_degree() -> None:
     off = np.degrees(np.linalg.norm(np.cross(read, normals), axis=1))
     assert off.max() < 0.004
     assert (np.einsum("nk,nk->n", read, normals) > 0).all()
+
+
+@given(st.floats(0.0, 65504.0) | st.floats(0.0, 1e-4))
+def test_a_half_is_off_by_no_more_than_a_page_says(value: float) -> None:
+    assert halves(np.array([value])).astype(np.float64)[0] == pytest.approx(value, rel=5e-4, abs=3e-8)
 
 
 def test_a_kind_of_number_that_pages_do_not_read_is_refused() -> None:

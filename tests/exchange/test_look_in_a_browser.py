@@ -56,7 +56,7 @@ class Page:
             self.driver.execute_script("coupole.setSamples(1); coupole.state = arguments[0]", self.beginning)
             return
         self.opened = None if address else path
-        self.browser.open(f"file://{path}{address}")
+        self.browser.open(f"{path.as_uri()}{address}")
         cells.wait_until(lambda: self.run("Boolean(window.coupole?.readPixel)"), "the page's interface")
         self.run("coupole.setSamples(1)")  # it rests after each change
         self.beginning = self.run("coupole.state")
@@ -198,8 +198,8 @@ def test_a_measured_frame_lies_on_the_object_as_the_fit_under_the_same_led(
     page: Page, tmp_path: Path, most_bytes: int
 ) -> None:
     with_frame(tmp_path / "result")
-    write_page(look_of_result(tmp_path / "result"), "waves", tmp_path / "look.html", most_bytes)
-    page.open(tmp_path / "look.html")
+    write_page(look_of_result(tmp_path / "result"), "waves", tmp_path / "vase #3.html", most_bytes)
+    page.open(tmp_path / "vase #3.html")
     page.small()
     page.run("document.getElementById('frames-section').open = true")
     Select(page.browser.at("#view")).select_by_visible_text("top")
@@ -214,6 +214,25 @@ def test_a_measured_frame_lies_on_the_object_as_the_fit_under_the_same_led(
     ratio = measured[both][:, :3] / fitted[both][:, :3]
     np.testing.assert_allclose(np.median(ratio, axis=0), 1.0, atol=0.01)
     assert (np.abs(ratio - 1) < 0.1).mean() > 0.9  # the others lie at facets' edges: a frame's pixel is a wide one
+
+
+def test_a_snapshot_of_a_measured_frame_tells_the_white_that_was_used(page: Page, tmp_path: Path) -> None:
+    with_frame(tmp_path / "result")
+    look = look_of_result(tmp_path / "result")
+    write_page(look, "waves", tmp_path / "look.html")
+    page.open(tmp_path / "look.html")
+    page.small()
+    page.driver.execute_script("""
+        HTMLAnchorElement.prototype.click = () => {};
+        CanvasRenderingContext2D.prototype.fillText = (words) => { window.words = words; };""")
+    page.browser.at("#snapshot").click()
+    white = page.run("coupole.state.white")
+    assert f"white {white:#.4g} 1/sr" in page.run("words")
+    page.run("coupole.state = {...coupole.state, view: 'top'}")
+    assert not page.browser.at("#white-row").is_displayed()
+    page.browser.at("#snapshot").click()
+    peak = look.about["views"][0]["frames"][0]["peak"]
+    assert f"white {peak:#.4g} of the camera's range" in page.run("words")
 
 
 def test_a_white_sheet_under_the_whole_sky_is_as_white_as_facing_a_lamp(page: Page, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from relight_cases import waves, write_result
 
-from coupole.errors import InputError
+from coupole.errors import InputError, StorageError
 from coupole.exchange.look.look_blocks import block_of
 from coupole.exchange.look.look_of_runs import Look, welded
 from coupole.exchange.look.look_page import write_page
@@ -64,6 +64,40 @@ def test_a_folder_of_other_things_is_not_touched(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="something else than a page's data"):
         write_page(small(), "a vase", tmp_path / "look.html")
     assert (tmp_path / "look.data/notes.txt").read_text() == "mine"
+
+
+def test_scripts_of_others_are_not_touched(tmp_path: Path) -> None:
+    write_page(small(9000), "a vase", tmp_path / "look.html", most_bytes=10_000)
+    (tmp_path / "look.data/mine.js").write_text("let mine = 1;")
+    before = (tmp_path / "look.html").read_text()
+    with pytest.raises(InputError, match="something else than a page's data"):
+        write_page(small(), "a vase", tmp_path / "look.html")
+    assert sorted(one.name for one in (tmp_path / "look.data").iterdir()) == ["mine.js", "places.js"]
+    assert (tmp_path / "look.html").read_text() == before
+
+
+def test_a_page_that_cannot_be_written_leaves_the_data_of_the_earlier_one(tmp_path: Path) -> None:
+    write_page(small(9000), "a vase", tmp_path / "look.html", most_bytes=10_000)
+    before = (tmp_path / "look.data/places.js").read_text()
+    (tmp_path / "look.html").unlink()
+    (tmp_path / "look.html").mkdir()
+    for look in (small(), small(9001)):
+        with pytest.raises(StorageError, match=r"look\.html"):
+            write_page(look, "a vase", tmp_path / "look.html", most_bytes=10_000)
+        assert (tmp_path / "look.data/places.js").read_text() == before
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["look.data", "look.html"]
+
+
+def test_data_beside_the_page_take_the_place_of_earlier_ones(tmp_path: Path) -> None:
+    for numbers in (9000, 9001):
+        write_page(small(numbers), "a vase", tmp_path / "look.html", most_bytes=10_000)
+    assert '"shape": [9001]' in (tmp_path / "look.data/places.js").read_text()
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["look.data", "look.html"]
+
+
+def test_the_address_of_data_may_have_any_letters(tmp_path: Path) -> None:
+    page, *_ = write_page(small(9000), "a vase", tmp_path / "50% of vase #3.html", most_bytes=10_000)
+    assert '<script src="50%25%20of%20vase%20%233.data/places.js">' in page.read_text()
 
 
 def test_what_is_no_result_is_refused_with_the_remedy(tmp_path: Path) -> None:

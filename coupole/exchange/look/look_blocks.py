@@ -20,6 +20,8 @@ LOG_LEAST, LOG_STEPS = 1e-4, 254
 """Of `log_coded`: what 1 stands for, and steps from there to its `LOG_RATIO`-fold."""
 LOG_RATIO = 1e5
 _LARGEST_HALF = 65504.0
+SCRIPT_BEGINS = "coupoleBlock("
+"""Of each block's script."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Block:
     def script(self) -> str:
         """What a script tag has to say for the page to have it."""
         about = json.dumps({"name": self.name, "dtype": self.dtype, "shape": self.shape})
-        return f'coupoleBlock({about},"{self.text}");\n'
+        return f'{SCRIPT_BEGINS}{about},"{self.text}");\n'
 
 
 @dataclass(frozen=True)
@@ -83,5 +85,5 @@ def octahedral(normals: NDArray[np.float64]) -> NDArray[np.uint16]:
 
 
 def halves(values: NDArray[np.float64]) -> NDArray[np.float16]:
-    """Values of 0 and more, at most 0.05 % off; 0 where there is none."""
+    """Values of 0 and more, at most 0.05 % or 3e-8 off, whichever is more; 0 where there is none."""
     return np.clip(np.nan_to_num(values), 0.0, _LARGEST_HALF).astype(np.float16)

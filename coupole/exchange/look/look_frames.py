@@ -38,13 +38,17 @@ def frames_of_view(
         shares, leds = file["share"][()].astype(np.float32), file["leds"][()]
     surface = surface_of_view(result, view)
     axes, lens = _lens(surface)
+    size_px = np.array(shares.shape[2:0:-1])
+    step = math.ceil(size_px.max() / MOST_PX)
+    of_texture = size_px / (step * np.ceil(size_px / step))
     turn = support_from_base[:3, :3]
     frames, blocks = [], []
     for share, led in zip(shares, leds, strict=True):
         row = int(np.flatnonzero(view.leds == led)[0])
         if not np.isfinite(share).any():
             continue
-        picture, peak = _coded(share if share.shape[2] == 3 else np.repeat(share, 3, axis=2))
+        small = _averaged(share, step)
+        picture, peak = _coded(small if small.shape[2] == 3 else np.repeat(small, 3, axis=2))
         blocks.append(block_of(f"frame-{view.path.stem}-{led}", picture))
         full_scale = np.broadcast_to(np.nan_to_num(view.full_scales[row]), 3) / math.pi
         frames.append(
@@ -62,7 +66,7 @@ def frames_of_view(
         "name": view.view,
         "camera_mm": apply(support_from_base, surface.camera_mm).tolist(),
         "axes": (axes @ turn.T).tolist(),
-        "lens": lens.tolist(),
+        "lens": (lens * of_texture).tolist(),
         "frames": frames,
     }
     return (about, blocks) if frames else None
@@ -90,10 +94,24 @@ def _lens(surface: Surface) -> tuple[Floats, Floats]:
     return axes, found / scale[:, None]
 
 
-def _coded(share: NDArray[np.float32]) -> tuple[NDArray[np.uint8], float]:
+def _averaged(share: NDArray[np.float32], step: int) -> NDArray[np.float64]:
+    """Means of step x step pixels that have a value in all channels; NaN where none has. The last row and column
+    are of what is left over."""
+    height, width = share.shape[:2]
+    known = np.isfinite(share).all(axis=2, keepdims=True)
+    sums, counts = (
+        np.add.reduceat(
+            np.add.reduceat(values, range(0, height, step), axis=0, dtype=np.float64),
+            range(0, width, step),
+            axis=1,
+        )
+        for values in (np.where(known, share, 0.0), known)
+    )
+    return np.where(counts > 0, sums / np.maximum(counts, 1.0), np.nan)
+
+
+def _coded(small: Floats) -> tuple[NDArray[np.uint8], float]:
     """[h, w, 3] in sRGB's steps up to the peak that is returned, from 1; 0 where there is no value."""
-    step = math.ceil(max(share.shape[:2]) / MOST_PX)
-    small = share[::step, ::step]
     known = np.asarray(np.isfinite(small).all(axis=2))
     peak = max(float(np.quantile(small[known], _WHITE_QUANTILE)) if known.any() else 1.0, 1e-9)
     linear = np.clip(np.where(known[..., None], small, 0.0) / peak, 0.0, 1.0)

@@ -64,5 +64,5 @@ def look_of_pictures(folder: Path) -> Look:
             "`coupole reflectance relight` comes nearer to them: it interpolates between the pictures.",
         },
     }
-    errors = {"normals": "0.004 degrees", "kd, ks, roughness": "0.05 %"}
+    errors = {"normals": "0.004 degrees", "kd, ks, roughness": "0.05 % or 3e-8"}
     return Look(shown, blocks, errors=errors)

@@ -73,7 +73,7 @@ def look_of_result(folder: Path) -> Look:
     errors = {
         "places": f"{0.5e3 * step_mm:.2g} um in each coordinate",
         "normals": "0.004 degrees",
-        "kd, ks, roughness": "0.05 %",
+        "kd, ks, roughness": "0.05 % or 3e-8",
         "uncertainties": "2.3 % of their value",
         "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
     }

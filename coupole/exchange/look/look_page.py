@@ -7,14 +7,15 @@ by script tags: a page that is opened from a disk may load nothing else.
 from __future__ import annotations
 
 import json
-import shutil
 from html import escape
 from importlib import resources
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from urllib.parse import quote
 
 from coupole.errors import InputError, StorageError
-from coupole.exchange.look.look_blocks import Block, Look
-from coupole.storage.durable import make_folder, write_synced
+from coupole.exchange.look.look_blocks import SCRIPT_BEGINS, Block, Look
+from coupole.storage.durable import make_folder, sync_folder, write_synced
 
 MOST_BYTES = 25_000_000
 """Of a page that stands alone."""
@@ -48,7 +49,7 @@ SHADERS = (
 
 
 def write_page(look: Look, title: str, path: Path, most_bytes: int = MOST_BYTES) -> list[Path]:
-    """Write the page; the files that it needs, itself first.
+    """Write the page; the files that it needs, itself first. The data of an earlier page stay until it is written.
 
     Raises InputError if its name does not end in .html, or if there is a folder of its data that is not one;
     StorageError if it cannot be written.
@@ -59,17 +60,21 @@ def write_page(look: Look, title: str, path: Path, most_bytes: int = MOST_BYTES)
     blocks = (*look.blocks, *look.later)
     inside, beside = _shared_out(blocks, most_bytes)
     try:
+        earlier = _earlier(data)
         make_folder(path.parent)
-        _clear(data)
-        written = [path]
-        for block in beside:
-            make_folder(data)
-            written.append(data / f"{block.name}.js")
-            write_synced(written[-1], block.script)
-        write_synced(path, page_text(look, title, inside, data.name if beside else ""))
+        with TemporaryDirectory(prefix=f".{data.name}.", dir=path.parent) as aside:
+            new = Path(aside) / data.name
+            for block in beside:
+                make_folder(new)
+                write_synced(new / f"{block.name}.js", block.script)
+            write_synced(path, page_text(look, title, inside, data.name if beside else ""))
+            _clear(data, earlier)
+            if beside:
+                new.rename(data)
+        sync_folder(path.parent)
     except OSError as error:
         raise StorageError(f"{path}: {error.strerror or error}. Choose another place, or free space.") from error
-    return written
+    return [path, *(data / f"{block.name}.js" for block in beside)]
 
 
 def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
@@ -79,7 +84,7 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
     about = {**look.about, "title": title, "errors": look.errors, "blocks": names, "data": data}
     scripts = "\n".join(_part(name) for name in SCRIPTS)
     tags = [f"<script>{block.script}</script>\n" for block in inside]
-    tags += [f'<script src="{escape(f"{data}/{name}.js", quote=True)}"></script>\n' for name in names if data]
+    tags += [f'<script src="{quote(f"{data}/{name}.js")}"></script>\n' for name in names if data]
     parts = {
         "TITLE": escape(title),
         "STYLE": _part("page.css"),
@@ -105,13 +110,30 @@ def _own_bytes() -> int:
     return sum(len(_part(name)) for name in ("page.html", "page.css", *SCRIPTS, *SHADERS)) + 4096
 
 
-def _clear(data: Path) -> None:
-    """Remove the data of an earlier page. Raises InputError if the folder holds anything else."""
-    if not data.exists():
-        return
-    if not data.is_dir() or any(one.suffix != ".js" for one in data.iterdir()):
+def _earlier(data: Path) -> list[Path]:
+    """Data of an earlier page. Raises InputError if the folder holds anything else."""
+    if not data.exists() and not data.is_symlink():
+        return []
+    found = list(data.iterdir()) if data.is_dir() and not data.is_symlink() else [data]
+    if not all(_is_script(one) for one in found):
         raise InputError(f"{data}: holds something else than a page's data; name another page with --out")
-    shutil.rmtree(data)
+    return found
+
+
+def _is_script(path: Path) -> bool:
+    """Whether a file is one of a page's data."""
+    if path.suffix != ".js" or path.is_symlink() or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(SCRIPT_BEGINS)) == SCRIPT_BEGINS.encode()
+
+
+def _clear(data: Path, earlier: list[Path]) -> None:
+    """Remove the data of an earlier page, and their folder."""
+    for one in earlier:
+        one.unlink()
+    if data.exists():
+        data.rmdir()
 
 
 def _part(name: str) -> str:

@@ -112,7 +112,7 @@ class Controls {
     byId("split").disabled = !state.view;
     byId("quantity-row").hidden = state.mode !== "uncertainty";
     byId("relief-row").hidden = state.mode !== "unsharp";
-    byId("white-row").hidden = !isLit(state.mode);
+    byId("white-row").hidden = !isLit(state.mode) || Boolean(state.view);
     if (document.activeElement !== byId("white")) byId("white").value = Number(state.white.toPrecision(4));
     byId("legend").innerHTML = ["roughness", "uncertainty", "residual"].includes(state.mode)
       ? legendOf(state.mode, state.quantity) : "";

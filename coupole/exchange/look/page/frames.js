@@ -4,7 +4,8 @@
 async function laterBlock(about, name) {
   if (!(name in coupoleBlocks)) {
     await new Promise((resolve, reject) => {
-      const script = Object.assign(document.createElement("script"), { src: `${about.data}/${name}.js` });
+      const src = `${encodeURIComponent(about.data)}/${encodeURIComponent(name)}.js`;
+      const script = Object.assign(document.createElement("script"), { src });
       script.onload = resolve;
       script.onerror = () => reject(new Error(`${name} is missing: keep the page's .data folder beside it.`));
       document.head.append(script);

@@ -327,7 +327,8 @@ class App {
     context.drawImage(this.canvas, 0, 0);
     context.fillStyle = "#ece9e2";
     context.font = `${Math.round(13 * this.scale)}px sans-serif`;
-    const white = isLit(this.state.mode) ? ` · white ${this.state.white.toPrecision(4)}` : "";
+    const [shown, unit] = this.renderer.whiteOf(this.state);
+    const white = isLit(this.state.mode) ? ` · white ${shown.toPrecision(4)} ${unit}` : "";
     const words = `${this.about.title} · ${MODES[this.state.mode]}${white} · ${this.banner()}`;
     context.fillText(words, 8 * this.scale, height + line * 0.68, width - 16 * this.scale);
     made.toBlob((blob) => {

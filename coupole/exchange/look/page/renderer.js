@@ -43,6 +43,12 @@ class Renderer {
     return { view, frame, texture: this.frames[frame.block] };
   }
 
+  /** What is shown as white, and its unit: a frame that is compared with has its own. */
+  whiteOf(state) {
+    const compared = this.frameOf(state);
+    return compared ? [compared.frame.peak, "of the camera's range"] : [state.white || 1, this.about.unit];
+  }
+
   keepFrame(frame, bytes) {
     this.frames[frame.block] = bytesTexture(this.gl, bytes, ...frame.size_px);
   }
@@ -236,7 +242,7 @@ class Renderer {
     const { from, to, logarithmic } = rangeOf(state.mode, state.quantity);
     const number = ["roughness", "uncertainty", "residual"].includes(state.mode);
     gl.uniform1i(at("kind"), state.mode === "normals" ? 1 : number ? 2 : 0);
-    gl.uniform1f(at("white"), this.frameOf(state)?.frame.peak ?? (state.white || 1));
+    gl.uniform1f(at("white"), this.whiteOf(state)[0]);
     gl.uniform2f(at("range"), from, to);
     gl.uniform1i(at("logarithmic"), logarithmic ? 1 : 0);
     gl.uniform3fv(at("ramp"), RAMP.flatMap((text) => channelsOf(text)));

@@ -51,7 +51,7 @@ def cluster_result(
 ) -> dict[str, Any]:
     """Find at most `count` materials for all triangles, and harmonics of pairs of directions of so many `degrees`;
     write them, and say what is missed with them under the LEDs that were left out. A view that is left out too
-    gives no samples and is judged by itself.
+    gives no samples and is judged by itself; normals, and which triangles look alike, are still by all views.
 
     Raises InputError if samples or fits are not all there, or the view is none; StorageError.
     """
@@ -74,14 +74,13 @@ def cluster_result(
     pool = empty_pool(len(members), materials.kd.shape[1])
     random = np.random.default_rng(0)
     for block in result.blocks(memory_bytes):
-        used = ~np.isin(result.along_samples(block, "leds"), settings["left_out"])
-        used &= result.along_samples(block, "names") != without_view
+        used = _used(result, block, settings["left_out"], without_view)
         samples, normals = result.samples(block), materials.normals[block]
         pool_samples(pool, samples, used, normals, cluster[block], members, random)
         say("pool samples", block.stop, len(fitted))
     pooled = fit_pool(pool, _medians(materials, cluster, len(members)))
     harmonics = fit_pairs(pool, degrees)
-    borrowed = _borrow(result, pooled, cluster, settings["left_out"], memory_bytes, say)
+    borrowed = _borrow(result, pooled, cluster, settings["left_out"], without_view, memory_bytes, say)
     found = Clusters(
         cluster.astype(np.int32), borrowed, pooled.kd, pooled.ks, pooled.alpha, pooled.residual, harmonics
     )
@@ -102,6 +101,12 @@ def cluster_result(
     return told
 
 
+def _used(result: RunResult, block: slice, left_out: list[int], without_view: str | None) -> NDArray[np.bool_]:
+    """[samples] of a block: those of neither the LEDs nor the view that are left out."""
+    used = ~np.isin(result.along_samples(block, "leds"), left_out)
+    return np.asarray(used & (result.along_samples(block, "names") != without_view))
+
+
 def _medians(materials: TriangleMaterials, cluster: NDArray[np.int64], count: int) -> TriangleMaterials:
     """[count] of the members of each cluster."""
     order = np.argsort(cluster, kind="stable")
@@ -119,6 +124,7 @@ def _borrow(
     pooled: TriangleMaterials,
     cluster: NDArray[np.int64],
     left_out: list[int],
+    without_view: str | None,
     memory_bytes: int,
     say: Said,
 ) -> NDArray[np.bool_]:
@@ -127,7 +133,7 @@ def _borrow(
     for block in result.blocks(memory_bytes):
         lacking = np.flatnonzero(cluster[block] < 0)
         if len(lacking):
-            used = ~np.isin(result.along_samples(block, "leds"), left_out)
+            used = _used(result, block, left_out, without_view)
             some = result.samples(block).of_triangles(lacking)
             found = nearest_cluster(some, used, pooled, FEWEST_TO_BORROW)
             cluster[block.start + lacking] = found
@@ -153,7 +159,7 @@ def _mae(
     result: RunResult, settings: dict[str, Any], views: Sequence[ViewSamples], memory_bytes: int, say: Said
 ) -> dict[str, dict[str, float | None]]:
     """Of pictures by blocks of pixels, and of means of triangles: of those with a material of their own by it, by
-    their cluster's, and by its harmonics; of those that borrowed one."""
+    their cluster's, and by its harmonics, where all three give a value; of those that borrowed one."""
     clusters = result.clusters
     pictures, triangles = ({name: [0.0, 0] for name in _WAYS} for _ in range(2))
     for view in views:
@@ -161,12 +167,9 @@ def _mae(
             own, borrowed = result.materials(_FROM, part.places), clusters.borrowed[part.places][:, None, None]
             shared = model_values(part.samples, clusters.at(own, part.samples.normals, part.places)) * part.share
             number = np.where(borrowed[:, 0, 0], -1, clusters.cluster[part.places])
-            made = {
-                "own": model_values(part.samples, own) * part.share,
-                "clustered": np.where(borrowed, np.nan, shared),
-                "harmonics": pair_values(part.samples, own.normals, number, clusters.harmonics) * part.share,
-                "borrowed": np.where(borrowed, shared, np.nan),
-            }
+            by_pairs = pair_values(part.samples, own.normals, number, clusters.harmonics)
+            made = _alike(model_values(part.samples, own) * part.share, shared, by_pairs * part.share)
+            made["borrowed"] = np.where(borrowed, shared, np.nan)
             for name, values in made.items():
                 _add(triangles[name], values - part.samples.values * part.share)
                 for channel, (_, measured) in enumerate(part.blocks):
@@ -177,6 +180,13 @@ def _mae(
         for sums in (pictures, triangles)
     )
     return {"mae": mae, "mae_of_triangles": of_triangles}
+
+
+def _alike(*values: NDArray[np.floating]) -> dict[str, NDArray[np.floating]]:
+    """What the ways but the last give, where all of them do: harmonics have no value below the horizon of the
+    fitted normal, where GGX has one."""
+    all_do = np.logical_and.reduce([np.isfinite(one) for one in values])
+    return {name: np.where(all_do, one, np.nan) for name, one in zip(_WAYS[:-1], values, strict=True)}
 
 
 def _add(sums: list[float], off: NDArray[np.floating]) -> None:

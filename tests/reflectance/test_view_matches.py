@@ -14,6 +14,7 @@ from coupole.calibration.optics import Intrinsics
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.errors import InputError
 from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.alignment import refinement
 from coupole.reflectance.alignment.refinement import match_lines, refine
 from coupole.reflectance.alignment.unknowns import Doubts, Given, Unknowns, camera_covariance, control_points
 from coupole.reflectance.alignment.view_matches import Matches, match_views
@@ -212,6 +213,31 @@ def test_views_without_anything_in_common_are_refused() -> None:
     plain = [np.ones(SIZE[::-1], np.float32) for _ in CAMERAS]
     with pytest.raises(InputError, match="expected 30 matches or more, found 0"):
         refine(known.given, plain, known.doubts, 1.0, 1, lambda step, done, of: None)
+
+
+def test_what_is_clipped_is_not_compared() -> None:
+    first, second = painted(CAMERAS[0]), painted(CAMERAS[1], (1.3, -0.8))
+    first[:, 140:], second[:30] = np.nan, np.nan
+    assert np.isnan(surface(CAMERAS[0], first).points_mm[:, 140:]).all()
+    found = matched([first, second])
+    assert len(found.blocks) > 20
+    sign = np.where(found.other == 1, 1.0, -1.0)[:, None]
+    np.testing.assert_allclose(np.median(sign * found.shifts_mm, axis=0), [1.3, -0.8, 0.0], atol=0.03)
+
+
+def test_a_search_is_not_wider_than_it_was_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    known, searched = unknowns(), []
+
+    def matching(views: list[ViewSurface], search_mm: float, threads: int, say: refinement.Said) -> Matches:
+        searched.append(search_mm)
+        return match_views(views, search_mm, threads, say)
+
+    monkeypatch.setattr(refinement, "match_views", matching)
+    pictures = [painted(pose) for pose in CAMERAS]
+    for search_mm, after in ((0.1, 0.1), (0.6, 0.3)):
+        searched.clear()
+        refine(known.given, pictures, known.doubts, search_mm, 1, lambda step, done, of: None)
+        assert searched[:2] == [search_mm, after]
 
 
 def test_control_points_are_a_scale_apart_and_an_object_too_large_for_them_is_refused() -> None:

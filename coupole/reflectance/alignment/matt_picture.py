@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
-from coupole.reflectance.extraction.radiance import Radiometry
+from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT, Radiometry
 
 MOST_LEDS = 24
 FEWEST_LEDS = 5
 LOW_RANK, HIGH_RANK = 0.2, 0.6
 """Ranks of an LED's brightness at a place, 0 for the darkest, between which the mean is taken."""
+ALL_BUT = 1e-3
+"""Share of a picture's blocks that may be clipped without a look at a shorter exposure."""
 GREEN = "G"
 Said = Callable[[str, int, int], None]
 
@@ -42,30 +44,40 @@ def common_leds(views: Sequence[MeasuredView]) -> list[int]:
 def matt_picture(
     measured: MeasuredRun, radiometry: Radiometry, view: MeasuredView, leds: Sequence[int], say: Said
 ) -> NDArray[np.float32]:
-    """[h / 2, w / 2] mean of green DN per microsecond over the flat field, of blocks of 2 x 2 pixels. Raises
-    StorageError for a damaged frame."""
+    """[h / 2, w / 2] mean of green DN per microsecond over the flat field, of blocks of 2 x 2 pixels, each by the
+    longest exposure that does not clip it. A block that all exposures of an LED clip counts as brighter than
+    under the others; NaN where that reaches the ranks that are used. Raises StorageError for a damaged frame."""
     green = radiometry.channel == measured.channels.index(GREEN)
     height, width = green.shape
-    stack = np.empty((len(leds), height // 2, width // 2), np.float32)
+    stack = np.full((len(leds), height // 2, width // 2), np.inf, np.float32)
+    top_dn = radiometry.white_dn - RANGE_LEFT_OUT * (radiometry.white_dn - radiometry.black_dn)
     for number, led in enumerate(leds):
-        frame = max(view.by_led[led], key=lambda one: one.exposure_us)
-        _green_blocks(frame.read(), radiometry.dark(frame), radiometry.flat, green, stack[number])
-        stack[number] /= frame.exposure_us
+        for frame in sorted(view.by_led[led], key=lambda one: -one.exposure_us):
+            dark, means = radiometry.dark(frame), stack[number]
+            _green_blocks(frame.read(), dark, radiometry.flat, green, top_dn, frame.exposure_us, means)
+            if np.mean(np.isinf(means)) <= ALL_BUT:
+                break
         say(f"picture of {view.name}", number + 1, len(leds))
     low, high = int(LOW_RANK * len(leds)), max(int(HIGH_RANK * len(leds)), int(LOW_RANK * len(leds)) + 1)
     stack.partition((low, high - 1), axis=0)
-    return np.asarray(stack[low:high].mean(axis=0), np.float32)
+    mean = stack[low:high].mean(axis=0)
+    return np.asarray(np.where(np.isfinite(mean), mean, np.nan), np.float32)
 
 
 @numba.njit(cache=True, nogil=True)
-def _green_blocks(raw, dark, flat, green, means):  # type: ignore[no-untyped-def]
-    """Into `means` [h / 2, w / 2]: the two greens of a block lie evenly about its middle."""
+def _green_blocks(raw, dark, flat, green, top_dn, exposure_us, means):  # type: ignore[no-untyped-def]
+    """Into `means` [h / 2, w / 2], where they are infinite and the frame is below `top_dn`: the two greens of a
+    block lie evenly about its middle."""
     for row in range(means.shape[0]):
         for column in range(means.shape[1]):
-            total, count = 0.0, 0
+            if not np.isinf(means[row, column]):
+                continue
+            total, count, clipped = 0.0, 0, False
             for pixel in range(4):
                 y, x = 2 * row + pixel // 2, 2 * column + pixel % 2
                 if green[y, x]:
                     total += (float(raw[y, x]) - dark[y, x]) / flat[y, x]
                     count += 1
-            means[row, column] = total / count
+                    clipped |= raw[y, x] >= top_dn
+            if not clipped:
+                means[row, column] = total / (count * exposure_us)

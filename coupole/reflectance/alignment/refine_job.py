@@ -23,7 +23,7 @@ from coupole.preflight.object_shape import MM_PER_UNIT
 from coupole.reflectance.alignment.matt_picture import Said, common_leds, matt_picture
 from coupole.reflectance.alignment.refined_geometry import ABOUT, REFINED, SCHEMA, write_refined
 from coupole.reflectance.alignment.refinement import Refined, refine
-from coupole.reflectance.alignment.unknowns import STATED, Doubts, Given, camera_covariance, welded
+from coupole.reflectance.alignment.unknowns import STATED, Doubts, Given, camera_covariance, renumbered, welded
 from coupole.reflectance.alignment.view_matches import Matches
 from coupole.reflectance.extraction.measured_run import MeasuredRun, read_measured_run, refuse_different
 from coupole.reflectance.extraction.radiance import Radiometry
@@ -50,10 +50,12 @@ class RefineRequest:
 def refine_runs(request: RefineRequest, out: Path, say: Said) -> dict[str, Any]:
     """Refine, and write the folder; what `refined.json` says.
 
-    Raises InputError: fewer than two views, records of different cameras, views without common LEDs or texture, a
-    folder that is not empty; StorageError if a frame is damaged or the disk takes nothing.
+    Raises InputError: fewer than two views, records of different cameras, views without common LEDs or texture, an
+    `out` that is a file or not empty; StorageError if a frame is damaged or the disk takes nothing.
     """
     begun_s = time.monotonic()
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file: name a folder with --out")
     if out.exists() and any(out.iterdir()):
         raise InputError(f"{out} is not empty: name another folder with --out")
     runs = [read_measured_run(run, request.mesh, request.calibrations) for run in request.runs]
@@ -94,8 +96,8 @@ def given_by(runs: Sequence[MeasuredRun], doubts: Doubts) -> Given:
         prior = replace(prior, axis_sensitivity=np.concatenate([one for one in each if one is not None]))
     cameras = np.stack([view.base_from_camera for measured in runs for view in measured.views])
     covariance = camera_covariance(prior, cameras, doubts)
-    vertices_mm = welded(first.corners_mm, first.triangles)
-    return Given(first.lens, prior.free, cameras, covariance, vertices_mm, first.triangles)
+    triangles = renumbered(first.triangles)
+    return Given(first.lens, prior.free, cameras, covariance, welded(first.corners_mm, triangles), triangles)
 
 
 def _refuse_other_cameras(measured_runs: Sequence[MeasuredRun]) -> None:
@@ -110,13 +112,13 @@ def _refuse_other_cameras(measured_runs: Sequence[MeasuredRun]) -> None:
 
 
 def _write_mesh(refined: Refined, measured: MeasuredRun, path: Path) -> None:
-    """In the unit and frame of the mesh that was given."""
+    """In the unit and frame of the mesh that was given, without the vertices that no triangle uses."""
     plan = read_plan(measured.run.plan_path, measured.run.rig_path).plan
     assert plan.object is not None  # read_measured_run refuses runs without
     base_from_object = measured.base_from_support @ plan.object.support_from_object.matrix()
     vertices_mm = apply(inverse(base_from_object), refined.unknowns.vertices_at(refined.steps))
     vertices = vertices_mm / MM_PER_UNIT[plan.object.mesh_unit]
-    mesh = trimesh.Trimesh(vertices, measured.triangles, process=False)
+    mesh = trimesh.Trimesh(vertices, refined.unknowns.given.triangles, process=False)
     path.write_bytes(trimesh.exchange.ply.export_ply(mesh))
 
 

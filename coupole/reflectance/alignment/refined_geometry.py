@@ -15,19 +15,20 @@ from numpy.typing import NDArray
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.errors import InputError
 from coupole.reflectance.alignment.refinement import Refined
+from coupole.reflectance.alignment.unknowns import renumbered
 from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.storage.durable import sha256
 
 Floats = NDArray[np.float64]
 REFINED, ABOUT = "refined.h5", "refined.json"
-SCHEMA = "coupole-refinement/1"
+SCHEMA = "coupole-refinement/2"
 PREVIEW_PX = 640
 """Largest width of a view's picture in the file."""
 TOLD = {
     "lens": "fx, fy, cx, cy (px), k1, k2, p1, p2, k3",
     "views": "run and view",
     "base_from_camera": "[views, 4, 4] mm",
-    "vertices_mm": "[n, 3] of the mesh, in its order, base frame",
+    "vertices_mm": "[n, 3] of the mesh, those that triangles use, in its order, base frame",
     "vertex_u_mm": "[n] standard uncertainty along the normal",
     "names": "of the unknowns, with units; cameras by their places in `views`",
     "steps": "of the unknowns from what records and scan say",
@@ -54,9 +55,12 @@ class RefinedGeometry:
     """By run and view."""
     vertices_mm: Floats
     mesh_sha256: str
+    inputs: dict[str, dict[str, str]]
+    """Name and SHA-256 of the files that were read, by run."""
 
     def of(self, measured: MeasuredRun) -> MeasuredRun:
-        """A run with them. Raises InputError for a run, view or mesh that was not refined."""
+        """A run with them. Raises InputError for a run, view or mesh that was not refined, and for a run that has
+        changed since."""
         if sha256(measured.mesh_path) != self.mesh_sha256:
             raise InputError(
                 f"{self.path}: another mesh than {measured.mesh_path} was refined; name that with --mesh"
@@ -67,10 +71,15 @@ class RefinedGeometry:
                 f"{self.path}: holds no pose of the view {absent[0]} of {run}; `coupole reflectance refine` "
                 "with all runs that you name makes them"
             )
+        if self.inputs.get(run) != dict(measured.frames.inputs):
+            raise InputError(
+                f"{self.path}: {run} has other frames than when it was refined; `coupole reflectance refine` it "
+                "anew, with another --out"
+            )
         views = tuple(
             replace(view, base_from_camera=self.base_from_camera[run, view.name]) for view in measured.views
         )
-        corners_mm = self.vertices_mm[measured.triangles]
+        corners_mm = self.vertices_mm[renumbered(measured.triangles)]
         return replace(measured, lens=self.lens, views=views, corners_mm=corners_mm)
 
 
@@ -86,19 +95,15 @@ def read_refined(folder: Path) -> RefinedGeometry:
             views = [tuple(name) for name in file["views"].asstr()[()]]
             lens = Intrinsics(**dict(zip(NAMES, map(float, file["lens"][()]), strict=True)))
             poses = dict(zip(views, file["base_from_camera"][()], strict=True))
-            return RefinedGeometry(path, lens, poses, file["vertices_mm"][()], str(file.attrs["mesh_sha256"]))
+            vertices_mm, digest = file["vertices_mm"][()], str(file.attrs["mesh_sha256"])
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path}: expected the result of `coupole reflectance refine`: {error}") from error
+    return RefinedGeometry(path, lens, poses, vertices_mm, digest, _told(folder, "inputs"))
 
 
 def what_was_refined(folder: Path) -> dict[str, Any]:
     """What a result says of the refinement it was made with. Raises InputError if there is none."""
-    path = folder / ABOUT
-    try:
-        disagreement = json.loads(path.read_text(encoding="utf-8"))["disagreement"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: expected the result of `coupole reflectance refine`") from error
-    return {"sha256": sha256(folder / REFINED), "disagreement": disagreement}
+    return {"sha256": sha256(folder / REFINED), "disagreement": _told(folder, "disagreement")}
 
 
 def write_refined(
@@ -140,8 +145,18 @@ def write_refined(
             data.attrs["told"] = "what the view was compared by, scaled down; its height and width were `blocks`"
 
 
+def _told(folder: Path, name: str) -> Any:
+    """What `refined.json` says under a name."""
+    path = folder / ABOUT
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))[name]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: expected the result of `coupole reflectance refine`") from error
+
+
 def _preview(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
     every = -(-picture.shape[1] // PREVIEW_PX)
     small = picture[::every, ::every]
-    shown: NDArray[np.uint8] = (255 * np.clip(small / np.percentile(small, 99.5), 0, 1) ** 0.5).astype(np.uint8)
+    share = np.nan_to_num(small / np.nanpercentile(small, 99.5), nan=1.0)  # what is clipped is white
+    shown: NDArray[np.uint8] = (255 * np.clip(share, 0, 1) ** 0.5).astype(np.uint8)
     return shown

@@ -35,6 +35,7 @@ SETTLED_MM = 0.005
 """Change of the median disagreement from round to round below which matches are not made anew."""
 SEARCH_SHRINKS = 3.0
 LEAST_SEARCH_MM = 0.3
+"""Below which a search is not narrowed."""
 FEWEST_MATCHES = 30
 MATCHES, STATED = "matches", "records and scan"
 _GROUPS = (Group(MATCHES, estimated=True, rejects=2), Group(STATED, estimated=False))
@@ -106,7 +107,7 @@ def refine(
         adjusted = _adjusted(unknowns, steps, matches)
         say("rounds of refinement", number + 1, ROUNDS)
         settled = float(np.median(matches.apart_mm))
-        search_mm = max(search_mm / SEARCH_SHRINKS, LEAST_SEARCH_MM)
+        search_mm = min(search_mm, max(search_mm / SEARCH_SHRINKS, LEAST_SEARCH_MM))
         steps = adjusted.state
         matches = _matched(unknowns, steps, pictures, search_mm, threads, say)
         if number and settled - float(np.median(matches.apart_mm)) < SETTLED_MM:

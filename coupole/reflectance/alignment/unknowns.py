@@ -61,8 +61,9 @@ class Given:
     camera_covariance: Floats
     """[free + 6 views, free + 6 views] of the lens and the cameras' steps."""
     vertices_mm: Floats
-    """[n, 3] base frame."""
+    """[n, 3] those that triangles use, base frame."""
     triangles: NDArray[np.uint32]
+    """[m, 3] `renumbered`."""
 
 
 def camera_covariance(prior: CameraPrior, base_from_camera: Floats, doubts: Doubts) -> Floats:
@@ -213,8 +214,15 @@ def control_points(points_mm: Floats, spacing_mm: float) -> Floats:
     return points_mm[chosen]
 
 
+def renumbered(triangles: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """[m, 3] places of triangles' corners among the vertices that triangles use, which keep their order."""
+    used = np.zeros(int(triangles.max()) + 1, np.bool_)
+    used[triangles] = True
+    return (np.cumsum(used) - 1)[triangles].astype(np.uint32)
+
+
 def welded(corners_mm: Floats, triangles: NDArray[np.uint32]) -> Floats:
-    """[n, 3] vertices of triangles whose corners [m, 3, 3] are known."""
+    """[n, 3] vertices of triangles that are `renumbered`, whose corners [m, 3, 3] are known."""
     vertices = np.zeros((int(triangles.max()) + 1, 3))
     vertices[triangles] = corners_mm
     return vertices

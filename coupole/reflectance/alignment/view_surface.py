@@ -29,9 +29,10 @@ class ViewSurface:
     """A view's picture, and the place of the mesh that each of its blocks shows."""
 
     picture: NDArray[np.float32]
-    """[h, w]"""
+    """[h, w]; NaN where it is clipped."""
     points_mm: NDArray[np.float32]
-    """[h, w, 3] base frame; NaN beside the object, at silhouettes, and where it is seen at a grazing angle."""
+    """[h, w, 3] base frame; NaN beside the object, at silhouettes, where it is seen at a grazing angle, and
+    where the picture is clipped."""
     base_from_camera: Floats
     lens: Intrinsics
     """Of blocks."""
@@ -77,7 +78,7 @@ def view_surface(
     height, width = picture.shape
     blocks = block_lens(lens)
     surface = seen_surface(mesh, normals, blocks, base_from_camera, (width, height), threads=threads)
-    used = surface.places >= 0
+    used = (surface.places >= 0) & np.isfinite(picture)
     triangle = surface.triangles[surface.places[used]]
     ways = directions_of_rows(blocks, width, 0, height)[used] @ base_from_camera[:3, :3].T
     eye = base_from_camera[:3, 3]

@@ -151,10 +151,10 @@ def from_runs_or_pictures(
             raise InputError("--out: expected the folder of the result")
         if bool(runs) == (pictures is not None):
             raise InputError("expected runs, or --pictures with --lights; see coupole reflectance from --help")
-        if (uncalibrated and (calibrations or len(runs or ()) != 1)) or (view and not uncalibrated):
-            raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
-        if refined is not None and (uncalibrated or pictures is not None):
-            raise InputError("--refined: is for calibrated runs")
+        if (uncalibrated and (calibrations or refined or len(runs or ()) != 1)) or (view and not uncalibrated):
+            raise InputError(
+                "--uncalibrated: expected one run, no --calibrations, no --refined; --view goes with it alone"
+            )
         with step_bars(console) as say:
             if uncalibrated and runs:
                 made = _of_uncalibrated(runs[0], view, _numbers(leave_out), out, say)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.exchange.look.look_blocks import Block, block_of
+from coupole.exchange.srgb import srgb
 from coupole.geometry import apply
 from coupole.reflectance.new_light.pictured_surface import Surface, surface_of_view
 from coupole.reflectance.run_result import FRAMES, RunResult, ViewSamples
@@ -114,6 +115,5 @@ def _coded(small: Floats) -> tuple[NDArray[np.uint8], float]:
     """[h, w, 3] in sRGB's steps up to the peak that is returned, from 1; 0 where there is no value."""
     known = np.asarray(np.isfinite(small).all(axis=2))
     peak = max(float(np.quantile(small[known], _WHITE_QUANTILE)) if known.any() else 1.0, 1e-9)
-    linear = np.clip(np.where(known[..., None], small, 0.0) / peak, 0.0, 1.0)
-    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    shown = srgb(np.where(known[..., None], small, 0.0) / peak)
     return np.where(known[..., None], 1.0 + np.rint(254.0 * shown), 0.0).astype(np.uint8), peak

@@ -149,12 +149,7 @@ def from_runs_or_pictures(
     try:
         if out is None:
             raise InputError("--out: expected the folder of the result")
-        if bool(runs) == (pictures is not None):
-            raise InputError("expected runs, or --pictures with --lights; see coupole reflectance from --help")
-        if (uncalibrated and (calibrations or refined or len(runs or ()) != 1)) or (view and not uncalibrated):
-            raise InputError(
-                "--uncalibrated: expected one run, no --calibrations, no --refined; --view goes with it alone"
-            )
+        _refuse_mixed(runs or [], pictures, calibrations or [], view, refined, uncalibrated=uncalibrated)
         with step_bars(console) as say:
             if uncalibrated and runs:
                 made = _of_uncalibrated(runs[0], view, _numbers(leave_out), out, say)
@@ -196,6 +191,24 @@ def _of_pictures(
     given = read_pictures(pictures, lights, intensities=intensities, mask=mask)
     about = fit_pictures(given, out, left_out=left_out, say=say)
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
+
+
+def _refuse_mixed(
+    runs: list[Path],
+    pictures: Path | None,
+    calibrations: list[Path],
+    view: str | None,
+    refined: Path | None,
+    *,
+    uncalibrated: bool,
+) -> None:
+    """Raise InputError for options that do not go together."""
+    if bool(runs) == (pictures is not None):
+        raise InputError("expected runs, or --pictures with --lights; see coupole reflectance from --help")
+    if (uncalibrated and (calibrations or len(runs) != 1)) or (view and not uncalibrated):
+        raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
+    if refined is not None and (uncalibrated or pictures is not None):
+        raise InputError("--refined: is for calibrated runs")
 
 
 def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path, say: Said) -> Made:

@@ -120,7 +120,7 @@ def test_other_pictures_are_not_mixed_into_a_result(made: Made) -> None:
     case, out, _ = made
     ended = cells.here("reflectance", *case.arguments(), "--out", out)
     assert ended.code == 2
-    assert "other input or settings" in ended.err
+    assert "other input, settings or version" in ended.err
 
 
 def test_six_lights_are_enough_for_sums(made: Made, tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_the_camera_is_disarmed_if_the_box_does_not_start(cell: CellFolder, erro
 def test_the_camera_is_disarmed_before_a_burst_is_taken_again(cell: CellFolder) -> None:
     """After an arm that was pushed in the burst."""
     cell.write(lights={"kind": "every", "every": 4})
-    cell.faults({"kind": "nudge_arm", "deg": 0.05, "seconds": 0.5, "at_edge": 60})
+    cell.faults({"kind": "nudge_arm", "deg": 0.05, "seconds": 1.0, "at_edge": 60})
     with recorded() as calls:
         ended = cell.acquire()
     assert ended.code == 0, ended.err

@@ -6,13 +6,13 @@ import math
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.exchange.look.look_blocks import Look, block_of, halves, log_coded, octahedral
 from coupole.exchange.look.look_frames import frames_of_view
+from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.geometry import apply, inverse
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
@@ -43,8 +43,8 @@ def look_of_result(folder: Path) -> Look:
         block_of("places", places),
         block_of("triangles", triangles),
         block_of("normals", _spread(octahedral(turned), at, count)),
-        block_of("kd", _spread(halves(_three(materials.kd[mine])), at, count)),
-        block_of("ks", _spread(halves(_three(materials.ks[mine])), at, count)),
+        block_of("kd", _spread(halves(red_green_blue(materials.kd[mine])), at, count)),
+        block_of("ks", _spread(halves(red_green_blue(materials.ks[mine])), at, count)),
         block_of("gloss", _spread(halves(_pair(materials.alpha, materials.residual)[mine]), at, count)),
         block_of("uncertainty", _spread(_uncertainty(path)[mine], at, count)),
     ]
@@ -97,20 +97,8 @@ def welded(corners_mm: Floats) -> tuple[NDArray[np.uint16], NDArray[np.uint32], 
 
 
 def _uncertainty(path: Path) -> NDArray[np.uint8]:
-    """[n, 4] of kd, ks (relative, the channels' mean, all their sources), the normal's angle (rad) and alpha
-    (relative), standard. Raises InputError if there are none."""
-    with h5py.File(path, "r") as file:
-        if "covariance" not in file:
-            raise InputError(f"{path}: has no uncertainty, an earlier version made it; make the result anew")
-        lower, same = file["covariance"][()], np.hypot(file["u_triangle"][()], float(file["u_shared"][()]))
-        u_kd, u_ks = (np.sqrt(np.mean(file[name][()] ** 2, axis=1) + same**2) for name in ("u_kd", "u_ks"))
-    u_normal, u_alpha = np.sqrt(lower[:, 0] + lower[:, 2]), np.sqrt(lower[:, 14])
-    return log_coded(np.stack([u_kd, u_ks, u_normal, u_alpha], axis=1).astype(np.float64))
-
-
-def _three(values: Floats) -> Floats:
-    """[n, 3] of [n, channels]; one channel is grey."""
-    return values if values.shape[1] == 3 else np.repeat(values, 3, axis=1)
+    """[n, 4] codes of the standard uncertainties of kd, ks, normal and alpha."""
+    return log_coded(np.stack(list(standard_uncertainties(path).values()), axis=1))
 
 
 def _pair(one: Floats, other: Floats) -> Floats:

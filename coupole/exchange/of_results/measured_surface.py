@@ -7,15 +7,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.geometry import apply, inverse
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
-from coupole.reflectance.run_result_files import refuse_without_uncertainty
 
 Floats = NDArray[np.float64]
 
@@ -87,16 +86,6 @@ def read_surface(folder: Path, fit: str | None = None, chosen: tuple[int, ...] =
         whole[result.triangles] = values
         return whole
 
-    with h5py.File(path, "r") as file:
-        refuse_without_uncertainty(path, file)
-        lower, same = file["covariance"][()], np.hypot(file["u_triangle"][()], file["u_shared"][()])
-        u_kd, u_ks = (np.sqrt(np.mean(file[key][()] ** 2, axis=1) + same**2) for key in ("u_kd", "u_ks"))
-    uncertain = {
-        "u_kd": u_kd,
-        "u_ks": u_ks,
-        "u_alpha": np.sqrt(lower[:, 14]),
-        "u_normal": np.sqrt(lower[:, 0] + lower[:, 2]),
-    }
     return MeasuredSurface(
         result,
         name,
@@ -104,13 +93,9 @@ def read_surface(folder: Path, fit: str | None = None, chosen: tuple[int, ...] =
         vertices_mm,
         triangles,
         normals,
-        everywhere(_three(found.kd)),
-        everywhere(_three(found.ks)),
+        everywhere(red_green_blue(found.kd)),
+        everywhere(red_green_blue(found.ks)),
         everywhere(found.alpha),
-        {key: everywhere(values.astype(np.float64)) for key, values in uncertain.items()},
+        {key: everywhere(values) for key, values in standard_uncertainties(path).items()},
         chosen,
     )
-
-
-def _three(values: Floats) -> Floats:
-    return values if values.shape[1] == 3 else np.repeat(values, 3, axis=1)

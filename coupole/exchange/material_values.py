@@ -1,0 +1,33 @@
+"""What pages and exports take of a result's materials."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.run_result_files import refuse_without_uncertainty
+
+Floats = NDArray[np.float64]
+_FIRST_TILT, _SECOND_TILT, _ALPHA = 0, 2, 14
+"""Variances in the lower half of the covariance, row by row."""
+
+
+def red_green_blue(values: Floats) -> Floats:
+    """[n, 3] of [n, channels]; one channel is grey."""
+    return values if values.shape[1] == 3 else np.repeat(values, 3, axis=1)
+
+
+def standard_uncertainties(path: Path) -> dict[str, Floats]:
+    """[n] of a file of materials, all parts together: `u_kd`, `u_ks` (relative, the channels' mean), `u_normal`
+    (rad) and `u_alpha` (relative). Raises InputError if it has none."""
+    with h5py.File(path, "r") as file:
+        refuse_without_uncertainty(path, file)
+        lower = file["covariance"][()].astype(np.float64)
+        same = np.hypot(file["u_triangle"][()], float(file["u_shared"][()]))
+        found = {key: np.sqrt(np.mean(file[key][()] ** 2, axis=1) + same**2) for key in ("u_kd", "u_ks")}
+    found["u_normal"] = np.sqrt(lower[:, _FIRST_TILT] + lower[:, _SECOND_TILT])
+    found["u_alpha"] = np.sqrt(lower[:, _ALPHA])
+    return {key: values.astype(np.float64) for key, values in found.items()}

@@ -31,7 +31,7 @@ from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 
 _PART = 64
 _FLAT = 1e-9
-_LEFT_OUT = 64
+_LEFT_OUT = 100
 """Samples, at most, that the share of a model is judged by."""
 
 

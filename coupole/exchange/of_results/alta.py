@@ -13,8 +13,9 @@ import numpy as np
 from coupole.errors import InputError
 from coupole.exchange.of_results.material_tables import chosen_triangles
 from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface
-from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples, u_inter_reflection
-from coupole.reflectance.sample_uncertainty import Places, Sources, bounds
+from coupole.reflectance.run_result import RunResult, ViewSamples
+from coupole.reflectance.sample_sources import channel_samples
+from coupole.reflectance.sample_uncertainty import bounds
 from coupole.storage.durable import write_synced
 
 _QUANTILE = 1.959964
@@ -59,31 +60,15 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
 def _samples(result: RunResult, view: ViewSamples, row: int, scan_noise_um: float) -> Floats:
     """[leds, channels, 6] the columns of the file, of a triangle in a view; NaN where there is no sample."""
     with h5py.File(view.path, "r") as file:
-        f, u_noise = file["f"][row].astype(np.float64), file["u_own"][row].astype(np.float64)
-        own, shared, response = file["led_u_own"][()], file["led_u_shared"][()], file["u_response"][row]
-        indirect = np.zeros(f.shape)
-        if view.inter_reflection is not None:
-            indirect = u_inter_reflection(file[INTER_REFLECTION][row])
-        led_mm, normal = float(file.attrs["led_u_mm"]), file["normals"][row]
-    corners = result.corners_mm[view.triangles[row]].astype(np.float64)
-    count, same = len(view.leds), np.ones(len(view.leds))
-    places = Places(np.broadcast_to(corners, (count, 3, 3)), view.led_mm, view.led_normals)
-    lines = np.empty((count, f.shape[1], 6))
-    lines[:, :, :3] = _angles(view, corners.mean(axis=0), normal)[:, None]
-    for channel in range(f.shape[1]):
-        sources = Sources(
-            u_noise[:, channel],
-            response[channel] * same,
-            indirect[:, channel],
-            own[:, channel],
-            shared[:, channel],
-            scan_noise_um * same,
-            led_mm * same,
-        )
-        low, high = bounds(places, sources, _QUANTILE)
-        value = f[:, channel]
+        normal = file["normals"][row]
+    leds = np.arange(len(view.leds))
+    lines = np.empty((len(leds), result.channels, 6))
+    for channel in range(result.channels):
+        mine = channel_samples(result, view, np.array([row]), leds, channel, scan_noise_um)
+        low, high = bounds(mine.places, mine.sources, _QUANTILE)
         most = np.finfo(np.float32).max
-        lines[:, channel, 3:] = np.stack([value, value * low, np.minimum(value * high, most)], axis=1)
+        lines[:, channel, :3] = _angles(view, mine.places.corners_mm[0].mean(axis=0), normal)
+        lines[:, channel, 3:] = np.stack([mine.f, mine.f * low, np.minimum(mine.f * high, most)], axis=1)
     return lines
 
 

@@ -120,24 +120,27 @@ def left_out(rows, values, coefficients, factor, step, off):  # type: ignore[no-
     over 1 - h, h the diagonal of the matrix from samples to fitted values (Golub, Heath, Wahba, Technometrics 21,
     1979); with the matrix of the samples both have the diagonal of its inverse as a factor.
     """
-    count, samples = rows.shape
-    column = np.empty((1, len(factor)))
-    for number in range(0, samples, step):
+    (count, samples), size = rows.shape, len(factor)
+    columns = np.zeros((off.shape[1], size))
+    for place in range(len(columns)):
         if samples < count:
-            column[:] = 0.0
-            column[0, number] = 1.0
+            columns[place, place * step] = 1.0
         else:
-            column[0, :] = rows[:, number]
-        _half_solve(factor, column)
-        square = np.sum(column * column)
+            for k in range(count):
+                columns[place, k] = rows[k, place * step]
+    _half_solve(factor, columns)
+    for place in range(len(columns)):
+        square = 0.0
+        for k in range(size):
+            square += columns[place, k] ** 2
         for channel in range(len(values)):
-            rest = values[channel, number]
+            rest = values[channel, place * step]
             if samples < count:
-                off[channel, number // step] = rest / square
+                off[channel, place] = rest / square
             else:
                 for k in range(count):
-                    rest -= coefficients[channel, k] * rows[k, number]
-                off[channel, number // step] = rest / max(1.0 - square, 1e-9)
+                    rest -= coefficients[channel, k] * rows[k, place * step]
+                off[channel, place] = rest / max(1.0 - square, 1e-9)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
+from numpy import ascontiguousarray as ordered  # functions are compiled for each layout
 from numpy.typing import NDArray
 
 from coupole.reflectance.least_squares import (
@@ -57,8 +58,9 @@ def fit_slices(
     def fit(first: int) -> None:
         part = slice(first, min(first + _PART, count))
         _fit_part(
-            samples.values[part], left[:, part], samples.led_mm, camera_mm, samples.centres_mm[part],
-            samples.normals[part], which, fits[0][0].harmonic, penalties, over, found[:, part],
+            ordered(samples.values[part]), ordered(left[:, part]), ordered(samples.led_mm), ordered(camera_mm),
+            ordered(samples.centres_mm[part]), ordered(samples.normals[part]), which, fits[0][0].harmonic,
+            penalties, over, found[:, part],
         )  # fmt: skip
 
     with one_thread(), ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
@@ -78,10 +80,10 @@ def slice_values(
     if model is not None:
         share = coefficients[..., COUNT]
         made = np.nan_to_num(share, nan=1.0)[:, None] * model
-        coefficients = np.ascontiguousarray(np.nan_to_num(coefficients[..., :COUNT]))
+        coefficients = np.nan_to_num(coefficients[..., :COUNT])
     _add_part(
-        coefficients, samples.led_mm, samples.cameras_mm[0], samples.centres_mm, samples.normals, basis.harmonic,
-        made,
+        ordered(coefficients), ordered(samples.led_mm), ordered(samples.cameras_mm[0]),
+        ordered(samples.centres_mm), ordered(samples.normals), basis.harmonic, made,
     )  # fmt: skip
     return np.maximum(made, 0.0)
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.reflectance.block_work import Said, Workshop, silent, workshop
+from coupole.reflectance.contradictions import leave_out
 from coupole.reflectance.material_uncertainty import MaterialUncertainty, covariances
 from coupole.reflectance.model_bias import unbiased_normals
 from coupole.reflectance.result_folder import SETTINGS, clear_remains, complete, in_the_making, read_settings
@@ -51,8 +52,9 @@ class _Job:
 
 
 def fit_result(out: Path, memory_bytes: int, *, scheduler: str | None = None, say: Said = silent) -> None:
-    """Make the fits that a result lacks, in the workers of a `scheduler` if one is named. Raises InputError if its
-    samples are not all there, or for the scheduler as `workshop`; StorageError."""
+    """Make the fits that a result lacks, in the workers of a `scheduler` if one is named; between materials and
+    slices, samples that contradict others are left out. Raises InputError if the samples are not all there, or for
+    the scheduler as `workshop`; StorageError."""
     settings = read_settings(out)
     result = RunResult(out.resolve())
     result.refuse_unfinished(settings)
@@ -64,6 +66,8 @@ def fit_result(out: Path, memory_bytes: int, *, scheduler: str | None = None, sa
             for name in MATERIALS:
                 if not result.materials_path(name).exists():
                     _fit_materials(result, job, name, shop, say)
+            leave_out(result, memory_bytes, say)
+            result = RunResult(result.folder)
             for names in TOGETHER:
                 for number, view in enumerate(result.views):
                     if not all(result.slices_path(name, view).exists() for name in names):

@@ -48,6 +48,8 @@ Block = slice | NDArray[np.int64]
 """Places of triangles; numbers rise."""
 INTER_REFLECTION = "inter_reflection"
 """Attribute of a file of samples that it was taken from."""
+CONTRADICTED = "contradicted"
+"""Attribute too: samples that were left out because they contradict others."""
 SAMPLES = "samples"
 """Attribute too: how many are left."""
 AS_MEASURED = "as_measured.h5"
@@ -80,8 +82,10 @@ class ViewSamples:
     view: str
     inter_reflection: tuple[float, float] | None
     """Median and 95th percentile of its share that was taken off f; None if nothing was."""
+    contradicted: int | None
+    """Samples that were left out because they contradict others; None before they were looked for."""
     samples_left: int | None
-    """Samples that can be used after that."""
+    """Samples that can be used after both."""
     triangles: NDArray[np.int64]
     camera_mm: NDArray[np.float64]
     leds: NDArray[np.int64]
@@ -148,6 +152,7 @@ class RunResult:
             {
                 **summary,
                 INTER_REFLECTION: view.inter_reflection,
+                CONTRADICTED: view.contradicted,
                 SAMPLES: summary[SAMPLES] if view.samples_left is None else view.samples_left,
             }
             for summary, view in zip(told, self.views, strict=True)
@@ -330,7 +335,8 @@ def read_view_samples(path: Path) -> ViewSamples:
             path,
             str(file.attrs["view"]),
             None if share is None else (float(share[0]), float(share[1])),
-            None if share is None else int(file.attrs[SAMPLES]),
+            None if CONTRADICTED not in file.attrs else int(file.attrs[CONTRADICTED]),
+            None if SAMPLES not in file.attrs else int(file.attrs[SAMPLES]),
             *(file[name][()] for name in _HEAD),
         )
 

@@ -32,8 +32,8 @@ from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 
 _PART = 64
 _FLAT = 1e-9
-_LEFT_OUT = 100
-"""Samples, at most, that the share of a model is judged by."""
+_LEFT_OUT = 64
+"""Samples, at least, that the share of a model is judged by, if there are so many."""
 
 
 def fit_slices(
@@ -175,7 +175,7 @@ def _fit_one(  # type: ignore[no-untyped-def]
     found[:, :COUNT] = right
     found[:, COUNT] = 1.0
     if over:
-        step = (n + _LEFT_OUT - 1) // _LEFT_OUT
+        step = max(1, n // _LEFT_OUT)
         off = np.empty((2, channels, (n + step - 1) // step))
         left_out(rows, mine, right, factor, step, off[0])
         _wanted(values, which, first, mine)

@@ -102,6 +102,11 @@ def _page(folder: Path) -> Iterator[str]:
         yield "".join(f"<td>{100 * share:.1f} %" for share in summary["share_by_code"].values())
     yield f"</table><p>{about['seconds']:.1f} s, at most {about['peak_memory_bytes'] / 1e9:.1f} GB."
     yield f"<p>{_inter_reflection(about)} Veiling glare is not subtracted, and neither is in the bounds."
+    if left_out := sum(view["contradicted"] or 0 for view in about["views"]):
+        yield (
+            f"<p>{left_out} samples ({100 * left_out / max(about['samples'], 1):.3f} %) were left out: they are "
+            "darker than those beside them allow, as at the edge of a cable's shadow."
+        )
 
 
 def _inter_reflection(about: dict[str, Any]) -> str:

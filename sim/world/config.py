@@ -154,6 +154,8 @@ class Settings(_Model):
     """None: as `shading` has it."""
     arm_shadows: bool = True
     """Whether arm and tool block light."""
+    cables: tuple[ToolBody, ...] = ()
+    """Capsules in the support frame that hang in the cell and block light, of which no plan and no rig knows."""
     material: MaterialConfig | SpecimenConfig | None = None
     """Of the plan's object, multiplied by its mesh's own colours; None: these alone, or warm stone."""
     detail: tuple[Layer, ...] = ()

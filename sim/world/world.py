@@ -54,6 +54,7 @@ class World:
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
         self._ledbox_settings = settings.ledbox
         self._tool, self._arm_shadows = config.scene.tool, settings.arm_shadows
+        self._cables = tool_capsules(np.array(config.scene.base_from_support), settings.cables)
         tell = _told if config.tells_refusals else untold
         self.robot, robot_endpoint = robot.build(self.reactor, settings.robot, tell)
         self.camera, camera_endpoint = self._build_camera(config.camera, folder)
@@ -104,7 +105,7 @@ class World:
                 lighting=self.lighting,
                 pose=self.robot.true_base_from_flange,
                 render=self._photographer.render,
-                arm=self._arm,
+                arm=self._in_the_light,
                 on_exposed=self._exposures.note,
             ),
         )
@@ -117,8 +118,11 @@ class World:
 
     # -- the cables ---------------------------------------------------------------------------------------
 
+    def _in_the_light(self) -> Capsules:
+        """Parts of arm and tool that block light, and cables that hang in the cell."""
+        return np.concatenate([self._arm(), self._cables])
+
     def _arm(self) -> Capsules:
-        """Parts of arm and tool that block light."""
         if not self._arm_shadows:
             return NONE
         tool = tool_capsules(self.robot.true_base_from_flange(), self._tool)

@@ -38,7 +38,16 @@ Floats = NDArray[np.float64]
 
 BY_CELL = PENUMBRA + 1
 """Code of a triangle and an LED that arm, camera or tool may hide from each other."""
-CODES = {"reached": REACHED, "away": AWAY, "shaded": SHADED, "penumbra": PENUMBRA, "hidden by the cell": BY_CELL}
+BY_UNKNOWN = BY_CELL + 1
+"""Of a sample that contradicts those beside it (`contradictions`): something shades it that nobody described."""
+CODES = {
+    "reached": REACHED,
+    "away": AWAY,
+    "shaded": SHADED,
+    "penumbra": PENUMBRA,
+    "hidden by the cell": BY_CELL,
+    "shaded by what is not known": BY_UNKNOWN,
+}
 _PATCHES_BESIDE = 9
 """A patch and those around it."""
 MOST_BLUR_PX = 2.0

@@ -1,0 +1,113 @@
+"""Samples that something in the cell has shaded which nobody described, as a cable: found by their contradiction.
+
+A cable's full shadow is too dark to give samples. At its edge a triangle is lit in part, and its sample is too low
+by any amount. Such a sample is darker than the triangle's material in all channels, where that is mostly diffuse
+(the form of a lobe cannot be blamed), and darker than its noise allows; and the LEDs beside it agree with the
+material, so that neither the triangle nor the model is wrong.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from coupole.reflectance.block_work import Said
+from coupole.reflectance.extraction.extraction import BY_UNKNOWN
+from coupole.reflectance.result_folder import complete
+from coupole.reflectance.run_result import CONTRADICTED, SAMPLES, RunResult, ViewSamples
+from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
+
+Floats = NDArray[np.float64]
+
+BESIDE = 6
+"""LEDs beside one."""
+_FEWEST_BESIDE = 4
+"""Of them, that have a sample."""
+_MOST_LEFT = 0.8
+"""Share of its light that a sample has kept."""
+_AGREE = (0.9, 1.15)
+"""Median of the LEDs beside it over the material."""
+_LEAST_DIFFUSE = 0.5
+"""Of what the material gives."""
+_SIGMA = 5.0
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """LEDs beside each LED of a view."""
+
+    places: NDArray[np.int64]
+    """[leds, BESIDE]"""
+
+    @classmethod
+    def of(cls, led_mm: Floats, middle_mm: Floats) -> Neighbours:
+        """Those in the directions nearest to its own, as the object's middle has them."""
+        ways = led_mm - middle_mm
+        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+        found = cKDTree(ways).query(ways, k=min(BESIDE + 1, len(ways)))[1]
+        return cls(np.asarray(found[:, 1:], np.int64))
+
+
+def contradicted(
+    samples: TriangleSamples, materials: TriangleMaterials, u_noise: NDArray[np.float16], beside: Neighbours
+) -> NDArray[np.bool_]:
+    """[b, leds] of one view's samples, by materials [b] and relative noise [b, leds, channels]."""
+    whole = model_values(samples, materials)
+    ways = samples.led_mm - samples.centres_mm[:, None]
+    cosine = np.einsum("blk,bk->bl", ways, materials.normals) / np.linalg.norm(ways, axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        diffuse = materials.kd[:, None] * np.maximum(cosine, 0.0)[..., None] / whole
+        ratio = samples.values / whole
+    u_ratio = np.nan_to_num(u_noise.astype(np.float32))
+    known = np.isfinite(ratio)
+    low = known & (ratio < _AGREE[0]) & (ratio + _SIGMA * u_ratio * ratio < 1.0) & (diffuse > _LEAST_DIFFUSE)
+    dark: NDArray[np.bool_] = known.any(axis=2) & (low | ~known).all(axis=2)
+    if not dark.any():
+        return dark
+    row, led = np.nonzero(dark)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = np.nansum(ratio[row], axis=2) / known[row].sum(axis=2)
+    others = np.take_along_axis(mean, beside.places[led], axis=1)
+    enough = np.isfinite(others).sum(axis=1) >= _FEWEST_BESIDE
+    middle = np.full(len(others), np.nan)
+    middle[enough] = np.nanmedian(others[enough], axis=1)
+    dark[row, led] = (
+        (middle > _AGREE[0]) & (middle < _AGREE[1]) & (mean[np.arange(len(led)), led] < _MOST_LEFT * middle)
+    )
+    return dark
+
+
+def leave_out(result: RunResult, memory_bytes: int, say: Said) -> None:
+    """Take contradicted samples out of the files of views that still have them; each file is whole, before or
+    after. By `ggx_normal`. Raises OSError."""
+    left = [view for view in result.views if view.contradicted is None]
+    for number, view in enumerate(left, start=1):
+        _leave_out(result, view, memory_bytes)
+        say("contradictions", number, len(left))
+
+
+def _leave_out(result: RunResult, view: ViewSamples, memory_bytes: int) -> None:
+    beside = Neighbours.of(view.led_mm, result.middle_mm)
+
+    def write(part: Path) -> None:
+        shutil.copyfile(view.path, part)
+        with h5py.File(part, "r+") as file:
+            count = used = 0
+            for rows in result.view_blocks(view, memory_bytes // 4):
+                materials = result.materials("ggx_normal", np.searchsorted(result.triangles, view.triangles[rows]))
+                dark = contradicted(result.view_samples(view, rows), materials, file["u_own"][rows], beside)
+                f, codes = file["f"][rows], file["codes"][rows]
+                used += int(np.count_nonzero(np.isfinite(f)))
+                if dark.any():
+                    count += int(np.count_nonzero(np.isfinite(f[dark])))
+                    f[dark], codes[dark] = np.nan, BY_UNKNOWN
+                    file["f"][rows], file["codes"][rows] = f, codes
+            file.attrs[CONTRADICTED], file.attrs[SAMPLES] = count, used - count
+
+    complete(view.path, write)

@@ -77,9 +77,8 @@ def contradicted(
     enough = np.isfinite(others).sum(axis=1) >= _FEWEST_BESIDE
     middle = np.full(len(others), np.nan)
     middle[enough] = np.nanmedian(others[enough], axis=1)
-    dark[row, led] = (
-        (middle > _AGREE[0]) & (middle < _AGREE[1]) & (mean[np.arange(len(led)), led] < _MOST_LEFT * middle)
-    )
+    mine = mean[np.arange(len(led)), led]
+    dark[row, led] = (middle > _AGREE[0]) & (middle < _AGREE[1]) & (mine < _MOST_LEFT * middle)
     return dark
 
 

@@ -17,6 +17,8 @@ from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
 
 Floats = NDArray[np.float64]
+Y_UP_FROM_SUPPORT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""For the programs of computer graphics, in which y is up."""
 
 
 @dataclass(frozen=True)

@@ -200,7 +200,10 @@ def test_a_merl_table_is_read_as_its_reader_does() -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        (("--to", "dng"), "expected one of ply, gltf, materialx, exr, bsdf, merl, alta for a result; found dng"),
+        (
+            ("--to", "dng"),
+            "expected one of ply, gltf, materialx, exr, bsdf, merl, bird, alta for a result; found dng",
+        ),
         (("--to", "ply", "--fit", "sh"), "expected ggx or ggx_normal"),
         (("--to", "ply", "--views", "top"), "are for the frames of a run"),
         (("--to", "ply", "--linear"), "are for frames of a run as dng or tiff"),
@@ -212,7 +215,7 @@ def test_a_merl_table_is_read_as_its_reader_does() -> None:
         (("--to", "bsdf"), "has no clusters; name triangles with --triangle"),
         (("--to", "merl", "--triangle", "99999"), "the mesh has 722, counted from 0"),
         (("--to", "alta"), "--triangle: expected the numbers of triangles"),
-        (("--to", "ply", "--triangle", "3"), "--triangle: is for bsdf, merl, alta; ply has all triangles"),
+        (("--to", "ply", "--triangle", "3"), "--triangle: is for bsdf, merl, bird, alta; ply has all triangles"),
     ],
 )
 def test_what_cannot_be_exported_is_refused(

@@ -579,6 +579,40 @@ def test_samples_are_exported_with_bounds_that_hold_the_truth(made: Made, tmp_pa
     assert np.mean(inside) > 0.9
 
 
+def test_samples_as_the_bird_project_has_them_hold_the_truth(made: Made, tmp_path: Path) -> None:
+    """By its angles of zenith and azimuth the material's formula gives BRDF, within uBRDF as often as it says."""
+    _, out, _ = made
+    with h5py.File(out / "samples/top.h5") as file:
+        many = np.isfinite(file["f"][()]).all(axis=2).sum(axis=1)
+        chosen = file["triangles"][()][np.argsort(many)[-20::4]]
+    options = [word for number in chosen for word in ("--triangle", str(number))]
+    assert cells.here("export", out, "--to", "bird", *options, "--out", tmp_path).code == 0
+    inside = []
+    for path in sorted(tmp_path.glob("*_green.brdf")):
+        document = json.loads(path.read_text())
+        assert document["metadata"]["type"] == "BRDF"
+        assert document["metadata"]["method"] == "simulation"
+        data = document["data"]
+        columns = {name: np.array(data[name]["values"]) for name in data}
+        assert {one["unit"] for name, one in data.items() if "BRDF" not in name} == {"deg"}
+        assert data["BRDF"]["unit"] == data["uBRDF"]["unit"] == "1/sr"
+        assert len({len(column) for column in columns.values()}) == 1
+        assert 0 <= columns["phi_i"].min() < columns["phi_i"].max() < 360
+
+        def ways(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
+            return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
+
+        light, view = (
+            ways(np.radians(columns[f"theta_{end}"]), np.radians(columns[f"phi_{end}"])) for end in "ir"
+        )
+        truth = walter(np.array([[0.0, 0.0, 1.0]]), light, view)[:, 1]
+        inside += (np.abs(columns["BRDF"] - truth) < columns["uBRDF"]).tolist()
+        assert np.median(columns["BRDF"] / truth) == pytest.approx(1.0, abs=0.03)
+        assert 0.01 < np.median(columns["uBRDF"] / truth) < 0.2
+    assert len(inside) > 300
+    assert np.mean(inside) > 0.6  # the mesh is exact here, which a scan's would not be
+
+
 def test_clusters_are_a_few_materials_for_all_and_fill_what_has_too_few_samples(made: Made) -> None:
     _, out, document = made
     to = out / "clustered.npy"

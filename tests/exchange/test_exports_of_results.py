@@ -14,6 +14,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import trimesh
+from MaterialX import PyMaterialXGenGlsl, PyMaterialXGenShader
 from relight_cases import BASE_FROM_SUPPORT, Coat, moved, unit, waves, write_result
 
 from coupole.exchange.of_results.bsdf import encode as encode_bsdf
@@ -100,7 +101,7 @@ def test_gltf_has_the_materials_in_its_textures(result: RunResult, tmp_path: Pat
         value: np.ndarray = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
         return value
 
-    np.testing.assert_allclose(linear(texel(0)), np.pi * np.array(COAT.kd), rtol=0.02)
+    np.testing.assert_allclose((1 - max(COAT.ks)) * linear(texel(0)), np.pi * np.array(COAT.kd), rtol=0.02)
     assert texel(1)[1] ** 2 == pytest.approx(COAT.alpha, rel=0.01)
     f0 = 0.04 * linear(texel(2)) * specular["specularColorFactor"]
     np.testing.assert_allclose(f0, COAT.ks, rtol=0.02)
@@ -110,7 +111,9 @@ def test_materialx_is_a_valid_document_of_openpbr_with_the_materials_in_its_text
     result: RunResult, tmp_path: Path
 ) -> None:
     names = {path.name for path in exported(result, "materialx", tmp_path)}
-    textures = {f"{name}.exr" for name in ("base_color", "specular_color", "specular_roughness")}
+    textures = {
+        f"{name}.exr" for name in ("base_color", "specular_color", "specular_weight", "specular_roughness")
+    }
     assert names == {"surface.mtlx", "surface.obj", *textures}
     library, document = MaterialX.createDocument(), MaterialX.createDocument()
     MaterialX.loadLibraries(
@@ -119,7 +122,15 @@ def test_materialx_is_a_valid_document_of_openpbr_with_the_materials_in_its_text
     document.setDataLibrary(library)
     MaterialX.readFromXmlFile(document, str(tmp_path / "surface.mtlx"))
     assert document.validate() == (True, "")
+    whole = MaterialX.createDocument()
+    MaterialX.readFromXmlFile(whole, str(tmp_path / "surface.mtlx"))
+    whole.importLibrary(library)
+    context = PyMaterialXGenShader.GenContext(PyMaterialXGenGlsl.GlslShaderGenerator.create())
+    context.registerSourceCodeSearchPath(MaterialX.getDefaultDataSearchPath())
     (material,) = document.getMaterialNodes()
+    (rendered,) = PyMaterialXGenShader.findRenderableElements(whole)
+    made = context.getShaderGenerator().generate("measured", rendered, context)
+    assert "mx_dielectric_bsdf" in made.getSourceCode("pixel")
     (shader,) = MaterialX.getShaderNodes(material)
     assert shader.getCategory() == "open_pbr_surface"
     assert document.getActiveColorSpace() == "lin_rec709"
@@ -131,8 +142,11 @@ def test_materialx_is_a_valid_document_of_openpbr_with_the_materials_in_its_text
         return value
 
     ior = shader.getInput("specular_ior").getValue()
-    np.testing.assert_allclose(texel("base_color"), np.pi * np.array(COAT.kd), rtol=1e-6)
-    np.testing.assert_allclose(((ior - 1) / (ior + 1)) ** 2 * texel("specular_color"), COAT.ks, rtol=1e-6)
+    np.testing.assert_allclose((1 - max(COAT.ks)) * texel("base_color"), np.pi * np.array(COAT.kd), rtol=1e-6)
+    f0 = ((ior - 1) / (ior + 1)) ** 2 * texel("specular_weight")
+    assert f0 < 1.0  # of the layer under the tint, which keeps light from the base
+    np.testing.assert_allclose(f0 * texel("specular_color"), COAT.ks, rtol=1e-6)
+    assert texel("specular_color").max() == 1.0
     assert texel("specular_roughness") ** 2 == pytest.approx(COAT.alpha, rel=1e-6)
     mesh = trimesh.load(tmp_path / "surface.obj", process=False)
     x, y, z = moved(np.linalg.inv(BASE_FROM_SUPPORT), result.corners_mm[result.triangles].astype(float)).T

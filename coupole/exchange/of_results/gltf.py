@@ -2,7 +2,8 @@
 
 Colour is pi kd, roughness the square root of GGX's alpha, ks stands as the reflectance at normal incidence
 (KHR_materials_specular over an index of 1.5). glTF's own model differs from the fit: its specular part grows
-towards grazing by Schlick's formula and takes from the diffuse one what it reflects.
+towards grazing by Schlick's formula and takes from the diffuse one what it reflects; what it takes at normal
+incidence is made up for in the colour.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     gloss = np.zeros((len(known), 3))
     gloss[:, 1] = np.sqrt(surface.alpha[known])
     pictures = [
-        _png(srgb(np.pi * surface.kd[known])),
+        _png(srgb(surface.under_a_layer(known))),
         _png(gloss),
         _png(srgb(surface.ks[known] / (_F0 * most_ks))),
     ]

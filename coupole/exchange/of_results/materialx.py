@@ -1,8 +1,9 @@
 """MaterialX 1.39: a document with OpenPBR's surface model, textures of one texel for each triangle, and the mesh.
 
-OpenPBR (Academy Software Foundation, 1.1): colour of the base is pi kd, roughness the square root of GGX's alpha.
-The index of refraction is that of the brightest ks, which the specular colour scales down for each triangle. Like
-glTF's, its specular part grows towards grazing and takes from the diffuse one what it reflects.
+OpenPBR (Academy Software Foundation, 1.1): colour of the base is pi kd and what the layer keeps from it at normal
+incidence, roughness the square root of GGX's alpha. The specular weight scales the reflectance of an index of 1.5 at
+normal incidence to a triangle's ks, of which the specular colour has the hue. Like glTF's, its specular part grows
+towards grazing and takes from the diffuse one what it reflects.
 """
 
 from __future__ import annotations
@@ -19,8 +20,7 @@ from coupole.exchange.of_results.texel_layout import middles, texture
 from coupole.storage.durable import write_synced
 
 DOCUMENT, MESH = "surface.mtlx", "surface.obj"
-_LEAST_F0, _MOST_F0 = 1e-4, 0.95
-"""A ks above the latter is cut off: no index of refraction reflects so much."""
+_IOR, _F0 = 1.5, 0.04
 _SURFACE = "measured_surface"
 
 
@@ -29,39 +29,39 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     coordinate and one normal for each triangle). Triangles without a material are left out."""
     known = np.flatnonzero(surface.known)
     ks = surface.ks[known]
-    most_f0 = float(np.clip(ks.max(initial=0.0), _LEAST_F0, _MOST_F0))
+    most = ks.max(axis=1, keepdims=True)
     textures = {
-        "base_color": np.pi * surface.kd[known],
-        "specular_color": np.clip(ks / most_f0, 0.0, 1.0),
+        "base_color": surface.under_a_layer(known),
+        "specular_color": np.where(most > 0.0, ks / np.maximum(most, 1e-12), 1.0),
+        "specular_weight": most / _F0,
         "specular_roughness": np.sqrt(surface.alpha[known])[:, None],
     }
     paths = [_write_texture(folder / f"{name}.exr", values) for name, values in textures.items()]
-    write_synced(folder / DOCUMENT, _document(surface, ior_of(most_f0)))
+    write_synced(folder / DOCUMENT, _document(surface))
     write_synced(folder / MESH, _mesh(surface, known))
     return [folder / DOCUMENT, folder / MESH, *paths]
 
 
-def ior_of(f0: float) -> float:
-    """Index of refraction against air of a reflectance at normal incidence (Fresnel)."""
-    root = float(np.sqrt(f0))
-    return (1.0 + root) / (1.0 - root)
-
-
-def _document(surface: MeasuredSurface, ior: float) -> bytes:
+def _document(surface: MeasuredSurface) -> bytes:
     head = {"version": "1.39", "colorspace": "lin_rec709"}
     root = ET.Element("materialx", head)
     root.append(ET.Comment(f" {surface.remark} ".replace("--", "- -")))
-    inputs = (("base_color", "color3"), ("specular_color", "color3"), ("specular_roughness", "float"))
-    for name, kind in inputs:
+    inputs = {
+        "base_color": "color3",
+        "specular_color": "color3",
+        "specular_weight": "float",
+        "specular_roughness": "float",
+    }
+    for name, kind in inputs.items():
         image = ET.SubElement(root, "image", name=f"{name}_of_triangles", type=kind)
         ET.SubElement(image, "input", name="file", type="filename", value=f"{name}.exr")
         ET.SubElement(image, "input", name="filtertype", type="string", value="closest")
         for axis in ("uaddressmode", "vaddressmode"):
             ET.SubElement(image, "input", name=axis, type="string", value="clamp")
     shader = ET.SubElement(root, "open_pbr_surface", name=_SURFACE, type="surfaceshader")
-    for name, kind in inputs:
+    for name, kind in inputs.items():
         ET.SubElement(shader, "input", name=name, type=kind, nodename=f"{name}_of_triangles")
-    ET.SubElement(shader, "input", name="specular_ior", type="float", value=f"{ior:.9g}")
+    ET.SubElement(shader, "input", name="specular_ior", type="float", value=str(_IOR))
     material = ET.SubElement(root, "surfacematerial", name=f"{_SURFACE}_material", type="material")
     ET.SubElement(material, "input", name="surfaceshader", type="surfaceshader", nodename=_SURFACE)
     look = ET.SubElement(root, "look", name="measured")

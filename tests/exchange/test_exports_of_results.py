@@ -125,12 +125,12 @@ def test_materialx_is_a_valid_document_of_openpbr_with_the_materials_in_its_text
     whole = MaterialX.createDocument()
     MaterialX.readFromXmlFile(whole, str(tmp_path / "surface.mtlx"))
     whole.importLibrary(library)
-    context = PyMaterialXGenShader.GenContext(PyMaterialXGenGlsl.GlslShaderGenerator.create())
+    generator = PyMaterialXGenGlsl.GlslShaderGenerator.create()
+    context = PyMaterialXGenShader.GenContext(generator)
     context.registerSourceCodeSearchPath(MaterialX.getDefaultDataSearchPath())
-    (material,) = document.getMaterialNodes()
     (rendered,) = PyMaterialXGenShader.findRenderableElements(whole)
-    made = context.getShaderGenerator().generate("measured", rendered, context)
-    assert "mx_dielectric_bsdf" in made.getSourceCode("pixel")
+    assert "mx_dielectric_bsdf" in generator.generate("measured", rendered, context).getSourceCode("pixel")
+    (material,) = document.getMaterialNodes()
     (shader,) = MaterialX.getShaderNodes(material)
     assert shader.getCategory() == "open_pbr_surface"
     assert document.getActiveColorSpace() == "lin_rec709"

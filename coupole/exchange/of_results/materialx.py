@@ -1,9 +1,9 @@
 """MaterialX 1.39: a document with OpenPBR's surface model, textures of one texel for each triangle, and the mesh.
 
 OpenPBR (Academy Software Foundation, 1.1): colour of the base is pi kd and what the layer keeps from it at normal
-incidence, roughness the square root of GGX's alpha. The specular weight scales the reflectance of an index of 1.5 at
-normal incidence to a triangle's ks, of which the specular colour has the hue. Like glTF's, its specular part grows
-towards grazing and takes from the diffuse one what it reflects.
+incidence, roughness the square root of GGX's alpha. The specular weight scales the reflectance of an index of 1.5
+at normal incidence to a triangle's ks, of which the specular colour has the hue. Like glTF's, its specular part
+grows towards grazing and takes from the diffuse one what it reflects.
 """
 
 from __future__ import annotations

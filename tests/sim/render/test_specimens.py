@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from scenes import camera_above, quad, scene_of
+from scipy.spatial.transform import Rotation
 
 from coupole.appearance.matter.hemisphere import albedo
 from coupole.appearance.spectra import light
 from coupole.errors import InputError
 from coupole.exchange.of_results.material_tables import Material as ExportedMaterial
 from coupole.exchange.of_results.merl import encode as encode_merl
-from sim.objects.merl_file import merl_material
+from sim.objects.merl_file import merl_material, read_merl
 from sim.objects.specimens import SPECIMENS, specimen
 from sim.optics.led_light import LedModel, camera_weights
 from sim.render.camera_view import Viewer
@@ -91,6 +92,35 @@ def test_an_exported_material_comes_back_as_the_material_of_an_object(tmp_path: 
         off = np.abs(shown / (f * irradiance(emitter, view.points_mm, up)[:, None]) - 1.0)
         assert np.median(off) < 2e-3
         assert np.quantile(off, 0.95) < 0.01
+
+
+def test_a_measured_material_is_read_at_its_own_angles(tmp_path: Path) -> None:
+    """A made-up one that changes with each of them, and with the colour; angles by Rusinkiewicz' definition."""
+
+    def made_up(theta_h: np.ndarray, theta_d: np.ndarray, phi_d: np.ndarray) -> np.ndarray:
+        value: np.ndarray = 1.0 + 0.5 * np.cos(theta_h) + 0.3 * np.sin(theta_d) * np.cos(2.0 * phi_d + 0.5)
+        return value
+
+    steps = [(np.arange(count) + 0.5) / count for count in (90, 90, 180)]
+    middles = np.meshgrid(0.5 * np.pi * steps[0] ** 2, 0.5 * np.pi * steps[1], np.pi * steps[2], indexing="ij")
+    scales = (1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0)
+    planes = np.stack([(1 + channel) * made_up(*middles) / scale for channel, scale in enumerate(scales)])
+    path = tmp_path / "made-up.binary"
+    path.write_bytes(np.array([90, 90, 180], "<i4").tobytes() + planes.astype("<f8").tobytes())
+    light, eye = unit(np.random.default_rng(3).normal((0.0, 0.0, 1.5), size=(2, 4000, 3)))
+    above = (light[:, 2] > 0.1) & (eye[:, 2] > 0.1)
+    light, eye = light[above], eye[above]
+    middle = unit(light + eye)
+    theta_h, phi_h = np.arccos(middle[:, 2]), np.arctan2(middle[:, 1], middle[:, 0])
+    half = Rotation.from_euler("zy", np.stack([-phi_h, -theta_h], axis=1))
+    x, y, z = half.apply(light).T
+    expected = made_up(theta_h, np.arccos(z), np.arctan2(y, x))
+    found = read_merl(path)(light, eye)
+    np.testing.assert_allclose(found / [1, 2, 3], np.repeat(expected[:, None], 3, axis=1), rtol=5e-3)
+    planes[1, 3, 4, 5] = np.nan
+    path.write_bytes(np.array([90, 90, 180], "<i4").tobytes() + planes.astype("<f8").tobytes())
+    with pytest.raises(InputError, match="no numbers"):
+        read_merl(path)
 
 
 def test_what_is_no_material_of_merls_is_refused(tmp_path: Path) -> None:

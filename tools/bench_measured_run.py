@@ -115,6 +115,7 @@ def read_run(folder: Path) -> tuple[Any, Any]:
     from coupole.calibration.posed_camera import CameraPrior
     from coupole.geometry import apply
     from coupole.reflectance.extraction.measured_run import Drift, MeasuredRun, MeasuredView, Powers
+    from coupole.reflectance.extraction.pointing import pointings
     from coupole.reflectance.extraction.radiance import Radiometry
     from coupole.scan.mesh_files import read_mesh
     from coupole.storage.run import Run
@@ -126,10 +127,12 @@ def read_run(folder: Path) -> tuple[Any, Any]:
     equal = np.ones((count, len(channels_of(frames.pattern))))
     about = frames.about
     lens = Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+    camera, pose = CameraPrior(lens, (), np.eye(4), np.zeros((6, 6))), frames.lit[0].base_from_flange
+    (pointing,) = pointings(camera, pose[None], np.zeros(3))
     measured = MeasuredRun(
         run,
         frames,
-        (MeasuredView(VIEW, frames.lit[0].base_from_flange, frames.lit),),
+        (MeasuredView(VIEW, pose, frames.lit, pointing),),
         lens,
         apply(known["support"], shape.vertices)[shape.triangles],
         shape.triangles,
@@ -143,7 +146,7 @@ def read_run(folder: Path) -> tuple[Any, Any]:
         known["support"],
         Drift(),
         True,
-        CameraPrior(lens, (), np.eye(4), np.zeros((6, 6))),
+        camera,
     )
     radiometry = Radiometry(measured)
     radiometry.noise[:] = NOISE

@@ -9,6 +9,7 @@
 root=$(dirname "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")")
 
 prepare() {
+    forget_stale_kernels
     is_ready && return 0
     mkdir -p "$root/.tools"
     local status=0
@@ -49,6 +50,17 @@ prepare_packages() {
 }
 
 # ---- helpers ----
+
+# Numba keeps what it compiled as long as a function's own file is the same, also if one that it calls has changed
+# in another file: after another commit was checked out it compiles anew.
+forget_stale_kernels() {
+    local made_for="$root/.tools/kernels" commit
+    commit=$(git -C "$root" rev-parse HEAD 2>/dev/null) || return 0
+    [[ -f "$made_for" && "$(<"$made_for")" == "$commit" ]] && return 0
+    find "$root/coupole" "$root/drivers" "$root/sim" -name '*.nbi' -delete
+    mkdir -p "$root/.tools"
+    printf '%s\n' "$commit" >"$made_for"
+}
 
 say() { printf 'coupole: %s\n' "$*" >&2; }
 

@@ -42,7 +42,7 @@ def refine(
     The last options are standard uncertainties that no record states.
     """
     from coupole.reflectance.alignment.refine_job import RefineRequest, refine_runs
-    from coupole.reflectance.alignment.unknowns import Doubts
+    from coupole.reflectance.extraction.pointing import Doubts
     from coupole.viewing import refinement_page
     from coupole.viewing.terminal import make_console, step_bars
 

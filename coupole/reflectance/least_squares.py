@@ -30,6 +30,7 @@ _dgemm = _routine(
 )
 _dpotrf = _routine("lapack", "dpotrf", _CHAR, _INT, _DOUBLE, _INT, _INT)
 _dpotrs = _routine("lapack", "dpotrs", _CHAR, _INT, _INT, _DOUBLE, _INT, _DOUBLE, _INT, _INT)
+_dtrsm = _routine("blas", "dtrsm", _CHAR, _CHAR, _CHAR, _CHAR, _INT, _INT, _DOUBLE, _DOUBLE, _INT, _DOUBLE, _INT)
 
 
 def one_thread() -> Any:
@@ -85,12 +86,13 @@ def solve(factor, right):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def solve_by_samples(rows, penalty, values, memory, right):  # type: ignore[no-untyped-def]
+def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ignore[no-untyped-def]
     """Into `right` [m, n] what `gram`, `factorise`, `sums` and `solve` make of `rows` [n, samples] and `values`
-    [m, samples], with less work for fewer samples than rows; whether there is a solution. `values` are lost.
+    [m, samples], with less work for fewer samples than rows; whether there is a solution.
 
     x = P^-1 R (R^T P^-1 R + 1)^-1 y has a matrix of the samples (Golub and Van Loan, Matrix Computations, 2.1.4:
-    the Sherman-Morrison-Woodbury formula). `memory` has room for 3 n^2.
+    the Sherman-Morrison-Woodbury formula). Cholesky's of that is left in `factor` [samples, samples], its inverse
+    times y in `values`. `memory` has room for 2 n^2.
     """
     count, samples = rows.shape
     scaled = memory[: samples * count].reshape(samples, count)
@@ -98,9 +100,7 @@ def solve_by_samples(rows, penalty, values, memory, right):  # type: ignore[no-u
         weight = 1.0 / np.sqrt(penalty[k])
         for sample in range(samples):
             scaled[sample, k] = weight * rows[k, sample]
-    end = count * count + samples * samples
-    product = memory[count * count : end].reshape(samples, samples)
-    factor = memory[end : end + samples * samples].reshape(samples, samples)
+    product = memory[count * count : count * count + samples * samples].reshape(samples, samples)
     gram(scaled, product)
     if not factorise(product, np.ones(samples), factor):
         return False
@@ -109,3 +109,47 @@ def solve_by_samples(rows, penalty, values, memory, right):  # type: ignore[no-u
     for k in range(count):
         right[:, k] /= penalty[k]
     return True
+
+
+@numba.njit(cache=True, nogil=True)
+def left_out(rows, values, coefficients, factor, step, off):  # type: ignore[no-untyped-def]
+    """Into `off` [m, ...] by how much every `step`-th sample is missed by the fit to all the others.
+
+    `rows` [n, samples], `coefficients` [m, n] and `factor` are those of a solution. For fewer samples than rows
+    `values` [m, samples] are what `solve_by_samples` left, else the samples. That is what the fit to all leaves
+    over 1 - h, h the diagonal of the matrix from samples to fitted values (Golub, Heath, Wahba, Technometrics 21,
+    1979); with the matrix of the samples both have the diagonal of its inverse as a factor.
+    """
+    (count, samples), size = rows.shape, len(factor)
+    columns = np.zeros((off.shape[1], size))
+    for place in range(len(columns)):
+        if samples < count:
+            columns[place, place * step] = 1.0
+        else:
+            for k in range(count):
+                columns[place, k] = rows[k, place * step]
+    _half_solve(factor, columns)
+    for place in range(len(columns)):
+        square = 0.0
+        for k in range(size):
+            square += columns[place, k] ** 2
+        for channel in range(len(values)):
+            rest = values[channel, place * step]
+            if samples < count:
+                off[channel, place] = rest / square
+            else:
+                for k in range(count):
+                    rest -= coefficients[channel, k] * rows[k, place * step]
+                off[channel, place] = rest / max(1.0 - square, 1e-9)
+
+
+@numba.njit(cache=True, nogil=True)
+def _half_solve(factor, right):  # type: ignore[no-untyped-def]
+    """In place: L^-1 of each row of `right` [m, n], with L L^T what was factorised."""
+    letters = np.array([76, 85, 84, 78], np.uint8)  # from the left, upper, transposed, not of diagonal 1
+    sizes = np.array([len(factor), len(right)], np.intc)
+    one = np.array([1.0])
+    _dtrsm(
+        letters.ctypes, letters[1:].ctypes, letters[2:].ctypes, letters[3:].ctypes, sizes.ctypes, sizes[1:].ctypes,
+        one.ctypes, factor.ctypes, sizes.ctypes, right.ctypes, sizes.ctypes,
+    )  # fmt: skip

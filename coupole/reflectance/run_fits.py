@@ -91,8 +91,6 @@ def predicted(
         assert model is not None
         return model
     coefficients = result.slices(name, view, rows)
-    if model is not None:
-        coefficients = np.nan_to_num(coefficients)
     return slice_values(samples, coefficients, kind.basis, model)
 
 

@@ -178,7 +178,7 @@ def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = 
     over, coefficients = SLICES[name].over, result.slices(name, mine)
     slices = Slices(name, coefficients, None)
     if over is not None:
-        slices = Slices(name, np.nan_to_num(coefficients), materials_of(result, over, surface))
+        slices = Slices(name, coefficients, materials_of(result, over, surface))
     return RelitScene(result, name, surface, slices, order, rays)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError, Problem
 from coupole.reflectance.cluster_file import Clusters, read_clusters
 from coupole.reflectance.ggx import UNKNOWNS
-from coupole.reflectance.slice_basis import HARMONICS, RADIAL, RESIDUAL, Basis
+from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples
 
 SCHEMA = "coupole-reflectance-run/1"
@@ -298,8 +298,12 @@ class RunResult:
         return read_clusters(self.folder)
 
     def slices(self, name: str, view: ViewSamples, rows: slice = slice(None)) -> NDArray[np.float32]:
-        """[n, channels, coefficients] of rows of a view's file, by a fit's name in `SLICES`."""
-        with h5py.File(self.slices_path(name, view), "r") as file:
+        """[n, channels, coefficients] of rows of a view's file, by a fit's name in `SLICES`. Raises InputError for
+        one that an earlier version made."""
+        path = self.slices_path(name, view)
+        with h5py.File(path, "r") as file:
+            if file["coefficients"].shape[-1] != COUNT + (SLICES[name].over is not None):
+                raise InputError(f"{path}: an earlier version made it; make the result anew")
             return np.asarray(file["coefficients"][rows], np.float32)
 
 

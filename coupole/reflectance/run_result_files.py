@@ -53,10 +53,12 @@ def write_materials(
 
 
 def begin_slices(file: h5py.File, kind: SliceKind, view: ViewSamples, channels: int) -> h5py.Dataset:
-    """Describe a fit of a view in a new file; where its coefficients [triangles, channels, COUNT] go."""
-    shape = (len(view.triangles), channels, COUNT)
+    """Describe a fit of a view in a new file; where its coefficients [triangles, channels, ...] go."""
+    shape = (len(view.triangles), channels, COUNT + (kind.over is not None))
     data = file.create_dataset("coefficients", shape, np.float32, fillvalue=np.nan, track_times=False)
     data.attrs["told"] = "[triangles of the view, channels, coefficients] 1/sr; NaN where too few samples are"
+    if kind.over is not None:
+        data.attrs["last"] = "the share of the fit `added_to` that is in the sum"
     data.attrs["basis"] = (
         "real spherical harmonics, orthonormal, degrees 0 to 9, order by order"
         if kind.basis.harmonic

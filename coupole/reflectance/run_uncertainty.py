@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples, u_inter_reflection
+from coupole.reflectance.run_result import RunResult, ViewSamples
+from coupole.reflectance.sample_sources import ChannelSamples, channel_samples
 from coupole.reflectance.sample_uncertainty import SOURCES, Places, Sources, bounds, drawn
 
 Floats = NDArray[np.float64]
@@ -23,6 +22,8 @@ _TYPICAL = 200_000
 """Samples of all views, for what is typical."""
 _TRIANGLES = 2000
 """Of each view, which they are taken of."""
+_LEDS = 128
+"""Of each view."""
 _DRAWN, _DRAWS = 1000, 300
 """Samples, of all views, and draws for each."""
 
@@ -75,49 +76,18 @@ def percentiles(low: Floats, high: Floats) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class KnownSamples:
-    """Some samples of one channel of a view, and what is known of them."""
-
-    rows: NDArray[np.int64]
-    """[n] of the view's file."""
-    leds: NDArray[np.int64]
-    """[n] places in the view's LEDs."""
-    f: Floats
-    places: Places
-    sources: Sources
-
-
 def known_samples(
     result: RunResult, view: ViewSamples, channel: int, scan_noise_um: float, *, most: int, of_triangles: int
-) -> KnownSamples:
-    """At most `most` samples, of triangles that are spread over the view, about `of_triangles`."""
-    step = max(1, len(view.triangles) // of_triangles)
-    with h5py.File(view.path, "r") as file:
-        values, noise = (file[name][::step][..., channel] for name in ("f", "u_own"))
-        own, shared = file["led_u_own"][:, channel], file["led_u_shared"][:, channel]
-        response = file["u_response"][::step, channel]
-        indirect = np.zeros(noise.shape)
-        if view.inter_reflection is not None:
-            indirect = u_inter_reflection(file[INTER_REFLECTION][::step][..., channel])
-        led_mm = float(file.attrs["led_u_mm"])
-    known = np.flatnonzero(np.isfinite(noise))
+) -> ChannelSamples:
+    """At most `most` samples that have a value, of triangles and LEDs that are spread over the view, about
+    `of_triangles` of the former."""
+    rows = np.arange(0, len(view.triangles), max(1, len(view.triangles) // of_triangles))
+    leds = np.arange(0, len(view.leds), -(-len(view.leds) // _LEDS))
+    some = channel_samples(result, view, rows, leds, channel, scan_noise_um)
+    known = some.known
     if len(known) > most:
-        known = np.random.default_rng(2).choice(known, most, replace=False)
-    triangle, led = np.unravel_index(known, noise.shape)
-    corners = result.corners_mm[view.triangles[::step]].astype(np.float64)
-    same = np.ones(len(led))
-    sources = Sources(
-        noise[triangle, led].astype(np.float64),
-        response[triangle],
-        indirect[triangle, led],
-        own[led],
-        shared[led],
-        scan_noise_um * same,
-        led_mm * same,
-    )
-    places = Places(corners[triangle], view.led_mm[led], view.led_normals[led])
-    return KnownSamples(triangle * step, led, values[triangle, led].astype(np.float64), places, sources)
+        known = np.sort(np.random.default_rng(2).choice(known, most, replace=False))
+    return some.at(known)
 
 
 def _joined(parts: Sequence[Places] | Sequence[Sources]) -> list[Floats]:

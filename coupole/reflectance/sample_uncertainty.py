@@ -23,6 +23,7 @@ SOURCES = {
     "u_noise": "noise of the frames",
     "u_response": "own responses of pixels",
     "u_indirect": "inter-reflection taken off",
+    "u_place": "where pixels look",
     "u_own": "power of each LED",
     "u_shared": "power of all LEDs",
     "vertex_um": "vertices of the mesh",
@@ -41,6 +42,8 @@ class Sources:
     """[n] relative, of the responses of the pixels that a triangle covers."""
     u_indirect: Floats
     """[n] relative, of the inter-reflection that was taken off."""
+    u_place: Floats
+    """[n] relative, of what pixels may see beside a triangle."""
     u_own: Floats
     """[n] relative, of an LED's power."""
     u_shared: Floats
@@ -49,6 +52,13 @@ class Sources:
     """[n] of each coordinate of a vertex, independent."""
     led_mm: Floats
     """[n] of each coordinate of an LED."""
+
+    @property
+    def u_signal(self) -> Floats:
+        """[n] relative."""
+        parts = (self.u_noise, self.u_response, self.u_indirect, self.u_place)
+        found: Floats = np.sqrt(np.sum(np.square(parts), axis=0))
+        return found
 
     def without(self, source: str) -> Sources:
         """The same with one of `SOURCES` at 0."""
@@ -85,7 +95,7 @@ def bounds(places: Places, sources: Sources, quantile: float) -> tuple[Floats, F
     by_tilt2 = np.einsum("ni,nij,nj->n", towards, tilt, towards) / cosine**2
     by_place2 = (sources.led_mm / distances) ** 2 * (4.0 + 1.0 / cosine**2 - 1.0)
     below2 = quantile**2 * (by_tilt2 + by_place2 + sources.u_own**2 + sources.u_shared**2)
-    above2 = quantile**2 * (sources.u_noise**2 + sources.u_response**2 + sources.u_indirect**2)
+    above2 = quantile**2 * sources.u_signal**2
     root = np.sqrt(np.maximum(1.0 - (1.0 - below2) * (1.0 - above2), 0.0))
     # a tilt to any side makes the mean of the cosine smaller
     longer = np.sqrt(1.0 + np.trace(tilt, axis1=1, axis2=2))
@@ -128,8 +138,7 @@ def drawn(
     axes = np.broadcast_to(places.led_normals[:, None], leds.shape)
     flat = _geometry(corners.reshape(-1, 3, 3), leds.reshape(-1, 3), axes.reshape(-1, 3), paper)
     geometry = flat.reshape(count, draws)
-    above = np.sqrt(sources.u_noise**2 + sources.u_response**2 + sources.u_indirect**2)
-    signal = 1.0 + above[:, None] * normal()
+    signal = 1.0 + sources.u_signal[:, None] * normal()
     power = (1.0 + sources.u_own[:, None] * normal()) * (1.0 + sources.u_shared[:, None] * normal())
     with np.errstate(divide="ignore"):
         found: Floats = signal * measured[:, None] / (power * geometry)

@@ -2,6 +2,9 @@
 
 A sample's error counts as it shows in a picture, multiplied with the cosine of incidence; what a slice gives is
 never below 0. A slice holds for the view that it was fitted to (seed 003, 6.3).
+
+A fit to what a model leaves is stacked with one to the samples themselves (Breiman, Stacked regressions, Machine
+Learning 24, 1996): the share of the model is the one with which samples that are left out are missed least.
 """
 
 from __future__ import annotations
@@ -12,14 +15,25 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
+from numpy import ascontiguousarray as ordered  # functions are compiled for each layout
 from numpy.typing import NDArray
 
-from coupole.reflectance.least_squares import factorise, gram, one_thread, solve, solve_by_samples, sums
+from coupole.reflectance.least_squares import (
+    factorise,
+    gram,
+    left_out,
+    one_thread,
+    solve,
+    solve_by_samples,
+    sums,
+)
 from coupole.reflectance.slice_basis import COUNT, LEAST_RESIDUAL, USUAL_LEFT, Basis, functions
 from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 
 _PART = 64
 _FLAT = 1e-9
+_LEFT_OUT = 100
+"""Samples, at most, that the share of a model is judged by."""
 
 
 def fit_slices(
@@ -30,11 +44,12 @@ def fit_slices(
 ) -> list[NDArray[np.float32]]:
     """For each of some fits with the same functions, [b, channels, COUNT] coefficients; NaN for too few samples.
 
-    From those `used` [samples] of one view's samples, or of what a model [b, samples, channels] leaves of them.
-    The more it leaves, the less are coefficients held.
+    From those `used` [samples] of one view's samples. With a model [b, samples, channels] they are added to a
+    share of it, one more coefficient at the end: the mean of a fit to what the model leaves and of one to the
+    samples, by how well each foretells samples. The more a model leaves, the less are coefficients held.
     """
     count, _, channels = samples.values.shape
-    found = np.full((len(fits), count, channels, COUNT), np.nan, np.float32)
+    found = np.full((len(fits), count, channels, COUNT + 1), np.nan, np.float32)
     left = np.stack([samples.values if model is None else samples.values - model for _, model in fits])
     penalties = np.stack([basis.penalty for basis, _ in fits])
     over = np.array([model is not None for _, model in fits])
@@ -43,13 +58,14 @@ def fit_slices(
     def fit(first: int) -> None:
         part = slice(first, min(first + _PART, count))
         _fit_part(
-            samples.values[part], left[:, part], samples.led_mm, camera_mm, samples.centres_mm[part],
-            samples.normals[part], which, fits[0][0].harmonic, penalties, over, found[:, part],
+            ordered(samples.values[part]), ordered(left[:, part]), ordered(samples.led_mm), ordered(camera_mm),
+            ordered(samples.centres_mm[part]), ordered(samples.normals[part]), which, fits[0][0].harmonic,
+            penalties, over, found[:, part],
         )  # fmt: skip
 
     with one_thread(), ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(fit, range(0, count, _PART)))
-    return list(found)
+    return [one if model is not None else one[..., :COUNT] for one, (_, model) in zip(found, fits, strict=True)]
 
 
 def slice_values(
@@ -58,12 +74,16 @@ def slice_values(
     basis: Basis,
     model: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """[b, samples, channels] f cos_i, 1/sr, that slices, on top of a `model` if they were fitted to what it left,
-    give where the samples of one view are; NaN without slice."""
-    made = np.zeros(samples.values.shape, np.float32) if model is None else model.copy()
+    """[b, samples, channels] f cos_i, 1/sr, that slices, on top of their share of a `model` if they were fitted
+    with one, give where the samples of one view are. Without slice: the model, or NaN."""
+    made = np.zeros(samples.values.shape, np.float32)
+    if model is not None:
+        share = coefficients[..., COUNT]
+        made = np.nan_to_num(share, nan=1.0)[:, None] * model
+        coefficients = np.nan_to_num(coefficients[..., :COUNT])
     _add_part(
-        coefficients, samples.led_mm, samples.cameras_mm[0], samples.centres_mm, samples.normals, basis.harmonic,
-        made,
+        ordered(coefficients), ordered(samples.led_mm), ordered(samples.cameras_mm[0]),
+        ordered(samples.centres_mm), ordered(samples.normals), basis.harmonic, made,
     )  # fmt: skip
     return np.maximum(made, 0.0)
 
@@ -107,9 +127,11 @@ def _fit_part(  # type: ignore[no-untyped-def]
     """Channels with the same samples share their matrix."""
     count, _, channels = values.shape
     memory, which = np.empty(COUNT * len(used)), np.empty(len(used), np.int64)
-    wanted, xyz = np.empty(channels * len(used)), np.empty((3, len(used)))
-    product, room = np.zeros((COUNT, COUNT)), np.empty(3 * COUNT * COUNT)
-    right, frame, held = np.empty((channels, COUNT)), np.empty((3, 3)), np.empty(COUNT)
+    xyz, product, frame = np.empty((3, len(used))), np.zeros((COUNT, COUNT)), np.empty((3, 3))
+    memories = (
+        np.empty(COUNT), np.empty(COUNT * COUNT), np.empty(2 * COUNT * COUNT), np.empty(channels * len(used)),
+        np.empty((channels, COUNT)),
+    )  # fmt: skip
     for triangle in range(count):
         _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
         end = 0
@@ -128,16 +150,64 @@ def _fit_part(  # type: ignore[no-untyped-def]
                     rows[k, number] *= z[number]
             if n >= COUNT:
                 gram(rows, product)
-            mine = wanted[: (end - first) * n].reshape(end - first, n)
             for fit in range(len(left)):
-                for number in range(n):
-                    for channel in range(first, end):
-                        mine[channel - first, number] = left[fit, triangle, which[number], channel]
-                held[:] = penalties[fit]
-                if over[fit]:
-                    held *= _held_by(mine, values[triangle], which[:n], first)
-                if _solve(rows, product, held, mine, room, right[: end - first]):
-                    found[fit, triangle, first:end] = right[: end - first]
+                _fit_one(
+                    rows, product, values[triangle], left[fit, triangle], which[:n], first, penalties[fit],
+                    over[fit], memories, found[fit, triangle, first:end],
+                )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_one(  # type: ignore[no-untyped-def]
+    rows, product, values, left, which, first, penalty, over, memories, found
+):
+    """Into `found` [channels, COUNT + 1] a fit to `left` of the samples `which` [n] in channels from `first`."""
+    channels, n, size = len(found), len(which), min(len(which), COUNT)
+    held, matrix, room, wanted, solution = memories
+    mine, right = wanted[: channels * n].reshape(channels, n), solution[:channels]
+    factor = matrix[: size * size].reshape(size, size)
+    _wanted(left, which, first, mine)
+    held[:] = penalty
+    if over:
+        held *= _held_by(mine, values, which, first)
+    if not _solve(rows, product, held, mine, room, factor, right):
+        return
+    found[:, :COUNT] = right
+    found[:, COUNT] = 1.0
+    if over:
+        step = (n + _LEFT_OUT - 1) // _LEFT_OUT
+        off = np.empty((2, channels, (n + step - 1) // step))
+        left_out(rows, mine, right, factor, step, off[0])
+        _wanted(values, which, first, mine)
+        held[:] = LEAST_RESIDUAL * penalty
+        if _solve(rows, product, held, mine, room, factor, right):
+            left_out(rows, mine, right, factor, step, off[1])
+            _stack(off, right, found)
+
+
+@numba.njit(cache=True, nogil=True)
+def _wanted(values, which, first, wanted):  # type: ignore[no-untyped-def]
+    """Into `wanted` [channels, n] the samples `which` [n] in the channels from `first`."""
+    for channel in range(len(wanted)):
+        for number in range(len(which)):
+            wanted[channel, number] = values[which[number], first + channel]
+
+
+@numba.njit(cache=True, nogil=True)
+def _stack(off, plain, found):  # type: ignore[no-untyped-def]
+    """Make of `found` [channels, COUNT + 1], a model and what it leaves, and of `plain` [channels, COUNT] the mean
+    that misses least what both miss, `off` [2, channels, samples]."""
+    gained, apart = 0.0, 0.0
+    for channel in range(off.shape[1]):
+        for number in range(off.shape[2]):
+            between = off[1, channel, number] - off[0, channel, number]
+            gained += between * off[1, channel, number]
+            apart += between * between
+    share = min(1.0, max(0.0, gained / max(apart, 1e-30)))
+    for channel in range(len(found)):
+        found[channel, COUNT] = share
+        for k in range(COUNT):
+            found[channel, k] = share * found[channel, k] + (1.0 - share) * plain[channel, k]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -153,12 +223,11 @@ def _held_by(left, values, which, first):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _solve(rows, product, penalty, values, room, right):  # type: ignore[no-untyped-def]
+def _solve(rows, product, penalty, values, room, factor, right):  # type: ignore[no-untyped-def]
     """Into `right` the coefficients, the shorter way; whether there are some. `product` is of `gram` where samples
     are as many as functions."""
     if rows.shape[1] < COUNT:
-        return solve_by_samples(rows, penalty, values, room, right)
-    factor = room[: COUNT * COUNT].reshape(COUNT, COUNT)
+        return solve_by_samples(rows, penalty, values, room, factor, right)
     if not factorise(product, penalty, factor):
         return False
     sums(rows, values, right)

@@ -206,6 +206,20 @@ def test_a_packet_out_of_order_does_not_disturb_the_count_of_late_answers() -> N
     assert session.late == 2
 
 
+@pytest.mark.parametrize(("every", "told"), [(1000, False), (12, True)])
+def test_late_answers_are_told_of_an_arm_that_does_not_follow(every: int, told: bool) -> None:
+    session, delay = RsiSession(CONFIG), 0
+    session.answer(packet(100), 0)
+    session.obey(turn_a1(20.0))
+    for ipoc in range(104, 900, 4):
+        delay += ipoc % every == 0
+        session.answer(packet(ipoc, delay=delay), 0)
+        if session.fault != shared_state.NO_FAULT:
+            break
+    assert session.fault == shared_state.NOT_FOLLOWING
+    assert (b"late answers meanwhile" in session.fault_text) == told
+
+
 @pytest.mark.parametrize("mode", ["absolute", "relative"])
 def test_the_answers_after_a_fault_move_nothing(mode: str) -> None:
     session = RsiSession(replace(CONFIG, mode=mode))

@@ -20,7 +20,8 @@ from coupole.errors import InputError
 from coupole.reflectance.alignment import refine_job
 from coupole.reflectance.alignment.refine_job import given_by
 from coupole.reflectance.alignment.refined_geometry import ABOUT, REFINED, SCHEMA, read_refined
-from coupole.reflectance.alignment.unknowns import STATED, Unknowns
+from coupole.reflectance.alignment.unknowns import Unknowns
+from coupole.reflectance.extraction.pointing import STATED
 from coupole.storage.durable import sha256
 
 VERTICES = np.array([[900, 900, 900], [0, 0, 0], [7, 7, 7], [4, 0, 0], [0, 4, 0], [4, 4, 0], [-5, 0, 0]], float)

@@ -152,4 +152,4 @@ def test_a_model_that_leaves_everything_holds_coefficients_no_more_than_none() -
     samples, _ = noisy_case(1)
     used = np.ones(len(samples.led_mm), bool)
     alone, of_the_rest = fit_slices(samples, used, (RADIAL, None), (RESIDUAL, np.zeros_like(samples.values)))
-    np.testing.assert_allclose(of_the_rest, alone, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(of_the_rest[..., :COUNT], alone, rtol=1e-5, atol=1e-5)

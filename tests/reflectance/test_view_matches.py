@@ -16,9 +16,10 @@ from coupole.errors import InputError
 from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.alignment import refinement
 from coupole.reflectance.alignment.refinement import match_lines, refine
-from coupole.reflectance.alignment.unknowns import Doubts, Given, Unknowns, camera_covariance, control_points
+from coupole.reflectance.alignment.unknowns import Given, Unknowns, control_points
 from coupole.reflectance.alignment.view_matches import Matches, match_views
 from coupole.reflectance.alignment.view_surface import ViewSurface, view_surface
+from coupole.reflectance.extraction.pointing import Doubts, camera_covariance
 
 Floats = NDArray[np.float64]
 LENS = Intrinsics(800.0, 800.0, 199.5, 149.5, k1=-0.05)

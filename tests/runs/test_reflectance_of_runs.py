@@ -289,8 +289,8 @@ def noisy_samples(noisy: Path, clean: Path) -> tuple[np.ndarray, Places, Sources
     with h5py.File(noisy / "object.h5") as file:
         corners = file["corners_mm"][()].astype(float)[triangles[triangle]]
     same = np.ones(len(led))
-    noise = u_own[triangle, led].astype(float)
-    sources = Sources(noise, u_response[triangle], 0 * same, u_led[led], u_leds[led], 30.0 * same, led_mm * same)
+    noise, own = u_own[triangle, led].astype(float), u_response[triangle]
+    sources = Sources(noise, own, 0 * same, 0 * same, u_led[led], u_leds[led], 30.0 * same, led_mm * same)
     return truth / f[triangle, led], Places(corners, leds[led], axes[led]), sources
 
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from coupole.errors import InputError
 from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface
-from coupole.reflectance.run_result import INTER_REFLECTION, ViewSamples, u_inter_reflection
-from coupole.reflectance.sample_uncertainty import Places, Sources, bounds
+from coupole.reflectance.run_result import ViewSamples
+from coupole.reflectance.sample_sources import channel_samples
+from coupole.reflectance.sample_uncertainty import bounds
 
 
 @dataclass(frozen=True)
@@ -59,31 +60,19 @@ def _of_view(
 ) -> tuple[Floats, ...]:
     row = int(np.searchsorted(view.triangles, triangle))
     with h5py.File(view.path, "r") as file:
-        f, u_noise = file["f"][row].astype(np.float64), file["u_own"][row].astype(np.float64)
-        own, shared, response = file["led_u_own"][()], file["led_u_shared"][()], file["u_response"][row]
-        indirect = np.zeros(f.shape)
-        if view.inter_reflection is not None:
-            indirect = u_inter_reflection(file[INTER_REFLECTION][row])
-        led_mm, normal = float(file.attrs["led_u_mm"]), file["normals"][row].astype(np.float64)
+        normal = file["normals"][row].astype(np.float64)
+    leds = np.arange(len(view.leds))
+    shape = (len(leds), surface.result.channels)
+    f, low, high = np.empty(shape), np.empty(shape), np.empty(shape)
+    for channel in range(surface.result.channels):
+        mine = channel_samples(surface.result, view, np.array([row]), leds, channel, scan_noise_um)
+        f[:, channel] = mine.f
+        low[:, channel], high[:, channel] = bounds(mine.places, mine.sources, quantile)
     corners = surface.result.corners_mm[triangle].astype(np.float64)
-    count, same = len(view.leds), np.ones(len(view.leds))
-    places = Places(np.broadcast_to(corners, (count, 3, 3)), view.led_mm, view.led_normals)
-    low, high = np.empty(f.shape), np.empty(f.shape)
-    for channel in range(f.shape[1]):
-        sources = Sources(
-            u_noise[:, channel],
-            response[channel] * same,
-            indirect[:, channel],
-            own[:, channel],
-            shared[:, channel],
-            scan_noise_um * same,
-            led_mm * same,
-        )
-        low[:, channel], high[:, channel] = bounds(places, sources, quantile)
     own_from_base = _frame(normal, along_x)
     ways = [
         _directions(places_mm, corners.mean(axis=0), own_from_base)
-        for places_mm in (view.led_mm, np.broadcast_to(view.camera_mm, (count, 3)))
+        for places_mm in (view.led_mm, np.broadcast_to(view.camera_mm, (len(leds), 3)))
     ]
     return (*ways, f, low, high)
 

@@ -23,9 +23,10 @@ from coupole.preflight.object_shape import MM_PER_UNIT
 from coupole.reflectance.alignment.matt_picture import Said, common_leds, matt_picture
 from coupole.reflectance.alignment.refined_geometry import ABOUT, REFINED, SCHEMA, write_refined
 from coupole.reflectance.alignment.refinement import Refined, refine
-from coupole.reflectance.alignment.unknowns import STATED, Doubts, Given, camera_covariance, renumbered, welded
+from coupole.reflectance.alignment.unknowns import Given, renumbered, welded
 from coupole.reflectance.alignment.view_matches import Matches
 from coupole.reflectance.extraction.measured_run import MeasuredRun, read_measured_run, refuse_different
+from coupole.reflectance.extraction.pointing import STATED, Doubts, camera_covariance
 from coupole.reflectance.extraction.radiance import Radiometry
 from coupole.reflectance.result_folder import complete
 from coupole.storage.disk_errors import disk_error

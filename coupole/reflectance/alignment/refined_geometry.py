@@ -17,11 +17,12 @@ from coupole.errors import InputError
 from coupole.reflectance.alignment.refinement import Refined
 from coupole.reflectance.alignment.unknowns import renumbered
 from coupole.reflectance.extraction.measured_run import MeasuredRun
+from coupole.reflectance.extraction.pointing import Pointing
 from coupole.storage.durable import sha256
 
 Floats = NDArray[np.float64]
 REFINED, ABOUT = "refined.h5", "refined.json"
-SCHEMA = "coupole-refinement/2"
+SCHEMA = "coupole-refinement/3"
 PREVIEW_PX = 640
 """Largest width of a view's picture in the file."""
 TOLD = {
@@ -35,6 +36,7 @@ TOLD = {
     "covariance": "of the steps",
     "stated_covariance": "of the unknowns before the pictures counted, by records and scan",
     "controls_mm": "[controls, 3] where `shape` is, base frame",
+    "middle_mm": "[3] about which `mesh` turns, base frame",
 }
 MATCH_FIELDS = {
     "reference": "place in `views` of the one that sees the spot in the greatest detail",
@@ -57,6 +59,8 @@ class RefinedGeometry:
     mesh_sha256: str
     inputs: dict[str, dict[str, str]]
     """Name and SHA-256 of the files that were read, by run."""
+    pointings: dict[tuple[str, str], Pointing]
+    """By run and view."""
 
     def of(self, measured: MeasuredRun) -> MeasuredRun:
         """A run with them. Raises InputError for a run, view or mesh that was not refined, and for a run that has
@@ -77,7 +81,12 @@ class RefinedGeometry:
                 "anew, with another --out"
             )
         views = tuple(
-            replace(view, base_from_camera=self.base_from_camera[run, view.name]) for view in measured.views
+            replace(
+                view,
+                base_from_camera=self.base_from_camera[run, view.name],
+                pointing=self.pointings[run, view.name],
+            )
+            for view in measured.views
         )
         corners_mm = self.vertices_mm[renumbered(measured.triangles)]
         return replace(measured, lens=self.lens, views=views, corners_mm=corners_mm)
@@ -96,9 +105,11 @@ def read_refined(folder: Path) -> RefinedGeometry:
             lens = Intrinsics(**dict(zip(NAMES, map(float, file["lens"][()]), strict=True)))
             poses = dict(zip(views, file["base_from_camera"][()], strict=True))
             vertices_mm, digest = file["vertices_mm"][()], str(file.attrs["mesh_sha256"])
+            covariance, middle_mm = file["covariance"][()], file["middle_mm"][()]
+            pointings = _pointings(list(file["names"].asstr()[()]), covariance, middle_mm, views)
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path}: expected the result of `coupole reflectance refine`: {error}") from error
-    return RefinedGeometry(path, lens, poses, vertices_mm, digest, _told(folder, "inputs"))
+    return RefinedGeometry(path, lens, poses, vertices_mm, digest, _told(folder, "inputs"), pointings)
 
 
 def what_was_refined(folder: Path) -> dict[str, Any]:
@@ -125,6 +136,7 @@ def write_refined(
         "covariance": refined.covariance,
         "stated_covariance": unknowns.covariance,
         "controls_mm": unknowns.controls_mm,
+        "middle_mm": unknowns.middle_mm,
     }
     with h5py.File(path, "w") as file:
         file.attrs.update(schema=SCHEMA, mesh_sha256=mesh_sha256, simulated=simulated)
@@ -143,6 +155,21 @@ def write_refined(
             data = file.create_dataset(f"pictures/{number}", data=_preview(picture), track_times=False)
             data.attrs["blocks"] = picture.shape
             data.attrs["told"] = "what the view was compared by, scaled down; its height and width were `blocks`"
+
+
+def _pointings(
+    names: list[str], covariance: Floats, middle_mm: Floats, views: Sequence[tuple[str, str]]
+) -> dict[tuple[str, str], Pointing]:
+    """How well it is known where cameras look, from the covariance of the unknowns of these names."""
+    of_lens = [place for place, name in enumerate(names) if name.removesuffix("_px") in NAMES]
+    of_mesh = [place for place, name in enumerate(names) if name.startswith("mesh.")]
+    free = tuple(names[place].removesuffix("_px") for place in of_lens)
+    found = {}
+    for number, view in enumerate(views):
+        of_camera = [place for place, name in enumerate(names) if name.startswith(f"camera{number}.")]
+        own = [*of_lens, *of_camera, *of_mesh]
+        found[view] = Pointing(free, covariance[np.ix_(own, own)], middle_mm)
+    return found
 
 
 def _told(folder: Path, name: str) -> Any:

@@ -23,9 +23,10 @@ from coupole.calibration.adjustment import Adjusted, Block, Group, adjust
 from coupole.calibration.rotations import skew
 from coupole.errors import InputError
 from coupole.motion.packet_rays import PacketMesh
-from coupole.reflectance.alignment.unknowns import Doubts, Given, Unknowns, control_points
+from coupole.reflectance.alignment.unknowns import Given, Unknowns, control_points
 from coupole.reflectance.alignment.view_matches import Matches, match_views
 from coupole.reflectance.alignment.view_surface import ViewSurface, view_surface
+from coupole.reflectance.extraction.pointing import Doubts
 
 Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from coupole.calibration.optics import NAMES, Intrinsics
-from coupole.calibration.posed_camera import CameraPrior
-from coupole.calibration.rotations import moved, rotation, skew
+from coupole.calibration.rotations import moved, rotation
 from coupole.errors import InputError
+from coupole.reflectance.extraction.pointing import Doubts
 
 Floats = NDArray[np.float64]
 MOST_CONTROLS = 600
@@ -29,25 +29,6 @@ _TOGETHER = 1 << 16
 """Vertices."""
 _NUGGET = 1e-6
 """Of a control point's variance, that it shares with no other: keeps the covariance's inverse exact."""
-
-
-@dataclass(frozen=True)
-class Doubts:
-    """Standard uncertainties that no record states."""
-
-    arm_mm: float = 0.03
-    """Of the flange's position in each view, in each direction."""
-    arm_deg: float = 0.003
-    mesh_mm: float = 0.1
-    """Of the mesh's place in the base frame, in each direction."""
-    mesh_deg: float = 0.02
-    shape_mm: float = 0.03
-    """Of the surface along its normals, alike over `scale_mm`."""
-    scale_mm: float = 20.0
-
-
-STATED = Doubts()
-"""Unless a user states others."""
 
 
 @dataclass(frozen=True)
@@ -64,26 +45,6 @@ class Given:
     """[n, 3] those that triangles use, base frame."""
     triangles: NDArray[np.uint32]
     """[m, 3] `renumbered`."""
-
-
-def camera_covariance(prior: CameraPrior, base_from_camera: Floats, doubts: Doubts) -> Floats:
-    """[free + 6 views, free + 6 views] of lens and cameras' steps: hand-eye, axis zeros, the arm's scatter."""
-    lens, count = len(prior.free), len(base_from_camera)
-    flange_from_camera = prior.flange_from_camera
-    base_from_flange = base_from_camera @ np.linalg.inv(flange_from_camera)
-    by_flange = np.zeros((count, 6, 6))
-    by_flange[:, :3, :3] = np.eye(3)
-    by_flange[:, :3, 3:] = -base_from_flange[:, :3, :3] @ skew(flange_from_camera[:3, 3])
-    by_flange[:, 3:, 3:] = flange_from_camera[:3, :3].T
-    by_hand_eye = np.zeros((count, 6, 6))
-    by_hand_eye[:, :3, :3] = base_from_flange[:, :3, :3]
-    by_hand_eye[:, 3:, 3:] = np.eye(3)
-    by_record = np.concatenate([by_hand_eye, by_flange @ prior.by_axes(base_from_flange)], axis=2)
-    spread = block_diag(np.eye(lens), by_record.reshape(6 * count, -1))
-    own = np.diag(np.repeat([doubts.arm_mm**2, np.radians(doubts.arm_deg) ** 2], 3))
-    scatter = block_diag(np.zeros((lens, lens)), *(by_flange @ own @ np.swapaxes(by_flange, 1, 2)))
-    result: Floats = spread @ prior.covariance @ spread.T + scatter
-    return result
 
 
 @dataclass(frozen=True)
@@ -131,8 +92,7 @@ class Unknowns:
     @cached_property
     def covariance(self) -> Floats:
         """[count, count] by records and doubts."""
-        doubts = self.doubts
-        mesh = np.diag(np.repeat([doubts.mesh_mm**2, np.radians(doubts.mesh_deg) ** 2], 3))
+        mesh = self.doubts.mesh_covariance
         return np.asarray(block_diag(self.given.camera_covariance, mesh, self._shape_covariance))
 
     @cached_property

@@ -178,6 +178,8 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
     file.attrs["simulated"] = measured.run.simulated
     file.attrs["frame"] = "base of the robot"
     file.attrs["led_u_mm"] = measured.led_u_mm  # of each coordinate of an LED's place
+    u_lateral_mm = view.pointing.u_lateral_mm(measured.lens, view.base_from_camera, work.facets.centres_mm)
+    file.attrs["lateral_u_mm"] = u_lateral_mm  # of where pixels look, across the line of sight
     file.create_dataset("seen", data=surface.places, compression="gzip", compression_opts=1, track_times=False)
     file["seen"].attrs["told"] = "[h, w] place in `triangles` of what a pixel sees, -1 where it is not used"
     _dataset(file, "triangles", surface.triangles, "numbers of the mesh's triangles, from 0")

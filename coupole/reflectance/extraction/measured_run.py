@@ -29,6 +29,7 @@ from coupole.plan.reading import read_plan
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import described_arm
 from coupole.preflight.object_shape import MM_PER_UNIT
+from coupole.reflectance.extraction.pointing import Pointing, pointings
 from coupole.scan.mesh_files import read_mesh
 from coupole.storage.run import Run
 
@@ -55,6 +56,8 @@ class MeasuredView:
     base_from_camera: Floats
     """[4, 4] mm, by the hand-eye's record, the arm's axis zeros applied."""
     frames: tuple[LightFrame, ...]
+    pointing: Pointing
+    """How well it is known where the camera looks."""
 
     @cached_property
     def by_led(self) -> dict[int, list[LightFrame]]:
@@ -171,11 +174,11 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
     _refuse_other_gain(by_kind["led-power"], power_record, frames)
     refuse_read_otherwise(by_kind["led-power"], power_record, by_kind)
     lens, leds = files.cell.rig.lens, calibrated_positions(by_kind["leds"])
-    views, prior = _views(run, frames, hand_eye, files.cell.rig, prior)
-    _refuse_unknown_leds(by_kind["leds"], leds, views)
     shape = read_mesh(mesh_path)
     base_from_object = base_from_support @ files.plan.object.support_from_object.matrix()
     vertices_mm = apply(base_from_object, shape.vertices * MM_PER_UNIT[files.plan.object.mesh_unit])
+    views, prior = _views(run, frames, hand_eye, files.cell.rig, prior, vertices_mm.mean(axis=0))
+    _refuse_unknown_leds(by_kind["leds"], leds, views)
     return MeasuredRun(
         run,
         frames,
@@ -280,9 +283,9 @@ def _by_kind(paths: Sequence[Path]) -> dict[str, Path]:
 
 
 def _views(
-    run: Run, frames: LightFrames, hand_eye: Path, rig: Rig, prior: CameraPrior
+    run: Run, frames: LightFrames, hand_eye: Path, rig: Rig, prior: CameraPrior, middle_mm: Floats
 ) -> tuple[tuple[MeasuredView, ...], CameraPrior]:
-    """Frames by view, with the camera's pose by the record; and the record for these views."""
+    """Frames by view of an object, with the camera's pose by the record; and the record for these views."""
     lit: dict[str, list[LightFrame]] = {}
     for frame in frames.lit:
         if frame.led is not None:
@@ -299,8 +302,8 @@ def _views(
         calibrated = read_arm(hand_eye, arm.arm)
         base_from_flange, prior = calibrated_poses(base_from_flange, joints_deg, calibrated, prior)
     base_from_camera = base_from_flange @ prior.flange_from_camera
-    views = zip(lit.items(), base_from_camera, strict=True)
-    return tuple(MeasuredView(name, pose, tuple(mine)) for (name, mine), pose in views), prior
+    views = zip(lit.items(), base_from_camera, pointings(prior, base_from_camera, middle_mm), strict=True)
+    return tuple(MeasuredView(name, pose, tuple(mine), known) for (name, mine), pose, known in views), prior
 
 
 def _only_pose(run: Run, view: str, frames: Sequence[LightFrame]) -> Floats:

@@ -78,7 +78,7 @@ class RsiSession:
         self.sender = self.other_sender = b""
         self.stop_answers = self.program_ended = 0
         """Answers that end the controller's program; 1 once it has ended on one of them."""
-        self.settled_cycles = self._astray_cycles = self._late_in_row = 0
+        self.settled_cycles = self._astray_cycles = self._late_before = self._late_in_row = 0
         limits = config.velocity_deg_s, config.acceleration_deg_s2, config.jerk_deg_s3
         self.motion = Motion(config.cycle_s, limits)
         self._config = config
@@ -297,11 +297,15 @@ class RsiSession:
 
         allowed_deg = config.follow_deg + config.follow_lag_s * max(map(abs, motion.velocity_deg_s))
         self._astray_cycles = self._astray_cycles + 1 if error_deg > allowed_deg else 0
+        if self._astray_cycles <= 1:
+            self._late_before = self.late
         if self._astray_cycles >= config.follow_cycles:
+            late = self.late - self._late_before
             self.fail(
                 shared_state.NOT_FOLLOWING,
                 f"the arm does not follow: {error_deg:.2f} deg from the commanded axes for "
-                f"{self._astray_cycles} cycles (emergency stop, brakes or collision)",
+                f"{self._astray_cycles} cycles (emergency stop, brakes or collision)"
+                + (f", with {late} late answers meanwhile" if late else ""),
             )
         if self.delay >= config.delay_limit:
             self.fail(shared_state.LATE, f"late answers: the controller's delay counter rose to {self.delay}")

@@ -1,0 +1,110 @@
+"""How well it is known what a pixel looks at: lens, camera and mesh with their covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from coupole.calibration import optics
+from coupole.calibration.optics import Intrinsics
+from coupole.calibration.posed_camera import CameraPrior
+from coupole.calibration.rotations import moved, rotation, skew
+
+Floats = NDArray[np.float64]
+
+_SMALL = 1e-3
+"""Of a standard uncertainty: steps of the differences that stand for derivatives."""
+_POINTS = 100
+"""Places on the object that stand for all of a view."""
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """Standard uncertainties that no record states."""
+
+    arm_mm: float = 0.03
+    """Of the flange's position in each view, in each direction."""
+    arm_deg: float = 0.003
+    mesh_mm: float = 0.1
+    """Of the mesh's place in the base frame, in each direction."""
+    mesh_deg: float = 0.02
+    shape_mm: float = 0.03
+    """Of the surface along its normals, alike over `scale_mm`."""
+    scale_mm: float = 20.0
+
+    @property
+    def mesh_covariance(self) -> Floats:
+        """[6, 6] of the mesh's steps, mm and rad."""
+        return np.diag(np.repeat([self.mesh_mm**2, np.radians(self.mesh_deg) ** 2], 3))
+
+
+STATED = Doubts()
+"""Unless a user states others."""
+
+
+def camera_covariance(prior: CameraPrior, base_from_camera: Floats, doubts: Doubts) -> Floats:
+    """[free + 6 views, free + 6 views] of lens and cameras' steps: hand-eye, axis zeros, the arm's scatter."""
+    lens, count = len(prior.free), len(base_from_camera)
+    flange_from_camera = prior.flange_from_camera
+    base_from_flange = base_from_camera @ np.linalg.inv(flange_from_camera)
+    by_flange = np.zeros((count, 6, 6))
+    by_flange[:, :3, :3] = np.eye(3)
+    by_flange[:, :3, 3:] = -base_from_flange[:, :3, :3] @ skew(flange_from_camera[:3, 3])
+    by_flange[:, 3:, 3:] = flange_from_camera[:3, :3].T
+    by_hand_eye = np.zeros((count, 6, 6))
+    by_hand_eye[:, :3, :3] = base_from_flange[:, :3, :3]
+    by_hand_eye[:, 3:, 3:] = np.eye(3)
+    by_record = np.concatenate([by_hand_eye, by_flange @ prior.by_axes(base_from_flange)], axis=2)
+    spread = block_diag(np.eye(lens), by_record.reshape(6 * count, -1))
+    own = np.diag(np.repeat([doubts.arm_mm**2, np.radians(doubts.arm_deg) ** 2], 3))
+    scatter = block_diag(np.zeros((lens, lens)), *(by_flange @ own @ np.swapaxes(by_flange, 1, 2)))
+    result: Floats = spread @ prior.covariance @ spread.T + scatter
+    return result
+
+
+@dataclass(frozen=True)
+class Pointing:
+    """Steps of lens, camera and mesh that are uncertain in one view."""
+
+    free: tuple[str, ...]
+    """Parameters of the lens."""
+    covariance: Floats
+    """[free + 12, free + 12] of the lens, the camera's steps and the mesh's, as `unknowns` has them."""
+    middle_mm: Floats
+    """[3] about which the mesh turns."""
+
+    def u_lateral_mm(self, lens: Intrinsics, base_from_camera: Floats, points_mm: Floats) -> float:
+        """Standard uncertainty, across the line of sight and in each direction, of where on the object pixels
+        look: root of the mean square over some of `points_mm` [n, 3], which the view sees."""
+        points_mm = points_mm[:: max(1, len(points_mm) // _POINTS)]
+
+        def seen(steps: Floats) -> Floats:
+            shift = steps[len(self.free) :]
+            steps_of_lens = zip(self.free, steps, strict=False)
+            bent = replace(lens, **{name: getattr(lens, name) + float(step) for name, step in steps_of_lens})
+            camera = moved(base_from_camera[None], shift[None, :6])[0]
+            there = (points_mm - self.middle_mm) @ rotation(shift[9:]).T + self.middle_mm + shift[6:9]
+            inside = (there - camera[:3, 3]) @ camera[:3, :3]
+            found: Floats = optics.project(inside, bent.vector()).pixels
+            return found
+
+        sizes = np.sqrt(np.diag(self.covariance))
+        steps = _SMALL * np.diag(np.where(sizes > 0.0, sizes, 1.0))
+        by_step = np.stack([(seen(one) - seen(-one)) / (2.0 * one.max()) for one in steps], axis=-1)
+        in_pixels = np.einsum("nki,ij,nkj->n", by_step, self.covariance, by_step) / 2.0
+        depth_mm = (points_mm - base_from_camera[:3, 3]) @ base_from_camera[:3, 2]
+        return float(np.sqrt(np.mean(in_pixels * (depth_mm / lens.fx) ** 2)))
+
+
+def pointings(prior: CameraPrior, base_from_camera: Floats, middle_mm: Floats) -> tuple[Pointing, ...]:
+    """Of views at poses [v, 4, 4] of an object, by a camera's records and what no record states."""
+    whole, lens = camera_covariance(prior, base_from_camera, STATED), len(prior.free)
+    found = []
+    for view in range(len(base_from_camera)):
+        own = [*range(lens), *range(lens + 6 * view, lens + 6 * view + 6)]
+        covariance = block_diag(whole[np.ix_(own, own)], STATED.mesh_covariance)
+        found.append(Pointing(prior.free, covariance, middle_mm))
+    return tuple(found)

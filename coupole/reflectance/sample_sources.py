@@ -1,0 +1,156 @@
+"""What is uncertain in samples of a view, put together from its file: for bounds, tables and exports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from coupole.errors import InputError
+from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples, u_inter_reflection
+from coupole.reflectance.sample_uncertainty import Places, Sources
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_SIDES = 8
+"""Of a triangle, on which others are looked for."""
+_BESIDE = 1.2
+"""Distance of a neighbour over the square root of a triangle's area: at least so far the others are."""
+
+
+@dataclass(frozen=True)
+class ChannelSamples:
+    """Samples of one channel on a grid of triangles and LEDs of a view, flattened row by row."""
+
+    rows: Integers
+    """[n] of the view's file."""
+    leds: Integers
+    """[n] places in the view's LEDs."""
+    f: Floats
+    """[n] 1/sr; NaN where there is none."""
+    places: Places
+    sources: Sources
+
+    def at(self, picked: Integers) -> ChannelSamples:
+        rows, leds, f = self.rows[picked], self.leds[picked], self.f[picked]
+        return ChannelSamples(rows, leds, f, self.places.at(picked), self.sources.at(picked))
+
+    @property
+    def known(self) -> Integers:
+        """Places of those that have a value."""
+        return np.flatnonzero(np.isfinite(self.f) & np.isfinite(self.sources.u_noise))
+
+
+def channel_samples(
+    result: RunResult, view: ViewSamples, rows: Integers, leds: Integers, channel: int, scan_noise_um: float
+) -> ChannelSamples:
+    """Of some rows of a view's file, rising, and some of its LEDs. Raises InputError for a file that an earlier
+    version made."""
+    with h5py.File(view.path, "r") as file:
+        if "lateral_u_mm" not in file.attrs:
+            raise InputError(f"{view.path}: an earlier version made it; make the result anew")
+        lateral_u_mm, led_u_mm = float(file.attrs["lateral_u_mm"]), float(file.attrs["led_u_mm"])
+        beside = _beside(file, rows, lateral_u_mm, result.areas_mm2[view.triangles])
+        used = np.unique(np.append(rows, beside.rows))
+
+        def table(name: str) -> Floats:
+            return _table(file[name], used, leds, channel)
+
+        f, u_noise, own = table("f"), table("u_own"), np.searchsorted(used, rows)
+        indirect = np.zeros(f.shape)
+        if view.inter_reflection is not None:
+            indirect = u_inter_reflection(table(INTER_REFLECTION).astype(np.float16))
+        u_response = file["u_response"][:, channel][rows]
+        u_own, u_shared = (file[name][:, channel][leds] for name in ("led_u_own", "led_u_shared"))
+        incidence = _cosines(file["centres_mm"][:][used], file["normals"][:][used], view.led_mm[leds])
+    u_place = beside.uncertainty(f * incidence, u_noise, own, np.searchsorted(used, beside.rows), lateral_u_mm)
+    grid = (len(rows), len(leds))
+
+    def each(values: Floats, shape: tuple[int, ...]) -> Floats:
+        return np.broadcast_to(values.reshape(shape), grid).ravel().astype(np.float64)
+
+    sources = Sources(
+        u_noise[own].ravel(),
+        each(u_response, (-1, 1)),
+        indirect[own].ravel(),
+        u_place.ravel(),
+        each(u_own, (1, -1)),
+        each(u_shared, (1, -1)),
+        np.full(grid, scan_noise_um).ravel(),
+        np.full(grid, led_u_mm).ravel(),
+    )
+    row, led = (places.ravel() for places in np.meshgrid(rows, leds, indexing="ij"))
+    corners = result.corners_mm[view.triangles[row]].astype(np.float64)
+    return ChannelSamples(
+        row, led, f[own].ravel(), Places(corners, view.led_mm[led], view.led_normals[led]), sources
+    )
+
+
+@dataclass(frozen=True)
+class _Beside:
+    """Triangles that pixels may show in the place of others."""
+
+    rows: Integers
+    """[n, sides] of the view's file; a triangle's own where there is no other."""
+    square_mm2: Floats
+    """[n, sides] of the distance across the line of sight."""
+
+    def uncertainty(
+        self, signal: Floats, u_noise: Floats, own: Integers, beside: Integers, lateral_u_mm: float
+    ) -> Floats:
+        """[n, leds] relative standard uncertainty of `signal` [used, leds], in any unit, of triangles at places
+        `own` [n] by those at `beside` [n, sides]: what they differ by, less what noise alone makes them differ by,
+        as the square of the shift over that of the distance, at most as far as they are away."""
+        mine, noise = signal[own], (signal[own] * u_noise[own]) ** 2
+        share = np.minimum(2.0 * lateral_u_mm**2 / np.maximum(self.square_mm2, 1e-12), 1.0)
+        total, count = np.zeros(mine.shape), np.zeros(mine.shape)
+        for side in range(beside.shape[1]):
+            other = signal[beside[:, side]]
+            apart = (other - mine) ** 2 - noise - (other * u_noise[beside[:, side]]) ** 2
+            known = np.isfinite(apart) & (self.square_mm2[:, side] > 0.0)[:, None]
+            total += np.where(known, share[:, side, None] * apart, 0.0)
+            count += known
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.sqrt(np.maximum(total / np.maximum(count, 1), 0.0)) / np.abs(mine)
+
+
+def _beside(file: h5py.File, rows: Integers, lateral_u_mm: float, areas_mm2: Floats) -> _Beside:
+    """Triangles as far away as a picture is likely to be off, or the nearest ones, on all sides of `rows`, in the
+    plane across the line of sight."""
+    centres_mm, camera_mm = file["centres_mm"][()], file["camera_mm"][()]
+    mine = centres_mm[rows]
+    towards = camera_mm - mine
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    right = np.cross(towards, np.where(np.abs(towards[:, [2]]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]))
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    up = np.cross(right, towards)
+    far_mm = np.maximum(np.sqrt(2.0) * lateral_u_mm, _BESIDE * np.sqrt(areas_mm2[rows]))
+    tree, found = cKDTree(centres_mm), np.empty((len(rows), _SIDES), np.int64)
+    square_mm2 = np.zeros(found.shape)
+    for side in range(_SIDES):
+        angle = 2.0 * np.pi * side / _SIDES
+        shift = far_mm[:, None] * (np.cos(angle) * right + np.sin(angle) * up)
+        away_mm, found[:, side] = tree.query(mine + shift)
+        apart = centres_mm[found[:, side]] - mine
+        across = apart - np.sum(apart * towards, axis=1)[:, None] * towards
+        there = away_mm < far_mm  # past the edge of what the view sees there is nothing
+        square_mm2[:, side] = np.where(there, np.sum(across**2, axis=1), 0.0)
+    return _Beside(found, square_mm2)
+
+
+def _cosines(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:
+    """[n, leds] of incidence."""
+    ways = led_mm - centres_mm[:, None]
+    found: Floats = np.einsum("nlk,nk->nl", ways, normals) / np.linalg.norm(ways, axis=2)
+    return found
+
+
+def _table(data: h5py.Dataset, rows: Integers, leds: Integers, channel: int) -> Floats:
+    """[rows, leds] of a channel, by rows or by LEDs, whichever reads less of the file."""
+    if len(rows) * data.shape[1] < len(leds) * data.shape[0]:
+        return np.stack([data[int(row), :, channel][leds] for row in rows]).astype(np.float64)
+    return np.stack([data[:, int(led), channel][rows] for led in leds], axis=1).astype(np.float64)

@@ -13,6 +13,7 @@ from coupole.commands import keeping, planning, running
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
 from coupole.commands.dose_ledger import dose
+from coupole.commands.exporting import export
 from coupole.commands.reflectance import reflectance_app
 from coupole.commands.render_scene import render
 from coupole.commands.show import show
@@ -41,7 +42,7 @@ for command in (
     keeping.report,
     keeping.verify,
     keeping.archive,
-    keeping.export,
+    export,
     keeping.scan,
     dose,
     render,

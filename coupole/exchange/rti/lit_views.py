@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.exchange.srgb import srgb
+from coupole.reflectance.light_files import read_rows
 from coupole.reflectance.picture_result import NORMALS, PictureResult
-from coupole.reflectance.picture_set import FEWEST_LIGHTS, read_picture, read_rows
+from coupole.reflectance.picture_set import FEWEST_LIGHTS, read_picture
 from coupole.reflectance.uncalibrated import INTENSITIES, write_pictures
 from coupole.storage.run import Run
 

@@ -4,118 +4,42 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from coupole.commands.common import JsonOption, RecordsOption, fail, records_named
+from coupole.commands.export_options import (
+    AuthorOption,
+    BaseUrlOption,
+    BasisOption,
+    EyeOption,
+    FitOption,
+    IdentifierOption,
+    InPlaceOption,
+    LedsOption,
+    LicenceOption,
+    LinearOption,
+    NameOption,
+    PlanesOption,
+    PublisherOption,
+    RefinedOption,
+    SensorOption,
+    ShotsOption,
+    ToOption,
+    TriangleOption,
+    ViewsOption,
+)
 from coupole.errors import CoupoleError, InputError
-from coupole.exchange import COLMAP, CRATE, FORMATS, RTI
-from coupole.exchange.of_results import FORMATS as OF_RESULTS
-from coupole.exchange.of_results import OF_MATERIALS
+from coupole.exchange import COLMAP, CRATE, FORMATS
+from coupole.exchange.rti import FORMATS as OF_VIEWS
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from coupole.exchange.run_colour import ColourWanted
-
-OF_RUNS = (*FORMATS, RTI, COLMAP, CRATE)
-_COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "What the crate says (rocrate)"
-
-ToOption = Annotated[
-    str,
-    typer.Option(
-        "--to",
-        help=f"Of runs: {', '.join(OF_RUNS)}. Of results: {', '.join((*OF_RESULTS, CRATE))}.",
-        show_default=False,
-    ),
-]
-ViewsOption = Annotated[
-    list[str] | None,
-    typer.Option("--views", help="Of runs: names, with * and ?; again for more.", rich_help_panel=_PARTS),
-]
-ShotsOption = Annotated[
-    list[str] | None,
-    typer.Option("--shots", help="Of runs: labels, as `led04*/e0`; again for more.", rich_help_panel=_PARTS),
-]
-FitOption = Annotated[
-    str | None,
-    typer.Option(
-        "--fit", help="Of results: ggx or ggx_normal; without it what missed least.", rich_help_panel=_PARTS
-    ),
-]
-TriangleOption = Annotated[
-    list[int] | None,
-    typer.Option(
-        "--triangle",
-        help=f"Of results, for {', '.join(OF_MATERIALS)}: its number; again for more.",
-        min=0,
-        rich_help_panel=_PARTS,
-    ),
-]
-RefinedOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--refined",
-        help="For colmap: folder of `coupole reflectance refine`, whose poses, lens and mesh hold.",
-        rich_help_panel=_PARTS,
-    ),
-]
-SensorOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--sensor-spectra",
-        help="Table of nm, red, green, blue: the sensor's sensitivities.",
-        rich_help_panel=_COLOUR,
-    ),
-]
-LedsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--led-spectrum",
-        help="Table of nm, power; without it the rig's dome.spectrum.",
-        rich_help_panel=_COLOUR,
-    ),
-]
-EyeOption = Annotated[
-    bool,
-    typer.Option(
-        "--for-the-eye",
-        help="TIFF of sRGB, 16 bit, in place of the camera's numbers; needs --sensor-spectra.",
-        rich_help_panel=_COLOUR,
-    ),
-]
-LinearOption = Annotated[
-    bool,
-    typer.Option(
-        "--linear", help="With --for-the-eye: without sRGB's curve, as its profile says.", rich_help_panel=_COLOUR
-    ),
-]
-LicenceOption = Annotated[
-    str | None,
-    typer.Option("--licence", help="Its URL, or words; without it the plan's.", rich_help_panel=_ABOUT),
-]
-AuthorOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--author",
-        help="'NAME <https://orcid.org/...> at HOUSE'; again for more.",
-        rich_help_panel=_ABOUT,
-    ),
-]
-PublisherOption = Annotated[str | None, typer.Option("--publisher", help="Its name.", rich_help_panel=_ABOUT)]
-NameOption = Annotated[
-    str | None, typer.Option("--name", help="Title; without it the folder's name.", rich_help_panel=_ABOUT)
-]
-IdentifierOption = Annotated[str | None, typer.Option("--identifier", help="A DOI.", rich_help_panel=_ABOUT)]
-InPlaceOption = Annotated[
-    bool,
-    typer.Option(
-        "--in-place", help="Write the metadata into SOURCE; no file is linked or copied.", rich_help_panel=_ABOUT
-    ),
-]
 
 
 @dataclass(frozen=True)
@@ -152,6 +76,16 @@ class Asked:
         return records_named([Path(text) for text in self.texts("calibrations")])
 
 
+@dataclass(frozen=True)
+class Found:
+    """What was written."""
+
+    files: int
+    bytes: int
+    misses_dn: dict[str, float] = field(default_factory=dict)
+    """Of views: how far the file is from their own pictures, rms, in steps of 8 bits."""
+
+
 _OF_FRAMES, _OF_A_RESULT = ("views", "shots"), ("fit", "triangle")
 _OF_COLOUR = ("sensor-spectra", "led-spectrum", "for-the-eye", "linear")
 _OF_A_CRATE = ("licence", "author", "publisher", "name", "identifier", "in-place")
@@ -176,6 +110,9 @@ def export(
     name: NameOption = None,
     identifier: IdentifierOption = None,
     in_place: InPlaceOption = False,
+    basis: BasisOption = None,
+    planes: PlanesOption = None,
+    base_url: BaseUrlOption = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder; SOURCE/export if not given.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite existing files.")] = False,
     as_json: JsonOption = False,
@@ -188,6 +125,7 @@ def export(
         "calibrations": calibrations, "sensor-spectra": sensor_spectra, "led-spectrum": led_spectrum,
         "for-the-eye": for_the_eye, "linear": linear, "licence": licence, "author": author,
         "publisher": publisher, "name": name, "identifier": identifier, "in-place": in_place,
+        "basis": basis, "planes": planes, "base-url": base_url,
     }  # fmt: skip
     folder = source if in_place else out or source / "export"
     asked = Asked(source, to, folder, overwrite, {key: value for key, value in given.items() if value})
@@ -195,46 +133,61 @@ def export(
         asked.options["triangle"] = triangle
     console = make_console(quiet=as_json)
     try:
-        files, size = _written(asked, console)
+        found = _written(asked, console)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
-    console.print(f"{files} files, {bytes_text(size)}, in {folder}")
+    console.print(f"{found.files} files, {bytes_text(found.bytes)}, in {folder}")
+    for view, missed in found.misses_dn.items():
+        console.print(f"{view}: its own pictures are missed by {missed:.1f} of 255, rms")
     if as_json:
-        print(json.dumps({"out": str(folder.resolve()), "files": files, "bytes": size}))
+        told = {"out": str(folder.resolve()), "files": found.files, "bytes": found.bytes}
+        print(json.dumps({**told, **({"misses_dn": found.misses_dn} if found.misses_dn else {})}))
 
 
-def _written(asked: Asked, console: Console) -> tuple[int, int]:
-    """Number and size of the files."""
-    is_result = (asked.source / "object.h5").exists()
-    if is_result:
+def _written(asked: Asked, console: Console) -> Found:
+    of_run = (asked.source / "object.h5").exists()
+    of_pictures = (asked.source / "normals.npy").exists()
+    if of_run:
         asked.refuse(_OF_FRAMES, "are for the frames of a run; this is a result")
-    elif (asked.source / "normals.npy").exists():
-        raise InputError(f"{asked.source}: is a result of pictures, which has no surface; `coupole show` shows it")
     else:
-        asked.refuse(_OF_A_RESULT, "are for results of reflectance; this is a run")
+        asked.refuse(_OF_A_RESULT, "are for results of reflectance of runs")
     if asked.to != CRATE:
         asked.refuse(_OF_A_CRATE, f"are for --to {CRATE}")
-    if is_result or asked.to not in FORMATS:
+    if of_run or of_pictures or asked.to not in FORMATS:
         asked.refuse(_OF_COLOUR, "are for frames of a run as dng or tiff")
     if asked.to != COLMAP:
         asked.refuse(("refined",), f"is for --to {COLMAP}")
         if asked.to not in FORMATS:
             asked.refuse(("calibrations",), f"is for {COLMAP}, and for colour of frames")
-    match asked.to:
-        case "rocrate":
-            return _export_crate(asked, console)
-        case _ if is_result:
-            return _export_result(asked, console)
-        case "lp":
-            return _export_rti(asked, console)
-        case "colmap":
-            return _export_colmap(asked, console)
-        case _:
-            return _export_frames(asked, console)
+    _refuse_misplaced(asked)
+    if asked.to == CRATE:
+        return _export_crate(asked, console)
+    if of_run:
+        return _export_result(asked, console)
+    if of_pictures or asked.to in OF_VIEWS:
+        return _export_views(asked, console)
+    if asked.to == COLMAP:
+        return _export_colmap(asked, console)
+    return _export_frames(asked, console)
 
 
-def _export_result(asked: Asked, console: Console) -> tuple[int, int]:
+def _refuse_misplaced(asked: Asked) -> None:
+    """Raise InputError for options of another kind of views, or values that they do not have."""
+    from coupole.exchange.rti.relight_web import BASES, PLANES
+
+    basis, planes = asked.text("basis"), asked.options.get("planes")
+    if asked.to != "relight":
+        asked.refuse(("basis", "planes"), f"are for --to relight; found --to {asked.to}")
+    if basis is not None and basis not in BASES:
+        raise InputError(f"--basis: expected one of {', '.join(BASES)}; found {basis}")
+    if planes is not None and (planes not in PLANES or basis in ("ptm", "hsh")):
+        raise InputError(f"--planes {planes}: expected {' or '.join(map(str, PLANES))}, with bilinear or rbf")
+    if asked.to != "iiif":
+        asked.refuse(("base-url",), f"is for --to iiif; found --to {asked.to}")
+
+
+def _export_result(asked: Asked, console: Console) -> Found:
     from coupole.exchange.of_results.export_result import export_result
 
     triangles = tuple(map(int, asked.texts("triangle")))
@@ -250,19 +203,20 @@ def _export_result(asked: Asked, console: Console) -> tuple[int, int]:
     return _sizes(paths)
 
 
-def _export_rti(asked: Asked, console: Console) -> tuple[int, int]:
-    from coupole.exchange.rti_pictures import export_rti
+def _export_views(asked: Asked, console: Console) -> Found:
+    from coupole.exchange.rti.export_views import HowShown, export_views
+    from coupole.viewing.terminal import step_bars
 
-    asked.refuse(("shots",), "are for single frames; of RTI all LEDs of a view are written")
+    asked.refuse(("shots",), "are for single frames; of views all LEDs are written")
+    given = {name.replace("-", "_"): asked.options.get(name) for name in ("basis", "planes", "base-url")}
+    how = HowShown(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
     views = asked.texts("views")
-    return _sizes(
-        _with_bars(
-            console, lambda say: export_rti(asked.source, asked.out, views, overwrite=asked.overwrite, say=say)
-        )
-    )
+    with step_bars(console) as say:
+        made = export_views(asked.source, asked.to, asked.out, views, how, overwrite=asked.overwrite, say=say)
+    return replace(_sizes(made.paths), misses_dn=made.misses_dn)
 
 
-def _export_colmap(asked: Asked, console: Console) -> tuple[int, int]:
+def _export_colmap(asked: Asked, console: Console) -> Found:
     from coupole.exchange.colmap import export_colmap
 
     asked.refuse(_OF_FRAMES, f"are for single frames; {COLMAP} has all views")
@@ -281,7 +235,7 @@ def _export_colmap(asked: Asked, console: Console) -> tuple[int, int]:
     )
 
 
-def _export_crate(asked: Asked, console: Console) -> tuple[int, int]:
+def _export_crate(asked: Asked, console: Console) -> Found:
     from coupole.exchange.research_crate import CrateFacts, write_crate
 
     asked.refuse((*_OF_FRAMES, *_OF_A_RESULT), f"are for parts; {CRATE} has all files")
@@ -303,7 +257,7 @@ def _export_crate(asked: Asked, console: Console) -> tuple[int, int]:
     )
 
 
-def _export_frames(asked: Asked, console: Console) -> tuple[int, int]:
+def _export_frames(asked: Asked, console: Console) -> Found:
     from rich.progress import Progress
 
     from coupole.exchange.export import export_run
@@ -322,7 +276,7 @@ def _export_frames(asked: Asked, console: Console) -> tuple[int, int]:
             overwrite=asked.overwrite,
             progress=lambda done, total: bars.update(bar, completed=done, total=total),
         )
-    return found.files, found.bytes
+    return Found(found.files, found.bytes)
 
 
 def _colour_of(asked: Asked) -> ColourWanted | None:
@@ -350,5 +304,5 @@ def _with_bars(console: Console, write: Callable[[Callable[[str, int, int], None
         return write(bars)
 
 
-def _sizes(paths: list[Path]) -> tuple[int, int]:
-    return len(paths), sum(path.stat().st_size for path in paths)
+def _sizes(paths: list[Path]) -> Found:
+    return Found(len(paths), sum(path.stat().st_size for path in paths))

@@ -2,8 +2,6 @@
 
 FORMATS = ("dng", "tiff")
 """What frames can be exported to: the names of these modules, and the suffixes of the files."""
-RTI = "lp"
-"""What views are exported to: pictures with directions of light (`coupole.exchange.rti_pictures`)."""
 COLMAP = "colmap"
 """What views are exported to with their poses (`coupole.exchange.colmap`)."""
 CRATE = "rocrate"

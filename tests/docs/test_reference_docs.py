@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 from places import REPO
 
-from coupole.commands.exporting import OF_RUNS
+from coupole.commands.export_options import OF_RUNS
 from coupole.exchange.of_results import FORMATS as OF_RESULTS
 from coupole.plan import arm_description, plan, rig
 from coupole.reflectance.new_light import light_kinds

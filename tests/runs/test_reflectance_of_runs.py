@@ -173,7 +173,10 @@ def test_pictures_for_rti_show_the_object_under_the_lights_that_their_file_names
     codes = np.stack([cv2.imread(str(tmp_path / "top" / line.split()[0]))[::9, ::9, 1] for line in lines]) / 255.0
     linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
     dome = json.loads((tmp_path / "top/top.dome").read_text())
-    places = np.array(dome["positions3d"])
+    places = np.array([[place[axis] for axis in "xyz"] for place in dome["positions3d"]])
+    alone = cells.here("export", cell.run_folder, "--to", "dome", "--views", "top", "--out", tmp_path / "dome")
+    assert alone.code == 0, alone.err
+    assert json.loads((tmp_path / "dome/top.dome").read_text()) == dome
     np.testing.assert_allclose(unit(places), ways, atol=1e-5)
     lens = cell.rig_data["lens"]
     image_mm = 1 / (1 / lens["focal_length_mm"] - 1 / lens["focus_distance_mm"])  # thin lens

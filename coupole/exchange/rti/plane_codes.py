@@ -18,7 +18,7 @@ from coupole.exchange.rti.lit_views import LitView, Picture, Said
 
 Floats = NDArray[np.float64]
 
-RESOLUTION = 16
+RESOLUTION = 20
 """Nodes of the bilinear grid a side; docs/decisions/0037-rti-exports.md tells why not 8."""
 SIGMA = 0.125
 """Of Gaussians between lights, in unit vectors: relight's own default."""
@@ -74,7 +74,8 @@ def of_principal_parts(samples: Picture, lights: Floats, name: str, planes: int)
     """Of principal components of encoded values [lights, pixels, 3] (relight's `mrgb`): functions of light are
     tables of 8 bit, over the lights (`rbf`) or the nodes of a grid (`bilinear`)."""
     count = len(lights)
-    values = samples.transpose(1, 0, 2).reshape(samples.shape[1], -1)
+    seen = samples[:, samples.any(axis=(0, 2))]
+    values = seen.transpose(1, 0, 2).reshape(seen.shape[1], -1)
     mean = values.mean(axis=0, dtype=np.float64)
     vectors = _principal(values - mean.astype(np.float32), planes)
     if name == "bilinear":

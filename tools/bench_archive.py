@@ -38,7 +38,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
 
     frames = min(FRAMES, int(shutil.disk_usage(root).free * 0.4 / FRAME_BYTES))
     drawn = pictures(DISTINCT)
-    with tempfile.TemporaryDirectory(dir=root) as folder:
+    with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
         for name, codec in CODECS.items():
             yield from _speeds(Path(folder) / "small.h5", drawn, name, codec, rounds)
         path, kept = Path(folder) / "view.h5", Path(folder) / "kept"

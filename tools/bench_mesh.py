@@ -24,7 +24,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
     from coupole.scan.mesh_files import read_mesh
     from coupole.scan.scanner_export import read_scan
 
-    with tempfile.TemporaryDirectory(dir=root) as folder:
+    with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
         path = Path(folder) / "sheet.ply"
         vertices = _write_sheet(path, TRIANGLES)
         read_mesh(path)  # compiles

@@ -40,7 +40,7 @@ _CHUNK = 16 << 20
 
 
 def figures(root: Path, rounds: int, frames: int = FRAMES) -> Iterator[dict[str, Any]]:
-    with tempfile.TemporaryDirectory(dir=root) as name:
+    with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as name:
         folder = Path(name)
         yield from _memory(root, folder, frames)
         yield from _extraction(folder, rounds)

@@ -60,7 +60,7 @@ def writers(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
     pixels = _pictures()
     for _ in range(rounds):
         for name, write in known.items():
-            with tempfile.TemporaryDirectory(dir=root) as folder:
+            with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
                 used_s, started_s = _cpu_s(), time.perf_counter()
                 write(Path(folder), pixels, FRAMES)
                 seconds[name].append(time.perf_counter() - started_s)
@@ -217,13 +217,13 @@ def stream(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
     ours, peers, cpu_ms, lost, megabytes = [], [], [], 0, []
     pixels = _pictures()
     for _ in range(rounds):
-        with tempfile.TemporaryDirectory(dir=root) as folder:
+        with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
             burst = _burst(root, Path(folder))
         ours.append(burst["frames_per_s"])
         cpu_ms.append(burst["cpu_ms_per_frame"])
         lost += burst["lost"]
         megabytes.append(burst["grown_mb"])
-        with tempfile.TemporaryDirectory(dir=root) as folder:
+        with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
             started_s = time.perf_counter()
             _o_direct_copy(Path(folder), pixels, STREAM_FRAMES)
             peers.append(STREAM_FRAMES / (time.perf_counter() - started_s))

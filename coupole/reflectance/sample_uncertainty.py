@@ -25,7 +25,7 @@ SOURCES = {
     "u_indirect": "inter-reflection taken off",
     "u_place": "where pixels look",
     "u_own": "power of each LED",
-    "u_shared": "power of all LEDs",
+    "u_shared": "power of all LEDs, response, fall-off, drift",
     "vertex_um": "vertices of the mesh",
     "led_mm": "places of the LEDs",
 }

@@ -99,7 +99,7 @@ def drift_of(cell: CellFolder, without: str = "") -> cells.Ended:
 def test_leds_that_are_old_and_warm_are_corrected_by_the_runs_own_drift(aged: CellFolder, tmp_path: Path) -> None:
     """Without its record only the usual loss of light with warmth is known."""
     assert (ended := drift_of(aged)).code == 0, ended.err
-    ratio = {}
+    ratio, u_shared = {}, {}
     for name, records in (("without", [RECORDS]), ("with", [RECORDS, aged.folder / "drift.yaml"])):
         words = [word for path in records for word in ("--calibrations", path)]
         ended = cells.here("reflectance", "extract", aged.run_folder, *words, "--out", tmp_path / name)
@@ -107,8 +107,14 @@ def test_leds_that_are_old_and_warm_are_corrected_by_the_runs_own_drift(aged: Ce
         with h5py.File(tmp_path / name / "samples/top.h5") as file:
             stone = np.array([0.62, 0.55, 0.42]) / np.pi
             ratio[name] = np.nanmedian(file["f"][()].astype(float), axis=(0, 1)) / stone
+            u_shared[name] = file["led_u_shared"][()]
     np.testing.assert_allclose(ratio["without"], 0.7 ** (6000 / 50_000), atol=0.012)
     np.testing.assert_allclose(ratio["with"], 1.0, atol=0.012)
+    told = next(
+        line for line in (aged.folder / "drift.yaml").read_text().splitlines() if "of the factor, worst" in line
+    )
+    u_drift = float(told.split('"found": ')[1].split(",")[0])
+    np.testing.assert_allclose(u_shared["with"] ** 2 - u_shared["without"] ** 2, u_drift**2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["flat-field", "response"])

@@ -195,7 +195,10 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
     _dataset(file, "led_normals", normals, "unit, base frame")
     powers = measured.powers.of(leds)
     _dataset(file, "led_u_own", powers.u_own, "relative standard uncertainty of an LED's power, its own")
-    _dataset(file, "led_u_shared", powers.u_shared, "relative, of what all LEDs share")
+    shared = np.hypot(powers.u_shared, measured.u_signal)
+    _dataset(
+        file, "led_u_shared", shared, "relative, of what all samples share: powers, response, fall-off, drift"
+    )
     scales = np.stack([_dn_share(measured, view, int(led)) for led in leds])
     _dataset(file, "full_scales", scales, "of the camera that f cos_i E/Phi of 1 gives in the longest exposure")
 

@@ -6,6 +6,7 @@ The run's own folder is enough: plan, rig, mesh and records are kept in it.
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -37,6 +38,8 @@ Floats = NDArray[np.float64]
 
 NEEDED = ("hand-eye", "leds", "led-power")
 USED = (*NEEDED, "dark", "response", "flat-field", "camera", "drift")
+U_SIGNAL = {"response": "uncertainty of linearity", "flat-field": "uncertainty", "drift": "uncertainty"}
+"""Records of what makes all samples uncertain alike, and how the limit that says how much begins."""
 TYPICAL_PER_K = -0.003
 """Of white power LEDs, relative."""
 SAME_GAIN_DB = 0.01
@@ -142,6 +145,8 @@ class MeasuredRun:
     """Whether the cell is simulated without light from surface to surface."""
     camera: CameraPrior
     """Lens and hand-eye with their covariance; `axis_sensitivity` is that of `views`, in their order."""
+    u_signal: float = 0.0
+    """Relative standard uncertainty that all samples share, of response, fall-off and drift."""
 
     def power_of(self, frame: LightFrame) -> Floats:
         """[channels] power of the LED of a frame at its board's temperature and time; NaN where there is none."""
@@ -197,6 +202,7 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
         _drift(by_kind.get("drift")),
         run.simulated and _direct_light_alone(files.cell.rig),
         prior,
+        _u_signal(by_kind),
     )
 
 
@@ -268,6 +274,15 @@ def _drift(path: Path | None) -> Drift:
         return Drift()
     record = read_accepted(path, "drift")
     return Drift(*(record.value(name) for name in ("level", "rate_per_h", "per_k", "start_s")))
+
+
+def _u_signal(records: Mapping[str, Path]) -> float:
+    """By the figures with which records of these kinds were accepted."""
+    square = 0.0
+    for kind, what in U_SIGNAL.items():
+        if kind in records:
+            square += sum(one.found**2 for one in read_record(records[kind]).limits if one.what.startswith(what))
+    return math.sqrt(square)
 
 
 def _by_kind(paths: Sequence[Path]) -> dict[str, Path]:

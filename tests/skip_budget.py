@@ -16,8 +16,8 @@ ALLOWED = ("punx, the NeXus validator, is not installed: it wants Qt", NO_WHEEL)
 
 
 def is_complete() -> bool:
-    """True where real data, libaravis and a browser are at hand: then nothing else may be skipped."""
-    tools = ("arv-tool-0.8", "arv-camera-test-0.8", "chromium", "chromedriver", "cc")
+    """True where real data, libaravis, a browser and ExifTool are at hand: then nothing else may be skipped."""
+    tools = ("arv-tool-0.8", "arv-camera-test-0.8", "chromium", "chromedriver", "exiftool", "cc")
     return SHARED_DATA.is_dir() and all(map(shutil.which, tools))
 
 

@@ -27,10 +27,11 @@ prepare() {
 
 # What some tests want of the system, installed by root where there is apt-get, tried once; without it they are
 # skipped. libaravis and its command line for the GigE Vision camera (the wheel `aravis-python` may serve in its
-# place), Chromium for the pages that operators look at.
+# place), Chromium for the pages that operators look at, ExifTool for the frames as DNG.
 prepare_tests() {
     prepare_packages aravis libaravis-0.8-0 aravis-tools-cli aravis-tools
     prepare_packages chromium chromium chromium-driver
+    prepare_packages exiftool libimage-exiftool-perl
 }
 
 # prepare_packages NAME PACKAGE...: installs the packages unless `has_NAME`.
@@ -75,6 +76,10 @@ has_aravis() {
 
 has_chromium() {
     command -v chromium >/dev/null && command -v chromedriver >/dev/null
+}
+
+has_exiftool() {
+    command -v exiftool >/dev/null
 }
 
 install_packages() {

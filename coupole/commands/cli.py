@@ -9,7 +9,7 @@ import traceback
 import typer
 
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
-from coupole.commands import keeping, planning, running
+from coupole.commands import exporting, keeping, planning, running
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
 from coupole.commands.dose_ledger import dose
@@ -41,7 +41,7 @@ for command in (
     keeping.report,
     keeping.verify,
     keeping.archive,
-    keeping.export,
+    exporting.export,
     keeping.scan,
     dose,
     render,

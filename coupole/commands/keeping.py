@@ -1,4 +1,4 @@
-"""Commands on stored data: status, report, verify, archive, export, scan."""
+"""Commands on stored data: status, report, verify, archive, scan."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import typer
 
 from coupole.commands.common import JsonOption, RunPath, fail
 from coupole.errors import ChecksumMismatch, CoupoleError, InputError, UnprovenError
-from coupole.exchange import FORMATS, RTI
-from coupole.exchange.of_results import FORMATS as OF_RESULTS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -147,111 +145,6 @@ def archive(
             console.print(f"{view}: {how}")
     if as_json:
         print(json.dumps({"run": str(run.resolve()), "codec": codec, **total}))
-
-
-def export(
-    source: Annotated[Path, typer.Argument(help="A run's folder, or a result's.", show_default=False)],
-    to: Annotated[
-        str,
-        typer.Option(
-            "--to",
-            help=f"Of runs: {', '.join((*FORMATS, RTI))}. Of results: {', '.join(OF_RESULTS)}.",
-            show_default=False,
-        ),
-    ],
-    views: Annotated[
-        list[str] | None, typer.Option("--views", help="Of runs: names, with * and ?; again for more.")
-    ] = None,
-    shots: Annotated[
-        list[str] | None, typer.Option("--shots", help="Of runs: labels, as `led04*/e0`; again for more.")
-    ] = None,
-    fit: Annotated[
-        str | None, typer.Option("--fit", help="Of results: ggx or ggx_normal; without it what missed least.")
-    ] = None,
-    triangle: Annotated[
-        list[int] | None,
-        typer.Option("--triangle", help="Of results, for bsdf, merl, alta: its number; again for more.", min=0),
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder; SOURCE/export if not given.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite existing files.")] = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Write a run's proven frames, or a result of reflectance, as other programs read them."""
-    from coupole.viewing.terminal import bytes_text, make_console
-
-    console = make_console(quiet=as_json)
-    folder = out or source / "export"
-    try:
-        if (source / "object.h5").exists():
-            if views or shots:
-                raise InputError("--views, --shots: are for the frames of a run; this is a result")
-            files, size = _export_result(source, to, folder, fit, tuple(triangle or ()), overwrite, console)
-        elif (source / "normals.npy").exists():
-            raise InputError(f"{source}: is a result of pictures, which has no surface; `coupole show` shows it")
-        else:
-            if fit is not None or triangle:
-                raise InputError("--fit, --triangle: are for results of reflectance; this is a run")
-            if to == RTI:
-                files, size = _export_rti(source, folder, views or [], shots or [], overwrite, console)
-            else:
-                files, size = _export_frames(source, to, folder, views or [], shots or [], overwrite, console)
-    except CoupoleError as error:
-        fail(error, as_json=as_json)
-        raise
-    console.print(f"{files} files, {bytes_text(size)}, in {folder}")
-    if as_json:
-        print(json.dumps({"out": str(folder.resolve()), "files": files, "bytes": size}))
-
-
-def _export_result(
-    source: Path,
-    to: str,
-    folder: Path,
-    fit: str | None,
-    triangles: tuple[int, ...],
-    overwrite: bool,
-    console: Console,
-) -> tuple[int, int]:
-    from coupole.exchange.of_results.export_result import export_result
-
-    with console.status(f"writing {to}"):
-        paths = export_result(source, to, folder, fit=fit, triangles=triangles, overwrite=overwrite)
-    return len(paths), sum(path.stat().st_size for path in paths)
-
-
-def _export_rti(
-    source: Path, folder: Path, views: list[str], shots: list[str], overwrite: bool, console: Console
-) -> tuple[int, int]:
-    from coupole.exchange.rti_pictures import export_rti
-    from coupole.viewing.terminal import step_bars
-
-    if shots:
-        raise InputError("--shots: are for single frames; of RTI all LEDs of a view are written")
-    with step_bars(console) as bars:
-        paths = export_rti(source, folder, views, overwrite=overwrite, say=bars)
-    return len(paths), sum(path.stat().st_size for path in paths)
-
-
-def _export_frames(
-    source: Path, to: str, folder: Path, views: list[str], shots: list[str], overwrite: bool, console: Console
-) -> tuple[int, int]:
-    from rich.progress import Progress
-
-    from coupole.exchange.export import export_run
-    from coupole.storage.run import Run
-
-    with Progress(console=console, disable=not console.is_terminal) as bars:
-        bar = bars.add_task("export")
-        found = export_run(
-            Run(source),
-            to,
-            folder,
-            views=views,
-            shots=shots,
-            overwrite=overwrite,
-            progress=lambda done, total: bars.update(bar, completed=done, total=total),
-        )
-    return found.files, found.bytes
 
 
 def scan(

@@ -77,7 +77,8 @@ PicturesOption = Annotated[
     Path | None,
     typer.Option(
         "--pictures",
-        help="Folder of 8- or 16-bit pictures, linear, in the order of its filenames.txt, else sorted.",
+        help="Folder of 8- or 16-bit pictures, linear (or see --srgb), in the order of its filenames.txt, else "
+        "sorted.",
         show_default=False,
     ),
 ]
@@ -85,9 +86,14 @@ LightsOption = Annotated[
     Path | None,
     typer.Option(
         "--lights",
-        help="Directions to the lights, one in each line (x right, y up, z to the camera), or an .lp file.",
+        help="Directions to the lights, one in each line (x right, y up, z to the camera), an .lp file, or "
+        "relight's .dome or .relight.",
         show_default=False,
     ),
+]
+SrgbOption = Annotated[
+    bool,
+    typer.Option("--srgb", help="The pictures of --pictures are encoded for displays, as JPEGs of cameras are."),
 ]
 IntensitiesOption = Annotated[
     Path | None,
@@ -131,6 +137,7 @@ def from_runs_or_pictures(
     scheduler: SchedulerOption = None,
     pictures: PicturesOption = None,
     lights: LightsOption = None,
+    srgb: SrgbOption = False,
     intensities: IntensitiesOption = None,
     mask: MaskOption = None,
     uncalibrated: UncalibratedOption = False,
@@ -154,7 +161,7 @@ def from_runs_or_pictures(
             if uncalibrated and runs:
                 made = _of_uncalibrated(runs[0], view, _numbers(leave_out), out, say)
             elif pictures is not None:
-                made = _of_pictures(pictures, lights, intensities, mask, _numbers(leave_out), out, say)
+                made = _of_pictures(pictures, lights, intensities, mask, _numbers(leave_out), out, say, srgb=srgb)
             else:
                 records, left_out = records_named(calibrations or []), tuple(_numbers(leave_out))
                 request = RunRequest(
@@ -181,6 +188,8 @@ def _of_pictures(
     left_out: list[int],
     out: Path,
     say: Said,
+    *,
+    srgb: bool,
 ) -> Made:
     from coupole.reflectance.picture_job import fit_pictures
     from coupole.reflectance.picture_set import read_pictures
@@ -188,7 +197,7 @@ def _of_pictures(
 
     if lights is None:
         raise InputError("--lights: expected the file of the lights' directions")
-    given = read_pictures(pictures, lights, intensities=intensities, mask=mask)
+    given = read_pictures(pictures, lights, intensities=intensities, mask=mask, srgb=srgb)
     about = fit_pictures(given, out, left_out=left_out, say=say)
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 

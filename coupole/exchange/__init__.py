@@ -2,5 +2,7 @@
 
 FORMATS = ("dng", "tiff")
 """What frames can be exported to: the names of these modules, and the suffixes of the files."""
-RTI = "lp"
-"""What views are exported to: pictures with directions of light (`coupole.exchange.rti_pictures`)."""
+COLMAP = "colmap"
+"""What views are exported to with their poses (`coupole.exchange.colmap`)."""
+CRATE = "rocrate"
+"""What wraps a run or a result with what is to be known of it (`coupole.exchange.research_crate`)."""

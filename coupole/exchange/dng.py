@@ -1,7 +1,8 @@
 """A frame as DNG (Adobe, Digital Negative Specification 1.4), for LibRaw, darktable, RawTherapee.
 
-The pixels are the camera's, bit for bit: uncompressed, packed if they have 12 bits, else 16 bits each. There is no
-colour calibration, so the colour matrix is the identity, which the file states: colours are those of the sensor.
+The pixels are the camera's, bit for bit: uncompressed, packed if they have 12 bits, else 16 bits each. Exposure,
+lens and time are in the Exif directory. Where the camera's colours are not known the colour matrix is the
+identity, which the file states: colours are those of the sensor.
 """
 
 from __future__ import annotations
@@ -9,18 +10,21 @@ from __future__ import annotations
 import json
 import struct
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from fractions import Fraction
 
 import numpy as np
 
 import coupole
+from coupole.exchange.camera_colour import D65_CODE, CameraColour, unknown_colour
 from coupole.exchange.exported_frame import Picture
 from coupole.storage.packing import pack12
 
-_BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _SRATIONAL = 1, 2, 3, 4, 5, 10
+_BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 _CFA, _LINEAR_RAW = 32803, 34892
-_UNCALIBRATED = "not calibrated: ColorMatrix1 is the identity, AsShotNeutral is 1 1 1"
 _HEADER_BYTES, _ENTRY_BYTES = 8, 12
+_STRIP_OFFSETS, _EXIF = 273, 34665
+"""Tags whose values are places in the file."""
 
 
 @dataclass(frozen=True)
@@ -33,19 +37,22 @@ class Tag:
     data: bytes
 
 
-def encode(picture: Picture) -> bytes:
-    """The whole file: header, directory, values that do not fit into it, one strip of pixels."""
+def encode(picture: Picture, colour: CameraColour | None = None) -> bytes:
+    """The whole file: header, two directories, each with values that do not fit into it, one strip of pixels."""
     height, width = picture.pixels.shape
     twelve = width % 2 == 0 and max(picture.white_dn, int(picture.pixels.max())) < 4096
     strip = pack12(picture.pixels, "msb").tobytes() if twelve else picture.pixels.astype("<u2").tobytes()
+    known = colour or unknown_colour()
     tags = [
         *_image_tags(height, width, bits=12 if twelve else 16, strip_bytes=len(strip)),
-        *_camera_tags(picture),
-        *(_colour_tags(picture.pattern) if picture.pattern != "MONO" else [_short(262, _LINEAR_RAW)]),
+        *_camera_tags(picture, known),
+        *(_colour_tags(picture, known) if picture.pattern != "MONO" else [_short(262, _LINEAR_RAW)]),
     ]
-    directory, values, strip_offset = _lay_out(tags)
-    header = struct.pack("<2sHI", b"II", 42, _HEADER_BYTES)
-    return b"".join([header, directory, values, b"\0" * (strip_offset % 2), strip])
+    exif_at = _HEADER_BYTES + _size(tags)
+    exif = _exif_tags(picture)
+    strip_at = exif_at + _size(exif)
+    first = _directory(tags, _HEADER_BYTES, {_STRIP_OFFSETS: strip_at, _EXIF: exif_at})
+    return b"".join([struct.pack("<2sHI", b"II", 42, _HEADER_BYTES), first, _directory(exif, exif_at, {}), strip])
 
 
 def _image_tags(height: int, width: int, *, bits: int, strip_bytes: int) -> list[Tag]:
@@ -55,7 +62,8 @@ def _image_tags(height: int, width: int, *, bits: int, strip_bytes: int) -> list
         _long(257, height),
         _short(258, bits),
         _short(259, 1),  # Compression: none
-        _STRIP_OFFSET,
+        _long(_STRIP_OFFSETS, 0),
+        _long(_EXIF, 0),
         _short(274, 1),  # Orientation: not rotated
         _short(277, 1),  # SamplesPerPixel
         _long(278, height),  # RowsPerStrip
@@ -66,63 +74,98 @@ def _image_tags(height: int, width: int, *, bits: int, strip_bytes: int) -> list
     ]
 
 
-def _camera_tags(picture: Picture) -> list[Tag]:
-    about = {**picture.about, "bayer_pattern": picture.pattern, "colour": _UNCALIBRATED}
+def _camera_tags(picture: Picture, colour: CameraColour) -> list[Tag]:
+    about = {**picture.about, "bayer_pattern": picture.pattern, "colour": colour.told}
     camera = str(about.get("camera", "unknown camera")) + (" (simulated)" if about["simulated"] else "")
-    tags = [
+    return [
         _ascii(270, json.dumps(about)),  # ImageDescription
         _ascii(271, "La Coupole"),  # Make
         _ascii(272, camera),  # Model
+        _rationals(282, [Fraction(72)]),  # XResolution
+        _rationals(283, [Fraction(72)]),  # YResolution
+        _short(296, 2),  # ResolutionUnit: inch
         _ascii(305, f"coupole {coupole.__version__}"),  # Software
-        _rationals(33434, [Fraction(picture.exposure_us, 1_000_000)]),  # ExposureTime, s
+        *_times(picture, 306),  # DateTime
         _ascii(50708, f"La Coupole {camera}"),  # UniqueCameraModel
         _short(50713, 1, 1),  # BlackLevelRepeatDim
         _long(50714, picture.black_dn),
         _long(50717, picture.white_dn),
     ]
-    for number, key in ((33437, "f_number"), (37386, "focal_length_mm")):
-        if about.get(key):
-            tags.append(_rationals(number, [Fraction(about[key]).limit_denominator(10_000)]))
+
+
+def _exif_tags(picture: Picture) -> list[Tag]:
+    """Exif 2.31: UTC, and what is known of the lens."""
+    tags = [
+        _rationals(33434, [Fraction(picture.exposure_us, 1_000_000)]),  # ExposureTime, s
+        Tag(36864, _UNDEFINED, 4, b"0231"),  # ExifVersion
+        *_times(picture, 36867),  # DateTimeOriginal
+    ]
+    f_number, focal_mm = (float(picture.about.get(key) or 0.0) for key in ("f_number", "focal_length_mm"))
+    if f_number:
+        tags.append(_rationals(33437, [_fraction(f_number)]))  # FNumber
+    if picture.taken:
+        tags.append(_ascii(36881, "+00:00"))  # OffsetTimeOriginal
+    if focal_mm:
+        tags.append(_rationals(37386, [_fraction(focal_mm)]))  # FocalLength, mm
+        tags.append(_ascii(42036, f"{focal_mm:g} mm" + (f" f/{f_number:g}" if f_number else "")))  # LensModel
     return tags
 
 
-def _colour_tags(pattern: str) -> list[Tag]:
-    one, nothing = Fraction(1), Fraction(0)
+def _times(picture: Picture, number: int) -> list[Tag]:
+    if not picture.taken:
+        return []
+    return [_ascii(number, f"{datetime.fromisoformat(picture.taken).astimezone(UTC):%Y:%m:%d %H:%M:%S}")]
+
+
+def _colour_tags(picture: Picture, colour: CameraColour) -> list[Tag]:
+    """With colours: ColorMatrix1 gives of XYZ under D65 what the channels give under the LED."""
+    neutral = colour.neutral(picture.about.get("led"))
+    matrix = np.eye(3)
+    if colour.xyz_from_balanced is not None:
+        matrix = neutral[:, None] * np.linalg.inv(colour.xyz_from_balanced)
     return [
         _short(262, _CFA),
         _short(33421, 2, 2),  # CFARepeatPatternDim
-        Tag(33422, _BYTE, 4, bytes("RGB".index(letter) for letter in pattern)),
+        Tag(33422, _BYTE, 4, bytes("RGB".index(letter) for letter in picture.pattern)),
         Tag(50710, _BYTE, 3, bytes([0, 1, 2])),  # CFAPlaneColor
         _short(50711, 1),  # CFALayout: rectangular
-        _rationals(
-            50721, [one if i == j else nothing for i in range(3) for j in range(3)], _SRATIONAL
-        ),  # ColorMatrix1
-        _rationals(50728, [one] * 3),  # AsShotNeutral
-        _short(50778, 0),  # CalibrationIlluminant1: unknown
+        _rationals(50721, [_fraction(value) for value in matrix.ravel()], _SRATIONAL),  # ColorMatrix1
+        _rationals(50728, [_fraction(value) for value in neutral]),  # AsShotNeutral
+        _short(50778, 0 if colour.xyz_from_balanced is None else D65_CODE),  # CalibrationIlluminant1
     ]
 
 
-def _lay_out(tags: list[Tag]) -> tuple[bytes, bytes, int]:
-    """The directory, the values after it, and the offset of the strip (even)."""
-    values_offset = _HEADER_BYTES + 2 + _ENTRY_BYTES * len(tags) + 4
+def _size(tags: list[Tag]) -> int:
+    """Bytes of a directory and its values; even."""
+    return (
+        2
+        + _ENTRY_BYTES * len(tags)
+        + 4
+        + sum(len(tag.data) + len(tag.data) % 2 for tag in tags if len(tag.data) > 4)
+    )
+
+
+def _directory(tags: list[Tag], at: int, places: dict[int, int]) -> bytes:
+    """A directory that begins at the byte `at`, without a next one, and its values; `places` are tags whose value
+    is a place in the file."""
+    values_at = at + 2 + _ENTRY_BYTES * len(tags) + 4
     values = bytearray()
-    offsets = {}
-    for tag in tags:
-        if len(tag.data) > 4:
-            offsets[tag.number] = values_offset + len(values)
-            values += tag.data + b"\0" * (len(tag.data) % 2)
-    strip_offset = values_offset + len(values)
     entries = [struct.pack("<H", len(tags))]
     for tag in sorted(tags, key=lambda t: t.number):
-        if tag is _STRIP_OFFSET:
-            data = struct.pack("<I", strip_offset)
-        elif tag.number in offsets:
-            data = struct.pack("<I", offsets[tag.number])
+        if tag.number in places:
+            data = struct.pack("<I", places[tag.number])
+        elif len(tag.data) > 4:
+            data = struct.pack("<I", values_at + len(values))
+            values += tag.data + b"\0" * (len(tag.data) % 2)
         else:
             data = tag.data.ljust(4, b"\0")
         entries.append(struct.pack("<HHI", tag.number, tag.kind, tag.count) + data)
-    entries.append(struct.pack("<I", 0))  # no further directory
-    return b"".join(entries), bytes(values), strip_offset
+    entries.append(struct.pack("<I", 0))
+    return b"".join(entries) + bytes(values)
+
+
+def _fraction(value: float) -> Fraction:
+    return Fraction(value).limit_denominator(10_000)
 
 
 def _short(number: int, *values: int) -> Tag:
@@ -141,7 +184,3 @@ def _ascii(number: int, text: str) -> Tag:
 def _rationals(number: int, values: list[Fraction], kind: int = _RATIONAL) -> Tag:
     pairs = [part for value in values for part in (value.numerator, value.denominator)]
     return Tag(number, kind, len(values), np.array(pairs, "<i4").tobytes())
-
-
-_STRIP_OFFSET = _long(273, 0)
-"""StripOffsets: a placeholder until everything else is laid out."""

@@ -6,14 +6,16 @@ import fnmatch
 import importlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from coupole.errors import InputError
-from coupole.exchange import FORMATS
+from coupole.exchange import FORMATS, dng, tiff_for_the_eye
 from coupole.exchange.exported_frame import Picture
+from coupole.exchange.run_colour import ColourWanted, colour_of_run
 from coupole.exchange.target_folder import refuse_standing, writing_into
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
@@ -36,16 +38,19 @@ def export_run(
     *,
     views: list[str],
     shots: list[str],
+    colour: ColourWanted | None = None,
+    linear: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Exported:
     """Write proven frames into `folder`, as `<view>_led0417_e0.<to>`. View and label (`led0417/e0`) must each
-    match one of the patterns (`*` and `?`); without patterns all do.
+    match one of the patterns (`*` and `?`); without patterns all do. With `colour` a TIFF is sRGB for the eye, or
+    `linear`, and a DNG has its matrix.
 
     Raises InputError if nothing matches or a file exists already (unless `overwrite`), before anything is written;
     ChecksumMismatch if a frame is not what was proven, DiskFull or StorageError.
     """
-    encode = _encoder(to)
+    encode = _encoder(to, run, colour, linear=linear)
     frames = [
         frame
         for shot, frame in run.proven().items()
@@ -64,11 +69,16 @@ def export_run(
     return Exported(len(frames), written)
 
 
-def _encoder(to: str) -> Callable[[Picture], bytes]:
+def _encoder(to: str, run: Run, colour: ColourWanted | None, *, linear: bool) -> Callable[[Picture], bytes]:
     if to not in FORMATS:
         raise InputError(f"--to: expected one of {', '.join(FORMATS)}; found {to}")
-    encode: Callable[[Picture], bytes] = importlib.import_module(f"coupole.exchange.{to}").encode
-    return encode
+    if colour is None:
+        encode: Callable[[Picture], bytes] = importlib.import_module(f"coupole.exchange.{to}").encode
+        return encode
+    known = colour_of_run(run, colour)
+    if to == "dng":
+        return partial(dng.encode, colour=known)
+    return partial(tiff_for_the_eye.encode, colour=known, linear=linear)
 
 
 def _matches(name: str, patterns: list[str]) -> bool:
@@ -107,6 +117,7 @@ def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
                 black_dn=file.black_dn,
                 white_dn=file.white_dn,
                 exposure_us=int(record["exposure_us"]),
+                taken=frame.t,
                 about=about,
             )
 

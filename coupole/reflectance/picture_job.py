@@ -112,6 +112,7 @@ def _inputs(pictures: PictureSet) -> dict[str, Any]:
         "directions": pictures.directions.round(9).tolist(),
         "intensities": pictures.intensities.tolist(),
         "mask": hashlib.sha256(np.packbits(pictures.mask).tobytes()).hexdigest(),
+        **({"encoding": "sRGB"} if pictures.srgb else {}),
     }
 
 
@@ -123,7 +124,7 @@ def _store(pictures: PictureSet, path: Path, say: Said) -> None:
             file["intensities"] = pictures.intensities
             file["names"] = [one.name for one in pictures.files]
             values = file.create_dataset("values", (len(pictures), pictures.pixels, 3), pictures.dtype)
-            values.attrs["shape"] = "lights, pixels of the mask in the order of rows, rgb; as in the files"
+            values.attrs["shape"] = "lights, pixels of the mask in the order of rows, rgb; linear"
             for number in range(len(pictures)):
                 say("reading", number, len(pictures))
                 values[number] = pictures.raw_values(number)

@@ -5,17 +5,15 @@ Axes: x to the right of the picture, y up, z to the camera, which is taken as fa
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError, Problem
+from coupole.reflectance.light_files import read_lights, read_rows, refuse
 
 PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 ORDER_FILE = "filenames.txt"
@@ -35,7 +33,9 @@ class PictureSet:
     mask: NDArray[np.bool_]
     """[h, w] what is fitted."""
     full_scale: int
-    """Largest value that a file can hold."""
+    """Largest value that a picture can hold."""
+    srgb: bool = False
+    """Whether files are encoded for displays; their values are decoded to 16 bit."""
     uncalibrated_run: str = ""
     """The run that these are pictures of, with nominal lights; empty for others."""
 
@@ -47,11 +47,13 @@ class PictureSet:
         return int(np.count_nonzero(self.mask))
 
     def raw_values(self, number: int) -> NDArray[Any]:
-        """[pixels, 3] of one picture, those of the mask in the order of rows, as the file has them.
+        """[pixels, 3] of one picture, those of the mask in the order of rows, linear.
 
         Raises InputError if it differs from the first picture in size or depth.
         """
         picture = read_picture(self.files[number])
+        if self.srgb:
+            picture = _decoded(picture)
         if picture.shape[:2] != self.mask.shape or picture.dtype != self.dtype:
             refuse(self.files[number], _differs(picture, self.mask.shape, self.dtype))
         return picture[self.mask]
@@ -70,17 +72,18 @@ def _differs(picture: NDArray[Any], shape: tuple[int, ...], dtype: Any) -> str:
 
 
 def read_pictures(
-    folder: Path, lights: Path, *, intensities: Path | None = None, mask: Path | None = None
+    folder: Path, lights: Path, *, intensities: Path | None = None, mask: Path | None = None, srgb: bool = False
 ) -> PictureSet:
-    """The set in a folder; `lights` is an .lp file, or one with a direction in each line.
+    """The set in a folder; `lights` is any file that `read_lights` takes. `srgb`: pictures are encoded for
+    displays, as those are of which the file of the lights says so.
 
     Raises InputError that names file and line.
     """
     if not folder.is_dir():
         refuse(folder, "is no folder of pictures")
-    names, directions = read_lp(lights) if lights.suffix.lower() == ".lp" else ([], read_rows(lights, (3,)))
-    if not names:
-        names = _names_in(folder, {path.resolve() for path in (mask,) if path is not None})
+    said = read_lights(lights)
+    directions = said.directions
+    names = said.names or _names_in(folder, {path.resolve() for path in (mask,) if path is not None})
     if len(names) != len(directions):
         refuse(lights, f"has {len(directions)} lights, {folder} has {len(names)} pictures; expected as many")
     if len(names) < FEWEST_LIGHTS:
@@ -88,15 +91,16 @@ def read_pictures(
     files = tuple(folder / name for name in names)
     for path in files:
         if not path.is_file():
-            refuse(
-                lights if lights.suffix.lower() == ".lp" else folder / ORDER_FILE, f"names {path}: no such file"
-            )
+            refuse(lights if said.names else folder / ORDER_FILE, f"names {path}: no such file")
     lengths = np.linalg.norm(directions, axis=1)
     for line, length in enumerate(lengths, start=1):
         if length < 1e-6:
             refuse(lights, "a light's direction has no length", line)
     first = read_picture(files[0])
-    factors = read_rows(intensities, (1, 3)) if intensities else np.ones((len(files), 3))
+    srgb = srgb or said.srgb
+    factors = said.intensities if said.intensities is not None else np.ones((len(files), 3))
+    if intensities is not None:
+        factors = read_rows(intensities, (1, 3))
     if len(factors) != len(files) or not np.all(factors > 0):
         refuse(intensities or lights, f"expected {len(files)} lines of positive intensities, got {len(factors)}")
     return PictureSet(
@@ -104,16 +108,27 @@ def read_pictures(
         directions / lengths[:, None],
         np.broadcast_to(factors, (len(files), 3)),
         _read_mask(mask, first.shape[:2]),
-        int(np.iinfo(first.dtype).max),
+        65535 if srgb else int(np.iinfo(first.dtype).max),
+        srgb,
     )
 
 
-def _names_in(folder: Path, others: set[Path]) -> list[str]:
+def _decoded(picture: NDArray[Any]) -> NDArray[np.uint16]:
+    """Linear values, full scale 65535, of sRGB's codes (IEC 61966-2-1)."""
+    most = int(np.iinfo(picture.dtype).max)
+    codes = np.arange(most + 1) / most
+    linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    table = np.rint(65535.0 * linear).astype(np.uint16)
+    values: NDArray[np.uint16] = table[picture]
+    return values
+
+
+def _names_in(folder: Path, others: set[Path]) -> tuple[str, ...]:
     order = folder / ORDER_FILE
     if order.is_file():
-        return order.read_text(encoding="utf-8").split()
+        return tuple(order.read_text(encoding="utf-8").split())
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
-    return [path.name for path in found if path.resolve() not in others and path.stem != "mask"]
+    return tuple(path.name for path in found if path.resolve() not in others and path.stem != "mask")
 
 
 def read_picture(path: Path) -> NDArray[Any]:
@@ -137,53 +152,3 @@ def _read_mask(path: Path | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     if not mask.any():
         refuse(path, "is black everywhere: nothing to fit")
     return mask
-
-
-def read_rows(path: Path, lengths: Sequence[int]) -> NDArray[np.float64]:
-    """[n, 3] numbers, one row a line; a single number stands for three. Raises InputError with the line."""
-    rows = []
-    for line, text in enumerate(_lines(path), start=1):
-        if words := text.replace(",", " ").split():
-            if len(words) not in lengths:
-                refuse(path, f"{len(words)} values; expected {' or '.join(map(str, lengths))}", line)
-            rows.append(np.resize([_number(path, line, word) for word in words], 3))
-    return np.array(rows, dtype=np.float64).reshape(-1, 3)
-
-
-def read_lp(path: Path) -> tuple[list[str], NDArray[np.float64]]:
-    """Names of pictures and directions [n, 3] of an .lp file: a count, then `name x y z` in each line."""
-    names, rows = [], []
-    lines = [(number, text) for number, text in enumerate(_lines(path), start=1) if text.strip()]
-    if not lines or not lines[0][1].strip().isdecimal():
-        refuse(path, "expected the number of lights", lines[0][0] if lines else 1)
-    for line, text in lines[1:]:
-        words = text.split()
-        if len(words) < 4:
-            refuse(path, "expected `name x y z`", line)
-        names.append(Path(" ".join(words[:-3]).replace("\\", "/")).name)
-        rows.append([_number(path, line, word) for word in words[-3:]])
-    if len(rows) != int(lines[0][1]):
-        refuse(path, f"says {lines[0][1].strip()} lights, has {len(rows)}", lines[0][0])
-    return names, np.array(rows, dtype=np.float64)
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError([Problem(str(path), 0, 0, "", f"cannot be read: {error}")]) from error
-
-
-def _number(path: Path, line: int, word: str) -> float:
-    try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        refuse(path, f"{word!r} is no number", line)
-    return value
-
-
-def refuse(path: Path, message: str, line: int = 0) -> NoReturn:
-    """Raise InputError about a file."""
-    raise InputError([Problem(str(path), line, 1 if line else 0, "", message)])

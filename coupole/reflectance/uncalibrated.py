@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from coupole.calibration.light.frames import LightFrame, LightFrames, channel_ma
 from coupole.calibration.light.records import dark_signal
 from coupole.errors import InputError
 from coupole.geometry import apply, inverse
-from coupole.plan.reading import read_plan
+from coupole.plan.reading import PlanFiles, read_plan
 from coupole.reflectance.extraction.frames_for_check import block_offsets
 from coupole.reflectance.picture_set import FEWEST_LIGHTS, ORDER_FILE
 from coupole.reflectance.result_folder import complete
@@ -41,6 +41,7 @@ class PicturedView:
 
     leds: tuple[int, ...]
     files: tuple[Path, ...]
+    """In the order of the LEDs; none if they were not asked for."""
     lights_mm: NDArray[np.float64]
     """[n, 3] LEDs from the point that the camera is focused on: x right, y up, z to the camera."""
     width_mm: float
@@ -74,23 +75,41 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> Pict
         assert read is not None
         brightest = np.maximum(brightest, read.reshape(*brightest.shape, -1).max(axis=2))
         say("pictures", number + 1, len(leds))
-    pose = chosen[leds[0]].base_from_camera
-    target_mm = pose[:3, 3] + files.cell.rig.lens.focus_distance_mm * pose[:3, 2]
+    seen = _nominal(files, chosen, run.simulated)
     rows = files.cell.leds.rows(leds)
-    towards = apply(inverse(pose), files.cell.leds.positions_mm[rows]) - apply(inverse(pose), target_mm)
-    towards *= (1.0, -1.0, -1.0)  # x right, y up, z to the camera
+    target_mm = _target_mm(files, chosen[leds[0]].base_from_camera)
     light = files.cell.leds.illuminance_lux(target_mm[None])[0, rows]
-    _write_rows(out / LIGHTS, towards / np.linalg.norm(towards, axis=1, keepdims=True))
+    _write_rows(out / LIGHTS, seen.lights_mm / np.linalg.norm(seen.lights_mm, axis=1, keepdims=True))
     _write_rows(out / INTENSITIES, np.repeat(light[:, None] / light.max(), 3, axis=1))
     write_synced(out / ORDER_FILE, "".join(f"led{led:04d}.png\n" for led in leds))
     mask = np.where(brightest > _LEAST_SHARE * 65535, np.uint8(255), np.uint8(0))
     complete(out / MASK, partial(_write_png, mask))
+    return replace(seen, files=tuple(out / f"led{led:04d}.png" for led in leds))
+
+
+def lights_of_view(folder: Path, view: str | None) -> PicturedView:
+    """What the pictures of a view of a run are taken with, without writing them. Raises as `write_pictures`."""
+    run = Run(folder)
+    chosen = _frames_of(folder, open_light_frames([folder]), view)
+    return _nominal(read_plan(run.plan_path, run.rig_path), chosen, run.simulated)
+
+
+def _nominal(files: PlanFiles, chosen: dict[int, LightFrame], simulated: bool) -> PicturedView:
+    leds = tuple(sorted(chosen))
+    pose = chosen[leds[0]].base_from_camera
+    rows = files.cell.leds.rows(leds)
+    towards = apply(inverse(pose), files.cell.leds.positions_mm[rows])
+    towards -= apply(inverse(pose), _target_mm(files, pose))
+    towards *= (1.0, -1.0, -1.0)  # x right, y up, z to the camera
     rig = files.cell.rig
     wide_mm = rig.sensor.width_px * rig.sensor.pixel_pitch_um * 1e-3
     width_mm = wide_mm * (rig.lens.focus_distance_mm / rig.lens.focal_length_mm - 1.0)
-    return PicturedView(
-        tuple(leds), tuple(out / f"led{led:04d}.png" for led in leds), towards, width_mm, run.simulated
-    )
+    return PicturedView(leds, (), towards, width_mm, simulated)
+
+
+def _target_mm(files: PlanFiles, base_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3] the point that the camera is focused on."""
+    return base_from_camera[:3, 3] + files.cell.rig.lens.focus_distance_mm * base_from_camera[:3, 2]
 
 
 def _refuse_others(path: Path, text: str) -> None:

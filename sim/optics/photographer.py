@@ -33,7 +33,15 @@ from sim.render.shadows import Shadows
 from sim.scene.scene import Scene, build_scene, load_surface, support_disk
 from sim.scene.surface import Material, Surface
 from sim.scene.things import placed
-from sim.world.config import CameraConfig, MaterialConfig, MeshConfig, SceneConfig, Settings, SpecimenConfig
+from sim.world.config import (
+    CameraConfig,
+    MaterialConfig,
+    MeasuredConfig,
+    MeshConfig,
+    SceneConfig,
+    Settings,
+    SpecimenConfig,
+)
 
 _POSE_TOLERANCE, _ARM_TOLERANCE_MM = 1e-6, 1e-3
 _SHADOW_BYTES = 512 << 20
@@ -338,6 +346,10 @@ def _surface(mesh: MeshConfig, settings: Settings) -> Surface:
             from sim.objects.specimens import specimen
 
             material = specimen(given.specimen)
+        case MeasuredConfig():
+            from sim.objects.merl_file import merl_material
+
+            material = merl_material(given.merl)
         case MaterialConfig():
             material = Material(mesh.path.stem, given.diffuse, given.f0, given.roughness)
     surface = load_surface(mesh.path, mesh.unit, material, settings.detail)

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from sim.devices import camera_server, kuka_controller, ledbox_firmware
 from sim.devices.arm_bodies import ToolBody
@@ -59,13 +59,26 @@ class SpecimenConfig(_Model):
     specimen: Literal["tabulated", "layered", "makie", "four-flux", "fabric"]
 
 
+class MeasuredConfig(_Model):
+    """A measured material (`sim.objects.merl_file`)."""
+
+    merl: Path
+
+    @field_validator("merl")
+    @classmethod
+    def _absolute(cls, path: Path) -> Path:
+        if not path.is_absolute():
+            raise ValueError("expected an absolute path, as the world does not know from where the rig was read")
+        return path
+
+
 class MeshConfig(_Model):
     """One object: its mesh and its pose on the support (row-major 4x4)."""
 
     path: Path
     unit: Literal["mm", "m", "um"]
     support_from_object: list[list[float]]
-    material: MaterialConfig | SpecimenConfig | None = None
+    material: MaterialConfig | SpecimenConfig | MeasuredConfig | None = None
     """Multiplied by the mesh's own colours; None: these alone, or warm stone for a mesh without colours."""
 
 
@@ -156,7 +169,7 @@ class Settings(_Model):
     """Whether arm and tool block light."""
     cables: tuple[ToolBody, ...] = ()
     """Capsules in the support frame that hang in the cell and block light, of which no plan and no rig knows."""
-    material: MaterialConfig | SpecimenConfig | None = None
+    material: MaterialConfig | SpecimenConfig | MeasuredConfig | None = None
     """Of the plan's object, multiplied by its mesh's own colours; None: these alone, or warm stone."""
     detail: tuple[Layer, ...] = ()
     """Of the plan's object: texture, bumps and turned normals that its mesh does not have."""

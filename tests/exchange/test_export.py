@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +34,9 @@ REFERENCE = SHARED_DATA / "raw/colorchart.dng"
 def picture(pixels: Frame, *, pattern: str = "GBRG", black_dn: int = 64, white_dn: int = 4095) -> Picture:
     """Pixels with the least that must be known of them."""
     about = {"shot": "top/led0417/e0", "simulated": True, "camera": "memory camera sim-0"}
-    return Picture(pixels, pattern, black_dn, white_dn, exposure_us=8000, about=about)
+    return Picture(
+        pixels, pattern, black_dn, white_dn, exposure_us=8000, taken="2026-11-23T08:39:19.485Z", about=about
+    )
 
 
 def random_pixels(height: int, width: int, most: int, seed: int = 1) -> Frame:
@@ -131,6 +135,26 @@ def test_a_pixel_beyond_twelve_bits_is_kept_in_sixteen() -> None:
         assert raw.raw_image[3, 5] == 4096
 
 
+@pytest.mark.skipif(shutil.which("exiftool") is None, reason="ExifTool is not installed")
+@pytest.mark.parametrize("pattern", ["GBRG", "MONO"])
+def test_exiftool_finds_nothing_amiss_in_a_dng_and_reads_how_it_was_taken(pattern: str, tmp_path: Path) -> None:
+    made = picture(random_pixels(64, 96, 4095), pattern=pattern)
+    made.about.update(f_number=8.0, focal_length_mm=35.0)
+    path = tmp_path / "frame.dng"
+    path.write_bytes(dng.encode(made))
+    words = ["exiftool", "-validate", "-warning", "-error", "-a", "-j", "-n", "-G1", "-all", str(path)]
+    (found,) = json.loads(subprocess.run(words, check=True, capture_output=True).stdout)
+    assert found["ExifTool:Validate"] == "0 0 0"  # errors, warnings, minor ones
+    assert {key: found[f"ExifIFD:{key}"] for key in ("ExposureTime", "FNumber", "FocalLength", "LensModel")} == {
+        "ExposureTime": 0.008,
+        "FNumber": 8,
+        "FocalLength": 35,
+        "LensModel": "35 mm f/8",
+    }
+    assert found["ExifIFD:DateTimeOriginal"] == found["IFD0:ModifyDate"] == "2026:11:23 08:39:19"
+    assert (found["IFD0:Make"], found["IFD0:Model"]) == ("La Coupole", "memory camera sim-0 (simulated)")
+
+
 def test_a_dng_says_that_it_is_simulated_and_that_its_colours_are_not_calibrated() -> None:
     tags = tags_of(dng.encode(picture(random_pixels(64, 96, 4095))))
     about = json.loads(tags["ImageDescription"])
@@ -141,7 +165,7 @@ def test_a_dng_says_that_it_is_simulated_and_that_its_colours_are_not_calibrated
 
 
 def test_a_dng_holds_the_exposure_time() -> None:
-    assert tags_of(dng.encode(picture(random_pixels(64, 96, 4095))))["ExposureTime"] == (1, 125)
+    assert tags_of(dng.encode(picture(random_pixels(64, 96, 4095))))["ExifTag"]["ExposureTime"] == (1, 125)
 
 
 def test_tags_of_a_dng_stand_in_ascending_order() -> None:

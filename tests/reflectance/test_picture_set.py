@@ -1,4 +1,6 @@
 import contextlib
+import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +11,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from coupole.errors import InputError
-from coupole.reflectance.picture_set import read_lp, read_pictures, read_rows
+from coupole.reflectance.light_files import read_lights, read_lp, read_rows
+from coupole.reflectance.picture_set import read_pictures
 
 DIRECTIONS = "".join(f"{x} {y} 1\n" for x in (-0.5, 0, 0.5) for y in (-0.5, 0.5))
 
@@ -110,3 +113,68 @@ def test_any_text_is_read_or_refused(
     path.write_text(text, encoding="utf-8")
     with contextlib.suppress(InputError):
         reader(path)
+
+
+def points(rows: np.ndarray) -> list[dict[str, float]]:
+    return [dict(zip("xyz", row, strict=True)) for row in rows.tolist()]
+
+
+def rows_of(text: str) -> np.ndarray:
+    return np.array([line.split() for line in text.splitlines()], float)
+
+
+def test_a_project_of_relight_names_pictures_places_and_strengths_of_lights(folder: Path) -> None:
+    """As relight saves it: skipped pictures have no light, places hold if the configuration says so."""
+    ways = rows_of(DIRECTIONS)
+    images = [{"filename": f"{5 - number}.png", "skip": False, "visible": True} for number in range(6)]
+    images.insert(2, {"filename": "blurred.png", "skip": True, "visible": True})
+    dome = {
+        "imageWidth": 200.0,
+        "domeDiameter": 600.0,
+        "lightConfiguration": "lights3d",
+        "directions": points(-ways),
+        "positionsSphere": [],
+        "positions3d": points(250.0 * ways),
+        "ledAdjust": [{"r": 2.0, "g": 1.0, "b": 0.5}] * 6,
+    }
+    project = {"application": "RelightLab", "width": 5, "height": 4, "folder": "pictures", "images": images}
+    path = folder / "coin.relight"
+    path.write_text(json.dumps({**project, "dome": dome, "forcedInputColorspace": "srgb"}))
+    given = read_pictures(folder / "pictures", path)
+    assert [file.name for file in given.files] == [f"{5 - number}.png" for number in range(6)]
+    np.testing.assert_allclose(given.directions, ways / np.linalg.norm(ways, axis=1, keepdims=True))
+    assert given.intensities[0].tolist() == [0.5, 1.0, 2.0]
+    red = given.raw_values(0)[0][0]  # code 35 of 255
+    assert given.full_scale == 65535
+    assert red == pytest.approx(65535 * ((35 / 255 + 0.055) / 1.055) ** 2.4, abs=0.6)
+    path.write_text(json.dumps({**project, "dome": {**dome, "lightConfiguration": "directional"}}))
+    plain = read_pictures(folder / "pictures", path)
+    np.testing.assert_allclose(plain.directions, -given.directions)
+    assert (plain.full_scale, plain.raw_values(0)[0][0]) == (255, 35)
+
+
+def test_a_dome_file_has_lights_for_pictures_in_the_order_of_their_names(folder: Path) -> None:
+    ways = rows_of(DIRECTIONS)
+    path = folder / "mine.dome"
+    path.write_text(json.dumps({"lightConfiguration": "spherical", "directions": ways.tolist()}))
+    given = read_pictures(folder / "pictures", path)
+    np.testing.assert_allclose(given.directions, ways / np.linalg.norm(ways, axis=1, keepdims=True))
+    assert given.files[0].name == "0.png"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.dome", "[1", "is no JSON"),
+        ("a.dome", "{}", "directions: expected a list of lights, of x, y, z; there is none"),
+        ("a.dome", '{"directions": [{"x": 1, "y": true, "z": 1}]}', "directions, number 0: expected x, y, z"),
+        ("a.dome", '{"directions": [[1, 2, 3]], "ledAdjust": [[1, 0, 1]]}', "ledAdjust: expected 1 of positive"),
+        ("a.relight", '{"dome": {}}', "expected a project of relight"),
+        ("a.relight", '{"dome": {"directions": [[0, 0, 1]]}, "images": []}', "1 lights; 0 pictures are used of 0"),
+        ("a.relight", '{"dome": {}, "images": [{}]}', "images: expected a `filename` in each"),
+    ],
+)
+def test_files_of_relight_that_say_too_little_are_refused(name: str, text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=re.escape(said)):
+        read_lights(tmp_path / name)

@@ -15,13 +15,18 @@ import cv2
 import h5py
 import numpy as np
 import OpenEXR
+import pycolmap
 import pytest
 import trimesh
+from arms import KR10_R1100_SIXX
 from cells import CellFolder
 from dask_cluster import cluster
 from relief_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, SIDE, shipped_cell, unit, walter
+from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
 
 from coupole.calibration.light.frames import open_light_frames
+from coupole.kinematics import forward
 from coupole.reflectance import ggx
 from coupole.reflectance.new_light.light_kinds import DistantLight
 from coupole.reflectance.new_light.shading import coats_of
@@ -168,7 +173,10 @@ def test_pictures_for_rti_show_the_object_under_the_lights_that_their_file_names
     codes = np.stack([cv2.imread(str(tmp_path / "top" / line.split()[0]))[::9, ::9, 1] for line in lines]) / 255.0
     linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
     dome = json.loads((tmp_path / "top/top.dome").read_text())
-    places = np.array(dome["positions3d"])
+    places = np.array([[place[axis] for axis in "xyz"] for place in dome["positions3d"]])
+    alone = cells.here("export", cell.run_folder, "--to", "dome", "--views", "top", "--out", tmp_path / "dome")
+    assert alone.code == 0, alone.err
+    assert json.loads((tmp_path / "dome/top.dome").read_text()) == dome
     np.testing.assert_allclose(unit(places), ways, atol=1e-5)
     lens = cell.rig_data["lens"]
     image_mm = 1 / (1 / lens["focal_length_mm"] - 1 / lens["focus_distance_mm"])  # thin lens
@@ -574,6 +582,40 @@ def test_samples_are_exported_with_bounds_that_hold_the_truth(made: Made, tmp_pa
     assert np.mean(inside) > 0.9
 
 
+def test_samples_as_the_bird_project_has_them_hold_the_truth(made: Made, tmp_path: Path) -> None:
+    """By its angles of zenith and azimuth the material's formula gives BRDF, within uBRDF as often as it says."""
+    _, out, _ = made
+    with h5py.File(out / "samples/top.h5") as file:
+        many = np.isfinite(file["f"][()]).all(axis=2).sum(axis=1)
+        chosen = file["triangles"][()][np.argsort(many)[-20::4]]
+    options = [word for number in chosen for word in ("--triangle", str(number))]
+    assert cells.here("export", out, "--to", "bird", *options, "--out", tmp_path).code == 0
+    inside = []
+    for path in sorted(tmp_path.glob("*_green.brdf")):
+        document = json.loads(path.read_text())
+        assert document["metadata"]["type"] == "BRDF"
+        assert document["metadata"]["method"] == "simulation"
+        data = document["data"]
+        columns = {name: np.array(data[name]["values"]) for name in data}
+        assert {one["unit"] for name, one in data.items() if "BRDF" not in name} == {"deg"}
+        assert data["BRDF"]["unit"] == data["uBRDF"]["unit"] == "1/sr"
+        assert len({len(column) for column in columns.values()}) == 1
+        assert 0 <= columns["phi_i"].min() < columns["phi_i"].max() < 360
+
+        def ways(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
+            return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
+
+        light, view = (
+            ways(np.radians(columns[f"theta_{end}"]), np.radians(columns[f"phi_{end}"])) for end in "ir"
+        )
+        truth = walter(np.array([[0.0, 0.0, 1.0]]), light, view)[:, 1]
+        inside += (np.abs(columns["BRDF"] - truth) < columns["uBRDF"]).tolist()
+        assert np.median(columns["BRDF"] / truth) == pytest.approx(1.0, abs=0.03)
+        assert 0.01 < np.median(columns["uBRDF"] / truth) < 0.2
+    assert len(inside) > 300
+    assert np.mean(inside) > 0.6  # the mesh is exact here, which a scan's would not be
+
+
 def test_clusters_are_a_few_materials_for_all_and_fill_what_has_too_few_samples(made: Made) -> None:
     _, out, document = made
     to = out / "clustered.npy"
@@ -615,3 +657,61 @@ def test_clusters_are_a_few_materials_for_all_and_fill_what_has_too_few_samples(
     assert cells.here(*relight, "--fit", "ggx_normal").code == 0
     assert np.count_nonzero(filled) > np.count_nonzero(np.load(to))
     assert "any colours" in (out / "clusters.html").read_text()
+
+
+def test_colmap_projects_the_mesh_where_the_records_do(made: Made, tmp_path: Path) -> None:
+    """Its own camera against OpenCV's, with lens and hand-eye as the record has them."""
+    cell, _, _ = made
+    options = ("--to", "colmap", "--calibrations", RECORDS, "--out", tmp_path)
+    assert cells.here("export", cell.run_folder, *options).code == 0
+    model = pycolmap.Reconstruction(tmp_path / "sparse/0")
+    model.update_point_3d_errors()
+    assert len(model.points3D) > 1000
+    assert max(point.error for point in model.points3D.values()) < 1e-4
+    record = YAML(typ="safe").load(RECORDS / "hand-eye.yaml")
+    lens = {one["name"].removesuffix("_px"): one["value"] for one in record["parameters"]}
+    hand_eye = record["transforms"]["flange_from_camera"]
+    flange_from_camera = np.eye(4)
+    turned = Rotation.from_euler("ZYX", hand_eye["abc_deg"], degrees=True)
+    flange_from_camera[:3, :3], flange_from_camera[:3, 3] = turned.as_matrix(), hand_eye["translation_mm"]
+    zeros_deg = [0.0, *(lens[f"axis_zero.a{axis}_deg"] for axis in range(2, 7))]
+    matrix = np.array([[lens["fx"], 0, lens["cx"]], [0, lens["fy"], lens["cy"]], [0, 0, 1]])
+    bent = np.array([lens.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
+    corners = trimesh.load(cell.plan_data["object"]["mesh"], process=False).vertices
+    proven = [event for event in cells.events(cell.run_folder, "frame") if "/led" in event["shot"]]
+    first = {event["shot"].partition("/")[0]: event["index"] for event in reversed(proven)}
+    for image in model.images.values():
+        with h5py.File(cell.run_folder / f"views/{Path(image.name).stem}.h5") as file:
+            frames = file["entry/instrument/detector/frames"][()]
+            at = int(frames["pose"][first[Path(image.name).stem]])
+            pose = file["entry/instrument/robot/poses"][at]
+            base_from_support = file["entry"].attrs["base_from_support"]
+        moved = [forward(KR10_R1100_SIXX, pose["joints_deg"] + zeros) for zeros in (np.zeros(6), zeros_deg)]
+        base_from_flange = pose["base_from_flange"] @ np.linalg.inv(moved[0]) @ moved[1]
+        camera = np.linalg.inv(base_from_flange @ flange_from_camera) @ base_from_support
+        wanted, _ = cv2.projectPoints(corners, camera[:3, :3], camera[:3, 3], matrix, bent)
+        found = np.array([image.project_point(corner) for corner in corners]) - 0.5
+        np.testing.assert_allclose(found, wanted[:, 0], rtol=0, atol=1e-3)
+        picture = cv2.imread(str(tmp_path / "images" / image.name))
+        assert picture.shape == (384, 512, 3)
+    red, green, blue = np.mean([point.color for point in model.points3D.values()], axis=0)
+    assert red > green > blue  # as the relief is
+
+
+def test_a_frame_becomes_a_picture_for_the_eye(made: Made, tmp_path: Path) -> None:
+    cell, _, _ = made
+    nm = np.arange(380, 781, 10)
+    bells = np.exp(-0.5 * ((nm[:, None] - [600, 540, 460]) / 40) ** 2)
+    np.savetxt(tmp_path / "sensor.csv", np.column_stack([nm, bells]), delimiter=";")
+    np.savetxt(tmp_path / "led.csv", np.column_stack([nm, np.ones(len(nm))]), delimiter=";")
+    options = ("--to", "tiff", "--for-the-eye", "--sensor-spectra", tmp_path / "sensor.csv", "--views", "top")
+    asked = ("export", cell.run_folder, *options, "--calibrations", RECORDS, "--out", tmp_path / "out")
+    ended = cells.here(*asked)
+    assert ended.code == 2
+    assert "its rig names no spectrum of the LEDs" in " ".join(ended.err.split())
+    assert cells.here(*asked, "--shots", "led0000/*", "--led-spectrum", tmp_path / "led.csv").code == 0
+    (path,) = (tmp_path / "out").iterdir()
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert picture.dtype == np.uint16
+    blue, green, red = picture[picture.min(axis=2) > 20000].mean(axis=0)
+    assert red > green > blue

@@ -41,7 +41,8 @@ def encode(material: Material, told: str = "") -> bytes:
         way_in = np.array([np.sin(theta), 0.0, max(np.cos(theta), 1e-6)])
         ways_out = 2.0 * (half @ way_in)[:, None] * half - way_in
         values = material.reflectance(np.broadcast_to(way_in, half.shape), ways_out) * ways_out[:, 2:]
-        rgb[0, number] = values.T.reshape(3, SIDE, SIDE)
+        rgb[0, number] = np.maximum(values, 0.0).T.reshape(3, SIDE, SIDE)
+    rgb = nodes_for_linear_reading(rgb)
     text = f"{material.name}; {told}".encode()
     return tensors(
         {
@@ -56,6 +57,25 @@ def encode(material: Material, told: str = "") -> bytes:
             "jacobian": np.ones(1, np.uint8),
         }
     )
+
+
+def nodes_for_linear_reading(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Nodes [1, theta_i, channels, phi, theta_m] whose linear interpolation misses least, of values there.
+
+    Between values h apart it misses f by f'' h^2 t (1 - t) / 2, in the mean by f'' h^2 / 12, on each axis: that
+    much is taken from the nodes, but not where f ends at the horizon.
+    """
+    found = values.copy()
+    for axis, periodic in ((1, False), (3, True), (4, False)):
+        along, nodes = np.moveaxis(values, axis, 0), np.moveaxis(found, axis, 0)
+        whole = along > 0.0
+        inner = whole[2:] & whole[1:-1] & whole[:-2]
+        nodes[1:-1] -= np.where(inner, along[2:] - 2.0 * along[1:-1] + along[:-2], 0.0) / 12.0
+        if periodic:
+            bend = np.where(whole[1] & whole[0] & whole[-2], along[1] - 2.0 * along[0] + along[-2], 0.0) / 12.0
+            nodes[0] -= bend
+            nodes[-1] -= bend
+    return np.maximum(found, 0.0)
 
 
 def tensors(fields: dict[str, NDArray[np.float32] | NDArray[np.uint8]]) -> bytes:

@@ -2,13 +2,13 @@
 
 Colour is pi kd, roughness the square root of GGX's alpha, ks stands as the reflectance at normal incidence
 (KHR_materials_specular over an index of 1.5). glTF's own model differs from the fit: its specular part grows
-towards grazing by Schlick's formula and takes from the diffuse one what it reflects.
+towards grazing by Schlick's formula and takes from the diffuse one what it reflects; what it takes at normal
+incidence is made up for in the colour.
 """
 
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface
+from coupole.exchange.of_results.measured_surface import Y_UP_FROM_SUPPORT, Floats, MeasuredSurface
+from coupole.exchange.of_results.texel_layout import middles, texture
 from coupole.exchange.srgb import srgb
 from coupole.storage.durable import write_synced
 
@@ -25,25 +26,21 @@ _F0 = 0.04
 _NEAREST, _CLAMP = 9728, 33071
 _FLOAT, _ARRAY_BUFFER = 5126, 34962
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
-_GL_FROM_SUPPORT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""y is up there."""
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     """`surface.glb`: metres, y up. Triangles without a material are left out."""
     known = np.flatnonzero(surface.known)
-    corners = (surface.vertices_mm[surface.triangles[known]].reshape(-1, 3) @ _GL_FROM_SUPPORT.T) * 1e-3
-    normals = np.repeat(surface.normals[known] @ _GL_FROM_SUPPORT.T, 3, axis=0)
-    side = max(1, math.ceil(math.sqrt(len(known))))
-    row, column = np.divmod(np.arange(len(known)), side)
-    places = np.repeat((np.stack([column, row], axis=1) + 0.5) / side, 3, axis=0)
+    corners = (surface.vertices_mm[surface.triangles[known]].reshape(-1, 3) @ Y_UP_FROM_SUPPORT.T) * 1e-3
+    normals = np.repeat(surface.normals[known] @ Y_UP_FROM_SUPPORT.T, 3, axis=0)
+    places = np.repeat(middles(len(known)), 3, axis=0)
     most_ks = max(float(surface.ks[known].max(initial=0.0)) / _F0, 1e-6)
     gloss = np.zeros((len(known), 3))
     gloss[:, 1] = np.sqrt(surface.alpha[known])
     pictures = [
-        _png(srgb(np.pi * surface.kd[known]), side),
-        _png(gloss, side),
-        _png(srgb(surface.ks[known] / (_F0 * most_ks)), side),
+        _png(srgb(surface.under_a_layer(known))),
+        _png(gloss),
+        _png(srgb(surface.ks[known] / (_F0 * most_ks))),
     ]
     arrays = [values.astype("<f4") for values in (corners, normals, places)]
     document = _document(surface, arrays, pictures, most_ks)
@@ -94,11 +91,10 @@ def _document(
     }
 
 
-def _png(values: Floats, side: int) -> bytes:
-    """[n, 3] of 0..1 as the texels of a square, row by row."""
-    texels = np.zeros((side * side, 3), np.uint8)
-    texels[: len(values)] = np.rint(255 * np.clip(values, 0.0, 1.0))
-    return cv2.imencode(".png", texels.reshape(side, side, 3)[..., ::-1])[1].tobytes()
+def _png(values: Floats) -> bytes:
+    """[n, 3] of 0..1 as texels."""
+    texels = np.rint(255 * np.clip(texture(values), 0.0, 1.0)).astype(np.uint8)
+    return cv2.imencode(".png", texels[..., ::-1])[1].tobytes()
 
 
 def _glb(document: dict[str, Any], blocks: list[bytes]) -> bytes:

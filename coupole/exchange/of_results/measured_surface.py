@@ -17,6 +17,9 @@ from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
 
 Floats = NDArray[np.float64]
+_LEAST_PASSED = 0.05
+Y_UP_FROM_SUPPORT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""For the programs of computer graphics, in which y is up."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,12 @@ class MeasuredSurface:
     def known(self) -> NDArray[np.bool_]:
         """[n] triangles that have a material."""
         return np.isfinite(self.alpha) & np.isfinite(self.kd).all(axis=1)
+
+    def under_a_layer(self, picked: NDArray[np.int64]) -> Floats:
+        """[n, 3] colour, 0 to 1, of the diffuse part of triangles where a model's specular layer keeps light from
+        it: pi kd, and more by what a layer of the brightest ks reflects at normal incidence."""
+        passes = np.maximum(1.0 - self.ks[picked].max(axis=1, keepdims=True), _LEAST_PASSED)
+        return np.asarray(np.clip(np.pi * self.kd[picked] / passes, 0.0, 1.0))
 
     @property
     def remark(self) -> str:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,17 +11,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError
+from coupole.exchange.rti.lit_views import WHITE_QUANTILE, chosen_views
 from coupole.exchange.srgb import srgb
 from coupole.exchange.target_folder import refuse_standing, writing_into
-from coupole.reflectance.uncalibrated import write_pictures
+from coupole.reflectance.uncalibrated import PicturedView, lights_of_view, write_pictures
 from coupole.storage.durable import write_synced
 from coupole.storage.run import Run
 
 LINEAR = "linear"
 """Folder of the pictures of 16 bit, with lights, intensities and mask, from which `--pictures` makes a result."""
-_WHITE_QUANTILE = 0.999
-"""Of the brightest value of each pixel under any LED: what is white."""
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
 
@@ -36,10 +33,7 @@ def export_rti(
     `overwrite`); StorageError for damaged frames or a disk that cannot be written.
     """
     run = Run(folder)
-    names = list(dict.fromkeys(shot.view for shot in run.proven()))
-    chosen = [name for name in names if not views or any(fnmatch.fnmatchcase(name, one) for one in views)]
-    if not chosen:
-        raise InputError(f"{folder}: no view matches; it has {', '.join(names)}")
+    chosen = chosen_views(run, views)
     if not overwrite:
         refuse_standing([out / view / f"{view}.lp" for view in chosen])
     paths: list[Path] = []
@@ -54,7 +48,7 @@ def _export_view(run: Run, view: str, out: Path, say: Callable[[str, int, int], 
     brightest = _read(taken.files[0])
     for source in taken.files:
         brightest = np.maximum(brightest, _read(source))
-    codes = _srgb_codes(float(np.quantile(brightest.max(axis=2), _WHITE_QUANTILE)))
+    codes = _srgb_codes(float(np.quantile(brightest.max(axis=2), WHITE_QUANTILE)))
     paths = []
     for number, source in enumerate(taken.files):
         paths.append(out / f"{source.stem}.jpg")
@@ -63,18 +57,36 @@ def _export_view(run: Run, view: str, out: Path, say: Callable[[str, int, int], 
     directions = taken.lights_mm / np.linalg.norm(taken.lights_mm, axis=1, keepdims=True)
     lines = [f"{path.name} {x:.6f} {y:.6f} {z:.6f}" for path, (x, y, z) in zip(paths, directions, strict=True)]
     write_synced(out / f"{view}.lp", "\n".join([str(len(lines)), *lines]) + "\n")
+    dome = _write_dome(run, view, taken, out / f"{view}.dome")
+    return [*paths, out / f"{view}.lp", dome]
+
+
+def write_dome(run: Run, view: str, path: Path) -> Path:
+    """Write relight's file of the places of the LEDs that lit a view, in the order of their numbers. Raises
+    InputError for too few LEDs."""
+    return _write_dome(run, view, lights_of_view(run.folder, view), path)
+
+
+def _write_dome(run: Run, view: str, taken: PicturedView, path: Path) -> Path:
+    distances_mm = np.linalg.norm(taken.lights_mm, axis=1, keepdims=True)
     dome = {
         "label": f"{run.folder.name} {view}",
         "notes": f"Coupole, {'simulated' if taken.simulated else 'measured'}; nominal places of the LEDs",
         "imageWidth": taken.width_mm,
-        "domeDiameter": 2.0 * float(np.linalg.norm(taken.lights_mm, axis=1).mean()),
+        "domeDiameter": 2.0 * float(distances_mm.mean()),
         "verticalOffset": 0.0,
         "lightConfiguration": "lights3d",
-        "directions": directions.tolist(),
-        "positions3d": taken.lights_mm.tolist(),
+        "directions": _points(taken.lights_mm / distances_mm),
+        "positionsSphere": [],
+        "positions3d": _points(taken.lights_mm),
+        "ledAdjust": [],
     }
-    write_synced(out / f"{view}.dome", json.dumps(dome, indent=1) + "\n")
-    return [*paths, out / f"{view}.lp", out / f"{view}.dome"]
+    write_synced(path, json.dumps(dome, indent=1) + "\n")
+    return path
+
+
+def _points(places: NDArray[np.float64]) -> list[dict[str, float]]:
+    return [dict(zip("xyz", place, strict=True)) for place in places.tolist()]
 
 
 def _read(path: Path) -> NDArray[np.uint16]:

@@ -1,0 +1,140 @@
+"""The options of `coupole export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coupole.exchange import COLMAP, CRATE, FORMATS
+from coupole.exchange.of_results import FORMATS as OF_RESULTS
+from coupole.exchange.of_results import OF_MATERIALS
+from coupole.exchange.rti import FORMATS as OF_VIEWS
+from coupole.exchange.rti import OF_RUNS_ONLY
+
+OF_RUNS = (*FORMATS, *OF_VIEWS, COLMAP, CRATE)
+_OF_PICTURES = [name for name in OF_VIEWS if name not in OF_RUNS_ONLY]
+_COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "What the crate says (rocrate)"
+_SHOWN = "How views are shown (relight, iiif)"
+
+ToOption = Annotated[
+    str,
+    typer.Option(
+        "--to",
+        help=f"Of runs: {', '.join(OF_RUNS)}. Of results: {', '.join((*OF_RESULTS, CRATE))}; "
+        f"of results of pictures: {', '.join(_OF_PICTURES)}.",
+        show_default=False,
+    ),
+]
+ViewsOption = Annotated[
+    list[str] | None,
+    typer.Option("--views", help="Of runs: names, with * and ?; again for more.", rich_help_panel=_PARTS),
+]
+ShotsOption = Annotated[
+    list[str] | None,
+    typer.Option("--shots", help="Of runs: labels, as `led04*/e0`; again for more.", rich_help_panel=_PARTS),
+]
+FitOption = Annotated[
+    str | None,
+    typer.Option(
+        "--fit", help="Of results: ggx or ggx_normal; without it what missed least.", rich_help_panel=_PARTS
+    ),
+]
+TriangleOption = Annotated[
+    list[int] | None,
+    typer.Option(
+        "--triangle",
+        help=f"Of results, for {', '.join(OF_MATERIALS)}: its number; again for more.",
+        min=0,
+        rich_help_panel=_PARTS,
+    ),
+]
+RefinedOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--refined",
+        help="For colmap: folder of `coupole reflectance refine`, whose poses, lens and mesh hold.",
+        rich_help_panel=_PARTS,
+    ),
+]
+SensorOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--sensor-spectra",
+        help="Table of nm, red, green, blue: the sensor's sensitivities.",
+        rich_help_panel=_COLOUR,
+    ),
+]
+LedsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--led-spectrum",
+        help="Table of nm, power; without it the rig's dome.spectrum.",
+        rich_help_panel=_COLOUR,
+    ),
+]
+EyeOption = Annotated[
+    bool,
+    typer.Option(
+        "--for-the-eye",
+        help="TIFF of sRGB, 16 bit, in place of the camera's numbers; needs --sensor-spectra.",
+        rich_help_panel=_COLOUR,
+    ),
+]
+LinearOption = Annotated[
+    bool,
+    typer.Option(
+        "--linear", help="With --for-the-eye: without sRGB's curve, as its profile says.", rich_help_panel=_COLOUR
+    ),
+]
+LicenceOption = Annotated[
+    str | None,
+    typer.Option("--licence", help="Its URL, or words; without it the plan's.", rich_help_panel=_ABOUT),
+]
+AuthorOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--author",
+        help="'NAME <https://orcid.org/...> at HOUSE'; again for more.",
+        rich_help_panel=_ABOUT,
+    ),
+]
+PublisherOption = Annotated[str | None, typer.Option("--publisher", help="Its name.", rich_help_panel=_ABOUT)]
+NameOption = Annotated[
+    str | None, typer.Option("--name", help="Title; without it the folder's name.", rich_help_panel=_ABOUT)
+]
+IdentifierOption = Annotated[str | None, typer.Option("--identifier", help="A DOI.", rich_help_panel=_ABOUT)]
+InPlaceOption = Annotated[
+    bool,
+    typer.Option(
+        "--in-place", help="Write the metadata into SOURCE; no file is linked or copied.", rich_help_panel=_ABOUT
+    ),
+]
+
+
+BasisOption = Annotated[
+    str | None,
+    typer.Option(
+        "--basis",
+        help="For relight: bilinear (without this option), rbf, ptm or hsh.",
+        rich_help_panel=_SHOWN,
+    ),
+]
+PlanesOption = Annotated[
+    int | None,
+    typer.Option(
+        "--planes",
+        help="For relight, bilinear and rbf: 27 (without this option) or 18.",
+        rich_help_panel=_SHOWN,
+    ),
+]
+BaseUrlOption = Annotated[
+    str | None,
+    typer.Option(
+        "--base-url",
+        help="For iiif: the address where the folder will be found; ids in the files begin with it. Without it "
+        "they begin with https://example.org/iiif, and no viewer finds the pictures.",
+        rich_help_panel=_SHOWN,
+    ),
+]

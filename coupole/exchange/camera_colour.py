@@ -1,0 +1,100 @@
+"""Colour of frames for the eye: from the sensor's sensitivities and the LEDs' spectrum to CIE XYZ.
+
+The transform is the linear one that misses least, in the mean over smooth reflectances, what the same surface has
+under daylight (D65) for the 1931 observer; the perfect white is exact. Reflectances are taken as a random process
+of wavelength with a Gaussian covariance (Wiener estimation: Pratt and Mancill, Spectral estimation techniques for
+the spectral calibration of a color image scanner, Applied Optics 15, 1976).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+
+Floats = NDArray[np.float64]
+Neutral = Callable[[int | None], Floats]
+"""[3] of white under an LED, by its id: what the channels give, the greatest 1."""
+
+_NOISE = 0.02
+"""Of a table's greatest value, that it may fall below 0."""
+D65_CODE = 21
+"""EXIF's LightSource."""
+_CORRELATED_NM = 50.0
+"""Of reflectances: the standard deviation of their covariance over wavelength."""
+
+
+@dataclass(frozen=True)
+class CameraColour:
+    """What is known of the colours of a camera under the LEDs."""
+
+    xyz_from_balanced: Floats | None
+    """[3, 3] XYZ under D65, Y = 1 for white, of red, green, blue of which white has 1, 1, 1; None: not known."""
+    neutral: Neutral
+    told: str
+    """From what it is known."""
+
+
+def unknown_colour() -> CameraColour:
+    """Of a camera of which nothing is known."""
+    told = "not calibrated: ColorMatrix1 is the identity, AsShotNeutral is 1 1 1"
+    return CameraColour(None, lambda led: np.ones(3), told)
+
+
+def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None) -> CameraColour:
+    """From tables of the sensor's sensitivities (nm, red, green, blue; relative to each other) and of the LEDs'
+    spectral power (nm, power). `white_of_leds` is what the channels measured of white, if a record has it.
+
+    Raises InputError for other tables, or without colour-science, which has the CIE's observer.
+    """
+    from coupole.appearance.spectra.grid import WAVELENGTHS_NM
+    from coupole.appearance.spectra.light import illuminant, observer
+
+    sensitivities = np.stack([_spectrum(sensor, column) for column in (1, 2, 3)])
+    signals = sensitivities * _spectrum(leds, 1)
+    white = signals.sum(axis=1)
+    if not (white > 0.0).all():
+        raise InputError(f"{sensor}: a channel sees nothing of the light of {leds}; see to both tables")
+    try:
+        functions, daylight = observer("2 deg"), illuminant("D65")
+    except ImportError as error:
+        raise InputError(
+            f"colour for the eye needs colour-science: pip install coupole[materials] ({error})"
+        ) from error
+    towards = functions * daylight / (functions[1] @ daylight)
+    apart = (WAVELENGTHS_NM[:, None] - WAVELENGTHS_NM) / _CORRELATED_NM
+    matrix = _least_missing(signals / white[:, None], towards, np.exp(-0.5 * apart**2) + 1.0)
+    neutral = white / white.max()
+    known = "measured by the record of the LEDs' power" if white_of_leds is not None else "by the spectra"
+    told = f"XYZ under D65, 1931 observer, by the spectra {sensor.name} and {leds.name}; white {known}"
+    return CameraColour(matrix, white_of_leds or (lambda led: neutral), told)
+
+
+def _least_missing(signals: Floats, towards: Floats, covariance: Floats) -> Floats:
+    """[3, 3] Wiener's matrix of `signals` [3, 81] to `towards` [3, 81], corrected to keep white."""
+    within = signals @ covariance @ signals.T
+    free = np.linalg.solve(within, signals @ covariance @ towards.T).T
+    white = signals.sum(axis=1)
+    direction = np.linalg.solve(within, white)
+    missed = towards.sum(axis=1) - free @ white
+    return np.asarray(free + np.outer(missed, direction) / (direction @ white))
+
+
+def _spectrum(path: Path, column: int) -> Floats:
+    """[81] of a column of a table; what lies beyond its ends is 0."""
+    from coupole.appearance.spectra.measured import read_spectrum
+    from coupole.appearance.spectra.resampling import on_grid
+
+    try:
+        found = on_grid(read_spectrum(path, unit="power", column=column)).values
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot read the table of spectra: {error}") from error
+    values: Floats = np.nan_to_num(found)
+    if values.min() < -_NOISE * values.max():
+        raise InputError(f"{path}: column {column} goes below 0; expected relative sensitivities or power")
+    return np.maximum(values, 0.0)

@@ -1,0 +1,176 @@
+"""Views of a run as a sparse model of COLMAP's text format, with pictures: for dense stereo, splatting, texturing.
+
+The lens of the record is COLMAP's OPENCV model, or FULL_OPENCV where k3 was estimated: the same equations, so
+nothing is lost; only the first pixel's centre is (0.5, 0.5) there. The world is the support frame, in mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import coupole
+from coupole.calibration.optics import Intrinsics, project
+from coupole.calibration.rotations import Floats
+from coupole.exchange.srgb import srgb
+from coupole.exchange.target_folder import refuse_standing, writing_into
+from coupole.exchange.tiff_for_the_eye import DEMOSAIC
+from coupole.geometry import Transform, apply, inverse
+from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.alignment.refined_geometry import read_refined
+from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView, read_measured_run
+from coupole.reflectance.extraction.seen_surface import seen_surface
+from coupole.storage.durable import write_synced
+
+MODEL, PICTURES = "sparse/0", "images"
+MOST_POINTS = 50_000
+_MOST_FRAMES = 48
+"""Of a view, spread over its LEDs, whose mean is its picture: light from all sides, almost without shadows."""
+_WHITE_QUANTILE = 0.999
+_TO_CENTRE_PX = 0.5
+"""From our pixels to COLMAP's, in which the first one ends at 1."""
+
+
+@dataclass(frozen=True)
+class PosedPicture:
+    """A view and the triangles' centres that it sees."""
+
+    name: str
+    """Of its file."""
+    support_from_camera: Transform
+    triangles: NDArray[np.int64]
+    """[n] rising numbers."""
+    pixels: Floats
+    """[n, 2] where their centres are, ours: the first pixel's centre is (0, 0)."""
+    codes: NDArray[np.uint8]
+    """[h, w, 3] sRGB, blue first."""
+
+
+def export_colmap(
+    folder: Path,
+    out: Path,
+    *,
+    records: Sequence[Path] = (),
+    refined: Path | None = None,
+    overwrite: bool,
+    say: Callable[[str, int, int], None],
+) -> list[Path]:
+    """Write `images/VIEW.png` (8 bit, sRGB, the mean of some 48 frames of the view) and `sparse/0` with cameras,
+    images and points: centres of at most 50 000 triangles, each with the views that see it. Poses and lens are of
+    the run's records, or of those that are named, or of `refined`, a folder of `coupole reflectance refine`.
+
+    Raises InputError: records or mesh are missing, files stand there already (unless `overwrite`); StorageError.
+    """
+    measured = read_measured_run(folder, records=records)
+    if refined is not None:
+        measured = read_refined(refined).of(measured)
+    model = out / MODEL
+    pictures = [out / PICTURES / f"{view.name}.png" for view in measured.views]
+    texts = [model / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
+    if not overwrite:
+        refuse_standing([*texts, *pictures])
+    mesh = PacketMesh(measured.corners_mm)
+    posed = []
+    with writing_into(model), writing_into(out / PICTURES):
+        for number, (view, path) in enumerate(zip(measured.views, pictures, strict=True)):
+            posed.append(_posed(measured, view, mesh))
+            write_synced(path, cv2.imencode(".png", posed[-1].codes)[1].tobytes())
+            say("views", number + 1, len(pictures))
+        centres_mm = apply(inverse(measured.base_from_support), measured.corners_mm.mean(axis=1))
+        told = "refined by overlapping views" if refined is not None else "by the run's calibrations"
+        source = "simulated" if measured.run.simulated else "measured"
+        head = f"# Coupole {coupole.__version__}: {measured.run.folder.name}, {source}; {told}; world in mm\n"
+        contents = (
+            camera_text(measured.lens, measured.frames.size_px),
+            *texts_of(posed, centres_mm, measured.lens),
+        )
+        for path, text in zip(texts, contents, strict=True):
+            write_synced(path, head + text)
+    return [*texts, *pictures]
+
+
+def camera_text(lens: Intrinsics, size_px: tuple[int, int]) -> str:
+    """cameras.txt with one camera."""
+    centre = (lens.cx + _TO_CENTRE_PX, lens.cy + _TO_CENTRE_PX)
+    figures = [lens.fx, lens.fy, *centre, lens.k1, lens.k2, lens.p1, lens.p2]
+    name = "OPENCV"
+    if lens.k3 != 0.0:
+        name, figures = "FULL_OPENCV", [*figures, lens.k3, 0.0, 0.0, 0.0]
+    width, height = size_px
+    return f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {name} {width} {height} {_row(figures)}\n"
+
+
+def texts_of(posed: Sequence[PosedPicture], centres_mm: Floats, lens: Intrinsics) -> tuple[str, str]:
+    """images.txt and points3D.txt; `centres_mm` [m, 3] of all triangles, support frame."""
+    seen = np.unique(np.concatenate([picture.triangles for picture in posed]))
+    chosen = seen[np.unique(np.linspace(0, len(seen) - 1, min(len(seen), MOST_POINTS)).astype(np.int64))]
+    tracks: list[list[int]] = [[] for _ in chosen]
+    colours = np.zeros((len(chosen), 3))
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
+    for number, picture in enumerate(posed, start=1):
+        camera_from_support = inverse(picture.support_from_camera)
+        x, y, z, w = Rotation.from_matrix(camera_from_support[:3, :3]).as_quat(canonical=True)
+        pose = _row([w, x, y, z, *camera_from_support[:3, 3]])
+        images.append(f"{number} {pose} 1 {picture.name}")
+        mine = np.isin(picture.triangles, chosen, assume_unique=True)
+        points = np.searchsorted(chosen, picture.triangles[mine])
+        pixels = picture.pixels[mine]
+        column, row = np.rint(pixels).astype(int).T
+        colours[points] += picture.codes[row, column, ::-1]
+        for place, point in enumerate(points.tolist()):
+            tracks[point] += [number, place]
+        at = (pixels + _TO_CENTRE_PX).tolist()
+        images.append(" ".join(f"{u:.6f} {v:.6f} {n + 1}" for (u, v), n in zip(at, points.tolist(), strict=True)))
+    points_lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
+    for number, (place, colour, track) in enumerate(
+        zip(centres_mm[chosen], colours, tracks, strict=True), start=1
+    ):
+        red, green, blue = np.rint(colour / (len(track) // 2)).astype(int)
+        points_lines.append(f"{number} {_row(place)} {red} {green} {blue} 0 {' '.join(map(str, track))}")
+    return "\n".join(images) + "\n", "\n".join(points_lines) + "\n"
+
+
+def _posed(measured: MeasuredRun, view: MeasuredView, mesh: PacketMesh) -> PosedPicture:
+    corners = measured.corners_mm
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    width, height = measured.frames.size_px
+    seen = seen_surface(mesh, normals, measured.lens, view.base_from_camera, (width, height))
+    centres_mm = apply(inverse(view.base_from_camera), corners[seen.triangles].mean(axis=1))
+    pixels = project(centres_mm, measured.lens.vector()).pixels
+    column, row = np.rint(pixels).astype(int).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    shown = np.zeros(len(pixels), np.bool_)
+    shown[inside] = seen.places[row[inside], column[inside]] == np.flatnonzero(inside)
+    return PosedPicture(
+        f"{view.name}.png",
+        inverse(measured.base_from_support) @ view.base_from_camera,
+        seen.triangles[shown],
+        pixels[shown],
+        _picture(measured, view),
+    )
+
+
+def _picture(measured: MeasuredRun, view: MeasuredView) -> NDArray[np.uint8]:
+    """[h, w, 3] sRGB, blue first, of the mean of frames of LEDs all round."""
+    frames = [mine[0] for mine in view.by_led.values()]
+    chosen = frames[:: -(-len(frames) // _MOST_FRAMES)]
+    total = np.zeros(chosen[0].read().shape)
+    for frame in chosen:
+        total += np.maximum(frame.read().astype(np.float64) - measured.frames.black_dn, 0.0)
+    white = float(np.quantile(total, _WHITE_QUANTILE)) or 1.0
+    mosaic = np.rint(65535.0 * np.clip(total / white, 0.0, 1.0)).astype(np.uint16)
+    pattern = measured.frames.pattern
+    colour = cv2.merge([mosaic] * 3) if pattern == "MONO" else cv2.cvtColor(mosaic, DEMOSAIC[pattern])[..., ::-1]
+    codes: NDArray[np.uint8] = np.rint(255.0 * srgb(colour / 65535.0)).astype(np.uint8)
+    return codes
+
+
+def _row(values: Sequence[float] | Floats) -> str:
+    return " ".join(f"{float(value):.12g}" for value in values)

@@ -1,0 +1,254 @@
+"""A run or a result as a research object crate (RO-Crate 1.1): its files, with `ro-crate-metadata.json` beside
+them, which says in JSON-LD what they are, whose they are, from what and by what they were made."""
+
+from __future__ import annotations
+
+import json
+import mimetypes
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from coupole.errors import InputError
+from coupole.exchange.target_folder import writing_into
+from coupole.reflectance.run_result import ABOUT, read_about
+from coupole.storage.durable import sha256, write_synced
+from coupole.storage.run import Run
+
+METADATA = "ro-crate-metadata.json"
+DATA = "data"
+"""Folder of the files, where they are not described in place."""
+_SPECIFICATION = "https://w3id.org/ro/crate/1.1"
+_ORCID = re.compile(r"https://orcid\.org/\d{4}-\d{4}-\d{4}-\d{3}[\dX]")
+_TOLD = {
+    ".h5": "HDF5",
+    ".yaml": "application/yaml",
+    ".jsonl": "application/jsonl",
+    ".ply": "application/octet-stream",
+    ".sha256": "text/plain",
+}
+Entity = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class CrateFacts:
+    """What only its authors can say."""
+
+    licence: str | None = None
+    """A URL, or words; None: what the run's plan says."""
+    authors: tuple[str, ...] = ()
+    """`NAME <https://orcid.org/...> at HOUSE` each, or a name alone."""
+    publisher: str | None = None
+    name: str | None = None
+    """Title; None: the folder's name."""
+    identifier: str | None = None
+    """Such as a DOI."""
+
+
+def write_crate(
+    source: Path,
+    out: Path,
+    facts: CrateFacts,
+    *,
+    in_place: bool,
+    overwrite: bool,
+    say: Callable[[str, int, int], None],
+) -> list[Path]:
+    """Write the crate into `out`: its files below `data/`, hard links where the file system allows them, else
+    copies. With `in_place` only the metadata is written, into `source`.
+
+    Raises InputError: no licence or author is known, a run that is being acquired, a folder that has files (unless
+    `overwrite`); DiskFull or StorageError.
+    """
+    described = _described(source)
+    licence = facts.licence or described.get("licence")
+    if not licence:
+        raise InputError("--licence: RO-Crate demands one and the plan names none; give its URL, or words")
+    if not facts.authors:
+        raise InputError("--author: expected at least one, 'NAME <https://orcid.org/...> at HOUSE' or a name")
+    root = source if in_place else out
+    if not overwrite and ((root / METADATA).exists() or (not in_place and root.is_dir() and any(root.iterdir()))):
+        raise InputError(f"{root}: has files already. Choose another --out, or give --overwrite")
+    inside = "" if in_place else f"{DATA}/"
+    paths = sorted(_files(source, without=None if in_place else root))
+    files, written = [], []
+    with writing_into(root):
+        for number, path in enumerate(paths):
+            inner = path.relative_to(source).as_posix()
+            files.append(_file_entity(path, f"{inside}{inner}"))
+            if not in_place:
+                written.append(root / DATA / inner)
+                _link(path, written[-1])
+            say("files", number + 1, len(paths))
+        graph = [*_entities(source, described, licence, facts, files)]
+        document = {"@context": f"{_SPECIFICATION}/context", "@graph": graph}
+        write_synced(root / METADATA, json.dumps(document, indent=1, ensure_ascii=False) + "\n")
+    return [root / METADATA, *written]
+
+
+def _described(source: Path) -> dict[str, Any]:
+    """Kind, time, software and inputs of the source."""
+    if (source / ABOUT).exists():
+        about = read_about(source)
+        made = datetime.fromtimestamp((source / ABOUT).stat().st_mtime, UTC).isoformat(timespec="seconds")
+        runs = about["runs"]
+        return {
+            "kind": "result",
+            "ended": made,
+            "simulated": bool(about.get("simulated")),
+            "software": about["software"],
+            "inputs": {name: digest for files in runs.values() for name, digest in files.items()},
+            "told": f"Reflectance of the surface of an object, from {', '.join(sorted(runs))}",
+        }
+    run = Run(source)
+    if run.in_use:
+        raise InputError(f"{source}: another process is acquiring into this run; wait for it")
+    return {
+        "kind": "run",
+        "ended": run.about["created"],
+        "simulated": run.simulated,
+        "software": {run.about["software"]["name"]: run.about["software"]["version"]},
+        "inputs": {},
+        "licence": run.about.get("licence"),
+        "told": f"Photographs of {run.about.get('object') or 'an object without a name'} under single lights of "
+        f"the dome La Coupole; frames are proven by: {run.proof}",
+        "devices": run.about.get("devices") or {},
+    }
+
+
+def _files(source: Path, without: Path | None) -> Iterator[Path]:
+    for path in source.rglob("*"):
+        inner = path.relative_to(source)
+        hidden = any(part.startswith(".") for part in inner.parts)
+        if not path.is_file() or hidden or inner.as_posix() == METADATA:
+            continue
+        if without is None or not path.resolve().is_relative_to(without.resolve()):
+            yield path
+
+
+def _entities(
+    source: Path, described: dict[str, Any], licence: str, facts: CrateFacts, files: Sequence[Entity]
+) -> Iterator[Entity]:
+    people = [_person(text) for text in facts.authors]
+    authors = [person for person, _ in people]
+    houses = {house["@id"]: house for _, house in people if house is not None}
+    softwares = [_software(name, version) for name, version in described["software"].items()]
+    inputs = [
+        {"@id": f"#input-{digest[:16]}", "@type": "CreativeWork", "name": name, "identifier": f"sha256:{digest}"}
+        for name, digest in described["inputs"].items()
+    ]
+    terms = _licence(licence)
+    kind = "simulated, no real object or light" if described["simulated"] else "measured"
+    root: Entity = {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": facts.name or source.resolve().name,
+        "description": f"{described['told']} ({kind}).",
+        "datePublished": datetime.now(UTC).date().isoformat(),
+        "license": _to(terms),
+        "author": _to_all(authors),
+        "hasPart": _to_all(files),
+        "mentions": {"@id": "#made"},
+    }
+    if facts.identifier:
+        root["identifier"] = facts.identifier
+    yield {
+        "@id": METADATA,
+        "@type": "CreativeWork",
+        "conformsTo": {"@id": _SPECIFICATION},
+        "about": {"@id": "./"},
+    }
+    if facts.publisher:
+        publisher = _organisation(facts.publisher)
+        houses[publisher["@id"]] = publisher
+        root["publisher"] = _to(publisher)
+    action: Entity = {
+        "@id": "#made",
+        "@type": "CreateAction",
+        "name": "acquisition" if described["kind"] == "run" else "measurement of reflectance",
+        "endTime" if described["kind"] == "result" else "startTime": described["ended"],
+        "result": {"@id": "./"},
+    }
+    devices = [
+        {
+            "@id": f"#device-{role}",
+            "@type": "Product",
+            "name": f"{role}: {device.get('vendor', '')} {device['model']}".strip(),
+            "identifier": str(device["serial"]),
+        }
+        for role, device in described.get("devices", {}).items()
+    ]
+    action["instrument"] = _to_all([*softwares, *devices])
+    if inputs:
+        action["object"] = _to_all(inputs)
+    yield from (root, *authors, *houses.values(), terms, *softwares, *devices, *inputs, action, *files)
+
+
+def _file_entity(path: Path, inner: str) -> Entity:
+    known = _TOLD.get(path.suffix) or mimetypes.guess_type(path.name)[0] or "application/octet-stream"
+    return {
+        "@id": inner.replace("%", "%25").replace(" ", "%20"),
+        "@type": "File",
+        "name": Path(inner).name,
+        "encodingFormat": "application/x-hdf5" if known == "HDF5" else known,
+        "contentSize": str(path.stat().st_size),
+        "identifier": f"sha256:{sha256(path)}",
+    }
+
+
+def _person(text: str) -> tuple[Entity, Entity | None]:
+    """An author and the house they belong to."""
+    own, _, house = map(str.strip, text.partition(" at "))
+    name, _, within = map(str.strip, own.partition("<"))
+    url = within.removesuffix(">")
+    if not name or (within and not _ORCID.fullmatch(url)):
+        raise InputError(
+            f"--author {text!r}: expected 'NAME', 'NAME <https://orcid.org/0000-0000-0000-0000>', and ' at HOUSE' "
+            "behind it if it is to be named"
+        )
+    person = {"@id": url or f"#{_plain(name)}", "@type": "Person", "name": name}
+    if not house:
+        return person, None
+    organisation = _organisation(house)
+    return {**person, "affiliation": _to(organisation)}, organisation
+
+
+def _organisation(name: str) -> Entity:
+    return {"@id": f"#organisation-{_plain(name)}", "@type": "Organization", "name": name}
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"\W+", "-", name, flags=re.ASCII)
+
+
+def _licence(text: str) -> Entity:
+    if text.startswith(("https://", "http://")):
+        return {"@id": text, "@type": "CreativeWork", "name": text}
+    return {"@id": "#licence", "@type": "CreativeWork", "name": text, "description": f"Terms of use: {text}"}
+
+
+def _software(name: str, version: str) -> Entity:
+    return {"@id": f"#software-{name}", "@type": "SoftwareApplication", "name": name, "version": version}
+
+
+def _to(entity: Entity) -> Entity:
+    return {"@id": entity["@id"]}
+
+
+def _to_all(entities: Sequence[Entity]) -> Entity | list[Entity]:
+    """A list, but of one entity that itself, as the specification wants it."""
+    return _to(entities[0]) if len(entities) == 1 else [_to(entity) for entity in entities]
+
+
+def _link(path: Path, to: Path) -> None:
+    to.parent.mkdir(parents=True, exist_ok=True)
+    to.unlink(missing_ok=True)
+    try:
+        os.link(path, to)
+    except OSError:
+        shutil.copy2(path, to)

@@ -1,0 +1,95 @@
+"""Views of a run, or the one of a result of pictures, for programs that relight or show pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from coupole.errors import InputError
+from coupole.exchange.rti import FORMATS, OF_RUNS_ONLY, iiif, relight_web, rti_files, rti_pictures
+from coupole.exchange.rti.lit_views import LitView, Said, chosen_views, lit_views
+from coupole.exchange.target_folder import refuse_standing, writing_into
+from coupole.storage.run import Run
+
+
+@dataclass(frozen=True)
+class HowShown:
+    """What the formats leave open."""
+
+    basis: str = relight_web.BASES[0]
+    planes: int = relight_web.PLANES[0]
+    base_url: str = iiif.EXAMPLE_URL
+
+
+@dataclass
+class Written:
+    """Files, and of each view the rms in steps of 8 bits of what its file misses of its pictures."""
+
+    paths: list[Path] = field(default_factory=list)
+    misses_dn: dict[str, float] = field(default_factory=dict)
+
+
+def export_views(
+    source: Path,
+    to: str,
+    out: Path,
+    views: Sequence[str],
+    how: HowShown = HowShown(),  # frozen
+    *,
+    overwrite: bool,
+    say: Said,
+) -> Written:
+    """Write the views of a run that match one of the patterns, or a result of pictures, into `out`.
+
+    Raises InputError for a format or options that do not fit the source, no such view, too few lights, files that
+    stand there (unless `overwrite`); StorageError for damaged frames or a disk that cannot be written.
+    """
+    of_result = (source / "normals.npy").exists()
+    if to not in FORMATS or (of_result and to in OF_RUNS_ONLY):
+        fitting = [name for name in FORMATS if not (of_result and name in OF_RUNS_ONLY)]
+        raise InputError(f"--to: expected one of {', '.join(fitting)} for {source}; found {to}")
+    if of_result and views:
+        raise InputError("--views: are for runs; a result of pictures has one view")
+    if to == "lp":
+        return Written(rti_pictures.export_rti(source, out, views, overwrite=overwrite, say=say))
+    names = [source.resolve().name] if of_result else chosen_views(Run(source), views)
+    if not overwrite:
+        refuse_standing([_first_file(out, to, name) for name in names])
+    written = Written()
+    with writing_into(out), threadpool_limits(1, "blas"):  # its threads only wait for each other here
+        if to == "dome":
+            written.paths = [rti_pictures.write_dome(Run(source), name, out / f"{name}.dome") for name in names]
+        elif to == "iiif":
+            written.paths = iiif.write(lit_views(source, views, out, say), out, how.base_url, say)
+        else:
+            for view in lit_views(source, views, out, say):
+                paths, misses_dn = _write(view, to, out, how, say)
+                written.paths += paths
+                written.misses_dn[view.name] = misses_dn
+    return written
+
+
+def _first_file(out: Path, to: str, name: str) -> Path:
+    match to:
+        case "relight":
+            return out / name / "info.json"
+        case "iiif":
+            return out / iiif.MANIFEST
+        case _:
+            return out / f"{name}.{to}"
+
+
+def _write(view: LitView, to: str, out: Path, how: HowShown, say: Said) -> tuple[list[Path], float]:
+    match to:
+        case "relight":
+            folder = out / view.name
+            folder.mkdir(exist_ok=True)
+            return relight_web.write(view, folder, how.basis, how.planes, say)
+        case "ptm":
+            path, write = out / f"{view.name}.ptm", rti_files.write_ptm
+        case _:
+            path, write = out / f"{view.name}.rti", rti_files.write_hsh
+    return [path], write(view, path, say)

@@ -1,0 +1,157 @@
+"""Views under distant lights of equal strength, from runs and from results of pictures."""
+
+from __future__ import annotations
+
+import fnmatch
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.exchange.srgb import srgb
+from coupole.reflectance.light_files import read_rows
+from coupole.reflectance.picture_result import NORMALS, PictureResult
+from coupole.reflectance.picture_set import FEWEST_LIGHTS, read_picture
+from coupole.reflectance.uncalibrated import INTENSITIES, write_pictures
+from coupole.storage.run import Run
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.float32]
+Said = Callable[[str, int, int], None]
+
+WHITE_QUANTILE = 0.999
+"""Of the brightest value of each pixel under any light: what is white."""
+_BATCH = 8
+"""Pictures that are held at a time."""
+
+
+@dataclass(frozen=True)
+class LitView:
+    """Pictures of one view, read one by one."""
+
+    name: str
+    origin: str
+    """Measured or simulated, and of which run or pictures."""
+    size_px: tuple[int, int]
+    """Width, height."""
+    pixel_mm: float | None
+    directions: Floats
+    """[lights, 3] unit vectors: x right, y up, z to the camera; all above the picture's plane."""
+    linear: Callable[[int], Picture]
+    """[h, w, 3] of a light, white 1; brighter values are above."""
+    normals: Picture | None = None
+    """[h, w, 3] where they were fitted; NaN outside the mask."""
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    def encoded(self, number: int) -> Picture:
+        """[h, w, 3] as displays take it: sRGB, 0 to 1."""
+        encoded: Picture = srgb(self.linear(number))
+        return encoded
+
+    def some_pixels(self, most: int) -> slice:
+        """At equal steps, in the order of rows."""
+        return slice(None, None, -(-self.size_px[0] * self.size_px[1] // most))
+
+    def samples(self, pixels: slice, say: Said) -> Picture:
+        """[lights, pixels, 3] encoded."""
+        found = []
+        for number in range(len(self)):
+            found.append(srgb(self.linear(number).reshape(-1, 3)[pixels]))
+            say(f"{self.name}: reading", number + 1, len(self))
+        return np.stack(found)
+
+    def projected(self, weights: Floats, say: Said) -> Picture:
+        """[h, w, planes]: sums of encoded values by `weights` [lights, 3, planes]."""
+        width, height = self.size_px
+        weights = weights.astype(np.float32)
+        planes = np.zeros((height * width, weights.shape[2]), np.float32)
+        for first in range(0, len(self), _BATCH):
+            batch = range(first, min(first + _BATCH, len(self)))
+            values = np.concatenate([self.encoded(number).reshape(-1, 3) for number in batch], axis=1)
+            planes += values @ weights[first : batch.stop].reshape(-1, weights.shape[2])
+            say(f"{self.name}: planes", batch.stop, len(self))
+        return planes.reshape(height, width, -1)
+
+
+def chosen_views(run: Run, patterns: Sequence[str]) -> list[str]:
+    """Names of the views that match one of the patterns; all without patterns. Raises InputError if none does."""
+    names = list(dict.fromkeys(shot.view for shot in run.proven()))
+    chosen = [name for name in names if not patterns or any(fnmatch.fnmatchcase(name, one) for one in patterns)]
+    if not chosen:
+        raise InputError(f"{run.folder}: no view matches; it has {', '.join(names)}")
+    return chosen
+
+
+def lit_views(source: Path, patterns: Sequence[str], scratch: Path, say: Said) -> Iterator[LitView]:
+    """Views of a run, whose pictures lie in a folder under `scratch` while they are used; or the one of a result
+    of pictures. Raises InputError, StorageError for damaged frames."""
+    if (source / "normals.npy").exists():
+        yield view_of_result(PictureResult(source.resolve()), say)
+        return
+    run = Run(source)
+    for name in chosen_views(run, patterns):
+        with tempfile.TemporaryDirectory(prefix=".pictures-", dir=scratch) as folder:
+            yield view_of_run(run, name, Path(folder), say)
+
+
+def view_of_run(run: Run, name: str, folder: Path, say: Said) -> LitView:
+    """A view whose pictures are written into `folder`: nominal places of LEDs, values divided by their nominal
+    light. Raises InputError for too few LEDs before the camera."""
+    taken = write_pictures(run.folder, name, folder, lambda step, done, of: say(f"{name}: {step}", done, of))
+    directions = taken.lights_mm / np.linalg.norm(taken.lights_mm, axis=1, keepdims=True)
+    strengths = read_rows(folder / INTENSITIES, (3,))
+    height, width = read_picture(taken.files[0]).shape[:2]
+
+    def linear(number: int) -> Picture:
+        factors = (1.0 / (65535.0 * strengths[number])).astype(np.float32)
+        values: Picture = read_picture(taken.files[number]) * factors
+        return values
+
+    return _seen(
+        name=name,
+        origin=f"Coupole, {'simulated' if taken.simulated else 'measured'}: {run.folder.name}, view {name}",
+        size_px=(width, height),
+        pixel_mm=taken.width_mm / width,
+        directions=directions,
+        linear=linear,
+        say=say,
+    )
+
+
+def view_of_result(result: PictureResult, say: Said) -> LitView:
+    """The view of a result of pictures; black outside its mask."""
+    about, height, width = result.about, *result.mask.shape
+    run = about.get("uncalibrated_run")
+    return _seen(
+        name=result.folder.name,
+        origin=f"Coupole, pictures under known lights: {run or result.folder.name}",
+        size_px=(width, height),
+        pixel_mm=None,
+        directions=result.directions,
+        linear=lambda number: result.picture(result.values(np.array([number]))[0]),
+        normals=np.load(result.folder / NORMALS),
+        say=say,
+    )
+
+
+def _seen(*, linear: Callable[[int], Picture], directions: Floats, name: str, say: Said, **about: Any) -> LitView:
+    """With the lights that viewers can have, those above the picture's plane, and white 1."""
+    above = np.flatnonzero(directions[:, 2] > 0.0)
+    if len(above) < FEWEST_LIGHTS:
+        raise InputError(
+            f"{name}: {len(above)} lights are before the picture's plane; at least {FEWEST_LIGHTS} are needed"
+        )
+    brightest = linear(int(above[0])).max(axis=2)
+    for done, number in enumerate(above):
+        brightest = np.maximum(brightest, linear(int(number)).max(axis=2))
+        say(f"{name}: white", done + 1, len(above))
+    lit = brightest[brightest > 0]
+    white = np.float32(np.quantile(lit, WHITE_QUANTILE)) if lit.size else np.float32(1.0)
+    return LitView(name, directions=directions[above], linear=lambda n: linear(int(above[n])) / white, **about)

@@ -1,0 +1,109 @@
+"""Coefficients of each pixel, as planes, from its values under lights, and what viewers make of them.
+
+Viewers show the sums as they are, so that values are encoded for displays (sRGB) before anything is fitted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse.linalg
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.exchange.rti import light_functions
+from coupole.exchange.rti.lit_views import LitView, Picture, Said
+
+Floats = NDArray[np.float64]
+
+RESOLUTION = 20
+"""Nodes of the bilinear grid a side; docs/decisions/0037-rti-exports.md tells why not 8."""
+SIGMA = 0.125
+"""Of Gaussians between lights, in unit vectors: relight's own default."""
+_LEAST_SINGULAR = 1e-4
+
+
+@dataclass(frozen=True)
+class PlaneCode:
+    """A pixel's planes are `weights` times its values, less `offset`; viewers show `base` and
+    `functions` times planes."""
+
+    weights: Floats
+    """[lights, 3, planes]"""
+    offset: Floats
+    """[planes]"""
+    functions: Floats
+    """[lights, 3, planes]: what a viewer multiplies planes with, at the lights."""
+    base: Floats
+    """[lights, 3]"""
+    about: dict[str, Any]
+    """What `info.json` says of the functions."""
+    ranges: tuple[float, ...] = ()
+    """[planes] by which tables of functions were multiplied to be of 8 bit; empty without tables."""
+
+    def planes_of(self, view: LitView, say: Said) -> Picture:
+        """[h, w, planes] of a view."""
+        planes = view.projected(self.weights, say)
+        planes -= self.offset.astype(np.float32)
+        return planes
+
+    def misses_dn(self, samples: Picture, planes: Floats) -> float:
+        """Rms of what planes [pixels, planes] miss of encoded values [lights, pixels, 3], in steps of 8 bits."""
+        shown = np.einsum("lcp,np->lnc", self.functions, planes) + self.base[:, None]
+        return 255.0 * float(np.sqrt(np.mean((np.clip(shown, 0.0, 1.0) - samples) ** 2)))
+
+
+def of_terms(terms: Floats, name: str) -> PlaneCode:
+    """Of functions [lights, terms] that all pixels and channels share: plane 3 t + c has term t of channel c, by
+    least squares over the lights."""
+    lights, count = terms.shape
+    if np.linalg.matrix_rank(terms, tol=_LEAST_SINGULAR * np.sqrt(lights)) < count:
+        raise InputError(f"{name}: {lights} lights at these directions do not determine {count} coefficients")
+    inverse = np.linalg.pinv(terms)
+    weights, functions = np.zeros((lights, 3, 3 * count)), np.zeros((lights, 3, 3 * count))
+    for channel in range(3):
+        weights[:, channel, channel::3] = inverse.T
+        functions[:, channel, channel::3] = terms
+    about = {"type": name, "colorspace": "rgb", "nplanes": 3 * count}
+    return PlaneCode(weights, np.zeros(3 * count), functions, np.zeros((lights, 3)), about)
+
+
+def of_principal_parts(samples: Picture, lights: Floats, name: str, planes: int) -> PlaneCode:
+    """Of principal components of encoded values [lights, pixels, 3] (relight's `mrgb`): functions of light are
+    tables of 8 bit, over the lights (`rbf`) or the nodes of a grid (`bilinear`)."""
+    count = len(lights)
+    seen = samples[:, samples.any(axis=(0, 2))]
+    values = seen.transpose(1, 0, 2).reshape(seen.shape[1], -1)
+    mean = values.mean(axis=0, dtype=np.float64)
+    vectors = _principal(values - mean.astype(np.float32), planes)
+    if name == "bilinear":
+        nodes = light_functions.bilinear_nodes(lights, RESOLUTION)
+        shares = light_functions.bilinear(lights, RESOLUTION)
+        about: dict[str, Any] = {"type": name, "resolution": RESOLUTION}
+    else:
+        nodes, shares = np.eye(count), light_functions.gaussian(lights, lights, SIGMA)
+        about = {"type": name, "sigma": SIGMA}
+    tables = np.einsum("gl,plc->pgc", nodes, vectors.reshape(planes, count, 3))
+    ranges = 127.0 / np.maximum(np.abs(tables).max(axis=(1, 2)), 1e-9)
+    codes = np.rint(127.0 + tables * ranges[:, None, None])
+    base_codes = np.rint(255.0 * np.clip(nodes @ mean.reshape(count, 3), 0.0, 1.0))
+    about |= {"colorspace": "mrgb", "nplanes": planes, "lights": lights.round(6).ravel().tolist()}
+    about["basis"] = np.concatenate([base_codes[None], codes]).astype(int).ravel().tolist()
+    functions = np.einsum("lg,pgc->lcp", shares, (codes - 127.0) / ranges[:, None, None])
+    weights = vectors.reshape(planes, count, 3).transpose(1, 2, 0)
+    offset = np.einsum("lcp,lc->p", weights, mean.reshape(count, 3))
+    return PlaneCode(weights, offset, functions, shares @ (base_codes / 255.0), about, tuple(ranges.tolist()))
+
+
+def _principal(values: Picture, count: int) -> Floats:
+    """[count, dimensions] of values [pixels, dimensions], the largest first; zeros where there are no more."""
+    vectors = np.zeros((count, values.shape[1]))
+    if count < min(values.shape):
+        _, sizes, found = scipy.sparse.linalg.svds(values, k=count, random_state=0)
+    else:
+        _, sizes, found = np.linalg.svd(values, full_matrices=False)
+    order = np.argsort(-sizes)[:count]
+    vectors[: len(order)] = found[order]
+    return vectors

@@ -1,0 +1,83 @@
+"""Files of one view for viewers of RTI: `.ptm` (PTM 1.2, LRGB) and `.rti` (HSH 1.2)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.exchange.rti import light_functions
+from coupole.exchange.rti.lit_views import LitView, Picture, Said
+from coupole.exchange.rti.plane_codes import of_terms
+from coupole.storage.durable import write_synced
+
+Floats = NDArray[np.float64]
+
+_PTM_ORDER = (3, 5, 4, 1, 2, 0)
+"""x2, y2, xy, x, y, 1 among the terms of `light_functions.ptm`."""
+_CHECKED_PIXELS = 10_000
+
+
+def write_ptm(view: LitView, path: Path, say: Said) -> float:
+    """Write polynomials of luminance and a colour for each pixel, the bottom row first (Malzbender and others, PTM
+    file format, 1.2); the rms in steps of 8 bits of what they miss of the view's own pictures.
+
+    Raises InputError if the lights do not determine the polynomials.
+    """
+    width, height = view.size_px
+    terms = light_functions.ptm(view.directions)
+    code = of_terms(terms, "ptm")
+    each = code.planes_of(view, say).reshape(-1, 6, 3)
+    luminance, colour = _one_colour(each, np.linalg.qr(terms).R)
+    scale, bias, codes = _with_whole_bias(255.0 * luminance[:, _PTM_ORDER])
+    colours = np.rint(255.0 * colour).astype(np.uint8)
+    header = ["PTM_1.2", "PTM_FORMAT_LRGB", str(width), str(height)]
+    header += [" ".join(f"{value:.9g}" for value in scale), " ".join(map(str, bias))]
+    bottom_first = (plane.reshape(height, width, -1)[::-1].tobytes() for plane in (codes, colours))
+    write_synced(path, "\n".join([*header, ""]).encode("ascii") + b"".join(bottom_first))
+    shown = np.empty_like(luminance)
+    shown[:, _PTM_ORDER] = (codes - bias.astype(np.float64)) * scale / 255.0
+    planes = shown[..., None] * (colours / 255.0)[:, None]
+    some = view.some_pixels(_CHECKED_PIXELS)
+    return code.misses_dn(view.samples(some, say), planes.reshape(len(planes), -1)[some])
+
+
+def write_hsh(view: LitView, path: Path, say: Said) -> float:
+    """The same with nine hemispherical harmonics for each channel, the top row first. The layout is that of
+    RTIBuilder's fitter: lines of header, scales and biases in float32, nine bytes a channel for each pixel."""
+    width, height = view.size_px
+    code = of_terms(light_functions.hsh(view.directions), "hsh")
+    planes = code.planes_of(view, say).reshape(-1, 9, 3)
+    bias = planes.min(axis=(0, 2)).astype("<f4")
+    scale = np.maximum(planes.max(axis=(0, 2)) - bias, 1e-6).astype("<f4")
+    codes = np.rint(255.0 * (planes - bias[:, None]) / scale[:, None]).clip(0, 255).astype(np.uint8)
+    header = f"#HSH1.2\r\n3\r\n{width} {height} 3\r\n9 2 1\r\n".encode("ascii")
+    write_synced(path, header + scale.tobytes() + bias.tobytes() + codes.transpose(0, 2, 1).tobytes())
+    shown = codes / 255.0 * scale[:, None] + bias[:, None]
+    some = view.some_pixels(_CHECKED_PIXELS)
+    return code.misses_dn(view.samples(some, say), shown.reshape(len(shown), -1)[some])
+
+
+def _one_colour(each: Picture, triangular: Floats) -> tuple[Floats, Floats]:
+    """Luminance [pixels, 6] and colour [pixels, 3], the largest channel 1, whose product is nearest to `each`
+    [pixels, 6, 3] over the lights; `triangular` is R of the terms' QR: the first singular vectors of R `each`."""
+    weighed = np.einsum("ij,pjc->pic", triangular.astype(np.float32), each)
+    products = np.einsum("pic,pid->pcd", weighed, weighed)
+    vectors = np.linalg.eigh(products)[1][..., -1].astype(np.float64)
+    vectors *= np.where(vectors.sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
+    vectors = np.maximum(vectors, 0.0)
+    largest = vectors.max(axis=1, keepdims=True)
+    colour = np.where(largest > 0.0, vectors / np.maximum(largest, 1e-12), 1.0)
+    luminance = np.einsum("pjc,pc->pj", each, colour) / np.sum(colour * colour, axis=1, keepdims=True)
+    return luminance, colour
+
+
+def _with_whole_bias(values: Floats) -> tuple[Floats, NDArray[np.int64], NDArray[np.uint8]]:
+    """Scales [6], biases [6] and codes of values [pixels, 6] = (code - bias) scale; biases of a PTM are whole
+    codes, so that 0 is one."""
+    low, high = np.minimum(values.min(axis=0), 0.0), np.maximum(values.max(axis=0), 0.0)
+    scale = np.maximum(high - low, 1e-3) / 254.0
+    bias = np.ceil(-low / scale).astype(np.int64)
+    codes = np.rint(values / scale + bias).clip(0, 255).astype(np.uint8)
+    return scale, bias, codes

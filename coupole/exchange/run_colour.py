@@ -1,0 +1,60 @@
+"""The colour of a run's frames: tables of spectra, and the white that its records have measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coupole.calibration.record import read_record
+from coupole.errors import InputError
+from coupole.exchange.camera_colour import CameraColour, Floats, Neutral, camera_colour
+from coupole.plan.reading import read_plan
+from coupole.reflectance.extraction.measured_run import read_powers
+from coupole.storage.run import Run
+
+_HOW = "give a table of nm, power with --led-spectrum, or name it in the rig (dome.spectrum)"
+
+
+@dataclass(frozen=True)
+class ColourWanted:
+    """How frames are to be coloured."""
+
+    sensor: Path
+    """Table of nm, red, green, blue."""
+    leds: Path | None
+    """Table of nm, power; None: the rig's."""
+    records: tuple[Path, ...] = ()
+    """In place of those that the run names."""
+
+
+def colour_of_run(run: Run, wanted: ColourWanted) -> CameraColour:
+    """Raises InputError: no table of the LEDs' spectrum, tables that are wrong, no colour-science."""
+    files = read_plan(run.plan_path, run.rig_path)
+    leds, given = wanted.leds, files.cell.rig.dome.spectrum
+    if leds is None and given is None:
+        raise InputError(f"{run.folder}: its rig names no spectrum of the LEDs; {_HOW}")
+    if leds is None and given is not None:
+        leds = files.cell.document.resolve(given)
+    assert leds is not None
+    return camera_colour(wanted.sensor, leds, _measured_white(wanted.records or files.record_paths or ()))
+
+
+def _measured_white(records: Sequence[Path]) -> Neutral | None:
+    """By the record of the LEDs' power, if one is named."""
+    named = [path for path in records if read_record(path).kind == "led-power"]
+    if not named:
+        return None
+    powers = read_powers(named[0], ("R", "G", "B"))
+    known = powers.power[(powers.power > 0.0).all(axis=1)]
+    usual: Floats = np.median(known / known.max(axis=1, keepdims=True), axis=0)
+
+    def neutral(led: int | None) -> Floats:
+        if led is None or led not in powers.ids:
+            return usual
+        power: Floats = powers.of(np.array([led])).power[0]
+        return np.asarray(power / power.max()) if (power > 0.0).all() else usual
+
+    return neutral

@@ -1,0 +1,77 @@
+"""A frame as TIFF for the eye: demosaicked, white-balanced, by CIE XYZ to sRGB (IEC 61966-2-1), 16 bits, with its
+profile."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import cv2
+import numpy as np
+
+import coupole
+from coupole.errors import InputError
+from coupole.exchange.camera_colour import CameraColour
+from coupole.exchange.exported_frame import Picture
+from coupole.exchange.srgb import srgb
+
+DEMOSAIC = {
+    "RGGB": cv2.COLOR_BayerRGGB2RGB,
+    "GRBG": cv2.COLOR_BayerGRBG2RGB,
+    "BGGR": cv2.COLOR_BayerBGGR2RGB,
+    "GBRG": cv2.COLOR_BayerGBRG2RGB,
+}
+"""OpenCV's codes, red first."""
+_PARAMETRIC = b"para\0\0\0\0\0\x03\0\0"
+_SRGB_NAME, _LINEAR_NAME = ("sRGB built-in".encode("utf-16-be"), "sRGB, linear ".encode("utf-16-be"))
+
+
+def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
+    """The whole file. 1 is the camera's range above black in the frame's own exposure, in the channel that gets
+    most of white. Raises InputError for a camera without colours."""
+    import tifffile
+
+    from coupole.appearance.spectra.light import linear_srgb
+
+    if picture.pattern not in DEMOSAIC:
+        raise InputError(f"--for-the-eye: the camera's pattern is {picture.pattern}; it has no colours")
+    assert colour.xyz_from_balanced is not None
+    signal = picture.pixels.astype(np.float64) - picture.black_dn
+    top = float(picture.white_dn - picture.black_dn)
+    mosaic = np.rint(np.clip(signal / top, 0.0, 1.0) * 65535).astype(np.uint16)
+    channels = cv2.cvtColor(mosaic, DEMOSAIC[picture.pattern]).astype(np.float64) / 65535.0
+    balanced = channels / colour.neutral(picture.about.get("led"))
+    shown = np.clip(linear_srgb(balanced @ colour.xyz_from_balanced.T), 0.0, 1.0)
+    codes = np.rint(65535.0 * (shown if linear else srgb(shown))).astype(np.uint16)
+    about = {**picture.about, "colour": colour.told, "linear": linear}
+    buffer = io.BytesIO()
+    tifffile.imwrite(
+        buffer,
+        codes,
+        photometric="rgb",
+        description=json.dumps(about),
+        software=f"coupole {coupole.__version__}",
+        metadata=None,
+        iccprofile=linear_profile() if linear else srgb_profile(),
+    )
+    return buffer.getvalue()
+
+
+def srgb_profile() -> bytes:
+    """ICC profile of sRGB, as LittleCMS makes it."""
+    from PIL import ImageCms
+
+    return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+
+
+def linear_profile() -> bytes:
+    """The same primaries with the identity as curve: (a x + b)^g from d on, below it c x (ICC.1, type 3)."""
+    profile = bytearray(srgb_profile().replace(_SRGB_NAME, _LINEAR_NAME))
+    ones = np.array([1, 1, 0, 1, 0], ">i4") << 16
+    place = profile.find(_PARAMETRIC)
+    while place >= 0:
+        first = place + len(_PARAMETRIC)
+        profile[first : first + 20] = ones.astype(">i4").tobytes()
+        place = profile.find(_PARAMETRIC, first)
+    profile[84:100] = bytes(16)  # the profile's checksum, which is not computed
+    return bytes(profile)

@@ -1,0 +1,167 @@
+"""Files that say from where pictures were lit: tables, `.lp`, and relight's `.dome` and `.relight`.
+
+relight's JSON (its src/dome.cpp, image.cpp and project.cpp): `directions`, `positionsSphere` and `positions3d` are
+lists of {x, y, z}, one for each picture that is not skipped; `lightConfiguration` tells which of them hold. Places
+are mm from the middle of the picture; here they only give directions.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError, Problem
+
+Floats = NDArray[np.float64]
+
+_PLACES = {"spherical": "positionsSphere", "lights3d": "positions3d"}
+"""Where relight has the lights, by `lightConfiguration`; else, and where the list is empty, in `directions`."""
+
+
+@dataclass(frozen=True)
+class LightFile:
+    """What a file says of the lights."""
+
+    directions: Floats
+    """[n, 3] of any length, from the object to the light: x right, y up, z to the camera."""
+    names: tuple[str, ...] = ()
+    """Of the pictures; empty if the file has none."""
+    intensities: Floats | None = None
+    """[n, 3] by which values are divided."""
+    srgb: bool = False
+    """Whether it says that the pictures are encoded for displays."""
+
+
+def read_lights(path: Path) -> LightFile:
+    """An `.lp`, `.dome` or `.relight` file, or a table of directions. Raises InputError with the line."""
+    match path.suffix.lower():
+        case ".lp":
+            names, directions = read_lp(path)
+            return LightFile(directions, tuple(names))
+        case ".dome":
+            return _read_dome(path, _json_object(path))
+        case ".relight":
+            return _read_project(path)
+        case _:
+            return LightFile(read_rows(path, (3,)))
+
+
+def _read_project(path: Path) -> LightFile:
+    project = _json_object(path)
+    images, dome = project.get("images"), project.get("dome")
+    if not isinstance(images, list) or not isinstance(dome, dict):
+        refuse(path, "expected a project of relight, with `images` and `dome`")
+    if not all(isinstance(image, dict) and isinstance(image.get("filename"), str) for image in images):
+        refuse(path, "images: expected a `filename` in each")
+    used = [number for number, image in enumerate(images) if not image.get("skip", False)]
+    lights = _read_dome(path, dome)
+    count = len(lights.directions)
+    if count not in (len(used), len(images)):
+        refuse(path, f"dome: {count} lights; {len(used)} pictures are used of {len(images)}")
+    rows = used if count == len(images) else list(range(count))
+    names = tuple(_last_part(images[number]["filename"]) for number in used)
+    intensities = None if lights.intensities is None else lights.intensities[rows]
+    forced = project.get("forcedInputColorspace")
+    srgb = forced == "srgb" or (forced is None and project.get("iccProfileIsSRGB") is True)
+    return LightFile(lights.directions[rows], names, intensities, srgb)
+
+
+def _read_dome(path: Path, dome: dict[str, Any]) -> LightFile:
+    places = _PLACES.get(str(dome.get("lightConfiguration", "")), "directions")
+    key = places if dome.get(places) else "directions"
+    directions = _vectors(path, dome, key, "xyz")
+    if not len(directions):
+        refuse(path, f"{key}: expected a list of lights, of x, y, z; there is none")
+    adjust = _vectors(path, dome, "ledAdjust", "rgb") if dome.get("ledAdjust") else None
+    if adjust is not None and (len(adjust) != len(directions) or not np.all(adjust > 0)):
+        refuse(path, f"ledAdjust: expected {len(directions)} of positive r, g, b")
+    return LightFile(directions, intensities=None if adjust is None else 1.0 / adjust)
+
+
+def _vectors(path: Path, dome: dict[str, Any], key: str, axes: str) -> Floats:
+    """[n, 3] of a list of objects, or of lists of three."""
+    rows = dome.get(key, [])
+    if not isinstance(rows, list):
+        refuse(path, f"{key}: expected a list")
+    found = np.zeros((len(rows), 3))
+    for number, row in enumerate(rows):
+        values = [row.get(axis) for axis in axes] if isinstance(row, dict) else row
+        if not isinstance(values, list) or len(values) != 3 or not all(map(_is_number, values)):
+            refuse(path, f"{key}, number {number}: expected {', '.join(axes)}; found {json.dumps(row)}")
+        found[number] = values
+    return found
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
+
+
+def _json_object(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads("\n".join(_lines(path)))
+    except (ValueError, RecursionError) as error:
+        refuse(path, f"is no JSON: {error}")
+    if not isinstance(document, dict):
+        refuse(path, "expected a JSON object")
+    return document
+
+
+def _last_part(name: str) -> str:
+    return Path(name.replace("\\", "/")).name
+
+
+def read_rows(path: Path, lengths: Sequence[int]) -> NDArray[np.float64]:
+    """[n, 3] numbers, one row a line; a single number stands for three. Raises InputError with the line."""
+    rows = []
+    for line, text in enumerate(_lines(path), start=1):
+        if words := text.replace(",", " ").split():
+            if len(words) not in lengths:
+                refuse(path, f"{len(words)} values; expected {' or '.join(map(str, lengths))}", line)
+            rows.append(np.resize([_number(path, line, word) for word in words], 3))
+    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+
+
+def read_lp(path: Path) -> tuple[list[str], NDArray[np.float64]]:
+    """Names of pictures and directions [n, 3] of an .lp file: a count, then `name x y z` in each line."""
+    names, rows = [], []
+    lines = [(number, text) for number, text in enumerate(_lines(path), start=1) if text.strip()]
+    if not lines or not lines[0][1].strip().isdecimal():
+        refuse(path, "expected the number of lights", lines[0][0] if lines else 1)
+    for line, text in lines[1:]:
+        words = text.split()
+        if len(words) < 4:
+            refuse(path, "expected `name x y z`", line)
+        names.append(_last_part(" ".join(words[:-3])))
+        rows.append([_number(path, line, word) for word in words[-3:]])
+    if len(rows) != int(lines[0][1]):
+        refuse(path, f"says {lines[0][1].strip()} lights, has {len(rows)}", lines[0][0])
+    return names, np.array(rows, dtype=np.float64)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError([Problem(str(path), 0, 0, "", f"cannot be read: {error}")]) from error
+
+
+def _number(path: Path, line: int, word: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        refuse(path, f"{word!r} is no number", line)
+    return value
+
+
+def refuse(path: Path, message: str, line: int = 0) -> NoReturn:
+    """Raise InputError about a file."""
+    raise InputError([Problem(str(path), line, 1 if line else 0, "", message)])

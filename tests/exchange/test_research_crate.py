@@ -1,0 +1,70 @@
+"""A run and a result as crates, read by the community's own library."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import cells
+import pytest
+from archives import MadeRun, make_run
+from relight_cases import waves, write_result
+from rocrate.rocrate import ROCrate
+
+CC_BY = "https://creativecommons.org/licenses/by/4.0/"
+AUTHOR = "A. Person <https://orcid.org/0000-0002-1825-0097> at Some House"
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> MadeRun:
+    return make_run(tmp_path / "runs", views=("top",), shots=2)
+
+
+def export(source: Path, *options: str | Path) -> None:
+    ended = cells.here("export", source, "--to", "rocrate", "--author", AUTHOR, *options, "--json")
+    assert ended.code == 0, ended.err
+
+
+def test_a_run_in_a_crate_has_all_its_files_with_their_hashes(made: MadeRun, tmp_path: Path) -> None:
+    folder, out = made.run.folder, tmp_path / "crate"
+    export(folder, "--licence", CC_BY, "--publisher", "Some House", "--identifier", "doi:10.1/x", "--out", out)
+    crate = ROCrate(out)
+    found = {Path(file.id).relative_to("data").as_posix(): file for file in crate.data_entities}
+    assert set(found) == {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    for name, file in found.items():
+        digest = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        assert file["identifier"] == f"sha256:{digest}"
+        assert (out / file.id).samefile(folder / name)  # a hard link: nothing is stored twice
+        assert file["contentSize"] == str((folder / name).stat().st_size)
+    root = crate.root_dataset
+    assert (root["license"].id, root["identifier"]) == (CC_BY, "doi:10.1/x")
+    assert root["author"]["affiliation"]["name"] == root["publisher"]["name"] == "Some House"
+    assert "simulated" in root["description"]
+    action = crate.dereference("#made")
+    assert action.type == "CreateAction"
+    assert action["result"].id == "./"
+    assert action["instrument"]["name"] == "coupole"
+
+
+def test_a_result_says_of_which_frames_it_was_made_and_may_be_described_in_place(tmp_path: Path) -> None:
+    result = write_result(tmp_path / "result", waves(12)).folder
+    about = json.loads((result / "result.json").read_text())
+    about["runs"] = {"waves": {"waves/run.json": "ab" * 32, "waves/views/top.h5": "cd" * 32}}
+    (result / "result.json").write_text(json.dumps(about))
+    before = {path for path in result.rglob("*") if path.is_file()}
+    export(result, "--licence", "ask the museum", "--in-place")
+    assert {path for path in result.rglob("*") if path.is_file()} - before == {result / "ro-crate-metadata.json"}
+    crate = ROCrate(result)
+    used = {one["name"]: one["identifier"] for one in crate.dereference("#made")["object"]}
+    assert used == {"waves/run.json": f"sha256:{'ab' * 32}", "waves/views/top.h5": f"sha256:{'cd' * 32}"}
+    assert crate.root_dataset["license"]["name"] == "ask the museum"
+    assert len(crate.data_entities) == len(before)
+
+
+def test_a_run_that_is_being_acquired_is_left_alone(made: MadeRun, tmp_path: Path) -> None:
+    options = ("--to", "rocrate", "--licence", CC_BY, "--author", AUTHOR, "--out", tmp_path / "crate")
+    with made.run.locked():
+        ended = cells.here("export", made.run.folder, *options)
+    assert ended.code == 2
+    assert "is acquiring into this run" in ended.err

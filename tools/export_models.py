@@ -1,0 +1,146 @@
+"""Models of materials by which `tools/prove_exports.py` reads exports: pi f cos_i, 1 for white from above."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+Array = np.ndarray
+_F0S, _ALPHAS, _COSINES, _STEPS = 12, 16, 16, 48
+"""Nodes of a table of albedos, and steps of its integrals."""
+
+
+@dataclass(frozen=True)
+class Lit:
+    """Pixels under one light each."""
+
+    triangles: Array
+    lights: Array
+    """[n, 3] unit, support frame."""
+    cameras: Array
+    """[n, 3]"""
+    views: Array
+    rows: Array
+    columns: Array
+
+    def of(self, picked: Array) -> Lit:
+        return Lit(*(getattr(self, field.name)[picked] for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class Materials:
+    """[n] of pixels, in the parameters of the model that takes them."""
+
+    normals: Array
+    diffuse: Array
+    specular: Array
+    alpha: Array
+
+
+def ggx(of: Materials, lit: Lit) -> Array:
+    """[n, 3] kd + ks D V: Walter and others 2007, Heitz 2014."""
+    nl, nv, nh, _ = _cosines(of, lit)
+    return np.pi * nl[:, None] * (of.diffuse + (_d(nh, of.alpha) * _v(nl, nv, of.alpha))[:, None] * of.specular)
+
+
+def gltf(of: Materials, lit: Lit) -> Array:
+    """glTF 2.0, appendix B, with KHR_materials_specular: `diffuse` is the base colour, `specular` F0."""
+    nl, nv, nh, vh = _cosines(of, lit)
+    fresnel = of.specular + (1.0 - of.specular) * (1.0 - vh[:, None]) ** 5
+    lobe = (_d(nh, of.alpha) * _v(nl, nv, of.alpha))[:, None]
+    base = of.diffuse / np.pi
+    return np.pi * nl[:, None] * ((1.0 - fresnel.max(axis=1, keepdims=True)) * base + fresnel * lobe)
+
+
+def openpbr(of: Materials, lit: Lit, f0: Array) -> Array:
+    """OpenPBR as MaterialX builds it: a dielectric layer of reflectance `f0` [n], tinted by `specular`, with
+    compensation for what is scattered more than once, over what it lets through to the base colour `diffuse`."""
+    nl, nv, nh, vh = _cosines(of, lit)
+    grid = np.linspace(0.0, 0.999, _F0S) ** 2
+    once = _albedo(np.stack([np.sqrt(f0), of.alpha, nv], 1), np.stack([_albedos(one) for one in grid]))
+    white = _albedo(np.stack([np.ones(len(f0)), of.alpha, nv], 1), np.stack([_albedos(None)] * _F0S))
+    fresnel = _fresnel(vh, f0)
+    more = 1.0 + fresnel * (1.0 - white) / white
+    lobe = _d(nh, of.alpha) * _v(nl, nv, of.alpha) * fresnel * more
+    through = (1.0 - once * more)[:, None] * of.diffuse / np.pi
+    return np.pi * nl[:, None] * (lobe[:, None] * of.specular + through)
+
+
+def lab_differences(found: Array, wanted: Array) -> Array:
+    """[n] dE00 of linear sRGB, white 1, cut off above it."""
+    import colour
+
+    white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]
+    labs = (
+        colour.XYZ_to_Lab(colour.RGB_to_XYZ(np.clip(part, 0.0, 1.0), "sRGB", white), white)
+        for part in (found, wanted)
+    )
+    return np.asarray(colour.delta_E(*labs, method="CIE 2000"))
+
+
+def _cosines(of: Materials, lit: Lit) -> tuple[Array, Array, Array, Array]:
+    """Of light, camera and half vector to the normal, and of camera to half vector."""
+    half = lit.lights + lit.cameras
+    half = half / np.linalg.norm(half, axis=1, keepdims=True)
+    normals = of.normals / np.linalg.norm(of.normals, axis=1, keepdims=True)
+    pairs = ((lit.lights, normals), (lit.cameras, normals), (half, normals), (lit.cameras, half))
+    nl, nv, nh, vh = (np.clip(np.sum(one * other, axis=1), 1e-4, 1.0) for one, other in pairs)
+    return nl, nv, nh, vh
+
+
+def _d(nh: Array, alpha: Array) -> Array:
+    return alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1.0) + 1.0) ** 2)
+
+
+def _v(nl: Array, nv: Array, alpha: Array) -> Array:
+    """Smith's shadowing with correlated heights, over 4 nl nv."""
+    a2 = alpha**2
+    return 0.5 / (nl * np.sqrt(nv**2 * (1.0 - a2) + a2) + nv * np.sqrt(nl**2 * (1.0 - a2) + a2))
+
+
+def _fresnel(cosine: Array, f0: Array | float) -> Array:
+    """Of a dielectric that reflects `f0` at normal incidence."""
+    root = np.sqrt(np.minimum(f0, 0.999))
+    ior = (1.0 + root) / (1.0 - root)
+    g = np.sqrt(ior**2 - 1.0 + cosine**2)
+    near, far = g - cosine, g + cosine
+    return 0.5 * (near / far) ** 2 * (1.0 + ((far * cosine - 1.0) / (near * cosine + 1.0)) ** 2)
+
+
+def _albedos(f0: float | None) -> Array:
+    """[alphas, cosines] of light that the lobe reflects, of Fresnel 1 without `f0`; by Heitz' sampling of visible
+    normals (2018), on a grid of its two numbers."""
+    u, v = ((np.arange(_STEPS) + 0.5) / _STEPS for _ in range(2))
+    radius, phi = (part.ravel() for part in np.meshgrid(np.sqrt(u), 2 * np.pi * v, indexing="ij"))
+    found = np.empty((_ALPHAS, _COSINES))
+    for i, alpha in enumerate(np.linspace(0.02, 1.0, _ALPHAS)):
+        for j, nv in enumerate(np.linspace(0.02, 1.0, _COSINES)):
+            way = np.array([alpha * np.sqrt(1.0 - nv**2), 0.0, nv])
+            way /= np.linalg.norm(way)
+            s = 0.5 * (1.0 + way[2])
+            across = radius * np.cos(phi)
+            along = (1.0 - s) * np.sqrt(1.0 - across**2) + s * radius * np.sin(phi)
+            up = np.sqrt(np.maximum(0.0, 1.0 - across**2 - along**2))
+            side = np.array([0.0, 1.0, 0.0])
+            normal = across[:, None] * side + along[:, None] * np.cross(way, side) + up[:, None] * way
+            half = normal * [alpha, alpha, 1.0]
+            half /= np.linalg.norm(half, axis=1, keepdims=True)
+            vh = half @ [np.sqrt(1.0 - nv**2), 0.0, nv]
+            nl = 2.0 * vh * half[:, 2] - nv
+            a2 = alpha**2
+            lambda_v = 0.5 * (np.sqrt(1.0 + a2 * (1.0 / nv**2 - 1.0)) - 1.0)
+            above = np.maximum(nl, 1e-6)
+            lambda_l = 0.5 * (np.sqrt(1.0 + a2 * (1.0 / above**2 - 1.0)) - 1.0)
+            passed = np.where(nl > 0.0, (1.0 + lambda_v) / (1.0 + lambda_v + lambda_l), 0.0)
+            found[i, j] = np.mean(passed * (1.0 if f0 is None else _fresnel(vh, f0)))
+    return found
+
+
+def _albedo(at: Array, table: Array) -> Array:
+    """[n] of a table at [n, 3] root of F0, alpha, cosine."""
+    from scipy.interpolate import RegularGridInterpolator
+
+    nodes = [np.linspace(*ends) for ends in ((0.0, 0.999, _F0S), (0.02, 1.0, _ALPHAS), (0.02, 1.0, _COSINES))]
+    low, high = np.array([[nodes[0][0], 0.02, 0.02], [nodes[0][-1], 1.0, 1.0]])
+    return np.asarray(RegularGridInterpolator(nodes, table)(np.clip(at, low, high)))

@@ -329,3 +329,7 @@ def test_lights_that_do_not_determine_harmonics_and_files_that_stand_are_refused
     ended = cells.here("export", source, "--to", "ptm", "--out", tmp_path)
     assert ended.code == 2
     assert (tmp_path / "ring.ptm").read_text() == "mine"
+    black = write_result(tmp_path / "black", np.zeros_like(pictures), ring)
+    ended = cells.here("export", black, "--to", "relight", "--out", tmp_path)
+    assert ended.code == 2
+    assert "black: the pictures are black" in " ".join(ended.err.split())

@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from coupole.calibration.light.frames import open_light_frames
 from coupole.kinematics import forward
 from coupole.reflectance import ggx
+from coupole.reflectance.light_files import read_lights
 from coupole.reflectance.new_light.light_kinds import DistantLight
 from coupole.reflectance.new_light.shading import coats_of
 from coupole.reflectance.normal_fit import fit_materials
@@ -177,7 +178,16 @@ def test_pictures_for_rti_show_the_object_under_the_lights_that_their_file_names
     alone = cells.here("export", cell.run_folder, "--to", "dome", "--views", "top", "--out", tmp_path / "dome")
     assert alone.code == 0, alone.err
     assert json.loads((tmp_path / "dome/top.dome").read_text()) == dome
+    np.testing.assert_allclose(unit(read_lights(tmp_path / "dome/top.dome").directions), ways, atol=1e-5)
     np.testing.assert_allclose(unit(places), ways, atol=1e-5)
+    web = cells.here("export", cell.run_folder, "--to", "relight", "--views", "top", "--out", tmp_path, "--json")
+    assert web.code == 0, web.err
+    info = json.loads((tmp_path / "top/info.json").read_text())
+    np.testing.assert_allclose(np.reshape(info["lights"], (-1, 3)), ways, atol=1e-5)
+    assert info["width"] * info["pixelSizeInMM"] == pytest.approx(dome["imageWidth"])
+    assert "simulated" in info["origin"]
+    assert web.document["misses_dn"]["top"] < 15.0
+    assert not list(tmp_path.glob(".pictures-*"))
     lens = cell.rig_data["lens"]
     image_mm = 1 / (1 / lens["focal_length_mm"] - 1 / lens["focus_distance_mm"])  # thin lens
     assert dome["imageWidth"] == pytest.approx(512 * 44e-3 * lens["focus_distance_mm"] / image_mm)

@@ -152,6 +152,7 @@ def _seen(*, linear: Callable[[int], Picture], directions: Floats, name: str, sa
     for done, number in enumerate(above):
         brightest = np.maximum(brightest, linear(int(number)).max(axis=2))
         say(f"{name}: white", done + 1, len(above))
-    lit = brightest[brightest > 0]
-    white = np.float32(np.quantile(lit, WHITE_QUANTILE)) if lit.size else np.float32(1.0)
+    if not brightest.any():
+        raise InputError(f"{name}: the pictures are black")
+    white = np.float32(np.quantile(brightest[brightest > 0], WHITE_QUANTILE))
     return LitView(name, directions=directions[above], linear=lambda n: linear(int(above[n])) / white, **about)

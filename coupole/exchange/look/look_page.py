@@ -27,6 +27,9 @@ SCRIPTS = (
     "lights.js",
     "programs.js",
     "renderer.js",
+    "tiles.js",
+    "flat.js",
+    "run.js",
     "material.js",
     "frames.js",
     "plot.js",
@@ -34,6 +37,7 @@ SCRIPTS = (
     "overlay.js",
     "controls.js",
     "pointer.js",
+    "app.js",
     "main.js",
 )
 """In the order in which they are read."""
@@ -41,6 +45,9 @@ SHADERS = (
     "common.glsl",
     "surface.vert",
     "surface.frag",
+    "flat.vert",
+    "flat.frag",
+    "planes.frag",
     "shadow.frag",
     "screen.vert",
     "light.frag",
@@ -57,8 +64,7 @@ def write_page(look: Look, title: str, path: Path, most_bytes: int = MOST_BYTES)
     if path.suffix.lower() != ".html":
         raise InputError(f"--out {path}: expected a name that ends in .html")
     data = path.with_suffix(".data")
-    blocks = (*look.blocks, *look.later)
-    inside, beside = _shared_out(blocks, most_bytes)
+    inside, beside = _shared_out(look, most_bytes)
     try:
         earlier = _earlier(data)
         make_folder(path.parent)
@@ -84,7 +90,8 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
     about = {**look.about, "title": title, "errors": look.errors, "blocks": names, "data": data}
     scripts = "\n".join(_part(name) for name in SCRIPTS)
     tags = [f"<script>{block.script}</script>\n" for block in inside]
-    tags += [f'<script src="{quote(f"{data}/{name}.js")}"></script>\n' for name in names if data]
+    held = {block.name for block in inside}
+    tags += [f'<script src="{quote(f"{data}/{name}.js")}"></script>\n' for name in names if name not in held]
     parts = {
         "TITLE": escape(title),
         "STYLE": _part("page.css"),
@@ -99,11 +106,24 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
     return page
 
 
-def _shared_out(blocks: tuple[Block, ...], most_bytes: int) -> tuple[list[Block], list[Block]]:
-    """Those that go into the page, and those that go beside it: none, or all."""
-    if sum(len(block.text) for block in blocks) + _own_bytes() <= most_bytes:
-        return list(blocks), []
-    return [], list(blocks)
+def _shared_out(look: Look, most_bytes: int) -> tuple[list[Block], list[Block]]:
+    """Those that go into the page, and those that go beside it: all of what a page needs to begin, or none of it;
+    then as many of the others as have room, in their order."""
+    free = (
+        most_bytes - _own_bytes() - len(json.dumps(look.about)) - sum(len(block.script) for block in look.blocks)
+    )
+    if free < 0:
+        return [], [*look.blocks, *look.later]
+    inside = list(look.blocks)
+    for block in look.later:
+        free -= len(block.script) + _TAGS
+        if free < 0:
+            break
+        inside.append(block)
+    return inside, [*look.blocks, *look.later][len(inside) :]
+
+
+_TAGS = len("<script></script>\n")
 
 
 def _own_bytes() -> int:

@@ -24,6 +24,10 @@ class Controls {
     return this.app.state;
   }
 
+  get isRun() {
+    return this.app.about.kind === "run";
+  }
+
   get light() {
     return this.state.lights[this.state.chosen];
   }
@@ -49,7 +53,12 @@ class Controls {
       if (input.valueAsNumber > 0) this.state.white = input.valueAsNumber;
       this.changed("screen");
     });
-    byId("view").append(new Option("None", ""), ...this.app.about.views.map(({ name }) => new Option(name, name)));
+    if (!this.isRun) byId("view").append(new Option("None", ""));
+    byId("view").append(...this.app.about.views.map(({ name }) => new Option(name, name)));
+    for (const name of ["sky-row", "split-row", "frame-told"]) byId(name).hidden = this.isRun;
+    byId("shot-section").hidden = !this.isRun;
+    byId("frames-section").querySelector("summary").textContent = this.isRun ? "View" : "Measured frames";
+    byId("frames-section").open = this.isRun;
     byId("frames-section").hidden = !this.app.about.views.length;
     this.on("view", "change", (input) => this.app.compare(input.value));
     this.on("split", "input", (input) => {
@@ -112,7 +121,7 @@ class Controls {
     byId("split").disabled = !state.view;
     byId("quantity-row").hidden = state.mode !== "uncertainty";
     byId("relief-row").hidden = state.mode !== "unsharp";
-    byId("white-row").hidden = !isLit(state.mode) || Boolean(state.view);
+    byId("white-row").hidden = !isLit(state.mode) || Boolean(state.view && !this.isRun);
     if (document.activeElement !== byId("white")) byId("white").value = Number(state.white.toPrecision(4));
     byId("legend").innerHTML = ["roughness", "uncertainty", "residual"].includes(state.mode)
       ? legendOf(state.mode, state.quantity) : "";
@@ -122,6 +131,7 @@ class Controls {
     this.put("height", height, `${height.toFixed(0)}°`);
     this.put("sky", state.sky, state.sky.toFixed(2));
     byId("colour").value = light.colour;
+    if (this.isRun) byId("shot").innerHTML = this.app.renderer.shotTold(state);
     this.showLights();
   }
 
@@ -149,4 +159,4 @@ class Controls {
 }
 
 /** Whether a mode shows light, and not a number or a direction. */
-const isLit = (mode) => ["relit", "diffuse", "specular", "unsharp"].includes(mode);
+const isLit = (mode) => !["normals", "roughness", "uncertainty", "residual"].includes(mode);

@@ -45,7 +45,7 @@ const aimOf = (width, height) => `<path class="aim" d="M${width / 2 - 9} ${heigh
 /** Where the measured frame ends and the fitted one begins, as markup. */
 function splitOf(state, width, height) {
   const x = state.split * width;
-  return state.view && isLit(state.mode) ? `<line class="split" x1="${x}" x2="${x}" y1="0" y2="${height}"/>` : "";
+  return state.view && ABOUT.kind === "mesh" && isLit(state.mode) ? `<line class="split" x1="${x}" x2="${x}" y1="0" y2="${height}"/>` : "";
 }
 
 function legendOf(mode, quantity) {
@@ -61,7 +61,7 @@ function legendOf(mode, quantity) {
 function bannerOf(about, state, compared) {
   const kinds = { true: "Simulated object", false: "Measured object", null: "Pictures of an object" };
   const told = [kinds[about.simulated]];
-  if (["relit", "diffuse", "specular", "unsharp"].includes(state.mode)) {
+  if (isLit(state.mode)) {
     told.push(`light computed from a fit (${about.fit})`);
     if (state.sky > 0 || state.lights.some((light) => light.kelvin !== NEUTRAL_KELVIN)) {
       told.push("colour of light and sky are hypotheses in RGB");

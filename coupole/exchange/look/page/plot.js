@@ -44,7 +44,7 @@ const three = (values) => values.map((value) => value.toPrecision(3)).join(" / "
 /** What is told of a point, as markup. */
 function toldOf(triangle, place, material, view) {
   const at = ABOUT.picture_px
-    ? `Pixel ${triangle % ABOUT.picture_px[0]}, ${Math.floor(triangle / ABOUT.picture_px[0])}`
+    ? `Pixel ${Math.floor(place[0])}, ${Math.floor(ABOUT.picture_px[1] - place[1])}`
     : `Triangle ${triangle} at ${place.map((value) => value.toFixed(2)).join(", ")} mm`;
   if (!material) return `<p>${at}: was seen in too few frames; it has no material.</p>`;
   const { kd, ks, normal, roughness } = material.uncertainty;

@@ -5,6 +5,7 @@ const SHADOW_PX = [512, 2048];  // least and most
 const MODE_NUMBERS = {
   relit: 0, diffuse: 1, specular: 2, unsharp: 3, normals: 4, roughness: 5, uncertainty: 6, residual: 7,
 };
+const ARRAYS = ["shadows", "planes"];
 const RAMP = ["#2a2140", "#3b4f8f", "#2f8f8c", "#8fbf5a", "#f0c24b", "#fff4cf"];
 const TEXTURES = {
   places: ["uint16", 3], triangles: ["uint32", 3], normals: ["uint16", 2], kd: ["float16", 3], ks: ["float16", 3],
@@ -25,12 +26,12 @@ class Renderer {
     if (!this.gl) throw new Error("This browser has no WebGL 2, which the picture needs.");
     this.canvas = canvas;
     this.about = about;
-    this.triangles = arrays.triangles.length / 3;
-    this.measure(arrays.places);
-    this.prepare(arrays);
     this.samples = 0;
     this.targets = null;
     this.depths = null;
+    this.arrived = () => {};  // what is called when more has come
+    this.measure(arrays);
+    this.prepare(arrays);
     this.drawnShadows = [];
     this.frames = {};
   }
@@ -49,12 +50,26 @@ class Renderer {
     return compared ? [compared.frame.peak, "of the camera's range"] : [state.white || 1, this.about.unit];
   }
 
+  banner(state) {
+    return bannerOf(this.about, state, this.frameOf(state));
+  }
+
+  /** The material of what `seenAt` has found. */
+  materialOf(number) {
+    return materialOf(this.arrays, number);
+  }
+
+  /** Whether something has yet to come for the picture to be whole. */
+  get isWaiting() {
+    return false;
+  }
+
   keepFrame(frame, bytes) {
     this.frames[frame.block] = bytesTexture(this.gl, bytes, ...frame.size_px);
   }
 
   /** The box and the sphere that hold the object. */
-  measure(places) {
+  measure({ places }) {
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
     for (let k = 0; k < places.length; k++) {
       if (places[k] < low[k % 3]) low[k % 3] = places[k];
@@ -70,6 +85,8 @@ class Renderer {
 
   prepare(arrays) {
     const gl = this.gl;
+    this.arrays = arrays;
+    this.triangles = arrays.triangles.length / 3;
     this.programs = {
       surface: programOf(gl, "surface.vert", "surface.frag"),
       shadow: programOf(gl, "surface.vert", "shadow.frag"),
@@ -89,7 +106,7 @@ class Renderer {
     gl.useProgram(program.program);
     Object.entries(textures).forEach(([uniform, texture], number) => {
       gl.activeTexture(gl.TEXTURE0 + number);
-      gl.bindTexture(uniform === "shadows" ? gl.TEXTURE_2D_ARRAY : gl.TEXTURE_2D, texture);
+      gl.bindTexture(ARRAYS.includes(uniform) ? gl.TEXTURE_2D_ARRAY : gl.TEXTURE_2D, texture);
       gl.uniform1i(program.at(uniform), number);
     });
     gl.uniform3fv(program.at("origin_mm"), this.about.origin_mm);
@@ -121,7 +138,7 @@ class Renderer {
     this.fit();
     const beams = this.beamsOf(state);
     this.drawShadows(beams);
-    this.drawSurface(state.camera);
+    this.drawSurface(state);
     this.drawLight(state, beams);
     [this.targets.mean, this.targets.other] = [this.targets.other, this.targets.mean];
     this.samples += 1;
@@ -173,16 +190,14 @@ class Renderer {
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.depths.frames[layer]);
       gl.clear(gl.DEPTH_BUFFER_BIT);
       gl.uniformMatrix4fv(at("clip_from_object"), false, beam.shadow);
-      if (!this.about.picture_px) gl.drawArrays(gl.TRIANGLES, 0, 3 * this.triangles);
+      gl.drawArrays(gl.TRIANGLES, 0, 3 * this.triangles);
       this.drawnShadows[layer] = String(beam.shadow);
     });
   }
 
-  drawSurface(camera) {
-    const gl = this.gl, [x, y] = evenly(this.samples);
-    const { places, triangles, gloss } = this.textures;
-    const at = this.use("surface", { places, triangles, gloss });
-    gl.uniform2iv(at("picture_px"), this.about.picture_px ?? [0, 0]);
+  drawSurface({ camera }) {
+    const gl = this.gl, [x, y] = evenly(this.samples), { places, triangles } = this.textures;
+    const at = this.use("surface", { places, triangles });
     const clip = clipOf(camera, this.width, this.height, this.middle, this.radius, [x - 0.5, y - 0.5]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.targets.seen.frame);
     gl.viewport(0, 0, this.width, this.height);

@@ -1,7 +1,9 @@
 // What a user has set: all of it goes into the address, and back.
 
 const MOST_LIGHTS = 10;
-const MODES = {
+const MODES = ABOUT.kind === "run" ? {
+  measured: "Nearest frame", between: "Between LEDs",
+} : {
   relit: "Relit", diffuse: "Diffuse only", specular: "Highlights only", unsharp: "Relief enhanced",
   normals: "Normals", roughness: "Roughness", uncertainty: "Uncertainty", residual: "What the fit misses",
 };
@@ -14,7 +16,7 @@ const startLight = () => ({
 });
 
 const startState = () => ({
-  mode: "relit", quantity: "kd", white: 0, relief: 1, sky: 0, chosen: 0, lights: [startLight()],
+  mode: Object.keys(MODES)[0], quantity: "kd", white: 0, relief: 1, sky: 0, chosen: 0, lights: [startLight()],
   camera: null, notes: [], view: "", split: 0.5,
 });
 

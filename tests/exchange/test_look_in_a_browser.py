@@ -246,27 +246,66 @@ def test_on_a_telephone_nothing_sticks_out_and_all_is_large_enough_to_touch(page
         page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
-def test_all_words_stand_out_from_what_is_behind_them(page: Page, folder: Path) -> None:
-    """Contrast as WCAG 2.2 has it (1.4.3), 4.5 at least."""
+def luminance(text: str) -> float:
+    """Relative, of a colour as the browser tells it (WCAG 2.2)."""
+    red, green, blue = (int(one) / 255 for one in re.findall(r"\d+", text)[:3])
+    linear = [one / 12.92 if one <= 0.04045 else ((one + 0.055) / 1.055) ** 2.4 for one in (red, green, blue)]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def contrast(one: str, other: str) -> float:
+    low, high = sorted([luminance(one), luminance(other)])
+    return (high + 0.05) / (low + 0.05)
+
+
+BEHIND = """(one) => {
+  while (getComputedStyle(one).backgroundColor === 'rgba(0, 0, 0, 0)') one = one.parentElement;
+  return getComputedStyle(one).backgroundColor;
+}"""
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_all_words_and_the_focus_stand_out_from_what_is_behind_them(page: Page, folder: Path, theme: str) -> None:
+    """WCAG 2.2: 4.5 at least of words (1.4.3), 3 of controls' edges and of the focus (1.4.11)."""
     page.open(folder / "look.html")
     page.driver.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
-    pairs = page.run("""[...document.querySelectorAll('#panel *, #tools *, #banner')]
-        .filter(one => one.checkVisibility() && [...one.childNodes].some(node => node.nodeType === 3))
-        .map(one => {
-          let behind = one;
-          while (getComputedStyle(behind).backgroundColor === 'rgba(0, 0, 0, 0)') behind = behind.parentElement;
-          return [getComputedStyle(one).color, getComputedStyle(behind).backgroundColor, one.textContent];
-        })""")
-    assert len(pairs) > 30
+    page.driver.execute_script(
+        "document.head.append(Object.assign(document.createElement('style'), "
+        "{textContent: '* { transition: none !important; }'}))"
+    )
+    Select(page.browser.at("#theme")).select_by_value(theme)
+    try:
+        pairs = page.run(f"""[...document.querySelectorAll('#panel *, #tools *, #banner, #scale')]
+            .filter(one => one.checkVisibility() && [...one.childNodes].some(node => node.nodeType === 3))
+            .map(one => [getComputedStyle(one).color, ({BEHIND})(one), one.textContent])""")
+        assert len(pairs) > 30
+        for front, behind, words in pairs:
+            assert contrast(front, behind) >= 4.5, words
+        edges = page.run(f"""[...document.querySelectorAll('button, select, input[type=number]')]
+            .filter(one => one.checkVisibility())
+            .map(one => [getComputedStyle(one).borderTopColor, ({BEHIND})(one.parentElement), one.textContent])""")
+        for edge, behind, words in edges:
+            assert contrast(edge, behind) >= 3.0, words
+        page.focus("white")
+        page.keys(Keys.TAB)
+        focus = page.run("getComputedStyle(document.activeElement).outlineColor")
+        assert page.run("parseFloat(getComputedStyle(document.activeElement).outlineWidth)") >= 2
+        for behind in ("#panel", "body"):
+            assert contrast(focus, page.browser.at(behind).value_of_css_property("background-color")) >= 3.0
+    finally:
+        Select(page.browser.at("#theme")).select_by_value("system")
 
-    def luminance(text: str) -> float:
-        red, green, blue = (int(one) / 255 for one in re.findall(r"\d+", text)[:3])
-        linear = [one / 12.92 if one <= 0.04045 else ((one + 0.055) / 1.055) ** 2.4 for one in (red, green, blue)]
-        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
-    for front, behind, words in pairs:
-        low, high = sorted([luminance(front), luminance(behind)])
-        assert (high + 0.05) / (low + 0.05) >= 4.5, words
+def test_the_page_is_as_light_as_the_system_unless_it_is_told_otherwise(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    for system, chosen, shown in (("light", "system", 0.5), ("dark", "system", 0.0), ("dark", "light", 0.5)):
+        media = {"features": [{"name": "prefers-color-scheme", "value": system}]}
+        page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+        Select(page.browser.at("#theme")).select_by_value(chosen)
+        found = luminance(page.browser.at("body").value_of_css_property("background-color"))
+        assert found == pytest.approx(shown + 0.25, abs=0.25), (system, chosen)
+    page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    Select(page.browser.at("#theme")).select_by_value("system")
 
 
 def test_an_address_brings_back_view_light_and_notes(page: Page, folder: Path) -> None:
@@ -346,6 +385,34 @@ def test_data_that_are_gone_from_beside_the_page_are_named(page: Page, tmp_path:
     page.browser.open(f"file://{tmp_path / 'look.html'}")
     told = cells.wait_until(lambda: page.browser.text("#status").replace("Reading…", ""), "what is missing")
     assert "(kd): keep its .data folder beside it" in told
+
+
+def test_a_coarse_picture_comes_first_and_the_whole_mesh_takes_its_place(page: Page, folder: Path) -> None:
+    write_page(look_of_result(folder / "result", coarse_over=500), "waves", folder / "coarse.html")
+    page.open(folder / "coarse.html")
+    assert page.run("performance.getEntriesByName('coupole: first picture').length") == 1
+    page.small()
+    page.look(-70.0, 50.0, 150.0)
+    mine = page.picture(1)
+    page.open(folder / "look.html")
+    page.small()
+    page.look(-70.0, 50.0, 150.0)
+    np.testing.assert_array_equal(mine, page.picture(1))
+
+
+def test_the_coarse_picture_stays_where_the_rest_is_missing(page: Page, folder: Path, tmp_path: Path) -> None:
+    look = look_of_result(folder / "result", coarse_over=500)
+    files = write_page(look, "waves", tmp_path / "look.html", most_bytes=1000)
+    next(file for file in files if file.name == "kd.js").unlink()
+    page.opened = None
+    page.browser.open(f"file://{tmp_path / 'look.html'}")
+    cells.wait_until(lambda: "(kd)" in page.browser.text("#status"), "what is missing")
+    bright = """(() => {
+        const shown = Object.assign(document.createElement("canvas"), { width: 60, height: 60 }).getContext("2d");
+        shown.drawImage(document.getElementById("picture"), 0, 0, 60, 60);
+        return shown.getImageData(0, 0, 60, 60).data.filter((value, k) => k % 4 === 1 && value > 60).length;
+    })()"""
+    assert page.run(bright) > 300
 
 
 def test_a_flat_picture_has_the_radiance_of_each_pixel_where_it_lies(page: Page, tmp_path: Path) -> None:

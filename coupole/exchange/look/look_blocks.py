@@ -49,8 +49,11 @@ class Look:
     about: dict[str, Any]
     """What its scripts know of it; docs/reference/page.md."""
     blocks: tuple[Block, ...]
+    """What its picture needs."""
     later: tuple[Block, ...] = ()
     """Blocks that a page reads when they are asked for."""
+    first: tuple[Block, ...] = ()
+    """Blocks of `first-` and a name of `blocks` that stand for them, and are few: for a first picture."""
     errors: dict[str, str] = field(default_factory=dict)
     """What is lost by writing numbers short, by the name of a quantity."""
 

@@ -91,7 +91,7 @@ def look_of_run(folder: Path, patterns: Sequence[str], say: Said) -> Look:
         tiles += tiled
         pictures += shown
     tiles.sort(key=lambda block: -int(block.name.rsplit("-", 3)[1]))  # the coarsest first
-    return Look(_about(run, frames, views), tuple(blocks), (*tiles, *pictures), _ERRORS)
+    return Look(_about(run, frames, views), tuple(blocks), (*tiles, *pictures), errors=_ERRORS)
 
 
 _ERRORS = {

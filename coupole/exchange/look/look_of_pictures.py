@@ -54,7 +54,7 @@ def look_of_pictures(folder: Path) -> Look:
         },
     }
     errors = {"normals": "0.004 degrees", "kd, ks, roughness": "0.05 % or 3e-8"}
-    return Look(shown, (), tuple(sorted(tiles, key=_level, reverse=True)), errors)
+    return Look(shown, (), tuple(sorted(tiles, key=_level, reverse=True)), errors=errors)
 
 
 _TILES = "tile"

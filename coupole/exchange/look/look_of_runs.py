@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from coupole.exchange.look.look_blocks import Look, block_of, halves, log_coded, octahedral
+from coupole.exchange.look.coarse_mesh import MOST_TRIANGLES, coarse_mesh
+from coupole.exchange.look.look_blocks import Block, Look, block_of, halves, log_coded, octahedral
 from coupole.exchange.look.look_frames import frames_of_view
 from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.geometry import apply, inverse
@@ -23,8 +24,11 @@ PLACES = 65535
 """Steps of a coordinate along the longest side of the object."""
 
 
-def look_of_result(folder: Path) -> Look:
-    """Of a whole result. Raises InputError if it is none, or has no material."""
+def look_of_result(folder: Path, coarse_over: int = MOST_TRIANGLES) -> Look:
+    """Of a whole result; a mesh of more than `coarse_over` triangles has a coarse one for the first picture.
+
+    Raises InputError if it is none, or has no material.
+    """
     known = read_about(folder)
     result = RunResult(folder)
     fit = best_fit(result, MATERIALS)
@@ -39,15 +43,15 @@ def look_of_result(folder: Path) -> Look:
     finite = np.isfinite(materials.alpha) & np.isfinite(materials.kd).all(axis=1)
     at, mine = result.triangles[finite], finite.nonzero()[0]
     turned = materials.normals[mine] @ support_from_base[:3, :3].T
-    blocks = [
-        block_of("places", places),
-        block_of("triangles", triangles),
-        block_of("normals", _spread(octahedral(turned), at, count)),
-        block_of("kd", _spread(halves(red_green_blue(materials.kd[mine])), at, count)),
-        block_of("ks", _spread(halves(red_green_blue(materials.ks[mine])), at, count)),
-        block_of("gloss", _spread(halves(_pair(materials.alpha, materials.residual)[mine]), at, count)),
-        block_of("uncertainty", _spread(_uncertainty(path)[mine], at, count)),
-    ]
+    shapes: dict[str, NDArray[Any]] = {"places": places, "triangles": triangles}
+    of_triangles: dict[str, NDArray[Any]] = {
+        "normals": _spread(octahedral(turned), at, count),
+        "kd": _spread(halves(red_green_blue(materials.kd[mine])), at, count),
+        "ks": _spread(halves(red_green_blue(materials.ks[mine])), at, count),
+        "gloss": _spread(halves(_pair(materials.alpha, materials.residual)[mine]), at, count),
+        "uncertainty": _spread(_uncertainty(path)[mine], at, count),
+    }
+    blocks = tuple(block_of(name, values) for name, values in (shapes | of_triangles).items())
     views = [found for view in result.views if (found := frames_of_view(result, view, support_from_base))]
     about = {
         "kind": "mesh",
@@ -67,6 +71,7 @@ def look_of_result(folder: Path) -> Look:
             "Light": "straight from lamps, with shadows; none from surface to surface. White is the radiance that "
             "is shown as white; a white diffuser that faces a light of strength 1 has 1.",
         },
+        "box": [places.min(axis=0).tolist(), places.max(axis=0).tolist()],
         "origin_mm": origin_mm.tolist(),
         "step_mm": step_mm,
     }
@@ -78,7 +83,19 @@ def look_of_result(folder: Path) -> Look:
         "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
     }
     later = tuple(block for _, pictures in views for block in pictures)
-    return Look(about, tuple(blocks), later, errors)
+    return Look(about, blocks, later, _first(places, triangles, of_triangles, coarse_over), errors)
+
+
+def _first(
+    places: NDArray[np.uint16], triangles: NDArray[np.uint32], of_triangles: dict[str, NDArray[Any]], over: int
+) -> tuple[Block, ...]:
+    """Blocks of a coarse mesh; none of a mesh that is not larger than `over`."""
+    if len(triangles) <= over:
+        return ()
+    coarse = coarse_mesh(places, triangles, over)
+    found: dict[str, NDArray[Any]] = {"places": coarse.places, "triangles": coarse.triangles}
+    found |= {name: values[coarse.stands_for] for name, values in of_triangles.items()}
+    return tuple(block_of(f"first-{name}", values) for name, values in found.items())
 
 
 def welded(corners_mm: Floats) -> tuple[NDArray[np.uint16], NDArray[np.uint32], Floats, float]:

@@ -36,6 +36,7 @@ SCRIPTS = (
     "sphere.js",
     "overlay.js",
     "controls.js",
+    "theme.js",
     "pointer.js",
     "app.js",
     "main.js",
@@ -88,6 +89,7 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
     shaders = {name: _part(name) for name in SHADERS}
     names = [block.name for block in look.blocks]
     about = {**look.about, "title": title, "errors": look.errors, "blocks": names, "data": data}
+    about["first"] = [block.name for block in look.first]
     scripts = "\n".join(_part(name) for name in SCRIPTS)
     tags = [f"<script>{block.script}</script>\n" for block in inside]
     held = {block.name for block in inside}
@@ -98,6 +100,7 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
         "ABOUT": _in_script(about),
         "SHADERS": _in_script(shaders),
         "SCRIPTS": scripts,
+        "FIRST": "".join(f"<script>{block.script}</script>\n" for block in look.first),
         "BLOCKS": "".join(tags),
     }
     page = _part("page.html")
@@ -109,9 +112,8 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
 def _shared_out(look: Look, most_bytes: int) -> tuple[list[Block], list[Block]]:
     """Those that go into the page, and those that go beside it: all of what a page needs to begin, or none of it;
     then as many of the others as have room, in their order."""
-    free = (
-        most_bytes - _own_bytes() - len(json.dumps(look.about)) - sum(len(block.script) for block in look.blocks)
-    )
+    needed = sum(len(block.script) for block in (*look.first, *look.blocks))
+    free = most_bytes - _own_bytes() - len(json.dumps(look.about)) - needed
     if free < 0:
         return [], [*look.blocks, *look.later]
     inside = list(look.blocks)

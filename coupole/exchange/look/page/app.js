@@ -1,6 +1,5 @@
 // The page: what the user does, and when the picture is drawn.
 
-const GROUND = "#121418";
 const ADDRESS_MS = 300;
 const LIGHT_PX = 160;  // that a dragged light goes from the middle to the rim
 const MOST_PIXELS = 4e6;
@@ -14,6 +13,7 @@ class App {
     this.renderer = new RENDERERS[about.kind](this.canvas, about, arrays);
     this.renderer.arrived = (error) => this.arrived(error);
     this.lost = new Set();
+    this.theme = new Theme(() => this.changed("screen"));
     this.tool = "turn";
     this.ruler = [];
     this.pinned = null;
@@ -32,6 +32,12 @@ class App {
     }
     this.isNew = !this.state.white;
     if (this.isNew) this.fitWhite();
+    this.changed("light");
+  }
+
+  /** All of the mesh has come. */
+  refine(arrays) {
+    this.renderer.take(arrays);
     this.changed("light");
   }
 
@@ -132,7 +138,7 @@ class App {
     this.frame ??= requestAnimationFrame(() => {
       this.frame = null;
       if (this.renderer.samples < this.most) this.draw();
-      else if (this.wanted) this.renderer.show(this.state, GROUND);
+      else if (this.wanted) this.renderer.show(this.state, this.theme.ground);
       this.wanted = false;
       if (this.renderer.samples < this.most) this.schedule();
     });
@@ -140,7 +146,7 @@ class App {
 
   draw() {
     this.renderer.sample(this.state);
-    this.renderer.show(this.state, GROUND);
+    this.renderer.show(this.state, this.theme.ground);
   }
 
   /** Draw until the mean has so many samples. */
@@ -377,10 +383,10 @@ class App {
     const made = document.createElement("canvas");
     Object.assign(made, { width, height: height + line });
     const context = made.getContext("2d");
-    context.fillStyle = GROUND;
+    context.fillStyle = this.theme.ground;
     context.fillRect(0, 0, width, height + line);
     context.drawImage(this.canvas, 0, 0);
-    context.fillStyle = "#ece9e2";
+    context.fillStyle = this.theme.text;
     context.font = `${Math.round(13 * this.scale)}px sans-serif`;
     const [shown, unit] = this.renderer.whiteOf(this.state);
     const white = isLit(this.state.mode) ? ` · white ${shown.toPrecision(4)} ${unit}` : "";

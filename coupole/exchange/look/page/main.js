@@ -41,15 +41,41 @@ function interfaceOf(app) {
   };
 }
 
-const ready = readBlocks(ABOUT.blocks).then(async (arrays) => {
-  const app = new App(ABOUT, arrays);
-  if (app.about.picture_px) {
-    await app.whole();
-    if (app.isNew) app.fitWhite();
-  }
+/** When all of the page's scripts were read. */
+const allRead = new Promise((resolve) => {
+  if (document.readyState === "loading") document.addEventListener("DOMContentLoaded", resolve);
+  else resolve();
+});
+
+const shown = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 0)));
+
+/** The page with its coarse mesh, which stands at its beginning; null of pages that have none. */
+async function begun() {
+  if (!ABOUT.first.length) return null;
+  const arrays = await readBlocks(ABOUT.first);
+  const app = new App(ABOUT, Object.fromEntries(ABOUT.blocks.map((name) => [name, arrays[`first-${name}`]])));
+  app.say("A coarse picture; the rest is being read…");
+  await shown();
+  performance.mark(FIRST_PICTURE);
+  return app;
+}
+
+const FIRST_PICTURE = "coupole: first picture";
+
+async function begin() {
+  let app = await begun();
+  await allRead;
+  const arrays = await readBlocks(ABOUT.blocks);
+  if (app) app.refine(arrays);
+  else app = new App(ABOUT, arrays);
+  if (app.about.picture_px) await app.whole();
+  if (app.about.picture_px && app.isNew) app.fitWhite();
+  if (!ABOUT.first.length) shown().then(() => performance.mark(FIRST_PICTURE));
   Object.defineProperties(window.coupole, Object.getOwnPropertyDescriptors(interfaceOf(app)));
   byId("status").textContent = "";
-});
+}
+
+const ready = begin();
 window.coupole = { ready };
 ready.catch((error) => {
   byId("status").textContent = error.message;

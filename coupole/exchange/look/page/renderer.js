@@ -30,7 +30,7 @@ class Renderer {
     this.targets = null;
     this.depths = null;
     this.arrived = () => {};  // what is called when more has come
-    this.measure(arrays);
+    this.measure();
     this.prepare(arrays);
     this.drawnShadows = [];
     this.frames = {};
@@ -69,13 +69,8 @@ class Renderer {
   }
 
   /** The box and the sphere that hold the object. */
-  measure({ places }) {
-    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
-    for (let k = 0; k < places.length; k++) {
-      if (places[k] < low[k % 3]) low[k % 3] = places[k];
-      if (places[k] > high[k % 3]) high[k % 3] = places[k];
-    }
-    const { origin_mm: origin, step_mm: step } = this.about, ends = [low, high];
+  measure() {
+    const { origin_mm: origin, step_mm: step, box: ends } = this.about, [low, high] = ends;
     this.corners = [0, 1, 2, 3, 4, 5, 6, 7].map((number) => add(
       origin, times([0, 1, 2].map((k) => ends[number >> k & 1][k]), step),
     ));
@@ -85,8 +80,6 @@ class Renderer {
 
   prepare(arrays) {
     const gl = this.gl;
-    this.arrays = arrays;
-    this.triangles = arrays.triangles.length / 3;
     this.programs = {
       surface: programOf(gl, "surface.vert", "surface.frag"),
       shadow: programOf(gl, "surface.vert", "shadow.frag"),
@@ -94,11 +87,21 @@ class Renderer {
       show: programOf(gl, "screen.vert", "show.frag"),
     };
     this.textures = {};
-    for (const [name, [dtype, count]] of Object.entries(TEXTURES)) {
-      this.textures[name] = numbersTexture(gl, arrays[name], dtype, count);
-    }
+    this.take(arrays);
     gl.bindVertexArray(gl.createVertexArray());
     gl.enable(gl.DEPTH_TEST);
+  }
+
+  /** Show these numbers of the object from now on. */
+  take(arrays) {
+    this.arrays = arrays;
+    this.triangles = arrays.triangles.length / 3;
+    for (const [name, [dtype, count]] of Object.entries(TEXTURES)) {
+      this.gl.deleteTexture(this.textures[name] ?? null);
+      this.textures[name] = numbersTexture(this.gl, arrays[name], dtype, count);
+    }
+    this.drawnShadows = [];
+    this.restart();
   }
 
   use(name, textures) {

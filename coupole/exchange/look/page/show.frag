@@ -35,7 +35,7 @@ void main() {
   vec3 behind = ground;
   if (here > 0u && found.a < 0.5) {  // seen by the page, never by the instrument
     float line = mod(gl_FragCoord.x + gl_FragCoord.y, HATCH_PX) < 1.2 ? 0.16 : 0.06;
-    behind = ground + line;
+    behind = ground + (ground.g > 0.5 ? -line : line);
   }
   vec3 front = found.rgb / max(found.a, 1e-6);
   if (kind == RADIANCE) front = shown(front / white);

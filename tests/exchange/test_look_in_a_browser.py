@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from browser import needs_chromium
 from relief_in_mitsuba import Mitsuba
-from relight_cases import LED, Coat, sheet, waves, write_result
+from relight_cases import LED, Coat, sheet, waves, write_exr, write_result
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
@@ -341,6 +341,54 @@ def test_a_point_tells_its_material(page: Page, folder: Path) -> None:
     assert "0.400 / 0.300 / 0.200" in told
     assert "holds no samples" in told
     assert page.driver.find_elements(By.CSS_SELECTOR, "#point svg polyline")
+
+
+@pytest.mark.parametrize("most_bytes", [MOST_BYTES, 1000])
+def test_a_point_tells_its_measured_samples_beside_the_fit(page: Page, tmp_path: Path, most_bytes: int) -> None:
+    result = write_result(tmp_path / "result", sheet(np.zeros((5, 5)), 60.0), camera_mm=(0.0, 0.0, 330.0))
+    with h5py.File(result.views[0].path, "a") as file:
+        file["f"][...] = 1.2 * np.array(Coat().kd)
+        file["u_own"], file["led_u_own"] = np.full(file["f"].shape, 0.02, np.float16), np.zeros((1, 3))
+    look = look_of_result(tmp_path / "result", with_samples=True)
+    files = write_page(look, "sheet", tmp_path / "look.html", most_bytes)
+    page.open(tmp_path / "look.html", "#")
+    page.look(-90.0, 80.0, 200.0)
+    page.focus("picture")
+    page.keys(Keys.ENTER)
+    cells.wait_until(lambda: "median" in page.browser.text("#samples-told"), "samples")
+    told = page.browser.text("#samples-told")
+    assert "1 measured samples of top" in told
+    share = float(re.findall(r"difference ([\d.]+) %", told)[0])
+    assert share == pytest.approx(100 * (1 - 1 / 1.2), abs=2.5)  # values are kept to 2.3 %
+    assert "holds no samples" not in page.browser.text("#point")
+    if most_bytes == 1000:
+        next(file for file in files if file.name == "samples-top-0.js").unlink()
+        page.open(tmp_path / "look.html", "#")
+        page.focus("picture")
+        page.keys(Keys.ENTER)
+        cells.wait_until(lambda: "No samples" in page.browser.text("#samples-told"), "what is missing")
+
+
+def test_light_from_all_around_is_as_white_as_a_lamp_and_its_sun_as_a_light(page: Page, tmp_path: Path) -> None:
+    white = Coat(kd=(1 / np.pi,) * 3)
+    write_result(tmp_path / "result", sheet(np.zeros((12, 12)), 60.0), white, camera_mm=(0.0, 0.0, 330.0))
+    around = np.ones((32, 64, 3))
+    sun = np.zeros((64, 128, 3))
+    sun[16, 64] = np.array([1.0, 0.5, 0.25]) * 1000.0
+    height = np.pi / 2 - 16.5 * np.pi / 64
+    solid = 2 * np.pi / 128 * (np.sin(height + np.pi / 128) - np.sin(height - np.pi / 128))
+    expected = sun[16, 64] * solid * np.sin(height) / np.pi
+    for name, radiance, shown in (("around", around, np.ones(3)), ("sun", sun, expected)):
+        write_exr(tmp_path / f"{name}.exr", radiance)
+        words = ("--environment", tmp_path / f"{name}.exr", "--out", tmp_path / f"{name}.html")
+        ended = cells.here("show", tmp_path / "result", *words)
+        assert ended.code == 0, ended.err
+        page.open(tmp_path / f"{name}.html")
+        page.small()
+        page.look(-90.0, 80.0, 150.0)
+        page.run("coupole.state = {...coupole.state, lights: [{...coupole.state.lights[0], strength: 0}]}")
+        np.testing.assert_allclose(page.picture(64)[60, 80, :3], shown, rtol=0.03)
+        assert f"surroundings {name}.exr" in page.browser.text("#banner")
 
 
 def test_the_ruler_measures_what_the_object_measures(page: Page, tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def block_of(name: str, values: NDArray[Any]) -> Block:
         raise ValueError(f"{name}: a page reads {', '.join(TYPES)}, not {values.dtype.name}")
     small = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("<")))
     rows = small.reshape(-1).view(np.uint8).reshape(-1, values.dtype.itemsize).T
-    packed = zlib.compress(np.ascontiguousarray(rows).tobytes(), 9)
+    packed = zlib.compress(np.ascontiguousarray(rows).tobytes(), 6)
     return Block(name, base64.b64encode(packed).decode("ascii"), values.dtype.name, values.shape)
 
 

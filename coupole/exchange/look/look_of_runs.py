@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +14,22 @@ from coupole.errors import InputError
 from coupole.exchange.look.coarse_mesh import MOST_TRIANGLES, coarse_mesh
 from coupole.exchange.look.look_blocks import Block, Look, block_of, halves, log_coded, octahedral
 from coupole.exchange.look.look_frames import frames_of_view
+from coupole.exchange.look.look_samples import samples_of_view
 from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.geometry import apply, inverse
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
 
 Floats = NDArray[np.float64]
+Said = Callable[[str, int, int], None]
 
 PLACES = 65535
 """Steps of a coordinate along the longest side of the object."""
 
 
-def look_of_result(folder: Path, coarse_over: int = MOST_TRIANGLES) -> Look:
+def look_of_result(
+    folder: Path, say: Said = lambda *_: None, *, with_samples: bool = False, coarse_over: int = MOST_TRIANGLES
+) -> Look:
     """Of a whole result; a mesh of more than `coarse_over` triangles has a coarse one for the first picture.
 
     Raises InputError if it is none, or has no material.
@@ -53,7 +58,7 @@ def look_of_result(folder: Path, coarse_over: int = MOST_TRIANGLES) -> Look:
     }
     blocks = tuple(block_of(name, values) for name, values in (shapes | of_triangles).items())
     views = [found for view in result.views if (found := frames_of_view(result, view, support_from_base))]
-    about = {
+    about: dict[str, Any] = {
         "kind": "mesh",
         "fit": fit,
         "simulated": bool(known.get("simulated")),
@@ -82,8 +87,15 @@ def look_of_result(folder: Path, coarse_over: int = MOST_TRIANGLES) -> Look:
         "uncertainties": "2.3 % of their value",
         "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
     }
-    later = tuple(block for _, pictures in views for block in pictures)
-    return Look(about, blocks, later, _first(places, triangles, of_triangles, coarse_over), errors)
+    later = [block for _, pictures in views for block in pictures]
+    if with_samples:
+        about["samples"] = []
+        for view in result.views:
+            told, blocks_of_view = samples_of_view(result, view, support_from_base, say)
+            about["samples"].append(told)
+            later += blocks_of_view
+        errors["samples"] = "2.3 % of their value, and of their uncertainty"
+    return Look(about, blocks, tuple(later), _first(places, triangles, of_triangles, coarse_over), errors)
 
 
 def _first(

@@ -33,6 +33,7 @@ SCRIPTS = (
     "material.js",
     "frames.js",
     "plot.js",
+    "samples.js",
     "sphere.js",
     "overlay.js",
     "controls.js",

@@ -14,6 +14,7 @@ class App {
     this.renderer.arrived = (error) => this.arrived(error);
     this.lost = new Set();
     this.theme = new Theme(() => this.changed("screen"));
+    this.samples = new Samples(about);
     this.tool = "turn";
     this.ruler = [];
     this.pinned = null;
@@ -269,6 +270,20 @@ class App {
     const view = unit(minus(axesOf(this.state.camera).place, found.place));
     const angle = material ? degrees(Math.acos(clamp(dot(view, material.normal), -1, 1))) : 0;
     this.tellPoint(toldOf(found.triangle, found.place, material, Math.min(angle, PLOT.reach)));
+    if (material && this.about.samples) this.tellSamples(found, material);
+  }
+
+  /** Samples of a triangle, when they have come. */
+  async tellSamples({ triangle, place }, material) {
+    this.told = triangle;
+    const said = byId("samples-told");
+    said.textContent = "Reading the samples…";
+    try {
+      const samples = await this.samples.of(triangle, place, material);
+      if (this.told === triangle) said.innerHTML = samplesTold(samples);
+    } catch (error) {
+      said.textContent = `No samples: ${error.message}`;
+    }
   }
 
   /** What a pixel of a run has, as it is shown. */

@@ -83,6 +83,11 @@ class Controls {
       this.state.sky = input.valueAsNumber;
       this.changed("light");
     });
+    byId("environment-row").hidden = !this.app.about.environment;
+    this.on("environment", "input", (input) => {
+      this.state.environment = input.valueAsNumber;
+      this.changed("light");
+    });
     for (const name of ["azimuth", "height"]) {
       this.on(name, "input", () => {
         this.light.direction = wayOf(byId("azimuth").valueAsNumber, byId("height").valueAsNumber);
@@ -130,6 +135,7 @@ class Controls {
     this.put("azimuth", azimuth, `${azimuth.toFixed(0)}°`);
     this.put("height", height, `${height.toFixed(0)}°`);
     this.put("sky", state.sky, state.sky.toFixed(2));
+    this.put("environment", state.environment, state.environment.toFixed(2));
     byId("colour").value = light.colour;
     if (this.isRun) byId("shot").innerHTML = this.app.renderer.shotTold(state);
     this.showLights();

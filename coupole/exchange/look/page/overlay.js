@@ -63,7 +63,8 @@ function bannerOf(about, state, compared) {
   const told = [kinds[about.simulated]];
   if (isLit(state.mode)) {
     told.push(`light computed from a fit (${about.fit})`);
-    if (state.sky > 0 || state.lights.some((light) => light.kelvin !== NEUTRAL_KELVIN)) {
+    if (about.environment && state.environment > 0) told.push(`surroundings ${about.environment.name}`);
+    if (state.sky > 0 || state.environment > 0 || state.lights.some((light) => light.kelvin !== NEUTRAL_KELVIN)) {
       told.push("colour of light and sky are hypotheses in RGB");
     }
   }

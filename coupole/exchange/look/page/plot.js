@@ -53,7 +53,8 @@ function toldOf(triangle, place, material, view) {
   const row = (name, value, u) => `<tr><th scope="row">${name}</th><td>${value}</td><td>± ${u}</td></tr>`;
   return `<p>${at}</p>${plotOf(material, view)}
     <p class="small">${ABOUT.unit}; red, green, blue. ${bounds} Dotted: where the camera is mirrored. Drawn from
-    the fitted coefficients; this page holds no samples.</p>
+    the fitted coefficients${ABOUT.samples ? "" : "; this page holds no samples"}.</p>
+    <div id="samples-told" role="status"></div>
     <table><tbody>
     ${row("Diffuse kd", three(material.kd), percent(kd))}
     ${row("Highlight ks", three(material.ks), percent(ks))}

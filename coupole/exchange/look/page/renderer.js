@@ -158,6 +158,12 @@ class Renderer {
       const { way, irradiance: sky } = sampledSky(state.sky * this.about.irradiance / Math.PI, this.samples);
       beams.push({ way, irradiance: sky });
     }
+    const { environment } = this.about;
+    if (environment && state.environment > 0) {
+      const number = this.samples % environment.ways.length;
+      const factor = state.environment * this.about.irradiance / Math.PI;
+      beams.push({ way: environment.ways[number], irradiance: times(environment.irradiances[number], factor) });
+    }
     return beams.map((beam) => ({ ...beam, place: null, shadow: this.shadowMatrix(beam.way) }));
   }
 

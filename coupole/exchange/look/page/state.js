@@ -16,7 +16,7 @@ const startLight = () => ({
 });
 
 const startState = () => ({
-  mode: Object.keys(MODES)[0], quantity: "kd", white: 0, relief: 1, sky: 0, chosen: 0, lights: [startLight()],
+  mode: Object.keys(MODES)[0], quantity: "kd", white: 0, relief: 1, sky: 0, environment: ABOUT.environment ? 1 : 0, chosen: 0, lights: [startLight()],
   camera: null, notes: [], view: "", split: 0.5,
 });
 
@@ -60,6 +60,7 @@ function stateOf(address) {
   }
   const fits = found?.mode in MODES && found.quantity in UNCERTAIN && isNumber(found.white, 0, 1e9)
     && isNumber(found.relief, 0, 10) && isNumber(found.sky, 0, 100) && isCamera(found.camera)
+    && (found.environment === undefined || isNumber(found.environment, 0, 100))
     && Array.isArray(found.lights) && isNumber(found.lights.length, 1, MOST_LIGHTS) && found.lights.every(isLight)
     && isNumber(found.chosen, 0, found.lights.length - 1) && Number.isInteger(found.chosen)
     && Array.isArray(found.notes) && found.notes.every(isNote)

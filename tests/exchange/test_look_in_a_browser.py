@@ -391,6 +391,40 @@ def test_light_from_all_around_is_as_white_as_a_lamp_and_its_sun_as_a_light(page
         assert f"surroundings {name}.exr" in page.browser.text("#banner")
 
 
+def test_an_illuminant_has_its_chromaticity_and_an_eye_may_be_used_to_it(page: Page, tmp_path: Path) -> None:
+    coat = Coat(kd=(0.2, 0.1, 0.05))
+    write_result(tmp_path / "result", sheet(np.zeros((12, 12)), 60.0), coat, camera_mm=(0.0, 0.0, 330.0))
+    write_page(look_of_result(tmp_path / "result"), "sheet", tmp_path / "look.html")
+    page.open(tmp_path / "look.html")
+    page.small()
+    page.look(-90.0, 80.0, 150.0)
+    page.run("coupole.setLight(0, 0, 1)")
+    page.run("document.getElementById('panel').scrollTo(0, 300)")
+    Select(page.browser.at("#illuminant")).select_by_value("A")
+    whites = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]
+    white_a, white_d65 = (colour.xy_to_XYZ(whites[name]) for name in ("A", "D65"))
+    tint = colour.XYZ_to_RGB(white_a, "sRGB", apply_cctf_encoding=False)
+    expected = np.array(coat.kd) * np.pi * tint / tint.mean()
+    found = page.picture(1)[60, 80, :3]
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
+    pixel = """(() => {
+        const shown = Object.assign(document.createElement("canvas"), { width: 1, height: 1 }).getContext("2d");
+        shown.drawImage(document.getElementById("picture"), 80, 60, 1, 1, 0, 0, 1, 1);
+        return [...shown.getImageData(0, 0, 1, 1).data].slice(0, 3);
+    })()"""
+    for adapted in (False, True):
+        page.driver.execute_script(f"coupole.state = {{adapted: {str(adapted).lower()}, white: 1.2}}")
+        page.picture(1)
+        xyz = colour.RGB_to_XYZ(expected / 1.2, "sRGB")
+        if adapted:
+            xyz = colour.adaptation.chromatic_adaptation_VonKries(xyz, white_a, white_d65, transform="Bradford")
+        shown = (
+            colour.cctf_encoding(np.clip(colour.XYZ_to_RGB(xyz, "sRGB", apply_cctf_encoding=False), 0, 1)) * 255
+        )
+        np.testing.assert_allclose(page.run(pixel), shown, atol=1.5)
+    assert "eye used to the chosen light (Bradford)" in page.browser.text("#banner")
+
+
 def test_the_ruler_measures_what_the_object_measures(page: Page, tmp_path: Path) -> None:
     flat = sheet(np.zeros((5, 5)), 60.0)
     write_result(tmp_path / "result", flat, camera_mm=(0.0, 0.0, 330.0))

@@ -44,18 +44,8 @@ def look_of_result(
     corners_mm = apply(support_from_base, result.corners_mm.reshape(-1, 3).astype(np.float64))
     places, triangles, origin_mm, step_mm = welded(corners_mm)
     count = len(triangles)
-    materials = result.materials(fit)
-    finite = np.isfinite(materials.alpha) & np.isfinite(materials.kd).all(axis=1)
-    at, mine = result.triangles[finite], finite.nonzero()[0]
-    turned = materials.normals[mine] @ support_from_base[:3, :3].T
     shapes: dict[str, NDArray[Any]] = {"places": places, "triangles": triangles}
-    of_triangles: dict[str, NDArray[Any]] = {
-        "normals": _spread(octahedral(turned), at, count),
-        "kd": _spread(halves(red_green_blue(materials.kd[mine])), at, count),
-        "ks": _spread(halves(red_green_blue(materials.ks[mine])), at, count),
-        "gloss": _spread(halves(_pair(materials.alpha, materials.residual)[mine]), at, count),
-        "uncertainty": _spread(_uncertainty(path)[mine], at, count),
-    }
+    of_triangles, measured = _materials(result, fit, support_from_base)
     blocks = tuple(block_of(name, values) for name, values in (shapes | of_triangles).items())
     views = [found for view in result.views if (found := frames_of_view(result, view, support_from_base))]
     about: dict[str, Any] = {
@@ -66,12 +56,12 @@ def look_of_result(
         "views": [view for view, _ in views],
         "led_exponent": 2 if known.get("emission") == "paper" else 1,
         "triangles": count,
-        "measured": len(at),
+        "measured": measured,
         "irradiance": math.pi,
         "unit": "1/sr",
         "told": {
             "Object": "simulated" if known.get("simulated") else "measured",
-            "Triangles": f"{count:,}, {len(at):,} with a material",
+            "Triangles": f"{count:,}, {measured:,} with a material",
             "Views": ", ".join(view.view for view in result.views),
             "Light": "straight from lamps, with shadows; none from surface to surface. White is the radiance that "
             "is shown as white; a white diffuser that faces a light of strength 1 has 1.",
@@ -80,22 +70,40 @@ def look_of_result(
         "origin_mm": origin_mm.tolist(),
         "step_mm": step_mm,
     }
-    errors = {
-        "places": f"{0.5e3 * step_mm:.2g} um in each coordinate",
-        "normals": "0.004 degrees",
-        "kd, ks, roughness": "0.05 % or 3e-8",
-        "uncertainties": "2.3 % of their value",
-        "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
-    }
     later = [block for _, pictures in views for block in pictures]
+    errors = _ERRORS | {"places": f"{0.5e3 * step_mm:.2g} um in each coordinate"}
     if with_samples:
         about["samples"] = []
+        errors["samples"] = "2.3 % of their value, and of their uncertainty"
         for view in result.views:
             told, blocks_of_view = samples_of_view(result, view, support_from_base, say)
             about["samples"].append(told)
             later += blocks_of_view
-        errors["samples"] = "2.3 % of their value, and of their uncertainty"
     return Look(about, blocks, tuple(later), _first(places, triangles, of_triangles, coarse_over), errors)
+
+
+_ERRORS = {
+    "normals": "0.004 degrees",
+    "kd, ks, roughness": "0.05 % or 3e-8",
+    "uncertainties": "2.3 % of their value",
+    "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
+}
+
+
+def _materials(result: RunResult, fit: str, support_from_base: Floats) -> tuple[dict[str, NDArray[Any]], int]:
+    """Numbers of all triangles by name, 0 of those without a material; how many have one."""
+    materials, count = result.materials(fit), len(result.corners_mm)
+    finite = np.isfinite(materials.alpha) & np.isfinite(materials.kd).all(axis=1)
+    at, mine = result.triangles[finite], finite.nonzero()[0]
+    turned = materials.normals[mine] @ support_from_base[:3, :3].T
+    values: dict[str, NDArray[Any]] = {
+        "normals": octahedral(turned),
+        "kd": halves(red_green_blue(materials.kd[mine])),
+        "ks": halves(red_green_blue(materials.ks[mine])),
+        "gloss": halves(_pair(materials.alpha, materials.residual)[mine]),
+        "uncertainty": _uncertainty(result.materials_path(fit))[mine],
+    }
+    return {name: _spread(one, at, count) for name, one in values.items()}, len(at)
 
 
 def _first(

@@ -88,6 +88,15 @@ class Controls {
       this.state.environment = input.valueAsNumber;
       this.changed("light");
     });
+    byId("illuminant").append(...Object.entries(ILLUMINANTS).map(([name, { told }]) => new Option(told, name)));
+    this.on("illuminant", "change", (input) => {
+      this.light.illuminant = input.value;
+      this.changed("light");
+    });
+    this.on("adapted", "change", (input) => {
+      this.state.adapted = input.value === "yes";
+      this.changed("screen");
+    });
     for (const name of ["azimuth", "height"]) {
       this.on(name, "input", () => {
         this.light.direction = wayOf(byId("azimuth").valueAsNumber, byId("height").valueAsNumber);
@@ -136,6 +145,9 @@ class Controls {
     this.put("height", height, `${height.toFixed(0)}°`);
     this.put("sky", state.sky, state.sky.toFixed(2));
     this.put("environment", state.environment, state.environment.toFixed(2));
+    byId("illuminant").value = light.illuminant ?? "";
+    byId("kelvin").disabled = Boolean(light.illuminant);
+    byId("adapted").value = state.adapted ? "yes" : "no";
     byId("colour").value = light.colour;
     if (this.isRun) byId("shot").innerHTML = this.app.renderer.shotTold(state);
     this.showLights();

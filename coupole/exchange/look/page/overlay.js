@@ -57,6 +57,16 @@ function legendOf(mode, quantity) {
     <span class="ends"><span>${low}</span><span>${mid}</span><span>${high} ${told}</span></span>`;
 }
 
+/** What has to be said of the colours of lights. */
+function coloursTold(about, state) {
+  const isTinted = (light) => light.illuminant || light.kelvin !== NEUTRAL_KELVIN;
+  if (!state.lights.some(isTinted)) {
+    return state.sky > 0 || state.environment > 0 ? ["colour of sky and surroundings are hypotheses in RGB"] : [];
+  }
+  const eye = state.adapted ? "eye used to the chosen light (Bradford)" : "no adaptation of the eye";
+  return [`colours of lights are hypotheses in RGB, ${eye}`];
+}
+
 /** What has to be said of the picture, wherever it is seen; `compared` is the measured frame in it. */
 function bannerOf(about, state, compared) {
   const kinds = { true: "Simulated object", false: "Measured object", null: "Pictures of an object" };
@@ -64,9 +74,7 @@ function bannerOf(about, state, compared) {
   if (isLit(state.mode)) {
     told.push(`light computed from a fit (${about.fit})`);
     if (about.environment && state.environment > 0) told.push(`surroundings ${about.environment.name}`);
-    if (state.sky > 0 || state.environment > 0 || state.lights.some((light) => light.kelvin !== NEUTRAL_KELVIN)) {
-      told.push("colour of light and sky are hypotheses in RGB");
-    }
+    told.push(...coloursTold(about, state));
   }
   if (state.mode === "unsharp") told.push("relief exaggerated");
   if (compared?.texture && isLit(state.mode)) told.push(`left: measured frame under LED ${compared.frame.led}`);

@@ -20,6 +20,8 @@ function rangeOf(mode, quantity) {
   return { from: 0.003, to: 3, logarithmic: true, unit: "%" };
 }
 
+const IDENTITY = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+
 class Renderer {
   constructor(canvas, about, arrays) {
     this.gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
@@ -62,6 +64,11 @@ class Renderer {
   /** Whether something has yet to come for the picture to be whole. */
   get isWaiting() {
     return false;
+  }
+
+  /** Whether colours are shown to an eye that is used to the chosen light; never those of measured frames. */
+  isAdapted(state) {
+    return state.adapted && isLit(state.mode) && !this.frameOf(state);
   }
 
   keepFrame(frame, bytes) {
@@ -267,6 +274,8 @@ class Renderer {
     const number = ["roughness", "uncertainty", "residual"].includes(state.mode);
     gl.uniform1i(at("kind"), state.mode === "normals" ? 1 : number ? 2 : 0);
     gl.uniform1f(at("white"), this.whiteOf(state)[0]);
+    const eye = this.isAdapted(state) ? adaptation(chromaticity(state.lights[state.chosen])) : IDENTITY;
+    gl.uniformMatrix3fv(at("adapted"), false, eye.flat());
     gl.uniform2f(at("range"), from, to);
     gl.uniform1i(at("logarithmic"), logarithmic ? 1 : 0);
     gl.uniform3fv(at("ramp"), RAMP.flatMap((text) => channelsOf(text)));

@@ -96,6 +96,7 @@ class RunRenderer extends FlatRenderer {
       told.push(`frame under LED ${frame.led}, proven`);
     } else {
       told.push("interpolated between frames: a hypothesis");
+      told.push(...coloursTold(this.about, state));
       if (apart > this.viewShown(state).apart_deg) told.push("beyond the LEDs");
     }
     return told.join(" · ");

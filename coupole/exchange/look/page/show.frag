@@ -8,6 +8,7 @@ uniform usampler2D mean;
 uniform usampler2D seen;
 uniform int kind;
 uniform float white;
+uniform mat3 adapted;  // of linear red, green, blue
 uniform vec2 range;  // of numbers, from and to
 uniform bool logarithmic;
 uniform vec3 ramp[STOPS];  // sRGB
@@ -38,7 +39,7 @@ void main() {
     behind = ground + (ground.g > 0.5 ? -line : line);
   }
   vec3 front = found.rgb / max(found.a, 1e-6);
-  if (kind == RADIANCE) front = shown(front / white);
+  if (kind == RADIANCE) front = shown(adapted * front / white);
   if (kind == NUMBER) front = of_number(front.r);
   colour = vec4(mix(behind, front, clamp(found.a, 0.0, 1.0)), 1.0);
 }

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from html import escape
 from importlib import resources
+from itertools import accumulate
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from urllib.parse import quote
@@ -19,6 +20,7 @@ from coupole.storage.durable import make_folder, sync_folder, write_synced
 
 MOST_BYTES = 25_000_000
 """Of a page that stands alone."""
+_EARLY_BYTES = 3_000_000
 SCRIPTS = (
     "vectors.js",
     "blocks.js",
@@ -92,7 +94,8 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
     about = {**look.about, "title": title, "errors": look.errors, "blocks": names, "data": data}
     about["first"] = [block.name for block in look.first]
     scripts = "\n".join(_part(name) for name in SCRIPTS)
-    tags = [f"<script>{block.script}</script>\n" for block in inside]
+    early = _early(look, inside)
+    tags = [f"<script>{block.script}</script>\n" for block in inside[early:]]
     held = {block.name for block in inside}
     tags += [f'<script src="{quote(f"{data}/{name}.js")}"></script>\n' for name in names if name not in held]
     parts = {
@@ -101,13 +104,21 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
         "ABOUT": _in_script(about),
         "SHADERS": _in_script(shaders),
         "SCRIPTS": scripts,
-        "FIRST": "".join(f"<script>{block.script}</script>\n" for block in look.first),
+        "FIRST": "".join(f"<script>{block.script}</script>\n" for block in (*look.first, *inside[:early])),
         "BLOCKS": "".join(tags),
     }
     page = _part("page.html")
     for name, text in parts.items():
         page = page.replace(f"%{name}%", text)
     return page
+
+
+def _early(look: Look, inside: list[Block]) -> int:
+    """How many of what is inside stand before the scripts, so that they begin with them while the rest is read."""
+    if look.first:
+        return 0
+    sizes = accumulate(len(block.script) for block in inside)
+    return max(len(look.blocks) if inside else 0, sum(size <= _EARLY_BYTES for size in sizes))
 
 
 def _shared_out(look: Look, most_bytes: int) -> tuple[list[Block], list[Block]]:

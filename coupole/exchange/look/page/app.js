@@ -4,6 +4,8 @@ const ADDRESS_MS = 300;
 const LIGHT_PX = 160;  // that a dragged light goes from the middle to the rim
 const MOST_PIXELS = 4e6;
 
+const FIRST_PICTURE = "coupole: first picture";
+const shown = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 0)));
 const RENDERERS = { mesh: Renderer, pictures: FlatRenderer, run: RunRenderer };
 
 class App {
@@ -32,7 +34,6 @@ class App {
       byId("mode").querySelector("[value=uncertainty]")?.remove();
     }
     this.isNew = !this.state.white;
-    if (this.isNew) this.fitWhite();
     this.changed("light");
   }
 
@@ -107,12 +108,18 @@ class App {
     this.schedule();
   }
 
-  /** Wait until all that the picture needs has come. */
-  async whole() {
+  /** Wait until the tiles that are seen have come. */
+  async tilesCome() {
     do {
       this.settle(1);
       await new Promise((resolve) => setTimeout(resolve, 10));
-    } while (this.renderer.isWaiting || this.missingFrame());
+    } while (this.renderer.isWaiting);
+  }
+
+  /** Wait until all that the picture needs has come. */
+  async whole() {
+    do await this.tilesCome();
+    while (this.missingFrame());
   }
 
   /** Something of the state is new: all, or only how the mean is shown ("screen"). */
@@ -147,7 +154,16 @@ class App {
 
   draw() {
     this.renderer.sample(this.state);
+    if (!this.hasBegun && this.renderer.hasPicture) this.drawnFirst();
     this.renderer.show(this.state, this.theme.ground);
+  }
+
+  /** The first time that there is something to be seen. */
+  drawnFirst() {
+    this.hasBegun = true;
+    if (this.isNew) this.state.white = this.renderer.brightest() || 1;
+    this.controls.show();
+    shown().then(() => performance.mark(FIRST_PICTURE));
   }
 
   /** Draw until the mean has so many samples. */

@@ -34,6 +34,12 @@ async function pictured(packed, [height, width, channels = 1]) {
   return bytes;
 }
 
+/** When all of the page's scripts were read. */
+const allRead = new Promise((resolve) => {
+  if (document.readyState === "loading") document.addEventListener("DOMContentLoaded", resolve);
+  else resolve();
+});
+
 /** All blocks by their names; raises an error that names those that did not come. */
 async function readBlocks(names) {
   if (!window.DecompressionStream) throw new Error("This page needs a browser of 2023 or later.");

@@ -3,6 +3,8 @@
 const TILE_ROWS = TILE_NUMBERS / ROW;
 const FIELDS_OF_TILES = { normals: ["uint16", 2], kd: ["float16", 3], ks: ["float16", 3], gloss: ["float16", 2] };
 
+const PATIENCE_MS = 300;
+
 class FlatRenderer extends Renderer {
   viewShown() {
     return this.about;
@@ -22,13 +24,24 @@ class FlatRenderer extends Renderer {
       show: programOf(gl, "screen.vert", "show.frag"),
       light: programOf(gl, ...this.lightShaders()),
     };
+    this.drawnAnew = -Infinity;
     this.prepareTiles();
-    this.tiles = new TileCache(this.about, (slot, numbers) => this.keepTile(slot, numbers), (error) => {
-      this.restart();
-      this.arrived(error);
-    });
+    this.tiles = new TileCache(this.about, (slot, numbers) => this.keepTile(slot, numbers), (error) => this.tileCame(error));
     gl.bindVertexArray(gl.createVertexArray());
     gl.enable(gl.DEPTH_TEST);
+  }
+
+  /** Draw anew when all tiles are here, and a few times before. */
+  tileCame(error) {
+    if (error || !this.tiles.isWaiting || performance.now() > this.drawnAnew + PATIENCE_MS) {
+      this.drawnAnew = performance.now();
+      this.restart();
+    }
+    this.arrived(error);
+  }
+
+  get hasPicture() {
+    return this.tiles.slots.size > 0;
   }
 
   lightShaders() {

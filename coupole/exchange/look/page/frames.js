@@ -2,6 +2,7 @@
 
 /** A block that may still lie beside the page; its script is asked for by a tag. */
 async function laterBlock(about, name) {
+  if (!(name in coupoleBlocks)) await allRead;
   const isBeside = !(name in coupoleBlocks);
   if (isBeside) {
     await new Promise((resolve, reject) => {

@@ -41,14 +41,6 @@ function interfaceOf(app) {
   };
 }
 
-/** When all of the page's scripts were read. */
-const allRead = new Promise((resolve) => {
-  if (document.readyState === "loading") document.addEventListener("DOMContentLoaded", resolve);
-  else resolve();
-});
-
-const shown = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 0)));
-
 /** The page with its coarse mesh, which stands at its beginning; null of pages that have none. */
 async function begun() {
   if (!ABOUT.first.length) return null;
@@ -56,21 +48,17 @@ async function begun() {
   const app = new App(ABOUT, Object.fromEntries(ABOUT.blocks.map((name) => [name, arrays[`first-${name}`]])));
   app.say("A coarse picture; the rest is being read…");
   await shown();
-  performance.mark(FIRST_PICTURE);
+  await shown();
   return app;
 }
 
-const FIRST_PICTURE = "coupole: first picture";
-
 async function begin() {
   let app = await begun();
-  await allRead;
+  if (ABOUT.blocks.some((name) => !(name in coupoleBlocks))) await allRead;
   const arrays = await readBlocks(ABOUT.blocks);
   if (app) app.refine(arrays);
   else app = new App(ABOUT, arrays);
-  if (app.about.picture_px) await app.whole();
-  if (app.about.picture_px && app.isNew) app.fitWhite();
-  if (!ABOUT.first.length) shown().then(() => performance.mark(FIRST_PICTURE));
+  await app.whole();
   Object.defineProperties(window.coupole, Object.getOwnPropertyDescriptors(interfaceOf(app)));
   byId("status").textContent = "";
 }

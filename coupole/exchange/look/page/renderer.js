@@ -61,6 +61,11 @@ class Renderer {
     return materialOf(this.arrays, number);
   }
 
+  /** Whether there is anything to be seen. */
+  get hasPicture() {
+    return true;
+  }
+
   /** Whether something has yet to come for the picture to be whole. */
   get isWaiting() {
     return false;

@@ -20,7 +20,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
-from shown_page import CONTROLS, FIELD_DEG, HEIGHT, Page, opened_page
+from shown_page import CONTROLS, FIELD_DEG, HEIGHT, WIDTH, Page, opened_page
 
 from coupole.exchange.look.look_of_runs import look_of_result
 from coupole.exchange.look.look_page import MOST_BYTES, write_page
@@ -389,6 +389,24 @@ def test_light_from_all_around_is_as_white_as_a_lamp_and_its_sun_as_a_light(page
         page.run("coupole.state = {...coupole.state, lights: [{...coupole.state.lights[0], strength: 0}]}")
         np.testing.assert_allclose(page.picture(64)[60, 80, :3], shown, rtol=0.03)
         assert f"surroundings {name}.exr" in page.browser.text("#banner")
+
+
+def test_two_eyes_see_what_cameras_at_their_sides_see(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    page.small()
+    page.look(-70.0, 50.0, 150.0)
+    page.run("coupole.state = {...coupole.state, stereo: true}")
+    eyes = page.picture(1)
+    assert "for two eyes" in page.browser.text("#banner")
+    half = f"document.getElementById('stage').style.cssText = 'width:{WIDTH // 2}px; height:{HEIGHT}px'"
+    page.driver.execute_script(half)
+    cells.wait_until(lambda: page.run("document.getElementById('picture').width") == WIDTH // 2, "the size")
+    for side, seen in ((-1, eyes[:, : WIDTH // 2]), (1, eyes[:, WIDTH // 2 :])):
+        page.look(-70.0 + side * 1.7, 50.0, 150.0)
+        page.run("coupole.state = {...coupole.state, stereo: false}")
+        one = np.array(page.run("[...coupole.readPicture().rgba]"), np.float32).reshape(HEIGHT, WIDTH // 2, 4)
+        assert (one[..., 3] > 0).mean() > 0.1
+        np.testing.assert_allclose(seen, one, atol=1e-5)
 
 
 def test_an_illuminant_has_its_chromaticity_and_an_eye_may_be_used_to_it(page: Page, tmp_path: Path) -> None:

@@ -368,10 +368,11 @@ class App {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const pins = this.pinned ? [...this.state.notes, { place: this.pinned }] : this.state.notes;
     byId("marks").setAttribute("viewBox", `0 0 ${width} ${height}`);
-    byId("marks").innerHTML = marksOf(this.state.camera, width, height, pins, this.ruler)
+    const stereo = isStereo(this.state);
+    byId("marks").innerHTML = stereo ? "" : marksOf(this.state.camera, width, height, pins, this.ruler)
       + splitOf(this.state, width, height)
       + (this.canvas.matches(":focus-visible") ? aimOf(width, height) : "");
-    drawScale(byId("scale"), this.state.camera, Math.min(width, height));
+    drawScale(byId("scale"), this.state.camera, Math.min(stereo ? width / 2 : width, height));
     byId("notes").replaceChildren(...this.state.notes.map((note, number) => {
       const line = document.createElement("li"), text = document.createElement("span");
       text.textContent = `${note.text} `;

@@ -65,6 +65,11 @@ class Controls {
       this.state.split = input.valueAsNumber;
       this.changed("light");
     });
+    byId("stereo-row").hidden = this.app.about.kind !== "mesh";
+    this.on("stereo", "change", (input) => {
+      this.state.stereo = input.value === "two";
+      this.changed("light");
+    });
     this.on("auto-white", "click", () => this.app.fitWhite());
   }
 
@@ -145,6 +150,7 @@ class Controls {
     this.put("height", height, `${height.toFixed(0)}°`);
     this.put("sky", state.sky, state.sky.toFixed(2));
     this.put("environment", state.environment, state.environment.toFixed(2));
+    byId("stereo").value = state.stereo ? "two" : "one";
     byId("illuminant").value = light.illuminant ?? "";
     byId("kelvin").disabled = Boolean(light.illuminant);
     byId("adapted").value = state.adapted ? "yes" : "no";

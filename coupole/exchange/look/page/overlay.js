@@ -76,6 +76,7 @@ function bannerOf(about, state, compared) {
     if (about.environment && state.environment > 0) told.push(`surroundings ${about.environment.name}`);
     told.push(...coloursTold(about, state));
   }
+  if (isStereo(state)) told.push("for two eyes, the left one's to the left");
   if (state.mode === "unsharp") told.push("relief exaggerated");
   if (compared?.texture && isLit(state.mode)) told.push(`left: measured frame under LED ${compared.frame.led}`);
   return told.join(" · ");

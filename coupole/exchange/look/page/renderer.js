@@ -22,6 +22,10 @@ function rangeOf(mode, quantity) {
 
 const IDENTITY = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
 
+const EYES_DEG = 3.4;  // between two eyes, 65 mm apart, that look at a thing 1.1 m away
+
+const isStereo = (state) => Boolean(state.stereo && !state.view && ABOUT.kind === "mesh");
+
 class Renderer {
   constructor(canvas, about, arrays) {
     this.gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
@@ -153,10 +157,24 @@ class Renderer {
     this.fit();
     const beams = this.beamsOf(state);
     this.drawShadows(beams);
-    this.drawSurface(state);
-    this.drawLight(state, beams);
+    this.gl.enable(this.gl.SCISSOR_TEST);
+    for (const part of this.parts(state)) {
+      this.gl.scissor(part.x, 0, part.width, this.height);
+      this.drawSurface(part.state, part);
+      this.drawLight(part.state, beams);
+    }
+    this.gl.disable(this.gl.SCISSOR_TEST);
     [this.targets.mean, this.targets.other] = [this.targets.other, this.targets.mean];
     this.samples += 1;
+  }
+
+  /** Parts of the picture, pixels from the left: all of it, or one for each eye, the left eye's to the left. */
+  parts(state) {
+    if (!isStereo(state)) return [{ x: 0, width: this.width, state }];
+    const width = Math.floor(this.width / 2);
+    return [-1, 1].map((side, number) => ({
+      x: number * width, width, state: { ...state, camera: turned(state.camera, side * EYES_DEG / 2, 0) },
+    }));
   }
 
   /** Lights of this sample. */
@@ -216,12 +234,12 @@ class Renderer {
     });
   }
 
-  drawSurface({ camera }) {
+  drawSurface({ camera }, { x: left, width }) {
     const gl = this.gl, [x, y] = evenly(this.samples), { places, triangles } = this.textures;
     const at = this.use("surface", { places, triangles });
-    const clip = clipOf(camera, this.width, this.height, this.middle, this.radius, [x - 0.5, y - 0.5]);
+    const clip = clipOf(camera, width, this.height, this.middle, this.radius, [x - 0.5, y - 0.5]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.targets.seen.frame);
-    gl.viewport(0, 0, this.width, this.height);
+    gl.viewport(left, 0, width, this.height);
     gl.clearBufferuiv(gl.COLOR, 0, [0, 0, 0, 0]);
     gl.clear(gl.DEPTH_BUFFER_BIT);
     gl.uniformMatrix4fv(at("clip_from_object"), false, clip);
@@ -251,6 +269,7 @@ class Renderer {
     const texel = 2 * this.radius * 1.01 / this.depths.size;
     gl.uniform1fv(at("offset_mm"), beams.map(() => 1.5 * texel));
     gl.bindFramebuffer(gl.FRAMEBUFFER, other.frame);
+    gl.viewport(0, 0, this.width, this.height);
     gl.disable(gl.DEPTH_TEST);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.enable(gl.DEPTH_TEST);

@@ -17,7 +17,7 @@ const startLight = () => ({
 
 const startState = () => ({
   mode: Object.keys(MODES)[0], quantity: "kd", white: 0, relief: 1, sky: 0, environment: ABOUT.environment ? 1 : 0, chosen: 0, lights: [startLight()],
-  camera: null, notes: [], view: "", split: 0.5, adapted: false,
+  camera: null, notes: [], view: "", split: 0.5, adapted: false, stereo: false,
 });
 
 const rounded = (key, value) => typeof value === "number" ? Number(value.toPrecision(5)) : value;
@@ -64,6 +64,7 @@ function stateOf(address) {
     && Array.isArray(found.lights) && isNumber(found.lights.length, 1, MOST_LIGHTS) && found.lights.every(isLight)
     && isNumber(found.chosen, 0, found.lights.length - 1) && Number.isInteger(found.chosen)
     && Array.isArray(found.notes) && found.notes.every(isNote)
+    && (found.stereo === undefined || typeof found.stereo === "boolean")
     && (found.adapted === undefined || typeof found.adapted === "boolean")
     && (!found.view || viewOf(ABOUT, found.view)) && (found.split === undefined || isNumber(found.split, 0, 1));
   return fits ? { ...startState(), ...found } : null;

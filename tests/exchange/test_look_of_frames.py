@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import base64
 import re
+import zlib
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
 import cells
+import cv2
 import numpy as np
 import pytest
 from browser import needs_chromium
@@ -146,10 +149,28 @@ def test_a_light_between_leds_mixes_their_frames(page: Page, look: Look, run: Pa
     frames = look.about["views"][0]["frames"]
     ways, wanted = np.array([frame["way"] for frame in frames]), np.array([0.3, -0.2, 0.93])
     page.run("coupole.setLight(0.3, -0.2, 0.93)")
+    found = seen(page, "between")
     mixed = weights(ways, wanted[None] / np.linalg.norm(wanted), "thin plate")[0]
     roots = [np.sqrt(np.maximum(shares(run, frame["led"]), 0.0)) for frame in frames]
     expected = np.maximum(np.einsum("n,nhwc->hwc", mixed, roots), 0.0) ** 2
-    np.testing.assert_allclose(seen(page, "between").mean(axis=(0, 1)), expected.mean(axis=(0, 1)), rtol=0.03)
+    np.testing.assert_allclose(found.mean(axis=(0, 1)), expected.mean(axis=(0, 1)), rtol=0.03)
+    np.testing.assert_allclose(found, between(look, ways, wanted / np.linalg.norm(wanted)), atol=2e-3)
+
+
+def between(look: Look, ways: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """[48, 64, 3] of what the page holds: thin plates of the distances, components, tile."""
+    (view,), (lights,) = look.about["views"], look.blocks
+    rows = np.frombuffer(zlib.decompress(base64.b64decode(lights.text)), np.uint8).reshape(4, -1)
+    bases = np.ascontiguousarray(rows.T).view(np.float32).reshape(lights.shape).astype(float)
+    apart = np.linalg.norm(ways - wanted, axis=1)
+    found = np.einsum("b,bpc->pc", [*(apart**2 * np.log(apart)), 1.0, *wanted], bases)
+    tile = next(block for block in look.later if block.name == "tile-top-0-0-0")
+    codes = cv2.imdecode(np.frombuffer(base64.b64decode(tile.text), np.uint8), cv2.IMREAD_GRAYSCALE)
+    planes = codes.reshape(-1, 256, 256)[:, :96, :128] * np.array(view["step"])[:, None, None]
+    planes += np.array(view["low"])[:, None, None]
+    picture = np.maximum(np.einsum("pc,phw->hwc", found[1:], planes) + found[0], 0.0) ** 2
+    made: np.ndarray = picture.reshape(48, 2, 64, 2, 3).mean(axis=(1, 3))
+    return made
 
 
 @needs_chromium
@@ -189,8 +210,8 @@ def test_zooming_into_twelve_megapixels_asks_for_the_tiles_that_are_seen(page: P
 
     look_at(2048, 1536, 1536)
     whole = page.run(tags)
-    assert len(whole) <= 1 + 4 + 12
-    assert {int(re.findall(r"top-(\d)", one)[0]) for one in whole} <= {3, 4, 2}
+    assert len(whole) <= 1 + 4
+    assert {int(re.findall(r"top-(\d)", one)[0]) for one in whole} <= {3, 4}
     near = page.picture(1)
     assert near[60, 40, 0] == pytest.approx(0.0, abs=1e-3)
     assert near[60, 120, 0] == pytest.approx(0.25, rel=0.02)

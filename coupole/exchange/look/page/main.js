@@ -59,6 +59,7 @@ async function begin() {
   if (app) app.refine(arrays);
   else app = new App(ABOUT, arrays);
   await app.whole();
+  if (app.about.picture_px && app.isNew) app.fitWhite();
   Object.defineProperties(window.coupole, Object.getOwnPropertyDescriptors(interfaceOf(app)));
   byId("status").textContent = "";
 }

@@ -140,6 +140,14 @@ def test_the_command_tells_what_it_made(result: Path, tmp_path: Path) -> None:
     assert ended.document["about"]["simulated"] is True
 
 
+@pytest.mark.parametrize("option", [("--view", "top"), ("--environment", "none.exr")])
+def test_an_option_that_does_not_fit_is_refused(result: Path, tmp_path: Path, option: tuple[str, str]) -> None:
+    ended = cells.here("show", result, *option, "--out", tmp_path / "look.html")
+    assert ended.code == 2
+    assert option[0] in ended.err or option[1] in ended.err
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_page_of_another_name_is_refused(result: Path, tmp_path: Path) -> None:
     ended = cells.here("show", result, "--out", tmp_path / "look.pdf")
     assert ended.code == 2

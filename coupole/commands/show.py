@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,12 +16,30 @@ if TYPE_CHECKING:
     from coupole.exchange.look.look_blocks import Look
 
 SourceArgument = Annotated[
-    Path, typer.Argument(help="Folder of a result of runs or of pictures.", show_default=False)
+    Path, typer.Argument(help="Folder of a run, or of a result of runs or of pictures.", show_default=False)
 ]
 OutOption = Annotated[Path, typer.Option("--out", help="The page, FILE.html.", show_default=False)]
+ViewOption = Annotated[
+    list[str] | None,
+    typer.Option("--view", help="Of a run: views to show, NAME or a pattern; repeatable. All without it."),
+]
+SamplesOption = Annotated[
+    bool, typer.Option("--samples", help="Of a result of runs: put all samples beside the page, for its plots.")
+]
+EnvironmentOption = Annotated[
+    Path | None,
+    typer.Option("--environment", help="Of a result: light from all around, .exr or .hdr, twice as wide as high."),
+]
 
 
-def show(source: SourceArgument, out: OutOption, as_json: JsonOption = False) -> None:
+def show(
+    source: SourceArgument,
+    out: OutOption,
+    view: ViewOption = None,
+    samples: SamplesOption = False,
+    environment: EnvironmentOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """Make a page to look at a measured object: turn it, light it anew, measure it, see how well it is known."""
     from coupole.exchange.look.look_page import write_page
     from coupole.viewing.terminal import make_console, step_bars
@@ -29,14 +48,13 @@ def show(source: SourceArgument, out: OutOption, as_json: JsonOption = False) ->
     try:
         if not source.is_dir():
             raise InputError(
-                f"{source}: expected the folder of a result; `coupole reflectance RUN --out FOLDER` makes one"
+                f"{source}: is neither run nor result (`coupole reflectance RUN --out FOLDER` makes one)"
             )
         with step_bars(console) as bars:
-            bars("read", 0, 2)
-            look = _look(source)
-            bars("write", 1, 2)
+            bars("read", 0, 1)
+            look = _look(source, view or [], samples, environment, bars)
+            bars("write", 0, 1)
             files = write_page(look, source.resolve().name, out)
-            bars("write", 2, 2)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -48,17 +66,33 @@ def show(source: SourceArgument, out: OutOption, as_json: JsonOption = False) ->
         console.print(f"{files[0]}: {size_bytes / 1e6:.1f} MB in {len(files)} files; open it in a browser")
 
 
-def _look(source: Path) -> Look:
-    """By what the folder holds. Raises InputError if that is no whole result."""
+def _look(
+    source: Path, views: list[str], samples: bool, environment: Path | None, say: Callable[[str, int, int], None]
+) -> Look:
+    """By what the folder holds. Raises InputError if that is neither a run nor a whole result."""
+    from coupole.exchange.look.look_environment import with_environment
+    from coupole.exchange.look.look_of_frames import look_of_run
     from coupole.exchange.look.look_of_pictures import look_of_pictures
     from coupole.exchange.look.look_of_runs import look_of_result
     from coupole.reflectance import picture_result, run_result
+    from coupole.reflectance.new_light.environment import OF_PICTURES, OF_RUNS
+    from coupole.storage.run_json import RUN_JSON
 
     try:
+        if (source / RUN_JSON).exists():
+            _refuse({"--samples": samples, "--environment": environment}, f"{source} is a run")
+            return look_of_run(source, views, say)
         if (source / picture_result.SAMPLES).exists():
-            return look_of_pictures(source)
+            _refuse({"--view": views, "--samples": samples}, f"{source} is a result of pictures")
+            return with_environment(look_of_pictures(source), environment, OF_PICTURES)
         if (source / run_result.OBJECT).exists():
-            return look_of_result(source)
+            _refuse({"--view": views}, f"{source} is a result")
+            return with_environment(look_of_result(source, say, with_samples=samples), environment, OF_RUNS)
     except (OSError, KeyError) as error:
         raise InputError(f"{source}: is damaged ({error}); make the result again into another folder") from error
-    raise InputError(f"{source}: holds no result; `coupole reflectance {source} --out FOLDER` makes one of a run")
+    raise InputError(f"{source}: holds no run or result (`coupole reflectance RUN --out FOLDER` makes one)")
+
+
+def _refuse(options: dict[str, object], because: str) -> None:
+    if given := [name for name, value in options.items() if value]:
+        raise InputError(f"{', '.join(given)}: would do nothing, as {because}; leave it out")

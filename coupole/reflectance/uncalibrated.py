@@ -58,7 +58,7 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> Pict
     run = Run(folder)
     files = read_plan(run.plan_path, run.rig_path)
     frames = open_light_frames([folder])
-    chosen = _frames_of(folder, frames, view)
+    chosen = frames_of_leds(folder, frames, view)
     out.mkdir(parents=True, exist_ok=True)
     leds = sorted(chosen)
     shortest_us = min(frame.exposure_us for frame in chosen.values())
@@ -118,7 +118,7 @@ def _refuse_others(path: Path, text: str) -> None:
     write_synced(path, text)
 
 
-def _frames_of(folder: Path, frames: LightFrames, view: str | None) -> dict[int, LightFrame]:
+def frames_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[int, LightFrame]:
     """Of each LED the longest exposure that is hardly clipped, else the shortest."""
     views = list(dict.fromkeys(frame.view for frame in frames.lit if frame.led is not None))
     if not views:

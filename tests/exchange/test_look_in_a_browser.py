@@ -2,111 +2,41 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cells
 import colour
 import h5py
 import numpy as np
 import pytest
-from browser import Browser, needs_chromium
+from browser import needs_chromium
 from relief_in_mitsuba import Mitsuba
-from relight_cases import LED, Coat, sheet, waves, write_result
+from relight_cases import LED, Coat, sheet, waves, write_exr, write_result
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
+from shown_page import CONTROLS, FIELD_DEG, HEIGHT, WIDTH, Page, opened_page
 
 from coupole.exchange.look.look_of_runs import look_of_result
 from coupole.exchange.look.look_page import MOST_BYTES, write_page
 from coupole.reflectance.new_light.light_kinds import DistantLight, LedLight
-from coupole.reflectance.new_light.pictured_surface import FreeCamera
 from coupole.reflectance.run_relighting import scene_from, scene_of_view
 from coupole.reflectance.run_result import RunResult
 
 pytestmark = needs_chromium
 
 GLOSSY = Coat((0.05, 0.04, 0.03), (0.4, 0.3, 0.2), 0.15)
-FIELD_DEG = 24.0
-"""Of the page's camera, along the shorter side."""
-WIDTH, HEIGHT = 160, 120
-CONTROLS = "a[href], button, input, select, summary, canvas[tabindex]"
-
-
-class Page:
-    """The page in a window."""
-
-    def __init__(self, browser: Browser) -> None:
-        self.browser, self.driver = browser, browser.driver
-        self.opened: Path | None = None
-        self.beginning: dict[str, Any] = {}
-
-    def open(self, path: Path, address: str = "") -> None:
-        """Open a page, or have an open one begin anew: shaders take a second to compile."""
-        if path == self.opened and not address:
-            self.driver.execute_script("document.getElementById('stage').style.cssText = ''")
-            cells.wait_until(lambda: self.run("document.getElementById('picture').width") != WIDTH, "the size")
-            self.browser.at("[data-tool=turn]").click()
-            self.driver.execute_script("coupole.setSamples(1); coupole.state = arguments[0]", self.beginning)
-            return
-        self.opened = None if address else path
-        self.browser.open(f"{path.as_uri()}{address}")
-        cells.wait_until(lambda: self.run("Boolean(window.coupole?.readPixel)"), "the page's interface")
-        self.run("coupole.setSamples(1)")  # it rests after each change
-        self.beginning = self.run("coupole.state")
-
-    def run(self, script: str) -> Any:
-        return self.browser.run(script)
-
-    def small(self) -> None:
-        """The picture has a size that is quick to draw."""
-        self.driver.execute_script(
-            f"document.getElementById('stage').style.cssText = 'width:{WIDTH}px; height:{HEIGHT}px'"
-        )
-        cells.wait_until(lambda: self.run("document.getElementById('picture').width") == WIDTH, "the size")
-
-    def look(self, azimuth: float, height: float, distance: float, softness: float = 0.0) -> FreeCamera:
-        """Put the camera somewhere, with one light; the same camera for others."""
-        camera = {"target": [0, 0, 0], "azimuth": azimuth, "height": height, "distance": distance}
-        light = f"{{...coupole.state.lights[0], softness: {softness}}}"
-        self.driver.execute_script(f"coupole.state = {{camera: {camera}, lights: [{light}], chosen: 0, sky: 0}}")
-        a, h = math.radians(azimuth), math.radians(height)
-        at = distance * np.array([math.cos(h) * math.cos(a), math.cos(h) * math.sin(a), math.sin(h)])
-        across = 2.0 * math.degrees(math.atan(math.tan(math.radians(FIELD_DEG / 2)) * WIDTH / HEIGHT))
-        return FreeCamera(at, np.zeros(3), (WIDTH, HEIGHT), across)
-
-    def picture(self, samples: int) -> np.ndarray:
-        """[h, w, 4] float32: linear red, green, blue, and how much of a pixel has a material."""
-        text = self.driver.execute_script(f"""
-            coupole.setSamples({samples});
-            const bytes = new Uint8Array(coupole.readPicture().rgba.buffer);
-            let letters = "";
-            for (let k = 0; k < bytes.length; k += 32768) {{
-              letters += String.fromCharCode(...bytes.subarray(k, k + 32768));
-            }}
-            return btoa(letters);""")
-        return np.frombuffer(base64.b64decode(text), np.float32).reshape(HEIGHT, WIDTH, 4)
-
-    def keys(self, *keys: str) -> None:
-        ActionChains(self.driver).send_keys(*keys).perform()
-
-    def focus(self, name: str) -> None:
-        self.driver.execute_script(f"document.getElementById('{name}').focus()")
 
 
 @pytest.fixture(scope="module")
 def page() -> Iterator[Page]:
-    browser = Browser()
-    browser.driver.set_window_size(780, 440)  # quick to draw, and wide enough for the panel beside the picture
-    browser.driver.set_network_conditions(offline=True, latency=0, throughput=0)
-    yield Page(browser)
-    browser.driver.quit()
+    with opened_page() as page:
+        yield page
 
 
 @pytest.fixture(scope="module")
@@ -316,27 +246,66 @@ def test_on_a_telephone_nothing_sticks_out_and_all_is_large_enough_to_touch(page
         page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
-def test_all_words_stand_out_from_what_is_behind_them(page: Page, folder: Path) -> None:
-    """Contrast as WCAG 2.2 has it (1.4.3), 4.5 at least."""
+def luminance(text: str) -> float:
+    """Relative, of a colour as the browser tells it (WCAG 2.2)."""
+    red, green, blue = (int(one) / 255 for one in re.findall(r"\d+", text)[:3])
+    linear = [one / 12.92 if one <= 0.04045 else ((one + 0.055) / 1.055) ** 2.4 for one in (red, green, blue)]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def contrast(one: str, other: str) -> float:
+    low, high = sorted([luminance(one), luminance(other)])
+    return (high + 0.05) / (low + 0.05)
+
+
+BEHIND = """(one) => {
+  while (getComputedStyle(one).backgroundColor === 'rgba(0, 0, 0, 0)') one = one.parentElement;
+  return getComputedStyle(one).backgroundColor;
+}"""
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_all_words_and_the_focus_stand_out_from_what_is_behind_them(page: Page, folder: Path, theme: str) -> None:
+    """WCAG 2.2: 4.5 at least of words (1.4.3), 3 of controls' edges and of the focus (1.4.11)."""
     page.open(folder / "look.html")
     page.driver.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
-    pairs = page.run("""[...document.querySelectorAll('#panel *, #tools *, #banner')]
-        .filter(one => one.checkVisibility() && [...one.childNodes].some(node => node.nodeType === 3))
-        .map(one => {
-          let behind = one;
-          while (getComputedStyle(behind).backgroundColor === 'rgba(0, 0, 0, 0)') behind = behind.parentElement;
-          return [getComputedStyle(one).color, getComputedStyle(behind).backgroundColor, one.textContent];
-        })""")
-    assert len(pairs) > 30
+    page.driver.execute_script(
+        "document.head.append(Object.assign(document.createElement('style'), "
+        "{textContent: '* { transition: none !important; }'}))"
+    )
+    Select(page.browser.at("#theme")).select_by_value(theme)
+    try:
+        pairs = page.run(f"""[...document.querySelectorAll('#panel *, #tools *, #banner, #scale')]
+            .filter(one => one.checkVisibility() && [...one.childNodes].some(node => node.nodeType === 3))
+            .map(one => [getComputedStyle(one).color, ({BEHIND})(one), one.textContent])""")
+        assert len(pairs) > 30
+        for front, behind, words in pairs:
+            assert contrast(front, behind) >= 4.5, words
+        edges = page.run(f"""[...document.querySelectorAll('button, select, input[type=number]')]
+            .filter(one => one.checkVisibility())
+            .map(one => [getComputedStyle(one).borderTopColor, ({BEHIND})(one.parentElement), one.textContent])""")
+        for edge, behind, words in edges:
+            assert contrast(edge, behind) >= 3.0, words
+        page.focus("white")
+        page.keys(Keys.TAB)
+        focus = page.run("getComputedStyle(document.activeElement).outlineColor")
+        assert page.run("parseFloat(getComputedStyle(document.activeElement).outlineWidth)") >= 2
+        for behind in ("#panel", "body"):
+            assert contrast(focus, page.browser.at(behind).value_of_css_property("background-color")) >= 3.0
+    finally:
+        Select(page.browser.at("#theme")).select_by_value("system")
 
-    def luminance(text: str) -> float:
-        red, green, blue = (int(one) / 255 for one in re.findall(r"\d+", text)[:3])
-        linear = [one / 12.92 if one <= 0.04045 else ((one + 0.055) / 1.055) ** 2.4 for one in (red, green, blue)]
-        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
-    for front, behind, words in pairs:
-        low, high = sorted([luminance(front), luminance(behind)])
-        assert (high + 0.05) / (low + 0.05) >= 4.5, words
+def test_the_page_is_as_light_as_the_system_unless_it_is_told_otherwise(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    for system, chosen, shown in (("light", "system", 0.5), ("dark", "system", 0.0), ("dark", "light", 0.5)):
+        media = {"features": [{"name": "prefers-color-scheme", "value": system}]}
+        page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+        Select(page.browser.at("#theme")).select_by_value(chosen)
+        found = luminance(page.browser.at("body").value_of_css_property("background-color"))
+        assert found == pytest.approx(shown + 0.25, abs=0.25), (system, chosen)
+    page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    Select(page.browser.at("#theme")).select_by_value("system")
 
 
 def test_an_address_brings_back_view_light_and_notes(page: Page, folder: Path) -> None:
@@ -372,6 +341,106 @@ def test_a_point_tells_its_material(page: Page, folder: Path) -> None:
     assert "0.400 / 0.300 / 0.200" in told
     assert "holds no samples" in told
     assert page.driver.find_elements(By.CSS_SELECTOR, "#point svg polyline")
+
+
+@pytest.mark.parametrize("most_bytes", [MOST_BYTES, 1000])
+def test_a_point_tells_its_measured_samples_beside_the_fit(page: Page, tmp_path: Path, most_bytes: int) -> None:
+    result = write_result(tmp_path / "result", sheet(np.zeros((5, 5)), 60.0), camera_mm=(0.0, 0.0, 330.0))
+    with h5py.File(result.views[0].path, "a") as file:
+        file["f"][...] = 1.2 * np.array(Coat().kd)
+        file["u_own"], file["led_u_own"] = np.full(file["f"].shape, 0.02, np.float16), np.zeros((1, 3))
+    look = look_of_result(tmp_path / "result", with_samples=True)
+    files = write_page(look, "sheet", tmp_path / "look.html", most_bytes)
+    page.open(tmp_path / "look.html", "#")
+    page.look(-90.0, 80.0, 200.0)
+    page.focus("picture")
+    page.keys(Keys.ENTER)
+    cells.wait_until(lambda: "median" in page.browser.text("#samples-told"), "samples")
+    told = page.browser.text("#samples-told")
+    assert "1 measured samples of top" in told
+    share = float(re.findall(r"difference ([\d.]+) %", told)[0])
+    assert share == pytest.approx(100 * (1 - 1 / 1.2), abs=2.5)  # values are kept to 2.3 %
+    assert "holds no samples" not in page.browser.text("#point")
+    if most_bytes == 1000:
+        next(file for file in files if file.name == "samples-top-0.js").unlink()
+        page.open(tmp_path / "look.html", "#")
+        page.focus("picture")
+        page.keys(Keys.ENTER)
+        cells.wait_until(lambda: "No samples" in page.browser.text("#samples-told"), "what is missing")
+
+
+def test_light_from_all_around_is_as_white_as_a_lamp_and_its_sun_as_a_light(page: Page, tmp_path: Path) -> None:
+    white = Coat(kd=(1 / np.pi,) * 3)
+    write_result(tmp_path / "result", sheet(np.zeros((12, 12)), 60.0), white, camera_mm=(0.0, 0.0, 330.0))
+    around = np.ones((32, 64, 3))
+    sun = np.zeros((64, 128, 3))
+    sun[16, 64] = np.array([1.0, 0.5, 0.25]) * 1000.0
+    height = np.pi / 2 - 16.5 * np.pi / 64
+    solid = 2 * np.pi / 128 * (np.sin(height + np.pi / 128) - np.sin(height - np.pi / 128))
+    expected = sun[16, 64] * solid * np.sin(height) / np.pi
+    for name, radiance, shown in (("around", around, np.ones(3)), ("sun", sun, expected)):
+        write_exr(tmp_path / f"{name}.exr", radiance)
+        words = ("--environment", tmp_path / f"{name}.exr", "--out", tmp_path / f"{name}.html")
+        ended = cells.here("show", tmp_path / "result", *words)
+        assert ended.code == 0, ended.err
+        page.open(tmp_path / f"{name}.html")
+        page.small()
+        page.look(-90.0, 80.0, 150.0)
+        page.run("coupole.state = {...coupole.state, lights: [{...coupole.state.lights[0], strength: 0}]}")
+        np.testing.assert_allclose(page.picture(64)[60, 80, :3], shown, rtol=0.03)
+        assert f"surroundings {name}.exr" in page.browser.text("#banner")
+
+
+def test_two_eyes_see_what_cameras_at_their_sides_see(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    page.small()
+    page.look(-70.0, 50.0, 150.0)
+    page.run("coupole.state = {...coupole.state, stereo: true}")
+    eyes = page.picture(1)
+    assert "for two eyes" in page.browser.text("#banner")
+    half = f"document.getElementById('stage').style.cssText = 'width:{WIDTH // 2}px; height:{HEIGHT}px'"
+    page.driver.execute_script(half)
+    cells.wait_until(lambda: page.run("document.getElementById('picture').width") == WIDTH // 2, "the size")
+    for side, seen in ((-1, eyes[:, : WIDTH // 2]), (1, eyes[:, WIDTH // 2 :])):
+        page.look(-70.0 + side * 1.7, 50.0, 150.0)
+        page.run("coupole.state = {...coupole.state, stereo: false}")
+        one = np.array(page.run("[...coupole.readPicture().rgba]"), np.float32).reshape(HEIGHT, WIDTH // 2, 4)
+        assert (one[..., 3] > 0).mean() > 0.1
+        np.testing.assert_allclose(seen, one, atol=1e-5)
+
+
+def test_an_illuminant_has_its_chromaticity_and_an_eye_may_be_used_to_it(page: Page, tmp_path: Path) -> None:
+    coat = Coat(kd=(0.2, 0.1, 0.05))
+    write_result(tmp_path / "result", sheet(np.zeros((12, 12)), 60.0), coat, camera_mm=(0.0, 0.0, 330.0))
+    write_page(look_of_result(tmp_path / "result"), "sheet", tmp_path / "look.html")
+    page.open(tmp_path / "look.html")
+    page.small()
+    page.look(-90.0, 80.0, 150.0)
+    page.run("coupole.setLight(0, 0, 1)")
+    page.run("document.getElementById('panel').scrollTo(0, 300)")
+    Select(page.browser.at("#illuminant")).select_by_value("A")
+    whites = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]
+    white_a, white_d65 = (colour.xy_to_XYZ(whites[name]) for name in ("A", "D65"))
+    tint = colour.XYZ_to_RGB(white_a, "sRGB", apply_cctf_encoding=False)
+    expected = np.array(coat.kd) * np.pi * tint / tint.mean()
+    found = page.picture(1)[60, 80, :3]
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
+    pixel = """(() => {
+        const shown = Object.assign(document.createElement("canvas"), { width: 1, height: 1 }).getContext("2d");
+        shown.drawImage(document.getElementById("picture"), 80, 60, 1, 1, 0, 0, 1, 1);
+        return [...shown.getImageData(0, 0, 1, 1).data].slice(0, 3);
+    })()"""
+    for adapted in (False, True):
+        page.driver.execute_script(f"coupole.state = {{adapted: {str(adapted).lower()}, white: 1.2}}")
+        page.picture(1)
+        xyz = colour.RGB_to_XYZ(expected / 1.2, "sRGB")
+        if adapted:
+            xyz = colour.adaptation.chromatic_adaptation_VonKries(xyz, white_a, white_d65, transform="Bradford")
+        shown = (
+            colour.cctf_encoding(np.clip(colour.XYZ_to_RGB(xyz, "sRGB", apply_cctf_encoding=False), 0, 1)) * 255
+        )
+        np.testing.assert_allclose(page.run(pixel), shown, atol=1.5)
+    assert "eye used to the chosen light (Bradford)" in page.browser.text("#banner")
 
 
 def test_the_ruler_measures_what_the_object_measures(page: Page, tmp_path: Path) -> None:
@@ -416,6 +485,34 @@ def test_data_that_are_gone_from_beside_the_page_are_named(page: Page, tmp_path:
     page.browser.open(f"file://{tmp_path / 'look.html'}")
     told = cells.wait_until(lambda: page.browser.text("#status").replace("Reading…", ""), "what is missing")
     assert "(kd): keep its .data folder beside it" in told
+
+
+def test_a_coarse_picture_comes_first_and_the_whole_mesh_takes_its_place(page: Page, folder: Path) -> None:
+    write_page(look_of_result(folder / "result", coarse_over=500), "waves", folder / "coarse.html")
+    page.open(folder / "coarse.html")
+    assert page.run("performance.getEntriesByName('coupole: first picture').length") == 1
+    page.small()
+    page.look(-70.0, 50.0, 150.0)
+    mine = page.picture(1)
+    page.open(folder / "look.html")
+    page.small()
+    page.look(-70.0, 50.0, 150.0)
+    np.testing.assert_array_equal(mine, page.picture(1))
+
+
+def test_the_coarse_picture_stays_where_the_rest_is_missing(page: Page, folder: Path, tmp_path: Path) -> None:
+    look = look_of_result(folder / "result", coarse_over=500)
+    files = write_page(look, "waves", tmp_path / "look.html", most_bytes=1000)
+    next(file for file in files if file.name == "kd.js").unlink()
+    page.opened = None
+    page.browser.open(f"file://{tmp_path / 'look.html'}")
+    cells.wait_until(lambda: "(kd)" in page.browser.text("#status"), "what is missing")
+    bright = """(() => {
+        const shown = Object.assign(document.createElement("canvas"), { width: 60, height: 60 }).getContext("2d");
+        shown.drawImage(document.getElementById("picture"), 0, 0, 60, 60);
+        return shown.getImageData(0, 0, 60, 60).data.filter((value, k) => k % 4 === 1 && value > 60).length;
+    })()"""
+    assert page.run(bright) > 300
 
 
 def test_a_flat_picture_has_the_radiance_of_each_pixel_where_it_lies(page: Page, tmp_path: Path) -> None:

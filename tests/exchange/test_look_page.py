@@ -12,6 +12,7 @@ import pytest
 from relight_cases import waves, write_result
 
 from coupole.errors import InputError, StorageError
+from coupole.exchange.look.coarse_mesh import coarse_mesh
 from coupole.exchange.look.look_blocks import block_of
 from coupole.exchange.look.look_of_runs import Look, welded
 from coupole.exchange.look.look_page import write_page
@@ -30,6 +31,23 @@ def test_corners_keep_their_triangle_and_move_by_less_than_half_a_step() -> None
     read = origin_mm + step_mm * places[triangles.reshape(-1)]
     assert np.abs(read - corners_mm).max() <= 0.5001 * step_mm
     assert step_mm == pytest.approx(200.0 / 65535, rel=0.02)
+
+
+def test_a_coarse_mesh_has_the_shape_of_the_fine_one_in_few_triangles() -> None:
+    places, triangles, _, _ = welded(waves(120).reshape(-1, 3).astype(float))
+    coarse = coarse_mesh(places, triangles, 2000)
+    assert 1000 < len(coarse.triangles) <= 2000
+
+    def across(corners: np.ndarray) -> np.ndarray:
+        found: np.ndarray = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+        return found
+
+    fine_corners, corners = places[triangles].astype(float), coarse.places[coarse.triangles].astype(float)
+    np.testing.assert_allclose(across(corners).sum(axis=0)[2], across(fine_corners).sum(axis=0)[2], rtol=0.1)
+    cell = 65536 / np.sqrt(len(coarse.triangles) / 2)
+    apart = corners.mean(axis=1) - fine_corners[coarse.stands_for].mean(axis=1)
+    assert np.linalg.norm(apart, axis=1).max() < 2 * cell
+    assert len(np.unique(np.sort(coarse.triangles, axis=1), axis=0)) == len(coarse.triangles)
 
 
 def test_a_page_names_no_host(tmp_path: Path) -> None:
@@ -120,6 +138,14 @@ def test_the_command_tells_what_it_made(result: Path, tmp_path: Path) -> None:
     assert ended.document["bytes"] == (tmp_path / "look.html").stat().st_size
     assert ended.document["about"]["triangles"] == 2 * 19**2
     assert ended.document["about"]["simulated"] is True
+
+
+@pytest.mark.parametrize("option", [("--view", "top"), ("--environment", "none.exr")])
+def test_an_option_that_does_not_fit_is_refused(result: Path, tmp_path: Path, option: tuple[str, str]) -> None:
+    ended = cells.here("show", result, *option, "--out", tmp_path / "look.html")
+    assert ended.code == 2
+    assert option[0] in ended.err or option[1] in ended.err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_page_of_another_name_is_refused(result: Path, tmp_path: Path) -> None:

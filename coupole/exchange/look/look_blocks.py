@@ -12,6 +12,7 @@ import zlib
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +21,7 @@ LOG_LEAST, LOG_STEPS = 1e-4, 254
 """Of `log_coded`: what 1 stands for, and steps from there to its `LOG_RATIO`-fold."""
 LOG_RATIO = 1e5
 _LARGEST_HALF = 65504.0
+_SAME_SIZE = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
 SCRIPT_BEGINS = "coupoleBlock("
 """Of each block's script."""
 
@@ -47,8 +49,11 @@ class Look:
     about: dict[str, Any]
     """What its scripts know of it; docs/reference/page.md."""
     blocks: tuple[Block, ...]
+    """What its picture needs."""
     later: tuple[Block, ...] = ()
     """Blocks that a page reads when they are asked for."""
+    first: tuple[Block, ...] = ()
+    """Blocks of `first-` and a name of `blocks` that stand for them, and are few: for a first picture."""
     errors: dict[str, str] = field(default_factory=dict)
     """What is lost by writing numbers short, by the name of a quantity."""
 
@@ -59,8 +64,16 @@ def block_of(name: str, values: NDArray[Any]) -> Block:
         raise ValueError(f"{name}: a page reads {', '.join(TYPES)}, not {values.dtype.name}")
     small = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("<")))
     rows = small.reshape(-1).view(np.uint8).reshape(-1, values.dtype.itemsize).T
-    packed = zlib.compress(np.ascontiguousarray(rows).tobytes(), 9)
+    packed = zlib.compress(np.ascontiguousarray(rows).tobytes(), 6)
     return Block(name, base64.b64encode(packed).decode("ascii"), values.dtype.name, values.shape)
+
+
+def jpeg_of(name: str, picture: NDArray[np.uint8], quality: int) -> Block:
+    """A picture [h, w] or [h, w, 3] (red first), as JPEG without coarser colours; its numbers change a little."""
+    shown = picture if picture.ndim == 2 else picture[..., ::-1]
+    options = (cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, _SAME_SIZE)
+    packed = cv2.imencode(".jpg", shown, options)[1].tobytes()
+    return Block(name, base64.b64encode(packed).decode("ascii"), "jpeg", picture.shape)
 
 
 def log_coded(values: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -48,7 +48,7 @@ def frames_of_view(
         row = int(np.flatnonzero(view.leds == led)[0])
         if not np.isfinite(share).any():
             continue
-        small = _averaged(share, step)
+        small = averaged(share, step)
         picture, peak = _coded(small if small.shape[2] == 3 else np.repeat(small, 3, axis=2))
         blocks.append(block_of(f"frame-{view.path.stem}-{led}", picture))
         full_scale = np.broadcast_to(np.nan_to_num(view.full_scales[row]), 3) / math.pi
@@ -95,7 +95,7 @@ def _lens(surface: Surface) -> tuple[Floats, Floats]:
     return axes, found / scale[:, None]
 
 
-def _averaged(share: NDArray[np.float32], step: int) -> NDArray[np.float64]:
+def averaged(share: NDArray[np.float32], step: int) -> NDArray[np.float64]:
     """Means of step x step pixels that have a value in all channels; NaN where none has. The last row and column
     are of what is left over."""
     height, width = share.shape[:2]

@@ -2,54 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from coupole.exchange.look.look_blocks import Look, block_of, halves, octahedral
+from coupole.exchange.look.look_blocks import Block, Look, block_of, halves, octahedral
+from coupole.exchange.look.look_tiles import TILE_PX, levels_of, tiles_of
 from coupole.reflectance.picture_result import MATERIALS, PictureResult, opened
-
-MOST_PX = 16_000_000
-"""More has no place in a texture that every browser takes."""
 
 
 def look_of_pictures(folder: Path) -> Look:
-    """Of a whole result. Raises InputError if it is none, has no materials, or is too large."""
+    """Of a whole result. Raises InputError if it is none, or has no materials."""
     result = PictureResult(folder)
     about, mask = result.about, result.mask
     height, width = mask.shape
-    if mask.size > MOST_PX:
-        raise InputError(
-            f"{folder}: pictures of {width} x {height} are too large for a page; make a result of a part of them"
-        )
     if not (folder / MATERIALS).exists():
         raise InputError(f"{folder / MATERIALS}: is not there; `coupole reflectance --pictures` makes it")
+    fields = np.full((_FIELDS, height, width), np.nan, np.float32)
     with opened(folder / MATERIALS) as file:
-        normal, kd, ks = (file[name][()].astype(np.float64) for name in ("normal", "kd", "ks"))
-        gloss = np.stack([file["alpha"][()], file["residual"][()]], axis=1).astype(np.float64)
-    known = np.isfinite(gloss[:, 0])
-
-    def spread(values: NDArray[Any]) -> NDArray[Any]:
-        """[h * w, ...] 0 but where pixels have values."""
-        all_of_them = np.zeros((mask.size, *values.shape[1:]), values.dtype)
-        all_of_them[np.flatnonzero(mask)[known]] = values[known]
-        return all_of_them
-
-    blocks = (
-        block_of("places", np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0]], np.uint16)),
-        block_of("triangles", np.array([[0, 1, 2], [0, 2, 3]], np.uint32)),
-        block_of("normals", spread(octahedral(normal))),
-        block_of("kd", spread(halves(kd))),
-        block_of("ks", spread(halves(ks))),
-        block_of("gloss", spread(halves(gloss))),
-        block_of("uncertainty", np.zeros((1, 4), np.uint8)),
-    )
+        known = mask.copy()
+        known[mask] = np.isfinite(file["alpha"][()])
+        first = 0
+        for name in ("normal", "kd", "ks", "alpha", "residual"):
+            values = np.atleast_2d(file[name][()].T).astype(np.float32)
+            fields[first : first + len(values), known] = values[:, known[mask]]
+            first += len(values)
+    tiles = list(_material_tiles(fields))
     shown = {
         "kind": "pictures",
         "picture_px": [width, height],
+        "tile_px": TILE_PX,
+        "levels": levels_of(width, height),
+        "tiles": _TILES,
         "views": [],
         "fit": "GGX of each pixel",
         "simulated": None,
@@ -62,7 +49,29 @@ def look_of_pictures(folder: Path) -> Look:
             "Pictures": f"{len(result.directions)} of {width} x {height}",
             "Light": "distant, without the shadows that the object casts. Strength 1 is that of the pictures. "
             "`coupole reflectance relight` comes nearer to them: it interpolates between the pictures.",
+            "Seen from afar": "the mean materials of 2 x 2 pixels, of 4 x 4 and so on, which shine as their mean "
+            "does, not as the mean of what they would send back.",
         },
     }
     errors = {"normals": "0.004 degrees", "kd, ks, roughness": "0.05 % or 3e-8"}
-    return Look(shown, blocks, errors=errors)
+    return Look(shown, (), tuple(sorted(tiles, key=_level, reverse=True)), errors=errors)
+
+
+_TILES = "tile"
+_FIELDS, _ALPHA = 11, 9
+
+
+def _level(block: Block) -> int:
+    return int(block.name.split("-")[1])
+
+
+def _material_tiles(fields: NDArray[np.float32]) -> Iterator[Block]:
+    """Of [11, h, w] normal, kd, ks, alpha, residual: tiles [10, TILE_PX, TILE_PX] of 16 bits each."""
+    for tile in tiles_of(fields):
+        flat = tile.values.reshape(_FIELDS, -1).astype(np.float64)
+        codes = np.zeros((_FIELDS - 1, flat.shape[1]), np.uint16)
+        some = np.isfinite(flat[_ALPHA])
+        if some.any():
+            codes[:2, some] = octahedral(flat[:3, some].T).T
+            codes[2:, some] = halves(flat[3:, some]).view(np.uint16)
+        yield block_of(tile.name(_TILES), codes.reshape(-1, TILE_PX, TILE_PX))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,21 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from coupole.exchange.look.look_blocks import Look, block_of, halves, log_coded, octahedral
+from coupole.exchange.look.coarse_mesh import MOST_TRIANGLES, coarse_mesh
+from coupole.exchange.look.look_blocks import Block, Look, block_of, halves, log_coded, octahedral
 from coupole.exchange.look.look_frames import frames_of_view
+from coupole.exchange.look.look_samples import samples_of_view
 from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.geometry import apply, inverse
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
 
 Floats = NDArray[np.float64]
+Said = Callable[[str, int, int], None]
 
 PLACES = 65535
 """Steps of a coordinate along the longest side of the object."""
 
 
-def look_of_result(folder: Path) -> Look:
-    """Of a whole result. Raises InputError if it is none, or has no material."""
+def look_of_result(
+    folder: Path, say: Said = lambda *_: None, *, with_samples: bool = False, coarse_over: int = MOST_TRIANGLES
+) -> Look:
+    """Of a whole result; a mesh of more than `coarse_over` triangles has a coarse one for the first picture.
+
+    Raises InputError if it is none, or has no material.
+    """
     known = read_about(folder)
     result = RunResult(folder)
     fit = best_fit(result, MATERIALS)
@@ -35,21 +44,11 @@ def look_of_result(folder: Path) -> Look:
     corners_mm = apply(support_from_base, result.corners_mm.reshape(-1, 3).astype(np.float64))
     places, triangles, origin_mm, step_mm = welded(corners_mm)
     count = len(triangles)
-    materials = result.materials(fit)
-    finite = np.isfinite(materials.alpha) & np.isfinite(materials.kd).all(axis=1)
-    at, mine = result.triangles[finite], finite.nonzero()[0]
-    turned = materials.normals[mine] @ support_from_base[:3, :3].T
-    blocks = [
-        block_of("places", places),
-        block_of("triangles", triangles),
-        block_of("normals", _spread(octahedral(turned), at, count)),
-        block_of("kd", _spread(halves(red_green_blue(materials.kd[mine])), at, count)),
-        block_of("ks", _spread(halves(red_green_blue(materials.ks[mine])), at, count)),
-        block_of("gloss", _spread(halves(_pair(materials.alpha, materials.residual)[mine]), at, count)),
-        block_of("uncertainty", _spread(_uncertainty(path)[mine], at, count)),
-    ]
+    shapes: dict[str, NDArray[Any]] = {"places": places, "triangles": triangles}
+    of_triangles, measured = _materials(result, fit, support_from_base)
+    blocks = tuple(block_of(name, values) for name, values in (shapes | of_triangles).items())
     views = [found for view in result.views if (found := frames_of_view(result, view, support_from_base))]
-    about = {
+    about: dict[str, Any] = {
         "kind": "mesh",
         "fit": fit,
         "simulated": bool(known.get("simulated")),
@@ -57,28 +56,66 @@ def look_of_result(folder: Path) -> Look:
         "views": [view for view, _ in views],
         "led_exponent": 2 if known.get("emission") == "paper" else 1,
         "triangles": count,
-        "measured": len(at),
+        "measured": measured,
         "irradiance": math.pi,
         "unit": "1/sr",
         "told": {
             "Object": "simulated" if known.get("simulated") else "measured",
-            "Triangles": f"{count:,}, {len(at):,} with a material",
+            "Triangles": f"{count:,}, {measured:,} with a material",
             "Views": ", ".join(view.view for view in result.views),
             "Light": "straight from lamps, with shadows; none from surface to surface. White is the radiance that "
             "is shown as white; a white diffuser that faces a light of strength 1 has 1.",
         },
+        "box": [places.min(axis=0).tolist(), places.max(axis=0).tolist()],
         "origin_mm": origin_mm.tolist(),
         "step_mm": step_mm,
     }
-    errors = {
-        "places": f"{0.5e3 * step_mm:.2g} um in each coordinate",
-        "normals": "0.004 degrees",
-        "kd, ks, roughness": "0.05 % or 3e-8",
-        "uncertainties": "2.3 % of their value",
-        "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
+    later = [block for _, pictures in views for block in pictures]
+    errors = _ERRORS | {"places": f"{0.5e3 * step_mm:.2g} um in each coordinate"}
+    if with_samples:
+        about["samples"] = []
+        errors["samples"] = "2.3 % of their value, and of their uncertainty"
+        for view in result.views:
+            told, blocks_of_view = samples_of_view(result, view, support_from_base, say)
+            about["samples"].append(told)
+            later += blocks_of_view
+    return Look(about, blocks, tuple(later), _first(places, triangles, of_triangles, coarse_over), errors)
+
+
+_ERRORS = {
+    "normals": "0.004 degrees",
+    "kd, ks, roughness": "0.05 % or 3e-8",
+    "uncertainties": "2.3 % of their value",
+    "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
+}
+
+
+def _materials(result: RunResult, fit: str, support_from_base: Floats) -> tuple[dict[str, NDArray[Any]], int]:
+    """Numbers of all triangles by name, 0 of those without a material; how many have one."""
+    materials, count = result.materials(fit), len(result.corners_mm)
+    finite = np.isfinite(materials.alpha) & np.isfinite(materials.kd).all(axis=1)
+    at, mine = result.triangles[finite], finite.nonzero()[0]
+    turned = materials.normals[mine] @ support_from_base[:3, :3].T
+    values: dict[str, NDArray[Any]] = {
+        "normals": octahedral(turned),
+        "kd": halves(red_green_blue(materials.kd[mine])),
+        "ks": halves(red_green_blue(materials.ks[mine])),
+        "gloss": halves(_pair(materials.alpha, materials.residual)[mine]),
+        "uncertainty": _uncertainty(result.materials_path(fit))[mine],
     }
-    later = tuple(block for _, pictures in views for block in pictures)
-    return Look(about, tuple(blocks), later, errors)
+    return {name: _spread(one, at, count) for name, one in values.items()}, len(at)
+
+
+def _first(
+    places: NDArray[np.uint16], triangles: NDArray[np.uint32], of_triangles: dict[str, NDArray[Any]], over: int
+) -> tuple[Block, ...]:
+    """Blocks of a coarse mesh; none of a mesh that is not larger than `over`."""
+    if len(triangles) <= over:
+        return ()
+    coarse = coarse_mesh(places, triangles, over)
+    found: dict[str, NDArray[Any]] = {"places": coarse.places, "triangles": coarse.triangles}
+    found |= {name: values[coarse.stands_for] for name, values in of_triangles.items()}
+    return tuple(block_of(f"first-{name}", values) for name, values in found.items())
 
 
 def welded(corners_mm: Floats) -> tuple[NDArray[np.uint16], NDArray[np.uint32], Floats, float]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from html import escape
 from importlib import resources
+from itertools import accumulate
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from urllib.parse import quote
@@ -19,6 +20,7 @@ from coupole.storage.durable import make_folder, sync_folder, write_synced
 
 MOST_BYTES = 25_000_000
 """Of a page that stands alone."""
+_EARLY_BYTES = 3_000_000
 SCRIPTS = (
     "vectors.js",
     "blocks.js",
@@ -27,13 +29,19 @@ SCRIPTS = (
     "lights.js",
     "programs.js",
     "renderer.js",
+    "tiles.js",
+    "flat.js",
+    "run.js",
     "material.js",
     "frames.js",
     "plot.js",
+    "samples.js",
     "sphere.js",
     "overlay.js",
     "controls.js",
+    "theme.js",
     "pointer.js",
+    "app.js",
     "main.js",
 )
 """In the order in which they are read."""
@@ -41,6 +49,9 @@ SHADERS = (
     "common.glsl",
     "surface.vert",
     "surface.frag",
+    "flat.vert",
+    "flat.frag",
+    "planes.frag",
     "shadow.frag",
     "screen.vert",
     "light.frag",
@@ -57,8 +68,7 @@ def write_page(look: Look, title: str, path: Path, most_bytes: int = MOST_BYTES)
     if path.suffix.lower() != ".html":
         raise InputError(f"--out {path}: expected a name that ends in .html")
     data = path.with_suffix(".data")
-    blocks = (*look.blocks, *look.later)
-    inside, beside = _shared_out(blocks, most_bytes)
+    inside, beside = _shared_out(look, most_bytes)
     try:
         earlier = _earlier(data)
         make_folder(path.parent)
@@ -82,15 +92,19 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
     shaders = {name: _part(name) for name in SHADERS}
     names = [block.name for block in look.blocks]
     about = {**look.about, "title": title, "errors": look.errors, "blocks": names, "data": data}
+    about["first"] = [block.name for block in look.first]
     scripts = "\n".join(_part(name) for name in SCRIPTS)
-    tags = [f"<script>{block.script}</script>\n" for block in inside]
-    tags += [f'<script src="{quote(f"{data}/{name}.js")}"></script>\n' for name in names if data]
+    early = _early(look, inside)
+    tags = [f"<script>{block.script}</script>\n" for block in inside[early:]]
+    held = {block.name for block in inside}
+    tags += [f'<script src="{quote(f"{data}/{name}.js")}"></script>\n' for name in names if name not in held]
     parts = {
         "TITLE": escape(title),
         "STYLE": _part("page.css"),
         "ABOUT": _in_script(about),
         "SHADERS": _in_script(shaders),
         "SCRIPTS": scripts,
+        "FIRST": "".join(f"<script>{block.script}</script>\n" for block in (*look.first, *inside[:early])),
         "BLOCKS": "".join(tags),
     }
     page = _part("page.html")
@@ -99,11 +113,31 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
     return page
 
 
-def _shared_out(blocks: tuple[Block, ...], most_bytes: int) -> tuple[list[Block], list[Block]]:
-    """Those that go into the page, and those that go beside it: none, or all."""
-    if sum(len(block.text) for block in blocks) + _own_bytes() <= most_bytes:
-        return list(blocks), []
-    return [], list(blocks)
+def _early(look: Look, inside: list[Block]) -> int:
+    """How many of what is inside stand before the scripts, so that they begin with them while the rest is read."""
+    if look.first:
+        return 0
+    sizes = accumulate(len(block.script) for block in inside)
+    return max(len(look.blocks) if inside else 0, sum(size <= _EARLY_BYTES for size in sizes))
+
+
+def _shared_out(look: Look, most_bytes: int) -> tuple[list[Block], list[Block]]:
+    """Those that go into the page, and those that go beside it: all of what a page needs to begin, or none of it;
+    then as many of the others as have room, in their order."""
+    needed = sum(len(block.script) for block in (*look.first, *look.blocks))
+    free = most_bytes - _own_bytes() - len(json.dumps(look.about)) - needed
+    if free < 0:
+        return [], [*look.blocks, *look.later]
+    inside = list(look.blocks)
+    for block in look.later:
+        free -= len(block.script) + _TAGS
+        if free < 0:
+            break
+        inside.append(block)
+    return inside, [*look.blocks, *look.later][len(inside) :]
+
+
+_TAGS = len("<script></script>\n")
 
 
 def _own_bytes() -> int:

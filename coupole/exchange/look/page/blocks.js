@@ -7,6 +7,7 @@ const TYPES = {
 /** The numbers of a block; float16 as the 16 bits that they are. */
 async function unpacked({ about, text }) {
   const packed = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  if (about.dtype === "jpeg") return pictured(packed, about.shape);
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
   const rows = new Uint8Array(await new Response(stream).arrayBuffer());
   const Kind = TYPES[about.dtype];
@@ -18,6 +19,26 @@ async function unpacked({ about, text }) {
   }
   return new Kind(bytes.buffer);
 }
+
+/** The bytes [h, w] or [h, w, 3] of a JPEG. */
+async function pictured(packed, [height, width, channels = 1]) {
+  const picture = await createImageBitmap(new Blob([packed], { type: "image/jpeg" }), { colorSpaceConversion: "none" });
+  const canvas = Object.assign(document.createElement("canvas"), { width, height });
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.drawImage(picture, 0, 0);
+  picture.close();
+  const { data } = context.getImageData(0, 0, width, height), bytes = new Uint8Array(width * height * channels);
+  for (let k = 0; k < width * height; k++) {
+    for (let channel = 0; channel < channels; channel++) bytes[k * channels + channel] = data[4 * k + channel];
+  }
+  return bytes;
+}
+
+/** When all of the page's scripts were read. */
+const allRead = new Promise((resolve) => {
+  if (document.readyState === "loading") document.addEventListener("DOMContentLoaded", resolve);
+  else resolve();
+});
 
 /** All blocks by their names; raises an error that names those that did not come. */
 async function readBlocks(names) {

@@ -24,6 +24,10 @@ class Controls {
     return this.app.state;
   }
 
+  get isRun() {
+    return this.app.about.kind === "run";
+  }
+
   get light() {
     return this.state.lights[this.state.chosen];
   }
@@ -49,11 +53,21 @@ class Controls {
       if (input.valueAsNumber > 0) this.state.white = input.valueAsNumber;
       this.changed("screen");
     });
-    byId("view").append(new Option("None", ""), ...this.app.about.views.map(({ name }) => new Option(name, name)));
+    if (!this.isRun) byId("view").append(new Option("None", ""));
+    byId("view").append(...this.app.about.views.map(({ name }) => new Option(name, name)));
+    for (const name of ["sky-row", "split-row", "frame-told"]) byId(name).hidden = this.isRun;
+    byId("shot-section").hidden = !this.isRun;
+    byId("frames-section").querySelector("summary").textContent = this.isRun ? "View" : "Measured frames";
+    byId("frames-section").open = this.isRun;
     byId("frames-section").hidden = !this.app.about.views.length;
     this.on("view", "change", (input) => this.app.compare(input.value));
     this.on("split", "input", (input) => {
       this.state.split = input.valueAsNumber;
+      this.changed("light");
+    });
+    byId("stereo-row").hidden = this.app.about.kind !== "mesh";
+    this.on("stereo", "change", (input) => {
+      this.state.stereo = input.value === "two";
       this.changed("light");
     });
     this.on("auto-white", "click", () => this.app.fitWhite());
@@ -73,6 +87,20 @@ class Controls {
     this.on("sky", "input", (input) => {
       this.state.sky = input.valueAsNumber;
       this.changed("light");
+    });
+    byId("environment-row").hidden = !this.app.about.environment;
+    this.on("environment", "input", (input) => {
+      this.state.environment = input.valueAsNumber;
+      this.changed("light");
+    });
+    byId("illuminant").append(...Object.entries(ILLUMINANTS).map(([name, { told }]) => new Option(told, name)));
+    this.on("illuminant", "change", (input) => {
+      this.light.illuminant = input.value;
+      this.changed("light");
+    });
+    this.on("adapted", "change", (input) => {
+      this.state.adapted = input.value === "yes";
+      this.changed("screen");
     });
     for (const name of ["azimuth", "height"]) {
       this.on(name, "input", () => {
@@ -112,7 +140,7 @@ class Controls {
     byId("split").disabled = !state.view;
     byId("quantity-row").hidden = state.mode !== "uncertainty";
     byId("relief-row").hidden = state.mode !== "unsharp";
-    byId("white-row").hidden = !isLit(state.mode) || Boolean(state.view);
+    byId("white-row").hidden = !isLit(state.mode) || Boolean(state.view && !this.isRun);
     if (document.activeElement !== byId("white")) byId("white").value = Number(state.white.toPrecision(4));
     byId("legend").innerHTML = ["roughness", "uncertainty", "residual"].includes(state.mode)
       ? legendOf(state.mode, state.quantity) : "";
@@ -121,7 +149,13 @@ class Controls {
     this.put("azimuth", azimuth, `${azimuth.toFixed(0)}°`);
     this.put("height", height, `${height.toFixed(0)}°`);
     this.put("sky", state.sky, state.sky.toFixed(2));
+    this.put("environment", state.environment, state.environment.toFixed(2));
+    byId("stereo").value = state.stereo ? "two" : "one";
+    byId("illuminant").value = light.illuminant ?? "";
+    byId("kelvin").disabled = Boolean(light.illuminant);
+    byId("adapted").value = state.adapted ? "yes" : "no";
     byId("colour").value = light.colour;
+    if (this.isRun) byId("shot").innerHTML = this.app.renderer.shotTold(state);
     this.showLights();
   }
 
@@ -149,4 +183,4 @@ class Controls {
 }
 
 /** Whether a mode shows light, and not a number or a direction. */
-const isLit = (mode) => ["relit", "diffuse", "specular", "unsharp"].includes(mode);
+const isLit = (mode) => !["normals", "roughness", "uncertainty", "residual"].includes(mode);

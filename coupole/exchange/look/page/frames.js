@@ -2,7 +2,9 @@
 
 /** A block that may still lie beside the page; its script is asked for by a tag. */
 async function laterBlock(about, name) {
-  if (!(name in coupoleBlocks)) {
+  if (!(name in coupoleBlocks)) await allRead;
+  const isBeside = !(name in coupoleBlocks);
+  if (isBeside) {
     await new Promise((resolve, reject) => {
       const src = `${encodeURIComponent(about.data)}/${encodeURIComponent(name)}.js`;
       const script = Object.assign(document.createElement("script"), { src });
@@ -11,7 +13,9 @@ async function laterBlock(about, name) {
       document.head.append(script);
     });
   }
-  return unpacked(coupoleBlocks[name]);
+  const block = coupoleBlocks[name];
+  if (isBeside) delete coupoleBlocks[name];
+  return unpacked(block);
 }
 
 const viewOf = (about, name) => about.views.find((view) => view.name === name);

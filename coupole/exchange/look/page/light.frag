@@ -2,7 +2,7 @@
 // One sample of each light; the mean with the samples before is written.
 
 const float PI = 3.14159265358979;
-const int MOST = 11;  // the user's ten lights, and the sky
+const int MOST = 12;  // the user's ten lights, the sky and the surroundings
 const int RELIT = 0, DIFFUSE = 1, SPECULAR = 2, UNSHARP = 3, NORMALS = 4, ROUGHNESS = 5, UNCERTAINTY = 6;
 const int TAPS = 24;  // of what relief is compared with
 const float RELIEF_PX = 9.0;

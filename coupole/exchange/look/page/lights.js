@@ -15,25 +15,58 @@ function blackBody(kelvin) {
   return [x, 3.081758 * x ** 3 - 5.8733867 * x ** 2 + 3.75112997 * x - 0.37001483];
 }
 
-/** Linear sRGB of a black body, of mean 1. */
-function warmth(kelvin) {
-  const [x, y] = blackBody(kelvin);
-  const X = x / y, Z = (1 - x - y) / y;
-  const rgb = [
-    3.2404542 * X - 1.5371385 - 0.4985314 * Z,
-    -0.969266 * X + 1.8760108 + 0.041556 * Z,
-    0.0556434 * X - 0.2040259 + 1.0572252 * Z,
-  ].map((value) => Math.max(value, 0));
+/** Chromaticities x, y of lights, for the observer of 1931 (CIE 15:2018); of a black body by its own kelvin. */
+const ILLUMINANTS = {
+  "": { told: "By warmth" },
+  D65: { told: "D65, daylight", xy: [0.31272, 0.32903] },
+  A: { told: "A, tungsten", xy: [0.44758, 0.40745] },
+  "3000 K": { told: "3000 K", xy: blackBody(3000) },
+  "LED-B1": { told: "LED-B1, warm", xy: [0.456, 0.4078] },
+  "LED-B3": { told: "LED-B3, neutral", xy: [0.3756, 0.3723] },
+};
+const NEUTRAL_KELVIN = 6500;
+
+/** Chromaticity of a light without its colour. */
+function chromaticity({ illuminant, kelvin }) {
+  if (illuminant) return ILLUMINANTS[illuminant].xy;
+  return kelvin === NEUTRAL_KELVIN ? ILLUMINANTS.D65.xy : blackBody(kelvin);
+}
+
+/** X, Y, Z of a white of luminance 1. */
+const whiteOf = ([x, y]) => [x / y, 1, (1 - x - y) / y];
+
+const RGB_FROM_XYZ = [
+  [3.2404542, -1.5371385, -0.4985314], [-0.969266, 1.8760108, 0.041556], [0.0556434, -0.2040259, 1.0572252],
+];
+const XYZ_FROM_RGB = [
+  [0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.072175], [0.0193339, 0.119192, 0.9503041],
+];
+const CONES_FROM_XYZ = [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]];
+const XYZ_FROM_CONES = [
+  [0.9869929, -0.1470543, 0.1599627], [0.4323053, 0.5183603, 0.0492912], [-0.0085287, 0.0400428, 0.9684867],
+];
+const turnedBy = (matrix, values) => matrix.map((row) => dot(row, values));
+
+/** Linear sRGB of a chromaticity, of mean 1. */
+function tintOf(xy) {
+  const rgb = turnedBy(RGB_FROM_XYZ, whiteOf(xy)).map((value) => Math.max(value, 0));
   return times(rgb, 3 / (rgb[0] + rgb[1] + rgb[2]));
 }
 
-const NEUTRAL_KELVIN = 6500;
+/** What an eye that is used to a white sees as linear sRGB, whose white is D65 (Bradford's transform, complete
+ * adaptation), of red, green and blue: three columns. */
+function adaptation(xy) {
+  const [from, to] = [xy, ILLUMINANTS.D65.xy].map((one) => turnedBy(CONES_FROM_XYZ, whiteOf(one)));
+  return [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((rgb) => {
+    const cones = turnedBy(CONES_FROM_XYZ, turnedBy(XYZ_FROM_RGB, rgb));
+    return turnedBy(RGB_FROM_XYZ, turnedBy(XYZ_FROM_CONES, cones.map((value, k) => value * to[k] / from[k])));
+  });
+}
 
 /** Irradiance by channel of a light on what faces it, `whole` for strength 1 and neutral colour. */
 function irradiance(light, whole) {
   const colour = [1, 3, 5].map((at) => toLinear(parseInt(light.colour.slice(at, at + 2), 16) / 255));
-  const neutral = warmth(NEUTRAL_KELVIN), warm = warmth(light.kelvin);
-  const tint = light.kelvin === NEUTRAL_KELVIN ? [1, 1, 1] : warm.map((value, k) => value / neutral[k]);
+  const neutral = tintOf(ILLUMINANTS.D65.xy), tint = tintOf(chromaticity(light)).map((value, k) => value / neutral[k]);
   return colour.map((value, k) => whole * light.strength * value * tint[k]);
 }
 

@@ -1,354 +1,4 @@
-// The page: what the user does, and when the picture is drawn.
-
-const GROUND = "#121418";
-const ADDRESS_MS = 300;
-const LIGHT_PX = 160;  // that a dragged light goes from the middle to the rim
-const MOST_PIXELS = 4e6;
-
-class App {
-  constructor(about, arrays) {
-    this.about = about;
-    this.arrays = arrays;
-    this.canvas = byId("picture");
-    this.renderer = new Renderer(this.canvas, about, arrays);
-    this.tool = "turn";
-    this.ruler = [];
-    this.pinned = null;
-    this.most = SAMPLES;
-    this.fitCanvas();
-    this.state = stateOf(location.hash.slice(1)) ?? startState();
-    this.state.camera ??= this.startCamera();
-    this.controls = new Controls(this, (what) => this.changed(what));
-    new Pointer(this, this.canvas, byId("sphere"));
-    this.listen();
-    this.tellAbout();
-    if (about.picture_px) {
-      byId("tools").querySelector("[data-tool=turn]").textContent = "Move";
-      byId("mode").querySelector("[value=uncertainty]").remove();
-    }
-    if (!this.state.white) this.fitWhite();
-    this.changed("light");
-  }
-
-  startCamera() {
-    const above = this.about.picture_px ? 90 : 50;
-    return startCamera(this.renderer.corners, this.canvas.width, this.canvas.height, above);
-  }
-
-  listen() {
-    new ResizeObserver(() => this.resize()).observe(byId("stage"));
-    window.addEventListener("hashchange", () => this.goTo(stateOf(location.hash.slice(1))));
-    for (const name of ["focus", "blur"]) this.canvas.addEventListener(name, () => this.showMarks());
-    this.canvas.addEventListener("webglcontextlost", () => this.say("The graphics failed: load the page again."));
-    byId("tools").addEventListener("click", (event) => this.choose(event.target.dataset.tool));
-    byId("reset").addEventListener("click", () => this.whole());
-    byId("snapshot").addEventListener("click", () => this.snapshot());
-    byId("link").addEventListener("click", () => this.copyLink());
-    byId("notes").addEventListener("click", (event) => this.pressedNote(event.target.dataset));
-    byId("note-form").addEventListener("submit", (event) => {
-      event.preventDefault();
-      this.keepNote(byId("note-text").value.trim());
-    });
-  }
-
-  /** Show a view's measured frame beside the fitted one; none for an empty name. */
-  compare(name) {
-    const view = viewOf(this.about, name), { width, height } = this.canvas;
-    this.state.view = view ? name : "";
-    this.state.camera = view ? cameraOf(view, this.renderer.corners, width, height) : this.startCamera();
-    this.changed("light");
-  }
-
-  banner() {
-    return bannerOf(this.about, this.state, this.renderer.frameOf(this.state));
-  }
-
-  /** Fetch the frame that is compared with, once. */
-  async bringFrame() {
-    const compared = this.renderer.frameOf(this.state);
-    if (!compared || compared.texture || this.coming === compared.frame.block) return;
-    this.coming = compared.frame.block;
-    try {
-      this.renderer.keepFrame(compared.frame, await laterBlock(this.about, compared.frame.block));
-      this.changed("light");
-    } catch (error) {
-      this.say(error.message);
-    }
-  }
-
-  /** Something of the state is new: all, or only how the mean is shown ("screen"). */
-  changed(what) {
-    if (what !== "screen") this.renderer.restart();
-    this.controls.show();
-    this.bringFrame();
-    byId("banner").textContent = this.banner();
-    drawSphere(byId("sphere"), this.state.camera, this.state.lights, this.state.chosen);
-    this.showMarks();
-    this.wanted = true;
-    this.schedule();
-    clearTimeout(this.addressed);
-    this.addressed = setTimeout(() => history.replaceState(null, "", `#${addressOf(this.state)}`), ADDRESS_MS);
-  }
-
-  goTo(state) {
-    if (!state) return;
-    this.state = { ...state, camera: state.camera ?? this.startCamera(), white: state.white || this.state.white };
-    this.changed("light");
-  }
-
-  schedule() {
-    this.frame ??= requestAnimationFrame(() => {
-      this.frame = null;
-      if (this.renderer.samples < this.most) this.draw();
-      else if (this.wanted) this.renderer.show(this.state, GROUND);
-      this.wanted = false;
-      if (this.renderer.samples < this.most) this.schedule();
-    });
-  }
-
-  draw() {
-    this.renderer.sample(this.state);
-    this.renderer.show(this.state, GROUND);
-  }
-
-  /** Draw until the mean has so many samples. */
-  settle(samples) {
-    while (this.renderer.samples < samples) this.draw();
-    this.renderer.read(0, 0, 1, 1);  // waits for it
-  }
-
-  /** Give the canvas the pixels of its place on the page; whether they are others than before. */
-  fitCanvas() {
-    const { clientWidth: width, clientHeight: height } = byId("stage");
-    const wished = Math.min(window.devicePixelRatio || 1, 2);
-    this.scale = Math.min(wished, Math.sqrt(MOST_PIXELS / Math.max(width * height, 1)));
-    const size = [width, height].map((side) => Math.max(1, Math.round(side * this.scale)));
-    if (size[0] === this.canvas.width && size[1] === this.canvas.height) return false;
-    [this.canvas.width, this.canvas.height] = size;
-    return true;
-  }
-
-  resize() {
-    if (!this.fitCanvas()) return;
-    this.renderer.restart();
-    this.draw();
-    this.changed("screen");
-  }
-
-  fitWhite() {
-    const { white, mode } = this.state;
-    this.state.mode = isLit(mode) ? mode : "relit";
-    this.renderer.restart();
-    this.renderer.sample({ ...this.state, white: white || 1 });
-    this.state.white = this.renderer.brightest() || 1;
-    this.changed("screen");
-  }
-
-  // -- camera and light ------------------------------------------------------------------------------------------
-
-  /** Go round the object by pixels that the pointer went; a measured picture moves instead. */
-  turn(x, y) {
-    if (this.about.picture_px) {
-      this.move(x, y);
-      return;
-    }
-    this.state.view = "";
-    const azimuth = -x * TURN_DEG_PER_PX, height = y * TURN_DEG_PER_PX;
-    this.state.camera = turned(this.state.camera, azimuth, height);
-    this.changed("light");
-  }
-
-  zoom(factor) {
-    const { camera, view } = this.state;
-    this.state.camera = view
-      ? { ...camera, field: clamp(camera.field * factor, 0.2, 120) }
-      : zoomed(camera, factor, this.renderer.radius);
-    this.changed("light");
-  }
-
-  move(x, y) {
-    const shorter = Math.min(this.canvas.clientWidth, this.canvas.clientHeight);
-    this.state.view = "";
-    this.state.camera = moved(this.state.camera, x, y, shorter);
-    this.changed("light");
-  }
-
-  whole() {
-    this.state.view = "";
-    this.state.camera = this.startCamera();
-    this.changed("light");
-  }
-
-  /** Move the chosen light as its dot would go on the sphere, by pixels to the right and down. */
-  dragLight(x, y) {
-    const [a, b] = inView(this.state.camera, this.state.lights[this.state.chosen].direction);
-    this.aim(a + x / LIGHT_PX, b - y / LIGHT_PX);
-  }
-
-  aim(x, y) {
-    this.state.lights[this.state.chosen].direction = wayOn(this.state.camera, x, y);
-    this.changed("light");
-  }
-
-  // -- points ----------------------------------------------------------------------------------------------------
-
-  choose(tool) {
-    if (!tool) return;
-    this.tool = tool;
-    for (const button of byId("tools").querySelectorAll("[data-tool]")) {
-      button.setAttribute("aria-pressed", String(button.dataset.tool === tool));
-    }
-    this.canvas.classList.toggle("aims", tool === "measure" || tool === "note");
-    this.say({ measure: "Click two places.", note: "Click a place." }[tool] ?? "");
-  }
-
-  click(x, y) {
-    if (this.tool === "measure") this.measure(x, y);
-    else if (this.tool === "note") this.pin(x, y);
-    else this.tell(x, y);
-  }
-
-  /** What is seen at a place of the page. */
-  seenAt(x, y) {
-    const found = this.renderer.seenAt(Math.floor(x * this.scale), Math.floor(y * this.scale));
-    if (!found) this.say("There is nothing of the object at this place.");
-    return found;
-  }
-
-  tell(x, y) {
-    const found = this.seenAt(x, y);
-    if (!found) return;
-    const material = materialOf(this.arrays, found.triangle);
-    const view = unit(minus(axesOf(this.state.camera).place, found.place));
-    const angle = material ? degrees(Math.acos(clamp(dot(view, material.normal), -1, 1))) : 0;
-    byId("point").innerHTML = toldOf(found.triangle, found.place, material, Math.min(angle, PLOT.reach));
-    byId("point-section").open = true;
-    byId("point-section").scrollIntoView({ block: "nearest" });
-    this.say("");
-  }
-
-  measure(x, y) {
-    const found = this.seenAt(x, y);
-    if (!found) return;
-    this.ruler = [...this.ruler.slice(this.ruler.length === 2 ? 2 : 0), found.place];
-    const [one, other] = this.ruler;
-    this.say(other ? `Straight distance ${lengthText(length(minus(other, one)))}` : "Now the other end.");
-    this.showMarks();
-  }
-
-  pin(x, y) {
-    const found = this.seenAt(x, y);
-    if (!found) return;
-    this.pinned = found.place;
-    byId("notes-section").open = true;
-    byId("note-text").focus();
-    this.say("Write the note, then press Enter.");
-    this.showMarks();
-  }
-
-  keepNote(text) {
-    if (!text || !this.pinned) {
-      this.say(text ? "Click a place for the note first." : "A note needs words.");
-      return;
-    }
-    const { camera, lights } = structuredClone(this.state);
-    this.state.notes.push({ text, place: this.pinned, camera, lights });
-    this.pinned = null;
-    byId("note-text").value = "";
-    this.say("");
-    this.changed("screen");
-  }
-
-  pressedNote({ show, remove }) {
-    if (show !== undefined) {
-      const { camera, lights } = structuredClone(this.state.notes[show]);
-      Object.assign(this.state, { camera, lights, chosen: 0, view: "" });
-      this.changed("light");
-    } else if (remove !== undefined) {
-      this.state.notes.splice(Number(remove), 1);
-      this.changed("screen");
-    }
-  }
-
-  // -- what lies beside the picture ------------------------------------------------------------------------------
-
-  showMarks() {
-    const { clientWidth: width, clientHeight: height } = this.canvas;
-    const pins = this.pinned ? [...this.state.notes, { place: this.pinned }] : this.state.notes;
-    byId("marks").setAttribute("viewBox", `0 0 ${width} ${height}`);
-    byId("marks").innerHTML = marksOf(this.state.camera, width, height, pins, this.ruler)
-      + splitOf(this.state, width, height)
-      + (this.canvas.matches(":focus-visible") ? aimOf(width, height) : "");
-    drawScale(byId("scale"), this.state.camera, Math.min(width, height));
-    byId("notes").replaceChildren(...this.state.notes.map((note, number) => {
-      const line = document.createElement("li"), text = document.createElement("span");
-      text.textContent = `${note.text} `;
-      line.append(text);
-      for (const [what, told] of [["show", "Show"], ["remove", "Remove"]]) {
-        const button = Object.assign(document.createElement("button"), { type: "button", textContent: told });
-        button.dataset[what] = number;
-        button.setAttribute("aria-label", `${told} note ${number + 1}`);
-        line.append(button, " ");
-      }
-      return line;
-    }));
-  }
-
-  say(words) {
-    byId("status").textContent = words;
-  }
-
-  tellAbout() {
-    const { about } = this, told = {
-      ...about.told,
-      Fit: about.fit,
-      "Written short": Object.entries(about.errors).map(([name, error]) => `${name}: ${error}`).join("; "),
-      Software: Object.entries(about.software).map(([name, version]) => `${name} ${version}`).join(", "),
-    };
-    const list = document.createElement("dl");
-    for (const [name, text] of Object.entries(told)) {
-      list.append(
-        Object.assign(document.createElement("dt"), { textContent: name }),
-        Object.assign(document.createElement("dd"), { textContent: text }),
-      );
-    }
-    byId("about").append(list);
-  }
-
-  /** The picture as a file, with what has to be said of it. */
-  snapshot() {
-    this.settle(this.most);
-    const { width, height } = this.canvas, line = Math.round(26 * this.scale);
-    const made = document.createElement("canvas");
-    Object.assign(made, { width, height: height + line });
-    const context = made.getContext("2d");
-    context.fillStyle = GROUND;
-    context.fillRect(0, 0, width, height + line);
-    context.drawImage(this.canvas, 0, 0);
-    context.fillStyle = "#ece9e2";
-    context.font = `${Math.round(13 * this.scale)}px sans-serif`;
-    const [shown, unit] = this.renderer.whiteOf(this.state);
-    const white = isLit(this.state.mode) ? ` · white ${shown.toPrecision(4)} ${unit}` : "";
-    const words = `${this.about.title} · ${MODES[this.state.mode]}${white} · ${this.banner()}`;
-    context.fillText(words, 8 * this.scale, height + line * 0.68, width - 16 * this.scale);
-    made.toBlob((blob) => {
-      const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob) });
-      link.download = `${this.about.title}.png`;
-      link.click();
-      URL.revokeObjectURL(link.href);
-    });
-  }
-
-  async copyLink() {
-    history.replaceState(null, "", `#${addressOf(this.state)}`);
-    try {
-      await navigator.clipboard.writeText(location.href);
-      this.say("The link is copied: view, light and notes are in it.");
-    } catch {
-      this.say("View, light and notes are in the address of this page: copy it from there.");
-    }
-  }
-}
+// The page begins, and is given to scripts.
 
 /** What scripts may use; docs/reference/page.md. */
 function interfaceOf(app) {
@@ -374,6 +24,7 @@ function interfaceOf(app) {
       const { width, height } = app.canvas;
       return { width, height, rgba: app.renderer.read(0, 0, width, height) };
     },
+    whole: () => app.whole(),
     setSamples(most) {
       app.most = Math.max(1, Math.floor(most));
       app.changed("light");
@@ -390,11 +41,30 @@ function interfaceOf(app) {
   };
 }
 
-const ready = readBlocks(ABOUT.blocks).then((arrays) => {
-  const app = new App(ABOUT, arrays);
+/** The page with its coarse mesh, which stands at its beginning; null of pages that have none. */
+async function begun() {
+  if (!ABOUT.first.length) return null;
+  const arrays = await readBlocks(ABOUT.first);
+  const app = new App(ABOUT, Object.fromEntries(ABOUT.blocks.map((name) => [name, arrays[`first-${name}`]])));
+  app.say("A coarse picture; the rest is being read…");
+  await shown();
+  await shown();
+  return app;
+}
+
+async function begin() {
+  let app = await begun();
+  if (ABOUT.blocks.some((name) => !(name in coupoleBlocks))) await allRead;
+  const arrays = await readBlocks(ABOUT.blocks);
+  if (app) app.refine(arrays);
+  else app = new App(ABOUT, arrays);
+  await app.whole();
+  if (app.about.picture_px && app.isNew) app.fitWhite();
   Object.defineProperties(window.coupole, Object.getOwnPropertyDescriptors(interfaceOf(app)));
   byId("status").textContent = "";
-});
+}
+
+const ready = begin();
 window.coupole = { ready };
 ready.catch((error) => {
   byId("status").textContent = error.message;

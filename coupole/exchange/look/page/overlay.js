@@ -45,7 +45,7 @@ const aimOf = (width, height) => `<path class="aim" d="M${width / 2 - 9} ${heigh
 /** Where the measured frame ends and the fitted one begins, as markup. */
 function splitOf(state, width, height) {
   const x = state.split * width;
-  return state.view && isLit(state.mode) ? `<line class="split" x1="${x}" x2="${x}" y1="0" y2="${height}"/>` : "";
+  return state.view && ABOUT.kind === "mesh" && isLit(state.mode) ? `<line class="split" x1="${x}" x2="${x}" y1="0" y2="${height}"/>` : "";
 }
 
 function legendOf(mode, quantity) {
@@ -57,16 +57,26 @@ function legendOf(mode, quantity) {
     <span class="ends"><span>${low}</span><span>${mid}</span><span>${high} ${told}</span></span>`;
 }
 
+/** What has to be said of the colours of lights. */
+function coloursTold(about, state) {
+  const isTinted = (light) => light.illuminant || light.kelvin !== NEUTRAL_KELVIN;
+  if (!state.lights.some(isTinted)) {
+    return state.sky > 0 || state.environment > 0 ? ["colour of sky and surroundings are hypotheses in RGB"] : [];
+  }
+  const eye = state.adapted ? "eye used to the chosen light (Bradford)" : "no adaptation of the eye";
+  return [`colours of lights are hypotheses in RGB, ${eye}`];
+}
+
 /** What has to be said of the picture, wherever it is seen; `compared` is the measured frame in it. */
 function bannerOf(about, state, compared) {
   const kinds = { true: "Simulated object", false: "Measured object", null: "Pictures of an object" };
   const told = [kinds[about.simulated]];
-  if (["relit", "diffuse", "specular", "unsharp"].includes(state.mode)) {
+  if (isLit(state.mode)) {
     told.push(`light computed from a fit (${about.fit})`);
-    if (state.sky > 0 || state.lights.some((light) => light.kelvin !== NEUTRAL_KELVIN)) {
-      told.push("colour of light and sky are hypotheses in RGB");
-    }
+    if (about.environment && state.environment > 0) told.push(`surroundings ${about.environment.name}`);
+    told.push(...coloursTold(about, state));
   }
+  if (isStereo(state)) told.push("for two eyes, the left one's to the left");
   if (state.mode === "unsharp") told.push("relief exaggerated");
   if (compared?.texture && isLit(state.mode)) told.push(`left: measured frame under LED ${compared.frame.led}`);
   return told.join(" · ");

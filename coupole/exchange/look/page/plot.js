@@ -44,7 +44,7 @@ const three = (values) => values.map((value) => value.toPrecision(3)).join(" / "
 /** What is told of a point, as markup. */
 function toldOf(triangle, place, material, view) {
   const at = ABOUT.picture_px
-    ? `Pixel ${triangle % ABOUT.picture_px[0]}, ${Math.floor(triangle / ABOUT.picture_px[0])}`
+    ? `Pixel ${Math.floor(place[0])}, ${Math.floor(ABOUT.picture_px[1] - place[1])}`
     : `Triangle ${triangle} at ${place.map((value) => value.toFixed(2)).join(", ")} mm`;
   if (!material) return `<p>${at}: was seen in too few frames; it has no material.</p>`;
   const { kd, ks, normal, roughness } = material.uncertainty;
@@ -53,7 +53,8 @@ function toldOf(triangle, place, material, view) {
   const row = (name, value, u) => `<tr><th scope="row">${name}</th><td>${value}</td><td>± ${u}</td></tr>`;
   return `<p>${at}</p>${plotOf(material, view)}
     <p class="small">${ABOUT.unit}; red, green, blue. ${bounds} Dotted: where the camera is mirrored. Drawn from
-    the fitted coefficients; this page holds no samples.</p>
+    the fitted coefficients${ABOUT.samples ? "" : "; this page holds no samples"}.</p>
+    <div id="samples-told" role="status"></div>
     <table><tbody>
     ${row("Diffuse kd", three(material.kd), percent(kd))}
     ${row("Highlight ks", three(material.ks), percent(ks))}

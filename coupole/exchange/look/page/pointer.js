@@ -73,7 +73,7 @@ class Pointer {
     else if (way) app.turn(way[0] * KEY_PX, way[1] * KEY_PX);
     else if (event.key === "+" || event.key === "=") app.zoom(0.9);
     else if (event.key === "-") app.zoom(1 / 0.9);
-    else if (event.key === "0") app.whole();
+    else if (event.key === "0") app.showAll();
     else if (event.key === "Enter") app.tell(...middle);
     else if (event.key.toLowerCase() === "m") app.measure(...middle);
     else if (event.key.toLowerCase() === "n") app.pin(...middle);

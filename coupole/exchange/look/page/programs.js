@@ -58,6 +58,51 @@ function numbersTexture(gl, numbers, dtype, count) {
   return texture;
 }
 
+/** A texture of rows of numbers that come later. */
+function emptyTexture(gl, height, dtype, count) {
+  const texture = plainTexture(gl, gl.TEXTURE_2D);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, formatOf(gl, dtype, count)[0], ROW, height);
+  return texture;
+}
+
+/** Put numbers [n, count] into whole rows of a texture. */
+function putRows(gl, texture, row, numbers, dtype, count) {
+  const [, format, type] = formatOf(gl, dtype, count), height = numbers.length / count / ROW;
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, ROW, height, format, type, numbers);
+}
+
+/** Layers of rows of four bytes that come later. */
+function layersTexture(gl, layers, height) {
+  const texture = plainTexture(gl, gl.TEXTURE_2D_ARRAY);
+  gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA8, ROW, height, layers);
+  return texture;
+}
+
+function putLayer(gl, texture, layer, row, bytes) {
+  gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  const size = [ROW, bytes.length / 4 / ROW, 1];
+  gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, row, layer, ...size, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+}
+
+const MOST_FACTORS = 32;
+
+/** For each light a row of factors, four floats each. */
+function factorsTexture(gl) {
+  const texture = plainTexture(gl, gl.TEXTURE_2D);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, MOST_FACTORS, MOST_LIGHTS);
+  return texture;
+}
+
+function putFactors(gl, texture, rows) {
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  rows.forEach((row, number) => {
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, number, row.length / 4, 1, gl.RGBA, gl.FLOAT, row);
+  });
+}
+
 /** A texture of a picture of bytes [height, width, 3]. */
 function bytesTexture(gl, bytes, width, height) {
   const texture = plainTexture(gl, gl.TEXTURE_2D);

@@ -5,6 +5,7 @@ const SHADOW_PX = [512, 2048];  // least and most
 const MODE_NUMBERS = {
   relit: 0, diffuse: 1, specular: 2, unsharp: 3, normals: 4, roughness: 5, uncertainty: 6, residual: 7,
 };
+const ARRAYS = ["shadows", "planes"];
 const RAMP = ["#2a2140", "#3b4f8f", "#2f8f8c", "#8fbf5a", "#f0c24b", "#fff4cf"];
 const TEXTURES = {
   places: ["uint16", 3], triangles: ["uint32", 3], normals: ["uint16", 2], kd: ["float16", 3], ks: ["float16", 3],
@@ -19,18 +20,24 @@ function rangeOf(mode, quantity) {
   return { from: 0.003, to: 3, logarithmic: true, unit: "%" };
 }
 
+const IDENTITY = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+
+const EYES_DEG = 3.4;  // between two eyes, 65 mm apart, that look at a thing 1.1 m away
+
+const isStereo = (state) => Boolean(state.stereo && !state.view && ABOUT.kind === "mesh");
+
 class Renderer {
   constructor(canvas, about, arrays) {
     this.gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
     if (!this.gl) throw new Error("This browser has no WebGL 2, which the picture needs.");
     this.canvas = canvas;
     this.about = about;
-    this.triangles = arrays.triangles.length / 3;
-    this.measure(arrays.places);
-    this.prepare(arrays);
     this.samples = 0;
     this.targets = null;
     this.depths = null;
+    this.arrived = () => {};  // what is called when more has come
+    this.measure();
+    this.prepare(arrays);
     this.drawnShadows = [];
     this.frames = {};
   }
@@ -49,18 +56,37 @@ class Renderer {
     return compared ? [compared.frame.peak, "of the camera's range"] : [state.white || 1, this.about.unit];
   }
 
+  banner(state) {
+    return bannerOf(this.about, state, this.frameOf(state));
+  }
+
+  /** The material of what `seenAt` has found. */
+  materialOf(number) {
+    return materialOf(this.arrays, number);
+  }
+
+  /** Whether there is anything to be seen. */
+  get hasPicture() {
+    return true;
+  }
+
+  /** Whether something has yet to come for the picture to be whole. */
+  get isWaiting() {
+    return false;
+  }
+
+  /** Whether colours are shown to an eye that is used to the chosen light; never those of measured frames. */
+  isAdapted(state) {
+    return state.adapted && isLit(state.mode) && !this.frameOf(state);
+  }
+
   keepFrame(frame, bytes) {
     this.frames[frame.block] = bytesTexture(this.gl, bytes, ...frame.size_px);
   }
 
   /** The box and the sphere that hold the object. */
-  measure(places) {
-    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
-    for (let k = 0; k < places.length; k++) {
-      if (places[k] < low[k % 3]) low[k % 3] = places[k];
-      if (places[k] > high[k % 3]) high[k % 3] = places[k];
-    }
-    const { origin_mm: origin, step_mm: step } = this.about, ends = [low, high];
+  measure() {
+    const { origin_mm: origin, step_mm: step, box: ends } = this.about, [low, high] = ends;
     this.corners = [0, 1, 2, 3, 4, 5, 6, 7].map((number) => add(
       origin, times([0, 1, 2].map((k) => ends[number >> k & 1][k]), step),
     ));
@@ -77,11 +103,21 @@ class Renderer {
       show: programOf(gl, "screen.vert", "show.frag"),
     };
     this.textures = {};
-    for (const [name, [dtype, count]] of Object.entries(TEXTURES)) {
-      this.textures[name] = numbersTexture(gl, arrays[name], dtype, count);
-    }
+    this.take(arrays);
     gl.bindVertexArray(gl.createVertexArray());
     gl.enable(gl.DEPTH_TEST);
+  }
+
+  /** Show these numbers of the object from now on. */
+  take(arrays) {
+    this.arrays = arrays;
+    this.triangles = arrays.triangles.length / 3;
+    for (const [name, [dtype, count]] of Object.entries(TEXTURES)) {
+      this.gl.deleteTexture(this.textures[name] ?? null);
+      this.textures[name] = numbersTexture(this.gl, arrays[name], dtype, count);
+    }
+    this.drawnShadows = [];
+    this.restart();
   }
 
   use(name, textures) {
@@ -89,7 +125,7 @@ class Renderer {
     gl.useProgram(program.program);
     Object.entries(textures).forEach(([uniform, texture], number) => {
       gl.activeTexture(gl.TEXTURE0 + number);
-      gl.bindTexture(uniform === "shadows" ? gl.TEXTURE_2D_ARRAY : gl.TEXTURE_2D, texture);
+      gl.bindTexture(ARRAYS.includes(uniform) ? gl.TEXTURE_2D_ARRAY : gl.TEXTURE_2D, texture);
       gl.uniform1i(program.at(uniform), number);
     });
     gl.uniform3fv(program.at("origin_mm"), this.about.origin_mm);
@@ -121,10 +157,24 @@ class Renderer {
     this.fit();
     const beams = this.beamsOf(state);
     this.drawShadows(beams);
-    this.drawSurface(state.camera);
-    this.drawLight(state, beams);
+    this.gl.enable(this.gl.SCISSOR_TEST);
+    for (const part of this.parts(state)) {
+      this.gl.scissor(part.x, 0, part.width, this.height);
+      this.drawSurface(part.state, part);
+      this.drawLight(part.state, beams);
+    }
+    this.gl.disable(this.gl.SCISSOR_TEST);
     [this.targets.mean, this.targets.other] = [this.targets.other, this.targets.mean];
     this.samples += 1;
+  }
+
+  /** Parts of the picture, pixels from the left: all of it, or one for each eye, the left eye's to the left. */
+  parts(state) {
+    if (!isStereo(state)) return [{ x: 0, width: this.width, state }];
+    const width = Math.floor(this.width / 2);
+    return [-1, 1].map((side, number) => ({
+      x: number * width, width, state: { ...state, camera: turned(state.camera, side * EYES_DEG / 2, 0) },
+    }));
   }
 
   /** Lights of this sample. */
@@ -137,6 +187,12 @@ class Renderer {
     if (state.sky > 0) {
       const { way, irradiance: sky } = sampledSky(state.sky * this.about.irradiance / Math.PI, this.samples);
       beams.push({ way, irradiance: sky });
+    }
+    const { environment } = this.about;
+    if (environment && state.environment > 0) {
+      const number = this.samples % environment.ways.length;
+      const factor = state.environment * this.about.irradiance / Math.PI;
+      beams.push({ way: environment.ways[number], irradiance: times(environment.irradiances[number], factor) });
     }
     return beams.map((beam) => ({ ...beam, place: null, shadow: this.shadowMatrix(beam.way) }));
   }
@@ -173,19 +229,17 @@ class Renderer {
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.depths.frames[layer]);
       gl.clear(gl.DEPTH_BUFFER_BIT);
       gl.uniformMatrix4fv(at("clip_from_object"), false, beam.shadow);
-      if (!this.about.picture_px) gl.drawArrays(gl.TRIANGLES, 0, 3 * this.triangles);
+      gl.drawArrays(gl.TRIANGLES, 0, 3 * this.triangles);
       this.drawnShadows[layer] = String(beam.shadow);
     });
   }
 
-  drawSurface(camera) {
-    const gl = this.gl, [x, y] = evenly(this.samples);
-    const { places, triangles, gloss } = this.textures;
-    const at = this.use("surface", { places, triangles, gloss });
-    gl.uniform2iv(at("picture_px"), this.about.picture_px ?? [0, 0]);
-    const clip = clipOf(camera, this.width, this.height, this.middle, this.radius, [x - 0.5, y - 0.5]);
+  drawSurface({ camera }, { x: left, width }) {
+    const gl = this.gl, [x, y] = evenly(this.samples), { places, triangles } = this.textures;
+    const at = this.use("surface", { places, triangles });
+    const clip = clipOf(camera, width, this.height, this.middle, this.radius, [x - 0.5, y - 0.5]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.targets.seen.frame);
-    gl.viewport(0, 0, this.width, this.height);
+    gl.viewport(left, 0, width, this.height);
     gl.clearBufferuiv(gl.COLOR, 0, [0, 0, 0, 0]);
     gl.clear(gl.DEPTH_BUFFER_BIT);
     gl.uniformMatrix4fv(at("clip_from_object"), false, clip);
@@ -215,6 +269,7 @@ class Renderer {
     const texel = 2 * this.radius * 1.01 / this.depths.size;
     gl.uniform1fv(at("offset_mm"), beams.map(() => 1.5 * texel));
     gl.bindFramebuffer(gl.FRAMEBUFFER, other.frame);
+    gl.viewport(0, 0, this.width, this.height);
     gl.disable(gl.DEPTH_TEST);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.enable(gl.DEPTH_TEST);
@@ -243,6 +298,8 @@ class Renderer {
     const number = ["roughness", "uncertainty", "residual"].includes(state.mode);
     gl.uniform1i(at("kind"), state.mode === "normals" ? 1 : number ? 2 : 0);
     gl.uniform1f(at("white"), this.whiteOf(state)[0]);
+    const eye = this.isAdapted(state) ? adaptation(chromaticity(state.lights[state.chosen])) : IDENTITY;
+    gl.uniformMatrix3fv(at("adapted"), false, eye.flat());
     gl.uniform2f(at("range"), from, to);
     gl.uniform1i(at("logarithmic"), logarithmic ? 1 : 0);
     gl.uniform3fv(at("ramp"), RAMP.flatMap((text) => channelsOf(text)));

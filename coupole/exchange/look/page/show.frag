@@ -8,6 +8,7 @@ uniform usampler2D mean;
 uniform usampler2D seen;
 uniform int kind;
 uniform float white;
+uniform mat3 adapted;  // of linear red, green, blue
 uniform vec2 range;  // of numbers, from and to
 uniform bool logarithmic;
 uniform vec3 ramp[STOPS];  // sRGB
@@ -35,10 +36,10 @@ void main() {
   vec3 behind = ground;
   if (here > 0u && found.a < 0.5) {  // seen by the page, never by the instrument
     float line = mod(gl_FragCoord.x + gl_FragCoord.y, HATCH_PX) < 1.2 ? 0.16 : 0.06;
-    behind = ground + line;
+    behind = ground + (ground.g > 0.5 ? -line : line);
   }
   vec3 front = found.rgb / max(found.a, 1e-6);
-  if (kind == RADIANCE) front = shown(front / white);
+  if (kind == RADIANCE) front = shown(adapted * front / white);
   if (kind == NUMBER) front = of_number(front.r);
   colour = vec4(mix(behind, front, clamp(found.a, 0.0, 1.0)), 1.0);
 }

@@ -27,7 +27,46 @@ function wayOf(azimuth, height) {
   return [Math.cos(h) * Math.cos(a), Math.cos(h) * Math.sin(a), Math.sin(h)];
 }
 
-function drawSphere(canvas, camera, lights, chosen) {
+const LED_PX = 1.6;
+
+/** LEDs of a run: with a frame filled, without one crosses, hidden ones rings; the nearest to the light larger. */
+function drawDome(context, camera, { proven, unproven, hidden, nearest }, middle, radius) {
+  const at = (way) => {
+    const [x, y] = inView(camera, way);
+    return [middle + x * radius, middle - y * radius];
+  };
+  const dot = (way, size) => {
+    context.beginPath();
+    context.arc(...at(way), size, 0, 2 * Math.PI);
+  };
+  context.fillStyle = context.strokeStyle = "#9fd8cf";
+  context.lineWidth = 1;
+  for (const way of proven) {
+    dot(way, LED_PX);
+    context.fill();
+  }
+  for (const way of hidden) {
+    dot(way, LED_PX + 0.5);
+    context.stroke();
+  }
+  context.strokeStyle = "#ff8a7a";
+  for (const way of unproven) {
+    const [x, y] = at(way), arm = LED_PX + 1;
+    context.beginPath();
+    for (const side of [-arm, arm]) {
+      context.moveTo(x - arm, y - side);
+      context.lineTo(x + arm, y + side);
+    }
+    context.stroke();
+  }
+  context.strokeStyle = "#ffffff";
+  context.lineWidth = 2;
+  dot(nearest, LED_PX + 3);
+  context.stroke();
+}
+
+/** `dome` are LEDs of a run; none of other pages. */
+function drawSphere(canvas, camera, lights, chosen, dome) {
   const context = canvas.getContext("2d"), size = canvas.width, middle = size / 2, radius = middle - DOT_PX;
   context.clearRect(0, 0, size, size);
   const shade = context.createRadialGradient(middle * 0.8, middle * 0.75, 0, middle, middle, radius);
@@ -39,6 +78,7 @@ function drawSphere(canvas, camera, lights, chosen) {
   context.arc(middle, middle, radius, 0, 2 * Math.PI);
   context.fill();
   context.stroke();
+  if (dome) drawDome(context, camera, dome, middle, radius);
   lights.forEach((light, number) => {
     const [x, y, z] = inView(camera, light.direction);
     context.globalAlpha = z < 0 ? 0.35 : 1;

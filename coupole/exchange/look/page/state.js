@@ -1,7 +1,9 @@
 // What a user has set: all of it goes into the address, and back.
 
 const MOST_LIGHTS = 10;
-const MODES = {
+const MODES = ABOUT.kind === "run" ? {
+  measured: "Nearest frame", between: "Between LEDs",
+} : {
   relit: "Relit", diffuse: "Diffuse only", specular: "Highlights only", unsharp: "Relief enhanced",
   normals: "Normals", roughness: "Roughness", uncertainty: "Uncertainty", residual: "What the fit misses",
 };
@@ -10,12 +12,12 @@ const UNCERTAIN = {
 };
 
 const startLight = () => ({
-  direction: unit([-0.45, -0.15, 0.85]), strength: 1, colour: "#ffffff", kelvin: 6500, softness: 1,
+  direction: unit([-0.45, -0.15, 0.85]), strength: 1, colour: "#ffffff", kelvin: 6500, illuminant: "", softness: 1,
 });
 
 const startState = () => ({
-  mode: "relit", quantity: "kd", white: 0, relief: 1, sky: 0, chosen: 0, lights: [startLight()],
-  camera: null, notes: [], view: "", split: 0.5,
+  mode: Object.keys(MODES)[0], quantity: "kd", white: 0, relief: 1, sky: 0, environment: ABOUT.environment ? 1 : 0, chosen: 0, lights: [startLight()],
+  camera: null, notes: [], view: "", split: 0.5, adapted: false, stereo: false,
 });
 
 const rounded = (key, value) => typeof value === "number" ? Number(value.toPrecision(5)) : value;
@@ -32,7 +34,7 @@ const isVector = (value) => Array.isArray(value) && value.length === 3 && value.
 function isLight(light) {
   return isVector(light?.direction) && length(light.direction) > 1e-6 && isNumber(light.strength, 0, 100)
     && /^#[0-9a-f]{6}$/.test(light.colour) && isNumber(light.kelvin, 1000, 20000)
-    && isNumber(light.softness, 0, 30);
+    && isNumber(light.softness, 0, 30) && (light.illuminant ?? "") in ILLUMINANTS;
 }
 
 function isCamera(camera) {
@@ -58,9 +60,12 @@ function stateOf(address) {
   }
   const fits = found?.mode in MODES && found.quantity in UNCERTAIN && isNumber(found.white, 0, 1e9)
     && isNumber(found.relief, 0, 10) && isNumber(found.sky, 0, 100) && isCamera(found.camera)
+    && (found.environment === undefined || isNumber(found.environment, 0, 100))
     && Array.isArray(found.lights) && isNumber(found.lights.length, 1, MOST_LIGHTS) && found.lights.every(isLight)
     && isNumber(found.chosen, 0, found.lights.length - 1) && Number.isInteger(found.chosen)
     && Array.isArray(found.notes) && found.notes.every(isNote)
+    && (found.stereo === undefined || typeof found.stereo === "boolean")
+    && (found.adapted === undefined || typeof found.adapted === "boolean")
     && (!found.view || viewOf(ABOUT, found.view)) && (found.split === undefined || isNumber(found.split, 0, 1));
   return fits ? { ...startState(), ...found } : null;
 }

@@ -1,0 +1,60 @@
+"""A mesh of few triangles that stands for one of many, for the first picture of a page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_TRIANGLES = 20_000
+_FINER = 1.25
+"""By how much more cells are there on a side at each further trial."""
+
+
+@dataclass(frozen=True)
+class CoarseMesh:
+    """Places that lie in one cell of a grid become one (Rossignac and Borrel, Multi-resolution 3D approximations
+    for rendering complex scenes, 1993); triangles that are left without area go."""
+
+    places: NDArray[np.uint16]
+    """[m, 3]"""
+    triangles: NDArray[np.uint32]
+    """[n, 3] places."""
+    stands_for: NDArray[np.int64]
+    """[n] a triangle of the fine mesh that each was."""
+
+
+def coarse_mesh(
+    places: NDArray[np.uint16], triangles: NDArray[np.uint32], most: int = MOST_TRIANGLES
+) -> CoarseMesh:
+    """Of places [m, 3] in steps of a grid and triangles [n, 3]: the finest trial of at most `most` triangles."""
+    cells = 4.0
+    found = _clustered(places, triangles, cells)
+    while len(found.triangles) <= most and cells < 1 << 16:
+        kept, cells = found, cells * _FINER
+        found = _clustered(places, triangles, cells)
+    return kept if len(found.triangles) > most else found
+
+
+def _clustered(places: NDArray[np.uint16], triangles: NDArray[np.uint32], cells: float) -> CoarseMesh:
+    x, y, z = (places / (65536.0 / cells)).astype(np.uint64).T
+    _, cluster, members = np.unique(
+        x << np.uint64(40) | y << np.uint64(20) | z, return_inverse=True, return_counts=True
+    )
+    means = np.stack([np.bincount(cluster, places[:, k], len(members)) / members for k in range(3)], axis=1)
+    new = cluster[triangles]
+    whole = ((new[:, 0] != new[:, 1]) & (new[:, 1] != new[:, 2]) & (new[:, 2] != new[:, 0])).nonzero()[0]
+    first = _first_of_each(np.sort(new[whole], axis=1))
+    return CoarseMesh(np.rint(means).astype(np.uint16), new[whole[first]].astype(np.uint32), whole[first])
+
+
+def _first_of_each(rows: NDArray[Any]) -> NDArray[np.int64]:
+    """[n] rows of [m, 3] small numbers that were not there before."""
+    number = rows.astype(np.uint64)
+    if len(number) and number.max() >= 1 << 21:
+        return np.arange(len(rows))
+    keys = number[:, 0] << np.uint64(42) | number[:, 1] << np.uint64(21) | number[:, 2]
+    first: NDArray[np.int64] = np.unique(keys, return_index=True)[1]
+    return first

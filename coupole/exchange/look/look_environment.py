@@ -1,0 +1,28 @@
+"""Light from all around for a page: as many directions as it averages, the denser the brighter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.exchange.look.look_blocks import Look
+from coupole.reflectance.new_light.environment import read_environment
+
+SAMPLES = 64
+"""As many as a page averages."""
+
+
+def with_environment(look: Look, path: Path | None, axes: NDArray[np.float64]) -> Look:
+    """The same with the light of a file; `axes` [3, 3] are its middle, left and up. Raises InputError, as
+    `read_environment`."""
+    if path is None:
+        return look
+    ways, radiances, density = read_environment(path, axes, np.ones(3)).sample(SAMPLES)
+    order = np.argsort(np.arange(SAMPLES) * 0.6180339887498949 % 1.0)  # so that the first few stand for all
+    irradiances = SAMPLES * radiances / density[:, None]
+    about = {"name": path.name, "ways": ways[order].tolist(), "irradiances": irradiances[order].tolist()}
+    told = look.about["told"] | {"Surroundings": f"{path.name}, {SAMPLES} directions of it"}
+    return replace(look, about=look.about | {"environment": about, "told": told})

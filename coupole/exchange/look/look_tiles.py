@@ -1,0 +1,65 @@
+"""A large picture as square tiles in levels, each half as wide as the one before: a page loads what it shows.
+
+Level 0 is the whole picture; row 0 of a tile is its uppermost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+TILE_PX = 256
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A square of a level; what lies outside of the picture is NaN."""
+
+    level: int
+    column: int
+    row: int
+    values: NDArray[np.float32]
+    """[n, TILE_PX, TILE_PX]"""
+
+    def name(self, of: str) -> str:
+        """Of its block."""
+        return f"{of}-{self.level}-{self.column}-{self.row}"
+
+
+def levels_of(width: int, height: int) -> list[list[int]]:
+    """Width and height, pixels, of each level; the last fits into one tile."""
+    found = [[width, height]]
+    while max(found[-1]) > TILE_PX:
+        found.append([-(-side // 2) for side in found[-1]])
+    return found
+
+
+def tiles_of(values: NDArray[np.float32]) -> Iterator[Tile]:
+    """Of a picture's values [n, h, w], NaN where there is none."""
+    height, width = values.shape[1:]
+    for level, _ in enumerate(levels_of(width, height)):
+        if level:
+            values = halved(values)
+        for row in range(-(-values.shape[1] // TILE_PX)):
+            for column in range(-(-values.shape[2] // TILE_PX)):
+                rows, columns = (slice(k * TILE_PX, (k + 1) * TILE_PX) for k in (row, column))
+                part = np.full((len(values), TILE_PX, TILE_PX), np.nan, np.float32)
+                inside = values[:, rows, columns]
+                part[:, : inside.shape[1], : inside.shape[2]] = inside
+                yield Tile(level, column, row, part)
+
+
+def halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[n, ceil(h / 2), ceil(w / 2)] means of those of 2 x 2 pixels that have a value."""
+    count, height, width = values.shape
+    found = np.empty((count, -(-height // 2), -(-width // 2)), np.float32)
+    for whole, half in zip(values, found, strict=True):
+        even = np.pad(whole, ((0, height % 2), (0, width % 2)), constant_values=np.nan)
+        four = np.stack([even[row::2, column::2] for row in (0, 1) for column in (0, 1)])
+        known = np.isfinite(four)
+        counted = known.sum(axis=0)
+        half[:] = np.where(counted, np.where(known, four, 0.0).sum(axis=0) / np.maximum(counted, 1), np.nan)
+    return found

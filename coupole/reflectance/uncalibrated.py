@@ -90,7 +90,7 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> Pict
 def lights_of_view(folder: Path, view: str | None) -> PicturedView:
     """What the pictures of a view of a run are taken with, without writing them. Raises as `write_pictures`."""
     run = Run(folder)
-    chosen = _frames_of(folder, open_light_frames([folder]), view)
+    chosen = frames_of_leds(folder, open_light_frames([folder]), view)
     return _nominal(read_plan(run.plan_path, run.rig_path), chosen, run.simulated)
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
-import colour
 import numpy as np
 import pytest
 import rawpy
 import tifffile
+from lazily import lazily
 from PIL import Image, ImageCms
 
 from coupole.errors import InputError
@@ -18,30 +19,35 @@ from coupole.exchange import dng, tiff_for_the_eye
 from coupole.exchange.camera_colour import CameraColour, camera_colour
 from coupole.exchange.exported_frame import Picture
 
-SHAPE = colour.SpectralShape(380, 780, 5)
+colour: Any = lazily("colour")
+
 BLACK, WHITE = 256, 16383
 SIDE = 32
 """Of a patch, px."""
-D65 = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]
+D65 = (0.3127, 0.3290)
 RGB = {"R": 0, "G": 1, "B": 2}
+
+
+def shape() -> Any:
+    return colour.SpectralShape(380, 780, 5)
 
 
 def sensor() -> np.ndarray:
     """[81, 3] of a camera that is known."""
-    return np.asarray(colour.MSDS_CAMERA_SENSITIVITIES["Nikon 5100 (NPL)"].copy().align(SHAPE).values)
+    return np.asarray(colour.MSDS_CAMERA_SENSITIVITIES["Nikon 5100 (NPL)"].copy().align(shape()).values)
 
 
 def lamp() -> np.ndarray:
     """[81] of a white LED."""
-    return np.asarray(colour.SDS_ILLUMINANTS["LED-B3"].copy().align(SHAPE).values)
+    return np.asarray(colour.SDS_ILLUMINANTS["LED-B3"].copy().align(shape()).values)
 
 
 def patches() -> tuple[np.ndarray, np.ndarray]:
     """[25, 81] reflectances of a colour checker and the perfect white, and their [25, 3] XYZ under D65."""
-    chart = [one.copy().align(SHAPE) for one in colour.SDS_COLOURCHECKERS["BabelColor Average"].values()]
-    chart.append(colour.SpectralDistribution(np.ones(SHAPE.wavelengths.size), SHAPE.wavelengths))
-    daylight = colour.SDS_ILLUMINANTS["D65"].copy().align(SHAPE)
-    eye = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(SHAPE)
+    chart = [one.copy().align(shape()) for one in colour.SDS_COLOURCHECKERS["BabelColor Average"].values()]
+    chart.append(colour.SpectralDistribution(np.ones(81), shape().wavelengths))
+    daylight = colour.SDS_ILLUMINANTS["D65"].copy().align(shape())
+    eye = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape())
     truth = [colour.sd_to_XYZ(one, eye, daylight, method="Integration") / 100.0 for one in chart]
     return np.stack([one.values for one in chart]), np.stack(truth)
 
@@ -51,7 +57,7 @@ def tables(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("spectra")
     paths = folder / "sensor.csv", folder / "led.csv"
     for path, values in zip(paths, (sensor(), lamp()[:, None]), strict=True):
-        np.savetxt(path, np.column_stack([SHAPE.wavelengths, values]), delimiter=";", fmt="%.8g")
+        np.savetxt(path, np.column_stack([shape().wavelengths, values]), delimiter=";", fmt="%.8g")
     return paths
 
 

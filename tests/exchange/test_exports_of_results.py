@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import cells
 import cv2
-import MaterialX
-import mitsuba
 import numpy as np
 import OpenEXR
 import pytest
 import trimesh
-from MaterialX import PyMaterialXGenGlsl, PyMaterialXGenShader
+from lazily import lazily
 from relight_cases import BASE_FROM_SUPPORT, Coat, moved, unit, waves, write_result
 
 from coupole.exchange.of_results.bsdf import encode as encode_bsdf
@@ -22,6 +21,11 @@ from coupole.exchange.of_results.material_tables import Material
 from coupole.exchange.of_results.merl import SCALES
 from coupole.exchange.of_results.merl import encode as encode_merl
 from coupole.reflectance.run_result import RunResult
+
+MaterialX: Any = lazily("MaterialX")
+PyMaterialXGenGlsl: Any = lazily("MaterialX.PyMaterialXGenGlsl")
+PyMaterialXGenShader: Any = lazily("MaterialX.PyMaterialXGenShader")
+mitsuba: Any = lazily("mitsuba")
 
 COAT = Coat((0.2, 0.1, 0.05), (0.06, 0.05, 0.04), 0.36)
 GLOSSY = Material("glossy", np.array([0.2, 0.15, 0.1]), np.array([0.05, 0.04, 0.03]), 0.2)

@@ -7,13 +7,14 @@ import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cells
-import colour
 import h5py
 import numpy as np
 import pytest
 from browser import needs_chromium
+from lazily import lazily
 from relief_in_mitsuba import Mitsuba
 from relight_cases import LED, Coat, sheet, waves, write_exr, write_result
 from selenium.webdriver.common.action_chains import ActionChains
@@ -27,6 +28,8 @@ from coupole.exchange.look.look_page import MOST_BYTES, write_page
 from coupole.reflectance.new_light.light_kinds import DistantLight, LedLight
 from coupole.reflectance.run_relighting import scene_from, scene_of_view
 from coupole.reflectance.run_result import RunResult
+
+colour: Any = lazily("colour")
 
 pytestmark = needs_chromium
 

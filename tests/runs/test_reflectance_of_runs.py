@@ -15,12 +15,12 @@ import cv2
 import h5py
 import numpy as np
 import OpenEXR
-import pycolmap
 import pytest
 import trimesh
 from arms import KR10_R1100_SIXX
 from cells import CellFolder
 from dask_cluster import cluster
+from lazily import lazily
 from relief_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, SIDE, shipped_cell, unit, walter
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
@@ -40,6 +40,8 @@ from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.sample_uncertainty import Places, Sources, bounds
 from coupole.reflectance.triangle_fit import fit_triangles
 from coupole.reflectance.uncalibrated import FILES, write_pictures
+
+pycolmap: Any = lazily("pycolmap")
 
 Made = tuple[CellFolder, Path, dict[str, Any]]
 

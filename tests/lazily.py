@@ -1,0 +1,16 @@
+"""Libraries that few tests want and that take a second to import: every worker imports every test's module."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+
+class lazily:  # noqa: N801  # reads as the import that it stands for
+    """`colour: Any = lazily("colour")` is the module from the first time on that something of it is asked for."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, attribute: str) -> Any:
+        return getattr(importlib.import_module(self._name), attribute)

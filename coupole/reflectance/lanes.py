@@ -204,7 +204,8 @@ def total(_context, numbers):  # type: ignore[no-untyped-def]
 
 @_compiled
 def gathered(_context, arrays, rows, place):  # type: ignore[no-untyped-def]
-    """The numbers at a place of eight `rows` [8] of `arrays` [m, n], of unsigned integers."""
+    """The numbers at a place of eight `rows` [8] of `arrays` [m, n], of unsigned integers or floats, in single
+    precision."""
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
         frames, chosen, place = values
@@ -217,7 +218,10 @@ def gathered(_context, arrays, rows, place):  # type: ignore[no-untyped-def]
             address = _address(context, builder, of_arrays, frames, row, place)
             number = builder.load(builder.inttoptr(address, own.as_pointer()))
             vector = builder.insert_element(vector, number, _INT(lane))
-        return builder.uitofp(vector, _vector(types.float32))
+        if isinstance(of_arrays.dtype, types.Integer):
+            return builder.uitofp(vector, _vector(types.float32))
+        single = of_arrays.dtype == types.float32
+        return vector if single else builder.fptrunc(vector, _vector(types.float32))
 
     return _KINDS[types.float32](arrays, rows, types.intp), generate
 

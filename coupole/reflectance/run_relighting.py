@@ -21,6 +21,7 @@ from coupole.reflectance.new_light.shading import (
     MIRROR_SHARE,
     Coats,
     Picture,
+    add_beam,
     add_beams,
     add_mirrored,
     add_values,
@@ -113,7 +114,10 @@ class RelitScene:
                 codes[lane] = reached(self.rays, self.surface, beam)
                 done += 1
                 say(done, work)
-            add_beams(picture, self.surface, coats, codes, beams, lobe_rays)
+            if len(beams) == 1 and beams[0].density == 0.0:
+                add_beam(picture, self.surface, coats, codes[0], beams[0])
+            else:
+                add_beams(picture, self.surface, coats, codes, beams, lobe_rays)
         for number, emitter in enumerate(lighting.emitters):
             add_mirrored(picture, self.surface, coats, self.rays, emitter, lobe_rays)
             say(len(lighting.beams) + number + 1, work)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from coupole.motion.occlusion import RAY_START_MM, blocked
 from coupole.reflectance.ggx import drawn, reflected, shine
-from coupole.reflectance.lanes import LANES, absolute, gathered, if_less, lanes, larger, loaded, root, total
+from coupole.reflectance.lanes import LANES, absolute, gathered, if_less, lanes, larger, loaded, root, store, total
 from coupole.reflectance.new_light.beams import Beam, Emitter
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 from coupole.reflectance.new_light.shadow_edges import DISTANT_MM, LIT, Codes
@@ -74,6 +74,19 @@ def add_beams(
         lambda rows: _add_beams(
             rows.start, surface.seen[rows], surface.places_mm[rows], flat, surface.camera_mm, coats, *of_beams,
             picture[rows],
+        ),
+    )  # fmt: skip
+
+
+def add_beam(picture: Picture, surface: Surface, coats: Coats, codes: Codes, beam: Beam) -> None:
+    """As `add_beams` of a single one that is no part of an emitter, where `codes` [h, w] say that it reaches."""
+    single = (values.astype(np.float32) for values in (surface.camera_mm, beam.place, beam.axis, beam.strength))
+    camera_mm, place, axis, strength = single
+    in_strips(
+        len(picture),
+        lambda rows: _add_beam(
+            surface.seen[rows], surface.places_mm[rows].reshape(-1, 3), codes[rows], camera_mm, coats, beam.near,
+            place, axis, beam.exponent, strength, picture[rows],
         ),
     )  # fmt: skip
 
@@ -197,6 +210,69 @@ def _add_beams(  # type: ignore[no-untyped-def]
                 light = reach * loaded(strengths, channel)
                 shining = coat[4 + channels + channel] * total(light * lobe)
                 picture[row, column, channel] += coat[4 + channel] * total(light) + shining
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_beam(  # type: ignore[no-untyped-def]
+    seen, places_mm, codes, camera_mm, coats, near, place, axis, exponent, strength, picture
+):
+    """Eight neighbouring pixels of a row in the lanes."""
+    (height, width), channels, none, half = seen.shape, picture.shape[2], np.float32(0.0), np.float32(0.5)
+    pixel, triangle = np.zeros(LANES, np.int64), np.zeros(LANES, np.int64)
+    on, added = np.zeros((1, LANES), np.float32), np.empty((channels, LANES), np.float32)
+    for row in range(height):
+        for first in range(0, width, LANES):
+            count = min(LANES, width - first)
+            on[:] = none
+            for k in range(count):
+                mine = seen[row, first + k]
+                pixel[k], triangle[k] = row * width + first + k, max(mine, 0)
+                on[0, k] = mine >= 0 and codes[row, first + k] == LIT and coats[max(mine, 0), 3] > none
+            if not on.any():
+                continue
+            lit = loaded(on, 0)
+            x, y, z = gathered(places_mm, pixel, 0), gathered(places_mm, pixel, 1), gathered(places_mm, pixel, 2)
+            n0, n1, n2 = gathered(coats, triangle, 0), gathered(coats, triangle, 1), gathered(coats, triangle, 2)
+            l0, l1, l2, reach = _reach_from(near, place, axis, exponent, x, y, z)
+            v0, v1, v2 = camera_mm[0] - x, camera_mm[1] - y, camera_mm[2] - z
+            inverse = np.float32(1.0) / root(v0 * v0 + v1 * v1 + v2 * v2)
+            v0, v1, v2 = v0 * inverse, v1 * inverse, v2 * inverse
+            nl, nv = larger(n0 * l0 + n1 * l1 + n2 * l2, none), n0 * v0 + n1 * v1 + n2 * v2
+            lobe = _lobe(n0, n1, n2, l0 + v0, l1 + v1, l2 + v2, nl, nv, gathered(coats, triangle, 3))
+            reach = if_less(half, lit, reach * nl, none)
+            for channel in range(channels):
+                kd, ks = gathered(coats, triangle, 4 + channel), gathered(coats, triangle, 4 + channels + channel)
+                store(if_less(half, lit, reach * strength[channel] * (kd + ks * lobe), none), added, channel)
+            for k in range(count):
+                for channel in range(channels):
+                    picture[row, first + k, channel] += added[channel, k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _reach_from(near, place, axis, exponent, x, y, z):  # type: ignore[no-untyped-def]
+    """As `_reach`, of one beam from eight places."""
+    if not near:
+        return lanes(place[0]), lanes(place[1]), lanes(place[2]), lanes(np.float32(1.0))
+    dx, dy, dz = place[0] - x, place[1] - y, place[2] - z
+    inverse = np.float32(1.0) / root(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz, found = dx * inverse, dy * inverse, dz * inverse, np.float32(1e6) * inverse * inverse
+    for _ in range(exponent):
+        found = found * larger(np.float32(-1.0) * (dx * axis[0] + dy * axis[1] + dz * axis[2]), np.float32(0.0))
+    return dx, dy, dz, found
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _lobe(n0, n1, n2, h0, h1, h2, nl, nv, alpha):  # type: ignore[no-untyped-def]
+    """D V of eight pixels, by `_facets`' sines; 0 where the normal looks away from the camera."""
+    one, none = np.float32(1.0), np.float32(0.0)
+    x, y, z = n1 * h2 - n2 * h1, n2 * h0 - n0 * h2, n0 * h1 - n1 * h0
+    sin2 = (x * x + y * y + z * z) / (h0 * h0 + h1 * h1 + h2 * h2)
+    alpha2 = alpha * alpha
+    rest = one - alpha2
+    t = alpha2 + rest * sin2
+    a, b = root(alpha2 + rest * nl * nl), root(alpha2 + rest * nv * nv)
+    found = np.float32(0.5 / math.pi) * alpha2 / (t * t * (nl * b + nv * a))
+    return if_less(none, nv, found, none)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -55,6 +55,7 @@ prepare_packages() {
 # in another file: after another commit was checked out it compiles anew.
 forget_stale_kernels() {
     local made_for="$root/.tools/kernels" commit
+    [[ -e "$root/.git" && -w "$root" ]] || return 0
     commit=$(git -C "$root" rev-parse HEAD 2>/dev/null) || return 0
     [[ -f "$made_for" && "$(<"$made_for")" == "$commit" ]] && return 0
     find "$root/coupole" "$root/drivers" "$root/sim" -name '*.nbi' -delete

@@ -50,8 +50,9 @@ class Neighbours:
         """Those in the directions nearest to its own, as the object's middle has them."""
         ways = led_mm - middle_mm
         ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-        found = cKDTree(ways).query(ways, k=min(BESIDE + 1, len(ways)))[1]
-        return cls(np.asarray(found[:, 1:], np.int64))
+        if len(ways) < 2:
+            return cls(np.zeros((len(ways), 0), np.int64))
+        return cls(np.asarray(cKDTree(ways).query(ways, k=range(2, min(BESIDE, len(ways) - 1) + 2))[1], np.int64))
 
 
 def contradicted(
@@ -64,7 +65,7 @@ def contradicted(
     with np.errstate(divide="ignore", invalid="ignore"):
         diffuse = materials.kd[:, None] * np.maximum(cosine, 0.0)[..., None] / whole
         ratio = samples.values / whole
-    u_ratio = np.nan_to_num(u_noise.astype(np.float32))
+    u_ratio = np.nan_to_num(u_noise.astype(np.float32), nan=np.inf)  # of unknown noise nothing contradicts
     known = np.isfinite(ratio)
     low = known & (ratio < _AGREE[0]) & (ratio + _SIGMA * u_ratio * ratio < 1.0) & (diffuse > _LEAST_DIFFUSE)
     dark: NDArray[np.bool_] = known.any(axis=2) & (low | ~known).all(axis=2)

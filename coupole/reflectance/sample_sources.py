@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from coupole.errors import InputError
+from coupole.reflectance.extraction.lamp_sight import REACHED
 from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples, u_inter_reflection
 from coupole.reflectance.sample_uncertainty import Places, Sources
 
@@ -54,20 +57,22 @@ def channel_samples(
         if "lateral_u_mm" not in file.attrs:
             raise InputError(f"{view.path}: an earlier version made it; make the result anew")
         lateral_u_mm, led_u_mm = float(file.attrs["lateral_u_mm"]), float(file.attrs["led_u_mm"])
-        beside = _beside(file, rows, lateral_u_mm, result.areas_mm2[view.triangles])
+        beside = _beside(view.path, rows, lateral_u_mm, result.areas_mm2[view.triangles])
         used = np.unique(np.append(rows, beside.rows))
 
         def table(name: str) -> Floats:
             return _table(file[name], used, leds, channel)
 
         f, u_noise, own = table("f"), table("u_own"), np.searchsorted(used, rows)
+        dark = _table(file["codes"], used, leds, None) != REACHED
         indirect = np.zeros(f.shape)
         if view.inter_reflection is not None:
             indirect = u_inter_reflection(table(INTER_REFLECTION).astype(np.float16))
         u_response = file["u_response"][:, channel][rows]
         u_own, u_shared = (file[name][:, channel][leds] for name in ("led_u_own", "led_u_shared"))
         incidence = _cosines(file["centres_mm"][:][used], file["normals"][:][used], view.led_mm[leds])
-    u_place = beside.uncertainty(f * incidence, u_noise, own, np.searchsorted(used, beside.rows), lateral_u_mm)
+    signal, u_signal = np.where(dark, 0.0, f * incidence), np.where(dark, 0.0, u_noise)
+    u_place = beside.uncertainty(signal, u_signal, own, np.searchsorted(used, beside.rows), lateral_u_mm)
     grid = (len(rows), len(leds))
 
     def each(values: Floats, shape: tuple[int, ...]) -> Floats:
@@ -104,7 +109,8 @@ class _Beside:
     ) -> Floats:
         """[n, leds] relative standard uncertainty of `signal` [used, leds], in any unit, of triangles at places
         `own` [n] by those at `beside` [n, sides]: what they differ by, less what noise alone makes them differ by,
-        as the square of the shift over that of the distance, at most as far as they are away."""
+        as the square of the shift over that of the distance, at most as far as they are away. 1 where nothing
+        beside is known."""
         mine, noise = signal[own], (signal[own] * u_noise[own]) ** 2
         share = np.minimum(2.0 * lateral_u_mm**2 / np.maximum(self.square_mm2, 1e-12), 1.0)
         total, count = np.zeros(mine.shape), np.zeros(mine.shape)
@@ -115,13 +121,22 @@ class _Beside:
             total += np.where(known, share[:, side, None] * apart, 0.0)
             count += known
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.sqrt(np.maximum(total / np.maximum(count, 1), 0.0)) / np.abs(mine)
+            found: Floats = np.sqrt(np.maximum(total / np.maximum(count, 1), 0.0)) / np.abs(mine)
+        return np.where(count > 0, found, 1.0)
 
 
-def _beside(file: h5py.File, rows: Integers, lateral_u_mm: float, areas_mm2: Floats) -> _Beside:
+@lru_cache(maxsize=4)
+def _centres(path: Path) -> tuple[Floats, Floats, cKDTree]:
+    """Of a view's triangles, mm; the projection centre; the former in a tree."""
+    with h5py.File(path, "r") as file:
+        centres_mm = file["centres_mm"][()]
+        return centres_mm, file["camera_mm"][()], cKDTree(centres_mm)
+
+
+def _beside(path: Path, rows: Integers, lateral_u_mm: float, areas_mm2: Floats) -> _Beside:
     """Triangles as far away as a picture is likely to be off, or the nearest ones, on all sides of `rows`, in the
     plane across the line of sight."""
-    centres_mm, camera_mm = file["centres_mm"][()], file["camera_mm"][()]
+    centres_mm, camera_mm, tree = _centres(path)
     mine = centres_mm[rows]
     towards = camera_mm - mine
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
@@ -129,7 +144,7 @@ def _beside(file: h5py.File, rows: Integers, lateral_u_mm: float, areas_mm2: Flo
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     up = np.cross(right, towards)
     far_mm = np.maximum(np.sqrt(2.0) * lateral_u_mm, _BESIDE * np.sqrt(areas_mm2[rows]))
-    tree, found = cKDTree(centres_mm), np.empty((len(rows), _SIDES), np.int64)
+    found = np.empty((len(rows), _SIDES), np.int64)
     square_mm2 = np.zeros(found.shape)
     for side in range(_SIDES):
         angle = 2.0 * np.pi * side / _SIDES
@@ -149,8 +164,9 @@ def _cosines(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:
     return found
 
 
-def _table(data: h5py.Dataset, rows: Integers, leds: Integers, channel: int) -> Floats:
-    """[rows, leds] of a channel, by rows or by LEDs, whichever reads less of the file."""
+def _table(data: h5py.Dataset, rows: Integers, leds: Integers, channel: int | None) -> Floats:
+    """[rows, leds] of a channel, if there are channels, by rows or by LEDs, whichever reads less of the file."""
+    own = () if channel is None else (channel,)
     if len(rows) * data.shape[1] < len(leds) * data.shape[0]:
-        return np.stack([data[int(row), :, channel][leds] for row in rows]).astype(np.float64)
-    return np.stack([data[:, int(led), channel][rows] for led in leds], axis=1).astype(np.float64)
+        return np.stack([data[(int(row), slice(None), *own)][leds] for row in rows]).astype(np.float64)
+    return np.stack([data[(slice(None), int(led), *own)][rows] for led in leds], axis=1).astype(np.float64)

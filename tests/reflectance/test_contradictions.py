@@ -29,7 +29,7 @@ def test_of_what_nothing_shades_nothing_is_left_out(shiny: TriangleSamples) -> N
     assert found(shiny).mean() < 1e-3
 
 
-def test_samples_that_lost_half_of_their_light_are_found(shiny: TriangleSamples) -> None:
+def test_of_samples_that_lost_more_than_half_of_their_light_many_are_found(shiny: TriangleSamples) -> None:
     """A strip of LEDs as a cable hides it, from every second triangle; where a lobe is most of the light
     nothing is said."""
     ways = shiny.led_mm - shiny.centres_mm.mean(axis=0)
@@ -54,3 +54,16 @@ def test_one_channel_alone_is_no_shadow(shiny: TriangleSamples) -> None:
     values = shiny.values.copy()
     values[:, 100:110, 1] *= 0.3
     assert found(replace(shiny, values=values)).mean() < 1e-3
+
+
+def test_nothing_is_left_out_where_noise_is_not_known_or_there_is_one_led(shiny: TriangleSamples) -> None:
+    values = shiny.values.copy()
+    values[::2, 20] *= 0.4
+    dim = replace(shiny, values=values)
+    materials = fit_triangles(dim, np.ones(len(shiny.led_mm), bool), 30.0)
+    beside = Neighbours.of(shiny.led_mm, shiny.centres_mm.mean(axis=0))
+    assert contradicted(dim, materials, np.full(values.shape, NOISE), beside).any()
+    assert not contradicted(dim, materials, np.full(values.shape, np.nan, np.float16), beside).any()
+    alone = replace(dim, values=values[:, 20:21], led_mm=shiny.led_mm[20:21], view_of=shiny.view_of[20:21])
+    beside = Neighbours.of(alone.led_mm, alone.centres_mm.mean(axis=0))
+    assert not contradicted(alone, materials, np.full(alone.values.shape, NOISE), beside).any()

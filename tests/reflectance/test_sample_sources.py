@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from coupole.errors import InputError
+from coupole.reflectance.extraction.lamp_sight import SHADED
 from coupole.reflectance.sample_sources import ChannelSamples, channel_samples
 
 SIDE, PITCH_MM = 40, 0.5
@@ -32,6 +33,7 @@ def sheet(folder: Path, shift_mm: float, u_noise: float, brightness: Any) -> tup
         values = {"f": f, "u_own": np.full(f.shape, u_noise), "u_response": np.full((count, 1), 0.002)}
         values |= {"led_u_own": np.full((2, 1), 0.01), "led_u_shared": np.full((2, 1), 0.006)}
         values |= {"centres_mm": centres, "normals": np.tile([0.0, 0, 1], (count, 1)), "camera_mm": [0.0, 0, 1e6]}
+        file["codes"] = np.zeros((count, 2), np.uint8)
         for name, data in values.items():
             file[name] = np.asarray(data, np.float16 if name in ("f", "u_own") else np.float64)
     corners = centres[:, None] + PITCH_MM * np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]]) / 3
@@ -72,6 +74,22 @@ def test_an_edge_counts_on_both_sides_of_it_and_nowhere_else(tmp_path: Path) -> 
     away_mm = np.abs(edge.places.corners_mm[:, :, 0].mean(axis=1) - 10.25)
     assert (edge.sources.u_place[away_mm < 0.3] > 0.2).all()
     assert (edge.sources.u_place[away_mm > 1.0] < 1e-6).all()
+
+
+def test_a_neighbour_in_shadow_is_dark_and_one_that_nobody_knows_may_be(tmp_path: Path) -> None:
+    made = sheet(tmp_path, 0.3, 0.0, lambda places: np.full(len(places), 1.0))
+    with h5py.File(made[1].path, "a") as file:
+        x, f, codes = file["centres_mm"][:, 0], file["f"][()], file["codes"][()]
+        f[x > 10.2, 0], codes[x > 10.2, 0] = np.nan, SHADED
+        lonely = int(inner()[100])
+        f[:, 1] = np.where(np.arange(len(f)) == lonely, 1.0, np.nan)[:, None]
+        file["f"][()], file["codes"][()] = f, codes
+    mine = of(made, inner())
+    away_mm = np.abs(mine.places.corners_mm[:, :, 0].mean(axis=1) - 10.25)
+    lit = np.isfinite(mine.f)
+    assert (mine.sources.u_place[lit & (mine.leds == 0) & (away_mm < 0.3)] > 0.2).all()
+    assert (mine.sources.u_place[lit & (mine.leds == 0) & (away_mm > 1.0)] < 1e-6).all()
+    assert mine.sources.u_place[lit & (mine.leds == 1)].tolist() == [1.0]
 
 
 def test_the_other_sources_come_from_the_file_row_by_row_or_led_by_led(tmp_path: Path) -> None:

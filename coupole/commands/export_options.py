@@ -14,7 +14,8 @@ from coupole.exchange.rti import FORMATS as OF_VIEWS
 from coupole.exchange.rti import OF_RUNS_ONLY
 
 OF_RUNS = (*FORMATS, *OF_VIEWS, COLMAP, CRATE)
-_OF_PICTURES = [name for name in OF_VIEWS if name not in OF_RUNS_ONLY]
+OF_RESULTS_OF_RUNS = (*OF_RESULTS, CRATE)
+OF_PICTURES = tuple(name for name in OF_VIEWS if name not in OF_RUNS_ONLY)
 _COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "What the crate says (rocrate)"
 _SHOWN = "How views are shown (relight, iiif)"
 
@@ -22,8 +23,8 @@ ToOption = Annotated[
     str,
     typer.Option(
         "--to",
-        help=f"Of runs: {', '.join(OF_RUNS)}. Of results: {', '.join((*OF_RESULTS, CRATE))}; "
-        f"of results of pictures: {', '.join(_OF_PICTURES)}.",
+        help=f"Of runs: {', '.join(OF_RUNS)}. Of results of runs: {', '.join(OF_RESULTS_OF_RUNS)}; "
+        f"of results of pictures: {', '.join(OF_PICTURES)}.",
         show_default=False,
     ),
 ]

@@ -12,6 +12,9 @@ import typer
 
 from coupole.commands.common import JsonOption, RecordsOption, fail, records_named
 from coupole.commands.export_options import (
+    OF_PICTURES,
+    OF_RESULTS_OF_RUNS,
+    OF_RUNS,
     AuthorOption,
     BaseUrlOption,
     BasisOption,
@@ -54,9 +57,9 @@ class Asked:
     """By name, only those that were given."""
 
     def refuse(self, names: tuple[str, ...], why: str) -> None:
-        """Raise InputError if one of these options was given."""
-        if any(name in self.options for name in names):
-            raise InputError(f"{', '.join(f'--{name}' for name in names)}: {why}")
+        """Raise InputError if one of these options was given; `why` is what they are for."""
+        if given := [f"--{name}" for name in names if name in self.options]:
+            raise InputError(f"{', '.join(given)}: {'is' if len(given) == 1 else 'are'} {why}")
 
     def texts(self, name: str) -> list[str]:
         found = self.options.get(name, [])
@@ -128,11 +131,14 @@ def export(
         "basis": basis, "planes": planes, "base-url": base_url,
     }  # fmt: skip
     folder = source if in_place else out or source / "export"
-    asked = Asked(source, to, folder, overwrite, {key: value for key, value in given.items() if value})
-    if triangle:
-        asked.options["triangle"] = triangle
+    options: dict[str, object] = {
+        key: value for key, value in given.items() if value is not False and value not in (None, [])
+    }
+    asked = Asked(source, to, folder, overwrite, options)
     console = make_console(quiet=as_json)
     try:
+        if in_place and out is not None:
+            raise InputError("--in-place writes into SOURCE: give it, or --out, not both")
         found = _written(asked, console)
     except CoupoleError as error:
         fail(error, as_json=as_json)
@@ -148,18 +154,19 @@ def export(
 def _written(asked: Asked, console: Console) -> Found:
     of_run = (asked.source / "object.h5").exists()
     of_pictures = (asked.source / "normals.npy").exists()
+    _refuse_unknown(asked, of_run=of_run, of_pictures=of_pictures)
     if of_run:
-        asked.refuse(_OF_FRAMES, "are for the frames of a run; this is a result")
+        asked.refuse(_OF_FRAMES, "for the frames of a run; this is a result")
     else:
-        asked.refuse(_OF_A_RESULT, "are for results of reflectance of runs")
+        asked.refuse(_OF_A_RESULT, "for results of reflectance of runs")
     if asked.to != CRATE:
-        asked.refuse(_OF_A_CRATE, f"are for --to {CRATE}")
+        asked.refuse(_OF_A_CRATE, f"for --to {CRATE}")
     if of_run or of_pictures or asked.to not in FORMATS:
-        asked.refuse(_OF_COLOUR, "are for frames of a run as dng or tiff")
+        asked.refuse(_OF_COLOUR, "for frames of a run as dng or tiff")
     if asked.to != COLMAP:
-        asked.refuse(("refined",), f"is for --to {COLMAP}")
+        asked.refuse(("refined",), f"for --to {COLMAP}")
         if asked.to not in FORMATS:
-            asked.refuse(("calibrations",), f"is for {COLMAP}, and for colour of frames")
+            asked.refuse(("calibrations",), f"for {COLMAP}, and for colour of frames")
     _refuse_misplaced(asked)
     if asked.to == CRATE:
         return _export_crate(asked, console)
@@ -172,19 +179,35 @@ def _written(asked: Asked, console: Console) -> Found:
     return _export_frames(asked, console)
 
 
+def _refuse_unknown(asked: Asked, *, of_run: bool, of_pictures: bool) -> None:
+    """Raise InputError for a format that there is none of for the source, or an option without a value."""
+    if of_run:
+        formats, kind = OF_RESULTS_OF_RUNS, "a result"
+    elif of_pictures:
+        formats, kind = OF_PICTURES, "a result of pictures"
+    else:
+        formats, kind = OF_RUNS, "a run"
+    if asked.to not in formats:
+        why = f"; {CRATE} is for runs and their results" if asked.to == CRATE else ""
+        raise InputError(f"--to: expected one of {', '.join(formats)} for {kind}; found {asked.to}{why}")
+    for name, value in asked.options.items():
+        if value == "" or (isinstance(value, list) and "" in value):
+            raise InputError(f"--{name}: is empty; give a value, or leave it out")
+
+
 def _refuse_misplaced(asked: Asked) -> None:
     """Raise InputError for options of another kind of views, or values that they do not have."""
     from coupole.exchange.rti.relight_web import BASES, PLANES
 
     basis, planes = asked.text("basis"), asked.options.get("planes")
     if asked.to != "relight":
-        asked.refuse(("basis", "planes"), f"are for --to relight; found --to {asked.to}")
+        asked.refuse(("basis", "planes"), f"for --to relight; found --to {asked.to}")
     if basis is not None and basis not in BASES:
         raise InputError(f"--basis: expected one of {', '.join(BASES)}; found {basis}")
     if planes is not None and (planes not in PLANES or basis in ("ptm", "hsh")):
         raise InputError(f"--planes {planes}: expected {' or '.join(map(str, PLANES))}, with bilinear or rbf")
     if asked.to != "iiif":
-        asked.refuse(("base-url",), f"is for --to iiif; found --to {asked.to}")
+        asked.refuse(("base-url",), f"for --to iiif; found --to {asked.to}")
 
 
 def _export_result(asked: Asked, console: Console) -> Found:
@@ -207,7 +230,7 @@ def _export_views(asked: Asked, console: Console) -> Found:
     from coupole.exchange.rti.export_views import HowShown, export_views
     from coupole.viewing.terminal import step_bars
 
-    asked.refuse(("shots",), "are for single frames; of views all LEDs are written")
+    asked.refuse(("shots",), "for single frames; of views all LEDs are written")
     given = {name.replace("-", "_"): asked.options.get(name) for name in ("basis", "planes", "base-url")}
     how = HowShown(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
     views = asked.texts("views")
@@ -219,7 +242,7 @@ def _export_views(asked: Asked, console: Console) -> Found:
 def _export_colmap(asked: Asked, console: Console) -> Found:
     from coupole.exchange.colmap import export_colmap
 
-    asked.refuse(_OF_FRAMES, f"are for single frames; {COLMAP} has all views")
+    asked.refuse(_OF_FRAMES, f"for single frames; {COLMAP} has all views")
     return _sizes(
         _with_bars(
             console,
@@ -238,7 +261,7 @@ def _export_colmap(asked: Asked, console: Console) -> Found:
 def _export_crate(asked: Asked, console: Console) -> Found:
     from coupole.exchange.research_crate import CrateFacts, write_crate
 
-    asked.refuse((*_OF_FRAMES, *_OF_A_RESULT), f"are for parts; {CRATE} has all files")
+    asked.refuse((*_OF_FRAMES, *_OF_A_RESULT), f"for parts; {CRATE} has all files")
     facts = CrateFacts(
         asked.text("licence"),
         tuple(asked.texts("author")),
@@ -287,9 +310,9 @@ def _colour_of(asked: Asked) -> ColourWanted | None:
     if eye and asked.to != "tiff":
         raise InputError(f"--for-the-eye: is for --to tiff; a {asked.to} with --sensor-spectra has its colours")
     if not eye:
-        asked.refuse(("linear",), "goes with --for-the-eye")
+        asked.refuse(("linear",), "for --for-the-eye")
         if asked.to == "tiff":
-            asked.refuse(("sensor-spectra", "led-spectrum"), "are for --for-the-eye, or for --to dng")
+            asked.refuse(("sensor-spectra", "led-spectrum"), "for --for-the-eye, or for --to dng")
     if sensor is None:
         if eye or "led-spectrum" in asked.options or "calibrations" in asked.options:
             raise InputError("--sensor-spectra: expected a table of nm, red, green, blue, from the sensor's maker")

@@ -5,4 +5,4 @@ FORMATS = ("dng", "tiff")
 COLMAP = "colmap"
 """What views are exported to with their poses (`coupole.exchange.colmap`)."""
 CRATE = "rocrate"
-"""What wraps a run or a result with what is to be known of it (`coupole.exchange.research_crate`)."""
+"""What wraps a run or a result of runs with what is to be known of it (`coupole.exchange.research_crate`)."""

@@ -25,6 +25,8 @@ _NOISE = 0.02
 """Of a table's greatest value, that it may fall below 0."""
 D65_CODE = 21
 """EXIF's LightSource."""
+_LARGEST_CONDITION = 1e5
+"""Of the covariance of what the channels give of reflectances; that of real sensors is below 1e4."""
 _CORRELATED_NM = 50.0
 """Of reflectances: the standard deviation of their covariance over wavelength."""
 
@@ -50,7 +52,8 @@ def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None
     """From tables of the sensor's sensitivities (nm, red, green, blue; relative to each other) and of the LEDs'
     spectral power (nm, power). `white_of_leds` is what the channels measured of white, if a record has it.
 
-    Raises InputError for other tables, or without colour-science, which has the CIE's observer.
+    Raises InputError for other tables, channels that do not tell colours apart, or without colour-science, which
+    has the CIE's observer.
     """
     from coupole.appearance.spectra.grid import WAVELENGTHS_NM
     from coupole.appearance.spectra.light import illuminant, observer
@@ -68,7 +71,14 @@ def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None
         ) from error
     towards = functions * daylight / (functions[1] @ daylight)
     apart = (WAVELENGTHS_NM[:, None] - WAVELENGTHS_NM) / _CORRELATED_NM
-    matrix = _least_missing(signals / white[:, None], towards, np.exp(-0.5 * apart**2) + 1.0)
+    covariance = np.exp(-0.5 * apart**2) + 1.0
+    balanced = signals / white[:, None]
+    if np.linalg.cond(balanced @ covariance @ balanced.T) > _LARGEST_CONDITION:
+        raise InputError(
+            f"{sensor}: its channels are too much alike under the light of {leds} to tell colours apart; expected "
+            "sensitivities of red, green and blue that differ in shape"
+        )
+    matrix = _least_missing(balanced, towards, covariance)
     neutral = white / white.max()
     known = "measured by the record of the LEDs' power" if white_of_leds is not None else "by the spectra"
     told = f"XYZ under D65, 1931 observer, by the spectra {sensor.name} and {leds.name}; white {known}"

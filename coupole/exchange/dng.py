@@ -16,6 +16,7 @@ from fractions import Fraction
 import numpy as np
 
 import coupole
+from coupole.errors import InputError
 from coupole.exchange.camera_colour import D65_CODE, CameraColour, unknown_colour
 from coupole.exchange.exported_frame import Picture
 from coupole.storage.packing import pack12
@@ -38,7 +39,10 @@ class Tag:
 
 
 def encode(picture: Picture, colour: CameraColour | None = None) -> bytes:
-    """The whole file: header, two directories, each with values that do not fit into it, one strip of pixels."""
+    """The whole file: header, two directories, each with values that do not fit into it, one strip of pixels.
+    Raises InputError for colours of a camera that has none."""
+    if colour is not None and picture.pattern == "MONO":
+        raise InputError("--sensor-spectra: the camera's pattern is MONO; it has no colours")
     height, width = picture.pixels.shape
     twelve = width % 2 == 0 and max(picture.white_dn, int(picture.pixels.max())) < 4096
     strip = pack12(picture.pixels, "msb").tobytes() if twelve else picture.pixels.astype("<u2").tobytes()
@@ -75,7 +79,8 @@ def _image_tags(height: int, width: int, *, bits: int, strip_bytes: int) -> list
 
 
 def _camera_tags(picture: Picture, colour: CameraColour) -> list[Tag]:
-    about = {**picture.about, "bayer_pattern": picture.pattern, "colour": colour.told}
+    told = "none: the sensor has no filters" if picture.pattern == "MONO" else colour.told
+    about = {**picture.about, "bayer_pattern": picture.pattern, "colour": told}
     camera = str(about.get("camera", "unknown camera")) + (" (simulated)" if about["simulated"] else "")
     return [
         _ascii(270, json.dumps(about)),  # ImageDescription

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from coupole.errors import InputError
 from coupole.exchange.target_folder import writing_into
@@ -62,8 +63,10 @@ def write_crate(
     """Write the crate into `out`: its files below `data/`, hard links where the file system allows them, else
     copies. With `in_place` only the metadata is written, into `source`.
 
-    Raises InputError: no licence or author is known, a run that is being acquired, a folder that has files (unless
-    `overwrite`); DiskFull or StorageError.
+    With `overwrite` the files of a crate that is in `out` are removed first; what else is there is kept.
+
+    Raises InputError: no licence or author is known, or one is named twice, a run that is being acquired, an `out`
+    that holds the source, or has files (unless `overwrite`); DiskFull or StorageError.
     """
     described = _described(source)
     licence = facts.licence or described.get("licence")
@@ -71,13 +74,22 @@ def write_crate(
         raise InputError("--licence: RO-Crate demands one and the plan names none; give its URL, or words")
     if not facts.authors:
         raise InputError("--author: expected at least one, 'NAME <https://orcid.org/...> at HOUSE' or a name")
+    people = _people(facts.authors)
     root = source if in_place else out
+    if not in_place and source.resolve().is_relative_to(root.resolve()):
+        raise InputError(f"{root}: holds SOURCE. Choose another --out, or give --in-place")
     if not overwrite and ((root / METADATA).exists() or (not in_place and root.is_dir() and any(root.iterdir()))):
         raise InputError(f"{root}: has files already. Choose another --out, or give --overwrite")
+    if not in_place and (root / DATA).exists() and not (root / METADATA).exists():
+        raise InputError(
+            f"{root / DATA}: is no crate's, {METADATA} is missing. Remove it, or choose another --out"
+        )
     inside = "" if in_place else f"{DATA}/"
     paths = sorted(_files(source, without=None if in_place else root))
     files, written = [], []
     with writing_into(root):
+        if not in_place and (root / DATA).exists():
+            shutil.rmtree(root / DATA)
         for number, path in enumerate(paths):
             inner = path.relative_to(source).as_posix()
             files.append(_file_entity(path, f"{inside}{inner}"))
@@ -85,7 +97,7 @@ def write_crate(
                 written.append(root / DATA / inner)
                 _link(path, written[-1])
             say("files", number + 1, len(paths))
-        graph = [*_entities(source, described, licence, facts, files)]
+        graph = [*_entities(source, described, licence, facts, people, files)]
         document = {"@context": f"{_SPECIFICATION}/context", "@graph": graph}
         write_synced(root / METADATA, json.dumps(document, indent=1, ensure_ascii=False) + "\n")
     return [root / METADATA, *written]
@@ -132,9 +144,13 @@ def _files(source: Path, without: Path | None) -> Iterator[Path]:
 
 
 def _entities(
-    source: Path, described: dict[str, Any], licence: str, facts: CrateFacts, files: Sequence[Entity]
+    source: Path,
+    described: dict[str, Any],
+    licence: str,
+    facts: CrateFacts,
+    people: Sequence[tuple[Entity, Entity | None]],
+    files: Sequence[Entity],
 ) -> Iterator[Entity]:
-    people = [_person(text) for text in facts.authors]
     authors = [person for person, _ in people]
     houses = {house["@id"]: house for _, house in people if house is not None}
     softwares = [_software(name, version) for name, version in described["software"].items()]
@@ -192,13 +208,21 @@ def _entities(
 def _file_entity(path: Path, inner: str) -> Entity:
     known = _TOLD.get(path.suffix) or mimetypes.guess_type(path.name)[0] or "application/octet-stream"
     return {
-        "@id": inner.replace("%", "%25").replace(" ", "%20"),
+        "@id": quote(inner),
         "@type": "File",
         "name": Path(inner).name,
         "encodingFormat": "application/x-hdf5" if known == "HDF5" else known,
         "contentSize": str(path.stat().st_size),
         "identifier": f"sha256:{sha256(path)}",
     }
+
+
+def _people(texts: Sequence[str]) -> list[tuple[Entity, Entity | None]]:
+    people = [_person(text) for text in texts]
+    ids = [person["@id"] for person, _ in people]
+    if twice := [one for one in ids if ids.count(one) > 1]:
+        raise InputError(f"--author: {twice[0]} is named twice; give an ORCID where names are alike")
+    return people
 
 
 def _person(text: str) -> tuple[Entity, Entity | None]:
@@ -211,7 +235,7 @@ def _person(text: str) -> tuple[Entity, Entity | None]:
             f"--author {text!r}: expected 'NAME', 'NAME <https://orcid.org/0000-0000-0000-0000>', and ' at HOUSE' "
             "behind it if it is to be named"
         )
-    person = {"@id": url or f"#{_plain(name)}", "@type": "Person", "name": name}
+    person = {"@id": url or f"#person-{_part_of_id(name)}", "@type": "Person", "name": name}
     if not house:
         return person, None
     organisation = _organisation(house)
@@ -219,11 +243,12 @@ def _person(text: str) -> tuple[Entity, Entity | None]:
 
 
 def _organisation(name: str) -> Entity:
-    return {"@id": f"#organisation-{_plain(name)}", "@type": "Organization", "name": name}
+    return {"@id": f"#organisation-{_part_of_id(name)}", "@type": "Organization", "name": name}
 
 
-def _plain(name: str) -> str:
-    return re.sub(r"\W+", "-", name, flags=re.ASCII)
+def _part_of_id(name: str) -> str:
+    """Of a URI; other names give other ids."""
+    return quote(name, safe="")
 
 
 def _licence(text: str) -> Entity:
@@ -233,7 +258,8 @@ def _licence(text: str) -> Entity:
 
 
 def _software(name: str, version: str) -> Entity:
-    return {"@id": f"#software-{name}", "@type": "SoftwareApplication", "name": name, "version": version}
+    own = f"#software-{_part_of_id(name)}"
+    return {"@id": own, "@type": "SoftwareApplication", "name": name, "version": version}
 
 
 def _to(entity: Entity) -> Entity:

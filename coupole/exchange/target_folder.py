@@ -21,11 +21,14 @@ def refuse_standing(paths: Sequence[Path]) -> None:
 
 @contextmanager
 def writing_into(folder: Path) -> Iterator[None]:
-    """Make the folder; an operating system's error becomes DiskFull or StorageError."""
+    """Make the folder; an operating system's error becomes DiskFull or StorageError, a file in the folder's place
+    InputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         yield
     except OSError as error:
+        if files := [path for path in (folder, *folder.parents) if path.is_file()]:
+            raise InputError(f"--out: {files[0]} is a file; expected a folder, or a name that is free") from error
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise DiskFull(f"{folder}: the disk is full. Free space on it, then export again.") from error
         raise StorageError(f"{folder}: {error.strerror or error}. Check the disk, then export again.") from error

@@ -28,7 +28,8 @@ _SRGB_NAME, _LINEAR_NAME = ("sRGB built-in".encode("utf-16-be"), "sRGB, linear "
 
 def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
     """The whole file. 1 is the camera's range above black in the frame's own exposure, in the channel that gets
-    most of white. Raises InputError for a camera without colours."""
+    most of white; the others are cut where that one is, so that what is saturated is white. Raises InputError for
+    a camera without colours."""
     import tifffile
 
     from coupole.appearance.spectra.light import linear_srgb
@@ -40,7 +41,7 @@ def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
     top = float(picture.white_dn - picture.black_dn)
     mosaic = np.rint(np.clip(signal / top, 0.0, 1.0) * 65535).astype(np.uint16)
     channels = cv2.cvtColor(mosaic, DEMOSAIC[picture.pattern]).astype(np.float64) / 65535.0
-    balanced = channels / colour.neutral(picture.about.get("led"))
+    balanced = np.minimum(channels / colour.neutral(picture.about.get("led")), 1.0)
     shown = np.clip(linear_srgb(balanced @ colour.xyz_from_balanced.T), 0.0, 1.0)
     codes = np.rint(65535.0 * (shown if linear else srgb(shown))).astype(np.uint16)
     about = {**picture.about, "colour": colour.told, "linear": linear}

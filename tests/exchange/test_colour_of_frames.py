@@ -4,6 +4,7 @@ observer, and what other programs make of the files."""
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,13 @@ def test_a_tiff_for_the_eye_shows_the_colours_under_daylight(
     assert shown == pytest.approx(encoded if linear else (128, 20, 240), abs=1)
 
 
+def test_what_is_saturated_is_white_in_a_tiff_for_the_eye(known: CameraColour) -> None:
+    about = {"shot": "top/led0417/e0", "simulated": True, "led": 417}
+    full = Picture(np.full((16, 16), WHITE, np.uint16), "GBRG", BLACK, WHITE, 8000, taken="", about=about)
+    codes, _ = opened(tiff_for_the_eye.encode(full, known, linear=True))
+    np.testing.assert_allclose(codes, 1.0, atol=2e-3)
+
+
 def test_libraw_develops_the_colours_of_a_dng(photograph: Picture, known: CameraColour) -> None:
     def developed(content: bytes) -> np.ndarray:
         with rawpy.imread(io.BytesIO(content)) as raw:
@@ -122,6 +130,13 @@ def test_libraw_develops_the_colours_of_a_dng(photograph: Picture, known: Camera
     assert differences(developed(dng.encode(photograph))).mean() > 8.0  # without the matrix
 
 
+def test_a_monochrome_dng_refuses_colours_and_claims_none(photograph: Picture, known: CameraColour) -> None:
+    grey = replace(photograph, pattern="MONO")
+    with pytest.raises(InputError, match="--sensor-spectra: the camera's pattern is MONO"):
+        dng.encode(grey, known)
+    assert b"ColorMatrix1" not in dng.encode(grey)
+
+
 def test_white_of_a_record_goes_before_that_of_the_spectra(tables: tuple[Path, Path]) -> None:
     measured = camera_colour(*tables, lambda led: np.array([0.5, 1.0, 0.25]))
     assert measured.neutral(7).tolist() == [0.5, 1.0, 0.25]
@@ -132,6 +147,8 @@ def test_white_of_a_record_goes_before_that_of_the_spectra(tables: tuple[Path, P
     ("rows", "why"),
     [
         ("400;1;1;0\n500;1;1;0\n600;1;1;0\n", "a channel sees nothing"),
+        ("400;1;1;1\n500;2;2;2\n600;1;1;1\n", "channels are too much alike"),
+        ("400;1;1;1.000002\n500;2;2.000001;2\n600;1;1;1\n", "channels are too much alike"),
         ("400;1\n500;1\n600;1\n", "expected column 1 to 1, found 2"),
         ("400;1;1;1\n500;1;-1;1\n600;1;1;1\n", "column 2 goes below 0"),
     ],

@@ -9,6 +9,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import cells
 import numpy as np
 import pytest
 import rawpy
@@ -265,6 +266,13 @@ def test_a_choice_without_a_frame_is_refused(made: MadeRun, out: Path) -> None:
 def test_a_format_that_is_not_known_is_refused_by_name(made: MadeRun, out: Path) -> None:
     with pytest.raises(InputError, match=f"expected one of {', '.join(FORMATS)}; found jpeg"):
         export(made, "jpeg", out)
+
+
+def test_a_format_that_there_is_none_of_is_refused_by_all_that_a_run_has(made: MadeRun, out: Path) -> None:
+    ended = cells.here("export", made.run.folder, "--to", "bogus", "--out", out)
+    assert ended.code == 2
+    formats = "dng, tiff, lp, dome, relight, ptm, rti, iiif, colmap, rocrate"
+    assert f"--to: expected one of {formats} for a run; found bogus" in " ".join(ended.err.split())
 
 
 def test_nothing_is_written_over_unless_that_is_asked(made: MadeRun, out: Path) -> None:

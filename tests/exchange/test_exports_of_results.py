@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cells
 import cv2
@@ -160,6 +162,17 @@ def test_materialx_is_a_valid_document_of_openpbr_with_the_materials_in_its_text
     np.testing.assert_allclose(first, [[0.5 / side, 1 - 0.5 / side]] * 3, atol=1e-6)  # the top left texel
 
 
+def test_a_name_of_many_dashes_leaves_materialx_well_formed(result: RunResult, tmp_path: Path) -> None:
+    folder = tmp_path / "result"
+    shutil.copytree(result.folder, folder)
+    about = json.loads((folder / "result.json").read_text())
+    about["runs"] = {"vase---2--": {}}
+    (folder / "result.json").write_text(json.dumps(about))
+    exported(RunResult(folder), "materialx", tmp_path / "out")
+    document = ElementTree.parse(tmp_path / "out/surface.mtlx")
+    assert document.getroot().tag == "materialx"
+
+
 def test_exr_has_what_each_pixel_of_a_view_shows(result: RunResult, tmp_path: Path) -> None:
     (path,) = exported(result, "exr", tmp_path)
     parts = {part.name(): part.channels for part in OpenEXR.File(str(path), separate_channels=True).parts}
@@ -220,16 +233,24 @@ def test_a_merl_table_is_read_as_its_reader_does() -> None:
     [
         (
             ("--to", "dng"),
-            "expected one of ply, gltf, materialx, exr, bsdf, merl, bird, alta for a result; found dng",
+            "expected one of ply, gltf, materialx, exr, bsdf, merl, bird, alta, rocrate for a result; found dng",
         ),
         (("--to", "ply", "--fit", "sh"), "expected ggx or ggx_normal"),
-        (("--to", "ply", "--views", "top"), "are for the frames of a run"),
-        (("--to", "ply", "--linear"), "are for frames of a run as dng or tiff"),
+        (("--to", "ply", "--views", "top"), "--views: is for the frames of a run"),
+        (("--to", "ply", "--linear"), "--linear: is for frames of a run as dng or tiff"),
         (("--to", "gltf", "--refined", "there"), "--refined: is for --to colmap"),
-        (("--to", "exr", "--licence", "CC BY 4.0"), "are for --to rocrate"),
+        (("--to", "exr", "--licence", "CC BY 4.0"), "--licence: is for --to rocrate"),
         (("--to", "rocrate", "--author", "A. Person"), "--licence: RO-Crate demands one"),
         (("--to", "rocrate", "--licence", "CC0"), "--author: expected at least one"),
         (("--to", "rocrate", "--licence", "CC0", "--author", "A <x>"), "expected 'NAME'"),
+        (
+            ("--to", "rocrate", "--licence", "CC0", "--author", "A", "--author", "A at B"),
+            "#person-A is named twice",
+        ),
+        (("--to", "rocrate", "--licence", "CC0", "--author", "A", "--in-place"), "--in-place writes into SOURCE"),
+        (("--to", "rocrate", "--licence", "", "--author", "A"), "--licence: is empty"),
+        (("--to", "ply", "--fit", ""), "--fit: is empty"),
+        (("--to", "ply", "--planes", "0"), "--planes: is for --to relight"),
         (("--to", "bsdf"), "has no clusters; name triangles with --triangle"),
         (("--to", "merl", "--triangle", "99999"), "the mesh has 722, counted from 0"),
         (("--to", "alta"), "--triangle: expected the numbers of triangles"),
@@ -242,6 +263,14 @@ def test_what_cannot_be_exported_is_refused(
     ended = cells.here("export", result.folder, *options, "--out", tmp_path / "out")
     assert ended.code == 2
     assert why in " ".join(ended.err.split())
+
+
+def test_a_file_in_place_of_the_folder_is_refused(result: RunResult, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    for out in (tmp_path / "mine.txt", tmp_path / "mine.txt/in"):
+        ended = cells.here("export", result.folder, "--to", "ply", "--out", out)
+        assert ended.code == 2
+        assert "mine.txt is a file; expected a folder" in " ".join(ended.err.split())
 
 
 def test_a_folder_with_files_is_left_alone(result: RunResult, tmp_path: Path) -> None:

@@ -13,11 +13,13 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from archives import make_run
 from numpy.typing import NDArray
 from places import SHARED_DATA
 
 from coupole.exchange.rti.iiif import write_tiles
 from coupole.reflectance.light_interpolation import weights
+from coupole.reflectance.uncalibrated import PicturedView
 
 Floats = NDArray[np.float64]
 HEIGHT, WIDTH = 40, 56
@@ -299,6 +301,25 @@ def test_tiles_at_their_canonical_addresses_put_the_picture_together(tmp_path: P
     assert cv2.imread(str(tmp_path / "full/max/0/default.jpg")).shape == (700, 1301, 3)
 
 
+def test_pictures_for_rti_are_counted_with_their_linear_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write_pictures(run: Path, view: str, out: Path, say: object) -> PicturedView:
+        out.mkdir()
+        for led in range(4):
+            cv2.imwrite(str(out / f"led{led:04d}.png"), np.full((4, 6, 3), 9000 + led, np.uint16))
+        (out / "filenames.txt").write_text("told")
+        files = tuple(sorted(out.glob("*.png")))
+        return PicturedView(tuple(range(4)), files, 500.0 * lights(4), 60.0, simulated=True)
+
+    monkeypatch.setattr("coupole.exchange.rti.rti_pictures.write_pictures", write_pictures)
+    run = make_run(tmp_path / "runs").run.folder
+    said = export(run, tmp_path / "out", "--to", "lp", "--views", "top")
+    written = [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+    assert len(written) == 4 + 5 + 2
+    assert (said["files"], said["bytes"]) == (len(written), sum(path.stat().st_size for path in written))
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -306,7 +327,11 @@ def test_tiles_at_their_canonical_addresses_put_the_picture_together(tmp_path: P
         (("--to", "tiff"), "expected one of relight, ptm, rti, iiif"),
         (("--to", "relight", "--basis", "sh"), "expected one of bilinear, rbf, ptm, hsh"),
         (("--to", "relight", "--basis", "hsh", "--planes", "18"), "with bilinear or rbf"),
-        (("--to", "ptm", "--basis", "ptm"), "--basis, --planes: are for --to relight"),
+        (("--to", "ptm", "--basis", "ptm"), "--basis: is for --to relight"),
+        (("--to", "relight", "--planes", "0"), "--planes 0: expected 27 or 18"),
+        (("--to", "relight", "--basis", ""), "--basis: is empty"),
+        (("--to", "iiif", "--base-url", ""), "--base-url: is empty"),
+        (("--to", "rocrate", "--licence", "CC0", "--author", "A"), "rocrate is for runs and their results"),
         (("--to", "rti", "--base-url", "https://a.example"), "is for --to iiif"),
         (("--to", "iiif", "--base-url", "eggs/"), "expected the http address"),
         (("--to", "ptm", "--views", "top"), "a result of pictures has one view"),

@@ -8,6 +8,7 @@ grows towards grazing and takes from the diffuse one what it reflects.
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
 def _document(surface: MeasuredSurface) -> bytes:
     head = {"version": "1.39", "colorspace": "lin_rec709"}
     root = ET.Element("materialx", head)
-    root.append(ET.Comment(f" {surface.remark} ".replace("--", "- -")))
+    root.append(ET.Comment(re.sub("-(?=-)", "- ", f" {surface.remark} ")))
     inputs = {
         "base_color": "color3",
         "specular_color": "color3",

@@ -58,7 +58,7 @@ def _export_view(run: Run, view: str, out: Path, say: Callable[[str, int, int], 
     lines = [f"{path.name} {x:.6f} {y:.6f} {z:.6f}" for path, (x, y, z) in zip(paths, directions, strict=True)]
     write_synced(out / f"{view}.lp", "\n".join([str(len(lines)), *lines]) + "\n")
     dome = _write_dome(run, view, taken, out / f"{view}.dome")
-    return [*paths, out / f"{view}.lp", dome]
+    return [*paths, out / f"{view}.lp", dome, *sorted((out / LINEAR).iterdir())]
 
 
 def write_dome(run: Run, view: str, path: Path) -> Path:

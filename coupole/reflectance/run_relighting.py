@@ -16,6 +16,7 @@ from coupole.motion.occlusion import ray_mesh
 from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.beams import Beam, Lighting, lighting_of
 from coupole.reflectance.new_light.light_kinds import AnyLight
+from coupole.reflectance.new_light.mirrored import add_mirrored
 from coupole.reflectance.new_light.pictured_surface import FreeCamera, Surface, surface_from, surface_of_view
 from coupole.reflectance.new_light.shading import (
     MIRROR_SHARE,
@@ -23,7 +24,6 @@ from coupole.reflectance.new_light.shading import (
     Picture,
     add_beam,
     add_beams,
-    add_mirrored,
     add_values,
     alike,
     coats_of,

@@ -1,10 +1,10 @@
 """Radiance of pixels under beams, by GGX materials or by values of triangles that a slice gives.
 
 Emitters that have a size are seen by GGX in two ways at once: by their beams, and by rays that are drawn from each
-pixel's lobe and meet the emitter or not. Both are weighted by the balance heuristic (Veach, Robust Monte Carlo
-methods for light transport simulation, 1997, 9.2): a sharp lobe shows the emitter itself and not its beams, a
-rough one the beams and no noise. No rays are drawn for an area that is not larger than the lobe: its beams are as
-close to each other in the lobe as in the area.
+pixel's lobe and meet the emitter or not (`mirrored`). Both are weighted by the balance heuristic (Veach, Robust
+Monte Carlo methods for light transport simulation, 1997, 9.2): a sharp lobe shows the emitter itself and not its
+beams, a rough one the beams and no noise. No rays are drawn for an area that is not larger than the lobe: its
+beams are as close to each other in the lobe as in the area.
 """
 
 from __future__ import annotations
@@ -12,18 +12,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
-from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.motion.occlusion import RAY_START_MM, blocked
-from coupole.reflectance.ggx import drawn, reflected, shine
+from coupole.reflectance.ggx import drawn
 from coupole.reflectance.lanes import LANES, absolute, gathered, if_less, lanes, larger, loaded, root, store, total
-from coupole.reflectance.new_light.beams import Beam, Emitter
+from coupole.reflectance.new_light.beams import Beam
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
-from coupole.reflectance.new_light.shadow_edges import DISTANT_MM, LIT, Codes
+from coupole.reflectance.new_light.shadow_edges import LIT, Codes
 from coupole.reflectance.triangle_fit import TriangleMaterials
 
 Floats = NDArray[np.float64]
@@ -34,8 +32,6 @@ Coats = NDArray[np.float32]
 """[triangles, 4 + 2 channels]: normal, alpha (0 for no material), kd, ks, side by side in memory."""
 MIRROR_SHARE = 4
 """Rays from a lobe are one for so many beams of an emitter."""
-_R2 = (0.7548776662466927, 0.5698402909980532)
-"""Steps of Roberts' sequence: powers of 1 over the plastic number."""
 
 
 def coats_of(materials: TriangleMaterials) -> Coats:
@@ -102,43 +98,6 @@ def add_values(picture: Picture, surface: Surface, values: NDArray[np.float32], 
     )
 
 
-def add_mirrored(
-    picture: Picture,
-    surface: Surface,
-    coats: Coats,
-    rays: Any,
-    emitter: Emitter,
-    lobe_rays: int,
-) -> None:
-    """Add what rays drawn from the materials' lobes meet of an emitter; `rays` is the mesh's `ray_mesh`."""
-    of_emitter = (
-        emitter.near, emitter.axes, emitter.centre_mm, emitter.halves_mm, emitter.radiance, emitter.density
-    )  # fmt: skip
-
-    def add(rows: slice) -> None:
-        seen, places_mm, part = surface.seen[rows], surface.places_mm[rows], picture[rows]
-        asking = np.zeros(seen.shape, np.bool_)
-        _asking(seen, places_mm, surface.camera_mm, coats, *of_emitter[:3], emitter.density, lobe_rays, asking)
-        row, column = np.nonzero(asking)
-        if not len(row):
-            return
-        pixels = np.stack([row, column], axis=1)
-        starts_mm = places_mm[row, column] + RAY_START_MM * surface.normals[seen[row, column]]
-        met, ways_mm = np.empty(len(pixels), np.int64), np.empty((len(pixels), 3))
-        gains, sums = np.empty((len(pixels), part.shape[2])), np.zeros((len(pixels), part.shape[2]), np.float32)
-        for ray in range(lobe_rays):
-            count = _mirror(
-                pixels, rows.start, seen, places_mm, surface.camera_mm, surface.normals, coats, *of_emitter, ray,
-                lobe_rays, met, gains, ways_mm,
-            )  # fmt: skip
-            starts = starts_mm[met[:count]]
-            free = ~blocked(rays, starts, starts + ways_mm[:count])
-            sums[met[:count][free]] += gains[:count][free]
-        part[row, column] += sums
-
-    in_strips(len(picture), add)
-
-
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _towards(near, place, axis, exponent, x, y, z, way):  # type: ignore[no-untyped-def]
     """Into `way` [3] the direction from a pixel's place to a beam's; cos^k / d^2 in m^-2, 1 of distant light."""
@@ -197,7 +156,7 @@ def _add_beams(  # type: ignore[no-untyped-def]
                 d, b = _facets(n0, n1, n2, l0 + v0, l1 + v1, l2 + v2, nv, alpha)
                 alpha2 = alpha * alpha
                 lobe = d / (nl * b + nv * root(alpha2 + (np.float32(1.0) - alpha2) * nl * nl))
-                if lobe_rays > 0 and _shines(coat):
+                if lobe_rays > 0 and shines(coat):
                     mine = loaded(densities, 0)
                     shared = reach * mine / (mine + reach * d * (lobe_rays / (nv + b)))
                     if near:
@@ -308,121 +267,9 @@ def _add_values(seen, places_mm, codes, values, near, place, axis, exponent, str
 
 
 @numba.njit(cache=True, nogil=True)
-def _shines(coat):  # type: ignore[no-untyped-def]
+def shines(coat):  # type: ignore[no-untyped-def]
     """Whether a material has a lobe at all."""
     found = False
     for number in range(4 + (len(coat) - 4) // 2, len(coat)):
         found |= coat[number] > 0.0
     return found
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _mirror(  # type: ignore[no-untyped-def]
-    pixels, first_row, seen, places_mm, camera_mm, faces, coats, near, axes, centre_mm,
-    halves_mm, radiance, density, ray, lobe_rays, met, gains, ways_mm
-):  # fmt: skip
-    """How many of the rays of this number from pixels [n, 2] point at a bright part of an emitter: into `met`
-    which, into `gains` what they bring if nothing is in their way, into `ways_mm` how they get there."""
-    way, channels, count = np.empty(3), gains.shape[1], 0
-    for pixel in range(len(pixels)):
-        row, column = pixels[pixel]
-        triangle = seen[row, column]
-        coat = coats[triangle]
-        normal, place = coat[:3], places_mm[row, column]
-        v0, v1, v2 = camera_mm[0] - place[0], camera_mm[1] - place[1], camera_mm[2] - place[2]
-        length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-        v0, v1, v2 = v0 / length, v1 / length, v2 / length
-        nv = normal[0] * v0 + normal[1] * v1 + normal[2] * v2
-        first, second = _two_numbers(first_row + row, column, ray)
-        nh = reflected(normal, v0, v1, v2, nv, coat[3], first, second, way)
-        nl = normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]
-        face = faces[triangle]
-        if not nl > 0.0 or not way[0] * face[0] + way[1] * face[1] + way[2] * face[2] > 0.0:
-            continue
-        if near:
-            far_mm, among, x, y = _on_area(place, way, axes, centre_mm, halves_mm, density)
-        else:
-            far_mm, among, x, y = _in_environment(way, axes, radiance, density)
-        if not among > 0.0:
-            continue
-        lobe = shine(nl, nv, nh, coat[3])
-        share = nl / (among + lobe_rays * drawn(nv, nh, coat[3]))
-        for channel in range(channels):
-            value = coat[4 + channel] + coat[4 + channels + channel] * lobe
-            gains[count, channel] = radiance[x, y, channel] * value * share
-        for k in range(3):
-            ways_mm[count, k] = far_mm * way[k]
-        met[count] = pixel
-        count += 1
-    return count
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _asking(seen, places_mm, camera_mm, coats, near, axes, centre_mm, density, lobe_rays, asking):  # type: ignore[no-untyped-def]
-    """Mark the pixels for which rays are drawn. Not for an area that is at most as large as their lobe: the solid
-    angle that it could have at its distance, times how dense the lobe's rays can be, is at most 1."""
-    for row in range(seen.shape[0]):
-        for column in range(seen.shape[1]):
-            coat, place = coats[max(seen[row, column], 0)], places_mm[row, column]
-            if seen[row, column] < 0 or coat[3] == 0.0 or not _shines(coat):
-                continue
-            square, nv, above = 0.0, 0.0, 0.0
-            for k in range(3):
-                view = camera_mm[k] - place[k]
-                square += view * view
-                nv += coat[k] * view
-                above += (centre_mm[k] - place[k]) * axes[2, k]
-            nv /= math.sqrt(square)
-            peak = MIRROR_SHARE * lobe_rays * drawn(nv, 1.0, coat[3])
-            asking[row, column] = nv > 0.0 and not (near and density * above * above * 1e-6 >= peak)
-
-
-@numba.njit(cache=True, nogil=True)
-def _two_numbers(row, column, ray):  # type: ignore[no-untyped-def]
-    """From 0 to 1: those of this number in a sequence, shifted for each pixel (Wang's hash)."""
-    seed = np.uint32(row * 65536 + column)
-    seed = (seed ^ np.uint32(61)) ^ (seed >> np.uint32(16))
-    seed = np.uint32(seed * np.uint32(9))
-    seed = seed ^ (seed >> np.uint32(4))
-    seed = np.uint32(seed * np.uint32(0x27D4EB2D))
-    seed = seed ^ (seed >> np.uint32(15))
-    first = (float(seed & np.uint32(0xFFFF)) + 0.5) / 65536.0
-    second = (float((seed >> np.uint32(16)) & np.uint32(0xFFFF)) + 0.5) / 65536.0
-    return (first + ray * _R2[0]) % 1.0, (second + ray * _R2[1]) % 1.0
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _on_area(place, way, axes, centre_mm, halves_mm, density):  # type: ignore[no-untyped-def]
-    """Distance to the area along a direction; beams per sr there, 0 if it is not met from its bright side; its
-    pixel."""
-    above, slope = 0.0, 0.0
-    for k in range(3):
-        above += (centre_mm[k] - place[k]) * axes[2, k]
-        slope += way[k] * axes[2, k]
-    if slope >= 0.0 or above >= 0.0:
-        return 0.0, 0.0, 0, 0
-    far_mm = above / slope
-    for side in range(2):
-        at = 0.0
-        for k in range(3):
-            at += (place[k] + far_mm * way[k] - centre_mm[k]) * axes[side, k]
-        if abs(at) > halves_mm[side]:
-            return 0.0, 0.0, 0, 0
-    return far_mm, density * far_mm * far_mm * 1e-6 / -slope, 0, 0
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _in_environment(way, axes, radiance, density):  # type: ignore[no-untyped-def]
-    """How far shadows of an environment reach; its beams per sr in a direction; its pixel there."""
-    height, width, channels = radiance.shape
-    middle, left, up = 0.0, 0.0, 0.0
-    for k in range(3):
-        middle += way[k] * axes[0, k]
-        left += way[k] * axes[1, k]
-        up += way[k] * axes[2, k]
-    row = min(int(math.acos(min(1.0, max(-1.0, up))) / math.pi * height), height - 1)
-    column = min(int((0.5 - math.atan2(left, middle) / (2.0 * math.pi)) * width), width - 1)
-    mean = 0.0
-    for channel in range(channels):
-        mean += radiance[row, column, channel] / channels
-    return DISTANT_MM, density * mean, row, column

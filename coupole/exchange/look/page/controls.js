@@ -65,7 +65,8 @@ class Controls {
       this.state.split = input.valueAsNumber;
       this.changed("light");
     });
-    byId("stereo-row").hidden = this.app.about.kind !== "mesh";
+    byId("stereo-row").hidden = !["mesh", "scene"].includes(this.app.about.kind);
+    for (const name of ["kelvin", "colour"]) byId(name).closest("label").hidden = this.app.about.kind === "scene";
     this.on("stereo", "change", (input) => {
       this.state.stereo = input.value === "two";
       this.changed("light");

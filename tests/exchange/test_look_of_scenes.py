@@ -198,6 +198,26 @@ def alone(found: nashiji.Flakes) -> bool:
 
 
 @needs_chromium
+@pytest.mark.full
+def test_nashiji_under_the_sky_looks_as_rays_through_a_closed_body_of_lacquer(page: Page, tmp_path: Path) -> None:
+    """Also the renderer's flakes lie in the lacquer, but it takes the face's loss along the normal once more."""
+    sky = {"kind": "environment", "luminance_cd_m2": 100, "spectrum": {"kind": "illuminant", "name": "D65"}}
+    slab = {"kind": "nashiji_slab", "size_mm": [4, 4], "translation_mm": [-2, -2, -6.4]}
+    more = {"lights": [sky], "samples": 32, "depth": 8, "bands": {"step_nm": 40}, "observer": "2 deg"}
+    scene = scene_of(slab, **more, display={"white_cd_m2": 100})
+    near = [one.model_copy(update={"position_mm": np.multiply(0.04, one.position_mm)}) for one in scene.cameras]
+    scene = scene.model_copy(update={"cameras": tuple(near)})
+    opened(page, scene, tmp_path, distance=12.0)
+    page.run("coupole.state = {...coupole.state, sky: 1}")
+    mine = page.picture(64)
+    with rendering.opened(scene, tmp_path) as renderer:
+        red = renderer.render(scene.cameras[0]).radiance[..., 6]  # 620 nm
+    whole = mine[..., 3] > 0.999
+    assert whole.mean() > 0.2
+    assert np.corrcoef(mine[whole][:, 0], red[whole])[0, 1] > 0.93
+
+
+@needs_chromium
 def test_the_command_makes_a_page_that_says_it_is_a_hypothesis_and_knows_the_illuminant(
     page: Page, tmp_path: Path
 ) -> None:

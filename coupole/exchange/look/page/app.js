@@ -44,6 +44,7 @@ class App {
   }
 
   startCamera() {
+    if (this.about.start) return structuredClone(this.about.start.camera);
     const above = this.about.picture_px ? 90 : 50;
     return startCamera(this.renderer.corners, this.canvas.width, this.canvas.height, above);
   }

@@ -99,6 +99,12 @@ class Controls {
       this.light.illuminant = input.value;
       this.changed("light");
     });
+    byId("sky-illuminant-row").hidden = this.app.about.kind !== "scene";
+    byId("sky-illuminant").append(...Object.entries(ILLUMINANTS).map(([name, { told }]) => new Option(told, name)));
+    this.on("sky-illuminant", "change", (input) => {
+      this.state.skyIlluminant = input.value;
+      this.changed("light");
+    });
     this.on("adapted", "change", (input) => {
       this.state.adapted = input.value === "yes";
       this.changed("screen");
@@ -153,6 +159,7 @@ class Controls {
     this.put("environment", state.environment, state.environment.toFixed(2));
     byId("stereo").value = state.stereo ? "two" : "one";
     byId("illuminant").value = light.illuminant ?? "";
+    byId("sky-illuminant").value = state.skyIlluminant ?? "";
     byId("kelvin").disabled = Boolean(light.illuminant);
     byId("adapted").value = state.adapted ? "yes" : "no";
     byId("colour").value = light.colour;

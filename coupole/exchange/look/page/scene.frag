@@ -83,6 +83,13 @@ vec3 facet(vec3 normal, float alpha) {
   return normalize(reach * (cos(angle) * first + sin(angle) * cross(normal, first)) + height * normal);
 }
 
+// The lobe times the cosine to the light, over the density of `facet`.
+float weight_of_facet(float alpha, float nl, float nv, float nh, float vh) {
+  float square = alpha * alpha;
+  float a = sqrt(square + (1.0 - square) * nl * nl), b = sqrt(square + (1.0 - square) * nv * nv);
+  return 2.0 * nl * vh / (nh * (nl * b + nv * a));
+}
+
 // The sky's mirror image in facets.
 vec3 mirrored_sky(Place place, int source, vec3 view) {
   vec3 sum = vec3(0.0);
@@ -94,9 +101,7 @@ vec3 mirrored_sky(Place place, int source, vec3 view) {
     vec3 small = facet(place.normal, alpha), way = reflect(-view, small);
     float nl = dot(place.normal, way), nh = dot(place.normal, small), vh = dot(view, small);
     if (nl <= 0.0 || vh <= 0.0 || way.z <= 0.0) continue;
-    float square = alpha * alpha;
-    float a = sqrt(square + (1.0 - square) * nl * nl), b = sqrt(square + (1.0 - square) * nv * nv);
-    sum += weight_of(place, layer) * at_cosine(row, vh).rgb * 2.0 * nl * vh / (nh * (nl * b + nv * a));
+    sum += weight_of(place, layer) * at_cosine(row, vh).rgb * weight_of_facet(alpha, nl, nv, nh, vh);
   }
   return sky * sum;
 }
@@ -119,17 +124,36 @@ vec3 white_of(int source) {
   return texelFetch(tables, ivec2(ANGLES + 1, row_of(source, 0, 0)), 0).yzw;
 }
 
-// A flake's mirror behind a way through lacquer, or the body below, 1/sr.
+// Mirror reflectance of a flake behind a way through lacquer.
+vec3 flake_mirror(int source, float cosine, float way_mm) {
+  float at = clamp(way_mm / longest_mm, 0.0, 1.0) * float(paths - 1);
+  int low = min(int(at), paths - 2);
+  vec3 first = at_cosine(row_of(source, flakes + low, 0), cosine).rgb;
+  return mix(first, at_cosine(row_of(source, flakes + low + 1, 0), cosine).rgb, at - float(low));
+}
+
+// A flake's mirror, or the body below, 1/sr.
 vec3 under_reflectance(Place place, int source, vec3 way, vec3 view, float way_mm) {
   if (place.number != flakes) return reflectance(place, source, way, view, true);
-  float at = clamp(way_mm / longest_mm, 0.0, 1.0) * float(paths - 1);
-  Place near = place, far = place;
-  near.number += min(int(at), paths - 2);
-  far.number = near.number + 1;
-  return mix(
-    reflectance(near, source, way, view, true), reflectance(far, source, way, view, true),
-    at - float(near.number - place.number)
-  );
+  float nl = dot(place.normal, way), nv = dot(place.normal, view);
+  if (mode == DIFFUSE || nl <= 0.0 || nv <= 0.0) return vec3(0.0);
+  vec3 half_way = normalize(way + view);
+  float alpha = body_of(row_of(0, flakes, 0)).a;
+  return flake_mirror(source, dot(half_way, way), way_mm) * lobe(nl, nv, dot(place.normal, half_way), alpha);
+}
+
+// The sky's mirror image in a flake's facets, through the face.
+vec3 sky_in_flake(Place place, int source, vec3 view, float passed_out, float depth) {
+  float alpha = body_of(row_of(0, flakes, 0)).a, nv = dot(place.normal, view);
+  vec3 small = facet(place.normal, alpha), way = reflect(-view, small);
+  float nl = dot(place.normal, way), vh = dot(view, small), height_in = dot(way, face_normal);
+  vec3 across = face_index * (way - face_normal * height_in);
+  if (nv <= 0.0 || nl <= 0.0 || vh <= 0.0 || height_in <= 0.0 || dot(across, across) >= 1.0) return vec3(0.0);
+  float height = sqrt(1.0 - dot(across, across));
+  if ((across + height * face_normal).z <= 0.0) return vec3(0.0);
+  float way_mm = depth / height_in + depth / dot(view, face_normal);
+  return sky * passed_out * (1.0 - reflected(height)) * flake_mirror(source, vh, way_mm)
+    * weight_of_facet(alpha, nl, nv, dot(place.normal, small), vh);
 }
 
 // Under the lacquer's face, and what the face mirrors.
@@ -142,6 +166,10 @@ vec3 in_lacquer(Place place) {
     bool is_sky = sky > 0.0 && light == lights - 1;
     float height = dot(ways[light], face_normal);
     if (is_sky && mode != DIFFUSE && mirror.z > 0.0) sum += mirrored * white_of(sources[light]) * sky;
+    if (is_sky && place.number == flakes) {
+      if (mode != DIFFUSE) sum += sky_in_flake(place, sources[light], view_in, 1.0 - mirrored, depth);
+      continue;
+    }
     if (height <= 0.0) continue;
     float share = reaching(light, out_mm + face_normal * offset_mm[light]);
     if (!is_sky && mode != DIFFUSE && least_cosines[light] < 1.0 && dot(mirror, middles[light]) > least_cosines[light]) {

@@ -58,7 +58,8 @@ def show(
             bars("read", 0, 1)
             look = _look(source, view or [], samples, environment, bars)
             bars("write", 0, 1)
-            files = write_page(look, source.resolve().name, out)
+            title = source.stem if source.is_file() else source.resolve().name
+            files = write_page(look, title, out)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise

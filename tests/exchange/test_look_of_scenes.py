@@ -214,7 +214,9 @@ def test_nashiji_under_the_sky_looks_as_rays_through_a_closed_body_of_lacquer(pa
         red = renderer.render(scene.cameras[0]).radiance[..., 6]  # 620 nm
     whole = mine[..., 3] > 0.999
     assert whole.mean() > 0.2
-    assert np.corrcoef(mine[whole][:, 0], red[whole])[0, 1] > 0.93
+    alike = np.corrcoef(mine[whole][:, 0], red[whole])[0, 1]
+    print(f"correlation {alike:.3f}, ratio of means {mine[whole][:, 0].mean() / red[whole].mean():.4g}")
+    assert alike > 0.93
 
 
 @needs_chromium

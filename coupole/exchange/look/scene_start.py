@@ -70,15 +70,16 @@ def start_of(scene: Scene, folder: Path) -> dict[str, Any]:
     white_cd_m2 = scene.display.white_cd_m2 or max(
         [lamp.illuminance_lux / math.pi for lamp in lamps] + [light.luminance_cd_m2 for light in around]
     )
-    shown = [_shown(lamp, white_cd_m2) for lamp in lamps]
+    shown = [_shown(lamp, white_cd_m2) for lamp in lamps] or [_dark(named(around[0].spectrum))]
+    is_used_to_first = shown[0]["illuminant"] == named(scene.lights[0].spectrum)
     sky = sum(light.luminance_cd_m2 for light in around) / white_cd_m2
     return {
-        "lights": shown or [_dark(named(around[0].spectrum))],
+        "lights": shown,
         "sky": min(sky, 100.0),
         "skyIlluminant": named(next(iter(around or scene.lights)).spectrum),
         "white": 1.0 if scene.display.white_cd_m2 else 0.0,
         "camera": _camera(scene.cameras[0]),
-        "adapted": scene.display.adaptation != "none",
+        "adapted": scene.display.adaptation != "none" and is_used_to_first,
     }
 
 

@@ -247,3 +247,23 @@ def test_a_scene_that_a_page_cannot_show_is_refused_with_what_it_can(tmp_path: P
     ended = cells.here("show", tmp_path / "scene.yaml", "--view", "x", "--out", tmp_path / "look.html")
     assert ended.code == 2
     assert "--view" in ended.err
+
+
+@needs_chromium
+def test_a_ball_on_a_wide_sheet_throws_a_shadow_where_it_belongs(page: Page, tmp_path: Path) -> None:
+    grey = {"kind": "diffuse", "reflectance": {"kind": "constant", "value": 0.5}}
+    objects = [
+        {"kind": "sphere", "radius_mm": 5, "translation_mm": [0, 0, 20], "material": grey},
+        {"kind": "plane", "width_mm": 2000, "depth_mm": 2000, "material": grey},
+    ]
+    opened(page, scene_of({}, objects=objects), tmp_path)
+    page.run("coupole.setLight(1, 0, 1)")  # the ball's middle, 25 mm high, is thrown to x = -25
+
+    def lit(x: float, y: float) -> float:
+        camera = {"target": [x, y, 0], "azimuth": -90, "height": 20, "distance": 500, "field": 0.5}
+        page.run(f"coupole.state = {{...coupole.state, camera: {camera}}}")
+        return float(page.picture(1)[HEIGHT // 2, WIDTH // 2, 1])
+
+    places = [(-25, 0), (-31.5, 0), (-18.5, 0), (-25, 4.6), (-33, 0), (-17, 0), (-25, 5.4), (-25, -900), (700, 0)]
+    found = [lit(x, y) for x, y in places]
+    np.testing.assert_allclose(found, [0.0] * 4 + [0.5 / math.sqrt(2)] * 5, atol=2e-3)

@@ -47,6 +47,8 @@ class _Part:
 
     corners_mm: Array
     number: int
+    casts: bool = True
+    """False for a sheet that other things stand on."""
     share: Array | None = None
     """[n], of the material's first layer, where each triangle has its own."""
 
@@ -87,7 +89,8 @@ def look_of_scene(scene: Scene, folder: Path) -> Look:
             mine, face = _nashiji(thing, found)
             parts += mine
         else:
-            parts += [_opaque(piece, found) for piece in objects.pieces(thing, folder)]
+            casts = thing.kind != "plane"
+            parts += [_opaque(piece, found, casts) for piece in objects.pieces(thing, folder)]
     powers = illuminants(scene, folder)
     corners_mm = np.concatenate([part.corners_mm for part in parts])
     places, triangles, origin_mm, step_mm = welded(corners_mm.reshape(-1, 3))
@@ -105,6 +108,7 @@ def look_of_scene(scene: Scene, folder: Path) -> Look:
         "triangles": len(triangles),
         "face": face,
         "box": [places.min(axis=0).tolist(), places.max(axis=0).tolist()],
+        "casting_mm": _box([part for part in parts if part.casts] or parts),
         "origin_mm": origin_mm.tolist(),
         "step_mm": step_mm,
     }
@@ -153,13 +157,13 @@ def _about(scene: Scene, folder: Path, powers: dict[str, Array], found: _Materia
     }
 
 
-def _opaque(piece: Piece | Ball, found: _Materials) -> _Part:
+def _opaque(piece: Piece | Ball, found: _Materials, casts: bool) -> _Part:
     corners_mm = (
         piece.centre_mm + piece.radius_mm * unit_sphere(_BALL_PARTS)
         if isinstance(piece, Ball)
         else piece.corners_mm
     )
-    return _Part(corners_mm, found.number(piece.material))
+    return _Part(corners_mm, found.number(piece.material), casts)
 
 
 def _makie(thing: MakieTile, found: _Materials) -> list[_Part]:
@@ -171,7 +175,7 @@ def _makie(thing: MakieTile, found: _Materials) -> list[_Part]:
     drawn = found.add([layers], f"{told(metal)}, by its share, over {told(black)}", is_drawn=True)
     face = objects.placed(Piece(tile.face, black), thing).corners_mm
     body = objects.placed(Piece(tile.body, black), thing).corners_mm
-    return [_Part(face, drawn, tile.share), _Part(body, found.number(black))]
+    return [_Part(face, drawn, share=tile.share), _Part(body, found.number(black))]
 
 
 def _nashiji(thing: NashijiSlab, found: _Materials) -> tuple[list[_Part], dict[str, Any]]:
@@ -201,6 +205,12 @@ def _nashiji(thing: NashijiSlab, found: _Materials) -> tuple[list[_Part], dict[s
         "body": parts[0].number,
     }
     return parts, face
+
+
+def _box(parts: Sequence[_Part]) -> list[list[float]]:
+    """Least and greatest coordinates."""
+    corners_mm = np.concatenate([part.corners_mm.reshape(-1, 3) for part in parts])
+    return [corners_mm.min(axis=0).tolist(), corners_mm.max(axis=0).tolist()]
 
 
 def _numbered(parts: Sequence[_Part]) -> NDArray[np.uint16]:

@@ -108,6 +108,11 @@ class Renderer {
     gl.enable(gl.DEPTH_TEST);
   }
 
+  /** Of a sphere that holds what casts shadows. */
+  get castingRadius() {
+    return this.radius;
+  }
+
   get surfaceShader() {
     return "surface.vert";
   }
@@ -289,7 +294,7 @@ class Renderer {
     gl.uniform1i(at("lights"), beams.length);
     gl.uniform3fv(at("ways"), beams.flatMap((beam) => beam.way));
     gl.uniformMatrix4fv(at("shadow_from_object"), false, beams.flatMap((beam) => [...beam.shadow]));
-    const texel = 2 * this.radius * 1.01 / this.depths.size;
+    const texel = 2 * this.castingRadius * 1.01 / this.depths.size;
     gl.uniform1fv(at("offset_mm"), beams.map(() => 1.5 * texel));
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.targets.other.frame);
     gl.viewport(0, 0, this.width, this.height);

@@ -27,6 +27,24 @@ class SceneRenderer extends Renderer {
     gl.texImage2D(gl.TEXTURE_2D, 0, inside, COLUMNS, rows, 0, format, type, arrays.tables);
   }
 
+  /** What casts shadows is smaller than the sheets that it stands on. */
+  measure() {
+    super.measure();
+    const [low, high] = this.about.casting_mm;
+    this.casting = { middle: times(add(low, high), 0.5), radius: Math.max(length(minus(high, low)) / 2, 1e-6) };
+  }
+
+  get castingRadius() {
+    return this.casting.radius;
+  }
+
+  /** Across the light only what casts, along it all of the scene. */
+  shadowMatrix(way) {
+    const { middle } = this.casting, [right, up] = across(way), reach = this.castingRadius * 1.01;
+    const far = length(minus(middle, this.middle)) + this.radius * 1.01;
+    return product(orthographic(reach, reach, 0, 2 * far), lookingFrom(add(middle, times(way, far)), right, up, way));
+  }
+
   frameOf() {
     return null;
   }

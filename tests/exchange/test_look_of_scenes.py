@@ -264,6 +264,17 @@ def test_a_ball_on_a_wide_sheet_throws_a_shadow_where_it_belongs(page: Page, tmp
         page.run(f"coupole.state = {{...coupole.state, camera: {camera}}}")
         return float(page.picture(1)[HEIGHT // 2, WIDTH // 2, 1])
 
-    places = [(-25, 0), (-31.5, 0), (-18.5, 0), (-25, 4.6), (-33, 0), (-17, 0), (-25, 5.4), (-25, -900), (700, 0)]
+    places = [
+        (-25, 0),
+        (-31.5, 0),
+        (-18.5, 0),
+        (-25, 4.6),
+        (-33, 0),
+        (-17, 0),
+        (-25, 5.4),
+        (-25, -900),
+        (700, 0),
+        (-700, 0),
+    ]
     found = [lit(x, y) for x, y in places]
-    np.testing.assert_allclose(found, [0.0] * 4 + [0.5 / math.sqrt(2)] * 5, atol=2e-3)
+    np.testing.assert_allclose(found, [0.0] * 4 + [0.5 / math.sqrt(2)] * 6, atol=2e-3)

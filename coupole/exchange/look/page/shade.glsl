@@ -30,10 +30,11 @@ float lobe(float nl, float nv, float nh, float alpha) {
   return 0.5 * square / (PI * t * t * (nl * b + nv * a));
 }
 
-// Share of a light that comes to a place, of the four nearest texels of its depths.
+// Share of a light that comes to a place, of the four nearest texels of its depths; all of it beside them.
 float reaching(int light, vec3 at_mm) {
   vec4 clip = shadow_from_object[light] * vec4(at_mm, 1.0);
   vec3 inside = clip.xyz / clip.w * 0.5 + 0.5;
+  if (any(lessThan(inside.xy, vec2(0.0))) || any(greaterThan(inside.xy, vec2(1.0)))) return 1.0;
   ivec2 size = textureSize(shadows, 0).xy;
   vec2 texel = inside.xy * vec2(size) - 0.5;
   ivec2 corner = ivec2(floor(texel));

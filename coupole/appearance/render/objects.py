@@ -156,7 +156,7 @@ def pieces(thing: Object, folder: Path) -> list[Piece | Ball]:
     if isinstance(thing, Sphere):
         centre = thing.scene_from_thing() @ [0.0, 0.0, thing.radius_mm, 1.0]
         return [Ball(centre[:3], thing.radius_mm, thing.material)]
-    return [_placed(piece, thing) for piece in _local(thing, folder)]
+    return [placed(piece, thing) for piece in _local(thing, folder)]
 
 
 def _local(thing: LocalObject, folder: Path) -> list[Piece]:
@@ -251,7 +251,8 @@ def _clear(width: float, length: float, thickness_mm: float, rim_mm: float) -> P
     return Piece(box + lift, Glass(kind="glass", index=indices.URUSHI))
 
 
-def _placed(piece: Piece, pose: Pose) -> Piece:
+def placed(piece: Piece, pose: Pose) -> Piece:
+    """A piece of a thing's own frame, in the scene's."""
     scene_from_thing = pose.scene_from_thing()
     corners: NDArray[np.float64] = piece.corners_mm @ scene_from_thing[:3, :3].T + scene_from_thing[:3, 3]
     return Piece(corners, piece.material, piece.smooth)

@@ -43,6 +43,10 @@ class MakieTile:
     powder: Array
     ground: Array
     body: Array
+    face: Array
+    """Powder and ground together."""
+    share: Array
+    """[n], expected share of powder on each triangle of the face."""
 
 
 def makie_tile(side_mm: float, triangles: int, petals: int, seed: int) -> MakieTile:
@@ -52,7 +56,7 @@ def makie_tile(side_mm: float, triangles: int, petals: int, seed: int) -> MakieT
     face = rectangle(side_mm, side_mm, columns, rows, z_mm=_TILE_MM)
     share = _drawing(face.mean(axis=1)[:, :2] / (0.5 * side_mm), petals)
     powder = np.random.default_rng(seed).random(len(face)) < share
-    return MakieTile(face[powder], face[~powder], skirt(face))
+    return MakieTile(face[powder], face[~powder], skirt(face), face, share)
 
 
 def _drawing(place: Array, petals: int) -> Array:

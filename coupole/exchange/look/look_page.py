@@ -32,6 +32,7 @@ SCRIPTS = (
     "tiles.js",
     "flat.js",
     "run.js",
+    "scene.js",
     "material.js",
     "frames.js",
     "plot.js",
@@ -54,7 +55,11 @@ SHADERS = (
     "planes.frag",
     "shadow.frag",
     "screen.vert",
+    "shade.glsl",
     "light.frag",
+    "face.glsl",
+    "scene.vert",
+    "scene.frag",
     "show.frag",
 )
 

@@ -6,7 +6,7 @@ const MOST_PIXELS = 4e6;
 
 const FIRST_PICTURE = "coupole: first picture";
 const shown = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 0)));
-const RENDERERS = { mesh: Renderer, pictures: FlatRenderer, run: RunRenderer };
+const RENDERERS = { mesh: Renderer, pictures: FlatRenderer, run: RunRenderer, scene: SceneRenderer };
 
 class App {
   constructor(about, arrays) {
@@ -44,6 +44,7 @@ class App {
   }
 
   startCamera() {
+    if (this.about.start) return structuredClone(this.about.start.camera);
     const above = this.about.picture_px ? 90 : 50;
     return startCamera(this.renderer.corners, this.canvas.width, this.canvas.height, above);
   }
@@ -282,6 +283,10 @@ class App {
       this.tellPixel(found.place, x, y);
       return;
     }
+    if (this.about.kind === "scene") {
+      this.tellPoint(this.renderer.toldAt(found));
+      return;
+    }
     const material = this.renderer.materialOf(found.triangle);
     const view = unit(minus(axesOf(this.state.camera).place, found.place));
     const angle = material ? degrees(Math.acos(clamp(dot(view, material.normal), -1, 1))) : 0;
@@ -394,7 +399,7 @@ class App {
   tellAbout() {
     const { about } = this, told = {
       ...about.told,
-      Fit: about.fit,
+      ...about.fit && { Fit: about.fit },
       "Written short": Object.entries(about.errors).map(([name, error]) => `${name}: ${error}`).join("; "),
       Software: Object.entries(about.software).map(([name, version]) => `${name} ${version}`).join(", "),
     };

@@ -65,7 +65,8 @@ class Controls {
       this.state.split = input.valueAsNumber;
       this.changed("light");
     });
-    byId("stereo-row").hidden = this.app.about.kind !== "mesh";
+    byId("stereo-row").hidden = !["mesh", "scene"].includes(this.app.about.kind);
+    for (const name of ["kelvin", "colour"]) byId(name).closest("label").hidden = this.app.about.kind === "scene";
     this.on("stereo", "change", (input) => {
       this.state.stereo = input.value === "two";
       this.changed("light");
@@ -96,6 +97,12 @@ class Controls {
     byId("illuminant").append(...Object.entries(ILLUMINANTS).map(([name, { told }]) => new Option(told, name)));
     this.on("illuminant", "change", (input) => {
       this.light.illuminant = input.value;
+      this.changed("light");
+    });
+    byId("sky-illuminant-row").hidden = this.app.about.kind !== "scene";
+    byId("sky-illuminant").append(...Object.entries(ILLUMINANTS).map(([name, { told }]) => new Option(told, name)));
+    this.on("sky-illuminant", "change", (input) => {
+      this.state.skyIlluminant = input.value;
       this.changed("light");
     });
     this.on("adapted", "change", (input) => {
@@ -152,6 +159,7 @@ class Controls {
     this.put("environment", state.environment, state.environment.toFixed(2));
     byId("stereo").value = state.stereo ? "two" : "one";
     byId("illuminant").value = light.illuminant ?? "";
+    byId("sky-illuminant").value = state.skyIlluminant ?? "";
     byId("kelvin").disabled = Boolean(light.illuminant);
     byId("adapted").value = state.adapted ? "yes" : "no";
     byId("colour").value = light.colour;

@@ -22,7 +22,7 @@ class FlatRenderer extends Renderer {
     this.programs = {
       surface: programOf(gl, "flat.vert", "flat.frag"),
       show: programOf(gl, "screen.vert", "show.frag"),
-      light: programOf(gl, ...this.lightShaders()),
+      light: programOf(gl, "screen.vert", this.lightShader),
     };
     this.drawnAnew = -Infinity;
     this.prepareTiles();
@@ -42,10 +42,6 @@ class FlatRenderer extends Renderer {
 
   get hasPicture() {
     return this.tiles.slots.size > 0;
-  }
-
-  lightShaders() {
-    return ["screen.vert", "light.frag"];
   }
 
   prepareTiles() {

@@ -1,20 +1,16 @@
 // Radiance of pixels under lights: (n l) (kd + ks D V), GGX's D and the height-correlated V, as the fits have it.
 // One sample of each light; the mean with the samples before is written.
 
-const float PI = 3.14159265358979;
-const int MOST = 12;  // the user's ten lights, the sky and the surroundings
 const int RELIT = 0, DIFFUSE = 1, SPECULAR = 2, UNSHARP = 3, NORMALS = 4, ROUGHNESS = 5, UNCERTAINTY = 6;
 const int TAPS = 24;  // of what relief is compared with
 const float RELIEF_PX = 9.0;
 
 uniform usampler2D seen;
 uniform usampler2D before;
-uniform usampler2D normals;
 uniform sampler2D kd;
 uniform sampler2D ks;
 uniform sampler2D gloss;
 uniform usampler2D uncertainty;
-uniform sampler2DArray shadows;
 
 uniform int mode;
 uniform int quantity;
@@ -27,8 +23,6 @@ uniform mat3 view_from_object;
 uniform int lights;
 uniform vec3 ways[MOST];
 uniform vec3 irradiances[MOST];
-uniform mat4 shadow_from_object[MOST];
-uniform float offset_mm[MOST];  // from a surface to where its shadow is looked for
 
 // An LED as it was in the run, in place of the lights; and the frame that the camera took under it.
 uniform bool led;
@@ -50,46 +44,6 @@ struct Material {
   vec3 ks;
   float alpha;
 };
-
-vec3 normal_of(int triangle) {
-  vec2 square = vec2(texelFetch(normals, cell(triangle), 0).xy) / 65535.0 * 2.0 - 1.0;
-  vec3 normal = vec3(square, 1.0 - abs(square.x) - abs(square.y));
-  vec2 folded = (1.0 - abs(normal.yx)) * vec2(normal.x >= 0.0 ? 1.0 : -1.0, normal.y >= 0.0 ? 1.0 : -1.0);
-  normal.xy = normal.z < 0.0 ? folded : normal.xy;
-  return normalize(normal);
-}
-
-vec3 face_of(int triangle) {
-  uvec3 corners = texelFetch(triangles, cell(triangle), 0).xyz;
-  vec3 first = place_mm(corners.x);
-  return normalize(cross(place_mm(corners.y) - first, place_mm(corners.z) - first));
-}
-
-float lobe(float nl, float nv, float nh, float alpha) {
-  float square = alpha * alpha;
-  float t = nh * nh * (square - 1.0) + 1.0;
-  float a = sqrt(square + (1.0 - square) * nl * nl);
-  float b = sqrt(square + (1.0 - square) * nv * nv);
-  return 0.5 * square / (PI * t * t * (nl * b + nv * a));
-}
-
-// Share of a light that comes to a place, of the four nearest texels of its depths.
-float reaching(int light, vec3 at_mm) {
-  vec4 clip = shadow_from_object[light] * vec4(at_mm, 1.0);
-  vec3 inside = clip.xyz / clip.w * 0.5 + 0.5;
-  ivec2 size = textureSize(shadows, 0).xy;
-  vec2 texel = inside.xy * vec2(size) - 0.5;
-  ivec2 corner = ivec2(floor(texel));
-  vec2 part = texel - vec2(corner);
-  float found = 0.0;
-  for (int k = 0; k < 4; k++) {
-    ivec2 next = ivec2(k % 2, k / 2);
-    ivec2 at = clamp(corner + next, ivec2(0), size - 1);
-    vec2 weight = mix(1.0 - part, part, vec2(next));
-    found += weight.x * weight.y * step(inside.z, texelFetch(shadows, ivec3(at, light), 0).r);
-  }
-  return found;
-}
 
 // 1/m^2, times a power of the cosine to the LED's axis.
 float led_reach(vec3 at_mm, vec3 way) {

@@ -15,10 +15,12 @@ function blackBody(kelvin) {
   return [x, 3.081758 * x ** 3 - 5.8733867 * x ** 2 + 3.75112997 * x - 0.37001483];
 }
 
-/** Chromaticities x, y of lights, for the observer of 1931 (CIE 15:2018); of a black body by its own kelvin. */
-const ILLUMINANTS = {
+const DAYLIGHT = [0.31272, 0.32903];
+
+/** Chromaticities x, y of lights: of a scene its own; else for the observer of 1931 (CIE 15:2018); of a black body by its own kelvin. */
+const ILLUMINANTS = ABOUT.illuminants ?? {
   "": { told: "By warmth" },
-  D65: { told: "D65, daylight", xy: [0.31272, 0.32903] },
+  D65: { told: "D65, daylight", xy: DAYLIGHT },
   A: { told: "A, tungsten", xy: [0.44758, 0.40745] },
   "3000 K": { told: "3000 K", xy: blackBody(3000) },
   "LED-B1": { told: "LED-B1, warm", xy: [0.456, 0.4078] },
@@ -29,7 +31,7 @@ const NEUTRAL_KELVIN = 6500;
 /** Chromaticity of a light without its colour. */
 function chromaticity({ illuminant, kelvin }) {
   if (illuminant) return ILLUMINANTS[illuminant].xy;
-  return kelvin === NEUTRAL_KELVIN ? ILLUMINANTS.D65.xy : blackBody(kelvin);
+  return kelvin === NEUTRAL_KELVIN ? DAYLIGHT : blackBody(kelvin);
 }
 
 /** X, Y, Z of a white of luminance 1. */
@@ -56,7 +58,7 @@ function tintOf(xy) {
 /** What an eye that is used to a white sees as linear sRGB, whose white is D65 (Bradford's transform, complete
  * adaptation), of red, green and blue: three columns. */
 function adaptation(xy) {
-  const [from, to] = [xy, ILLUMINANTS.D65.xy].map((one) => turnedBy(CONES_FROM_XYZ, whiteOf(one)));
+  const [from, to] = [xy, DAYLIGHT].map((one) => turnedBy(CONES_FROM_XYZ, whiteOf(one)));
   return [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((rgb) => {
     const cones = turnedBy(CONES_FROM_XYZ, turnedBy(XYZ_FROM_RGB, rgb));
     return turnedBy(RGB_FROM_XYZ, turnedBy(XYZ_FROM_CONES, cones.map((value, k) => value * to[k] / from[k])));
@@ -66,7 +68,7 @@ function adaptation(xy) {
 /** Irradiance by channel of a light on what faces it, `whole` for strength 1 and neutral colour. */
 function irradiance(light, whole) {
   const colour = [1, 3, 5].map((at) => toLinear(parseInt(light.colour.slice(at, at + 2), 16) / 255));
-  const neutral = tintOf(ILLUMINANTS.D65.xy), tint = tintOf(chromaticity(light)).map((value, k) => value / neutral[k]);
+  const neutral = tintOf(DAYLIGHT), tint = tintOf(chromaticity(light)).map((value, k) => value / neutral[k]);
   return colour.map((value, k) => whole * light.strength * value * tint[k]);
 }
 

@@ -2,9 +2,13 @@
 
 const ROW = 4096;
 
+/** What stands before a shader. */
+const BEFORE = { "light.frag": ["shade.glsl"], "scene.vert": ["face.glsl"], "scene.frag": ["shade.glsl", "face.glsl"] };
+
 function compiled(gl, kind, name) {
   const shader = gl.createShader(kind);
-  gl.shaderSource(shader, SHADERS["common.glsl"] + SHADERS[name]);
+  const parts = ["common.glsl", ...BEFORE[name] ?? [], name];
+  gl.shaderSource(shader, parts.map((part) => SHADERS[part]).join("\n"));
   gl.compileShader(shader);
   if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) {
     throw new Error(`${name}: ${gl.getShaderInfoLog(shader)}`);
@@ -37,6 +41,7 @@ function plainTexture(gl, target) {
 function formatOf(gl, dtype, count) {
   const formats = {
     "uint8 4": [gl.RGBA8UI, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE],
+    "float32 4": [gl.RGBA32F, gl.RGBA, gl.FLOAT],
     "uint16 2": [gl.RG16UI, gl.RG_INTEGER, gl.UNSIGNED_SHORT],
     "uint16 3": [gl.RGB16UI, gl.RGB_INTEGER, gl.UNSIGNED_SHORT],
     "uint32 3": [gl.RGB32UI, gl.RGB_INTEGER, gl.UNSIGNED_INT],

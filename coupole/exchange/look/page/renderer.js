@@ -24,7 +24,7 @@ const IDENTITY = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
 
 const EYES_DEG = 3.4;  // between two eyes, 65 mm apart, that look at a thing 1.1 m away
 
-const isStereo = (state) => Boolean(state.stereo && !state.view && ABOUT.kind === "mesh");
+const isStereo = (state) => Boolean(state.stereo && !state.view && ["mesh", "scene"].includes(ABOUT.kind));
 
 class Renderer {
   constructor(canvas, about, arrays) {
@@ -97,9 +97,9 @@ class Renderer {
   prepare(arrays) {
     const gl = this.gl;
     this.programs = {
-      surface: programOf(gl, "surface.vert", "surface.frag"),
+      surface: programOf(gl, this.surfaceShader, "surface.frag"),
       shadow: programOf(gl, "surface.vert", "shadow.frag"),
-      light: programOf(gl, "screen.vert", "light.frag"),
+      light: programOf(gl, "screen.vert", this.lightShader),
       show: programOf(gl, "screen.vert", "show.frag"),
     };
     this.textures = {};
@@ -108,11 +108,29 @@ class Renderer {
     gl.enable(gl.DEPTH_TEST);
   }
 
+  /** Of a sphere that holds what casts shadows. */
+  get castingRadius() {
+    return this.radius;
+  }
+
+  get surfaceShader() {
+    return "surface.vert";
+  }
+
+  get lightShader() {
+    return "light.frag";
+  }
+
+  /** Type and count of the numbers of each texture. */
+  get fields() {
+    return TEXTURES;
+  }
+
   /** Show these numbers of the object from now on. */
   take(arrays) {
     this.arrays = arrays;
     this.triangles = arrays.triangles.length / 3;
-    for (const [name, [dtype, count]] of Object.entries(TEXTURES)) {
+    for (const [name, [dtype, count]] of Object.entries(this.fields)) {
       this.gl.deleteTexture(this.textures[name] ?? null);
       this.textures[name] = numbersTexture(this.gl, arrays[name], dtype, count);
     }
@@ -235,8 +253,8 @@ class Renderer {
   }
 
   drawSurface({ camera }, { x: left, width }) {
-    const gl = this.gl, [x, y] = evenly(this.samples), { places, triangles } = this.textures;
-    const at = this.use("surface", { places, triangles });
+    const gl = this.gl, [x, y] = evenly(this.samples);
+    const at = this.useSurface(camera);
     const clip = clipOf(camera, width, this.height, this.middle, this.radius, [x - 0.5, y - 0.5]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.targets.seen.frame);
     gl.viewport(left, 0, width, this.height);
@@ -246,29 +264,39 @@ class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3 * this.triangles);
   }
 
+  useSurface() {
+    const { places, triangles } = this.textures;
+    return this.use("surface", { places, triangles });
+  }
+
   drawLight(state, beams) {
-    const gl = this.gl, { seen, mean, other } = this.targets;
+    const gl = this.gl, { seen, mean } = this.targets;
     const compared = this.frameOf(state);
     const at = this.use("light", {
       ...this.textures, seen: seen.texture, before: mean.texture, shadows: this.depths.texture,
       measured: compared?.texture ?? this.textures.kd,
     });
     this.setLed(at, compared, state.split);
-    const { right, up, back, place } = axesOf(state.camera);
-    gl.uniform1i(at("mode"), MODE_NUMBERS[state.mode]);
     gl.uniform1i(at("quantity"), Object.keys(UNCERTAIN).indexOf(state.quantity));
     gl.uniform1f(at("relief"), state.relief);
+    gl.uniform1i(at("flat_one"), this.about.picture_px ? 1 : 0);
+    gl.uniform3fv(at("irradiances"), beams.flatMap((beam) => beam.irradiance));
+    this.drawMean(at, state, beams);
+  }
+
+  /** Draw the mean with one sample more, by a program of light: what all of them have in common. */
+  drawMean(at, state, beams) {
+    const gl = this.gl, { right, up, back, place } = axesOf(state.camera);
+    gl.uniform1i(at("mode"), MODE_NUMBERS[state.mode]);
     gl.uniform1f(at("share"), 1 / (this.samples + 1));
     gl.uniform3fv(at("eye_mm"), place);
-    gl.uniform1i(at("flat_one"), this.about.picture_px ? 1 : 0);
     gl.uniformMatrix3fv(at("view_from_object"), false, [0, 1, 2].flatMap((k) => [right[k], up[k], back[k]]));
     gl.uniform1i(at("lights"), beams.length);
     gl.uniform3fv(at("ways"), beams.flatMap((beam) => beam.way));
-    gl.uniform3fv(at("irradiances"), beams.flatMap((beam) => beam.irradiance));
     gl.uniformMatrix4fv(at("shadow_from_object"), false, beams.flatMap((beam) => [...beam.shadow]));
-    const texel = 2 * this.radius * 1.01 / this.depths.size;
+    const texel = 2 * this.castingRadius * 1.01 / this.depths.size;
     gl.uniform1fv(at("offset_mm"), beams.map(() => 1.5 * texel));
-    gl.bindFramebuffer(gl.FRAMEBUFFER, other.frame);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.targets.other.frame);
     gl.viewport(0, 0, this.width, this.height);
     gl.disable(gl.DEPTH_TEST);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -13,8 +13,8 @@ class RunRenderer extends FlatRenderer {
     return viewOf(this.about, state.view) ?? this.about.views[0];
   }
 
-  lightShaders() {
-    return ["screen.vert", "planes.frag"];
+  get lightShader() {
+    return "planes.frag";
   }
 
   prepareTiles() {

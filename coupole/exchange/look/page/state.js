@@ -1,12 +1,15 @@
 // What a user has set: all of it goes into the address, and back.
 
 const MOST_LIGHTS = 10;
-const MODES = ABOUT.kind === "run" ? {
-  measured: "Nearest frame", between: "Between LEDs",
-} : {
+const MODES_OF_RUNS = { measured: "Nearest frame", between: "Between LEDs" };
+const MODES_OF_SCENES = {
+  relit: "Lit", diffuse: "Without highlights", specular: "Highlights only", normals: "Normals", roughness: "Roughness",
+};
+const MODES_OF_RESULTS = {
   relit: "Relit", diffuse: "Diffuse only", specular: "Highlights only", unsharp: "Relief enhanced",
   normals: "Normals", roughness: "Roughness", uncertainty: "Uncertainty", residual: "What the fit misses",
 };
+const MODES = { run: MODES_OF_RUNS, scene: MODES_OF_SCENES }[ABOUT.kind] ?? MODES_OF_RESULTS;
 const UNCERTAIN = {
   kd: "Diffuse colour", ks: "Highlight strength", normal: "Normal", roughness: "Roughness",
 };
@@ -17,7 +20,7 @@ const startLight = () => ({
 
 const startState = () => ({
   mode: Object.keys(MODES)[0], quantity: "kd", white: 0, relief: 1, sky: 0, environment: ABOUT.environment ? 1 : 0, chosen: 0, lights: [startLight()],
-  camera: null, notes: [], view: "", split: 0.5, adapted: false, stereo: false,
+  camera: null, notes: [], view: "", split: 0.5, adapted: false, stereo: false, ...structuredClone(ABOUT.start ?? {}),
 });
 
 const rounded = (key, value) => typeof value === "number" ? Number(value.toPrecision(5)) : value;
@@ -64,6 +67,7 @@ function stateOf(address) {
     && Array.isArray(found.lights) && isNumber(found.lights.length, 1, MOST_LIGHTS) && found.lights.every(isLight)
     && isNumber(found.chosen, 0, found.lights.length - 1) && Number.isInteger(found.chosen)
     && Array.isArray(found.notes) && found.notes.every(isNote)
+    && (found.skyIlluminant === undefined || found.skyIlluminant in ILLUMINANTS)
     && (found.stereo === undefined || typeof found.stereo === "boolean")
     && (found.adapted === undefined || typeof found.adapted === "boolean")
     && (!found.view || viewOf(ABOUT, found.view)) && (found.split === undefined || isNumber(found.split, 0, 1));

@@ -1,0 +1,225 @@
+"""What a page shows of a scene: its triangles, and tables of what their layers reflect under each illuminant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.optics import indices
+from coupole.appearance.render import objects
+from coupole.appearance.render.materials import Glass, Lacquer, Material, Metal
+from coupole.appearance.render.objects import Ball, MakieTile, NashijiSlab, Piece
+from coupole.appearance.render.scene_file import Scene
+from coupole.appearance.shapes import samples
+from coupole.appearance.shapes.solids import unit_sphere
+from coupole.appearance.shapes.triangles import flat_normals
+from coupole.appearance.spectra.grid import Array
+from coupole.errors import InputError
+from coupole.exchange.look.look_blocks import Look, block_of, octahedral
+from coupole.exchange.look.look_of_runs import welded
+from coupole.exchange.look.scene_layers import (
+    PATHS,
+    SHOWN,
+    Layer,
+    chromaticity,
+    flake_layers,
+    layers_of,
+    tables,
+)
+from coupole.exchange.look.scene_start import illuminants, start_of
+
+_BALL_PARTS = 48
+"""A ball has 20 times their square of triangles."""
+_WHOLE = 65535
+"""Code of a share of 1."""
+_PATH = float(1.0 / np.sqrt(1.0 - indices.URUSHI**-2))
+"""Longest way of light from the face to a depth, over the depth."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Triangles of one material."""
+
+    corners_mm: Array
+    number: int
+    casts: bool = True
+    """False for a sheet that other things stand on."""
+    share: Array | None = None
+    """[n], of the material's first layer, where each triangle has its own."""
+
+
+class _Materials:
+    """Materials in the order of their numbers, each once."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.layers: list[tuple[tuple[Layer, ...], bool]] = []
+        self.names: list[str] = []
+        self._numbers: dict[str, int] = {}
+
+    def number(self, material: Material) -> int:
+        key = material.model_dump_json()
+        if key not in self._numbers:
+            self._numbers[key] = self.add([layers_of(material, self.folder)], told(material))
+        return self._numbers[key]
+
+    def add(self, layers: Sequence[tuple[Layer, ...]], name: str, *, is_drawn: bool = False) -> int:
+        """Several for one name; the number of the first."""
+        first = len(self.layers)
+        self.layers += [(one, is_drawn) for one in layers]
+        self.names += [name] * len(layers)
+        return first
+
+
+def look_of_scene(scene: Scene, folder: Path) -> Look:
+    """Of a scene whose paths are relative to `folder`. Raises InputError, with what can be shown."""
+    found, face = _Materials(folder), None
+    parts: list[_Part] = []
+    for thing in scene.objects:
+        if isinstance(thing, MakieTile):
+            parts += _makie(thing, found)
+        elif isinstance(thing, NashijiSlab):
+            if face:
+                raise InputError(f"{scene.name}: has several nashiji_slab; a page shows {SHOWN}")
+            mine, face = _nashiji(thing, found)
+            parts += mine
+        else:
+            casts = thing.kind != "plane"
+            parts += [_opaque(piece, found, casts) for piece in objects.pieces(thing, folder)]
+    powers = illuminants(scene, folder)
+    corners_mm = np.concatenate([part.corners_mm for part in parts])
+    places, triangles, origin_mm, step_mm = welded(corners_mm.reshape(-1, 3))
+    normals = flat_normals(corners_mm)
+    normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
+    made = tables(found.layers, powers, scene.observer)
+    blocks: dict[str, NDArray[Any]] = {
+        "places": places,
+        "triangles": triangles,
+        "normals": octahedral(normals),
+        "material": _numbered(parts),
+        "tables": made.reshape(-1, *made.shape[-2:]),
+    }
+    about = _about(scene, folder, powers, found) | {
+        "triangles": len(triangles),
+        "face": face,
+        "box": [places.min(axis=0).tolist(), places.max(axis=0).tolist()],
+        "casting_mm": _box([part for part in parts if part.casts] or parts),
+        "origin_mm": origin_mm.tolist(),
+        "step_mm": step_mm,
+    }
+    errors = {"places": f"{0.5e3 * step_mm:.2g} um in each coordinate", "normals": "0.004 degrees"}
+    return Look(about, tuple(block_of(name, values) for name, values in blocks.items()), errors=errors)
+
+
+def told(material: Material) -> str:
+    """In a few words, without what is as usual."""
+    values = material.model_dump(mode="json", exclude_defaults=True)
+    values.pop("kind", None)
+    return f"{material.kind} {', '.join(f'{name} {_plain(value)}' for name, value in values.items())}".strip()
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, dict):
+        return " ".join(str(one) for name, one in value.items() if name != "kind" or len(value) == 1)
+    return str(value)
+
+
+def _about(scene: Scene, folder: Path, powers: dict[str, Array], found: _Materials) -> dict[str, Any]:
+    start = start_of(scene, folder)
+    lamps = [light.kind for light in scene.lights if light.kind in {"area", "leds"}]
+    return {
+        "kind": "scene",
+        "scene": scene.name,
+        "simulated": True,
+        "software": {},
+        "views": [],
+        "start": start,
+        "illuminants": {
+            name: {"told": name, "xy": chromaticity(power, scene.observer)} for name, power in powers.items()
+        },
+        "materials": found.names,
+        "observer": scene.observer,
+        "irradiance": float(np.pi),
+        "unit": "1/sr",
+        "told": {
+            "Object": "a hypothesis: described and computed, never measured",
+            "Colours": f"from 81 bands, 380 to 780 nm, each illuminant's own, CIE {scene.observer} observer",
+            "Light": "straight from lamps and from the upper half of the sky, with shadows of lamps; none from "
+            "surface to surface, and no mirror images of other objects."
+            + (" Lamps near by are disks far away, as strong as at the camera's target." if lamps else ""),
+            "Shape": "flat triangles, also where the renderer has them smooth",
+        },
+    }
+
+
+def _opaque(piece: Piece | Ball, found: _Materials, casts: bool) -> _Part:
+    corners_mm = (
+        piece.centre_mm + piece.radius_mm * unit_sphere(_BALL_PARTS)
+        if isinstance(piece, Ball)
+        else piece.corners_mm
+    )
+    return _Part(corners_mm, found.number(piece.material), casts)
+
+
+def _makie(thing: MakieTile, found: _Materials) -> list[_Part]:
+    """The drawing as shares of metal over lacquer, in place of grains."""
+    tile = samples.makie_tile(thing.side_mm, thing.triangles, thing.petals, thing.seed)
+    metal = Metal(kind="metal", roughness=thing.roughness)
+    black = Lacquer(kind="lacquer")
+    layers = (*layers_of(metal, found.folder), *layers_of(black, found.folder))
+    drawn = found.add([layers], f"{told(metal)}, by its share, over {told(black)}", is_drawn=True)
+    face = objects.placed(Piece(tile.face, black), thing).corners_mm
+    body = objects.placed(Piece(tile.body, black), thing).corners_mm
+    return [_Part(face, drawn, share=tile.share), _Part(body, found.number(black))]
+
+
+def _nashiji(thing: NashijiSlab, found: _Materials) -> tuple[list[_Part], dict[str, Any]]:
+    """Flakes and what lies under the lacquer; the lacquer's face, which the page refracts at."""
+    longest_mm = 2.0 * _PATH * thing.depth_mm
+    rotation = thing.scene_from_thing()[:3, :3]
+    parts, flakes = [], None
+    for piece in objects.pieces(thing, found.folder):
+        assert isinstance(piece, Piece)
+        if isinstance(piece.material, Glass):
+            top_mm = float((piece.corners_mm @ rotation[:, 2]).max())
+        elif isinstance(piece.material, Metal):
+            if flakes is None:
+                metal = piece.material
+                name = f"gold flake, roughness {metal.roughness:g}, in urushi"
+                flakes = found.add(flake_layers(metal.gold, metal.roughness, longest_mm), name)
+            parts.append(_Part(piece.corners_mm, flakes))
+        else:
+            parts.append(_Part(piece.corners_mm, found.number(piece.material)))
+    face = {
+        "normal": rotation[:, 2].tolist(),
+        "height_mm": top_mm,
+        "index": indices.URUSHI,
+        "flakes": -1 if flakes is None else flakes,
+        "paths": PATHS,
+        "longest_mm": longest_mm,
+        "body": parts[0].number,
+    }
+    return parts, face
+
+
+def _box(parts: Sequence[_Part]) -> list[list[float]]:
+    """Least and greatest coordinates."""
+    corners_mm = np.concatenate([part.corners_mm.reshape(-1, 3) for part in parts])
+    return [corners_mm.min(axis=0).tolist(), corners_mm.max(axis=0).tolist()]
+
+
+def _numbered(parts: Sequence[_Part]) -> NDArray[np.uint16]:
+    """[n, 2] of triangles: number of the material, code of the first layer's share."""
+    made = []
+    for part in parts:
+        one = np.full((len(part.corners_mm), 2), _WHOLE, np.uint16)
+        one[:, 0] = part.number
+        if part.share is not None:
+            one[:, 1] = np.rint(_WHOLE * np.clip(part.share, 0.0, 1.0))
+        made.append(one)
+    return np.concatenate(made)

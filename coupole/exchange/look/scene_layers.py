@@ -1,0 +1,165 @@
+"""Materials of a scene as layers that a page lights: spectra by angle, and their colours under each illuminant.
+
+A layer is GGX facets over a Lambertian body. Its colours are made here, from 81 bands, the illuminant and the
+observer: the page looks them up, and never multiplies a colour of a light with one of a material.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import assert_never
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.matter import gilding, lacquer, layered
+from coupole.appearance.optics import fresnel, indices
+from coupole.appearance.optics.thin_film import Film, stack_power
+from coupole.appearance.render import materials
+from coupole.appearance.render.materials import Diffuse, Films, Gilt, Glass, Lacquer, Material, Metal, Paint
+from coupole.appearance.render.spectra import reflectance
+from coupole.appearance.spectra import light
+from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex
+from coupole.errors import InputError
+
+ANGLES = 33
+COSINES: Array = np.maximum(np.linspace(0.0, 1.0, ANGLES) ** 2, 1e-9)
+"""Of angles of incidence at which a table has values; their roots have equal steps."""
+LAYERS = 2
+"""Of each material."""
+COLUMNS = ANGLES + 2
+PATHS = 17
+"""Lengths of way through lacquer for which a flake has values, from 0 to the longest."""
+SHOWN = "gilding, metals, films, paints, lacquer, makie, and one nashiji_slab beside opaque things"
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Facets over a body."""
+
+    mirror: Array
+    """[ANGLES, 81], reflectance of the facets at `COSINES`."""
+    passing: Array
+    """[ANGLES], share of light that the face lets pass at an angle, inwards as outwards."""
+    body: Array
+    """[81], reflectance of the body, without what the face keeps by `passing`."""
+    roughness: float
+    """GGX's alpha."""
+
+    def times(self, share: float) -> Layer:
+        """A layer that covers a share of the surface."""
+        return Layer(share * self.mirror, self.passing, share * self.body, self.roughness)
+
+
+def layers_of(material: Material, folder: Path) -> tuple[Layer, ...]:
+    """One or two layers, whose sum the material is; paths are relative to `folder`. Raises InputError."""
+    match material:
+        case Diffuse():
+            return (_bodied(np.zeros((ANGLES, BANDS)), reflectance(material.reflectance, folder), 1.0),)
+        case Paint():
+            return (_coated(materials.paint_inside(material, folder), material.index, material.roughness),)
+        case Lacquer():
+            return (_coated(reflectance(material.body, folder), material.index, material.roughness),)
+        case Metal():
+            return (_metal(material),)
+        case Films():
+            films = [Film(indices.constant(film.index), film.thickness_nm) for film in material.films]
+            base = (
+                indices.constant(material.index) if material.gold is None else materials.metal_index(material.gold)
+            )
+            return (_bodied(_stack(films, base), np.zeros(BANDS), material.roughness),)
+        case Gilt():
+            return _gilt(material, folder)
+        case Glass():
+            raise InputError(f"material of kind glass: a page does not refract; it shows {SHOWN}")
+        case _:
+            assert_never(material)
+
+
+def flake_layers(gold: float, roughness: float, longest_mm: float) -> list[tuple[Layer, ...]]:
+    """A metal under urushi, behind ways of 0 to `longest_mm` through it: `PATHS` materials. Without the lacquer's
+    face, which the page refracts at."""
+    index = materials.metal_index(gold) / indices.URUSHI
+    mirror, absorption = fresnel.reflectance(COSINES[:, None], index), lacquer.urushi_absorption()
+    ways_mm = np.linspace(0.0, longest_mm, PATHS)
+    return [(_bodied(mirror * np.exp(-way * absorption), np.zeros(BANDS), roughness),) for way in ways_mm]
+
+
+def tables(
+    found: Sequence[tuple[tuple[Layer, ...], bool]], powers: Mapping[str, Array], observer: light.Observer
+) -> NDArray[np.float32]:
+    """[illuminants, materials, LAYERS, COLUMNS, 4] linear sRGB of white 1 under each illuminant.
+
+    Columns: `mirror` at `COSINES` with `passing` as fourth number; body (1/sr) and roughness; then 1 if each
+    triangle has its own share of the first layer and the second has the rest, else 0, and the colour of white.
+    Colours outside the gamut have numbers below 0.
+    """
+    made = np.zeros((len(powers), len(found), LAYERS, COLUMNS, 4), np.float32)
+    made[..., :ANGLES, 3] = 1.0
+    made[..., ANGLES, 3] = 1.0
+    for at, power in enumerate(powers.values()):
+        for number, (layers, is_drawn) in enumerate(found):
+            for place, layer in enumerate(layers):
+                here = made[at, number, place]
+                here[:ANGLES, :3] = colours(layer.mirror, power, observer)
+                here[:ANGLES, 3] = layer.passing
+                here[ANGLES, :3] = colours(layer.body, power, observer) / np.pi
+                here[ANGLES, 3] = layer.roughness
+            made[at, number, :, ANGLES + 1, 0] = is_drawn
+            made[at, number, :, ANGLES + 1, 1:] = colours(np.ones(BANDS), power, observer)
+    return made
+
+
+def colours(spectral: Array, power: Array, observer: light.Observer) -> Array:
+    """Linear sRGB [..., 3] of reflectances [..., 81] under a light; Y of the perfect white is 1. No adaptation."""
+    return light.linear_srgb(light.tristimulus(spectral, power, light.observer(observer)))
+
+
+def chromaticity(power: Array, observer: light.Observer) -> list[float]:
+    """x, y of a light."""
+    xyz = light.tristimulus(np.ones(BANDS), power, light.observer(observer))
+    return [float(value) for value in xyz[:2] / xyz.sum()]
+
+
+def _bodied(mirror: Array, body: Array, roughness: float) -> Layer:
+    return Layer(mirror, np.ones(ANGLES), body, roughness)
+
+
+def _coated(body: Array, index: float, roughness: float) -> Layer:
+    """A body under a glossy face, with all reflections between them (Saunderson), as `materials.coated` has it."""
+    face = fresnel.reflectance(COSINES, index)
+    seen = body / (index**2 * (1.0 - fresnel.diffuse_internal(index) * body))
+    return Layer(np.repeat(face[:, None], BANDS, axis=1), 1.0 - face, seen, roughness)
+
+
+def _metal(material: Metal) -> Layer:
+    index, factor = materials.metal_index(material.gold), np.ones(BANDS)
+    if material.depth_mm is not None:
+        index = index / indices.URUSHI
+        inward = 1.0 - float(fresnel.reflectance(1.0, indices.URUSHI))
+        factor = (inward * lacquer.transmittance(material.depth_mm, 1.0, lacquer.urushi_absorption())) ** 2
+    return _bodied(fresnel.reflectance(COSINES[:, None], index) * factor, np.zeros(BANDS), material.roughness)
+
+
+def _stack(films: Sequence[Film], base: Complex) -> Array:
+    return stack_power(COSINES, WAVELENGTHS_NM, films, substrate=base)[0]
+
+
+def _gilt(material: Gilt, folder: Path) -> tuple[Layer, ...]:
+    """Leaf with the bole's light that comes through it, and bare bole, by their shares."""
+    index = materials.metal_index(material.gold)
+    if material.holes > 0.0:
+        index = gilding.leaf_index(index, material.holes)
+    seen = reflectance(material.bole, folder)
+    gilded = gilding.gilt(index, material.thickness_nm, seen, uncovered=material.uncovered)
+    bare = _coated(gilded.bole_inside, indices.EGG_WHITE, material.bole_roughness)
+    if material.thickness_nm < materials.THINNEST_NM or material.uncovered == 1.0:
+        return (bare,)
+    through = gilded.leaf.transmittance[-1] * layered.emerging(gilded.leaf, gilded.bole_inside)
+    films = [Film(index, material.thickness_nm)]
+    leaf = _bodied(_stack(films, indices.constant(indices.EGG_WHITE)), through, material.roughness)
+    if material.uncovered == 0.0:
+        return (leaf,)
+    return leaf.times(1.0 - material.uncovered), bare.times(material.uncovered)

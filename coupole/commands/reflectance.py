@@ -157,6 +157,9 @@ def from_runs_or_pictures(
         if out is None:
             raise InputError("--out: expected the folder of the result")
         _refuse_mixed(runs or [], pictures, calibrations or [], view, refined, uncalibrated=uncalibrated)
+        _refuse_without(
+            pictures, {"--lights": lights, "--srgb": srgb, "--intensities": intensities, "--mask": mask}
+        )
         with step_bars(console) as say:
             if uncalibrated and runs:
                 made = _of_uncalibrated(runs[0], view, _numbers(leave_out), out, say)
@@ -218,6 +221,13 @@ def _refuse_mixed(
         raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
     if refined is not None and (uncalibrated or pictures is not None):
         raise InputError("--refined: is for calibrated runs")
+
+
+def _refuse_without(pictures: Path | None, options: dict[str, Path | bool | None]) -> None:
+    """Raise InputError for options of pictures without `--pictures`."""
+    given = [name for name, value in options.items() if value]
+    if pictures is None and given:
+        raise InputError(f"{', '.join(given)}: goes with --pictures alone, not with runs; leave it out")
 
 
 def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path, say: Said) -> Made:

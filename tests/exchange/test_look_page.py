@@ -63,6 +63,15 @@ def test_a_title_cannot_become_part_of_the_page(tmp_path: Path) -> None:
     assert "</script><b>" not in text
 
 
+def test_names_stay_what_they_are(tmp_path: Path) -> None:
+    look = Look({"kind": "mesh"}, (block_of("frame-</script><i>", np.zeros(3, np.uint8)),))
+    write_page(look, "x %BLOCKS% y", tmp_path / "look.html")
+    text = (tmp_path / "look.html").read_text()
+    assert "<h1>x %BLOCKS% y</h1>" in text
+    assert '"title": "x %BLOCKS% y"' in text
+    assert "</script><i>" not in text
+
+
 def test_what_is_too_large_for_one_file_lies_beside_it(tmp_path: Path) -> None:
     files = write_page(small(9000), "a vase", tmp_path / "look.html", most_bytes=10_000)
     assert [file.relative_to(tmp_path).as_posix() for file in files] == ["look.html", "look.data/places.js"]
@@ -167,6 +176,14 @@ def test_a_damaged_result_is_refused_with_the_remedy(tmp_path: Path) -> None:
     ended = cells.here("show", tmp_path / "cut", "--out", tmp_path / "look.html")
     assert ended.code == 2
     assert "make the result again" in " ".join(ended.err.split())
+
+
+def test_a_result_that_does_not_say_enough_is_refused_with_what_it_lacks(tmp_path: Path) -> None:
+    write_result(tmp_path / "bare", waves(8))
+    (tmp_path / "bare/result.json").write_text('{"schema": "coupole-reflectance-run/1", "runs": {}, "mae": []}')
+    ended = cells.here("show", tmp_path / "bare", "--out", tmp_path / "look.html")
+    assert ended.code == 2
+    assert [name in ended.err for name in ("mae", "software", "simulated", "runs:")] == [True, True, True, False]
 
 
 def test_a_result_without_uncertainty_is_refused(tmp_path: Path) -> None:

@@ -309,13 +309,19 @@ def test_tiles_at_their_canonical_addresses_put_the_picture_together(tmp_path: P
         (("--to", "ptm", "--basis", "ptm"), "--basis, --planes: are for --to relight"),
         (("--to", "rti", "--base-url", "https://a.example"), "is for --to iiif"),
         (("--to", "iiif", "--base-url", "eggs/"), "expected the http address"),
+        (("--to", "iiif", "--base-url", "https://[::1"), "expected the http address"),
+        (("--to", "iiif", "--base-url", "http://x/a b"), "expected the http address"),
+        (("--to", "iiif", "--base-url", 'https://x/<b>"'), "expected the http address"),
+        (("--to", "iiif", "--base-url", "https://x:99999/"), "expected the http address"),
+        (("--to", "iiif", "--base-url", "https://x/a%2"), "expected the http address"),
         (("--to", "ptm", "--views", "top"), "a result of pictures has one view"),
     ],
 )
 def test_what_does_not_fit_is_refused(options: tuple[str, ...], said: str, result: Path, tmp_path: Path) -> None:
-    ended = cells.here("export", result, *options, "--out", tmp_path)
+    ended = cells.here("export", result, *options, "--out", tmp_path / "new")
     assert ended.code == 2
     assert said in " ".join(ended.err.split())
+    assert not (tmp_path / "new").exists()
 
 
 def test_lights_that_do_not_determine_harmonics_and_files_that_stand_are_refused(tmp_path: Path) -> None:

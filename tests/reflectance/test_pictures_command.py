@@ -165,6 +165,13 @@ def test_lights_that_cannot_be_left_out_are_refused(
     assert message in ended.document["error"]
 
 
+def test_options_of_pictures_are_refused_with_runs(tmp_path: Path) -> None:
+    for options in (["--srgb"], ["--lights", "a.lp"], ["--intensities", "a.txt"], ["--mask", "a.png"]):
+        ended = cells.here("reflectance", tmp_path / "run", *options, "--out", tmp_path / "out", "--json")
+        assert ended.code == 2
+        assert f"{options[0]}: goes with --pictures alone" in ended.document["error"]
+
+
 def test_an_environment_with_one_sun_is_that_direction(made: Made, tmp_path: Path) -> None:
     """Up is y, the middle z, and x to the left of it: the sun stands 30 degrees to x and 20 degrees up."""
     out = made[1]

@@ -239,13 +239,15 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
     from coupole.viewing import reflectance_page
 
     folder = out.with_name(f"{out.name}-pictures")
-    leds = uncalibrated.write_pictures(run, view, folder, say).leds
+    taken = uncalibrated.write_pictures(run, view, folder, say)
+    leds = taken.leds
     if wrong := sorted(set(left_out) - set(leds)):
         raise InputError(f"--leave-out: no frame under LED {wrong[0]} in this view")
     left_out = [leds.index(led) for led in left_out]
     lights, intensities, mask = (folder / name for name in uncalibrated.FILES)
     given = read_pictures(folder, lights, intensities=intensities, mask=mask)
-    about = fit_pictures(replace(given, uncalibrated_run=run.resolve().name), out, left_out=left_out, say=say)
+    given = replace(given, uncalibrated_run=run.resolve().name, simulated=taken.simulated)
+    about = fit_pictures(given, out, left_out=left_out, say=say)
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 

@@ -38,6 +38,8 @@ class PictureSet:
     """Whether files are encoded for displays; their values are decoded to 16 bit."""
     uncalibrated_run: str = ""
     """The run that these are pictures of, with nominal lights; empty for others."""
+    simulated: bool | None = None
+    """Whether they were simulated; None where nobody knows."""
 
     def __len__(self) -> int:
         return len(self.files)

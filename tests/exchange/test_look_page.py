@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import re
+import zlib
 from pathlib import Path
 
 import cells
@@ -16,6 +18,7 @@ from coupole.exchange.look.coarse_mesh import coarse_mesh
 from coupole.exchange.look.look_blocks import block_of
 from coupole.exchange.look.look_of_runs import Look, welded
 from coupole.exchange.look.look_page import write_page
+from coupole.exchange.look.look_samples import samples_of_view
 
 
 def small(numbers: int = 30) -> Look:
@@ -155,6 +158,17 @@ def test_an_option_that_does_not_fit_is_refused(result: Path, tmp_path: Path, op
     assert ended.code == 2
     assert option[0] in ended.err or option[1] in ended.err
     assert not list(tmp_path.iterdir())
+
+
+def test_bars_of_samples_hold_what_an_led_does_to_all_channels(tmp_path: Path) -> None:
+    result = write_result(tmp_path / "sheet", waves(8))
+    with h5py.File(result.views[0].path, "a") as file:
+        file["f"][...] = 0.1
+        file["u_own"], file["led_u_own"] = np.zeros(file["f"].shape, np.float16), np.full((1, 3), 0.05)
+    _, blocks = samples_of_view(result, result.views[0], np.eye(4), lambda *_: None)
+    packed = zlib.decompress(base64.b64decode(blocks[2].text))
+    u = 1e-4 * 1e5 ** ((np.frombuffer(packed, np.uint8).reshape(blocks[2].shape)[1] - 1.0) / 254)
+    np.testing.assert_allclose(u, 0.05, rtol=0.024)
 
 
 def test_a_page_of_another_name_is_refused(result: Path, tmp_path: Path) -> None:

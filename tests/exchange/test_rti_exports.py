@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -274,6 +275,28 @@ def test_a_manifest_leads_to_pictures_of_the_sizes_that_it_says(result: Path, tm
     for side, flank in flanks.items():
         bump = shown[f"egg-{side}"][4:24, 30:46]
         assert bump[flank].mean() > bump.mean() + 2.0, side
+
+
+@pytest.mark.parametrize(
+    ("told", "kind"),
+    [
+        ({"simulated": True, "uncalibrated_run": "vase"}, "simulated: vase"),
+        ({"simulated": False, "uncalibrated_run": "vase"}, "measured: vase"),
+        ({"simulated": None}, "not known whether measured or simulated: egg"),
+    ],
+)
+def test_files_say_whether_their_pictures_were_simulated(
+    told: dict[str, Any], kind: str, result: Path, tmp_path: Path
+) -> None:
+    source = tmp_path / "egg"
+    shutil.copytree(result, source)
+    (source / "result.json").write_text(json.dumps({"schema": "coupole-reflectance-pictures/1", **told}))
+    export(source, tmp_path / "r", "--to", "relight", "--basis", "ptm")
+    export(source, tmp_path / "i", "--to", "iiif")
+    info, manifest = (json.loads((tmp_path / name).read_text()) for name in ("r/egg/info.json", "i/manifest.json"))
+    wanted = f"Coupole, pictures under known lights, {kind}"
+    assert info["origin"] == wanted
+    assert manifest["metadata"][0]["value"]["none"] == [wanted]
 
 
 def test_tiles_at_their_canonical_addresses_put_the_picture_together(tmp_path: Path) -> None:

@@ -94,6 +94,7 @@ def test_the_result_is_read_by_plain_h5py(made: Made) -> None:
     about = json.loads((out / "result.json").read_text())
     assert about["left_out"] == LEFT_OUT
     assert len(about["inputs"]["pictures"]["007.png"]) == 64
+    assert about["simulated"] is None
 
 
 def test_the_report_shows_what_was_made(made: Made) -> None:

@@ -156,10 +156,8 @@ def from_runs_or_pictures(
     try:
         if out is None:
             raise InputError("--out: expected the folder of the result")
-        _refuse_mixed(runs or [], pictures, calibrations or [], view, refined, uncalibrated=uncalibrated)
-        _refuse_without(
-            pictures, {"--lights": lights, "--srgb": srgb, "--intensities": intensities, "--mask": mask}
-        )
+        alone = (lights, srgb, intensities, mask)
+        _refuse_mixed(runs or [], pictures, calibrations or [], view, refined, alone, uncalibrated=uncalibrated)
         with step_bars(console) as say:
             if uncalibrated and runs:
                 made = _of_uncalibrated(runs[0], view, _numbers(leave_out), out, say)
@@ -211,6 +209,7 @@ def _refuse_mixed(
     calibrations: list[Path],
     view: str | None,
     refined: Path | None,
+    of_pictures: tuple[Path | bool | None, ...],
     *,
     uncalibrated: bool,
 ) -> None:
@@ -221,13 +220,8 @@ def _refuse_mixed(
         raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
     if refined is not None and (uncalibrated or pictures is not None):
         raise InputError("--refined: is for calibrated runs")
-
-
-def _refuse_without(pictures: Path | None, options: dict[str, Path | bool | None]) -> None:
-    """Raise InputError for options of pictures without `--pictures`."""
-    given = [name for name, value in options.items() if value]
-    if pictures is None and given:
-        raise InputError(f"{', '.join(given)}: goes with --pictures alone, not with runs; leave it out")
+    if pictures is None and any(of_pictures):
+        raise InputError("--lights, --srgb, --intensities, --mask: go with --pictures alone, not with runs")
 
 
 def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path, say: Said) -> Made:
@@ -240,10 +234,9 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
 
     folder = out.with_name(f"{out.name}-pictures")
     taken = uncalibrated.write_pictures(run, view, folder, say)
-    leds = taken.leds
-    if wrong := sorted(set(left_out) - set(leds)):
+    if wrong := sorted(set(left_out) - set(taken.leds)):
         raise InputError(f"--leave-out: no frame under LED {wrong[0]} in this view")
-    left_out = [leds.index(led) for led in left_out]
+    left_out = [taken.leds.index(led) for led in left_out]
     lights, intensities, mask = (folder / name for name in uncalibrated.FILES)
     given = read_pictures(folder, lights, intensities=intensities, mask=mask)
     given = replace(given, uncalibrated_run=run.resolve().name, simulated=taken.simulated)

@@ -134,7 +134,7 @@ def view_of_run(run: Run, name: str, folder: Path, say: Said) -> LitView:
 def view_of_result(result: PictureResult, say: Said) -> LitView:
     """The view of a result of pictures; black outside its mask."""
     about, height, width = result.about, *result.mask.shape
-    known = {True: "simulated", False: "measured"}
+    known: dict[Any, str] = {True: "simulated", False: "measured"}
     kind = known.get(about.get("simulated"), "not known whether measured or simulated")
     of = about.get("uncalibrated_run") or result.folder.name
     return _seen(

@@ -236,11 +236,10 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
     taken = uncalibrated.write_pictures(run, view, folder, say)
     if wrong := sorted(set(left_out) - set(taken.leds)):
         raise InputError(f"--leave-out: no frame under LED {wrong[0]} in this view")
-    left_out = [taken.leds.index(led) for led in left_out]
     lights, intensities, mask = (folder / name for name in uncalibrated.FILES)
     given = read_pictures(folder, lights, intensities=intensities, mask=mask)
     given = replace(given, uncalibrated_run=run.resolve().name, simulated=taken.simulated)
-    about = fit_pictures(given, out, left_out=left_out, say=say)
+    about = fit_pictures(given, out, left_out=[taken.leds.index(led) for led in left_out], say=say)
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 

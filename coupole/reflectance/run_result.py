@@ -362,6 +362,8 @@ def read_about(folder: Path) -> dict[str, Any]:
         raise InputError([Problem(str(path), 0, 0, "schema", f"expected {SCHEMA}")])
     remedy = f"`coupole reflectance check {folder}` writes it anew"
     wrong = [name for name, kind in _TOLD.items() if not isinstance(about.get(name), kind)]
+    if "software" not in wrong and "coupole" not in about["software"]:
+        wrong.append("software: coupole")
     if wrong:
         raise InputError(
             [Problem(str(path), 0, 0, name, f"is missing or of another kind; {remedy}") for name in wrong]

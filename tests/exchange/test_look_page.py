@@ -194,10 +194,17 @@ def test_a_damaged_result_is_refused_with_the_remedy(tmp_path: Path) -> None:
 
 def test_a_result_that_does_not_say_enough_is_refused_with_what_it_lacks(tmp_path: Path) -> None:
     write_result(tmp_path / "bare", waves(8))
-    (tmp_path / "bare/result.json").write_text('{"schema": "coupole-reflectance-run/1", "runs": {}, "mae": []}')
+    (tmp_path / "bare/result.json").write_text(
+        '{"schema": "coupole-reflectance-run/1", "runs": {}, "mae": [], "software": {}}'
+    )
     ended = cells.here("show", tmp_path / "bare", "--out", tmp_path / "look.html")
     assert ended.code == 2
-    assert [name in ended.err for name in ("mae", "software", "simulated", "runs:")] == [True, True, True, False]
+    assert [name in ended.err for name in ("mae", "software: coupole", "simulated", "runs:")] == [
+        True,
+        True,
+        True,
+        False,
+    ]
 
 
 def test_a_result_without_uncertainty_is_refused(tmp_path: Path) -> None:

@@ -90,5 +90,6 @@ function samplesTold(samples) {
   return `${samplesPlotOf(samples)}<p class="small">${samples.length} measured samples of ${views}: f,
     1/sr, mean of the channels. Bars: 1.96 standard uncertainties by noise of the frames, each LED's own power and
     inter-reflection taken off, as if the channels were off together. Not in them: where pixels look, their own
-    responses, the mesh's vertices, places of LEDs, and what all samples share. Orange: what the fit makes of the same directions; median difference ${told} of the samples' mean.</p>`;
+    responses, the mesh's vertices, places of LEDs, and what all samples share. Orange: what the fit makes of the
+    same directions; median difference ${told} of the samples' mean.</p>`;
 }

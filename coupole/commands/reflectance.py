@@ -156,7 +156,8 @@ def from_runs_or_pictures(
     try:
         if out is None:
             raise InputError("--out: expected the folder of the result")
-        _refuse_mixed(runs or [], pictures, calibrations or [], view, refined, uncalibrated=uncalibrated)
+        alone = (lights, srgb, intensities, mask)
+        _refuse_mixed(runs or [], pictures, calibrations or [], view, refined, alone, uncalibrated=uncalibrated)
         with step_bars(console) as say:
             if uncalibrated and runs:
                 made = _of_uncalibrated(runs[0], view, _numbers(leave_out), out, say)
@@ -208,6 +209,7 @@ def _refuse_mixed(
     calibrations: list[Path],
     view: str | None,
     refined: Path | None,
+    of_pictures: tuple[Path | bool | None, ...],
     *,
     uncalibrated: bool,
 ) -> None:
@@ -218,6 +220,8 @@ def _refuse_mixed(
         raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
     if refined is not None and (uncalibrated or pictures is not None):
         raise InputError("--refined: is for calibrated runs")
+    if pictures is None and any(of_pictures):
+        raise InputError("--lights, --srgb, --intensities, --mask: go with --pictures alone, not with runs")
 
 
 def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path, say: Said) -> Made:
@@ -229,13 +233,13 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
     from coupole.viewing import reflectance_page
 
     folder = out.with_name(f"{out.name}-pictures")
-    leds = uncalibrated.write_pictures(run, view, folder, say).leds
-    if wrong := sorted(set(left_out) - set(leds)):
+    taken = uncalibrated.write_pictures(run, view, folder, say)
+    if wrong := sorted(set(left_out) - set(taken.leds)):
         raise InputError(f"--leave-out: no frame under LED {wrong[0]} in this view")
-    left_out = [leds.index(led) for led in left_out]
     lights, intensities, mask = (folder / name for name in uncalibrated.FILES)
     given = read_pictures(folder, lights, intensities=intensities, mask=mask)
-    about = fit_pictures(replace(given, uncalibrated_run=run.resolve().name), out, left_out=left_out, say=say)
+    given = replace(given, uncalibrated_run=run.resolve().name, simulated=taken.simulated)
+    about = fit_pictures(given, out, left_out=[taken.leds.index(led) for led in left_out], say=say)
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 

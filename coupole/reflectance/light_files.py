@@ -23,6 +23,8 @@ Floats = NDArray[np.float64]
 
 _PLACES = {"spherical": "positionsSphere", "lights3d": "positions3d"}
 """Where relight has the lights, by `lightConfiguration`; else, and where the list is empty, in `directions`."""
+_MOST_DIGITS = 9
+"""Of a number of lights."""
 
 
 @dataclass(frozen=True)
@@ -37,20 +39,22 @@ class LightFile:
     """[n, 3] by which values are divided."""
     srgb: bool = False
     """Whether it says that the pictures are encoded for displays."""
+    lines: tuple[int, ...] = ()
+    """In which each direction stands; empty for JSON."""
 
 
 def read_lights(path: Path) -> LightFile:
     """An `.lp`, `.dome` or `.relight` file, or a table of directions. Raises InputError with the line."""
     match path.suffix.lower():
         case ".lp":
-            names, directions = read_lp(path)
-            return LightFile(directions, tuple(names))
+            return read_lp(path)
         case ".dome":
             return _read_dome(path, _json_object(path))
         case ".relight":
             return _read_project(path)
         case _:
-            return LightFile(read_rows(path, (3,)))
+            lines, directions = _numbered_rows(path, (3,))
+            return LightFile(directions, lines=lines)
 
 
 def _read_project(path: Path) -> LightFile:
@@ -67,6 +71,9 @@ def _read_project(path: Path) -> LightFile:
         refuse(path, f"dome: {count} lights; {len(used)} pictures are used of {len(images)}")
     rows = used if count == len(images) else list(range(count))
     names = tuple(_last_part(images[number]["filename"]) for number in used)
+    for place, name in enumerate(names):
+        if name in names[:place]:
+            refuse(path, f"images: {_twice(name)}")
     intensities = None if lights.intensities is None else lights.intensities[rows]
     forced = project.get("forcedInputColorspace")
     srgb = forced == "srgb" or (forced is None and project.get("iccProfileIsSRGB") is True)
@@ -105,7 +112,7 @@ def _is_number(value: object) -> bool:
 
 def _json_object(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads("\n".join(_lines(path)))
+        document = json.loads(_text(path))
     except (ValueError, RecursionError) as error:
         refuse(path, f"is no JSON: {error}")
     if not isinstance(document, dict):
@@ -117,39 +124,64 @@ def _last_part(name: str) -> str:
     return Path(name.replace("\\", "/")).name
 
 
+def _twice(name: str) -> str:
+    return (
+        f"two pictures are called {name}; pictures are looked for in one folder by the last part of their names: "
+        "put all into one folder under names of their own, and name these here"
+    )
+
+
 def read_rows(path: Path, lengths: Sequence[int]) -> NDArray[np.float64]:
     """[n, 3] numbers, one row a line; a single number stands for three. Raises InputError with the line."""
-    rows = []
-    for line, text in enumerate(_lines(path), start=1):
+    return _numbered_rows(path, lengths)[1]
+
+
+def _numbered_rows(path: Path, lengths: Sequence[int]) -> tuple[tuple[int, ...], Floats]:
+    lines, rows = [], []
+    for line, text in enumerate(read_lines(path), start=1):
         if words := text.replace(",", " ").split():
             if len(words) not in lengths:
                 refuse(path, f"{len(words)} values; expected {' or '.join(map(str, lengths))}", line)
             rows.append(np.resize([_number(path, line, word) for word in words], 3))
-    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+            lines.append(line)
+    return tuple(lines), np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 
-def read_lp(path: Path) -> tuple[list[str], NDArray[np.float64]]:
-    """Names of pictures and directions [n, 3] of an .lp file: a count, then `name x y z` in each line."""
-    names, rows = [], []
-    lines = [(number, text) for number, text in enumerate(_lines(path), start=1) if text.strip()]
-    if not lines or not lines[0][1].strip().isdecimal():
+def read_lp(path: Path) -> LightFile:
+    """An .lp file: a count, then `name x y z` in each line. Raises InputError with the line."""
+    names: list[str] = []
+    rows = []
+    lines = [(number, text) for number, text in enumerate(read_lines(path), start=1) if text.strip()]
+    count = lines[0][1].strip() if lines else ""
+    if not count.isdecimal() or len(count) > _MOST_DIGITS:
         refuse(path, "expected the number of lights", lines[0][0] if lines else 1)
     for line, text in lines[1:]:
         words = text.split()
         if len(words) < 4:
             refuse(path, "expected `name x y z`", line)
-        names.append(_last_part(" ".join(words[:-3])))
+        name = _last_part(" ".join(words[:-3]))
+        if name in names:
+            refuse(path, _twice(name), line)
+        names.append(name)
         rows.append([_number(path, line, word) for word in words[-3:]])
-    if len(rows) != int(lines[0][1]):
-        refuse(path, f"says {lines[0][1].strip()} lights, has {len(rows)}", lines[0][0])
-    return names, np.array(rows, dtype=np.float64)
+    if len(rows) != int(count):
+        refuse(path, f"says {count} lights, has {len(rows)}", lines[0][0])
+    directions = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    return LightFile(directions, tuple(names), lines=tuple(line for line, _ in lines[1:]))
 
 
-def _lines(path: Path) -> list[str]:
+def read_lines(path: Path) -> list[str]:
+    """Of a text in UTF-8, with or without a mark of its beginning. Raises InputError."""
+    return _text(path).split("\n")
+
+
+def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError([Problem(str(path), 0, 0, "", f"cannot be read: {error}")]) from error
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        refuse(path, "is no text in UTF-8; save it as UTF-8")
+    except OSError as error:
+        refuse(path, f"cannot be read: {error.strerror or error}")
 
 
 def _number(path: Path, line: int, word: str) -> float:

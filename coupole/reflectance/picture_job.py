@@ -101,7 +101,8 @@ def _fit_pictures(pictures: PictureSet, out: Path, left_out: Sequence[int], say:
     interpolation = read_interpolation(out)
     peak = peak_of(result)
     checked = [check(result, interpolation, light, peak) for light in settings["left_out"]]
-    about = _about(result, settings, interpolation, materials, checked, time.monotonic() - begun_s)
+    told = {**settings, "simulated": pictures.simulated}
+    about = _about(result, told, interpolation, materials, checked, time.monotonic() - begun_s)
     complete(out / ABOUT, lambda path: path.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8"))
     return about
 
@@ -210,7 +211,7 @@ def pooled_psnr_db(checked: Sequence[Checked]) -> float | None:
 
 def _about(
     result: PictureResult,
-    settings: dict[str, Any],
+    told: dict[str, Any],
     interpolation: Interpolation,
     materials: PointMaterials,
     checked: Sequence[Checked],
@@ -224,7 +225,7 @@ def _about(
     return {
         "schema": SCHEMA,
         "software": {name: version(name) for name in ("coupole", "numpy", "numba", "h5py")},
-        **settings,
+        **told,
         "axes": AXES,
         "lights": len(names),
         "pixels": int(np.count_nonzero(result.mask)),

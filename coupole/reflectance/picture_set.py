@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.light_files import read_lights, read_rows, refuse
+from coupole.reflectance.light_files import read_lights, read_lines, read_rows, refuse
 
 PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 ORDER_FILE = "filenames.txt"
@@ -38,6 +38,8 @@ class PictureSet:
     """Whether files are encoded for displays; their values are decoded to 16 bit."""
     uncalibrated_run: str = ""
     """The run that these are pictures of, with nominal lights; empty for others."""
+    simulated: bool | None = None
+    """Whether they were simulated; None where nobody knows."""
 
     def __len__(self) -> int:
         return len(self.files)
@@ -93,9 +95,10 @@ def read_pictures(
         if not path.is_file():
             refuse(lights if said.names else folder / ORDER_FILE, f"names {path}: no such file")
     lengths = np.linalg.norm(directions, axis=1)
-    for line, length in enumerate(lengths, start=1):
+    for number, length in enumerate(lengths):
         if length < 1e-6:
-            refuse(lights, "a light's direction has no length", line)
+            line = said.lines[number] if said.lines else 0
+            refuse(lights, f"the direction of light number {number} (from 0), of {names[number]}, is 0 0 0", line)
     first = read_picture(files[0])
     srgb = srgb or said.srgb
     factors = said.intensities if said.intensities is not None else np.ones((len(files), 3))
@@ -126,7 +129,7 @@ def _decoded(picture: NDArray[Any]) -> NDArray[np.uint16]:
 def _names_in(folder: Path, others: set[Path]) -> tuple[str, ...]:
     order = folder / ORDER_FILE
     if order.is_file():
-        return tuple(order.read_text(encoding="utf-8").split())
+        return tuple(" ".join(read_lines(order)).split())
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
     return tuple(path.name for path in found if path.resolve() not in others and path.stem != "mask")
 

@@ -59,6 +59,15 @@ U_OF_INTER_REFLECTION = 0.2
 MOST_ROWS = 1 << 16
 LOWER = np.tril_indices(UNKNOWNS)
 _HEAD = ("triangles", "camera_mm", "leds", "led_positions_mm", "led_normals", "full_scales")
+_TOLD = {
+    "software": dict,
+    "runs": dict,
+    "mae": dict,
+    "emission": str,
+    "scan_noise_um": int | float,
+    "simulated": bool,
+}
+"""Of result.json, what others than its report read."""
 FIELDS = {
     "normals": "unit, base frame",
     "kd": "1/sr, by channel",
@@ -342,7 +351,7 @@ def read_view_samples(path: Path) -> ViewSamples:
 
 
 def read_about(folder: Path) -> dict[str, Any]:
-    """result.json of a result of runs. Raises InputError if there is none."""
+    """result.json of a result of runs. Raises InputError if there is none, or one without what results have."""
     path = folder / ABOUT
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
@@ -351,6 +360,14 @@ def read_about(folder: Path) -> dict[str, Any]:
         raise InputError([problem]) from error
     if not isinstance(about, dict) or about.get("schema") != SCHEMA:
         raise InputError([Problem(str(path), 0, 0, "schema", f"expected {SCHEMA}")])
+    remedy = f"`coupole reflectance check {folder}` writes it anew"
+    wrong = [name for name, kind in _TOLD.items() if not isinstance(about.get(name), kind)]
+    if "software" not in wrong and "coupole" not in about["software"]:
+        wrong.append("software: coupole")
+    if wrong:
+        raise InputError(
+            [Problem(str(path), 0, 0, name, f"is missing or of another kind; {remedy}") for name in wrong]
+        )
     return about
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 import re
@@ -332,6 +333,13 @@ def test_an_address_brings_back_view_light_and_notes(page: Page, folder: Path) -
 def test_an_address_that_was_damaged_opens_the_page_as_it_begins(page: Page, folder: Path) -> None:
     page.open(folder / "look.html", "#eyJtb2RlIjoi")
     assert page.run("coupole.state.mode") == "relit"
+    sound = page.run("coupole.state")
+    inherited = [{"mode": "toString"}, {"quantity": "toString"}]
+    inherited += [{"lights": [{**sound["lights"][0], "illuminant": "toString"}]}]
+    for wrong in inherited:
+        address = base64.urlsafe_b64encode(json.dumps({**sound, "white": 0.25, **wrong}).encode()).decode()
+        page.open(folder / "look.html", "#" + address.rstrip("="))
+        assert page.run("coupole.state.white") != 0.25
     assert page.browser.troubles() == []
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import re
+import zlib
 from pathlib import Path
 
 import cells
@@ -16,6 +18,7 @@ from coupole.exchange.look.coarse_mesh import coarse_mesh
 from coupole.exchange.look.look_blocks import block_of
 from coupole.exchange.look.look_of_runs import Look, welded
 from coupole.exchange.look.look_page import write_page
+from coupole.exchange.look.look_samples import samples_of_view
 
 
 def small(numbers: int = 30) -> Look:
@@ -61,6 +64,15 @@ def test_a_title_cannot_become_part_of_the_page(tmp_path: Path) -> None:
     write_page(small(), "</script><b>%BLOCKS%", tmp_path / "look.html")
     text = (tmp_path / "look.html").read_text()
     assert "</script><b>" not in text
+
+
+def test_names_stay_what_they_are(tmp_path: Path) -> None:
+    look = Look({"kind": "mesh"}, (block_of("frame-</script><i>", np.zeros(3, np.uint8)),))
+    write_page(look, "x %BLOCKS% y", tmp_path / "look.html")
+    text = (tmp_path / "look.html").read_text()
+    assert "<h1>x %BLOCKS% y</h1>" in text
+    assert '"title": "x %BLOCKS% y"' in text
+    assert "</script><i>" not in text
 
 
 def test_what_is_too_large_for_one_file_lies_beside_it(tmp_path: Path) -> None:
@@ -148,6 +160,17 @@ def test_an_option_that_does_not_fit_is_refused(result: Path, tmp_path: Path, op
     assert not list(tmp_path.iterdir())
 
 
+def test_bars_of_samples_hold_what_an_led_does_to_all_channels(tmp_path: Path) -> None:
+    result = write_result(tmp_path / "sheet", waves(8))
+    with h5py.File(result.views[0].path, "a") as file:
+        file["f"][...] = 0.1
+        file["u_own"], file["led_u_own"] = np.zeros(file["f"].shape, np.float16), np.full((1, 3), 0.05)
+    _, blocks = samples_of_view(result, result.views[0], np.eye(4), lambda *_: None)
+    packed = zlib.decompress(base64.b64decode(blocks[2].text))
+    u = 1e-4 * 1e5 ** ((np.frombuffer(packed, np.uint8).reshape(blocks[2].shape)[1] - 1.0) / 254)
+    np.testing.assert_allclose(u, 0.05, rtol=0.024)
+
+
 def test_a_page_of_another_name_is_refused(result: Path, tmp_path: Path) -> None:
     ended = cells.here("show", result, "--out", tmp_path / "look.pdf")
     assert ended.code == 2
@@ -167,6 +190,21 @@ def test_a_damaged_result_is_refused_with_the_remedy(tmp_path: Path) -> None:
     ended = cells.here("show", tmp_path / "cut", "--out", tmp_path / "look.html")
     assert ended.code == 2
     assert "make the result again" in " ".join(ended.err.split())
+
+
+def test_a_result_that_does_not_say_enough_is_refused_with_what_it_lacks(tmp_path: Path) -> None:
+    write_result(tmp_path / "bare", waves(8))
+    (tmp_path / "bare/result.json").write_text(
+        '{"schema": "coupole-reflectance-run/1", "runs": {}, "mae": [], "software": {}}'
+    )
+    ended = cells.here("show", tmp_path / "bare", "--out", tmp_path / "look.html")
+    assert ended.code == 2
+    assert [name in ended.err for name in ("mae", "software: coupole", "simulated", "runs:")] == [
+        True,
+        True,
+        True,
+        False,
+    ]
 
 
 def test_a_result_without_uncertainty_is_refused(tmp_path: Path) -> None:

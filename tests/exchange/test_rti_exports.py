@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -278,6 +279,28 @@ def test_a_manifest_leads_to_pictures_of_the_sizes_that_it_says(result: Path, tm
         assert bump[flank].mean() > bump.mean() + 2.0, side
 
 
+@pytest.mark.parametrize(
+    ("told", "kind"),
+    [
+        ({"simulated": True, "uncalibrated_run": "vase"}, "simulated: vase"),
+        ({"simulated": False, "uncalibrated_run": "vase"}, "measured: vase"),
+        ({"simulated": None}, "not known whether measured or simulated: egg"),
+    ],
+)
+def test_files_say_whether_their_pictures_were_simulated(
+    told: dict[str, Any], kind: str, result: Path, tmp_path: Path
+) -> None:
+    source = tmp_path / "egg"
+    shutil.copytree(result, source)
+    (source / "result.json").write_text(json.dumps({"schema": "coupole-reflectance-pictures/1", **told}))
+    export(source, tmp_path / "r", "--to", "relight", "--basis", "ptm")
+    export(source, tmp_path / "i", "--to", "iiif")
+    info, manifest = (json.loads((tmp_path / name).read_text()) for name in ("r/egg/info.json", "i/manifest.json"))
+    wanted = f"Coupole, pictures under known lights, {kind}"
+    assert info["origin"] == wanted
+    assert manifest["metadata"][0]["value"]["none"] == [wanted]
+
+
 def test_tiles_at_their_canonical_addresses_put_the_picture_together(tmp_path: Path) -> None:
     y, x = np.mgrid[:700, :1301]
     picture = np.stack([x / 6, y / 3, (x + y) / 9], axis=-1).astype(np.uint8)
@@ -334,13 +357,19 @@ def test_pictures_for_rti_are_counted_with_their_linear_ones(
         (("--to", "rocrate", "--licence", "CC0", "--author", "A"), "rocrate is for runs and their results"),
         (("--to", "rti", "--base-url", "https://a.example"), "is for --to iiif"),
         (("--to", "iiif", "--base-url", "eggs/"), "expected the http address"),
+        (("--to", "iiif", "--base-url", "https://[::1"), "expected the http address"),
+        (("--to", "iiif", "--base-url", "http://x/a b"), "expected the http address"),
+        (("--to", "iiif", "--base-url", 'https://x/<b>"'), "expected the http address"),
+        (("--to", "iiif", "--base-url", "https://x:99999/"), "expected the http address"),
+        (("--to", "iiif", "--base-url", "https://x/a%2"), "expected the http address"),
         (("--to", "ptm", "--views", "top"), "a result of pictures has one view"),
     ],
 )
 def test_what_does_not_fit_is_refused(options: tuple[str, ...], said: str, result: Path, tmp_path: Path) -> None:
-    ended = cells.here("export", result, *options, "--out", tmp_path)
+    ended = cells.here("export", result, *options, "--out", tmp_path / "new")
     assert ended.code == 2
     assert said in " ".join(ended.err.split())
+    assert not (tmp_path / "new").exists()
 
 
 def test_lights_that_do_not_determine_harmonics_and_files_that_stand_are_refused(tmp_path: Path) -> None:

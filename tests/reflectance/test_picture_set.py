@@ -73,8 +73,25 @@ def test_the_mask_says_what_is_fitted_and_intensities_may_be_one_number(folder: 
         (
             "lights.txt",
             DIRECTIONS.replace("-0.5 -0.5 1", "0 0 0", 1),
-            "lights.txt:1:1: a light's direction has no length",
+            "lights.txt:1:1: the direction of light number 0 \\(from 0\\), of 0.png, is 0 0 0",
         ),
+        (
+            "lights.lp",
+            "6\n\n" + "".join(f"{k}.png 0 0 {int(k != 3)}\n" for k in range(6)),
+            "lights.lp:6:1: the direction of light number 3 \\(from 0\\), of 3.png",
+        ),
+        (
+            "lights.dome",
+            json.dumps({"directions": [[0, 0, int(k != 4)] for k in range(6)]}),
+            "lights.dome: the direction of light number 4 \\(from 0\\), of 4.png",
+        ),
+        (
+            "lights.lp",
+            "6\n" + "".join(f"s{k // 2}/{k % 2}.png 0 0 1\n" for k in range(6)),
+            "lights.lp:4:1: two pictures are called 0.png; .*: put all into one folder",
+        ),
+        ("lights.lp", "9" * 5000 + "\n0.png 0 0 1\n", "lights.lp:1:1: expected the number of lights"),
+        ("pictures/filenames.txt", b"0.png \xe9.png", "filenames.txt: is no text in UTF-8; save it"),
         ("lights.lp", "7\n" + DIRECTIONS, "lights.lp:2:1: expected `name x y z`"),
         ("lights.lp", "six\n", "lights.lp:1:1: expected the number of lights"),
         ("lights.lp", "1\n9.png 0 0 1\n", "at least 6 are needed"),
@@ -83,11 +100,13 @@ def test_the_mask_says_what_is_fitted_and_intensities_may_be_one_number(folder: 
         ("mask.png", "no picture", "is no picture that can be read"),
     ],
 )
-def test_what_is_wrong_is_refused_with_its_place(folder: Path, name: str, content: str, message: str) -> None:
-    (folder / name).write_text(content)
+def test_what_is_wrong_is_refused_with_its_place(
+    folder: Path, name: str, content: str | bytes, message: str
+) -> None:
+    (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     lights = folder / (name if name.startswith("lights") else "lights.txt")
-    other = {name.partition(".")[0]: folder / name} if not name.startswith("lights") else {}
-    with pytest.raises(InputError, match=message.replace("(", "\\(").replace("`", ".")):
+    other = {name.partition(".")[0]: folder / name} if name.startswith(("intensities", "mask")) else {}
+    with pytest.raises(InputError, match=message.replace("`", ".")):
         read_pictures(folder / "pictures", lights, **other)
 
 
@@ -153,6 +172,18 @@ def test_a_project_of_relight_names_pictures_places_and_strengths_of_lights(fold
     assert (plain.full_scale, plain.raw_values(0)[0][0]) == (255, 35)
 
 
+def test_files_as_windows_writes_them_are_read(folder: Path) -> None:
+    ways = rows_of(DIRECTIONS)
+    texts = {
+        "a.lp": "6\r\n" + "".join(f"{k}.png {row}\r\n" for k, row in enumerate(DIRECTIONS.splitlines())),
+        "a.dome": json.dumps({"label": "one\u2028two", "directions": ways.tolist()}, ensure_ascii=False),
+        "a.txt": DIRECTIONS,
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8-sig", newline="")
+        np.testing.assert_allclose(read_lights(folder / name).directions, ways)
+
+
 def test_a_dome_file_has_lights_for_pictures_in_the_order_of_their_names(folder: Path) -> None:
     ways = rows_of(DIRECTIONS)
     path = folder / "mine.dome"
@@ -171,6 +202,11 @@ def test_a_dome_file_has_lights_for_pictures_in_the_order_of_their_names(folder:
         ("a.dome", '{"directions": [[1, 2, 3]], "ledAdjust": [[1, 0, 1]]}', "ledAdjust: expected 1 of positive"),
         ("a.relight", '{"dome": {}}', "expected a project of relight"),
         ("a.relight", '{"dome": {"directions": [[0, 0, 1]]}, "images": []}', "1 lights; 0 pictures are used of 0"),
+        (
+            "a.relight",
+            '{"dome": {"directions": [[0, 0, 1], [0, 1, 1]]}, "images": [{"filename": "a/1"}, {"filename": "1"}]}',
+            "images: two pictures are called 1; pictures are looked for in one folder",
+        ),
         ("a.relight", '{"dome": {}, "images": [{}]}', "images: expected a `filename` in each"),
     ],
 )

@@ -94,6 +94,7 @@ def test_the_result_is_read_by_plain_h5py(made: Made) -> None:
     about = json.loads((out / "result.json").read_text())
     assert about["left_out"] == LEFT_OUT
     assert len(about["inputs"]["pictures"]["007.png"]) == 64
+    assert about["simulated"] is None
 
 
 def test_the_report_shows_what_was_made(made: Made) -> None:
@@ -163,6 +164,13 @@ def test_lights_that_cannot_be_left_out_are_refused(
     ended = cells.here("reflectance", *made[0].arguments(), *options, "--out", tmp_path / "out", "--json")
     assert ended.code == 2
     assert message in ended.document["error"]
+
+
+def test_options_of_pictures_are_refused_with_runs(tmp_path: Path) -> None:
+    for options in (["--srgb"], ["--lights", "a.lp"], ["--intensities", "a.txt"], ["--mask", "a.png"]):
+        ended = cells.here("reflectance", tmp_path / "run", *options, "--out", tmp_path / "out", "--json")
+        assert ended.code == 2
+        assert "go with --pictures alone" in ended.document["error"]
 
 
 def test_an_environment_with_one_sun_is_that_direction(made: Made, tmp_path: Path) -> None:

@@ -219,6 +219,7 @@ def test_without_calibrations_values_are_relative_and_it_is_said(made: Made, tmp
     ended = cells.here(*words, "--json")
     assert ended.code == 0, ended.err
     assert ended.document["uncalibrated_run"] == cell.run_folder.name
+    assert ended.document["simulated"] is True
     assert "values are relative" in (tmp_path / "plain/report.html").read_text()
 
 

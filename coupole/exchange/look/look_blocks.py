@@ -26,6 +26,11 @@ SCRIPT_BEGINS = "coupoleBlock("
 """Of each block's script."""
 
 
+def in_script(value: object) -> str:
+    """JSON that may stand in a script element."""
+    return json.dumps(value, ensure_ascii=False).replace("<", "\\u003c")
+
+
 @dataclass(frozen=True)
 class Block:
     """A named array, and how the text that stands for it is read."""
@@ -38,7 +43,7 @@ class Block:
     @property
     def script(self) -> str:
         """What a script tag has to say for the page to have it."""
-        about = json.dumps({"name": self.name, "dtype": self.dtype, "shape": self.shape})
+        about = in_script({"name": self.name, "dtype": self.dtype, "shape": self.shape})
         return f'{SCRIPT_BEGINS}{about},"{self.text}");\n'
 
 

@@ -39,7 +39,7 @@ def look_of_pictures(folder: Path) -> Look:
         "tiles": _TILES,
         "views": [],
         "fit": "GGX of each pixel",
-        "simulated": None,
+        "simulated": about.get("simulated"),
         "software": about.get("software", {}),
         "origin_mm": [0.0, 0.0, 0.0],
         "step_mm": 1.0,

@@ -7,6 +7,7 @@ by script tags: a page that is opened from a disk may load nothing else.
 from __future__ import annotations
 
 import json
+import re
 from html import escape
 from importlib import resources
 from itertools import accumulate
@@ -15,7 +16,7 @@ from tempfile import TemporaryDirectory
 from urllib.parse import quote
 
 from coupole.errors import InputError, StorageError
-from coupole.exchange.look.look_blocks import SCRIPT_BEGINS, Block, Look
+from coupole.exchange.look.look_blocks import SCRIPT_BEGINS, Block, Look, in_script
 from coupole.storage.durable import make_folder, sync_folder, write_synced
 
 MOST_BYTES = 25_000_000
@@ -106,16 +107,13 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
     parts = {
         "TITLE": escape(title),
         "STYLE": _part("page.css"),
-        "ABOUT": _in_script(about),
-        "SHADERS": _in_script(shaders),
+        "ABOUT": in_script(about),
+        "SHADERS": in_script(shaders),
         "SCRIPTS": scripts,
         "FIRST": "".join(f"<script>{block.script}</script>\n" for block in (*look.first, *inside[:early])),
         "BLOCKS": "".join(tags),
     }
-    page = _part("page.html")
-    for name, text in parts.items():
-        page = page.replace(f"%{name}%", text)
-    return page
+    return re.sub(f"%({'|'.join(parts)})%", lambda found: parts[found[1]], _part("page.html"))
 
 
 def _early(look: Look, inside: list[Block]) -> int:
@@ -177,8 +175,3 @@ def _clear(data: Path, earlier: list[Path]) -> None:
 
 def _part(name: str) -> str:
     return (resources.files(__package__) / "page" / name).read_text(encoding="utf-8")
-
-
-def _in_script(value: object) -> str:
-    """JSON that may stand in a script element."""
-    return json.dumps(value, ensure_ascii=False).replace("<", "\\u003c")

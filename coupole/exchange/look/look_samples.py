@@ -23,7 +23,8 @@ def samples_of_view(
     say: Callable[[str, int, int], None],
 ) -> tuple[dict[str, Any], list[Block]]:
     """What the page knows of a view's samples, and its blocks: the numbers of triangles, and of `ROWS` of them
-    [2, ROWS, leds] codes of the channels' mean f cos_i and of its relative standard uncertainty."""
+    [2, ROWS, leds] codes of the channels' mean f cos_i and of its relative standard uncertainty at most: by what
+    `view_noise` has, as if all channels were off to the same side, as they are by an LED's power."""
     name, count = view.path.stem, len(view.triangles)
     leds = np.ones(len(view.leds), bool)
     blocks = [
@@ -36,7 +37,7 @@ def samples_of_view(
         u = result.view_noise(view, rows, leds)
         known = np.isfinite(values).all(axis=2)
         mean = np.where(known, values.mean(axis=2), np.nan)
-        own = np.sqrt(np.mean((values * u) ** 2, axis=2) / values.shape[2]) / np.maximum(np.abs(mean), 1e-12)
+        own = np.mean(np.abs(values) * u, axis=2) / np.maximum(np.abs(mean), 1e-12)
         codes = np.stack([log_coded(np.where(mean > 0.0, mean, np.nan)), log_coded(own)])
         blocks.append(block_of(f"samples-{name}-{first // ROWS}", codes))
         say(f"samples of {view.view}", rows.stop, count)

@@ -53,6 +53,8 @@ def export_views(
         raise InputError(f"--to: expected one of {', '.join(fitting)} for {source}; found {to}")
     if of_result and views:
         raise InputError("--views: are for runs; a result of pictures has one view")
+    if to == "iiif":
+        iiif.checked_base(how.base_url)
     if to == "lp":
         return Written(rti_pictures.export_rti(source, out, views, overwrite=overwrite, say=say))
     names = [source.resolve().name] if of_result else chosen_views(Run(source), views)

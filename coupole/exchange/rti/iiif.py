@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from coupole.storage.durable import write_synced
 
 MANIFEST = "manifest.json"
 EXAMPLE_URL = "https://example.org/iiif"
+_OF_ADDRESSES = re.compile(r"(?:[A-Za-z0-9\-._~:/?#\[\]@!$&'()*+,;=]|%[0-9A-Fa-f]{2})+")
 _TILE_PX = 512
 _LARGEST_WHOLE_PX = 1024
 """Of the scaled pictures that can be had in one piece, besides the full one."""
@@ -36,7 +38,7 @@ def write(views: Iterable[LitView], out: Path, base_url: str, say: Said) -> list
 
     Raises InputError for a base that is no http address.
     """
-    base = _checked(base_url)
+    base = checked_base(base_url)
     paths: list[Path] = []
     canvases, origins = [], []
     for view in views:
@@ -175,11 +177,17 @@ def _text(words: str) -> dict[str, list[str]]:
     return {"en": [words]}
 
 
-def _checked(base_url: str) -> str:
-    parts = urlsplit(base_url)
-    if parts.scheme not in ("http", "https") or not parts.netloc or parts.query or parts.fragment:
+def checked_base(base_url: str) -> str:
+    """Without slashes at its end. Raises InputError if it is no http address, or has what addresses do not hold
+    (RFC 3986, appendix A)."""
+    try:
+        parts = urlsplit(base_url)
+        fits = parts.scheme in ("http", "https") and parts.hostname and (parts.port or 1) > 0
+    except ValueError:  # brackets or a port that are none
+        fits = False
+    if not fits or "?" in base_url or "#" in base_url or not _OF_ADDRESSES.fullmatch(base_url):
         raise InputError(
             f"--base-url {base_url}: expected the http address under which the folder will be found, "
-            f"as {EXAMPLE_URL}; ids of IIIF hold it"
+            f"as {EXAMPLE_URL}, other characters than those of addresses as %20; ids of IIIF hold it"
         )
     return base_url.rstrip("/")

@@ -28,6 +28,8 @@ WHITE_QUANTILE = 0.999
 """Of the brightest value of each pixel under any light: what is white."""
 _BATCH = 8
 """Pictures that are held at a time."""
+_BLOCK = 1 << 16
+"""Pixels whose planes are added to at a time."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class LitView:
 
     name: str
     origin: str
-    """Measured or simulated, and of which run or pictures."""
+    """Measured or simulated, as far as it is known, and of which run or pictures."""
     size_px: tuple[int, int]
     """Width, height."""
     pixel_mm: float | None
@@ -72,10 +74,14 @@ class LitView:
         width, height = self.size_px
         weights = weights.astype(np.float32)
         planes = np.zeros((height * width, weights.shape[2]), np.float32)
+        values = np.empty((height * width, 3 * _BATCH), np.float32)
         for first in range(0, len(self), _BATCH):
             batch = range(first, min(first + _BATCH, len(self)))
-            values = np.concatenate([self.encoded(number).reshape(-1, 3) for number in batch], axis=1)
-            planes += values @ weights[first : batch.stop].reshape(-1, weights.shape[2])
+            for place, number in enumerate(batch):
+                values[:, 3 * place : 3 * place + 3] = self.encoded(number).reshape(-1, 3)
+            by = weights[first : batch.stop].reshape(-1, weights.shape[2])
+            for pixel in range(0, len(planes), _BLOCK):
+                planes[pixel : pixel + _BLOCK] += values[pixel : pixel + _BLOCK, : len(by)] @ by
             say(f"{self.name}: planes", batch.stop, len(self))
         return planes.reshape(height, width, -1)
 
@@ -128,10 +134,12 @@ def view_of_run(run: Run, name: str, folder: Path, say: Said) -> LitView:
 def view_of_result(result: PictureResult, say: Said) -> LitView:
     """The view of a result of pictures; black outside its mask."""
     about, height, width = result.about, *result.mask.shape
-    run = about.get("uncalibrated_run")
+    known: dict[Any, str] = {True: "simulated", False: "measured"}
+    kind = known.get(about.get("simulated"), "not known whether measured or simulated")
+    of = about.get("uncalibrated_run") or result.folder.name
     return _seen(
         name=result.folder.name,
-        origin=f"Coupole, pictures under known lights: {run or result.folder.name}",
+        origin=f"Coupole, pictures under known lights, {kind}: {of}",
         size_px=(width, height),
         pixel_mm=None,
         directions=result.directions,

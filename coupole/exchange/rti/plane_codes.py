@@ -55,6 +55,14 @@ class PlaneCode:
         return 255.0 * float(np.sqrt(np.mean((np.clip(shown, 0.0, 1.0) - samples) ** 2)))
 
 
+def eight_bits(values: Picture, low: Any, scale: Any) -> NDArray[np.uint8]:
+    """Codes of values from `low`, which has 0, to `low + scale`, which has 255; in single precision."""
+    codes = values - np.asarray(low, np.float32)
+    codes *= np.asarray(255.0 / scale, np.float32)
+    np.clip(np.rint(codes, out=codes), 0.0, 255.0, out=codes)
+    return codes.astype(np.uint8)
+
+
 def of_terms(terms: Floats, name: str) -> PlaneCode:
     """Of functions [lights, terms] that all pixels and channels share: plane 3 t + c has term t of channel c, by
     least squares over the lights."""

@@ -16,7 +16,7 @@ from PIL import Image
 
 from coupole.exchange.rti import light_functions
 from coupole.exchange.rti.lit_views import LitView, Picture, Said
-from coupole.exchange.rti.plane_codes import PlaneCode, of_principal_parts, of_terms
+from coupole.exchange.rti.plane_codes import PlaneCode, eight_bits, of_principal_parts, of_terms
 from coupole.storage.durable import write_synced
 
 BASES = ("bilinear", "rbf", "ptm", "hsh")
@@ -39,16 +39,14 @@ def write(view: LitView, folder: Path, basis: str, planes: int, say: Said) -> tu
     low, high = values.min(axis=(0, 1)), values.max(axis=(0, 1))
     scale = np.maximum(high - low, 1e-6).astype(np.float64)
     bias = -low / scale
-    codes = np.rint(255.0 * (values / scale + bias)).astype(np.uint8)
-    paths, decoded = [], np.empty_like(codes)
-    for number in range(codes.shape[2] // 3):
+    paths, decoded = [], []
+    for number in range(values.shape[2] // 3):
         channels = slice(3 * number, 3 * number + 3)
-        content = rgb_jpeg(np.ascontiguousarray(codes[..., channels]))
-        decoded[..., channels] = np.asarray(Image.open(io.BytesIO(content)))
+        content = rgb_jpeg(eight_bits(values[..., channels], low[channels], scale[channels]))
+        decoded.append(np.asarray(Image.open(io.BytesIO(content))).reshape(-1, 3)[some].copy())
         paths.append(folder / f"plane_{number}.jpg")
         write_synced(paths[-1], content)
-    shown = (decoded.reshape(-1, codes.shape[2])[some] / 255.0 - bias) * scale
-    misses_dn = code.misses_dn(samples, shown)
+    misses_dn = code.misses_dn(samples, (np.concatenate(decoded, axis=1) / 255.0 - bias) * scale)
     material = {"scale": scale.tolist(), "bias": bias.tolist()}
     if code.ranges:
         material["range"] = list(code.ranges)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from coupole.exchange.rti import light_functions
 from coupole.exchange.rti.lit_views import LitView, Picture, Said
-from coupole.exchange.rti.plane_codes import of_terms
+from coupole.exchange.rti.plane_codes import eight_bits, of_terms
 from coupole.storage.durable import write_synced
 
 Floats = NDArray[np.float64]
@@ -17,6 +17,8 @@ Floats = NDArray[np.float64]
 _PTM_ORDER = (3, 5, 4, 1, 2, 0)
 """x2, y2, xy, x, y, 1 among the terms of `light_functions.ptm`."""
 _CHECKED_PIXELS = 10_000
+_BLOCK = 1 << 16
+"""Pixels whose colours are found at a time."""
 
 
 def write_ptm(view: LitView, path: Path, say: Said) -> float:
@@ -29,18 +31,21 @@ def write_ptm(view: LitView, path: Path, say: Said) -> float:
     terms = light_functions.ptm(view.directions)
     code = of_terms(terms, "ptm")
     each = code.planes_of(view, say).reshape(-1, 6, 3)
-    luminance, colour = _one_colour(each, np.linalg.qr(terms).R)
-    scale, bias, codes = _with_whole_bias(255.0 * luminance[:, _PTM_ORDER])
-    colours = np.rint(255.0 * colour).astype(np.uint8)
+    luminance, colours = np.empty((len(each), 6), np.float32), np.empty((len(each), 3), np.uint8)
+    for first in range(0, len(each), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        found, colour = _one_colour(each[block], np.linalg.qr(terms).R)
+        luminance[block], colours[block] = found[:, _PTM_ORDER], np.rint(255.0 * colour)
+    scale, bias, codes = _with_whole_bias(luminance)
     header = ["PTM_1.2", "PTM_FORMAT_LRGB", str(width), str(height)]
     header += [" ".join(f"{value:.9g}" for value in scale), " ".join(map(str, bias))]
     bottom_first = (plane.reshape(height, width, -1)[::-1].tobytes() for plane in (codes, colours))
     write_synced(path, "\n".join([*header, ""]).encode("ascii") + b"".join(bottom_first))
-    shown = np.empty_like(luminance)
-    shown[:, _PTM_ORDER] = (codes - bias.astype(np.float64)) * scale / 255.0
-    planes = shown[..., None] * (colours / 255.0)[:, None]
     some = view.some_pixels(_CHECKED_PIXELS)
-    return code.misses_dn(view.samples(some, say), planes.reshape(len(planes), -1)[some])
+    shown = np.empty(codes[some].shape)
+    shown[:, _PTM_ORDER] = (codes[some] - bias.astype(np.float64)) * scale / 255.0
+    planes = shown[..., None] * (colours[some] / 255.0)[:, None]
+    return code.misses_dn(view.samples(some, say), planes.reshape(len(planes), -1))
 
 
 def write_hsh(view: LitView, path: Path, say: Said) -> float:
@@ -51,12 +56,14 @@ def write_hsh(view: LitView, path: Path, say: Said) -> float:
     planes = code.planes_of(view, say).reshape(-1, 9, 3)
     bias = planes.min(axis=(0, 2)).astype("<f4")
     scale = np.maximum(planes.max(axis=(0, 2)) - bias, 1e-6).astype("<f4")
-    codes = np.rint(255.0 * (planes - bias[:, None]) / scale[:, None]).clip(0, 255).astype(np.uint8)
+    codes = np.empty((len(planes), 3, 9), np.uint8)
+    for term in range(9):
+        codes[..., term] = eight_bits(planes[:, term], bias[term], scale[term])
     header = f"#HSH1.2\r\n3\r\n{width} {height} 3\r\n9 2 1\r\n".encode("ascii")
-    write_synced(path, header + scale.tobytes() + bias.tobytes() + codes.transpose(0, 2, 1).tobytes())
-    shown = codes / 255.0 * scale[:, None] + bias[:, None]
+    write_synced(path, header + scale.tobytes() + bias.tobytes() + codes.tobytes())
     some = view.some_pixels(_CHECKED_PIXELS)
-    return code.misses_dn(view.samples(some, say), shown.reshape(len(shown), -1)[some])
+    shown = (codes[some] / 255.0 * scale + bias).transpose(0, 2, 1)
+    return code.misses_dn(view.samples(some, say), shown.reshape(len(shown), -1))
 
 
 def _one_colour(each: Picture, triangular: Floats) -> tuple[Floats, Floats]:
@@ -73,11 +80,14 @@ def _one_colour(each: Picture, triangular: Floats) -> tuple[Floats, Floats]:
     return luminance, colour
 
 
-def _with_whole_bias(values: Floats) -> tuple[Floats, NDArray[np.int64], NDArray[np.uint8]]:
-    """Scales [6], biases [6] and codes of values [pixels, 6] = (code - bias) scale; biases of a PTM are whole
-    codes, so that 0 is one."""
-    low, high = np.minimum(values.min(axis=0), 0.0), np.maximum(values.max(axis=0), 0.0)
+def _with_whole_bias(values: Picture) -> tuple[Floats, NDArray[np.int64], NDArray[np.uint8]]:
+    """Scales [6], biases [6] and codes of values [pixels, 6] = (code - bias) scale / 255; biases of a PTM are
+    whole codes, so that 0 is one."""
+    low = 255.0 * np.minimum(values.min(axis=0), 0.0).astype(np.float64)
+    high = 255.0 * np.maximum(values.max(axis=0), 0.0).astype(np.float64)
     scale = np.maximum(high - low, 1e-3) / 254.0
     bias = np.ceil(-low / scale).astype(np.int64)
-    codes = np.rint(values / scale + bias).clip(0, 255).astype(np.uint8)
+    codes = np.empty(values.shape, np.uint8)
+    for term in range(values.shape[1]):
+        codes[:, term] = eight_bits(values[:, term], -bias[term] * scale[term] / 255.0, scale[term])
     return scale, bias, codes

@@ -71,7 +71,7 @@ function samplesPlotOf(samples) {
   const step = niceStep(most, 4), digits = Math.max(0, -Math.floor(Math.log10(step)));
   const levels = Array.from({ length: Math.floor(most / step) + 1 }, (_, k) => k * step);
   return `<svg viewBox="0 0 ${width} ${height}" role="img" class="samples"
-    aria-label="Measured samples by the angle of the half vector to the normal, with 95 % bounds, and the fit">
+    aria-label="Measured samples by the angle of the half vector to the normal, with bars of part of their uncertainty, and the fit">
     ${levels.map((value) => `<line class="grid" x1="${left}" x2="${width - right}" y1="${y(value)}" y2="${y(value)}"/>
       <text x="${left - 4}" y="${Number(y(value)) + 3}" text-anchor="end">${value.toFixed(digits)}</text>`).join("")}
     <path class="bars" d="${bars.join("")}"/><path class="measured" d="${dots(({ value }) => value)}"/>
@@ -88,6 +88,8 @@ function samplesTold(samples) {
   const off = samples.map(({ value, fitted }) => Math.abs(fitted - value)).sort((one, other) => one - other);
   const told = percent(off[off.length >> 1] / mean(samples.map(({ value }) => value)));
   return `${samplesPlotOf(samples)}<p class="small">${samples.length} measured samples of ${views}: f,
-    1/sr, mean of the channels. Bars: 95 % by noise and each LED's own power; what all samples share is not in
-    them. Orange: what the fit makes of the same directions; median difference ${told} of the samples' mean.</p>`;
+    1/sr, mean of the channels. Bars: 1.96 standard uncertainties by noise of the frames, each LED's own power and
+    inter-reflection taken off, as if the channels were off together. Not in them: where pixels look, their own
+    responses, the mesh's vertices, places of LEDs, and what all samples share. Orange: what the fit makes of the
+    same directions; median difference ${told} of the samples' mean.</p>`;
 }

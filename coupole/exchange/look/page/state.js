@@ -37,7 +37,7 @@ const isVector = (value) => Array.isArray(value) && value.length === 3 && value.
 function isLight(light) {
   return isVector(light?.direction) && length(light.direction) > 1e-6 && isNumber(light.strength, 0, 100)
     && /^#[0-9a-f]{6}$/.test(light.colour) && isNumber(light.kelvin, 1000, 20000)
-    && isNumber(light.softness, 0, 30) && (light.illuminant ?? "") in ILLUMINANTS;
+    && isNumber(light.softness, 0, 30) && Object.hasOwn(ILLUMINANTS, light.illuminant ?? "");
 }
 
 function isCamera(camera) {
@@ -61,7 +61,8 @@ function stateOf(address) {
   } catch {
     return null;
   }
-  const fits = found?.mode in MODES && found.quantity in UNCERTAIN && isNumber(found.white, 0, 1e9)
+  const fits = Object.hasOwn(MODES, found?.mode) && Object.hasOwn(UNCERTAIN, found.quantity)
+    && isNumber(found.white, 0, 1e9)
     && isNumber(found.relief, 0, 10) && isNumber(found.sky, 0, 100) && isCamera(found.camera)
     && (found.environment === undefined || isNumber(found.environment, 0, 100))
     && Array.isArray(found.lights) && isNumber(found.lights.length, 1, MOST_LIGHTS) && found.lights.every(isLight)

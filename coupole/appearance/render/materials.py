@@ -69,6 +69,8 @@ class Metal(Model):
     roughness: Roughness = 0.1
     depth_mm: Annotated[float, Field(ge=0)] | None = None
     """Under the lacquer's face. None: in air."""
+    face: bool = True
+    """Whether light that the face reflects is lost here; not where the scene has the face as a body of glass."""
 
 
 class Gilt(Model):
@@ -188,7 +190,7 @@ def _metal(material: Metal) -> Description:
     index = metal_index(material.gold)
     if material.depth_mm is None:
         return metal(index, material.roughness)
-    inward = 1.0 - float(fresnel.reflectance(1.0, indices.URUSHI))
+    inward = 1.0 - float(fresnel.reflectance(1.0, indices.URUSHI)) if material.face else 1.0
     left = lacquer.transmittance(material.depth_mm, 1.0, lacquer.urushi_absorption())
     return metal(index / indices.URUSHI, material.roughness, (inward * left) ** 2)
 

@@ -238,7 +238,7 @@ def _nashiji(thing: NashijiSlab) -> list[Piece]:
     level = (-found.centres_mm[:, 2] / thing.depth_mm * _NASHIJI_LEVELS).astype(int).clip(0, _NASHIJI_LEVELS - 1)
     for k in np.unique(level):
         depth_mm = (k + 0.5) / _NASHIJI_LEVELS * thing.depth_mm
-        gold = Metal(kind="metal", roughness=thing.roughness, depth_mm=depth_mm)
+        gold = Metal(kind="metal", roughness=thing.roughness, depth_mm=depth_mm, face=False)
         parts.append(Piece(corners[level == k].reshape(-1, 3, 3), gold))
     return [*parts, _clear(width, length, thing.depth_mm, 2.0 * thing.flake_radius_mm)]
 

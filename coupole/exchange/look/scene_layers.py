@@ -138,7 +138,7 @@ def _metal(material: Metal) -> Layer:
     index, factor = materials.metal_index(material.gold), np.ones(BANDS)
     if material.depth_mm is not None:
         index = index / indices.URUSHI
-        inward = 1.0 - float(fresnel.reflectance(1.0, indices.URUSHI))
+        inward = 1.0 - float(fresnel.reflectance(1.0, indices.URUSHI)) if material.face else 1.0
         factor = (inward * lacquer.transmittance(material.depth_mm, 1.0, lacquer.urushi_absorption())) ** 2
     return _bodied(fresnel.reflectance(COSINES[:, None], index) * factor, np.zeros(BANDS), material.roughness)
 

@@ -46,6 +46,18 @@ def test_a_film_whose_hues_turn_with_the_angle_is_refused() -> None:
         equivalent_index(lambda c: stack_power(c, WAVELENGTHS_NM, thick, substrate=indices.gold())[0])
 
 
+def test_a_face_that_the_scene_has_is_not_counted_again_by_the_metal_under_it() -> None:
+    """Gold under a smooth face of urushi, in light from everywhere, by the sum of all ways between the two."""
+    gold = {"kind": "metal", "roughness": 0.01, "depth_mm": 0.0, "face": False}
+    face = {"kind": "glass", "index": indices.URUSHI}
+    planes = [plane(gold), {**plane(face), "translation_mm": [0.0, 0.0, 0.5]}]
+    one = scene(planes, [everywhere(illuminant("E"))], samples=64, bands={"step_nm": 20}, depth=16)
+    reflected = rendered(one).radiance.mean(axis=(0, 1)) / scaled(light.illuminant("E"), 100.0)[::4]
+    above = float(fresnel.reflectance(1.0, indices.URUSHI))
+    below = np.ravel(fresnel.reflectance(1.0, indices.gold() / indices.URUSHI))[::4]
+    assert reflected == pytest.approx(above + (1 - above) ** 2 * below / (1 - above * below), abs=0.005)
+
+
 def test_an_antireflective_film_on_glass_dims_it_as_its_stack_does() -> None:
     coated = {
         "kind": "films",

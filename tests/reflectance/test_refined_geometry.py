@@ -21,7 +21,7 @@ from coupole.reflectance.alignment import refine_job
 from coupole.reflectance.alignment.refine_job import given_by
 from coupole.reflectance.alignment.refined_geometry import ABOUT, REFINED, SCHEMA, read_refined
 from coupole.reflectance.alignment.unknowns import Unknowns
-from coupole.reflectance.extraction.pointing import STATED
+from coupole.reflectance.extraction.pointing import STATED, Pointing
 from coupole.storage.durable import sha256
 
 VERTICES = np.array([[900, 900, 900], [0, 0, 0], [7, 7, 7], [4, 0, 0], [0, 4, 0], [4, 4, 0], [-5, 0, 0]], float)
@@ -37,6 +37,7 @@ LENS = Intrinsics(800.0, 800.0, 199.5, 149.5)
 class View:
     name: str
     base_from_camera: NDArray[np.float64]
+    pointing: Pointing | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,10 @@ def read(folder: Path, vertices_mm: NDArray[np.float64]) -> Any:
         file.attrs.update(schema=SCHEMA, mesh_sha256=sha256(folder / "scan.ply"))
         file.create_dataset("views", data=np.array([("vase", "top")], object), dtype=h5py.string_dtype())
         file["lens"], file["base_from_camera"], file["vertices_mm"] = LENS.vector(), np.eye(4)[None], vertices_mm
+        text, steps = h5py.string_dtype(), ("x_mm", "y_mm", "z_mm", "rx_rad", "ry_rad", "rz_rad")
+        names = ["fx_px", *(f"{what}.{step}" for what in ("camera0", "mesh") for step in steps), "shape0_mm"]
+        file.create_dataset("names", data=np.array(names, object), dtype=text)
+        file["covariance"], file["middle_mm"] = np.diag(np.arange(1.0, 15.0)), np.array([1.0, 2.0, 3.0])
     (folder / ABOUT).write_text(json.dumps({"inputs": {"vase": dict(INPUTS)}}))
     return read_refined(folder)
 
@@ -106,3 +111,14 @@ def test_a_run_with_other_frames_than_when_it_was_refined_is_refused(tmp_path: P
     resumed = replace(measured, frames=SimpleNamespace(inputs=(INPUTS[0], (INPUTS[1][0], "cc"))))
     with pytest.raises(InputError, match=r"vase has other frames than when it was refined; .* anew"):
         refined.of(resumed)
+
+
+def test_where_pixels_look_is_known_as_the_refinement_says(tmp_path: Path) -> None:
+    measured = measured_run(tmp_path)
+    refined = read(tmp_path, VERTICES[USED]).of(measured)
+    (view,) = refined.views
+    assert view.pointing.free == ("fx",)
+    assert np.diag(view.pointing.covariance).tolist() == list(
+        range(1, 14)
+    )  # lens, its camera, the mesh; not the shape
+    assert view.pointing.middle_mm.tolist() == [1.0, 2.0, 3.0]

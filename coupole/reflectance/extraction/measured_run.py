@@ -182,7 +182,8 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
     shape = read_mesh(mesh_path)
     base_from_object = base_from_support @ files.plan.object.support_from_object.matrix()
     vertices_mm = apply(base_from_object, shape.vertices * MM_PER_UNIT[files.plan.object.mesh_unit])
-    views, prior = _views(run, frames, hand_eye, files.cell.rig, prior, vertices_mm.mean(axis=0))
+    middle_mm = vertices_mm[np.unique(shape.triangles)].mean(axis=0)
+    views, prior = _views(run, frames, hand_eye, files.cell.rig, prior, middle_mm)
     _refuse_unknown_leds(by_kind["leds"], leds, views)
     return MeasuredRun(
         run,

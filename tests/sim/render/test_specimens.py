@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from sim.render.camera_view import Viewer
 from sim.render.emitter import irradiance, square
 from sim.render.lens import Lens
 from sim.render.radiance import led_radiance
+from sim.scene.scene import Scene
 from sim.world.config import MeasuredConfig
 
 LENS, TILTED = Lens(40, 30, 40.0), camera_above(330.0, 35.0)
@@ -35,21 +37,27 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return found
 
 
+def seen_under_leds(scene: Scene) -> Iterator[tuple[np.ndarray, ...]]:
+    """Of a plane under each of three LEDs, by pixel: radiance, irradiance, directions to the LED and the eye."""
+    view = Viewer(scene, LENS, shading="pixel").look(TILTED)
+    up = np.broadcast_to([0.0, 0.0, 1.0], view.points_mm.shape)
+    for place in ((0.0, 600.0, 800.0), (500.0, 700.0, 500.0), (-900.0, -100.0, 400.0)):
+        led_mm = np.array(place)
+        emitter = square(led_mm, -led_mm, side_mm=7.0, flux_lm=1800.0)
+        shown = led_radiance(view, scene.materials, scene.tables, emitter, "lambertian").astype(float)
+        lit = irradiance(emitter, view.points_mm, up)[:, None]
+        yield shown, lit, unit(led_mm - view.points_mm), unit(view.eye_mm - view.points_mm)
+
+
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.full if name in SLOW else ()) for name in SPECIMENS]
 )
 def test_a_specimen_is_shown_as_it_reflects(name: str) -> None:
     """A plane in a view whose rays are up to 35 degrees apart, under lights near the mirror direction and off."""
     scene = scene_of(quad((0.0, 0.0, 0.0), 400.0), specimen(name))
-    view = Viewer(scene, LENS, shading="pixel").look(TILTED)
-    for place in ((0.0, 600.0, 800.0), (500.0, 700.0, 500.0), (-900.0, -100.0, 400.0)):
-        led_mm = np.array(place)
-        emitter = square(led_mm, -led_mm, side_mm=7.0, flux_lm=1800.0)
-        shown = led_radiance(view, scene.materials, scene.tables, emitter, "lambertian").astype(float)
-        up = np.broadcast_to([0.0, 0.0, 1.0], view.points_mm.shape)
-        lights, eyes = unit(led_mm - view.points_mm), unit(view.eye_mm - view.points_mm)
+    for shown, lit, lights, eyes in seen_under_leds(scene):
         spectral = SPECIMENS[name]()(lights, eyes)
-        expected = spectral @ WEIGHTS.T * irradiance(emitter, view.points_mm, up)[:, None]
+        expected = spectral @ WEIGHTS.T * lit
         off = np.abs(shown / expected - 1.0)
         assert np.median(off) < 3e-3
         assert np.quantile(off, 0.95) < 0.02
@@ -77,19 +85,13 @@ def test_an_exported_material_comes_back_as_the_material_of_an_object(tmp_path: 
     path = tmp_path / "glossy.binary"
     path.write_bytes(encode_merl(glossy))
     scene = scene_of(quad((0.0, 0.0, 0.0), 400.0), merl_material(path))
-    view = Viewer(scene, LENS, shading="pixel").look(TILTED)
-    for place in ((0.0, 600.0, 800.0), (500.0, 700.0, 500.0), (-900.0, -100.0, 400.0)):
-        led_mm = np.array(place)
-        emitter = square(led_mm, -led_mm, side_mm=7.0, flux_lm=1800.0)
-        shown = led_radiance(view, scene.materials, scene.tables, emitter, "lambertian").astype(float)
-        up = np.broadcast_to([0.0, 0.0, 1.0], view.points_mm.shape)
-        lights, eyes = unit(led_mm - view.points_mm), unit(view.eye_mm - view.points_mm)
+    for shown, lit, lights, eyes in seen_under_leds(scene):
         half = unit(lights + eyes)[:, 2]
         nl, nv, a2 = lights[:, 2], eyes[:, 2], 0.3**2
         d = a2 / (np.pi * (half**2 * (a2 - 1) + 1) ** 2)
         v = 0.5 / (nl * np.sqrt(nv**2 * (1 - a2) + a2) + nv * np.sqrt(nl**2 * (1 - a2) + a2))
         f = glossy.kd + (d * v)[:, None] * glossy.ks
-        off = np.abs(shown / (f * irradiance(emitter, view.points_mm, up)[:, None]) - 1.0)
+        off = np.abs(shown / (f * lit) - 1.0)
         assert np.median(off) < 2e-3
         assert np.quantile(off, 0.95) < 0.01
 

@@ -239,7 +239,10 @@ def standing(tmp_path: Path) -> Iterator[tuple[CellFolder, World]]:
         yield cell, world
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 129, marks=pytest.mark.full)],
+)
 def test_a_stopped_run_ends_with_its_signal_leaves_the_cell_safe_and_is_resumed(
     standing: tuple[CellFolder, World], number: signal.Signals, code: int
 ) -> None:

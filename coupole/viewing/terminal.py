@@ -258,9 +258,10 @@ class LiveFigures:
         seen = shown.figures
         best = self._best[shown.title] = max(self._best.get(shown.title, 0.0), seen.sharpness)
         saturated = ", ".join(f"{name} {share:.2%}" for name, share in seen.saturated.items())
+        sharpness = f"sharpness {seen.sharpness / best:.0%} of the best" if best else "nothing but noise"
         line = (
             f"{shown.title}, {shown.exposure_us} us: brightest {seen.brightest:.0%}; saturated {saturated}; "
-            f"sharpness {seen.sharpness / best:.0%} of the best; {shown.frames_per_s:.1f} frames/s"
+            f"{sharpness}; {shown.frames_per_s:.1f} frames/s"
         )
         if self._live is not None:
             self._live.update("\n".join([line, *(_bars(name, bins) for name, bins in seen.histograms.items())]))

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 
-from coupole.acquisition.conclusion import conclude, open_for_session
+from coupole.acquisition.conclusion import close_complete, conclude, open_for_session
 from coupole.acquisition.memory_recorder import DryRecorder
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell, open_cell
@@ -105,6 +105,12 @@ def _acquire_into(
     )
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     refuse(preflight)
+    if run is not None and not preflight.frames:
+        dose_lux_h = close_complete(run, console)
+        outcome = Outcome(job.schedule.shots, job.schedule.shots, dose_lux_h=dose_lux_h)
+        found.update({**_figures(run, job, outcome), "unsafe": []})
+        _say_outcome(console, run, outcome, "done")
+        return
     faults = ArmFaults(job.cell.state_folder)
     faults.refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)

@@ -215,13 +215,17 @@ def test_a_folder_that_is_no_run_is_not_resumed(cell: CellFolder) -> None:
 
 def test_a_complete_run_is_resumed_at_once_and_shoots_nothing(cell: CellFolder) -> None:
     cell.write(lights={"kind": "ids", "ids": [3, 4]})
-    assert cell.acquire().code == 0
+    first = cell.acquire()
+    assert first.code == 0
     run = cell.run_folder
     before = cells.events(run)
     ended = cell.acquire("--resume", run)
     assert ended.code == 0
     assert (ended.document["proven"], ended.document["missing"]) == (2, 0)
-    assert [event["event"] for event in cells.events(run)[len(before) :]] == ["resume", "stop"]
+    assert ended.document["dose_lux_h"] == pytest.approx(first.document["dose_lux_h"], rel=1e-6)
+    assert "opening the devices" not in cells.command("acquire", "--resume", run).err
+    assert [event["event"] for event in cells.events(run)[len(before) :]] == ["resume", "stop"] * 2
+    assert cells.here("verify", run).code == 0
     cells.assert_each_shot_proven_once(run)
 
 

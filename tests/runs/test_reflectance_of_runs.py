@@ -25,6 +25,7 @@ from relief_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, SIDE, shipped_cell, un
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
+from coupole.appearance.matter.alta_samples import read_alta
 from coupole.calibration.light.frames import open_light_frames
 from coupole.kinematics import forward
 from coupole.reflectance import ggx
@@ -591,6 +592,10 @@ def test_samples_are_exported_with_bounds_that_hold_the_truth(made: Made, tmp_pa
         truth = walter(np.array([[0.0, 0.0, 1.0]]), light, view)[:, 1]
         inside += ((low < truth) & (truth < high)).tolist()
         assert np.median(f / truth) == pytest.approx(1.0, abs=0.03)
+        back = read_alta(path)
+        np.testing.assert_allclose(back.directions(), [light, view], atol=1e-12)
+        np.testing.assert_array_equal([back.values[:, 0], back.low[:, 0]], [f, low])
+        np.testing.assert_array_equal(back.high[:, 0], np.where(high > 3e38, np.inf, high))
     assert len(inside) > 300
     assert np.mean(inside) > 0.9
 

@@ -84,7 +84,7 @@ def test_bounds_are_absolute_or_a_radius_and_those_of_the_outputs_that_have_them
     ("text", "why"),
     [
         ("1 2 3 4", "expected ALTA's text with a line `#DIM inputs outputs`"),
-        ("#DIM 3\n1 2 3 4", "a.alta:1:1: #DIM: expected two whole numbers above 0; found '3'"),
+        ("#DIM 3\n1 2 3 4", "a.alta:1:1: #DIM: expected two whole numbers, 1 to 9999; found '3'"),
         ("#DIM 3 1\n1 2 3 4", "expected a line `#PARAM_IN`"),
         (HEAD.replace("3 1", "2 1") + "1 2 3", "a.alta:2:1: PARAM_IN ISOTROPIC_TL_TV_PROJ_DPHI has 3 inputs"),
         (HEAD + "#VS 3\n1 2 3 4", "a.alta:4:1: #VS: expected 0, 1 or 2"),

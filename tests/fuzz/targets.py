@@ -2,8 +2,8 @@
 
 To add a kind, add a line to `TARGETS`. `seeds` gives real files as bytes; `read` gets the path of a mutated one
 (named as `file` says, in a folder that holds a copy of `configs/`) and returns, or raises an error of
-`coupole.errors` whose message names the file. What a run keeps is in `fuzz.kept`, lights are in `fuzz.lit`, wires
-in `fuzz.wires`.
+`coupole.errors` whose message names the file. What a run keeps is in `fuzz.kept`, what other programs write in
+`fuzz.foreign`, lights are in `fuzz.lit`, wires in `fuzz.wires`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+from fuzz.foreign import FOREIGN
 from fuzz.kept import KEPT
 from fuzz.lit import LIT
 from fuzz.target import Target
@@ -113,33 +114,6 @@ def check_mesh(path: Path) -> None:
     check_plan_with(path, object={"id": "case", "mesh": f"../objects/{path.name}"})
 
 
-def tensor_file() -> list[bytes]:
-    """A small table of RGL's format."""
-    import numpy as np
-
-    from coupole.exchange.of_results.bsdf import tensors
-
-    shapes = {"theta_i": (2,), "phi_i": (1,), "ndf": (2, 2), "sigma": (2, 2), "vndf": (1, 2, 2, 2)}
-    fields = {name: np.arange(1, 1 + np.prod(shape), dtype=np.float32) for name, shape in shapes.items()}
-    tables = {name: fields[name].reshape(shape) for name, shape in shapes.items()}
-    return [tensors({**tables, "rgb": np.ones((1, 2, 3, 2, 2), np.float32), "jacobian": np.ones(1, np.uint8)})]
-
-
-def read_tensor_file(path: Path) -> None:
-    from coupole.appearance.matter.rgl_table import read_bsdf
-
-    read_bsdf(path)
-
-
-ALTA = b"#DIM 3 1\n#PARAM_IN ISOTROPIC_TL_TV_PROJ_DPHI\n#PARAM_OUT INV_STERADIAN\n#VS 2\n0.1 0.2 0 1.5 1.25 2\n"
-
-
-def read_alta_text(path: Path) -> None:
-    from coupole.appearance.matter.alta_samples import read_alta
-
-    read_alta(path)
-
-
 TARGETS = (
     Target("plan", "plans/case.yaml", files("plans/*.yaml"), check),
     Target("rig", "rigs/case.yaml", files("rigs/sim*.yaml"), check_rig),
@@ -151,8 +125,7 @@ TARGETS = (
     Target("mesh-stl", "objects/case.stl", mesh("stl"), check_mesh),
     Target("mesh-stl-ascii", "objects/case.stl", mesh("stl", encoding="ascii"), check_mesh),
     Target("mesh-obj", "objects/case.obj", mesh("obj"), check_mesh),
-    Target("bsdf", "objects/case.bsdf", tensor_file, read_tensor_file),
-    Target("alta", "objects/case.alta", lambda: [ALTA], read_alta_text),
+    *FOREIGN,
     *LIT,
     *KEPT,
     *WIRES,

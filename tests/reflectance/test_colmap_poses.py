@@ -200,7 +200,8 @@ def test_poses_that_the_records_do_not_allow_are_refused(tmp_path: Path) -> None
 
 def test_another_lens_is_refused(tmp_path: Path) -> None:
     measured = measured_run(4)
-    read_poses(written(model_of(measured, fx=801.0), tmp_path / "near"), measured)  # twice its uncertainty
+    near = model_of(measured, fx=801.0, cx=LENS.cx + 1.2)  # twice and four times its uncertainty
+    read_poses(written(near, tmp_path / "near"), measured)
     with pytest.raises(
         InputError, match=r"cameras.bin: camera 1: another lens .* fx is 804 there, 800 by the record"
     ):

@@ -109,8 +109,8 @@ def _dim(path: Path, head: dict[str, tuple[str, int]]) -> tuple[int, int]:
         raise InputError(f"{path}:{head['FORMAT'][1]}:1: expected ALTA's text; found its binary format")
     text, line = head["DIM"]
     words = text.split()
-    if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
-        raise InputError(f"{path}:{line}:1: #DIM: expected two whole numbers above 0; found {text!r}")
+    if len(words) != 2 or not all(word.isdecimal() and len(word) < 5 and int(word) > 0 for word in words):
+        raise InputError(f"{path}:{line}:1: #DIM: expected two whole numbers, 1 to 9999; found {text[:40]!r}")
     return int(words[0]), int(words[1])
 
 

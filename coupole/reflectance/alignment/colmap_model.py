@@ -3,6 +3,7 @@ the order of models and parameters is that of its `sensor/models.h`)."""
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -91,7 +92,7 @@ def _camera(path: Path, model: str, size_px: tuple[int, int], parameters: list[f
 def _image(path: Path, name: str, camera: int, pose: list[float]) -> ColmapImage:
     """`pose` is a quaternion, w first, and a translation."""
     w, x, y, z, *shift = pose
-    if not np.isfinite(pose).all() or abs(np.linalg.norm([w, x, y, z]) - 1.0) > _UNIT:
+    if not np.isfinite(pose).all() or abs(math.hypot(w, x, y, z) - 1.0) > _UNIT:
         raise InputError(f"{path}: image {name}: expected a unit quaternion and a translation; found {pose}")
     camera_from_world = np.eye(4)
     camera_from_world[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
@@ -156,7 +157,7 @@ def _records(path: Path, read: Callable[[bytes, int], tuple[Record, int]]) -> It
         for _ in range(count):
             one, at = read(data, at)
             yield one
-    except (OSError, struct.error, ValueError) as error:
+    except (OSError, OverflowError, struct.error, ValueError) as error:
         raise InputError(f"{path}: expected COLMAP's binary; it is damaged or cut short: {error}") from error
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from coupole.commands.completion import formats
 from coupole.exchange import COLMAP, CRATE, FORMATS
 from coupole.exchange.of_results import FORMATS as OF_RESULTS
 from coupole.exchange.of_results import OF_MATERIALS
@@ -26,6 +27,7 @@ ToOption = Annotated[
         help=f"Of runs: {', '.join(OF_RUNS)}. Of results of runs: {', '.join(OF_RESULTS_OF_RUNS)}; "
         f"of results of pictures: {', '.join(OF_PICTURES)}.",
         show_default=False,
+        autocompletion=formats,
     ),
 ]
 ViewsOption = Annotated[

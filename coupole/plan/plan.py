@@ -14,7 +14,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 
 from coupole.geometry import Transform, transform
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 """Letters, digits, dot, underscore, hyphen: it becomes part of file names and shot ids."""
 Words = Annotated[str, Field(min_length=1, max_length=500)]
 Millimetres = Annotated[float, Field(ge=-20_000, le=20_000)]

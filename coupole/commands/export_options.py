@@ -53,6 +53,19 @@ TriangleOption = Annotated[
         rich_help_panel=_PARTS,
     ),
 ]
+AdaptiveOption = Annotated[
+    float | None,
+    typer.Option(
+        "--adaptive",
+        metavar="ERROR",
+        help="For bsdf: as small a table as misses the fit by at most this share (as 0.003) in 95 % of "
+        "directions, of all and of those in the lobe; without it 17 MB.",
+        min=1e-5,
+        max=0.5,
+        show_default=False,
+        rich_help_panel=_PARTS,
+    ),
+]
 RefinedOption = Annotated[
     Path | None,
     typer.Option(

@@ -34,7 +34,7 @@ from coupole.viewing.progress import Progress
 VERSION = 1
 Command = Literal["pause", "go-on", "stop", "state"]
 State = dict[str, Any]
-"""`run`, `pid`, `state` (running, pausing, paused, stopping), and from the first burst on those of `Progress`."""
+"""`run`, `rig`, `pid`, `state` (running, pausing, paused, stopping); from the first burst on `Progress` too."""
 _LONGEST_LINE_BYTES = 4096
 _PATIENCE_S = 5.0
 
@@ -63,9 +63,15 @@ class RunControl:
     `trouble` says why."""
 
     def __init__(
-        self, run: Path, control: Control, halt: Callable[[], object], progress: Callable[[], Progress | None]
+        self,
+        run: Path,
+        rig: Path,
+        control: Control,
+        halt: Callable[[], object],
+        progress: Callable[[], Progress | None],
     ) -> None:
         """`halt` switches lights off and stops the arm, at once, from any thread; `progress` is the newest."""
+        self._about = {"version": VERSION, "run": str(run), "rig": str(rig.resolve()), "pid": os.getpid()}
         self._run, self._control, self._halt, self._progress = run, control, halt, progress
         self._socket: socket.socket | None = None
         self.trouble = ""
@@ -107,9 +113,8 @@ class RunControl:
         state = "pausing" if control.pause.is_set() else "running"
         state = "paused" if control.paused.is_set() else state
         state = "stopping" if control.stop.is_set() else state
-        found: State = {"version": VERSION, "run": str(self._run), "pid": os.getpid(), "state": state}
         progress = self._progress()
-        return {**found, **(vars(progress) if progress else {})}
+        return {**self._about, "state": state, **(vars(progress) if progress else {})}
 
     def _serve(self) -> None:
         while True:

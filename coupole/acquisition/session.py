@@ -222,7 +222,7 @@ def _acquire(
     outcome = sequencer.outcome
     ended: Literal["done", "interrupted", "failed"] = "failed"
     failure: BaseException | None = None
-    remote = RunControl(run.folder, control, cell.halt, lambda: observer.newest)
+    remote = RunControl(run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest)
 
     def stop() -> None:
         control.stop_by(signal.SIGINT)

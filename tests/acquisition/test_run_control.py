@@ -35,7 +35,7 @@ class Served:
 def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     found = Served(tmp_path / "run")
-    with RunControl(found.run, found.control, found.halt, lambda: PROGRESS) as control:
+    with RunControl(found.run, tmp_path / "rig.yaml", found.control, found.halt, lambda: PROGRESS) as control:
         assert control.trouble == ""
         yield found
 
@@ -50,7 +50,8 @@ def say(line: bytes) -> dict[str, object]:
 
 def test_it_pauses_goes_on_and_stops_and_tells_its_state_each_time(served: Served) -> None:
     assert say(b'{"version": 1, "command": "state"}\n') == {
-        "version": 1, "run": str(served.run), "pid": os.getpid(), "state": "running", "view": "top",
+        "version": 1, "run": str(served.run), "rig": str(served.run.parent / "rig.yaml"), "pid": os.getpid(),
+        "state": "running", "view": "top",
         "view_number": 0, "views": 2, "proven": 52, "frames": 132, "light": "led0417", "dose_lux_h": 0.125,
         "left_s": 33.5,
     }  # fmt: skip
@@ -127,5 +128,5 @@ def test_without_a_folder_for_its_socket_a_run_is_acquired_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / ("long" * 30)))
-    with RunControl(tmp_path, Control(), lambda: None, lambda: None) as control:
+    with RunControl(tmp_path, tmp_path / "rig.yaml", Control(), lambda: None, lambda: None) as control:
         assert "will not reach this run" in control.trouble

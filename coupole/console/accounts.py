@@ -1,0 +1,134 @@
+"""Who may sign in to a cell's console, and as what: names, roles and hashed passwords in one file."""
+
+from __future__ import annotations
+
+import hmac
+import json
+import re
+import secrets
+import threading
+import time
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+import argon2
+
+from coupole.errors import InputError, StorageError
+from coupole.storage.durable import make_folder, write_synced
+
+SHORTEST_PASSWORD, LONGEST_PASSWORD = 10, 200
+_NAME = re.compile(r"[^\W_][\w .'-]{0,63}", re.UNICODE)
+_MOST_FAILURES, _FORGOTTEN_AFTER_S = 5, 60.0
+
+
+class Role(IntEnum):
+    """What somebody may do; each may all that those below may."""
+
+    OBSERVER = 1
+    """Looks."""
+    OPERATOR = 2
+    """Runs plans."""
+    ENGINEER = 3
+    """Calibrates, and keeps the accounts."""
+
+    @property
+    def word(self) -> str:
+        return self.name.lower()
+
+    @classmethod
+    def of(cls, word: str) -> Role:
+        """Raises InputError."""
+        try:
+            return cls[word.upper()]
+        except KeyError:
+            raise InputError(f"role: expected {', '.join(role.word for role in cls)}; found {word!r}") from None
+
+
+@dataclass(frozen=True)
+class Account:
+    """A person."""
+
+    name: str
+    role: Role
+
+
+class Accounts:
+    """The accounts in a file that only its owner reads. Passwords are hashed by argon2id with its library's
+    parameters (RFC 9106)."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises StorageError: the file cannot be read."""
+        self._path, self._lock = path, threading.Lock()
+        self._hasher = argon2.PasswordHasher()
+        self._nobodys_hash = self._hasher.hash(secrets.token_hex())
+        self._failures: list[tuple[float, str]] = []
+        try:
+            self._stored: dict[str, dict[str, Any]] = json.loads(path.read_bytes()) if path.exists() else {}
+        except (OSError, ValueError) as error:
+            raise StorageError(f"{path}: the console's accounts cannot be read: {error}") from error
+
+    @property
+    def are_none(self) -> bool:
+        return not self._stored
+
+    def listed(self) -> list[Account]:
+        """All, by name."""
+        return [Account(name, Role.of(kept["role"])) for name, kept in sorted(self._stored.items())]
+
+    def add(self, name: str, password: str, role: Role) -> Account:
+        """A new account, on the disk when this returns. Raises InputError, StorageError."""
+        if not _NAME.fullmatch(name):
+            raise InputError("name: expected at most 64 letters, digits, spaces, dots, hyphens; a letter first")
+        if not SHORTEST_PASSWORD <= len(password) <= LONGEST_PASSWORD:
+            raise InputError(f"password: expected {SHORTEST_PASSWORD} to {LONGEST_PASSWORD} characters")
+        hashed = self._hasher.hash(password)
+        with self._lock:
+            if name in self._stored:
+                raise InputError(f"name: {name} has an account already")
+            self._keep({**self._stored, name: {"role": role.word, "password": hashed}})
+        return Account(name, role)
+
+    def remove(self, name: str) -> None:
+        """Raises InputError: no such account, or the last engineer's; StorageError."""
+        with self._lock:
+            if name not in self._stored:
+                raise InputError(f"name: {name} has no account")
+            left = {other: kept for other, kept in self._stored.items() if other != name}
+            if not any(kept["role"] == Role.ENGINEER.word for kept in left.values()):
+                raise InputError("name: this is the last engineer; nobody could keep the accounts")
+            self._keep(left)
+
+    def sign_in(self, name: str, password: str) -> Account | None:
+        """The account with this name and password; None if there is none, and for a minute after five failures.
+        It takes as long whether or not the name is known."""
+        with self._lock:
+            recent_s = time.monotonic() - _FORGOTTEN_AFTER_S
+            self._failures = [(t_s, who) for t_s, who in self._failures if t_s > recent_s]
+            kept = self._stored.get(name)
+            if sum(who == name for _, who in self._failures) >= _MOST_FAILURES:
+                return None
+        try:
+            self._hasher.verify(kept["password"] if kept else self._nobodys_hash, password[:LONGEST_PASSWORD])
+        except (argon2.exceptions.VerificationError, argon2.exceptions.InvalidHashError):
+            with self._lock:
+                self._failures.append((time.monotonic(), name))
+            return None
+        return Account(name, Role.of(kept["role"])) if kept else None
+
+    def _keep(self, stored: dict[str, dict[str, Any]]) -> None:
+        try:
+            make_folder(self._path.parent)
+            if not self._path.exists():
+                self._path.touch(mode=0o600)
+            write_synced(self._path, json.dumps(stored, indent=2, ensure_ascii=False))
+            self._path.chmod(0o600)
+        except OSError as error:
+            raise StorageError(f"{self._path}: the account cannot be kept: {error.strerror}") from error
+        self._stored = stored
+
+
+def same(one: str, other: str) -> bool:
+    """Whether two secrets are equal, in a time that does not tell where they differ."""
+    return hmac.compare_digest(one.encode(), other.encode())

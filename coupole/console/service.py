@@ -1,0 +1,207 @@
+"""`coupole serve`: the process that owns a cell's queue and serves its console."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import functools
+import getpass
+import ipaddress
+import json
+import os
+import secrets
+import socket
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from coupole.console.accounts import Account, Accounts, Role
+from coupole.console.acquisitions import Acquisitions
+from coupole.console.api import Service, StateNow, make_app
+from coupole.console.audit import Audit
+from coupole.console.client import service_socket
+from coupole.console.plan_queue import PlanQueue
+from coupole.console.sessions import Control, Session, Sessions
+from coupole.errors import InputError
+from coupole.plan.cell import Cell
+from coupole.plan.rig_devices import in_world
+from coupole.plan.yamlfile import read
+from coupole.preflight.job import read_job
+from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.durable import make_folder
+from coupole.storage.run import Run
+
+_STOP_WITHIN_S = 2
+
+
+def serve(cell: Cell, *, host: str, port: int, plans: Path, tls: tuple[Path, Path] | None, tell: Any) -> None:
+    """Serve a cell's console until a signal ends it; runs that are being acquired go on. `tell` is called with
+    `url`, `token` and `pid` when it listens.
+
+    Raises InputError: another service owns the cell, an address without TLS that others can reach, no such
+    address; StorageError.
+    """
+    if not _is_loopback(host) and tls is None:
+        raise InputError(f"--host {host}: others can reach this address: give --tls-certificate and --tls-key")
+    folder = cell.state_folder / "console"
+    make_folder(folder)
+    with _owned(folder), contextlib.closing(Audit(folder / "audit.jsonl")) as audit:
+        queue = PlanQueue(folder / "queue.json")
+        accounts = Accounts(folder / "accounts.json")
+        first_token = [secrets.token_urlsafe(24)] if accounts.are_none else []
+        listening = _listen(host, port)
+        url = f"{'https' if tls else 'http'}://{_name(host)}:{listening.getsockname()[1]}"
+        with Acquisitions(queue, cell.document.path, folder / "output") as acquisitions:
+            control = Control()
+            service = Service(
+                accounts, Sessions(), control, audit, queue, acquisitions,
+                state=lambda: state_of(cell, queue, acquisitions, control),
+                read_plan=lambda name: read_plan(cell, plans, name),
+                origins=frozenset({url, *_other_names(url)}),
+                first_token=first_token,
+                command_line=Session(Account(f"{getpass.getuser()} (command line)", Role.ENGINEER), 0.0, 0),
+            )  # fmt: skip
+            tell({"url": url, "token": first_token[0] if first_token else "", "pid": os.getpid()})
+            asyncio.run(_run(service, listening, service_socket(cell), tls))
+
+
+def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: Control) -> StateNow:
+    """The cell at this moment."""
+    at_work = acquisitions.state or {}
+    begun = "starting" if queue.running else "halted" if queue.halted else "idle"
+    faults = ArmFaults(cell.state_folder).standing()
+    return StateNow(
+        state=at_work.get("state", begun),
+        rig=cell.rig.name,
+        simulated=in_world(cell.rig, dry_run=False),
+        run=Path(at_work["run"]).name if at_work else None,
+        view=at_work.get("view"),
+        proven=at_work.get("proven", 0),
+        frames=at_work.get("frames", 0),
+        dose=at_work.get("dose_lux_h", 0.0),
+        left_s=at_work.get("left_s"),
+        halted=queue.halted,
+        arm_fault=faults[-1].message if faults else "",
+        devices=_devices(at_work["run"]) if at_work else {},
+        queue=list(queue.entries),
+        in_control=control.now.name,
+        asked_by=control.now.asked_by,
+    )
+
+
+@functools.lru_cache(4)
+def _devices(run: str) -> dict[str, Any]:
+    """Identities of a run's devices, which do not change."""
+    try:
+        return dict(Run(Path(run)).about["devices"])
+    except (InputError, KeyError):
+        return {}
+
+
+def read_plan(cell: Cell, plans: Path, name: str) -> Path:
+    """The file of a plan in the folder of plans, if it is whole and for this cell. Raises InputError."""
+    path = (plans / name).resolve()
+    if not path.is_relative_to(plans.resolve()):
+        raise InputError(f"plan: expected a file below {plans}; found {name!r}")
+    if "views" not in read(path).data:
+        raise InputError(f"{path}: expected a plan, with `views`")
+    job = read_job(path)
+    if job.cell.document.path.resolve() != cell.document.path.resolve():
+        raise InputError(f"{path}: its rig is {job.cell.document.path}; this console's is {cell.document.path}")
+    return path
+
+
+# -- sockets --------------------------------------------------------------------------------------------------
+
+
+class _OfThisUser(H11Protocol):
+    """HTTP on a Unix socket, with processes of this user alone."""
+
+    def connection_made(self, transport: Any) -> None:
+        peer = transport.get_extra_info("socket").getsockopt(
+            socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")
+        )
+        if struct.unpack("3i", peer)[1] not in (os.getuid(), 0):
+            transport.abort()
+            return
+        super().connection_made(transport)
+
+
+async def _run(service: Service, listening: socket.socket, path: Path, tls: tuple[Path, Path] | None) -> None:
+    app = make_app(service)
+    page, line = uvicorn.Server(_config(app)), uvicorn.Server(_config(app))
+    page.config.ssl_certfile, page.config.ssl_keyfile = tls or (None, None)
+    line.config.http = _OfThisUser
+    path.unlink(missing_ok=True)
+    with socket.socket(socket.AF_UNIX) as local:
+        local.bind(str(path))
+        path.chmod(0o600)
+        try:
+            page_task = asyncio.create_task(page.serve(sockets=[listening]))
+            line_task = asyncio.create_task(line.serve(sockets=[local]))
+            await asyncio.wait({page_task, line_task}, return_when=asyncio.FIRST_COMPLETED)
+            page.should_exit = line.should_exit = True
+            await asyncio.gather(page_task, line_task)
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def _config(app: FastAPI) -> uvicorn.Config:
+    return uvicorn.Config(
+        app,
+        log_level="warning",
+        access_log=False,
+        timeout_graceful_shutdown=_STOP_WITHIN_S,
+        lifespan="off",
+        proxy_headers=False,
+        server_header=False,
+    )
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listening = socket.socket(family, kind)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(address)
+        listening.listen(128)
+    except OSError as error:
+        raise InputError(f"--host {host} --port {port}: cannot listen there: {error}") from error
+    return listening
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _name(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+def _other_names(url: str) -> list[str]:
+    """`localhost` for an address of this machine."""
+    scheme, _, rest = url.partition("://")
+    host, _, port = rest.rpartition(":")
+    return [f"{scheme}://localhost:{port}"] if _is_loopback(host.strip("[]")) else []
+
+
+@contextlib.contextmanager
+def _owned(folder: Path) -> Iterator[None]:
+    """The cell's console, of this process alone. Raises InputError: another one has it."""
+    with (folder / "lock").open("w", encoding="utf-8") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(f"{folder}: another `coupole serve` has this cell") from error
+        json.dump({"pid": os.getpid()}, lock)
+        lock.flush()
+        yield

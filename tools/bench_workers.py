@@ -80,12 +80,13 @@ def _fit(root: Path, folder: Path, workers: int, number: int) -> Fitted:
         used_s = [_cpu_s(process.pid) for process in processes]
         begun_s = time.perf_counter()
         command = [sys.executable, "-m", "coupole.commands.cli", "reflectance", "fit", str(out)]
-        client = subprocess.Popen([*command, "--scheduler", address], cwd=root, stdout=subprocess.DEVNULL)
+        with (dask / "client.log").open("wb") as log:
+            client = subprocess.Popen([*command, "--scheduler", address], cwd=root, stdout=log, stderr=log)
         _, status, usage = os.wait4(client.pid, 0)
         seconds = time.perf_counter() - begun_s
         client.returncode = os.waitstatus_to_exitcode(status)
         if client.returncode:
-            raise RuntimeError(f"{' '.join(command)} has ended with {client.returncode}")
+            raise RuntimeError((dask / "client.log").read_text())
         each = (_cpu_s(process.pid) - before for process, before in zip(processes, used_s, strict=True))
         return Fitted(seconds, usage.ru_utime + usage.ru_stime, tuple(each))
 

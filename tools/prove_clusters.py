@@ -119,7 +119,7 @@ def _result(folder: Path, fine: Fine | None, every: int, waves: int) -> Path:
             draw_records(records, 0, Scale(pitch_um=fine.pitch_um, size_px=fine.size_px))
     request = RunRequest((Path(about.read_text()),), calibrations=tuple(sorted(records.glob("*.yaml"))))
     found = reflectance_of(request, folder / "result", say=_say)
-    mae = " ".join(f"{name} {1e2 * value:.3f} %" for name, value in found["mae"].items())
+    mae = " ".join(f"{name} {1e2 * value:.3f} %" for name, value in found["mae"].items() if value)
     print(
         f"{found['triangles']} triangles, {found['samples']} samples, {found['seconds']:.0f} s: {mae}", flush=True
     )

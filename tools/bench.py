@@ -220,6 +220,15 @@ def bench_reflectance(rounds: int) -> None:
         line(**figure)
 
 
+def bench_workers(rounds: int) -> None:
+    """Fits of the demo's samples by two workers of a cluster, against one; for two idle cores. It acquires the
+    demo first, and takes 3 GB of disk."""
+    from bench_workers import figures
+
+    for figure in figures(ROOT, rounds):
+        line(**figure)
+
+
 FRAMES_OF = {"reflectance": 300}
 BENCHES: dict[str, Callable[[int], None]] = {
     "check": bench_check,
@@ -234,6 +243,7 @@ BENCHES: dict[str, Callable[[int], None]] = {
     "mesh": bench_mesh,
     "calibration": bench_calibration,
     "reflectance": bench_reflectance,
+    "workers": bench_workers,
 }
 
 

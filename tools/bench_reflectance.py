@@ -353,7 +353,8 @@ def _relit(root: Path, folder: Path, samples: Any, rounds: int) -> Iterator[dict
     certain = MaterialUncertainty(np.zeros((count, 5, 5)), *np.zeros((2, *whole.kd.shape)))
     nothing = np.zeros(count, np.float32)
     write_materials(result.materials_path("ggx_normal"), [whole], [certain], nothing, 0.0, result.triangles)
-    (folder / ABOUT).write_text(json.dumps({"schema": SCHEMA, "emission": "lambertian"}))
+    about = {"schema": SCHEMA, "emission": "lambertian", "runs": {}, "mae": {}, "scan_noise_um": 30.0}
+    (folder / ABOUT).write_text(json.dumps({**about, "simulated": True, "software": {"coupole": "bench"}}))
     by, _ = photographer(root, folder / MESH, FULL)
     mitsuba = mitsuba_frame(folder / MESH, by)
     ready = scene_of_view(result, fit="ggx_normal")

@@ -52,6 +52,8 @@ class Scale:
     """Of each coordinate of the camera in the flange's frame."""
     pitch_um: float = 44.0
     """Of the pixels."""
+    size_px: tuple[int, int] | None = None
+    """Of another sensor: width and height; its pixels are alike."""
     sensor: SensorModel = SHIPPED_SENSOR
 
 
@@ -67,7 +69,13 @@ def draw_records(folder: Path, seed: int, scale: Scale | None = None) -> tuple[P
     _draw_hand_eye(folder, random, scale)
     _draw_leds(folder, random, scale)
     _draw_powers(folder, random)
-    return tuple(sorted(folder.glob("*.yaml")))
+    records = tuple(sorted(folder.glob("*.yaml")))
+    for path in records if scale.size_px is not None else ():
+        content = _content(read_record(path))
+        if content["validity"]["size_px"] is not None:
+            content["validity"]["size_px"] = scale.size_px
+            write_record(path, _sealed(content))
+    return records
 
 
 def true_powers() -> Floats:
@@ -88,10 +96,10 @@ def true_leds() -> Leds:
 def _draw_hand_eye(folder: Path, random: np.random.Generator, scale: Scale) -> None:
     """Lens, hand-eye and axis zeros by their common covariance; what the record has besides them is not used."""
     record, cell = read_record(SHIPPED / "hand-eye.yaml"), read_cell(RIG)
-    sensor = cell.rig.sensor
+    width_px, height_px = scale.size_px or (cell.rig.sensor.width_px, cell.rig.sensor.height_px)
     focal_px = 1e3 / scale.pitch_um * _image_mm(cell)
     truth = {"fx_px": focal_px, "fy_px": focal_px}
-    truth |= {"cx_px": 0.5 * (sensor.width_px - 1), "cy_px": 0.5 * (sensor.height_px - 1)}
+    truth |= {"cx_px": 0.5 * (width_px - 1), "cy_px": 0.5 * (height_px - 1)}
     covariance = record.covariance_matrix.copy()
     names = [parameter.name for parameter in record.parameters]
     steps = [names.index(f"flange_from_camera.{axis}_mm") for axis in "xyz"]
@@ -140,14 +148,21 @@ def _set_sensor(folder: Path, scale: Scale) -> None:
             }
             parameter["value"] = known.get(name, parameter["value"])
         write_record(folder / "response.yaml", _sealed(content))
-    if scale.pitch_um == cell.rig.sensor.pixel_pitch_um:
+    if scale.pitch_um == cell.rig.sensor.pixel_pitch_um and scale.size_px is None:
         return
     lens = cell.rig.lens
-    row, column = np.indices((cell.rig.sensor.height_px, cell.rig.sensor.width_px))
+    width_px, height_px = scale.size_px or (cell.rig.sensor.width_px, cell.rig.sensor.height_px)
+    row, column = np.indices((height_px, width_px))
     off = np.hypot(row - row.mean(), column - column.mean()) * scale.pitch_um * 1e-3 / _image_mm(cell)
     with h5py.File(folder / "flat-field.h5", "r+") as file:
         objective = Objective(lens.focal_length_mm, lens.focus_distance_mm, lens.f_number)
-        file["g"][...] = vignetting(objective, off)
+        fall_off = vignetting(objective, off)
+        if scale.size_px is None:
+            file["g"][...] = fall_off
+        else:
+            for name, values in (("g", fall_off), ("pixel_response", np.ones_like(fall_off))):
+                del file[name]
+                file[name] = values.astype(np.float32)
     content = _content(read_record(SHIPPED / "flat-field.yaml"))
     content["files"][0]["sha256"] = hashlib.sha256((folder / "flat-field.h5").read_bytes()).hexdigest()
     write_record(folder / "flat-field.yaml", _sealed(content))

@@ -65,13 +65,14 @@ def height_mm(x: Heights, y: Heights) -> Heights:
     return heights
 
 
-def relief() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Vertices [n, 3] in mm and triangles [m, 3], counter-clockwise seen from outside."""
-    xs = np.linspace(-WIDTH_MM / 2, WIDTH_MM / 2, COLUMNS + 1)
-    ys = np.linspace(-DEPTH_MM / 2, DEPTH_MM / 2, ROWS + 1)
+def relief(columns: int = COLUMNS, rows: int = ROWS) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Vertices [n, 3] in mm and triangles [m, 3], counter-clockwise seen from outside, two for each cell of a
+    grid."""
+    xs = np.linspace(-WIDTH_MM / 2, WIDTH_MM / 2, columns + 1)
+    ys = np.linspace(-DEPTH_MM / 2, DEPTH_MM / 2, rows + 1)
     x, y = np.meshgrid(xs, ys)
     top = np.stack([x, y, height_mm(x, y)], axis=-1).reshape(-1, 3)
-    index = np.arange(len(top)).reshape(ROWS + 1, COLUMNS + 1)
+    index = np.arange(len(top)).reshape(rows + 1, columns + 1)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     faces = [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))]
 

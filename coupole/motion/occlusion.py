@@ -211,8 +211,12 @@ def blocked(mesh: Any, starts_mm: NDArray[np.float64], ends_mm: NDArray[np.float
     """[n] True where the segment between two points [n, 3] meets a triangle of a `ray_mesh`."""
     if mesh is None or len(starts_mm) == 0:
         return np.zeros(len(starts_mm), np.bool_)
-    starts, ways = starts_mm.astype(np.float32), (ends_mm - starts_mm).astype(np.float32)
-    met = mesh.run(starts, ways, dists=np.ones(len(starts), np.float32), query="OCCLUDED")
+    return blocked_along(mesh, starts_mm.astype(np.float32), (ends_mm - starts_mm).astype(np.float32))
+
+
+def blocked_along(mesh: Any, starts_mm: NDArray[np.float32], ways_mm: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """[n] True where the way [n, 3] from a start to its end meets a triangle of a `ray_mesh`."""
+    met = mesh.run(starts_mm, ways_mm, dists=np.ones(len(starts_mm), np.float32), query="OCCLUDED")
     found: NDArray[np.bool_] = met >= 0
     return found
 

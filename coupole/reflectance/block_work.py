@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from coupole.errors import InputError
@@ -24,6 +25,8 @@ Said = Callable[[str, int, int], None]
 _ANSWERS_S = 10.0
 _AHEAD = 3
 """Blocks for each thread of the workers that are asked for before their results are taken."""
+_BLOCKS_EACH, _FEWEST_ROWS, _MOST_ROWS = 8, 256, 1 << 12
+"""Blocks that a thread gets at least, and triangles of a block."""
 _MISSING = "--scheduler: dask.distributed is not installed here; `pip install 'coupole[cluster]'` adds it"
 
 
@@ -36,8 +39,10 @@ class Workshop(Protocol):
 
     threads: int | None
     """That a block may use; None for as many as there are cores."""
-    most_rows: int
-    """Triangles of a block."""
+
+    def most_rows(self, count: int) -> int:
+        """Triangles of a block, of so many in all."""
+        ...
 
     def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
         """Results in the order of the blocks."""
@@ -61,7 +66,9 @@ class Here:
     """In this process, one block after the other."""
 
     threads: int | None = None
-    most_rows = MOST_ROWS
+
+    def most_rows(self, count: int) -> int:
+        return MOST_ROWS
 
     def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
         return map(function, blocks)
@@ -80,20 +87,27 @@ class Cluster:
     """In the workers of a scheduler, a block in each of their threads."""
 
     threads: int | None = 1
-    most_rows = 1 << 12
 
     def __init__(self, client: Any, address: str) -> None:
         self._client, self._address = client, address
 
+    def most_rows(self, count: int) -> int:
+        """So few that no worker waits long for the last one's last block."""
+        return int(np.clip(-(-count // (_BLOCKS_EACH * self._all_threads)), _FEWEST_ROWS, _MOST_ROWS))
+
     def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
         asked: deque[Any] = deque()
-        ahead = _AHEAD * max(1, sum(self._client.nthreads().values()))
+        ahead = _AHEAD * self._all_threads
         for block in blocks:
             asked.append(self._client.submit(_done_alone, function, block, pure=False))
             if len(asked) == ahead:
                 yield self._result(asked.popleft())
         while asked:
             yield self._result(asked.popleft())
+
+    @property
+    def _all_threads(self) -> int:
+        return max(1, sum(map(int, self._client.nthreads().values())))
 
     def _result(self, future: Any) -> Any:
         from dask.distributed import CancelledError, KilledWorker

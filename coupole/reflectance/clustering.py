@@ -32,6 +32,8 @@ _OFF_DEG = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 """Of the half vector to the normal: there materials are compared, lights and views slanted by 30 degrees."""
 _LEARNT_FROM = 20_000
 _ROUNDS = 10
+_DISTANCES = 1 << 23
+"""At a time."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,9 @@ def clusters_of(features: Floats, count: int) -> NDArray[np.int64]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of clusters that lost all their points: they are left out
         centres, _ = kmeans2(some, min(count, len(some)), iter=_ROUNDS, minit="points", rng=random)
-    numbers = vq(features, centres)[0]
+    step = max(1, _DISTANCES // len(centres))  # vq keeps those of all points to all centres
+    parts = [vq(features[first : first + step], centres)[0] for first in range(0, len(features), step)]
+    numbers = np.concatenate(parts)
     return np.unique(numbers, return_inverse=True)[1].astype(np.int64)
 
 

@@ -9,6 +9,7 @@ material, so that neither the triangle nor the model is wrong.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from coupole.reflectance.block_work import Said
-from coupole.reflectance.extraction.extraction import BY_UNKNOWN
+from coupole.reflectance.extraction.sample_codes import BY_UNKNOWN
 from coupole.reflectance.result_folder import complete
 from coupole.reflectance.run_result import CONTRADICTED, SAMPLES, RunResult, ViewSamples
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
@@ -83,31 +83,42 @@ def contradicted(
     return dark
 
 
-def leave_out(result: RunResult, memory_bytes: int, say: Said) -> None:
-    """Take contradicted samples out of the files of views that still have them; each file is whole, before or
-    after. By `ggx_normal`. Raises OSError."""
-    left = [view for view in result.views if view.contradicted is None]
-    for number, view in enumerate(left, start=1):
-        _leave_out(result, view, memory_bytes)
-        say("contradictions", number, len(left))
+@dataclass(frozen=True)
+class Found:
+    """What contradicts others among the samples of some rows of a view's file."""
+
+    rows: slice
+    places: NDArray[np.int64]
+    """[2, n] rows, from the first on, and LEDs."""
+    values: int
+    """That they have."""
+    all_values: int
+    """That the rows have."""
 
 
-def _leave_out(result: RunResult, view: ViewSamples, memory_bytes: int) -> None:
-    beside = Neighbours.of(view.led_mm, result.middle_mm)
+def find(result: RunResult, view: ViewSamples, rows: slice) -> Found:
+    """By `ggx_normal`."""
+    materials = result.materials("ggx_normal", np.searchsorted(result.triangles, view.triangles[rows]))
+    samples, beside = result.view_samples(view, rows), Neighbours.of(view.led_mm, result.middle_mm)
+    with h5py.File(view.path, "r") as file:
+        dark = contradicted(samples, materials, file["u_own"][rows], beside)
+        known = np.isfinite(file["f"][rows])
+    return Found(rows, np.stack(np.nonzero(dark)), int(known[dark].sum()), int(known.sum()))
+
+
+def leave_out(view: ViewSamples, found: Iterable[Found]) -> None:
+    """Take what contradicts others out of a view's file, which is whole, before or after. Raises OSError."""
 
     def write(part: Path) -> None:
+        count = used = 0
         shutil.copyfile(view.path, part)
         with h5py.File(part, "r+") as file:
-            count = used = 0
-            for rows in result.view_blocks(view, memory_bytes // 4):
-                materials = result.materials("ggx_normal", np.searchsorted(result.triangles, view.triangles[rows]))
-                dark = contradicted(result.view_samples(view, rows), materials, file["u_own"][rows], beside)
-                f, codes = file["f"][rows], file["codes"][rows]
-                used += int(np.count_nonzero(np.isfinite(f)))
-                if dark.any():
-                    count += int(np.count_nonzero(np.isfinite(f[dark])))
-                    f[dark], codes[dark] = np.nan, BY_UNKNOWN
-                    file["f"][rows], file["codes"][rows] = f, codes
+            for one in found:
+                count, used = count + one.values, used + one.all_values
+                if one.places.size:
+                    f, codes = file["f"][one.rows], file["codes"][one.rows]
+                    f[*one.places], codes[*one.places] = np.nan, BY_UNKNOWN
+                    file["f"][one.rows], file["codes"][one.rows] = f, codes
             file.attrs[CONTRADICTED], file.attrs[SAMPLES] = count, used - count
 
     complete(view.path, write)

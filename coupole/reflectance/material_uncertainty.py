@@ -240,8 +240,9 @@ def _colours(  # type: ignore[no-untyped-def]
             for j in range(2):
                 bread[i, j] += weight * row[i] * row[j]
         for channel in range(channels + 1):
-            part[:] = weight * off[channel] * row
-            score[channel] += part
+            for i in range(2):
+                part[i] = weight * off[channel] * row[i]
+                score[channel, i] += part[i]
             _add_square(part, single[channel])
     for channel in range(channels + 1):
         _add_square(score[channel], meat[channel])

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import groupby
 from pathlib import Path
 from uuid import uuid4
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.reflectance.block_work import Said, Workshop, silent, workshop
-from coupole.reflectance.contradictions import leave_out
+from coupole.reflectance.contradictions import Found, find, leave_out
 from coupole.reflectance.material_uncertainty import MaterialUncertainty, covariances
 from coupole.reflectance.model_bias import unbiased_normals
 from coupole.reflectance.result_folder import SETTINGS, clear_remains, complete, in_the_making, read_settings
@@ -66,12 +67,8 @@ def fit_result(out: Path, memory_bytes: int, *, scheduler: str | None = None, sa
             for name in MATERIALS:
                 if not result.materials_path(name).exists():
                     _fit_materials(result, job, name, shop, say)
-            leave_out(result, memory_bytes, say)
-            result = RunResult(result.folder)
-            for names in TOGETHER:
-                for number, view in enumerate(result.views):
-                    if not all(result.slices_path(name, view).exists() for name in names):
-                        _fit_slices(result, job, names, number, shop, say)
+            _leave_out(result, job, shop, say)
+            _fit_slices(RunResult(result.folder), job, shop, say)
             shop.everywhere(_opened.cache_clear)
     except OSError as error:
         raise disk_error(out, error) from error
@@ -101,7 +98,7 @@ def predicted(
 def _fit_materials(result: RunResult, job: _Job, name: str, shop: Workshop, say: Said) -> None:
     parts: list[TriangleMaterials] = []
     uncertain: list[MaterialUncertainty] = []
-    blocks = list(result.blocks(job.memory_bytes, shop.most_rows))
+    blocks = list(result.blocks(job.memory_bytes, shop.most_rows(len(result.triangles))))
     fit = partial(_materials_block, job, name == "ggx_normal", shop.threads)
     for block, found in zip(blocks, shop.map(fit, blocks), strict=True):
         parts.append(found)
@@ -159,12 +156,56 @@ def _uncertain_block(
     )
 
 
-def _fit_slices(
-    result: RunResult, job: _Job, names: Sequence[str], number: int, shop: Workshop, say: Said
+def _leave_out(result: RunResult, job: _Job, shop: Workshop, say: Said) -> None:
+    left = [number for number, view in enumerate(result.views) if view.contradicted is None]
+    tasks = _blocks_of_views(result, left, job.memory_bytes // 4, shop)
+    done = zip(tasks, shop.map(partial(_contradictions_block, job), tasks), strict=True)
+    for count, (number, blocks) in enumerate(groupby(done, key=lambda one: one[0][0]), start=1):
+        leave_out(result.views[number], (found for _, found in blocks))
+        say("contradictions", count, len(left))
+
+
+def _contradictions_block(job: _Job, task: tuple[int, slice]) -> Found:
+    number, rows = task
+    result = _opened(job.folder, job.token)
+    return find(result, result.views[number], rows)
+
+
+def _blocks_of_views(
+    result: RunResult, numbers: Sequence[int], memory_bytes: int, shop: Workshop
+) -> list[tuple[int, slice]]:
+    """Number of the view, and rows of its file."""
+    most = shop.most_rows(sum(len(result.views[number].triangles) for number in numbers))
+    return [
+        (number, rows)
+        for number in numbers
+        for rows in result.view_blocks(result.views[number], memory_bytes, most)
+    ]
+
+
+def _fit_slices(result: RunResult, job: _Job, shop: Workshop, say: Said) -> None:
+    """All views in one go: no worker waits for the last block of each."""
+    tasks = []
+    for names in TOGETHER:
+        left = [
+            number
+            for number, view in enumerate(result.views)
+            if not all(result.slices_path(name, view).exists() for name in names)
+        ]
+        tasks += [(names, *block) for block in _blocks_of_views(result, left, job.memory_bytes, shop)]
+    done = zip(tasks, shop.map(partial(_slices_block, job, shop.threads), tasks), strict=True)
+    for (names, number), blocks in groupby(done, key=lambda one: one[0][:2]):
+        fits = ((rows, found) for (_, _, rows), found in blocks)
+        _write_slices(result, names, result.views[number], fits, say)
+
+
+def _write_slices(
+    result: RunResult,
+    names: Sequence[str],
+    view: ViewSamples,
+    fits: Iterable[tuple[slice, list[NDArray[np.float32]]]],
+    say: Said,
 ) -> None:
-    view = result.views[number]
-    blocks = list(result.view_blocks(view, job.memory_bytes, shop.most_rows))
-    fit = partial(_slices_block, job, names, number, shop.threads)
     with ExitStack() as files:
         coefficients = []
         for name in names:
@@ -173,15 +214,16 @@ def _fit_slices(
             part = files.enter_context(in_the_making(path))
             file = files.enter_context(h5py.File(part, "w"))
             coefficients.append(begin_slices(file, SLICES[name], view, result.channels))
-        for rows, fits in zip(blocks, shop.map(fit, blocks), strict=True):
-            for data, found in zip(coefficients, fits, strict=True):
+        for rows, of_names in fits:
+            for data, found in zip(coefficients, of_names, strict=True):
                 data[rows] = found
             say(f"fit {', '.join(names)} of {view.view}", rows.stop, len(view.triangles))
 
 
 def _slices_block(
-    job: _Job, names: Sequence[str], number: int, threads: int | None, rows: slice
+    job: _Job, threads: int | None, task: tuple[Sequence[str], int, slice]
 ) -> list[NDArray[np.float32]]:
+    names, number, rows = task
     result = _opened(job.folder, job.token)
     view = result.views[number]
     samples = result.view_samples(view, rows)

@@ -374,6 +374,7 @@ def read_about(folder: Path) -> dict[str, Any]:
 def _parts(count: int, samples: int, budget_bytes: int, most: int) -> Iterator[slice]:
     each = 64 * samples  # values, a model's, and what is copied between
     step = int(np.clip(budget_bytes // max(1, each), 64, most))
+    step = -(-count // -(-count // step)) if count else step  # all alike
     for first in range(0, count, step):
         yield slice(first, min(first + step, count))
 

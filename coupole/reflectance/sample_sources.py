@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from coupole.errors import InputError
-from coupole.reflectance.extraction.lamp_sight import REACHED
+from coupole.reflectance.extraction.sample_codes import REACHED
 from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples, u_inter_reflection
 from coupole.reflectance.sample_uncertainty import Places, Sources
 

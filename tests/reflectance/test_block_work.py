@@ -6,6 +6,7 @@ import signal
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import cluster_blocks
 import numpy as np
@@ -14,7 +15,8 @@ from dask_cluster import cluster
 from triangle_cases import COUNT
 
 from coupole.errors import InputError
-from coupole.reflectance.block_work import Here, workshop
+from coupole.reflectance.block_work import Cluster, Here, workshop
+from coupole.reflectance.run_result import RunResult
 
 BLOCKS = [(first, first + 3) for first in range(0, COUNT, 3)]
 
@@ -70,3 +72,17 @@ def test_a_scheduler_without_workers_is_told_with_the_remedy(tmp_path: Path) -> 
         workshop(address),
     ):
         pass
+
+
+@pytest.mark.parametrize(("triangles", "most"), [(17_879, 1_118), (100, 256), (1_000_000, 4_096)])
+def test_blocks_are_alike_and_enough_for_every_worker(triangles: int, most: int) -> None:
+    """The demo has five blocks of 4,096 at most: the second of two workers would wait for the fifth."""
+    shop = Cluster(SimpleNamespace(nthreads=lambda: {"one": 1, "other": 1}), "")
+    assert shop.most_rows(triangles) == most
+    result = RunResult(Path())
+    result.__dict__.update(triangles=np.arange(triangles), views=())
+    blocks = list(result.blocks(10**9, most))
+    assert [place for block in blocks for place in range(block.start, block.stop)] == list(range(triangles))
+    sizes = [block.stop - block.start for block in blocks]
+    assert max(sizes) <= most
+    assert sizes[0] - sizes[-1] < len(sizes)

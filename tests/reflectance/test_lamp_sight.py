@@ -11,15 +11,12 @@ from coupole.calibration.light.irradiance import irradiance_per_flux
 from coupole.calibration.light.tile_views import Positions
 from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.extraction.lamp_sight import (
-    AWAY,
-    PENUMBRA,
-    REACHED,
-    SHADED,
     Facets,
     lamp_codes,
     lit_on,
     neighbours_of,
 )
+from coupole.reflectance.extraction.sample_codes import AWAY, PENUMBRA, REACHED, SHADED
 
 BALL_MM, RADIUS_MM = np.array([0.0, 0.0, 60.0]), 12.0
 LEDS_MM = np.array([[0.0, 0.0, 1000.0], [700.0, 0.0, 700.0], [-300.0, 600.0, 800.0], [0.0, 0.0, -500.0]])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from coupole.errors import InputError
-from coupole.reflectance.extraction.lamp_sight import SHADED
+from coupole.reflectance.extraction.sample_codes import SHADED
 from coupole.reflectance.sample_sources import ChannelSamples, channel_samples
 
 SIDE, PITCH_MM = 40, 0.5

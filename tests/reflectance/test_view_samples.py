@@ -11,8 +11,9 @@ import pytest
 
 from coupole.calibration.light.frames import LightFrame
 from coupole.plan.shot_id import ShotId
-from coupole.reflectance.extraction.lamp_sight import REACHED, SHADED, Facets
+from coupole.reflectance.extraction.lamp_sight import Facets
 from coupole.reflectance.extraction.radiance import SignalReader
+from coupole.reflectance.extraction.sample_codes import REACHED, SHADED
 from coupole.reflectance.extraction.seen_surface import SeenSurface
 from coupole.reflectance.extraction.view_samples import ViewPass
 
@@ -146,3 +147,14 @@ def test_a_pass_that_is_left_early_ends() -> None:
 def test_leds_are_read_together_as_long_as_their_frames_are_few(leds: int, exposures: int, together: int) -> None:
     view = SimpleNamespace(by_led={led: [None] * exposures for led in range(leds)})
     assert ViewPass(None, view, None, None).together == together  # type: ignore[arg-type]
+
+
+@pytest.mark.filterwarnings("error")
+def test_of_a_triangle_without_pixels_nothing_is_known_even_of_pixels_that_are_all_alike() -> None:
+    random = np.random.default_rng(6)
+    _, radiometry, seen = view_of(ONE, random, "lambertian", NOISE)
+    seen[seen == 7] = -1
+    reader = SignalReader(radiometry, SeenSurface(seen, np.arange(TRIANGLES)))
+    expected = np.zeros((TRIANGLES, 3))
+    expected[7] = np.inf
+    np.testing.assert_array_equal(reader.u_response, expected)

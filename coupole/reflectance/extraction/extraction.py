@@ -19,35 +19,16 @@ from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.motion import occlusion
 from coupole.motion.packet_rays import PacketMesh
-from coupole.reflectance.extraction.lamp_sight import (
-    AWAY,
-    PENUMBRA,
-    REACHED,
-    SHADED,
-    Facets,
-    lamp_codes,
-    neighbours_of,
-)
+from coupole.reflectance.extraction.lamp_sight import Facets, lamp_codes, neighbours_of
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
+from coupole.reflectance.extraction.sample_codes import BY_CELL, CODES, REACHED
 from coupole.reflectance.extraction.seen_surface import SeenSurface, seen_surface
 from coupole.reflectance.extraction.view_samples import BLOCK, Samples, ViewPass
 from coupole.reflectance.result_folder import complete
 
 Floats = NDArray[np.float64]
 
-BY_CELL = PENUMBRA + 1
-"""Code of a triangle and an LED that arm, camera or tool may hide from each other."""
-BY_UNKNOWN = BY_CELL + 1
-"""Of a sample that contradicts those beside it (`contradictions`): something shades it that nobody described."""
-CODES = {
-    "reached": REACHED,
-    "away": AWAY,
-    "shaded": SHADED,
-    "penumbra": PENUMBRA,
-    "hidden by the cell": BY_CELL,
-    "shaded by what is not known": BY_UNKNOWN,
-}
 _PATCHES_BESIDE = 9
 """A patch and those around it."""
 MOST_BLUR_PX = 2.0

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.light.frames import LightFrame
-from coupole.reflectance.extraction.lamp_sight import REACHED
 from coupole.reflectance.extraction.measured_run import MeasuredView
 from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT, Radiometry
+from coupole.reflectance.extraction.sample_codes import REACHED
 
 MOST_FRAMES = 12
 """Of a view; more LEDs than that are thinned out evenly."""

@@ -17,11 +17,10 @@ from coupole.calibration.light.irradiance import LED_SIDE_MM, led_corners_mm
 from coupole.calibration.light.tile_views import Positions
 from coupole.motion.occlusion import RAY_START_MM
 from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.extraction.sample_codes import AWAY, PENUMBRA, REACHED, SHADED
 
 Floats = NDArray[np.float64]
 
-REACHED, AWAY, SHADED, PENUMBRA = range(4)
-"""Codes of a triangle and an LED; AWAY: below `MOST_INCIDENCE_DEG`, or behind the LED."""
 MOST_INCIDENCE_DEG = 89.0
 _MOST_RINGS = 8
 

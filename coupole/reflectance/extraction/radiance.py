@@ -72,9 +72,9 @@ class SignalReader:
         self.pixels = np.zeros((count, channels), np.int32)
         """[triangles, channels]"""
         _count(surface.places, radiometry.channel, self.pixels)
-        with np.errstate(divide="ignore"):
-            self.u_response = radiometry.u_pixel / np.sqrt(self.pixels)
-            """[triangles, channels] relative standard uncertainty that all means share, of pixels' responses."""
+        each = np.sqrt(np.maximum(self.pixels, 1))
+        self.u_response = np.where(self.pixels > 0, radiometry.u_pixel / each, np.inf)
+        """[triangles, channels] relative standard uncertainty that all means share, of pixels' responses."""
         starts = np.concatenate([[0], np.cumsum(self.pixels.ravel(), dtype=np.int64)])
         places = np.empty(starts[-1], np.int32)
         _list(surface.places, radiometry.channel, starts[:-1].copy(), places)

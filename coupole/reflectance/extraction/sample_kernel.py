@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.extraction.lamp_sight import REACHED
+from coupole.reflectance.extraction.sample_codes import REACHED
 from coupole.reflectance.lanes import (
     absolute,
     gathered,

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from coupole.calibration.light.frames import LightFrame
 from coupole.reflectance.extraction.frame_ring import FrameRing
-from coupole.reflectance.extraction.lamp_sight import AWAY, Facets
+from coupole.reflectance.extraction.lamp_sight import Facets
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import SignalReader
+from coupole.reflectance.extraction.sample_codes import AWAY
 from coupole.reflectance.extraction.sample_kernel import NO_VALUE, Lamps, Shots, fill_samples
 from coupole.reflectance.lanes import LANES
 

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.motion.occlusion import RAY_START_MM, blocked
+from coupole.motion.occlusion import RAY_START_MM, blocked_along
 from coupole.reflectance.new_light.beams import Beam
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 
@@ -49,12 +49,22 @@ def _trace(rays: Any, surface: Surface, beam: Beam, pixels: NDArray[np.int64], c
 
     def trace(first: int) -> None:
         mine = pixels[first : first + _RAYS]
-        starts_mm = places_mm[mine] + RAY_START_MM * surface.normals[seen[mine]]
-        ends_mm = beam.place if beam.near else starts_mm + DISTANT_MM * beam.place
-        flat[mine] = np.where(blocked(rays, starts_mm, ends_mm), SHADED, LIT)
+        starts_mm, ways_mm = np.empty((2, len(mine), 3), np.float32)
+        _begin_rays(mine, seen, places_mm, surface.normals, beam.near, beam.place, starts_mm, ways_mm)
+        flat[mine] = np.where(blocked_along(rays, starts_mm, ways_mm), SHADED, LIT)
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         list(pool.map(trace, range(0, len(pixels), _RAYS)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _begin_rays(pixels, seen, places_mm, normals, near, place, starts_mm, ways_mm):  # type: ignore[no-untyped-def]
+    for n in range(len(pixels)):
+        triangle = seen[pixels[n]]
+        for k in range(3):
+            start_mm = places_mm[pixels[n], k] + RAY_START_MM * normals[triangle, k]
+            starts_mm[n, k] = start_mm
+            ways_mm[n, k] = place[k] - start_mm if near else DISTANT_MM * place[k]
 
 
 def _asked_on_grid(codes: Codes) -> NDArray[np.int64]:

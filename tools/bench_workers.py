@@ -1,0 +1,104 @@
+"""Fits of the demo's samples by two workers of a dask cluster, each a process of one thread, against one.
+
+The ratio of seconds means something on two idle cores only. Beside it is what CPU seconds say, which others' work
+disturbs less: what the asking process and the busiest worker used, with one and with two.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """How long it took."""
+
+    seconds: float
+    client_cpu_s: float
+    workers_cpu_s: tuple[float, ...]
+
+    @property
+    def cpu_s(self) -> float:
+        """One after the other."""
+        return self.client_cpu_s + max(self.workers_cpu_s)
+
+
+def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+    sys.path.append(str(root / "tests"))
+    with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as name:
+        folder = Path(name)
+        _coupole(root, "acquire", "configs/plans/demo.yaml", "--yes", "--output", str(folder / "runs"))
+        (run,) = (folder / "runs").glob("*demo")
+        _coupole(root, "reflectance", "extract", str(run), "--out", str(folder / "samples"))
+        found: dict[int, list[Fitted]] = {1: [], 2: []}
+        for number in range(rounds):
+            for workers, fitted in found.items():
+                fitted.append(_fit(root, folder, workers, number))
+        _refuse_others(folder / "by-1", folder / "by-2")
+    seconds, cpu_s = ({n: statistics.median(getattr(one, name) for one in fitted) for n, fitted in found.items()}
+                      for name in ("seconds", "cpu_s"))  # fmt: skip
+    last = found[2][-1]
+    yield {
+        "name": "fits_by_two_workers",
+        "value": seconds[2],
+        "unit": "s",
+        "peer": "one_worker",
+        "ratio": seconds[1] / seconds[2],
+        "ratio_of_cpu": round(cpu_s[1] / cpu_s[2], 3),
+        "client_cpu_s": round(last.client_cpu_s, 2),
+        "worker_cpu_s": [round(one, 2) for one in last.workers_cpu_s],
+        "cores": len(os.sched_getaffinity(0)),
+    }
+
+
+def _coupole(root: Path, *arguments: str) -> None:
+    subprocess.run(
+        [sys.executable, "-m", "coupole.commands.cli", *arguments], check=True, cwd=root, capture_output=True
+    )
+
+
+def _fit(root: Path, folder: Path, workers: int, number: int) -> Fitted:
+    from dask_cluster import cluster
+
+    out, dask = folder / f"by-{workers}", folder / f"dask-{workers}-{number}"
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(folder / "samples", out)
+    dask.mkdir()
+    with cluster(dask, workers) as (address, processes):
+        used_s = [_cpu_s(process.pid) for process in processes]
+        begun_s = time.perf_counter()
+        command = [sys.executable, "-m", "coupole.commands.cli", "reflectance", "fit", str(out)]
+        with (dask / "client.log").open("wb") as log:
+            client = subprocess.Popen([*command, "--scheduler", address], cwd=root, stdout=log, stderr=log)
+        _, status, usage = os.wait4(client.pid, 0)
+        seconds = time.perf_counter() - begun_s
+        client.returncode = os.waitstatus_to_exitcode(status)
+        if client.returncode:
+            raise RuntimeError((dask / "client.log").read_text())
+        each = (_cpu_s(process.pid) - before for process, before in zip(processes, used_s, strict=True))
+        return Fitted(seconds, usage.ru_utime + usage.ru_stime, tuple(each))
+
+
+def _cpu_s(pid: int) -> float:
+    told = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(told[11]) + int(told[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _refuse_others(one: Path, other: Path) -> None:
+    """Raises RuntimeError if a file of fits or samples has other numbers than the other's."""
+    for path in sorted(one.rglob("*.h5")):
+        with h5py.File(path) as mine, h5py.File(other / path.relative_to(one)) as its:
+            if wrong := [key for key in mine if mine[key][()].tobytes() != its[key][()].tobytes()]:
+                raise RuntimeError(f"{path.name}: two workers give another {wrong[0]} than one")

@@ -39,6 +39,9 @@ class Coat:
     alpha: float = 0.3
 
 
+GLOSSY = Coat((0.05, 0.04, 0.03), (0.4, 0.3, 0.2), 0.15)
+
+
 def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 

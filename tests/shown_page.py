@@ -12,9 +12,12 @@ from typing import Any
 import cells
 import numpy as np
 from browser import Browser
+from lazily import lazily
 from selenium.webdriver.common.action_chains import ActionChains
 
 from coupole.reflectance.new_light.pictured_surface import FreeCamera
+
+colour: Any = lazily("colour")
 
 FIELD_DEG = 24.0
 """Of the page's camera, along the shorter side."""
@@ -85,6 +88,18 @@ class Page:
     def wait_for_all(self) -> None:
         """Until all that the picture needs has come."""
         self.driver.execute_async_script("coupole.whole().then(arguments[0])")
+
+
+def difference(picture: np.ndarray, other: np.ndarray, white: float) -> np.ndarray:
+    """CIEDE2000 of two linear pictures, shown as sRGB with a white."""
+    lab = [
+        colour.XYZ_to_Lab(
+            colour.sRGB_to_XYZ(colour.cctf_encoding(np.clip(one / white, 0.0, 1.0))), [0.3127, 0.329]
+        )
+        for one in (picture, other)
+    ]
+    found: np.ndarray = colour.delta_E(*lab, method="CIE 2000")
+    return found
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from relight_cases import BASE_FROM_SUPPORT, moved, unit, write_result
+from relight_cases import BASE_FROM_SUPPORT, moved, unit, write_result, write_sources
 
 from coupole.reflectance.material_uncertainty import MaterialUncertainty
 from coupole.reflectance.new_light.pictured_surface import surface_of_view
@@ -52,6 +52,7 @@ def write_backscatter(folder: Path, corners_mm: np.ndarray) -> RunResult:
         f = backscatter(normals, lights, views) / np.maximum(cosine, 1e-6)
         noisy = f * np.random.default_rng(1).normal(1.0, 0.01, f.shape)
         file["f"] = np.where(cosine > 0.05, noisy, np.nan).astype(np.float32)
+        write_sources(file, {"u_own": 0.01})
     result = RunResult(folder)
     (view,) = result.views
     samples, used = result.view_samples(view, slice(None)), np.arange(LEDS) % LEFT_OUT != 0

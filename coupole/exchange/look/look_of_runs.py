@@ -14,7 +14,7 @@ from coupole.errors import InputError
 from coupole.exchange.look.coarse_mesh import MOST_TRIANGLES, coarse_mesh
 from coupole.exchange.look.look_blocks import Block, Look, block_of, halves, log_coded, octahedral
 from coupole.exchange.look.look_frames import frames_of_view
-from coupole.exchange.look.look_samples import samples_of_view
+from coupole.exchange.look.look_samples import samples_of_result
 from coupole.exchange.look.residual_planes import PLANES, residual_blocks, residual_fit
 from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.geometry import apply, inverse
@@ -82,12 +82,9 @@ def look_of_result(
     later += [block for _, pictures in views for block in pictures]
     errors = _ERRORS | {"places": f"{0.5e3 * step_mm:.2g} um in each coordinate"}
     if with_samples:
-        about["samples"] = []
-        errors["samples"] = "2.3 % of their value, and of their uncertainty"
-        for view in result.views:
-            told, blocks_of_view = samples_of_view(result, view, support_from_base, say)
-            about["samples"].append(told)
-            later += blocks_of_view
+        errors["samples"] = "2.3 % of their value, and of how far the ends of their intervals are from it"
+        told = samples_of_result(result, support_from_base, known["scan_noise_um"], say)
+        about["samples"], later = told[0], later + told[1]
     return Look(about, blocks, tuple(later), _first(places, triangles, of_triangles, coarse_over), errors)
 
 

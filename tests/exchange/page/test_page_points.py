@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 from browser import needs_chromium
-from relight_cases import GLOSSY, Coat, sheet, write_result
+from relight_cases import GLOSSY, Coat, sheet, write_result, write_sources
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
@@ -39,7 +39,7 @@ def test_a_point_tells_its_measured_samples_beside_the_fit(page: Page, tmp_path:
     result = write_result(tmp_path / "result", sheet(np.zeros((5, 5)), 60.0), camera_mm=(0.0, 0.0, 330.0))
     with h5py.File(result.views[0].path, "a") as file:
         file["f"][...] = 1.2 * np.array(Coat().kd)
-        file["u_own"], file["led_u_own"] = np.full(file["f"].shape, 0.02, np.float16), np.zeros((1, 3))
+        write_sources(file, {"u_own": 0.02, "led_u_shared": 0.03})
     look = look_of_result(tmp_path / "result", with_samples=True)
     files = write_page(look, "sheet", tmp_path / "look.html", most_bytes)
     page.open(tmp_path / "look.html", "#")
@@ -49,6 +49,9 @@ def test_a_point_tells_its_measured_samples_beside_the_fit(page: Page, tmp_path:
     cells.wait_until(lambda: "median" in page.browser.text("#samples-told"), "samples")
     told = page.browser.text("#samples-told")
     assert "1 measured samples of top" in told
+    below, above = map(float, re.findall(r"median ([\d.]+) % below, ([\d.]+) % above", told)[0])
+    assert below == pytest.approx(above, rel=0.2)
+    assert (below + above) / 2 == pytest.approx(196 * math.hypot(0.02, 0.03), rel=0.05)
     share = float(re.findall(r"difference ([\d.]+) %", told)[0])
     assert share == pytest.approx(100 * (1 - 1 / 1.2), abs=2.5)  # values are kept to 2.3 %
     assert "holds no samples" not in page.browser.text("#point")

@@ -122,8 +122,8 @@ def write_result(
 
 
 def write_sources(file: h5py.File, u: dict[str, float]) -> None:
-    """Put uncertainties of samples into a view's file: relative `u_own`, `u_response`, `led_u_own`, `led_u_shared`,
-    and `lateral_u_mm`, `led_u_mm`; 0 of those that are not named."""
+    """Put uncertainties of samples into a view's file: relative `u_own`, `u_response`, `led_u_own` and
+    `led_u_shared`, and `lateral_u_mm`, `led_u_mm`; 0 of those that are not named."""
     triangles, leds, channels = file["f"].shape
     file.attrs.update({name: u.get(name, 0.0) for name in ("lateral_u_mm", "led_u_mm")})
     shapes = {"u_own": file["f"].shape, "u_response": (triangles, channels)}

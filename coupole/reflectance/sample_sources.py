@@ -58,8 +58,8 @@ def channel_samples(
     beside: Beside | None = None,
 ) -> ChannelSamples:
     """Of some rows of a view's file, rising, and some of its LEDs; without a channel, of the channels' mean, as if
-    all were off to the same side. `beside` saves finding the rows' `triangles_beside` anew. Raises InputError for a
-    file that an earlier version made."""
+    all were off to the same side. `beside` saves finding the rows' `triangles_beside` anew. Raises InputError for
+    a file that an earlier version made."""
     beside = beside or triangles_beside(result, view, rows)
     with h5py.File(view.path, "r") as file:
         lateral_u_mm, led_u_mm = float(file.attrs["lateral_u_mm"]), float(file.attrs["led_u_mm"])

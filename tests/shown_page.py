@@ -22,6 +22,8 @@ colour: Any = lazily("colour")
 FIELD_DEG = 24.0
 """Of the page's camera, along the shorter side."""
 WIDTH, HEIGHT = 160, 120
+SMALL = 780, 440
+"""Of the window: quick to draw, and wide enough for the panel beside the picture."""
 CONTROLS = "a[href], button, input, select, summary, canvas[tabindex]"
 
 
@@ -105,7 +107,7 @@ def difference(picture: np.ndarray, other: np.ndarray, white: float) -> np.ndarr
 @contextmanager
 def opened_page() -> Iterator[Page]:
     browser = Browser()
-    browser.driver.set_window_size(780, 440)  # quick to draw, and wide enough for the panel beside the picture
+    browser.driver.set_window_size(*SMALL)
     browser.driver.set_network_conditions(offline=True, latency=0, throughput=0)
     yield Page(browser)
     browser.driver.quit()

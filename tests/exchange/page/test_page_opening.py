@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import re
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import cells
 import numpy as np
 from browser import needs_chromium
 from relight_cases import GLOSSY, waves, write_result
-from shown_page import Page
+from shown_page import SMALL, Page
 
+from coupole.exchange.look.look_blocks import block_of
 from coupole.exchange.look.look_of_runs import look_of_result
 from coupole.exchange.look.look_page import write_page
 
@@ -23,6 +29,58 @@ def test_the_page_opens_from_disk_without_a_network_and_loads_nothing(page: Page
     assert "Simulated object" in page.browser.text("#banner")
     assert page.browser.text("#status") == ""
     assert page.browser.troubles() == []
+
+
+FIRST_PICTURE_S, TRIALS = 3.0, 3
+MARK = "performance.getEntriesByName('coupole: first picture')"
+
+
+def demo_sized(folder: Path) -> Path:
+    """A page of 19,602 triangles and 3 MB, as that of the demo: its frames and residuals are noise here."""
+    result = write_result(folder / "result", waves(100), GLOSSY)
+    look = look_of_result(result.folder)
+    more = block_of("frame-more", np.random.default_rng(0).integers(0, 256, 2_000_000).astype(np.uint8))
+    path, *beside = write_page(replace(look, later=(*look.later, more)), "waves", folder / "look.html")
+    assert not beside
+    assert path.stat().st_size > 2_900_000
+    return path
+
+
+def seconds_to_the_first_picture(page: Page, path: Path) -> tuple[float, float]:
+    """From the start of navigation: by the clock, and the CPU time that the browser took for it."""
+    taken: list[tuple[float, float]] = []
+    ended = Event()
+
+    def watch() -> None:
+        while not ended.wait(0.05):
+            taken.append((time.time(), page.browser.cpu_s()))
+
+    with ThreadPoolExecutor(1) as pool:
+        watched = pool.submit(watch)
+        page.browser.open(path.as_uri())
+        cells.wait_until(lambda: page.run(f"{MARK}.length"), "the first picture")
+        ended.set()
+        watched.result()
+    begun, lasted = page.run(f"[performance.timeOrigin / 1000, {MARK}[0].startTime / 1000]")
+    cpu = np.interp([begun, begun + lasted], *np.transpose(taken))
+    return lasted, float(cpu[1] - cpu[0])
+
+
+def test_the_first_picture_of_the_demo_comes_within_three_seconds(page: Page, tmp_path: Path) -> None:
+    """On a machine that others use too, a clock tells of them: then what counts is the CPU time that all processes
+    of the browser took until the picture stood there. The best of three, each with shaders that the browser has
+    not seen before, as it keeps what it has compiled."""
+    text = demo_sized(tmp_path).read_text()
+    page.opened = None
+    page.driver.set_window_size(1300, 960)
+    trials: list[tuple[float, float]] = []
+    while len(trials) < TRIALS and not any(min(trial) < FIRST_PICTURE_S for trial in trials):
+        path = tmp_path / f"{len(trials)}.html"
+        path.write_text(re.sub(r"(RELIEF_PX|HATCH_PX) = (\d)\.0", rf"\1 = \2.000{len(trials)}1", text))
+        trials.append(seconds_to_the_first_picture(page, path))
+    page.run("coupole.setSamples(1)")
+    page.driver.set_window_size(*SMALL)
+    assert min(map(min, trials)) < FIRST_PICTURE_S, trials
 
 
 def test_data_that_are_gone_from_beside_the_page_are_named(page: Page, tmp_path: Path) -> None:

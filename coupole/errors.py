@@ -33,6 +33,8 @@ class CoupoleError(Exception):
     """Base class; never raised itself."""
 
     exit_code = 1
+    heading = ""
+    """What an operator reads above the message, where that does not say by itself what is the matter."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class PreflightRefused(CoupoleError):
     """Preflight found reasons not to run; `refusals` holds all of them."""
 
     exit_code = 3
+    heading = "refused:"
 
     def __init__(self, refusals: Sequence[str]) -> None:
         self.refusals = tuple(refusals)
@@ -83,6 +86,7 @@ class CalibrationRefused(CoupoleError):
     """A calibration misses its acceptance limits; `refusals` holds all of them."""
 
     exit_code = 3
+    heading = "the calibration misses its limits:"
 
     def __init__(self, refusals: Sequence[str]) -> None:
         self.refusals = tuple(refusals)

@@ -42,6 +42,8 @@ from export_models import Lit, Materials, ggx, gltf, lab_differences, openpbr  #
 LIGHTS, TRIANGLES = 12, 8
 LOSSLESS = ("ply", "exr", "alta", "bird")
 MOST = 1e-4
+ADAPTIVE = 0.003
+"""Largest error asked of adaptive tables, for 95 % of the directions."""
 DOCUMENT, BEGIN, END = ROOT / "docs/reference/exports.md", "<!-- figures -->\n", "<!-- end of figures -->\n"
 Row = tuple[np.ndarray, np.ndarray]
 """Values found and wanted, [n, 3]."""
@@ -99,11 +101,15 @@ def _compared(result: Path, folder: Path, count: int) -> dict[str, Row]:
         with console.status(to):
             export_result(result, to, folder / to)
             found[to] = read(folder / to, lit), wanted
-    for to, evaluate in (("bsdf", _bsdf), ("merl", _merl)):
-        with console.status(to):
-            export_result(result, to, folder / to, triangles=chosen)
-            rows = [_of_table(surface, folder / to, number, evaluate, random) for number in chosen]
-            found[to] = tuple(np.concatenate(part) for part in zip(*rows, strict=True))
+    for name, to, most_error, evaluate in (
+        ("bsdf", "bsdf", None, _bsdf),
+        (f"bsdf --adaptive {ADAPTIVE}", "bsdf", ADAPTIVE, _bsdf),
+        ("merl", "merl", None, _merl),
+    ):
+        with console.status(name):
+            export_result(result, to, folder / name, triangles=chosen, most_error=most_error)
+            rows = [_of_table(surface, folder / name, number, evaluate, random) for number in chosen]
+            found[name] = tuple(np.concatenate(part) for part in zip(*rows, strict=True))
     for to in ("alta", "bird"):
         export_result(result, to, folder / to, triangles=chosen)
         found[to] = _of_samples(surface, folder / to, chosen, to)

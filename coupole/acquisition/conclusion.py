@@ -7,7 +7,8 @@ from pathlib import Path
 from rich.console import Console
 
 from coupole.acquisition.signals import SignalReceived
-from coupole.storage import manifest
+from coupole.storage import journal, manifest, run_dose
+from coupole.storage.journal_events import SessionResumed, SessionStopped
 from coupole.storage.run import Run
 from coupole.viewing import report
 from coupole.viewing.terminal import bytes_text
@@ -39,6 +40,20 @@ def renew_report(run: Run) -> Path:
         path = report.write(run, in_use=False)
         manifest.enter(run.folder, [report.NAME])
     return path
+
+
+def close_complete(run: Run, console: Console) -> float:
+    """A session of a run whose frames are all there, perhaps killed before it could say so: no device is opened.
+    Returns the light of the run in lux hours."""
+    console.print("all frames are there; no device is opened")
+    open_for_session(run)
+    writer = journal.Journal(run.journal_path)
+    writer.write(SessionResumed(simulated=run.simulated))
+    writer.write(SessionStopped(outcome="done"))
+    writer.commit()
+    writer.close()
+    conclude(run, console)
+    return run_dose.highest_lux_h(journal.read(run.journal_path))
 
 
 def conclude(run: Run, console: Console) -> None:

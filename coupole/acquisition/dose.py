@@ -66,6 +66,11 @@ class LightOnObject:
         return float(self._given_lux_h.max())
 
     @property
+    def given_lux_h(self) -> LuxHours:
+        """[points] of the run so far, or of the live view."""
+        return self._given_lux_h
+
+    @property
     def left_lux_h(self) -> float:
         """Until the budget is reached; infinite without one."""
         return self._budget_lux_h - self.total_lux_h
@@ -163,11 +168,17 @@ class DoseMeter:
         self._row_of_led = {int(led): row for row, led in enumerate(job.cell.leds.ids)}
         self._job, self._cell, self._recorder = job, cell, recorder
         self._light = LightOnObject(job, cell, recorder.name, recorder.light_before_lux_h())
+        self._under_way_lux_h = np.zeros(1)
+        """[steps + 1] of the run after so many steps of the burst under way, where it ends highest."""
 
     @property
     def lux_h(self) -> float:
-        """Of the run so far, all its sessions."""
+        """Of the run so far, all its sessions; without the burst under way."""
         return self._light.lux_h
+
+    def lux_h_after(self, steps: int) -> float:
+        """Of the run so far, with so many steps of the burst under way, whose panel counts when it has ended."""
+        return max(self.lux_h, float(self._under_way_lux_h[min(steps, len(self._under_way_lux_h) - 1)]))
 
     def begin(self, burst: Burst) -> None:
         """To be called before a burst gives light: its plan is on the disk when this returns.
@@ -188,6 +199,7 @@ class DoseMeter:
                 at_most = expected + self._lux[:, rows].max(axis=1) * max(0.0, over_us) / 3.6e9
         w_per_lm = cell.panel_damage_w_per_lm if burst.panel else cell.led_damage_w_per_lm
         self._light.begin(at_most, expected, w_per_lm)
+        self._under_way_lux_h = self._course(burst.table["led"], burst.table["on_us"])
         planned = tuple(np.round(at_most, _DIGITS).tolist())
         self._recorder.note(BurstBegun(view=burst.view, planned_lux_h=planned))
         self._recorder.commit(now=True)
@@ -198,6 +210,7 @@ class DoseMeter:
 
         If it is not sure that the lights are off, all that was planned counts. Returns lux hours at each point.
         """
+        self._under_way_lux_h = np.zeros(1)
         if not self._cell.lights_confirmed:
             return tuple(np.round(self._light.end(None), _DIGITS).tolist())
         given = self._of_leds(log["led"], log["on_us"])
@@ -207,6 +220,13 @@ class DoseMeter:
         unlogged = burst.table[begun & ~np.isin(np.arange(len(begun)), log["step"])]
         given = given + self._of_leds(unlogged["led"], unlogged["on_us"]) + self._of_panel(panel_s)
         return tuple(np.round(self._light.end(given), _DIGITS).tolist())
+
+    def _course(self, leds: NDArray[np.int64], on_us: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[steps + 1] of the run, step by step, at the point that has received most when the burst is over."""
+        before = self._light.given_lux_h
+        highest = int(np.argmax(before + self._of_leds(leds, on_us)))
+        lux = np.array([self._lux[highest, self._row_of_led[int(led)]] if led != NO_LED else 0.0 for led in leds])
+        return np.asarray(before[highest] + np.concatenate([[0.0], np.cumsum(lux * on_us) / 3.6e9]))
 
     def _of_leds(self, leds: NDArray[np.int64], on_us: NDArray[np.float64]) -> LuxHours:
         lit = leds != NO_LED

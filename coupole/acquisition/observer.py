@@ -39,6 +39,8 @@ class Control:
 
     stop: threading.Event = field(default_factory=threading.Event)
     pause: threading.Event = field(default_factory=threading.Event)
+    paused: threading.Event = field(default_factory=threading.Event)
+    """Set while the session stands: lights off, the arm at rest."""
     signal_number: int = signal.SIGINT
     """The signal that set `stop`."""
 

@@ -26,6 +26,7 @@ from coupole.plan.bursts import Burst
 from coupole.plan.schedule import ViewPose, bursts_left
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.job import Job
+from coupole.preflight.preflight import BURST_OVERHEAD_S, SETTLE_CHECK_S
 from coupole.storage.journal_events import (
     ArmSettled,
     Continued,
@@ -57,6 +58,8 @@ class Sequencer:
         self._job, self._cell, self._recorder = job, cell, recorder
         self._observer, self._control = observer or Unwatched(), control or Control()
         self._dose = DoseMeter(job, cell, recorder)
+        self._ahead_s = 0.0
+        """Expected duration of all that follows the burst under way."""
         self._view_number = 0
         self._view_name = ""
         self.outcome = Outcome(shots=job.schedule.shots)
@@ -89,6 +92,10 @@ class Sequencer:
         left = {n: found for n, bursts in enumerate(schedule.bursts) if (found := bursts_left(bursts, proven))}
         numbers = list(left)
         itinerary = self._arm.itinerary([schedule.views[n] for n in numbers])
+        self._ahead_s = sum(
+            self._motion_s(itinerary.visits[index]) + sum(map(_expected_s, left[numbers[index]]))
+            for index in itinerary.order
+        )
         start_ns = self._cell.clock.now_ns()
         try:
             for count, index in enumerate(itinerary.order):
@@ -118,12 +125,13 @@ class Sequencer:
         self._recorder.note(ViewBegun(view=view.name, hidden_leds=tuple(hidden_leds)))
         patches = self._job.motion.occlusions.patches
         collections = {"shadow": {**occlusion.arrays(patches), "leds": self._job.cell.leds.ids}}
-        motion_s = visit.leg.duration_s + self._job.cell.rig.motion.settle_dwell_s
-        self.outcome.ideal_s += motion_s + sum(burst.duration_s for burst in left)
+        dwell_s = self._job.cell.rig.motion.settle_dwell_s
+        self.outcome.ideal_s += visit.leg.duration_s + dwell_s + sum(burst.duration_s for burst in left)
         waypoints_deg = tuple(tuple(np.round(place, 6).tolist()) for place in visit.leg.waypoints)
         self._recorder.note(MoveBegun(view=view.name, joints_deg=waypoints_deg))
         self._burst_runner.prepare(left[0])
         settled = self._arm.go(visit, meanwhile=self._burst_runner.look_at_upload)
+        self._ahead_s -= self._motion_s(visit)
         frame_format = self._cell.camera.configure(self._burst_runner.exposure(left[0]))
         self._check_format(frame_format)
         frames = sum(len(burst.labels) for burst in all_bursts)
@@ -168,6 +176,7 @@ class Sequencer:
         If an arm that was pushed springs back, `begin` is called again for the frames after that. It is never
         driven back: a person may be what pushed it.
         """
+        self._ahead_s -= _expected_s(burst)
         todo = burst
         for attempt in range(self._job.plan.reshoot_limit + 1):
             self._wait_while_paused()
@@ -192,6 +201,11 @@ class Sequencer:
             todo = burst.only({shot.label for shot in left})
 
     # -- small things -------------------------------------------------------------------------------------
+
+    def _motion_s(self, visit: Visit | None) -> float:
+        """Expected duration of the motion to a view, until the arm has settled."""
+        leg_s = visit.leg.duration_s if visit else 0.0
+        return leg_s + self._job.cell.rig.motion.settle_dwell_s + SETTLE_CHECK_S
 
     def _note_gap(self, burst: Burst, verdict: Verdict, left: Sequence[ShotId]) -> None:
         judged = verdict.match
@@ -232,7 +246,8 @@ class Sequencer:
                 len(self._recorder.proven()),
                 self._job.schedule.frames,
                 str(label.light) if label else "dark",
-                self._dose.lux_h,
+                self._dose.lux_h_after(step),
+                self._ahead_s + _expected_s(burst) - float(burst.table["period_us"][:step].sum()) / 1e6,
             )
         )
 
@@ -241,8 +256,17 @@ class Sequencer:
             return
         self._recorder.note(Paused())
         self._recorder.commit(now=True)
-        self._observer.note("paused; lights are off")
-        while self._control.pause.is_set():
-            self._arm.attend()
-            self._cell.clock.sleep(_PAUSE_NAP_S)
+        self._observer.note("paused: lights are off, the arm is at rest; the key p or `coupole go-on` continues")
+        self._control.paused.set()
+        try:
+            while self._control.pause.is_set():
+                self._arm.attend()
+                self._cell.clock.sleep(_PAUSE_NAP_S)
+        finally:
+            self._control.paused.clear()
         self._recorder.note(Continued())
+        self._observer.note("continued")
+
+
+def _expected_s(burst: Burst) -> float:
+    return burst.duration_s + BURST_OVERHEAD_S

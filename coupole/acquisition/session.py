@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import time
 import traceback
 from dataclasses import replace
@@ -13,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 
-from coupole.acquisition.conclusion import conclude, open_for_session
+from coupole.acquisition.conclusion import close_complete, conclude, open_for_session
 from coupole.acquisition.memory_recorder import DryRecorder
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell, open_cell
@@ -25,6 +26,7 @@ from coupole.acquisition.operator import (
     refuse_uncommissioned,
 )
 from coupole.acquisition.recorder import RunRecorder
+from coupole.acquisition.run_control import RunControl
 from coupole.acquisition.run_description import described_cell
 from coupole.acquisition.sequencer import Sequencer
 from coupole.acquisition.signals import obeyed_by
@@ -44,6 +46,7 @@ from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
+from coupole.viewing.keys import obeyed
 from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Outcome
 from coupole.viewing.terminal import RunObserver, alarm, show_dry_run
@@ -102,6 +105,12 @@ def _acquire_into(
     )
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     refuse(preflight)
+    if run is not None and not preflight.frames:
+        dose_lux_h = close_complete(run, console)
+        outcome = Outcome(job.schedule.shots, job.schedule.shots, dose_lux_h=dose_lux_h)
+        found.update({**_figures(run, job, outcome), "unsafe": []})
+        _say_outcome(console, run, outcome, "done")
+        return
     faults = ArmFaults(job.cell.state_folder)
     faults.refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)
@@ -213,9 +222,20 @@ def _acquire(
     outcome = sequencer.outcome
     ended: Literal["done", "interrupted", "failed"] = "failed"
     failure: BaseException | None = None
-    with obeyed_by(control, cell.halt):  # to the journal's last line: a signal must not cut that off
+    remote = RunControl(run.folder, control, cell.halt, lambda: observer.newest)
+
+    def stop() -> None:
+        control.stop_by(signal.SIGINT)
+        cell.halt()
+
+    keys = {"p": control.toggle_pause, "q": stop}
+    with obeyed_by(control, cell.halt), remote:  # to the journal's last line: a signal must not cut that off
+        if remote.trouble:
+            console.print(remote.trouble, markup=False)
         try:
-            with observer.showing(job.schedule.frames, len(job.schedule.views)):
+            with obeyed(keys) as read, observer.showing(job.schedule.frames, len(job.schedule.views)):
+                if read:
+                    console.print("keys: p pauses after the burst, and goes on; q stops")
                 try:
                     sequencer.acquire()
                 finally:
@@ -331,7 +351,7 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
     refuse(preflight)
     recorder, control = DryRecorder(), Control()
     with open_cell(job.cell, job=job, dry_run=True, speed=speed, on_opened=identity_printer(console)) as cell:
-        observer = RunObserver(console, cell.sensor.width_px * cell.sensor.height_px * 2, 0)
+        observer = RunObserver(console, cell.sensor.width_px * cell.sensor.height_px * 2, 0, speed=speed)
         sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
         outcome = sequencer.outcome
         started_s = time.monotonic()

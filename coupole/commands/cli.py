@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import sys
 import traceback
+from typing import Annotated
 
 import typer
 
+import coupole
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
-from coupole.commands import exporting, keeping, planning, running
+from coupole.commands import exporting, keeping, planning, run_controls, running
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
 from coupole.commands.dose_ledger import dose
@@ -17,7 +19,7 @@ from coupole.commands.reflectance import reflectance_app
 from coupole.commands.render_scene import render
 from coupole.commands.show import show
 from coupole.commands.uncertainty import budget
-from coupole.errors import CoupoleError, InputError, Interrupted
+from coupole.errors import CoupoleError, Interrupted
 
 app = typer.Typer(
     name="coupole",
@@ -31,6 +33,8 @@ for command in (
     planning.view,
     planning.simulate,
     running.acquire,
+    run_controls.pause,
+    run_controls.stop,
     running.meter,
     running.live,
     running.devices,
@@ -50,10 +54,25 @@ for command in (
     planning.schema,
 ):
     app.command()(command)
+app.command("go-on")(run_controls.go_on)
 plan_app.command("new")(planning.plan_new)
 app.add_typer(plan_app, name="plan")
 app.add_typer(calibrate_app, name="calibrate")
 app.add_typer(reflectance_app, name="reflectance")
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"coupole {coupole.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _: Annotated[
+        bool, typer.Option("--version", help="Print the version and end.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None: ...
 
 
 def main() -> None:
@@ -83,9 +102,8 @@ def main() -> None:
 
 
 def _say(error: CoupoleError) -> None:
-    kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
     with contextlib.suppress(OSError):  # the terminal may be gone
-        print(f"{kind}{error}", file=sys.stderr)
+        print(f"{error.heading}\n{error}".strip(), file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from coupole.errors import CoupoleError
+from coupole.commands.completion import plans, runs
+from coupole.errors import CoupoleError, InputError
 
-PlanPath = Annotated[Path, typer.Argument(help="The plan (YAML).", show_default=False)]
+PlanPath = Annotated[Path, typer.Argument(help="The plan (YAML).", show_default=False, autocompletion=plans)]
 RigOption = Annotated[Path | None, typer.Option("--rig", help="Another rig than the plan names.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
 ResultArgument = Annotated[Path, typer.Argument(help="Folder of a result.", show_default=False)]
@@ -26,7 +28,17 @@ RecordsOption = Annotated[
         show_default=False,
     ),
 ]
-RunPath = Annotated[Path, typer.Argument(help="The run's folder.", show_default=False)]
+RunPath = Annotated[Path, typer.Argument(help="The run's folder.", show_default=False, autocompletion=runs)]
+
+
+def shipped_rig() -> Path:
+    """The simulated cell that comes with a checkout of Coupole, from wherever one is. Raises InputError: an
+    installed package has none."""
+    project = Path(__file__).resolve().parent.parent.parent
+    path = project / "configs" / "rigs" / "sim.yaml"
+    if not path.is_file():
+        raise InputError("name a rig with --rig: the simulated cell comes with a checkout of Coupole only")
+    return Path(os.path.relpath(path)) if Path.cwd().is_relative_to(project) else path
 
 
 def fail(error: CoupoleError, *, as_json: bool, found: dict[str, Any] | None = None) -> None:

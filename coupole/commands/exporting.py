@@ -15,6 +15,7 @@ from coupole.commands.export_options import (
     OF_PICTURES,
     OF_RESULTS_OF_RUNS,
     OF_RUNS,
+    AdaptiveOption,
     AuthorOption,
     BaseUrlOption,
     BasisOption,
@@ -101,6 +102,7 @@ def export(
     shots: ShotsOption = None,
     fit: FitOption = None,
     triangle: TriangleOption = None,
+    adaptive: AdaptiveOption = None,
     refined: RefinedOption = None,
     calibrations: RecordsOption = None,
     sensor_spectra: SensorOption = None,
@@ -124,7 +126,8 @@ def export(
     from coupole.viewing.terminal import bytes_text, make_console
 
     given = {
-        "views": views, "shots": shots, "fit": fit, "triangle": triangle, "refined": refined,
+        "views": views, "shots": shots, "fit": fit, "triangle": triangle, "adaptive": adaptive,
+        "refined": refined,
         "calibrations": calibrations, "sensor-spectra": sensor_spectra, "led-spectrum": led_spectrum,
         "for-the-eye": for_the_eye, "linear": linear, "licence": licence, "author": author,
         "publisher": publisher, "name": name, "identifier": identifier, "in-place": in_place,
@@ -163,6 +166,8 @@ def _written(asked: Asked, console: Console) -> Found:
         asked.refuse(_OF_A_CRATE, f"for --to {CRATE}")
     if of_run or of_pictures or asked.to not in FORMATS:
         asked.refuse(_OF_COLOUR, "for frames of a run as dng or tiff")
+    if asked.to != "bsdf":
+        asked.refuse(("adaptive",), f"for --to bsdf; found --to {asked.to}")
     if asked.to != COLMAP:
         asked.refuse(("refined",), f"for --to {COLMAP}")
         if asked.to not in FORMATS:
@@ -213,7 +218,7 @@ def _refuse_misplaced(asked: Asked) -> None:
 def _export_result(asked: Asked, console: Console) -> Found:
     from coupole.exchange.of_results.export_result import export_result
 
-    triangles = tuple(map(int, asked.texts("triangle")))
+    triangles, most_error = tuple(map(int, asked.texts("triangle"))), asked.options.get("adaptive")
     with console.status(f"writing {asked.to}"):
         paths = export_result(
             asked.source,
@@ -221,6 +226,7 @@ def _export_result(asked: Asked, console: Console) -> Found:
             asked.out,
             fit=asked.text("fit"),
             triangles=triangles,
+            most_error=most_error if isinstance(most_error, float) else None,
             overwrite=asked.overwrite,
         )
     return _sizes(paths)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coupole.commands.common import JsonOption, RunPath, fail
+from coupole.commands.run_controls import RunningRun, follow, running_run
 from coupole.errors import ChecksumMismatch, CoupoleError, InputError, UnprovenError
 
 if TYPE_CHECKING:
@@ -18,14 +19,24 @@ if TYPE_CHECKING:
     from coupole.storage.verification import Verification
 
 
-def status(run: RunPath, as_json: JsonOption = False) -> None:
-    """Progress of a run, also while it is running, and the command line that takes what is left."""
+def status(
+    run: RunningRun = None,
+    following: Annotated[bool, typer.Option("--follow", help="Show its progress until it ends.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Progress of a run, also while it is running, and the command line that takes what is left.
+
+    Without a run: of the one that is being acquired.
+    """
     from coupole.storage.run import Run
     from coupole.storage.run_status import status as status_of
     from coupole.viewing.terminal import make_console, show_status
 
+    console = make_console(quiet=as_json)
+    if run is None or (following and Run(run).in_use):
+        run = follow(run, console) if following else Path(running_run(run)["run"])
     found = status_of(Run(run))
-    show_status(make_console(quiet=as_json), found)
+    show_status(console, found)
     if as_json:
         print(json.dumps(found.figures()))
 

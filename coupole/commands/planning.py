@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from coupole.commands.common import JsonOption, PlanPath, RigOption, fail
+from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, shipped_rig
+from coupole.commands.completion import schemas, templates
 from coupole.errors import InputError, PreflightRefused
 
 
@@ -121,7 +123,7 @@ def simulate(
     console.print(f"[bold]{out / 'sheet.png'}[/]")
 
 
-def schema(what: Annotated[str, typer.Argument(help="plan or rig")]) -> None:
+def schema(what: Annotated[str, typer.Argument(help="plan or rig", autocompletion=schemas)]) -> None:
     """JSON schema of plans or rigs, for editors."""
     from coupole.plan.plan import Plan
     from coupole.plan.rig import Rig
@@ -133,14 +135,26 @@ def schema(what: Annotated[str, typer.Argument(help="plan or rig")]) -> None:
 
 
 def plan_new(
-    name: Annotated[str, typer.Argument(help="Name of the plan; the file is NAME.yaml.", show_default=False)],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="Name of the plan; the file is NAME.yaml.", show_default=False, autocompletion=templates
+        ),
+    ],
     template: Annotated[
-        str | None, typer.Option("--template", help="Which template; the one called NAME, else `views`.")
+        str | None,
+        typer.Option(
+            "--template", help="Which template; the one called NAME, else `views`.", autocompletion=templates
+        ),
     ] = None,
-    rig: Annotated[str, typer.Option("--rig", help="Path of the rig, relative to the plan.")] = "../rigs/sim.yaml",
+    rig: Annotated[
+        Path | None,
+        typer.Option("--rig", help="The rig; without it the simulated cell.", show_default=False),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the views of `leds`, which are drawn.")] = 1,
 ) -> None:
     """Write a plan to start from. The views of `leds` are chosen for the rig's dome: a minute or two."""
+    from coupole.plan.plan import NAME_PATTERN
     from coupole.plan.templates import LEDS, TEMPLATES
     from coupole.viewing.terminal import make_console
 
@@ -148,6 +162,14 @@ def plan_new(
     template = template or (name if name in known else "views")
     if template not in known:
         raise typer.BadParameter(f"expected one of {', '.join(known)}; found {template}")
+    if not re.fullmatch(NAME_PATTERN, name):
+        raise InputError(
+            f"{name!r}: expected a name of letters, digits, dots, hyphens and underscores that begins with a "
+            "letter or digit: it becomes part of file names"
+        )
+    rig = rig or shipped_rig()
+    if not rig.is_file():
+        raise InputError(f"{rig}: no such file; name a rig with --rig")
     path = Path(f"{name}.yaml")
     if path.exists():
         raise InputError(f"{path}: exists already; choose another name")
@@ -156,7 +178,7 @@ def plan_new(
         from coupole.plan.cell import read_cell
 
         with make_console(quiet=False).status("reading the rig") as status:
-            text = led_plan(read_cell(path.parent / rig), name=name, rig=rig, seed=seed, tell=status.update)
+            text = led_plan(read_cell(rig), name=name, rig=str(rig), seed=seed, tell=status.update)
     else:
         text = TEMPLATES[template].format(name=name, rig=rig)
     path.write_text(text, encoding="utf-8")

@@ -13,6 +13,24 @@ from typer.core import TyperGroup
 from coupole.commands.common import JsonOption, MeshOption, RecordsOption, ResultArgument, records_named
 from coupole.commands.common import fail as fail_with
 from coupole.commands.refine import refine
+from coupole.commands.reflectance_options import (
+    IntensitiesOption,
+    KeepOption,
+    LeaveOutOption,
+    LightsOption,
+    MaskOption,
+    MemoryOption,
+    NoiseOption,
+    OutOption,
+    PicturesOption,
+    PosesOption,
+    RefinedOption,
+    SchedulerOption,
+    SrgbOption,
+    SupportOption,
+    UncalibratedOption,
+    ViewOption,
+)
 from coupole.commands.relight import relight
 from coupole.errors import CoupoleError, InputError
 
@@ -46,80 +64,6 @@ reflectance_app = typer.Typer(
 )
 
 
-OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the result.", show_default=False)]
-NoiseOption = Annotated[
-    float, typer.Option("--scan-noise-um", min=0.1, help="Standard uncertainty of the mesh's vertices.")
-]
-SupportOption = Annotated[
-    float,
-    typer.Option(
-        "--support-reflectance",
-        min=0.0,
-        max=0.95,
-        help="Of the disk under the object, which lights it too.",
-    ),
-]
-KeepOption = Annotated[
-    bool, typer.Option("--keep-inter-reflection", help="Leave in the samples what comes by way of other surfaces.")
-]
-MemoryOption = Annotated[
-    str, typer.Option("--memory", help="For the samples that are fitted together: 500MB, 4GB.")
-]
-RefinedOption = Annotated[
-    Path | None,
-    typer.Option("--refined", help="Folder of `coupole reflectance refine`: its poses, lens and mesh hold."),
-]
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask cluster that does the job: tcp://HOST:8786."),
-]
-PicturesOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--pictures",
-        help="Folder of 8- or 16-bit pictures, linear (or see --srgb), in the order of its filenames.txt, else "
-        "sorted.",
-        show_default=False,
-    ),
-]
-LightsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--lights",
-        help="Directions to the lights, one in each line (x right, y up, z to the camera), an .lp file, or "
-        "relight's .dome or .relight.",
-        show_default=False,
-    ),
-]
-SrgbOption = Annotated[
-    bool,
-    typer.Option("--srgb", help="The pictures of --pictures are encoded for displays, as JPEGs of cameras are."),
-]
-IntensitiesOption = Annotated[
-    Path | None,
-    typer.Option("--intensities", help="One number or three (r g b) for each light; values are divided by them."),
-]
-UncalibratedOption = Annotated[
-    bool,
-    typer.Option(
-        "--uncalibrated",
-        help="Of a run without calibrations: one view as pictures under lights at their nominal places; relative "
-        "values of single pixels.",
-    ),
-]
-ViewOption = Annotated[str | None, typer.Option("--view", help="Of --uncalibrated; the first without it.")]
-MaskOption = Annotated[Path | None, typer.Option("--mask", help="Picture that is black where nothing is fitted.")]
-LeaveOutOption = Annotated[
-    str,
-    typer.Option(
-        "--leave-out",
-        help="Lights (of pictures, from 0) or LEDs (of runs; every twelfth without it) that are kept for the "
-        "check: 4,12,20.",
-        show_default=False,
-    ),
-]
-
-
 @reflectance_app.command(JOB)
 def from_runs_or_pictures(
     runs: Annotated[
@@ -133,6 +77,7 @@ def from_runs_or_pictures(
     support_reflectance: SupportOption = 0.0,
     keep_inter_reflection: KeepOption = False,
     refined: RefinedOption = None,
+    poses: PosesOption = None,
     memory: MemoryOption = "2GB",
     scheduler: SchedulerOption = None,
     pictures: PicturesOption = None,
@@ -156,8 +101,8 @@ def from_runs_or_pictures(
     try:
         if out is None:
             raise InputError("--out: expected the folder of the result")
-        alone = (lights, srgb, intensities, mask)
-        _refuse_mixed(runs or [], pictures, calibrations or [], view, refined, alone, uncalibrated=uncalibrated)
+        alone, geometry = (lights, srgb, intensities, mask), (refined, poses)
+        _refuse_mixed(runs or [], pictures, calibrations or [], view, geometry, alone, uncalibrated=uncalibrated)
         with step_bars(console) as say:
             if uncalibrated and runs:
                 made = _of_uncalibrated(runs[0], view, _numbers(leave_out), out, say)
@@ -167,7 +112,7 @@ def from_runs_or_pictures(
                 records, left_out = records_named(calibrations or []), tuple(_numbers(leave_out))
                 request = RunRequest(
                     tuple(runs or ()), mesh, records, left_out, scan_noise_um, _bytes(memory), support_reflectance,
-                    keep_inter_reflection, refined,
+                    keep_inter_reflection, refined, poses,
                 )  # fmt: skip
                 made = _of_runs(request, out, scheduler, say)
     except CoupoleError as error:
@@ -208,7 +153,7 @@ def _refuse_mixed(
     pictures: Path | None,
     calibrations: list[Path],
     view: str | None,
-    refined: Path | None,
+    geometry: tuple[Path | None, Path | None],
     of_pictures: tuple[Path | bool | None, ...],
     *,
     uncalibrated: bool,
@@ -218,8 +163,8 @@ def _refuse_mixed(
         raise InputError("expected runs, or --pictures with --lights; see coupole reflectance from --help")
     if (uncalibrated and (calibrations or len(runs) != 1)) or (view and not uncalibrated):
         raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
-    if refined is not None and (uncalibrated or pictures is not None):
-        raise InputError("--refined: is for calibrated runs")
+    if any(geometry) and (uncalibrated or pictures is not None):
+        raise InputError("--refined, --poses: are for calibrated runs")
     if pictures is None and any(of_pictures):
         raise InputError("--lights, --srgb, --intensities, --mask: go with --pictures alone, not with runs")
 
@@ -280,6 +225,7 @@ def extract(
     support_reflectance: SupportOption = 0.0,
     keep_inter_reflection: KeepOption = False,
     refined: RefinedOption = None,
+    poses: PosesOption = None,
     leave_out: LeaveOutOption = "",
     scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
@@ -294,7 +240,7 @@ def extract(
         request = RunRequest(
             tuple(runs), mesh, records, left_out, scan_noise_um,
             support_reflectance=support_reflectance, keep_inter_reflection=keep_inter_reflection,
-            refined=refined,
+            refined=refined, poses=poses,
         )  # fmt: skip
         extract_runs(request, out, scheduler=scheduler, say=say)
         return {"views": RunResult(out).summaries}

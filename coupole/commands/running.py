@@ -9,17 +9,21 @@ from typing import Annotated, Any
 
 import typer
 
-from coupole.commands.common import JsonOption, PlanPath, RigOption, fail
+from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, shipped_rig
+from coupole.commands.completion import plans, runs
 from coupole.errors import CoupoleError
 
 
 def acquire(
     plan: Annotated[
-        Path | None, typer.Argument(help="The plan (YAML); not needed with --resume.", show_default=False)
+        Path | None,
+        typer.Argument(
+            help="The plan (YAML); not needed with --resume.", show_default=False, autocompletion=plans
+        ),
     ] = None,
     rig: RigOption = None,
     output: Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")] = None,
-    resume: Annotated[Path | None, typer.Option("--resume", help="Resume this run.")] = None,
+    resume: Annotated[Path | None, typer.Option("--resume", help="Resume this run.", autocompletion=runs)] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Rehearse on the rig's twin.")] = False,
     speed: Annotated[float, typer.Option("--speed", min=0.1, max=1000, help="Pace of a dry run.")] = 20.0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell moves.")] = False,
@@ -31,8 +35,8 @@ def acquire(
     """Run a plan: check it, move, trigger, prove the frames, store them.
 
     Ctrl-C stops safely (lights off, arm still) and the run can be resumed: `acquire --resume RUN`, with the run's
-    own copies of plan and rig, or with the plan again, whose comments alone may have changed. SIGUSR1 pauses
-    between bursts, and continues when sent again.
+    own copies of plan and rig, or with the plan again, whose comments alone may have changed. On a terminal the
+    key p pauses between bursts and goes on, q stops; from elsewhere `coupole pause`, `go-on` and `stop` do.
     """
     from coupole.acquisition.session import acquire_plan, rehearse
     from coupole.preflight.job import read_job
@@ -69,7 +73,10 @@ def _plan_of(resumed: Path | None) -> Path:
 
 
 def devices(
-    rig: Annotated[Path, typer.Option("--rig", help="The rig (YAML).")] = Path("configs/rigs/sim.yaml"),
+    rig: Annotated[
+        Path | None,
+        typer.Option("--rig", help="The rig (YAML); without it the simulated cell.", show_default=False),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Open each device of a rig, read its identity, run its self-test, close it."""
@@ -80,7 +87,7 @@ def devices(
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
-    cell = read_cell(rig)
+    cell = read_cell(rig or shipped_rig())
     found: dict[str, Any] = {}
     table = Table("device", "identity", "self-test", box=None)
     with open_cell(cell) as opened:

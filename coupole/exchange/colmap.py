@@ -62,8 +62,9 @@ def export_colmap(
     say: Callable[[str, int, int], None],
 ) -> list[Path]:
     """Write `images/VIEW.png` (8 bit, sRGB, the mean of some 48 frames of the view) and `sparse/0` with cameras,
-    images and points: centres of at most 50 000 triangles, each with the views that see it. Poses and lens are of
-    the run's records, or of those that are named, or of `refined`, a folder of `coupole reflectance refine`.
+    images and points: centres of at most 50 000 triangles that two views or more see, with these views. Poses and
+    lens are of the run's records, or of those that are named, or of `refined`, a folder of `coupole reflectance
+    refine`.
 
     Raises InputError: records or mesh are missing, files stand there already (unless `overwrite`); StorageError.
     """
@@ -108,7 +109,9 @@ def camera_text(lens: Intrinsics, size_px: tuple[int, int]) -> str:
 
 def texts_of(posed: Sequence[PosedPicture], centres_mm: Floats, lens: Intrinsics) -> tuple[str, str]:
     """images.txt and points3D.txt; `centres_mm` [m, 3] of all triangles, support frame."""
-    seen = np.unique(np.concatenate([picture.triangles for picture in posed]))
+    seen, times = np.unique(np.concatenate([picture.triangles for picture in posed]), return_counts=True)
+    if (times > 1).any():  # COLMAP's bundle adjustment ends at a point of one image
+        seen = seen[times > 1]
     chosen = seen[np.unique(np.linspace(0, len(seen) - 1, min(len(seen), MOST_POINTS)).astype(np.int64))]
     tracks: list[list[int]] = [[] for _ in chosen]
     colours = np.zeros((len(chosen), 3))

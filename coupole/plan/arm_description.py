@@ -43,6 +43,7 @@ class JointDescription(Model):
     """One joint, in the frame of the link before it; with all angles 0 that frame is parallel to the base's."""
 
     origin_mm: Vector
+    """Of the joint, in the frame of the link before it."""
     axis: Axis
     """Axis of rotation, right-handed."""
     limits_deg: Range
@@ -50,31 +51,40 @@ class JointDescription(Model):
     posture_limits_deg: Range | None = None
     """Limits for planned postures: narrower where links come near each other, or cables would twist."""
     speed_deg_s: Positive
+    """At most, by the data sheet."""
     acceleration_deg_s2: Positive
+    """At most."""
     jerk_deg_s3: Positive = 3000.0
+    """At most."""
 
 
 class CapsuleDescription(Model):
     """All points within `radius_mm` of a segment, in the frame of one link."""
 
     from_mm: Vector
+    """One end of the segment."""
     to_mm: Vector
+    """Its other end."""
     radius_mm: Length
+    """About the segment."""
 
 
 class LinkDescription(Model):
     """The body of a link: capsules that enclose it."""
 
     name: BodyName
+    """In messages and pictures."""
     link: Annotated[int, Field(ge=0, le=6)]
     """0 is the base, which is fixed; link k turns with joint k."""
     capsules: Annotated[tuple[CapsuleDescription, ...], Field(min_length=1, max_length=100)]
+    """Together they enclose the body."""
 
 
 class KeptApart(Model):
     """Two bodies of the arm that could touch. Those that are not listed touch by design, or cannot."""
 
     body: BodyName
+    """One of the two."""
     other: BodyName
     """Nearer to the base than `body`."""
     near_by_design_deg: Annotated[
@@ -97,11 +107,17 @@ class ArmDescription(Model):
     0."""
 
     schema_version: Literal[1]
+    """Of the format of arms."""
     name: Annotated[str, Field(min_length=1, max_length=64)]
+    """Model."""
     joints: Annotated[tuple[JointDescription, ...], Field(min_length=6, max_length=6)]
+    """From the base on."""
     link_6_from_flange: Pose
+    """Where the flange's frame lies in that of the last link."""
     links: Annotated[tuple[LinkDescription, ...], Field(min_length=1, max_length=100)]
+    """Bodies of the links."""
     kept_apart: Annotated[tuple[KeptApart, ...], Field(max_length=1000)] = ()
+    """Pairs of bodies that are checked against each other."""
     link_meshes: FilePath | None = None
     """Folder of meshes that replace the links' capsules; relative to the file."""
 

@@ -14,7 +14,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 
 from coupole.geometry import Transform, transform
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 """Letters, digits, dot, underscore, hyphen: it becomes part of file names and shot ids."""
 Words = Annotated[str, Field(min_length=1, max_length=500)]
 Millimetres = Annotated[float, Field(ge=-20_000, le=20_000)]
@@ -48,14 +49,16 @@ FilePath = Annotated[Path, AfterValidator(possible_path)]
 class Model(BaseModel):
     """Frozen; unknown keys are errors."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class Pose(Model):
     """A rigid transform in a file: translation in mm, KUKA's A, B, C in degrees."""
 
     translation_mm: Vector = (0.0, 0.0, 0.0)
+    """x, y, z."""
     abc_deg: Angles = (0.0, 0.0, 0.0)
+    """KUKA's A, B, C: turns about z, then the new y, then the new x."""
 
     def matrix(self) -> Transform:
         return transform(self.translation_mm, self.abc_deg)
@@ -63,11 +66,14 @@ class Pose(Model):
 
 class AllLights(Model):
     kind: Literal["all"]
+    """Each LED of the dome, one after the other."""
 
 
 class LightIds(Model):
     kind: Literal["ids"]
+    """LEDs by their ids in the LED table."""
     ids: Annotated[tuple[LedId, ...], Field(min_length=1)]
+    """Each once; lit in this order."""
 
     @field_validator("ids")
     @classmethod
@@ -81,37 +87,49 @@ class LightBoards(Model):
     """All LEDs of some boards."""
 
     kind: Literal["boards"]
+    """All LEDs of some boards."""
     boards: Annotated[tuple[Annotated[int, Field(ge=0, le=65535)], ...], Field(min_length=1)]
+    """Numbers of boards in the LED table."""
 
 
 class EveryLight(Model):
     """Every n-th LED of the table, from `offset` on."""
 
     kind: Literal["every"]
+    """Every n-th LED of the table."""
     every: Annotated[int, Field(ge=1, le=65535)]
+    """n; 1 is each LED."""
     offset: Annotated[int, Field(ge=0, le=65535)] = 0
+    """Rows of the table before the first."""
 
 
 class LightCone(Model):
     """LEDs within `half_angle_deg` of a direction seen from the support's centre."""
 
     kind: Literal["cone"]
+    """LEDs within an angle of a direction."""
     azimuth_deg: Degrees
+    """Of the direction, from the support frame's x towards y."""
     elevation_deg: Annotated[float, Field(ge=-90, le=90)]
+    """Of the direction, above the support's plane."""
     half_angle_deg: Annotated[float, Field(gt=0, le=180)]
+    """Between the direction and the outermost LED."""
 
 
 class Panels(Model):
     """The flat white panels, one after the other."""
 
     kind: Literal["panels"]
+    """The flat white panels, one after the other."""
     panels: Annotated[tuple[Annotated[int, Field(ge=1, le=4)], ...], Field(min_length=1)] = (1, 2, 3, 4)
+    """Numbers of panels."""
 
 
 class NoLights(Model):
     """Dark frames only."""
 
     kind: Literal["none"]
+    """Dark frames only."""
 
 
 Lights = Annotated[
@@ -123,12 +141,19 @@ class LookAt(Model):
     """One view: the camera looks at a point from a direction."""
 
     kind: Literal["look_at"]
+    """One view, from a direction."""
     name: Name
+    """Of the view, in shot ids and file names."""
     target_mm: Vector
-    distance_mm: Annotated[float, Field(gt=0, le=3000, description="to the camera's projection centre")]
+    """The point in the picture's middle, in the support frame."""
+    distance_mm: Annotated[float, Field(gt=0, le=3000)]
+    """To the camera's projection centre."""
     azimuth_deg: Degrees
+    """Where the camera stands, from the support frame's x towards y."""
     elevation_deg: Annotated[float, Field(ge=-90, le=90)]
+    """Where the camera stands, above the support's plane."""
     roll_deg: Degrees = 0.0
+    """Of the camera about its line of sight."""
     lights: Lights | None = None
     """Of this view; the plan's if not given."""
 
@@ -137,12 +162,19 @@ class Grid(Model):
     """Views from all pairs of azimuth and elevation, named `<name>-az<azimuth>-el<elevation>`."""
 
     kind: Literal["grid"]
+    """Views from all pairs of azimuth and elevation."""
     name: Name
+    """Begins the names of the views."""
     target_mm: Vector
+    """The point in the pictures' middle, in the support frame."""
     distance_mm: Annotated[float, Field(gt=0, le=3000)]
+    """To the camera's projection centre."""
     azimuths_deg: Annotated[tuple[Degrees, ...], Field(min_length=1)]
+    """Where the camera stands, from the support frame's x towards y."""
     elevations_deg: Annotated[tuple[Annotated[float, Field(ge=-90, le=90)], ...], Field(min_length=1)]
+    """Where the camera stands, above the support's plane."""
     roll_deg: Degrees = 0.0
+    """Of the camera about its line of sight."""
     lights: Lights | None = None
     """Of this view; the plan's if not given."""
 
@@ -151,8 +183,11 @@ class Joints(Model):
     """One view from given joint angles of the arm."""
 
     kind: Literal["joints"]
+    """One view, from angles of the arm."""
     name: Name
+    """Of the view, in shot ids and file names."""
     joints_deg: tuple[Degrees, Degrees, Degrees, Degrees, Degrees, Degrees]
+    """Of the six axes, from the base on."""
     lights: Lights | None = None
     """Of this view; the plan's if not given."""
 
@@ -162,7 +197,9 @@ View = Annotated[LookAt | Grid | Joints, Field(discriminator="kind")]
 
 class FixedExposure(Model):
     kind: Literal["fixed"]
+    """One exposure for each light."""
     exposure_us: ExposureUs
+    """Exposure time."""
 
     @property
     def exposures_us(self) -> tuple[int, ...]:
@@ -173,7 +210,9 @@ class BracketExposure(Model):
     """Each light at each of several exposures, shortest first as written."""
 
     kind: Literal["bracket"]
+    """Several exposures for each light."""
     exposures_us: Annotated[tuple[ExposureUs, ...], Field(min_length=2, max_length=16)]
+    """Exposure times, each longer than the one before."""
 
     @field_validator("exposures_us")
     @classmethod
@@ -190,41 +229,61 @@ class MeasuredObject(Model):
     """The object on the support: its id, mesh, pose and dose budget."""
 
     id: Name
+    """Of the object whose dose is kept in the ledger: an accession number."""
     mesh: FilePath | None = None
+    """PLY, STL or OBJ; for collisions, occlusion, dose and pictures."""
     mesh_unit: Literal["mm", "m", "um"] = "mm"
+    """Of the coordinates in the mesh."""
     support_from_object: Pose = Pose()
+    """Where the mesh's frame lies on the support."""
     dose_budget_lux_h: Annotated[float, Field(gt=0, le=1e9)] | None = None
+    """Light that the object may receive in its life; not limited if not given."""
 
 
 class Optics(Model):
     """The intended lens settings; preflight compares them with the rig."""
 
     focus_distance_mm: Length | None = None
+    """To which the lens is to be focused, from the projection centre."""
     f_number: Annotated[float, Field(gt=0, le=1000)] | None = None
+    """To which the aperture is to be set."""
 
 
 class Plan(Model):
     """One acquisition."""
 
     schema_version: Literal[1]
+    """Of the format of plans."""
     name: Name
+    """Ends the name of the run's folder."""
     rig: FilePath
+    """The rig's file, relative to the plan."""
     object: MeasuredObject | None = None
+    """What lies on the support."""
     optics: Optics = Optics()
+    """The lens settings that are meant."""
     calibrations: Literal["none"] | tuple[FilePath, ...] | None = None
     """Records that must be in force; None: those that the rig names."""
     views: Annotated[tuple[View, ...], Field(min_length=1)]
+    """Where the camera takes its pictures from."""
     order: Literal["fastest", "as_written"] = "fastest"
     """Order of the views: on the shortest path, or as written."""
     lights: Lights
+    """Lights of each view that has none of its own."""
     repeats: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Frames of each light at each exposure."""
     hidden_lights: Literal["mark", "skip"] = "mark"
     """LEDs that arm, camera or object hide from everything that a view sees: taken and marked, or left out."""
     exposure: Exposures
+    """One exposure time, or several."""
     gain_db: Annotated[float, Field(ge=0, le=42)] = 0.0
+    """Of the camera's amplifier."""
     darks_per_view: Annotated[int, Field(ge=0, le=1000)] = 2
+    """Frames without light in each view."""
     trigger: Literal["hardware", "software"] = "hardware"
+    """The camera is triggered by the LED box, or by the host, light by light."""
     reshoot_limit: Annotated[int, Field(ge=0, le=20)] = 3
+    """How often frames that are not proven are taken again."""
     licence: Words | None = None
     """Terms under which the run's data may be used; None: the rig's. For the run's README.txt."""
     contact: Words | None = None

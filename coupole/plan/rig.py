@@ -25,27 +25,39 @@ class Twin(Model):
     """The simulated counterpart that `--dry-run` opens in a device's place."""
 
     driver: DriverName
+    """Its class."""
     settings: dict[str, Any] = Field(default_factory=dict)
+    """What its driver asks for."""
 
 
 class Device(Model):
     """A driver and its settings. On a simulated rig the world's endpoint fills in the address."""
 
     driver: DriverName
+    """Its class."""
     settings: dict[str, Any] = Field(default_factory=dict)
+    """What its driver asks for: address, limits."""
     twin: Twin | None = None
+    """What `--dry-run` opens in its place; a stand-in of its kind if not given."""
 
 
 class Sensor(Model):
     """Format of the camera's frames; compared with the camera's report when it is opened."""
 
     width_px: Annotated[int, Field(ge=8, le=65536)]
+    """Of a frame."""
     height_px: Annotated[int, Field(ge=8, le=65536)]
+    """Of a frame."""
     pixel_pitch_um: Annotated[float, Field(gt=0, le=1000)]
+    """From pixel to pixel on the sensor."""
     bit_depth: Annotated[int, Field(ge=8, le=16)] = 12
+    """Bits of a pixel."""
     bayer_pattern: Literal["GBRG", "GRBG", "RGGB", "BGGR", "MONO"] = "GBRG"
+    """Colours of the 2 x 2 pixels from the top left; MONO without colours."""
     black_dn: Annotated[int, Field(ge=0, le=65535)] = 64
+    """Value of a pixel without light."""
     max_frames_per_s: Annotated[float, Field(ge=0.001, le=100_000)] = 100.0
+    """That camera and its link can keep up."""
     exposure_gap_us: Annotated[int, Field(ge=0, le=10_000_000)] = 100
     """Least time between the end of one exposure and the start of the next."""
 
@@ -62,7 +74,9 @@ class Sensor(Model):
 
 class Lens(Model):
     focal_length_mm: Annotated[float, Field(gt=0, le=5000)]
+    """By its maker."""
     f_number: Annotated[float, Field(gt=0, le=1000)]
+    """To which its aperture is set."""
     focus_distance_mm: Length
     """From the projection centre to the plane of best focus."""
 
@@ -86,7 +100,9 @@ class Dome(Model):
     """The LEDs: a CSV with columns id, board, x_mm, y_mm, z_mm, nx, ny, nz (base frame), flux_lm."""
 
     leds: FilePath
+    """The table of LEDs, relative to the rig."""
     emission: Literal["lambertian", "paper"] = "lambertian"
+    """Fall-off of an LED's light with the angle: a cosine, or the paper's second one."""
     panel_lux: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     """Illuminance at the support's centre with one flat panel on, for the light dose."""
     spectrum: FilePath | None = None
@@ -99,21 +115,28 @@ class BoardThermal(Model):
     """First-order thermal model of an LED board: heated by each joule, cooling with one time constant."""
 
     led_power_w: Annotated[float, Field(gt=0, le=10_000)] = 15.0
+    """Heat of an LED that is lit."""
     rise_c_per_j: Annotated[float, Field(gt=0, le=1000)] = 0.02
+    """Of the board."""
     time_constant_s: Annotated[float, Field(ge=0.001, le=1e6)] = 240.0
+    """Of its cooling."""
     ambient_c: Annotated[float, Field(ge=-50, le=100)] = 22.0
+    """Temperature of a board that was long dark."""
     limit_c: Annotated[float, Field(ge=-50, le=1000)] = 70.0
+    """Which preflight lets no board exceed."""
 
 
 class LedLimits(Model):
     """Limits of LEDs and boards; the box also enforces its own."""
 
     on_us: tuple[OnTimeUs, OnTimeUs] = (1_000, 2_000_000)
+    """Shortest and longest time for which an LED may be lit."""
     rise_us: Annotated[int, Field(ge=0, le=10_000_000)] = 1_000
     """From switching on to full current: the trigger waits for it."""
     cooldown_ratio: Annotated[float, Field(ge=0, le=100_000)] = 2.0
     """An LED that was lit for t stays dark for at least `cooldown_ratio` * t."""
     board: BoardThermal = BoardThermal()
+    """How boards warm up."""
 
     @model_validator(mode="after")
     def _shortest_first(self) -> LedLimits:
@@ -126,9 +149,13 @@ class Motion(Model):
     """Motion between views: share of the joint speeds, acceleration, jerk, and settling."""
 
     speed_fraction: Annotated[float, Field(ge=0.001, le=1)] = 0.3
+    """Of the joints' greatest speeds."""
     acceleration_deg_s2: Annotated[float, Field(ge=0.01, le=100_000)] = 300.0
+    """Of each joint, at most."""
     jerk_deg_s3: Annotated[float, Field(ge=0.01, le=10_000_000)] = 3000.0
+    """Of each joint, at most."""
     settle_dwell_s: Annotated[float, Field(ge=0, le=3600)] = 0.3
+    """Waited after the arm has come to rest."""
     still_deg: Annotated[float, Field(gt=0, le=10)] = 0.01
     """Largest change of an axis during a burst. Beyond it, shots that were not proven before are taken again."""
     home_joints_deg: Posture = (
@@ -146,23 +173,33 @@ class Support(Model):
     """The disk that carries the object, and the origin of the support frame."""
 
     base_from_support: Pose
+    """Where the support frame (the disk's centre, z up) lies in the robot's base frame."""
     diameter_mm: Length = 1480.0
+    """Of the disk."""
 
 
 class KeepOutSphere(Model):
     """A volume of the support frame that the flange must stay out of."""
 
     kind: Literal["sphere"]
+    """A ball."""
     name: Name
+    """In messages."""
     center_mm: Vector
+    """In the support frame."""
     radius_mm: Length
+    """Of the ball."""
 
 
 class KeepOutBox(Model):
     kind: Literal["box"]
+    """A box along the support frame's axes."""
     name: Name
+    """In messages."""
     min_mm: Vector
+    """Lowest corner, in the support frame."""
     max_mm: Vector
+    """Highest corner, in the support frame."""
 
     @model_validator(mode="after")
     def _has_a_volume(self) -> KeepOutBox:
@@ -178,23 +215,33 @@ class ToolBody(Model):
     """A body on the flange: a capsule in the flange's frame."""
 
     name: Name
+    """In messages and pictures."""
     from_mm: Vector
+    """One end of the capsule's axis."""
     to_mm: Vector
+    """Its other end."""
     radius_mm: Length
+    """Of the capsule."""
 
 
 class Clearances(Model):
     """Clearances of the arm, mm."""
 
     object_mm: Annotated[float, Field(ge=0, le=5000)] = 50.0
+    """To the object."""
     support_mm: Annotated[float, Field(ge=0, le=5000)] = 10.0
+    """To the disk."""
     dome_mm: Annotated[float, Field(ge=0, le=5000)] = 20.0
+    """To the dome."""
     self_mm: Annotated[float, Field(ge=0, le=5000)] = 0.0
+    """Between parts of the arm."""
     keep_out_mm: Annotated[float, Field(ge=0, le=5000)] = 0.0
+    """To the volumes to keep out of."""
 
 
 class Storage(Model):
     folder: FilePath
+    """Where runs are made, relative to the rig."""
     reserve_bytes: Annotated[int, Field(ge=0, le=2**60)] = 256 * 1024**2
     """Free space that a run leaves on the disk."""
     pixels: Literal["uint16", "packed12"] = "uint16"
@@ -208,44 +255,64 @@ class WorldSection(Model):
     """The stand-ins: started with the rig (or for dry runs only), or joined if they already run."""
 
     serves: Literal["always", "dry_run"] = "always"
+    """All sessions, or dry runs only."""
     join: FilePath | None = None
     """File with the JSON line of a running `coupole sim`."""
     driver: DriverName = WORLD
+    """Class of the stand-ins."""
     settings: dict[str, Any] = Field(default_factory=dict)
+    """What the stand-ins simulate, and how."""
 
 
 class Rig(Model):
     """One cell: devices, geometry, limits, storage."""
 
     schema_version: Literal[1]
+    """Of the format of rigs."""
     name: Name
+    """In runs and reports."""
     ledbox: Device
+    """The box that switches the LEDs."""
     camera: Device
+    """The camera."""
     robot: Device
+    """The arm's controller."""
     arm: FilePath | ArmDescription | None = None
     """The file that describes the arm, or the description itself. Default: the arm of the robot's driver."""
     sensor: Sensor
+    """Format of the frames."""
     lens: Lens
+    """The lens as it is set."""
     white_response: WhiteResponse | None = None
     """Without it, and without a record of the LEDs' power, exposures cannot be judged without the camera."""
     flange_from_camera: Pose
+    """Where the camera's frame lies in the flange's, by drawing; a hand-eye record replaces it."""
     dome: Dome
+    """The LEDs and panels."""
     support: Support
+    """The disk under the object."""
     tool: Annotated[tuple[ToolBody, ...], Field(max_length=100)]
+    """Camera, lens, cables: what collides besides the arm."""
     link_meshes: FilePath | None = None
     """Folder of meshes (`base_link.stl`, `link_1.stl` to `link_6.stl`) that replace the capsules of the arm's
     links."""
     clearances: Clearances = Clearances()
+    """Least distances of the arm."""
     keep_out: Annotated[tuple[KeepOut, ...], Field(max_length=1000)] = ()
+    """Volumes that the arm must not enter."""
     led_limits: LedLimits = LedLimits()
+    """For how long LEDs may be lit."""
     motion: Motion = Motion()
+    """How the arm moves between views."""
     storage: Storage
+    """Where runs go."""
     ledger: FilePath | None = None
     """Folder of the objects' dose ledgers, the same for all rigs under which they lie. `coupole/ledger` in the
     user's data folder (XDG) if not given."""
     calibrations: Literal["none"] | tuple[FilePath, ...] = "none"
     """Records that must be in force for plans without a list of their own."""
     world: WorldSection | None = None
+    """The stand-ins of a simulated rig; none on a real one."""
     licence: Words | None = None
     """Terms under which the data of its runs may be used, where the plan has none."""
     contact: Words | None = None

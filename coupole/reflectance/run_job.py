@@ -16,6 +16,8 @@ from typing import Any
 from uuid import uuid4
 
 from coupole.errors import InputError
+from coupole.reflectance.alignment.colmap_model import read_model
+from coupole.reflectance.alignment.colmap_poses import read_poses
 from coupole.reflectance.alignment.refined_geometry import ABOUT, read_refined, what_was_refined
 from coupole.reflectance.block_work import Said, Workshop, silent, workshop
 from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of
@@ -58,6 +60,22 @@ class RunRequest:
     """Do not take it off the samples."""
     refined: Path | None = None
     """Folder of `coupole reflectance refine`: its poses, lens and mesh hold instead of the records' and scan's."""
+    poses: Path | None = None
+    """Folder of COLMAP's, of one run: its poses hold instead of the records'."""
+
+    @property
+    def sources(self) -> _Sources:
+        """Where the runs' geometry is from, by whole paths."""
+        mesh, refined, poses = (path and path.resolve() for path in (self.mesh, self.refined, self.poses))
+        return _Sources(mesh, tuple(path.resolve() for path in self.calibrations), refined, poses)
+
+
+@dataclass(frozen=True)
+class _Sources:
+    mesh: Path | None
+    records: tuple[Path, ...]
+    refined: Path | None
+    poses: Path | None
 
 
 def reflectance_of(
@@ -79,13 +97,14 @@ def reflectance_of(
 def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None, say: Said = silent) -> None:
     """The samples of all views. Raises as `reflectance_of`."""
     token = uuid4().hex
-    measured_runs = [
-        _measured(token, run, request.mesh, request.calibrations, request.refined) for run in request.runs
-    ]
+    if request.poses is not None and (request.refined is not None or len(request.runs) != 1):
+        raise InputError("--poses: expected one run, and no --refined; COLMAP's images are named after its views")
+    sources = request.sources
+    measured_runs = [_measured(token, run, sources) for run in request.runs]
     refuse_different(measured_runs)
     try:
         with workshop(scheduler) as shop:
-            begin(out, _settings(request, measured_runs))
+            begin(out, _settings(request, token, measured_runs))
             first = measured_runs[0]
             complete(out / OBJECT, lambda path: write_object(path, first.corners_mm, first.base_from_support))
             shop.refuse_blind(out.resolve(), SETTINGS)
@@ -100,7 +119,7 @@ def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None
         _forget()
 
 
-def _settings(request: RunRequest, measured_runs: Sequence[MeasuredRun]) -> dict[str, Any]:
+def _settings(request: RunRequest, token: str, measured_runs: Sequence[MeasuredRun]) -> dict[str, Any]:
     frames = [frame for m in measured_runs for view in m.views for frame in view.frames]
     leds = sorted({frame.led for frame in frames if frame.led is not None})
     left_out = list(request.left_out) or leds[HELD_OUT_FIRST::HELD_OUT_EVERY]
@@ -115,11 +134,19 @@ def _settings(request: RunRequest, measured_runs: Sequence[MeasuredRun]) -> dict
         "records": [{kind: sha256(path) for kind, path in m.records.items()} for m in measured_runs],
         "mesh": sha256(measured_runs[0].mesh_path),
         "refined": None if request.refined is None else what_was_refined(request.refined),
+        **_posed(request, token),
         "emission": measured_runs[0].emission,
         "simulated": any(m.run.simulated for m in measured_runs),
         "channels": "".join(measured_runs[0].channels),
         "view_names": [_name(measured_runs, m, view) for m in measured_runs for view in m.views],
     }
+
+
+def _posed(request: RunRequest, token: str) -> dict[str, Any]:
+    """What a result says of poses by COLMAP."""
+    if request.poses is None:
+        return {}
+    return {"poses": read_poses(request.poses, _recorded(token, request.runs[0], request.sources)).told()}
 
 
 @dataclass(frozen=True)
@@ -143,13 +170,15 @@ def _extract(
         for view in measured.views
     ]
     left = [one for one in left if not one.path.with_suffix(".json").exists()]
-    mesh, refined = (path and path.resolve() for path in (request.mesh, request.refined))
-    records = tuple(path.resolve() for path in request.calibrations)
+    sources = request.sources
     for one in left:
         shop.refuse_blind(one.run, RUN_JSON)
-    if refined is not None:
-        shop.refuse_blind(refined, ABOUT)
-    extract = partial(_extract_one, token, mesh, records, refined, shop.threads, shop.heard(say))
+    if sources.refined is not None:
+        shop.refuse_blind(sources.refined, ABOUT)
+    if sources.poses is not None:
+        path = read_model(sources.poses).path
+        shop.refuse_blind(path.parent, path.name)
+    extract = partial(_extract_one, token, sources, shop.threads, shop.heard(say))
     for number, (one, found) in enumerate(zip(left, shop.map(extract, left), strict=True), start=1):
         write_synced(one.path.with_suffix(".json"), json.dumps(found))
         say("views", number, len(left))
@@ -158,15 +187,13 @@ def _extract(
 
 def _extract_one(
     token: str,
-    mesh: Path | None,
-    records: tuple[Path, ...],
-    refined: Path | None,
+    sources: _Sources,
     threads: int | None,
     say: Said,
     one: _View,
 ) -> dict[str, Any]:
     """Write the files of a view's samples and frames for the check; what the report says of them."""
-    measured, geometry, radiometry = _prepared(token, one.run, mesh, records, refined)
+    measured, geometry, radiometry = _prepared(token, one.run, sources)
     view = next(view for view in measured.views if view.name == one.view)
     found = extract_view(measured, geometry, radiometry, view, one.path, say, threads=threads)
     frames = one.path.parents[1] / FRAMES / one.path.name
@@ -175,25 +202,30 @@ def _extract_one(
 
 
 @lru_cache(maxsize=1)
-def _prepared(
-    token: str, run: Path, mesh: Path | None, records: tuple[Path, ...], refined: Path | None
-) -> tuple[MeasuredRun, Geometry, Radiometry]:
+def _prepared(token: str, run: Path, sources: _Sources) -> tuple[MeasuredRun, Geometry, Radiometry]:
     """What all views of a run share, once in each process and job (`token`)."""
-    measured = _measured(token, run, mesh, records, refined)
+    measured = _measured(token, run, sources)
     return measured, geometry_of(measured), Radiometry(measured)
 
 
 @lru_cache(maxsize=16)
-def _measured(
-    _token: str, run: Path, mesh: Path | None, records: tuple[Path, ...], refined: Path | None
-) -> MeasuredRun:
-    measured = read_measured_run(run, mesh, records)
-    return measured if refined is None else read_refined(refined).of(measured)
+def _measured(token: str, run: Path, sources: _Sources) -> MeasuredRun:
+    measured = _recorded(token, run, sources)
+    if sources.poses is not None:
+        return read_poses(sources.poses, measured).of(measured)
+    return measured if sources.refined is None else read_refined(sources.refined).of(measured)
+
+
+@lru_cache(maxsize=16)
+def _recorded(_token: str, run: Path, sources: _Sources) -> MeasuredRun:
+    """By the records alone."""
+    return read_measured_run(run, sources.mesh, sources.records)
 
 
 def _forget() -> None:
     _prepared.cache_clear()
     _measured.cache_clear()
+    _recorded.cache_clear()
 
 
 def _name(measured_runs: Sequence[MeasuredRun], measured: MeasuredRun, view: MeasuredView) -> str:

@@ -22,6 +22,9 @@ class Progress:
     frames: int
     light: str
     dose_lux_h: float
+    """Light on the object in all sessions of the run, the burst under way as far as it has come."""
+    left_s: float
+    """Expected until the last frame is proven, on the cell's clock, if nothing is taken again."""
 
 
 @dataclass

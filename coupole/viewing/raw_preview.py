@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,8 @@ BINS = 128
 _SATURATED, _SHARP = (255, 0, 0), (0, 255, 60)
 _SHARP_GRADIENT = 0.25
 """Relative change of brightness from one cell to the next, above which an edge is in focus."""
+_BEYOND_NOISE = 5.0
+"""Of the standard error of a frame's mean product of gradients, below which noise may have made it."""
 _DARK = 0.02
 """Share of full scale below which an edge is noise."""
 
@@ -38,8 +41,9 @@ class Figures:
     brightest: float
     """99.9 % quantile, share of the range above black."""
     sharpness: float
-    """Mean squared gradient of the green cells over their squared mean (Tenengrad, normalised by brightness);
-    comparable only for the same scene."""
+    """Mean squared gradient over mean square, by the product of the two green pixels of each cell, whose noise is
+    independent: noise adds nothing in the mean, and what it may have made alone counts as 0. Comparable only for
+    the same scene under the same light."""
 
 
 def develop(raw: NDArray[np.uint16], *, pattern: str, black_dn: int, white_dn: int) -> NDArray[np.uint8]:
@@ -87,8 +91,6 @@ def figures(raw: NDArray[np.uint16], coding: Coding) -> Figures:
     """Histograms, saturation and sharpness of a RAW frame."""
     planes = channels(raw, coding.pattern)
     step = coding.white_dn + 1
-    green = _brightness(raw, coding)
-    energy = float(np.mean(np.diff(green, axis=0) ** 2) + np.mean(np.diff(green, axis=1) ** 2))
     quantile = float(np.quantile(raw[:: max(1, raw.shape[0] // 512)], 0.999))
     return Figures(
         {
@@ -97,8 +99,17 @@ def figures(raw: NDArray[np.uint16], coding: Coding) -> Figures:
         },
         {name: float(np.mean(plane >= coding.white_dn)) for name, plane in planes.items()},
         (quantile - coding.black_dn) / (coding.white_dn - coding.black_dn),
-        energy / max(float(np.mean(green**2)), 1e-12),
+        _sharpness(*_two_greens(raw, coding)),
     )
+
+
+def _sharpness(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+    """Of two planes [h, w] of the same scene with independent noise; 0 where there is no more than noise."""
+    products = np.diff(one, axis=0)[:, 1:] * np.diff(other, axis=0)[:, 1:]
+    products += np.diff(one, axis=1)[1:] * np.diff(other, axis=1)[1:]
+    energy, noise = float(products.mean()), float(products.std()) / math.sqrt(products.size)
+    level = float(np.mean(one * other))
+    return energy / level if energy > _BEYOND_NOISE * noise and level > 0 else 0.0
 
 
 def look(raw: NDArray[np.uint16], coding: Coding, width_px: int, *, saturation: bool, focus: bool) -> bytes:
@@ -112,7 +123,7 @@ def look(raw: NDArray[np.uint16], coding: Coding, width_px: int, *, saturation: 
     few = np.ascontiguousarray(cells[:, :2, :, :2]).reshape(height // stride, width // stride)
     picture = develop(few, pattern=coding.pattern, black_dn=coding.black_dn, white_dn=coding.white_dn)
     if focus:
-        picture[_any_of(_in_focus(_brightness(raw[:height, :width], coding)), stride)] = _SHARP
+        picture[_any_of(_in_focus(_two_greens(raw[:height, :width], coding)[0]), stride)] = _SHARP
     if saturation:
         full = cells.max(axis=(1, 3)) >= coding.white_dn
         picture[full] = _SATURATED
@@ -121,11 +132,12 @@ def look(raw: NDArray[np.uint16], coding: Coding, width_px: int, *, saturation: 
     return buffer.getvalue()
 
 
-def _brightness(raw: NDArray[np.uint16], coding: Coding) -> NDArray[np.float32]:
-    """[h/2, w/2] first green of each cell above black, share of the range."""
+def _two_greens(raw: NDArray[np.uint16], coding: Coding) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """[h/2, w/2] both greens of each cell (of MONO the pixels of a diagonal) above black, share of the range."""
     planes = channels(raw, coding.pattern)
-    plane = planes["G1"] if "G1" in planes else raw[::2, ::2]
-    return (plane.astype(np.float32) - coding.black_dn) / np.float32(coding.white_dn - coding.black_dn)
+    one, other = (planes["G1"], planes["G2"]) if "G1" in planes else (raw[::2, ::2], raw[1::2, 1::2])
+    span = np.float32(coding.white_dn - coding.black_dn)
+    return (one.astype(np.float32) - coding.black_dn) / span, (other.astype(np.float32) - coding.black_dn) / span
 
 
 def _in_focus(green: NDArray[np.float32]) -> NDArray[np.bool_]:

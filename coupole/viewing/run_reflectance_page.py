@@ -61,6 +61,12 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
     if refined := about.get("refined"):
         before, after = (refined["disagreement"][when]["median_mm"] for when in ("before", "after"))
         yield f"views were refined: they disagreed by {before:.3f} mm (median), and by {after:.3f} mm afterwards"
+    if poses := about.get("poses"):
+        yield (
+            f"cameras stand where COLMAP has them, {poses['median_moved_mm']:.3g} mm and "
+            f"{poses['median_turned_deg']:.2g} degrees (median) from where the records do; their uncertainty is "
+            "taken to be the records'"
+        )
     if about["not_fitted"]:
         yield f"{about['not_fitted']} triangles have fewer than {FEWEST} samples and no material"
     for name, mae in about["mae"].items():

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from coupole.viewing.live import Shown
 
 _PLAIN_LINE_EVERY_S = 5.0
+_WIDE = 110
+"""Columns of a terminal that has room for rates beside the bars."""
 
 
 def make_console(*, quiet: bool) -> Console:
@@ -110,11 +112,13 @@ def bytes_text(count: float) -> str:
 class RunObserver:
     """Watches a run: bars on a terminal, a line every few seconds elsewhere."""
 
-    def __init__(self, console: Console, frame_bytes: int, proven_before: int) -> None:
-        self._console, self._frame_bytes = console, frame_bytes
+    def __init__(self, console: Console, frame_bytes: int, proven_before: int, *, speed: float = 1.0) -> None:
+        """`speed`: of the cell's clock, in seconds of it a second."""
+        self._console, self._frame_bytes, self._speed = console, frame_bytes, speed
         self._started_s = time.monotonic()
         self._printed_s = 0.0
         self._before = proven_before
+        self.newest: RunProgress | None = None
         self._bars: Progress | None = None
         self._view_bar: Any = None
         self._run_bar: Any = None
@@ -131,7 +135,6 @@ class RunObserver:
             BarColumn(bar_width=None),
             MofNCompleteColumn(),
             TextColumn("{task.fields[detail]}"),
-            TimeRemainingColumn(elapsed_when_finished=True),
         )
         with Progress(*columns, console=self._console, expand=True) as self._bars:
             self._run_bar = self._bars.add_task("frames", total=frames, completed=self._before, detail="")
@@ -140,11 +143,13 @@ class RunObserver:
         self._bars = None
 
     def progress(self, progress: RunProgress) -> None:
+        self.newest = progress
         elapsed_s = max(1e-6, time.monotonic() - self._started_s)
         rate = (progress.proven - self._before) / elapsed_s
-        detail = (
-            f"{rate:5.1f} frames/s  {rate * self._frame_bytes / 1e6:5.1f} MB/s  {progress.dose_lux_h:.3f} lux.h"
-        )
+        left = f"{duration_text(progress.left_s / self._speed)} left"
+        dose = f"{progress.dose_lux_h:.3f} lux.h"
+        rates = f"{rate:5.1f} frames/s  {rate * self._frame_bytes / 1e6:5.1f} MB/s  "
+        detail = f"{dose}, {left}" if self._console.width < _WIDE else f"{rates}{dose}, {left}"
         if self._bars is not None:
             self._bars.update(self._run_bar, completed=progress.proven, detail=detail)
             self._bars.update(
@@ -155,10 +160,9 @@ class RunObserver:
             )
         elif time.monotonic() - self._printed_s > _PLAIN_LINE_EVERY_S:
             self._printed_s = time.monotonic()
-            left_s = (progress.frames - progress.proven) / rate if rate > 0 else 0.0
             self._console.print(
                 f"view {progress.view} ({progress.view_number + 1}/{progress.views}) {progress.light}: "
-                f"{progress.proven}/{progress.frames} frames proven, {detail}, {duration_text(left_s)} left"
+                f"{progress.proven}/{progress.frames} frames proven, {rates}{dose}, {left}"
             )
 
     def note(self, message: str) -> None:
@@ -254,9 +258,10 @@ class LiveFigures:
         seen = shown.figures
         best = self._best[shown.title] = max(self._best.get(shown.title, 0.0), seen.sharpness)
         saturated = ", ".join(f"{name} {share:.2%}" for name, share in seen.saturated.items())
+        sharpness = f"sharpness {seen.sharpness / best:.0%} of the best" if best else "nothing but noise"
         line = (
             f"{shown.title}, {shown.exposure_us} us: brightest {seen.brightest:.0%}; saturated {saturated}; "
-            f"sharpness {seen.sharpness / best:.0%} of the best; {shown.frames_per_s:.1f} frames/s"
+            f"{sharpness}; {shown.frames_per_s:.1f} frames/s"
         )
         if self._live is not None:
             self._live.update("\n".join([line, *(_bars(name, bins) for name, bins in seen.histograms.items())]))

@@ -1,12 +1,10 @@
 """Measured materials of the MERL database, or files of its format: 90 x 90 x 180 values by half angle, difference
 angle and its azimuth (Matusik and others, A data-driven reflectance model, 2003).
-
-Their red, green and blue are taken as those of the simulated camera.
 """
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +12,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from coupole.appearance.matter.brdf import Brdf
-from coupole.appearance.matter.hemisphere import albedo
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
-from sim.scene.brdf_table import tabulate
-from sim.scene.surface import Material
 
 _STEPS = (90, 90, 180)
 _BYTES = 12 + 3 * 8 * 90 * 90 * 180
@@ -26,18 +21,9 @@ _SCALES = (1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0)
 """Of the database: a value is what is stored, times that of its colour."""
 
 
-@cache
-def merl_material(path: Path) -> Material:
-    """The file as a material of the simulated scene, its diffuse reflectance as in `specimens.specimen`. Raises
-    InputError for another kind of file."""
-    made = read_merl(path)
-    red, green, blue = np.clip(albedo(made, np.array([np.sqrt(0.5)]), nodes=24)[0], 1e-6, 1.0).tolist()
-    return Material(path.stem, (red, green, blue), table=tabulate(made, np.eye(3)))
-
-
 def read_merl(path: Path) -> Brdf:
     """[..., 3] per steradian, linear between the middles of steps. Below the horizon, where nothing is stored, the
-    last value above it holds."""
+    last value above it holds. Raises InputError for another kind of file."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -347,10 +347,16 @@ def _surface(mesh: MeshConfig, settings: Settings) -> Surface:
 
             material = specimen(given.specimen)
         case MeasuredConfig():
-            from sim.objects.merl_file import merl_material
-
-            material = merl_material(given.merl)
+            material = _measured(given)
         case MaterialConfig():
             material = Material(mesh.path.stem, given.diffuse, given.f0, given.roughness)
     surface = load_surface(mesh.path, mesh.unit, material, settings.detail)
     return settings.stickers.on(surface) if settings.stickers else surface
+
+
+def _measured(given: MeasuredConfig) -> Material:
+    from sim.objects.measured_files import alta_material, bsdf_material, merl_material
+
+    if given.merl is not None:
+        return merl_material(given.merl)
+    return bsdf_material(given.bsdf) if given.bsdf is not None else alta_material(given.alta_files)

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sim.devices import camera_server, kuka_controller, ledbox_firmware
 from sim.devices.arm_bodies import ToolBody
@@ -60,16 +60,25 @@ class SpecimenConfig(_Model):
 
 
 class MeasuredConfig(_Model):
-    """A measured material (`sim.objects.merl_file`)."""
+    """A measured material (`sim.objects.measured_files`): one of these."""
 
-    merl: Path
+    merl: Path | None = None
+    bsdf: Path | None = None
+    alta: Path | tuple[Path, Path, Path] | None = None
+    """One file, or those of red, green and blue."""
 
-    @field_validator("merl")
-    @classmethod
-    def _absolute(cls, path: Path) -> Path:
-        if not path.is_absolute():
+    @property
+    def alta_files(self) -> tuple[Path, ...]:
+        return (self.alta,) if isinstance(self.alta, Path) else self.alta or ()
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> MeasuredConfig:
+        given = [path for path in (self.merl, self.bsdf, *self.alta_files) if path is not None]
+        if sum(kind is not None for kind in (self.merl, self.bsdf, self.alta)) != 1:
+            raise ValueError("expected one of `merl`, `bsdf` and `alta`")
+        if not all(path.is_absolute() for path in given):
             raise ValueError("expected an absolute path, as the world does not know from where the rig was read")
-        return path
+        return self
 
 
 class MeshConfig(_Model):

@@ -93,6 +93,17 @@ def test_the_whole_plan_is_entered_first_and_noted_on_disk(job: Job, burst: Burs
     assert total(job) == pytest.approx(found.lux_h, abs=1e-8)
 
 
+def test_the_dose_moves_while_a_burst_is_under_way_and_ends_where_it_is_counted(job: Job, burst: Burst) -> None:
+    found = meter(job)
+    found.begin(burst)
+    on_the_way = [found.lux_h_after(steps) for steps in range(len(burst.table) + 1)]
+    assert found.lux_h == on_the_way[0] == 0.0
+    assert sorted(on_the_way) == on_the_way
+    assert len(set(on_the_way)) == len(lit(burst)) + 1
+    found.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    assert found.lux_h_after(3) == found.lux_h == pytest.approx(on_the_way[-1])
+
+
 def test_a_burst_that_ended_early_counts_its_log(job: Job, burst: Burst) -> None:
     found = meter(job)
     found.begin(burst)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from arms import KR10_R1100_SIXX
 from scipy.spatial.transform import Rotation
 from synthesis import Array, TrueLens, frame, looking_at_board
@@ -92,6 +93,7 @@ def test_poses_are_those_of_the_axes_with_their_zero_errors() -> None:
     assert np.linalg.norm(found[:, :3, 3] - reported(made.joints_deg)[:, :3, 3], axis=1).min() > 0.1
 
 
+@pytest.mark.full
 def test_intervals_hold_with_what_is_left_of_the_zero_errors(scale: Callable[[int, int], int]) -> None:
     scenes = scale(6, 100)
     normalised, off_mm = [], []

@@ -67,6 +67,7 @@ def test_stickers_that_fell_off_are_named(tmp_path: Path) -> None:
     assert any("were not found: T10" in remark for remark in result.record.remarks)
 
 
+@pytest.mark.full
 @pytest.mark.timeout(1200)  # 100 scenes of 8 photographs with --full
 def test_intervals_of_the_mesh_hold_from_photographs_on(scale: Callable[[int, int], int], tmp_path: Path) -> None:
     normalised = []

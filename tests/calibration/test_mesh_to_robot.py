@@ -136,6 +136,7 @@ def test_a_third_of_the_stickers_missing_and_as_many_false_change_no_match(seed:
     assert len(pose.missing) >= 9
 
 
+@pytest.mark.full
 def test_intervals_hold(scale: Callable[[int, int], int]) -> None:
     normalised = []
     for seed in range(scale(12, 100)):

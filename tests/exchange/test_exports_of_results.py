@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import struct
 from pathlib import Path
@@ -19,6 +20,8 @@ from checkers import gltf_messages, needs_checkers
 from lazily import lazily
 from relight_cases import BASE_FROM_SUPPORT, Coat, moved, unit, waves, write_result
 
+from coupole.exchange.of_results import adaptive_table
+from coupole.exchange.of_results.adaptive_table import encode_adaptive
 from coupole.exchange.of_results.bsdf import encode as encode_bsdf
 from coupole.exchange.of_results.material_tables import Material
 from coupole.exchange.of_results.merl import SCALES
@@ -195,20 +198,78 @@ def test_exr_has_what_each_pixel_of_a_view_shows(result: RunResult, tmp_path: Pa
     assert np.isnan(parts["kd"]["G"].pixels[~shown]).all()
 
 
-def test_mitsuba_makes_of_the_bsdf_what_it_was_made_from(tmp_path: Path) -> None:
-    path = tmp_path / "glossy.bsdf"
-    path.write_bytes(encode_bsdf(GLOSSY))
+def missed_by_mitsuba(path: Path, material: Material, ways_in: np.ndarray, ways_out: np.ndarray) -> np.ndarray:
+    """Median and 95 % of the relative error of its evaluation."""
     mitsuba.set_variant("scalar_rgb")
     bsdf = mitsuba.load_dict({"type": "measured", "filename": str(path)})
-    ways_in, ways_out = (directions(3000, 0.1, seed)[:2000] for seed in (1, 2))
     interaction, context = mitsuba.SurfaceInteraction3f(), mitsuba.BSDFContext()
     found = []
     for way_in, way_out in zip(ways_in, ways_out, strict=True):
         interaction.wi = mitsuba.Vector3f(*way_in)
         found.append(np.array(bsdf.eval(context, interaction, mitsuba.Vector3f(*way_out))))
-    off = np.abs(np.array(found) / (walter(ways_in, ways_out, GLOSSY) * ways_out[:, 2:]) - 1.0)
-    assert np.median(off) < 1e-4
-    assert np.quantile(off, 0.95) < 1e-3
+    off = np.abs(np.array(found) / (walter(ways_in, ways_out, material) * ways_out[:, 2:]) - 1.0)
+    missed: np.ndarray = np.quantile(off, [0.5, 0.95])
+    return missed
+
+
+def spread_of_drawn_light(path: Path) -> float:
+    """Of what Mitsuba's samples of a direction weigh, its noise: standard deviation over mean."""
+    bsdf = mitsuba.load_dict({"type": "measured", "filename": str(path)})
+    interaction, context = mitsuba.SurfaceInteraction3f(), mitsuba.BSDFContext()
+    interaction.wi = mitsuba.Vector3f(np.sin(1.0), 0.0, np.cos(1.0))
+    numbers = np.random.default_rng(1).uniform(size=(500, 3)).tolist()
+    drawn = [bsdf.sample(context, interaction, n, mitsuba.Point2f(a, b))[1][1] for n, a, b in numbers]
+    return float(np.std(drawn) / np.mean(drawn))
+
+
+def test_mitsuba_makes_of_the_bsdf_what_it_was_made_from(tmp_path: Path) -> None:
+    path = tmp_path / "glossy.bsdf"
+    path.write_bytes(encode_bsdf(GLOSSY))
+    ways_in, ways_out = (directions(3000, 0.1, seed)[:2000] for seed in (1, 2))
+    assert (missed_by_mitsuba(path, GLOSSY, ways_in, ways_out) < [1e-4, 1e-3]).all()
+    assert spread_of_drawn_light(path) < 0.1
+
+
+def test_an_adaptive_bsdf_misses_what_it_says_and_is_small(tmp_path: Path) -> None:
+    """A narrow lobe, of all directions and of those in it, against one eighth of the plain table's bytes."""
+    narrow = Material("narrow", GLOSSY.kd, GLOSSY.ks, 0.05)
+    path, plain = tmp_path / "narrow.bsdf", tmp_path / "plain.bsdf"
+    path.write_bytes(encode_adaptive(narrow, 0.003))
+    plain.write_bytes(encode_bsdf(narrow))
+    assert len(path.read_bytes()) < len(plain.read_bytes()) / 8
+    ways_in, ways_out = (directions(3000, 0.1, seed)[:1500] for seed in (8, 9))
+    random = np.random.default_rng(10)
+    share, phi = random.uniform(size=1500), random.uniform(0.0, 2.0 * np.pi, 1500)
+    tilt = narrow.alpha * np.sqrt(share / (1.0 - share))
+    half = unit(np.stack([tilt * np.cos(phi), tilt * np.sin(phi), np.ones(1500)], axis=1))
+    mirrored = 2.0 * np.sum(ways_in * half, axis=1, keepdims=True) * half - ways_in
+    high = mirrored[:, 2] > 0.1
+    of_all = missed_by_mitsuba(path, narrow, ways_in, ways_out)
+    of_lobe = missed_by_mitsuba(path, narrow, ways_in[high], mirrored[high])
+    assert (of_all < [7e-4, 3.2e-3]).all()
+    assert (of_lobe < [7e-4, 3.2e-3]).all()
+    assert spread_of_drawn_light(path) < 0.1
+    told = re.search(
+        rb"by (\S+) in the median and (\S+) at 95 % of all directions, by (\S+) and (\S+)", path.read_bytes()
+    )
+    assert told is not None
+    np.testing.assert_allclose([float(one) for one in told.groups()], [*of_all, *of_lobe], rtol=0.2)
+
+
+def test_an_adaptive_bsdf_that_cannot_be_is_refused(
+    result: RunResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    triangle = ("--triangle", str(result.triangles[0]))
+    (path,) = exported(result, "bsdf", tmp_path / "rough", *triangle, "--adaptive", "0.01")
+    assert len(path.read_bytes()) < 1e6
+    monkeypatch.setattr(adaptive_table, "THETAS", (16, 24))
+    monkeypatch.setattr(adaptive_table, "SIDES", (24, 32))
+    asked = ("export", result.folder, "--to", "bsdf", *triangle, "--adaptive", "0.001", "--out", tmp_path / "fine")
+    ended = cells.here(*asked)
+    assert ended.code == 2
+    assert re.search(
+        r"--adaptive 0.001: triangle\d+: a table of 0 MB misses its fit by", " ".join(ended.err.split())
+    )
 
 
 def test_a_merl_table_is_read_as_its_reader_does() -> None:
@@ -249,6 +310,7 @@ def test_a_merl_table_is_read_as_its_reader_does() -> None:
         (("--to", "ply", "--views", "top"), "--views: is for the frames of a run"),
         (("--to", "ply", "--linear"), "--linear: is for frames of a run as dng or tiff"),
         (("--to", "gltf", "--refined", "there"), "--refined: is for --to colmap"),
+        (("--to", "ply", "--adaptive", "0.01"), "--adaptive: is for --to bsdf; found --to ply"),
         (("--to", "exr", "--licence", "CC BY 4.0"), "--licence: is for --to rocrate"),
         (("--to", "rocrate", "--author", "A. Person"), "--licence: RO-Crate demands one"),
         (("--to", "rocrate", "--licence", "CC0"), "--author: expected at least one"),

@@ -14,7 +14,7 @@ from failing_calls import KINDS, Failure, acquire, cell_in, count_calls, run_cas
 
 from coupole.acquisition.recorder import RunRecorder
 
-CASES = 4
+CASES = 2
 
 
 @pytest.mark.timeout(600)

@@ -22,7 +22,11 @@ from sim.world.client import World
 
 ROBOT_FAULTS = pytest.mark.parametrize(
     "fault",
-    [{"kind": "emergency_stop"}, {"kind": "late_rsi"}, {"kind": "rsi_link_loss", "seconds": 60.0}],
+    [
+        {"kind": "emergency_stop"},
+        pytest.param({"kind": "late_rsi"}, marks=pytest.mark.full),
+        {"kind": "rsi_link_loss", "seconds": 60.0},
+    ],
     ids=lambda fault: str(fault["kind"]),
 )
 

@@ -75,6 +75,7 @@ def test_a_disk_that_stands_still_for_ten_seconds_in_a_burst_loses_nothing(
     assert_whole(cell)
 
 
+@pytest.mark.full
 @needs_compiler
 @needs_aravis
 def test_what_a_camera_on_the_network_lost_while_the_disk_stood_still_is_taken_again(
@@ -90,6 +91,7 @@ def test_what_a_camera_on_the_network_lost_while_the_disk_stood_still_is_taken_a
     assert_whole(cell)
 
 
+@pytest.mark.full
 def test_a_controller_that_stands_still_for_ten_seconds_in_a_burst_is_told_of_and_can_go_on(
     cell: CellFolder,
 ) -> None:

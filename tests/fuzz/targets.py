@@ -2,8 +2,8 @@
 
 To add a kind, add a line to `TARGETS`. `seeds` gives real files as bytes; `read` gets the path of a mutated one
 (named as `file` says, in a folder that holds a copy of `configs/`) and returns, or raises an error of
-`coupole.errors` whose message names the file. What a run keeps is in `fuzz.kept`, lights are in `fuzz.lit`, wires
-in `fuzz.wires`.
+`coupole.errors` whose message names the file. What a run keeps is in `fuzz.kept`, what other programs write in
+`fuzz.foreign`, lights are in `fuzz.lit`, wires in `fuzz.wires`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+from fuzz.foreign import FOREIGN
 from fuzz.kept import KEPT
 from fuzz.lit import LIT
 from fuzz.target import Target
@@ -124,6 +125,7 @@ TARGETS = (
     Target("mesh-stl", "objects/case.stl", mesh("stl"), check_mesh),
     Target("mesh-stl-ascii", "objects/case.stl", mesh("stl", encoding="ascii"), check_mesh),
     Target("mesh-obj", "objects/case.obj", mesh("obj"), check_mesh),
+    *FOREIGN,
     *LIT,
     *KEPT,
     *WIRES,

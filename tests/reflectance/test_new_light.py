@@ -104,6 +104,7 @@ def test_a_sensor_without_filter_has_the_green_of_all_lights(tmp_path: Path) -> 
         np.testing.assert_allclose(found[..., 0], wanted[..., 1], rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.full
 def test_beams_alone_show_an_area_that_is_smaller_than_the_lobe(tmp_path: Path) -> None:
     """No rays are drawn for it: 256 beams against 2304."""
     scene = scene_of_view(write_result(tmp_path / "result", sheet(np.zeros((20, 20)), 60.0), GLOSSY))

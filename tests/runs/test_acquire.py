@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
 import pty
+import termios
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,6 +179,8 @@ def test_without_a_terminal_the_run_is_told_in_plain_lines(cell: CellFolder) -> 
 
 
 def test_on_a_terminal_there_are_bars_with_view_and_rates(cell: CellFolder) -> None:
+    """The key p, pressed twice, pauses and goes on."""
+    cell.write(lights={"kind": "every", "every": 4})
     terminal, terminal_end = pty.openpty()
     shown = bytearray()
 
@@ -190,13 +194,23 @@ def test_on_a_terminal_there_are_bars_with_view_and_rates(cell: CellFolder) -> N
     watcher = threading.Thread(target=watch)
     watcher.start()
     environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "140", "LINES": "40"}
-    process = cells.start("acquire", cell.plan, stdin=terminal_end, stderr=terminal_end, env=environment)
+    modes = termios.tcgetattr(terminal_end)
+    process = cells.start(
+        "acquire", cell.plan, stdin=terminal_end, stderr=terminal_end, env=environment,
+        start_new_session=True, preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )  # fmt: skip
+    cells.wait_until(lambda: b"keys: p pauses" in shown, "the keys")
+    os.write(terminal, b"p")
+    cells.wait_until(lambda: cells.events(cell.run_folder, "pause"), "the pause")
+    os.write(terminal, b"p")
+    cells.wait_until(lambda: cells.events(cell.run_folder, "stop"), "the end")
+    cells.wait_until(lambda: termios.tcgetattr(terminal_end) == modes, "the terminal as it was")
     os.close(terminal_end)
     ended = cells.finish(process)
     watcher.join()
     os.close(terminal)
     assert ended.code == 0
-    for words in ("\x1b[", "view top", "frames/s", "MB/s", "lux.h", "66/66"):
+    for words in ("\x1b[", "view top", "frames/s", "MB/s", "lux.h", " left", "continued", "282/282"):
         assert words in shown.decode()
 
 

@@ -109,6 +109,7 @@ def test_exporting_twice_to_one_folder_ends_with_two(tmp_path: Path) -> None:
 # -- kill -9 ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_archiving_killed_again_and_again_loses_nothing_and_is_gone_on_with(
     tmp_path: Path, scale: Callable[[int, int], int]
 ) -> None:

@@ -33,6 +33,7 @@ def board_views(count: int) -> list[dict[str, Any]]:
     ]
 
 
+@pytest.mark.full
 @pytest.mark.timeout(900)
 def test_the_hand_eye_of_the_simulated_cell_is_found_within_its_interval(
     tmp_path: Path, scale: Callable[[int, int], int]

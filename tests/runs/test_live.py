@@ -212,7 +212,9 @@ def test_a_camera_that_is_unplugged_ends_the_live_view_with_four(cell: CellFolde
     assert "camera: expected" in ended.err
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 129, marks=pytest.mark.full)]
+)
 def test_a_live_view_that_is_ended_by_a_signal_ends_with_its_code(
     cell: CellFolder, number: signal.Signals, code: int
 ) -> None:

@@ -33,8 +33,8 @@ def eki(cell: CellFolder) -> CellFolder:
     [
         "sim",
         pytest.param("sim-gige", marks=needs_aravis),
-        "sim-eki",
-        pytest.param("sim-ur", marks=needs_ur_rtde),
+        pytest.param("sim-eki", marks=pytest.mark.full),
+        pytest.param("sim-ur", marks=(needs_ur_rtde, pytest.mark.full)),
         pytest.param("sim-ur5e", marks=needs_ur_rtde),
     ],
 )

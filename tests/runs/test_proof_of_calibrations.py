@@ -33,6 +33,7 @@ def proof(tmp_path_factory: pytest.TempPathFactory, scale: Callable[[int, int], 
     return [json.loads(line) for line in ended.stdout.splitlines()]
 
 
+@pytest.mark.full
 @pytest.mark.timeout(9000)  # 100 cells with --full
 def test_stated_intervals_hold_the_truth(proof: list[dict[str, Any]], scale: Callable[[int, int], int]) -> None:
     """A hundred cells tell whether 95 % hold; one tells an interval that is wrong altogether."""
@@ -53,6 +54,7 @@ def test_stated_intervals_hold_the_truth(proof: list[dict[str, Any]], scale: Cal
         assert line["rms_over_u"] < scale(4, 2), line
 
 
+@pytest.mark.full
 def test_camera_leds_and_mesh_are_near_the_truth(proof: list[dict[str, Any]]) -> None:
     """An eighth of the real camera's resolution allows for twice the distances that the real one must meet."""
     far = {line["name"]: line["median"] for line in proof if "median" in line}
@@ -83,6 +85,7 @@ def test_cells_that_were_kept_are_not_done_again(tmp_path: Path) -> None:
     assert second == {"name": "camera_mm", "median": 0.03, "percent_95": 0.03}
 
 
+@pytest.mark.full
 def test_intervals_that_are_not_true_are_a_failure(tmp_path: Path) -> None:
     normal = np.random.default_rng(1).normal(0.0, 0.1, 100)
     assert judge(tmp_path, normal.tolist()).returncode == 0

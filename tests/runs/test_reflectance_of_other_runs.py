@@ -34,6 +34,7 @@ def test_brackets_are_merged(tmp_path: Path) -> None:
     assert 0.9 < np.mean(np.abs(z) < 1.96) < 0.99
 
 
+@pytest.mark.full
 def test_light_from_fold_to_fold_is_taken_off(tmp_path: Path) -> None:
     """Of a white stone whose folds light each other, in a cell that is simulated with that light."""
     white = (0.8, 0.6, 0.3)
@@ -96,6 +97,7 @@ def drift_of(cell: CellFolder, without: str = "") -> cells.Ended:
     return cells.here("calibrate", "drift", cell.run_folder, *words)
 
 
+@pytest.mark.full
 def test_leds_that_are_old_and_warm_are_corrected_by_the_runs_own_drift(aged: CellFolder, tmp_path: Path) -> None:
     """Without its record only the usual loss of light with warmth is known."""
     assert (ended := drift_of(aged)).code == 0, ended.err
@@ -117,6 +119,7 @@ def test_leds_that_are_old_and_warm_are_corrected_by_the_runs_own_drift(aged: Ce
     np.testing.assert_allclose(u_shared["with"] ** 2 - u_shared["without"] ** 2, u_drift**2, rtol=1e-6)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["flat-field", "response"])
 def test_frames_are_not_read_otherwise_than_those_that_powers_come_from(
     aged: CellFolder, tmp_path: Path, kind: str

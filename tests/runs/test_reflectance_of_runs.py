@@ -25,6 +25,7 @@ from relief_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, SIDE, shipped_cell, un
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
+from coupole.appearance.matter.alta_samples import read_alta
 from coupole.calibration.light.frames import open_light_frames
 from coupole.kinematics import forward
 from coupole.reflectance import ggx
@@ -591,6 +592,10 @@ def test_samples_are_exported_with_bounds_that_hold_the_truth(made: Made, tmp_pa
         truth = walter(np.array([[0.0, 0.0, 1.0]]), light, view)[:, 1]
         inside += ((low < truth) & (truth < high)).tolist()
         assert np.median(f / truth) == pytest.approx(1.0, abs=0.03)
+        back = read_alta(path)
+        np.testing.assert_allclose(back.directions(), [light, view], atol=1e-12)
+        np.testing.assert_array_equal([back.values[:, 0], back.low[:, 0]], [f, low])
+        np.testing.assert_array_equal(back.high[:, 0], np.where(high > 3e38, np.inf, high))
     assert len(inside) > 300
     assert np.mean(inside) > 0.9
 
@@ -681,6 +686,7 @@ def test_colmap_projects_the_mesh_where_the_records_do(made: Made, tmp_path: Pat
     model.update_point_3d_errors()
     assert len(model.points3D) > 1000
     assert max(point.error for point in model.points3D.values()) < 1e-4
+    assert {point.track.length() for point in model.points3D.values()} == {2}
     record = YAML(typ="safe").load(RECORDS / "hand-eye.yaml")
     lens = {one["name"].removesuffix("_px"): one["value"] for one in record["parameters"]}
     hand_eye = record["transforms"]["flange_from_camera"]
@@ -709,6 +715,35 @@ def test_colmap_projects_the_mesh_where_the_records_do(made: Made, tmp_path: Pat
         assert picture.shape == (384, 512, 3)
     red, green, blue = np.mean([point.color for point in model.points3D.values()], axis=0)
     assert red > green > blue  # as the relief is
+
+
+def test_colmaps_poses_are_what_samples_are_made_with(made: Made, tmp_path: Path) -> None:
+    """One view, moved by a tenth of a millimetre in COLMAP's file."""
+    cell, out, _ = made
+    given = ("--calibrations", RECORDS, "--out")
+    assert cells.here("export", cell.run_folder, "--to", "colmap", *given, tmp_path / "model").code == 0
+    images = tmp_path / "model/sparse/0/images.txt"
+    lines = images.read_text().splitlines()
+    (number,) = (number for number, line in enumerate(lines) if line.endswith(" top.png"))
+    words = lines[number].split()
+    words[7] = f"{float(words[7]) + 0.1:.12g}"
+    lines[number] = " ".join(words)
+    images.write_text("\n".join(lines) + "\n")
+    asked = ("reflectance", "extract", cell.run_folder, *given, tmp_path / "result", "--poses", tmp_path / "model")
+    ended = cells.here(*asked)
+    assert ended.code == 0, ended.err
+    told = json.loads((tmp_path / "result/settings.json").read_text())["poses"]
+    assert told["median_moved_mm"] == pytest.approx(0.05, abs=1e-4)
+    for view, moved_mm in (("top", 0.1), ("side", 0.0)):
+        with (
+            h5py.File(out / f"samples/{view}.h5") as before,
+            h5py.File(tmp_path / f"result/samples/{view}.h5") as file,
+        ):
+            shift_mm = np.linalg.norm(file["camera_mm"][()] - before["camera_mm"][()])
+        assert shift_mm == pytest.approx(moved_mm, abs=1e-4)
+    ended = cells.here(*asked, "--refined", tmp_path)
+    assert ended.code == 2
+    assert "--poses: expected one run, and no --refined" in " ".join(ended.err.split())
 
 
 def test_a_frame_becomes_a_picture_for_the_eye(made: Made, tmp_path: Path) -> None:

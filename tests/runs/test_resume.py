@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import time
@@ -216,13 +215,17 @@ def test_a_folder_that_is_no_run_is_not_resumed(cell: CellFolder) -> None:
 
 def test_a_complete_run_is_resumed_at_once_and_shoots_nothing(cell: CellFolder) -> None:
     cell.write(lights={"kind": "ids", "ids": [3, 4]})
-    assert cell.acquire().code == 0
+    first = cell.acquire()
+    assert first.code == 0
     run = cell.run_folder
     before = cells.events(run)
     ended = cell.acquire("--resume", run)
     assert ended.code == 0
     assert (ended.document["proven"], ended.document["missing"]) == (2, 0)
-    assert [event["event"] for event in cells.events(run)[len(before) :]] == ["resume", "stop"]
+    assert ended.document["dose_lux_h"] == pytest.approx(first.document["dose_lux_h"], rel=1e-6)
+    assert "opening the devices" not in cells.command("acquire", "--resume", run).err
+    assert [event["event"] for event in cells.events(run)[len(before) :]] == ["resume", "stop"] * 2
+    assert cells.here("verify", run).code == 0
     cells.assert_each_shot_proven_once(run)
 
 
@@ -239,7 +242,10 @@ def standing(tmp_path: Path) -> Iterator[tuple[CellFolder, World]]:
         yield cell, world
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 129, marks=pytest.mark.full)],
+)
 def test_a_stopped_run_ends_with_its_signal_leaves_the_cell_safe_and_is_resumed(
     standing: tuple[CellFolder, World], number: signal.Signals, code: int
 ) -> None:
@@ -368,8 +374,34 @@ def test_a_paused_run_can_be_stopped(standing: tuple[CellFolder, World]) -> None
     process = cell.start_acquire()
     run = cell.run_folder
     cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
-    os.kill(process.pid, signal.SIGUSR1)
-    cells.wait_until(lambda: cells.events(run, "pause"), "the pause")
-    os.kill(process.pid, signal.SIGINT)
-    assert cells.finish(process).code == 130
+    paused = cells.here("pause", run, "--json")
+    assert (paused.code, paused.document["state"], paused.document["pid"]) == (0, "paused", process.pid)
+    assert cells.events(run, "pause")
     assert cells.safe(world)
+    stopped = cells.here("stop", run, "--json")
+    assert (stopped.code, stopped.document["state"]) == (0, "interrupted"), stopped.err
+    assert cells.safe(world)
+    assert cells.finish(process).code == 130
+    ended = cells.here("go-on", run)
+    assert ended.code == 2
+    assert "no process of this user acquires into this run" in ended.err
+
+
+def test_a_run_is_followed_from_another_terminal_and_stopped_in_a_burst(
+    standing: tuple[CellFolder, World],
+) -> None:
+    cell, world = standing
+    cell.write(lights=cells.SOME_LIGHTS, repeats=4)
+    process = cell.start_acquire()
+    run = cell.run_folder
+    follower = cells.start("status", run, "--follow")
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    stopped = cells.here("stop", run)
+    assert stopped.code == 0, stopped.err
+    assert "lights are off, the arm is at rest, the camera is disarmed" in stopped.err
+    assert cells.safe(world)
+    assert cells.finish(process).code == 130
+    seen = cells.finish(follower)
+    assert seen.code == 0
+    assert "interrupted: " in seen.err
+    assert f"--resume {run}" in " ".join(seen.err.split())

@@ -40,6 +40,7 @@ def test_sixty_runs_in_one_world_leave_no_memory_files_or_threads_behind(cell: C
     assert memory[-1] - memory[0] < 100e6
 
 
+@pytest.mark.full
 def test_thousands_of_rehearsed_shots_with_faults_are_labelled_truly_and_none_is_lost(tmp_path: Path) -> None:
     with soak(tmp_path, seed=3, faults_per_shot=2e-3, speed=30.0) as soaking:
         found = soaking.rehearse(0)

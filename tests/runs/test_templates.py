@@ -21,6 +21,23 @@ def test_a_new_plan_passes_preflight(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert ended.document["paths_checked"]
 
 
+def test_a_plan_made_anywhere_finds_the_simulated_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cells.here("plan", "new", "mine").code == 0
+    assert cells.here("check", tmp_path / "mine.yaml", "--no-paths").code == 0
+
+
+@pytest.mark.parametrize("name", ["my bunny", "../mine", "", "-x/y", "n" * 65])
+def test_a_name_that_no_plan_may_have_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = cells.here("plan", "new", "--", name)
+    assert ended.code == 2
+    assert "expected a name of letters, digits" in ended.err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_plan_with_the_name_of_a_template_is_made_from_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

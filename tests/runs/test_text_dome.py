@@ -172,7 +172,7 @@ def test_without_its_last_mark_a_burst_is_not_proven(tmp_path: Path) -> None:
     assert [event["reason"] for event in cells.events(cell.run_folder, "gap")] == ["a dark mark was not seen"]
 
 
-@pytest.mark.parametrize("fault", ["mute_box", "cut_wire"])
+@pytest.mark.parametrize("fault", ["mute_box", pytest.param("cut_wire", marks=pytest.mark.full)])
 def test_a_box_that_is_lost_ends_the_run_with_four_and_names_it(cell: CellFolder, fault: str) -> None:
     cell.join()
     with cell.world() as world:

@@ -26,7 +26,12 @@ def tools(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    ("arm", "plans"), [("kr10", 10), pytest.param("ur5e", 20, marks=pytest.mark.full), ("ur10e", 10)]
+    ("arm", "plans"),
+    [
+        ("kr10", 10),
+        pytest.param("ur5e", 20, marks=pytest.mark.full),
+        pytest.param("ur10e", 10, marks=pytest.mark.full),
+    ],
 )
 def test_random_plans_that_pass_touch_nothing(arm: str, plans: int, scale: Callable[[int, int], int]) -> None:
     """Of fewer plans than these, too few pass to say anything."""

@@ -16,20 +16,23 @@ from coupole.storage.durable import write_synced
 
 _QUANTILE = 1.959964
 """Of 95 %."""
+_OPEN = float(np.finfo(np.float32).max)
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     """`triangleN_red.alta` and so on (`_grey` of a sensor without filter): theta_l, theta_v cos dphi, theta_v sin
-    dphi (rad, about the mesh's normal), f (1/sr), its lower and upper bound at 95 %; an open upper bound is the
-    largest that float32 can hold."""
+    dphi (rad, about the mesh's normal), f (1/sr), its lower and upper bound at 95 %; an open bound is the
+    largest number that float32 can hold."""
     paths = []
     for triangle in chosen_triangles(surface):
         samples = samples_of(surface, int(triangle), _QUANTILE)
         angles = _angles(samples)
         for number, channel in enumerate(channels_of(surface)):
             f = samples.f[:, number]
-            most = np.minimum(f * samples.high[:, number], np.finfo(np.float32).max)
-            lines = np.column_stack([angles, f, f * samples.low[:, number], most])[np.isfinite(f)]
+            with np.errstate(invalid="ignore"):  # 0 with an open bound
+                bounds = f[:, None] * np.stack([samples.low[:, number], samples.high[:, number]], axis=1)
+            bounds = np.sort(np.clip(np.nan_to_num(bounds, nan=_OPEN), -_OPEN, _OPEN), axis=1)
+            lines = np.column_stack([angles, f, bounds])[np.isfinite(f)]
             head = [
                 f'#SAMPLE "triangle {triangle}, {channel}"',
                 f'#ORIGIN "{surface.remark}"',

@@ -1,5 +1,6 @@
 """RGL's tensor format (Dupuy and Jakob, An adaptive parameterization for efficient material acquisition and
-rendering, 2018), as a plain table: the fields by which a measured table adapts to its material are constant."""
+rendering, 2018), as a plain table: the fields by which a measured table adapts to its material are constant.
+`adaptive_table` has one that adapts."""
 
 from __future__ import annotations
 
@@ -16,15 +17,22 @@ THETAS, SIDE = 64, 128
 """Angles of incidence; rows and columns of half vectors at each."""
 _NDF = 4.0
 """Over 4 sigma it is 1."""
+_LEAST_DRAWN = 1e-3
+"""Of the mean density: nothing that reflects is never drawn."""
 _TYPES = {"uint8": 1, "float32": 10}
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
-    """`NAME.bsdf` for each material, some 13 MB."""
+    """`NAME.bsdf` for each material: some 17 MB, or what `surface.most_error` needs."""
+    from coupole.exchange.of_results.adaptive_table import encode_adaptive
+
     paths = []
     for material in materials_of(surface):
         paths.append(folder / f"{material.name}.bsdf")
-        write_synced(paths[-1], encode(material, surface.remark))
+        if surface.most_error is None:
+            write_synced(paths[-1], encode(material, surface.remark))
+        else:
+            write_synced(paths[-1], encode_adaptive(material, surface.most_error, surface.remark))
     return paths
 
 
@@ -32,50 +40,86 @@ def encode(material: Material, told: str = "") -> bytes:
     """f cos(theta_o) for isotropic incidence at `THETAS` angles; half vectors at azimuth (2 u - 1) pi by rows, and
     elevation pi/2 v^2 by columns."""
     theta_i = np.linspace(0.0, 0.5 * np.pi, THETAS, dtype=np.float32)
-    steps = np.linspace(0.0, 1.0, SIDE)
+    values = cosine_weighted(material, theta_i, half_vectors(SIDE))
+    rgb = nodes_for_linear_reading(values, theta_i)
+    return tensors(fields_of(theta_i, rgb, drawn_by(values, theta_i), f"{material.name}; {told}"))
+
+
+def half_vectors(side: int) -> NDArray[np.float64]:
+    """[side, side, 3] unit vectors of the rows and columns."""
+    steps = np.linspace(0.0, 1.0, side)
     phi_m, theta_m = np.meshgrid((2.0 * steps - 1.0) * np.pi, 0.5 * np.pi * steps**2, indexing="ij")
     sine = np.sin(theta_m)
-    half = np.stack([sine * np.cos(phi_m), sine * np.sin(phi_m), np.cos(theta_m)], axis=-1).reshape(-1, 3)
-    rgb = np.zeros((1, THETAS, 3, SIDE, SIDE), np.float32)
+    return np.stack([sine * np.cos(phi_m), sine * np.sin(phi_m), np.cos(theta_m)], axis=-1)
+
+
+def way_in(theta_i: float) -> NDArray[np.float64]:
+    """[3] at azimuth 0, and above the horizon."""
+    return np.array([np.sin(theta_i), 0.0, max(np.cos(theta_i), 1e-6)])
+
+
+def cosine_weighted(
+    material: Material, theta_i: NDArray[np.float32], half: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """[1, theta_i, 3, rows, columns] f cos(theta_o) of half vectors [rows, columns, 3], 0 below the horizon."""
+    found = np.zeros((1, len(theta_i), 3, *half.shape[:2]), np.float32)
+    ways = half.reshape(-1, 3)
     for number, theta in enumerate(theta_i.astype(np.float64)):
-        way_in = np.array([np.sin(theta), 0.0, max(np.cos(theta), 1e-6)])
-        ways_out = 2.0 * (half @ way_in)[:, None] * half - way_in
-        values = material.reflectance(np.broadcast_to(way_in, half.shape), ways_out) * ways_out[:, 2:]
-        rgb[0, number] = np.maximum(values, 0.0).T.reshape(3, SIDE, SIDE)
-    rgb = nodes_for_linear_reading(rgb)
-    text = f"{material.name}; {told}".encode()
-    return tensors(
-        {
-            "theta_i": theta_i,
-            "phi_i": np.zeros(1, np.float32),
-            "ndf": np.full((2, 2), _NDF, np.float32),
-            "sigma": np.ones((2, 2), np.float32),
-            "vndf": np.ones((1, THETAS, 2, 2), np.float32),
-            "luminance": rgb.mean(axis=2),
-            "rgb": rgb,
-            "description": np.frombuffer(text, np.uint8),
-            "jacobian": np.ones(1, np.uint8),
-        }
-    )
+        light = way_in(theta)
+        ways_out = 2.0 * (ways @ light)[:, None] * ways - light
+        values = material.reflectance(np.broadcast_to(light, ways.shape), ways_out) * ways_out[:, 2:]
+        found[0, number] = np.maximum(values, 0.0).T.reshape(3, *half.shape[:2])
+    return found
 
 
-def nodes_for_linear_reading(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def nodes_for_linear_reading(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArray[np.float32]:
     """Nodes [1, theta_i, channels, phi, theta_m] whose linear interpolation misses least, of values there.
 
     Between values h apart it misses f by f'' h^2 t (1 - t) / 2, in the mean by f'' h^2 / 12, on each axis: that
-    much is taken from the nodes, but not where f ends at the horizon.
+    much is taken from the nodes, of h before and after them, but not where f ends at the horizon.
     """
     found = values.copy()
-    for axis, periodic in ((1, False), (3, True), (4, False)):
+    even = np.linspace(0.0, 1.0, values.shape[3])
+    for axis, places in ((1, theta_i.astype(np.float64)), (3, even), (4, np.linspace(0.0, 1.0, values.shape[4]))):
         along, nodes = np.moveaxis(values, axis, 0), np.moveaxis(found, axis, 0)
+        before, after = (step.reshape(-1, 1, 1, 1, 1) for step in (np.diff(places)[:-1], np.diff(places)[1:]))
         whole = along > 0.0
         inner = whole[2:] & whole[1:-1] & whole[:-2]
-        nodes[1:-1] -= np.where(inner, along[2:] - 2.0 * along[1:-1] + along[:-2], 0.0) / 12.0
-        if periodic:
+        second = 2.0 * ((along[2:] - along[1:-1]) / after - (along[1:-1] - along[:-2]) / before) / (before + after)
+        nodes[1:-1] -= np.where(inner, second * (before**2 + after**2) / 24.0, 0.0)
+        if axis == 3:  # azimuth, whose first node is the last
             bend = np.where(whole[1] & whole[0] & whole[-2], along[1] - 2.0 * along[0] + along[-2], 0.0) / 12.0
             nodes[0] -= bend
             nodes[-1] -= bend
     return np.maximum(found, 0.0)
+
+
+def drawn_by(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[1, theta_i, rows, columns] `luminance`, by which renderers draw directions: the light that a step of rows
+    and columns reflects, of `values` f cos(theta_o). Its ways out take a solid angle as (wi m) u sin(theta_m)."""
+    half = half_vectors(values.shape[-1])
+    u = np.linspace(0.0, 1.0, values.shape[-1])
+    lights = np.stack([way_in(float(theta)) for theta in theta_i])
+    solid_angle = np.maximum(half @ lights.T, 0.0) * (u * np.sin(0.5 * np.pi * u**2))[None, :, None]
+    found = values.mean(axis=2) * np.moveaxis(solid_angle, -1, 0)[None]
+    return np.asarray(found + _LEAST_DRAWN * found.mean(axis=(2, 3), keepdims=True) + 1e-12, np.float32)
+
+
+def fields_of(
+    theta_i: NDArray[np.float32], rgb: NDArray[np.float32], luminance: NDArray[np.float32], text: str
+) -> dict[str, NDArray[np.float32] | NDArray[np.uint8]]:
+    """Of an isotropic file whose half vectors are not warped, and whose values are not divided by anything."""
+    return {
+        "theta_i": theta_i,
+        "phi_i": np.zeros(1, np.float32),
+        "ndf": np.full((2, 2), _NDF, np.float32),
+        "sigma": np.ones((2, 2), np.float32),
+        "vndf": np.ones((1, len(theta_i), 2, 2), np.float32),
+        "luminance": luminance,
+        "rgb": rgb,
+        "description": np.frombuffer(text.encode(), np.uint8),
+        "jacobian": np.ones(1, np.uint8),
+    }
 
 
 def tensors(fields: dict[str, NDArray[np.float32] | NDArray[np.uint8]]) -> bytes:

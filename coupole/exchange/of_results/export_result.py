@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 
 from coupole.errors import InputError
@@ -20,9 +21,10 @@ def export_result(
     *,
     fit: str | None = None,
     triangles: tuple[int, ...] = (),
+    most_error: float | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write a result in another format into `folder`; the files.
+    """Write a result in another format into `folder`; the files. `most_error` asks tables of `bsdf` to adapt.
 
     Raises InputError for a format that there is none of, a folder that has files (unless `overwrite`), a result
     without the fit; DiskFull or StorageError.
@@ -31,7 +33,7 @@ def export_result(
         raise InputError(f"--to: expected one of {', '.join(FORMATS)} for a result; found {to}")
     if triangles and to not in OF_MATERIALS:
         raise InputError(f"--triangle: is for {', '.join(OF_MATERIALS)}; {to} has all triangles")
-    surface = read_surface(result, fit, triangles)
+    surface = replace(read_surface(result, fit, triangles), most_error=most_error)
     if not overwrite and folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: has files already. Choose another --out, or give --overwrite")
     with writing_into(folder):

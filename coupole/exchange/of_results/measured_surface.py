@@ -48,6 +48,8 @@ class MeasuredSurface:
     `u_normal` rad."""
     chosen: tuple[int, ...] = ()
     """Triangles that are asked for by name."""
+    most_error: float | None = None
+    """Relative, of tables that adapt to their material; None: plain ones."""
 
     @cached_property
     def known(self) -> NDArray[np.bool_]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from coupole.appearance.matter.hemisphere import albedo
 from coupole.appearance.spectra import light
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.errors import InputError
+from coupole.exchange.of_results.bsdf import encode as encode_bsdf
+from coupole.exchange.of_results.bsdf import tensors
 from coupole.exchange.of_results.material_tables import Material as ExportedMaterial
 from coupole.exchange.of_results.merl import encode as encode_merl
-from sim.objects.merl_file import merl_material, read_merl
+from sim.objects.measured_files import alta_material, bsdf_material, merl_material
+from sim.objects.merl_file import read_merl
 from sim.objects.specimens import SPECIMENS, specimen
 from sim.optics.led_light import LedModel, camera_weights
 from sim.render.camera_view import Viewer
@@ -25,11 +29,13 @@ from sim.render.emitter import irradiance, square
 from sim.render.lens import Lens
 from sim.render.radiance import led_radiance
 from sim.scene.scene import Scene
+from sim.scene.surface import Material
 from sim.world.config import MeasuredConfig
 
 LENS, TILTED = Lens(40, 30, 40.0), camera_above(330.0, 35.0)
 WEIGHTS = camera_weights(LedModel(), light.camera())
 SLOW = {"tabulated", "four-flux"}
+GLOSSY = ExportedMaterial("glossy", np.array([0.2, 0.15, 0.1]), np.array([0.05, 0.04, 0.03]), 0.3)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -79,21 +85,72 @@ def test_a_specimens_tint_scales_all_of_it() -> None:
     np.testing.assert_allclose(shown[1], shown[0] * np.array([0.5, 0.25, 1.0]), rtol=1e-5)
 
 
-def test_an_exported_material_comes_back_as_the_material_of_an_object(tmp_path: Path) -> None:
-    """Written in MERL's format by the exporter, read by the simulator, shown as GGX has it."""
-    glossy = ExportedMaterial("glossy", np.array([0.2, 0.15, 0.1]), np.array([0.05, 0.04, 0.03]), 0.3)
-    path = tmp_path / "glossy.binary"
-    path.write_bytes(encode_merl(glossy))
-    scene = scene_of(quad((0.0, 0.0, 0.0), 400.0), merl_material(path))
+def ggx(light: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """[n, 3] of `GLOSSY`, by Heitz' form."""
+    half = unit(light + eye)[..., 2]
+    nl, nv, a2 = light[..., 2], eye[..., 2], GLOSSY.alpha**2
+    d = a2 / (np.pi * (half**2 * (a2 - 1) + 1) ** 2)
+    v = 0.5 / (nl * np.sqrt(nv**2 * (1 - a2) + a2) + nv * np.sqrt(nl**2 * (1 - a2) + a2))
+    found: np.ndarray = GLOSSY.kd + (d * v)[..., None] * GLOSSY.ks
+    return found
+
+
+def assert_shown_as_ggx(material: Material, median: float, high: float) -> None:
+    scene = scene_of(quad((0.0, 0.0, 0.0), 400.0), material)
     for shown, lit, lights, eyes in seen_under_leds(scene):
-        half = unit(lights + eyes)[:, 2]
-        nl, nv, a2 = lights[:, 2], eyes[:, 2], 0.3**2
-        d = a2 / (np.pi * (half**2 * (a2 - 1) + 1) ** 2)
-        v = 0.5 / (nl * np.sqrt(nv**2 * (1 - a2) + a2) + nv * np.sqrt(nl**2 * (1 - a2) + a2))
-        f = glossy.kd + (d * v)[:, None] * glossy.ks
-        off = np.abs(shown / (f * lit) - 1.0)
-        assert np.median(off) < 2e-3
-        assert np.quantile(off, 0.95) < 0.01
+        off = np.abs(shown / (ggx(lights, eyes) * lit) - 1.0)
+        assert np.median(off) < median
+        assert np.quantile(off, 0.95) < high
+
+
+@pytest.mark.parametrize(("encode", "read"), [(encode_merl, merl_material), (encode_bsdf, bsdf_material)])
+def test_an_exported_material_comes_back_as_the_material_of_an_object(
+    encode: Callable[[ExportedMaterial], bytes], read: Callable[[Path], Material], tmp_path: Path
+) -> None:
+    """Written by the exporter, read by the simulator, shown as GGX has it."""
+    path = tmp_path / "glossy"
+    path.write_bytes(encode(GLOSSY))
+    assert_shown_as_ggx(read(path), 2e-3, 0.01)
+
+
+def test_samples_come_back_as_the_material_of_an_object(tmp_path: Path) -> None:
+    """6,000 pairs of directions as ALTA's text, a file for each channel."""
+    light, eye = unit(np.random.default_rng(7).normal((0.0, 0.0, 1.0), size=(2, 6000, 3)))
+    above = (light[:, 2] > 0.02) & (eye[:, 2] > 0.02)
+    light, eye = light[above], eye[above]
+    paths = tuple(tmp_path / f"{name}.alta" for name in ("red", "green", "blue"))
+    for path, values in zip(paths, ggx(light, eye).T, strict=True):
+        rows = "\n".join(
+            " ".join(f"{value:.9g}" for value in row) for row in np.column_stack([eye, light, values])
+        )
+        path.write_text(f"#DIM 6 1\n#PARAM_IN CARTESIAN\n{rows}\n")
+    assert_shown_as_ggx(alta_material(paths), 0.01, 0.05)
+    grey = alta_material(paths[:1])
+    assert grey.diffuse[0] == grey.diffuse[2]
+    with pytest.raises(InputError, match="expected one or three values in each sample; found 2"):
+        alta_material(paths[:2])
+
+
+def test_spectra_are_seen_by_the_camera_and_threads_from_all_sides(tmp_path: Path) -> None:
+    """A material that reflects red light alone, and twice as much of it from one side as from all in the mean."""
+    nm = np.arange(380, 785, 10, dtype=np.float32)
+    azimuths = np.linspace(-np.pi, np.pi, 9, dtype=np.float32)
+    lit = 1.0 + np.cos(azimuths)
+    spectra = np.zeros((9, 2, len(nm), 4, 4), np.float32)
+    spectra[:, :, nm > 600] = lit[:, None, None, None, None]
+    ones = np.ones((9, 2, 2, 2), np.float32)
+    fields = {"theta_i": np.array([0, 1.6], np.float32), "phi_i": azimuths, "ndf": ones[0, 0], "sigma": ones[0, 0]}
+    fields |= {"vndf": ones, "spectra": spectra, "wavelengths": nm, "jacobian": np.zeros(1, np.uint8)}
+    path = tmp_path / "red.bsdf"
+    path.write_bytes(tensors(fields))
+    table = bsdf_material(path).table
+    assert table is not None
+    cosine = np.cos(0.25 * np.pi)  # light and eye at theta_h 0, theta_d 45 degrees; the table is f cos
+    theta_d = np.linspace(0, 0.5 * np.pi, table.shape[1])
+    found = np.array([np.interp(0.25 * np.pi, theta_d, table[0, :, 3, channel]) for channel in range(3)])
+    red = WEIGHTS @ np.interp(WAVELENGTHS_NM, nm, nm > 600)
+    np.testing.assert_allclose(found, red / cosine, rtol=1e-3)
+    assert found[0] > 5 * found[2]
 
 
 def test_a_measured_material_is_read_at_its_own_angles(tmp_path: Path) -> None:
@@ -130,8 +187,12 @@ def test_what_is_no_material_of_merls_is_refused(tmp_path: Path) -> None:
     path.write_bytes(bytes(100))
     with pytest.raises(InputError, match="expected a material of the MERL database"):
         merl_material(path)
-    with pytest.raises(ValidationError, match="expected an absolute path"):
-        MeasuredConfig(merl=Path("other.binary"))
+    for relative in ({"merl": Path("other.binary")}, {"alta": [Path("/a"), Path("b"), Path("/c")]}):
+        with pytest.raises(ValidationError, match="expected an absolute path"):
+            MeasuredConfig.model_validate(relative)
+    for given in ({}, {"merl": Path("/a"), "bsdf": Path("/a")}):
+        with pytest.raises(ValidationError, match="expected one of `merl`, `bsdf` and `alta`"):
+            MeasuredConfig.model_validate(given)
 
 
 def test_another_specimen_is_refused() -> None:

@@ -37,7 +37,7 @@ def stop(world: World) -> None:
         (
             kill,
             4,
-            "DeviceLost: world: expected the stand-ins to serve until they are told to stop; their process ",
+            "world: expected the stand-ins to serve until they are told to stop; their process ",
         ),
     ],
 )

@@ -1,0 +1,66 @@
+"""Values that the shell completes: formats, templates, plans and runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+_PLAN_SAYS, _FIRST_BYTES = "views:", 65536
+
+
+def formats(incomplete: str) -> list[str]:
+    """Formats of `coupole export --to`."""
+    from coupole.commands.export_options import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
+
+    return _beginning({*OF_RUNS, *OF_RESULTS_OF_RUNS, *OF_PICTURES}, incomplete)
+
+
+def templates(incomplete: str) -> list[str]:
+    """Templates of `coupole plan new`."""
+    from coupole.plan.templates import LEDS, TEMPLATES
+
+    return _beginning({*TEMPLATES, LEDS}, incomplete)
+
+
+def schemas(incomplete: str) -> list[str]:
+    """Files of which `coupole schema` has a schema."""
+    return _beginning({"plan", "rig"}, incomplete)
+
+
+def plans(incomplete: str) -> list[str]:
+    """Files that look like plans, and folders in which there may be some."""
+    return sorted(
+        f"{path}/" if path.is_dir() else str(path)
+        for path in _paths(incomplete)
+        if path.is_dir() or (path.suffix in (".yaml", ".yml") and _says_views(path))
+    )
+
+
+def runs(incomplete: str) -> list[str]:
+    """Folders of runs, and folders in which there may be some."""
+    return sorted(
+        str(path) if (path / "run.json").exists() else f"{path}/" for path in _paths(incomplete) if path.is_dir()
+    )
+
+
+def _beginning(words: set[str], incomplete: str) -> list[str]:
+    return sorted(word for word in words if word.startswith(incomplete))
+
+
+def _paths(incomplete: str) -> Iterator[Path]:
+    folder, _, begins = incomplete.rpartition("/")
+    parent = Path(f"{folder}/" if folder or incomplete.startswith("/") else ".")
+    try:
+        yield from (
+            path for path in parent.iterdir() if path.name.startswith(begins) and (begins or path.name[0] != ".")
+        )
+    except OSError:
+        return
+
+
+def _says_views(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return f"\n{_PLAN_SAYS}".encode() in file.read(_FIRST_BYTES)
+    except OSError:
+        return False

@@ -1,0 +1,154 @@
+"""Commands to a run that another process of this user acquires: pause, go-on, stop; and its progress."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coupole.commands.common import JsonOption
+from coupole.commands.completion import runs
+from coupole.errors import DeviceError, InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.acquisition.run_control import Command, State
+
+RunningRun = Annotated[
+    Path | None,
+    typer.Argument(
+        help="The run's folder; not needed while one run alone is acquired.",
+        show_default=False,
+        autocompletion=runs,
+    ),
+]
+_LOOK_EVERY_S = 0.2
+_PLAIN_LINE_EVERY_S = 5.0
+
+
+def pause(run: RunningRun = None, as_json: JsonOption = False) -> None:
+    """Pause a running acquisition after its burst; ends when lights are off and the arm is at rest."""
+    _say(_sent(run, "pause", until="paused"), as_json=as_json)
+
+
+def go_on(run: RunningRun = None, as_json: JsonOption = False) -> None:
+    """Go on with a paused acquisition. (One that has ended goes on by `coupole acquire --resume RUN`.)"""
+    _say(_sent(run, "go-on"), as_json=as_json)
+
+
+def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
+    """Stop a running acquisition now: lights off, arm still, camera disarmed. It can be resumed.
+
+    Ends when its process has ended; exit code 4 if the journal says that the cell may not be safe. This is no
+    emergency stop: that is the button at the cell.
+    """
+    from coupole.storage import journal
+    from coupole.storage.journal_events import FaultNoted
+    from coupole.storage.run import Run
+    from coupole.storage.run_status import status
+    from coupole.viewing.terminal import make_console, show_status
+
+    sent = _sent(run, "stop")
+    stopped = Run(Path(sent["run"]))
+    while stopped.in_use:
+        time.sleep(_LOOK_EVERY_S)
+    found = status(stopped)
+    if as_json:
+        print(json.dumps(found.figures()))
+    session = found.sessions[-1].begun if found.sessions else ""
+    unsafe = [
+        event.message
+        for event in journal.read(stopped.journal_path)
+        if isinstance(event, FaultNoted) and event.kind == "unsafe" and event.t >= session
+    ]
+    show_status(make_console(quiet=as_json), found)
+    if unsafe:
+        raise DeviceError(
+            "cell",
+            expected="lights off, the arm at rest and the camera disarmed",
+            happened="; ".join(unsafe),
+            remedy="Look at the cell.",
+        )
+    make_console(quiet=as_json).print("lights are off, the arm is at rest, the camera is disarmed")
+
+
+def follow(run: Path | None, console: Console) -> Path:
+    """Show a running acquisition until it ends, a line whenever there is something new; its folder."""
+    said_s, said = 0.0, ""
+    folder = run or Path(running_run(run)["run"])
+    for state in _states(folder):
+        changed = state["state"] != said
+        if changed or console.is_terminal or time.monotonic() - said_s > _PLAIN_LINE_EVERY_S:
+            said_s, said = time.monotonic(), state["state"]
+            console.print(_line(state), end="\r" if console.is_terminal else "\n", markup=False)
+    if console.is_terminal:
+        console.print()
+    return folder
+
+
+def _states(folder: Path) -> Iterator[State]:
+    """States of a run until its process has ended; none while that opens the run, or concludes it."""
+    from coupole.acquisition.run_control import ask
+    from coupole.storage.run import Run
+
+    run = Run(folder)
+    while run.in_use:
+        with contextlib.suppress(InputError):
+            yield ask(folder, "state")
+        time.sleep(_LOOK_EVERY_S)
+
+
+def running_run(run: Path | None) -> State:
+    """State of a run that is being acquired, or of the only one. Raises InputError."""
+    from coupole.acquisition.run_control import ask, running
+
+    if run is not None:
+        return ask(run, "state")
+    found = running()
+    if not found:
+        raise InputError("no run is being acquired by this user on this machine")
+    if len(found) > 1:
+        folders = "\n".join(f"  {state['run']}" for state in found)
+        raise InputError(f"several runs are being acquired; name one of\n{folders}")
+    return found[0]
+
+
+def _sent(run: Path | None, command: Command, *, until: str = "") -> State:
+    """State after a command, or once it is `until`. Raises InputError: the run is not being acquired, or ended."""
+    from coupole.acquisition.run_control import ask
+
+    folder = Path(running_run(run)["run"])
+    state = ask(folder, command)
+    while until and state["state"] != until:
+        time.sleep(_LOOK_EVERY_S)
+        state = ask(folder, "state")
+        if state["state"] in ("running", "stopping"):
+            break
+    return state
+
+
+def _say(state: State, *, as_json: bool) -> None:
+    from coupole.viewing.terminal import make_console
+
+    make_console(quiet=as_json).print(_line(state), markup=False)
+    if as_json:
+        print(json.dumps(state))
+
+
+def _line(state: dict[str, Any]) -> str:
+    from coupole.viewing.terminal import duration_text
+
+    name = Path(state["run"]).name
+    if "view" not in state:
+        return f"{state['state']}: {name}, nothing proven yet in this session"
+    return (
+        f"{state['state']}: {name}, view {state['view']} ({state['view_number'] + 1}/{state['views']}) "
+        f"{state['light']}, {state['proven']}/{state['frames']} frames proven, {state['dose_lux_h']:.3f} lux.h, "
+        f"{duration_text(state['left_s'])} left"
+    )

@@ -1,0 +1,185 @@
+"""A table of RGL's format that adapts to its material: as small as misses it by no more than is asked.
+
+What is stored is f cos(theta_o) over `ndf`, the reflectance that the half vector's own elevation accounts for; the
+reader multiplies with it again, and it takes next to no place, as it depends on one angle: 2 x 2048 nodes. What is
+left changes little within a lobe. Angles of incidence crowd towards the horizon, where f changes most with them.
+Their number, how much they crowd, and the number of half vectors grow until the table, as its readers read it,
+misses the material by no more than is asked. Half vectors are not warped by `vndf`: that missed more (decision
+38).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.matter.rgl_table import RglTable
+from coupole.errors import InputError
+from coupole.exchange.of_results.bsdf import (
+    cosine_weighted,
+    drawn_by,
+    fields_of,
+    half_vectors,
+    nodes_for_linear_reading,
+    tensors,
+)
+from coupole.exchange.of_results.material_tables import Material
+from coupole.exchange.of_results.measured_surface import Floats
+
+THETAS = (16, 24, 32, 48, 64, 96, 128)
+SIDES = (24, 32, 48, 64, 96, 128, 192)
+CROWDINGS = (1.0, 1.3)
+"""Angles of incidence are pi/2 (1 - (1 - t)^c) of even steps t."""
+SHARE = 0.95
+"""Of the pairs of directions that miss less than is asked."""
+_NDF_NODES = 2048
+_PAIRS, _LOWEST_Z = 2000, 0.1
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Pairs of directions with what the material reflects there."""
+
+    ways_in: Floats
+    """[n, 3]"""
+    ways_out: Floats
+    f: Floats
+    """[n, 3]"""
+
+    def misses(self, table: RglTable) -> Floats:
+        """[n, 3] relative errors."""
+        return np.asarray(np.abs(table(self.ways_in, self.ways_out) - self.f) / np.maximum(self.f, 1e-12))
+
+
+@dataclass(frozen=True)
+class AdaptiveTable:
+    """A material at angles of incidence and half vectors of some number."""
+
+    material: Material
+    thetas: int
+    side: int
+    crowding: float
+
+    @cached_property
+    def theta_i(self) -> NDArray[np.float32]:
+        steps = np.linspace(0.0, 1.0, self.thetas)
+        return np.asarray(0.5 * np.pi * (1.0 - (1.0 - steps) ** self.crowding), np.float32)
+
+    @cached_property
+    def ndf(self) -> NDArray[np.float32]:
+        """[2, nodes] the channels' mean of kd + ks D / 4, GGX's D of the half vector's elevation."""
+        cosine = np.cos(0.5 * np.pi * np.linspace(0.0, 1.0, _NDF_NODES) ** 2)
+        alpha2 = self.material.alpha**2
+        facets = alpha2 / (np.pi * (1.0 - cosine**2 * (1.0 - alpha2)) ** 2)
+        density = self.material.kd.mean() + 0.25 * self.material.ks.mean() * facets
+        return np.repeat(np.maximum(density, 1e-6)[None], 2, axis=0).astype(np.float32)
+
+    @cached_property
+    def _values(self) -> NDArray[np.float32]:
+        return cosine_weighted(self.material, self.theta_i, half_vectors(self.side))
+
+    @cached_property
+    def rgb(self) -> NDArray[np.float32]:
+        """[1, theta_i, 3, rows, columns]"""
+        elevations = np.linspace(0.0, 1.0, self.side)
+        over = np.interp(elevations, np.linspace(0.0, 1.0, _NDF_NODES), self.ndf[0])
+        return nodes_for_linear_reading((self._values / over).astype(np.float32), self.theta_i)
+
+    @property
+    def size_bytes(self) -> int:
+        """Of the file, but for its small fields."""
+        return 4 * 4 * self.thetas * self.side**2
+
+    def read(self) -> RglTable:
+        """As readers of the file have it."""
+        planes = np.ascontiguousarray(np.moveaxis(self.rgb, 2, -1))
+        flat = np.ones((1, self.thetas, 2, 2))
+        quarter = np.full((2, 2), 0.25)
+        theta_i = self.theta_i.astype(np.float64)
+        return RglTable(
+            np.zeros(1),
+            theta_i,
+            self.ndf.astype(np.float64),
+            quarter,
+            flat,
+            planes,
+            None,
+            jacobian=True,
+            description="",
+        )
+
+    def encode(self, text: str) -> bytes:
+        fields = fields_of(self.theta_i, self.rgb, drawn_by(self._values, self.theta_i), text)
+        return tensors({**fields, "ndf": self.ndf, "sigma": np.full((2, 2), 0.25, np.float32)})
+
+
+def encode_adaptive(material: Material, most_error: float, told: str = "") -> bytes:
+    """The file; its description says what it misses. Raises InputError if no table is large enough."""
+    checked = tuple(_pairs(material))
+    table, missed = _smallest(material, most_error, checked)
+    text = (
+        f"{material.name}; misses the fit by {missed[0]:.1e} in the median and {missed[1]:.1e} at 95 % of all "
+        f"directions, by {missed[2]:.1e} and {missed[3]:.1e} of those in its lobe; {told}"
+    )
+    return table.encode(text)
+
+
+def _smallest(material: Material, most_error: float, checked: tuple[Checked, ...]) -> tuple[AdaptiveTable, Floats]:
+    """A table that misses no more; from the smallest on it grows by what helps more for its bytes."""
+    table = AdaptiveTable(material, THETAS[0], SIDES[0], CROWDINGS[0])
+    missed = _missed(table, checked)
+    while missed[1::2].max() > most_error:
+        tried = [(larger, _missed(larger, checked)) for larger in _larger(table)]
+        if not tried:
+            raise InputError(
+                f"--adaptive {most_error:g}: {material.name}: a table of {table.size_bytes / 1e6:.0f} MB misses "
+                f"its fit by {missed[1::2].max():.1e} or more in 5 % of the directions; ask for no less"
+            )
+        worst = missed[1::2].max()
+        gains = [
+            np.log(worst / one[1::2].max()) / np.log(larger.size_bytes / table.size_bytes) for larger, one in tried
+        ]
+        table, missed = tried[int(np.argmax(gains))]
+    return table, missed
+
+
+def _larger(table: AdaptiveTable) -> Iterator[AdaptiveTable]:
+    """With the next number of angles of incidence, of half vectors, or both, crowded or not."""
+    thetas = [n for n in THETAS if n > table.thetas][:1]
+    sides = [n for n in SIDES if n > table.side][:1]
+    for crowding in CROWDINGS:
+        for more in thetas:
+            yield replace(table, thetas=more, crowding=crowding)
+        for more in sides:
+            yield replace(table, side=more, crowding=crowding)
+        for more, side in zip(thetas, sides, strict=False):
+            yield replace(table, thetas=more, side=side, crowding=crowding)
+
+
+def _missed(table: AdaptiveTable, checked: tuple[Checked, ...]) -> Floats:
+    """Median and `SHARE` of the relative errors, of each set of pairs."""
+    read = table.read()
+    return np.concatenate([np.quantile(pairs.misses(read), [0.5, SHARE]) for pairs in checked])
+
+
+def _pairs(material: Material) -> Iterator[Checked]:
+    """Of all directions alike, and of those about the mirror direction, by half vectors drawn from GGX's D."""
+    random = np.random.default_rng(1)
+    ways = random.normal(size=(2, 2 * _PAIRS, 3))
+    ways[..., 2] = np.abs(ways[..., 2])
+    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+    share = random.uniform(size=2 * _PAIRS)
+    theta, phi = (
+        np.arctan(material.alpha * np.sqrt(share / (1.0 - share))),
+        2.0 * np.pi * random.uniform(size=len(share)),
+    )
+    half = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
+    mirrored = 2.0 * np.sum(ways[0] * half, axis=-1, keepdims=True) * half - ways[0]
+    for ways_out in (ways[1], mirrored):
+        high = (ways[0, :, 2] > _LOWEST_Z) & (ways_out[:, 2] > _LOWEST_Z)
+        pair = ways[0][high][:_PAIRS], ways_out[high][:_PAIRS]
+        yield Checked(*pair, material.reflectance(*pair))

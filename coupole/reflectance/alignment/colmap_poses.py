@@ -1,0 +1,184 @@
+"""Cameras' poses of a run by a model of COLMAP's, instead of those by its records.
+
+A bundle adjustment may move, turn and scale its model. With three views or more a similarity brings the cameras'
+centres onto those of the records by least squares (Umeyama, PAMI 13(4), 1991); with one or two the model is taken
+as it is, in the frame of `coupole export RUN --to colmap`: the support's, in mm. Poses that are farther from the
+records than `MOST_APART` times the records' standard uncertainty are refused, and so are other lenses than the
+records': their uncertainties are what the poses have then, since COLMAP's files state none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coupole.calibration.optics import NAMES
+from coupole.calibration.posed_camera import MOST_APART
+from coupole.calibration.rotations import Floats, between, inverses, nearest_rotation
+from coupole.errors import InputError
+from coupole.reflectance.alignment.colmap_model import ColmapCamera, ColmapModel, read_model
+from coupole.reflectance.extraction.measured_run import MeasuredRun
+from coupole.storage.durable import sha256
+
+LEAST_FITTED = 3
+"""Views that fix a similarity."""
+_TO_CENTRE_PX = 0.5
+"""From our pixels to COLMAP's, in which the first one ends at 1."""
+_SAME = 1e-6
+"""Parameters of the lens that the record does not estimate."""
+
+
+@dataclass(frozen=True)
+class ColmapPoses:
+    """Poses of the views of a run."""
+
+    path: Path
+    """Of COLMAP's images."""
+    base_from_camera: Floats
+    """[v, 4, 4] mm, in the order of the run's views."""
+    scale: float
+    """mm for a unit of the model."""
+    moved: Floats
+    """[v, 6] from the records' poses: mm, and rad in the camera's frame."""
+    over_u: Floats
+    """[v, 2] shift and turn over the records' standard uncertainty."""
+
+    def of(self, measured: MeasuredRun) -> MeasuredRun:
+        """The run with them."""
+        views = zip(measured.views, self.base_from_camera, strict=True)
+        return replace(
+            measured,
+            views=tuple(replace(view, base_from_camera=base_from_camera) for view, base_from_camera in views),
+        )
+
+    def told(self) -> dict[str, Any]:
+        """What a result says of them."""
+        shift_mm = np.linalg.norm(self.moved[:, :3], axis=1)
+        turn_deg = np.degrees(np.linalg.norm(self.moved[:, 3:], axis=1))
+        return {
+            "sha256": sha256(self.path),
+            "fitted": len(self.moved) >= LEAST_FITTED,
+            "mm_per_unit": float(f"{self.scale:.9g}"),
+            "median_moved_mm": round(float(np.median(shift_mm)), 6),
+            "median_turned_deg": round(float(np.median(turn_deg)), 7),
+            "most_over_u": round(float(self.over_u.max()), 3),
+        }
+
+
+def read_poses(folder: Path, measured: MeasuredRun) -> ColmapPoses:
+    """Of a run by its records, and a folder of COLMAP's. Raises InputError: no model, a view that it lacks or has
+    twice, another lens, centres on a line, poses that the records do not allow."""
+    model = read_model(folder)
+    camera_from_world = _of_views(model, measured)
+    recorded = np.stack([view.base_from_camera for view in measured.views])
+    world_from_camera = inverses(camera_from_world)
+    if len(recorded) >= LEAST_FITTED:
+        _refuse_a_line(model.path, recorded[:, :3, 3], _uncertainties(measured)[:, 0])
+        scale, base_from_world = similarity(world_from_camera[:, :3, 3], recorded[:, :3, 3])
+    else:
+        scale, base_from_world = 1.0, measured.base_from_support
+    scaled = world_from_camera.copy()
+    scaled[:, :3, 3] *= scale
+    found = base_from_world @ scaled
+    moved = between(recorded, found)
+    lengths = np.stack([np.linalg.norm(moved[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))], axis=1)
+    poses = ColmapPoses(model.path, found, scale, moved, lengths / _uncertainties(measured))
+    _refuse_far(poses, measured)
+    return poses
+
+
+def similarity(of_points: Floats, to_points: Floats) -> tuple[float, Floats]:
+    """Scale s and transform [4, 4] of points [n, 3] to others, T (s p), by least squares (Umeyama)."""
+    middle_of, middle_to = of_points.mean(axis=0), to_points.mean(axis=0)
+    of, to = of_points - middle_of, to_points - middle_to
+    covariance = to.T @ of
+    turn = nearest_rotation(covariance)
+    spread = float(np.sum(of**2))
+    scale = float(np.trace(turn.T @ covariance)) / max(spread, np.finfo(float).tiny)
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = turn, middle_to - scale * turn @ middle_of
+    return scale, motion
+
+
+def _of_views(model: ColmapModel, measured: MeasuredRun) -> Floats:
+    """[v, 4, 4] camera_from_world of the run's views. Raises InputError for one without, or of another lens."""
+    stems = [Path(image.name).stem for image in model.images]
+    by_name = dict(zip(stems, model.images, strict=True))
+    found = []
+    for view in measured.views:
+        if (count := stems.count(view.name)) != 1:
+            names = ", ".join(sorted(image.name for image in model.images)[:5]) or "none"
+            raise InputError(
+                f"{model.path}: has {count} images of the view {view.name}; expected {view.name}.png, as `coupole "
+                f"export {measured.run.folder} --to colmap` names it; found {names}"
+            )
+        image = by_name[view.name]
+        if image.camera not in model.cameras:
+            raise InputError(f"{model.path}: image {image.name}: its camera {image.camera} is not in the model")
+        _refuse_other_lens(model.path, image.camera, model.cameras[image.camera], measured)
+        found.append(image.camera_from_world)
+    return np.stack(found)
+
+
+def _refuse_other_lens(path: Path, number: int, camera: ColmapCamera, measured: MeasuredRun) -> None:
+    """Poses hold for the lens with which they were found."""
+    where = f"{path.with_stem('cameras')}: camera {number}"
+    if camera.size_px != measured.frames.size_px:
+        raise InputError(f"{where}: expected pictures of {measured.frames.size_px} px; found {camera.size_px}")
+    given = dict(camera.parameters)
+    if "f" in given:
+        given["fx"] = given["fy"] = given.pop("f")
+    prior = measured.camera
+    u = dict(zip(prior.free, np.sqrt(np.diag(prior.covariance)), strict=False))
+    for name in (*NAMES, *(name for name in given if name not in NAMES)):
+        ours = getattr(measured.lens, name, 0.0) + (_TO_CENTRE_PX if name in ("cx", "cy") else 0.0)
+        apart, allowed = (
+            abs(given.get(name, 0.0) - ours),
+            max(MOST_APART * u.get(name, 0.0), _SAME * max(1.0, abs(ours))),
+        )
+        if apart > allowed:
+            raise InputError(
+                f"{where}: another lens than the record's: {name} is {given.get(name, 0.0):.6g} there, {ours:.6g} "
+                f"by the record, which allows {allowed:.2g}. Keep the camera as it was exported (COLMAP's "
+                "bundle adjuster: refine_focal_length, refine_principal_point and refine_extra_params 0)"
+            )
+
+
+def _uncertainties(measured: MeasuredRun) -> Floats:
+    """[v, 2] standard uncertainty of the records' poses in their worst direction: mm, rad."""
+    found = []
+    for view in measured.views:
+        first = len(view.pointing.free)
+        own = view.pointing.covariance[first : first + 6, first : first + 6]
+        found.append([np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in (own[:3, :3], own[3:, 3:])])
+    return np.array(found)
+
+
+def _refuse_a_line(path: Path, centres_mm: Floats, u_mm: Floats) -> None:
+    _, spread_mm, _ = np.linalg.svd(centres_mm - centres_mm.mean(axis=0))
+    if spread_mm[1] < MOST_APART * u_mm.max():
+        raise InputError(
+            f"{path}: the run's cameras stand on a line (within {spread_mm[1]:.2g} mm), about which COLMAP's "
+            "model may be turned; take more views, or `coupole reflectance refine`"
+        )
+
+
+def _refuse_far(poses: ColmapPoses, measured: MeasuredRun) -> None:
+    view, kind = np.unravel_index(np.argmax(poses.over_u), poses.over_u.shape)
+    if poses.over_u[view, kind] <= MOST_APART:
+        return
+    length = float(np.linalg.norm(poses.moved[view, 3 * kind : 3 * kind + 3]))
+    how_far = f"{np.degrees(length):.3g} degrees" if kind else f"{length:.3g} mm"
+    taken = (
+        f"after a similarity to the {len(poses.moved)} cameras of the records"
+        if len(poses.moved) >= LEAST_FITTED
+        else "in the support's frame, in mm, as with one or two views the model must be"
+    )
+    raise InputError(
+        f"{poses.path}: the camera of {measured.views[view].name} is {how_far} from where the records have it, "
+        f"{taken}: {poses.over_u[view, kind]:.1f} times their standard uncertainty; expected {MOST_APART:g} at "
+        "most. Is it another run's model, or a reconstruction that failed? Else calibrate hand-eye anew"
+    )

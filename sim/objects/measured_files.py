@@ -1,0 +1,82 @@
+"""Materials that are measured, or exported, as files: of MERL's, RGL's and ALTA's formats.
+
+Red, green and blue of a file are taken as those of the simulated camera; spectra are seen by it under its LEDs.
+The renderer's materials are isotropic: others count with their mean over turns of the surface.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from coupole.appearance.matter.alta_samples import interpolated, read_alta
+from coupole.appearance.matter.brdf import Brdf
+from coupole.appearance.matter.hemisphere import albedo
+from coupole.appearance.matter.rgl_table import read_bsdf
+from coupole.appearance.spectra import light
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
+from coupole.errors import InputError
+from sim.objects.merl_file import read_merl
+from sim.optics.led_light import LedModel, camera_weights
+from sim.scene.brdf_table import tabulate
+from sim.scene.surface import Material
+
+_TURNS = 16
+"""Of an anisotropic surface."""
+_NODES = 24
+"""Of each integral over the hemisphere."""
+
+
+@cache
+def merl_material(path: Path) -> Material:
+    """Raises InputError for another kind of file."""
+    return _shown(path.stem, read_merl(path))
+
+
+@cache
+def bsdf_material(path: Path) -> Material:
+    """Raises InputError for another kind of file."""
+    table = read_bsdf(path)
+    if table.wavelengths_nm is not None:
+        table = table.seen_with(_weights_of(table.wavelengths_nm))
+    return _shown(path.stem, table if table.isotropic else _turned_to_all_sides(table))
+
+
+@cache
+def alta_material(paths: tuple[Path, ...]) -> Material:
+    """One file of one channel, which is grey, or of three; or one file for each of red, green and blue. Raises
+    InputError for other files, and for samples between which nothing can be interpolated."""
+    parts = [interpolated(read_alta(path)) for path in paths]
+
+    def whole(wi: Array, wo: Array) -> Array:
+        found = np.concatenate([part(wi, wo) for part in parts], axis=-1)
+        return np.repeat(found, 3, axis=-1) if found.shape[-1] == 1 else found
+
+    up = np.array([0.0, 0.0, 1.0])
+    if (channels := whole(up, up).shape[-1]) != 3:
+        raise InputError(f"{paths[0]}: expected one or three values in each sample; found {channels} in all")
+    return _shown(paths[0].stem, whole)
+
+
+def _shown(name: str, made: Brdf) -> Material:
+    """As a material of the scene, its diffuse reflectance as in `specimens.specimen`."""
+    red, green, blue = np.clip(albedo(made, np.array([np.sqrt(0.5)]), nodes=_NODES)[0], 1e-6, 1.0).tolist()
+    return Material(name, (red, green, blue), table=tabulate(made, np.eye(3)))
+
+
+def _weights_of(wavelengths_nm: Array) -> Array:
+    """[3, n] of spectra at these wavelengths, linear between them, as the camera sees them under its LEDs."""
+    between = np.stack([np.interp(WAVELENGTHS_NM, wavelengths_nm, one) for one in np.eye(len(wavelengths_nm))])
+    return np.asarray(camera_weights(LedModel(), light.camera()) @ between.T)
+
+
+def _turned_to_all_sides(made: Brdf) -> Brdf:
+    angles = 2.0 * np.pi * (np.arange(_TURNS) + 0.5) / _TURNS
+    turns = [np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in angles]
+
+    def mean(wi: Array, wo: Array) -> Array:
+        return np.asarray(sum(made(wi @ turn, wo @ turn) for turn in turns) / len(turns))
+
+    return mean

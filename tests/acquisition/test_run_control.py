@@ -1,0 +1,131 @@
+"""The socket of a running acquisition, by a client that knows nothing but its words."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from coupole.acquisition import run_control
+from coupole.acquisition.observer import Control
+from coupole.acquisition.run_control import RunControl, ask, running, socket_folder
+from coupole.errors import InputError
+from coupole.viewing.progress import Progress
+
+PROGRESS = Progress("top", 0, 2, 52, 132, "led0417", 0.125, 33.5)
+
+
+class Served:
+    """A run's control, and what was done to it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.run, self.control, self.halted = folder, Control(), 0
+
+    def halt(self) -> None:
+        assert self.control.stop.is_set(), "else the sequencer would light the next"
+        self.halted += 1
+
+
+@pytest.fixture
+def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    found = Served(tmp_path / "run")
+    with RunControl(found.run, found.control, found.halt, lambda: PROGRESS) as control:
+        assert control.trouble == ""
+        yield found
+
+
+def say(line: bytes) -> dict[str, object]:
+    (path,) = socket_folder().glob("*.sock")
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.connect(str(path))
+        connection.sendall(line)
+        return json.loads(connection.makefile().readline())  # type: ignore[no-any-return]
+
+
+def test_it_pauses_goes_on_and_stops_and_tells_its_state_each_time(served: Served) -> None:
+    assert say(b'{"version": 1, "command": "state"}\n') == {
+        "version": 1, "run": str(served.run), "pid": os.getpid(), "state": "running", "view": "top",
+        "view_number": 0, "views": 2, "proven": 52, "frames": 132, "light": "led0417", "dose_lux_h": 0.125,
+        "left_s": 33.5,
+    }  # fmt: skip
+    assert say(b'{"version": 1, "command": "pause"}\n')["state"] == "pausing"
+    assert served.control.pause.is_set()
+    served.control.paused.set()
+    assert ask(served.run, "pause")["state"] == "paused", "asked again it is no other"
+    assert [state["state"] for state in running()] == ["paused"]
+    served.control.paused.clear()
+    assert ask(served.run, "go-on")["state"] == "running"
+    assert not served.control.pause.is_set()
+    assert served.halted == 0
+    assert ask(served.run, "stop")["state"] == "stopping"
+    assert served.halted == 1
+    assert served.control.interrupted().exit_code == 130
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        (b"pause\n", "expected one line of JSON"),
+        (b"[1]\n", "expected one line of JSON"),
+        (b'{"command": "pause"}\n', "expected one line of JSON with `version`"),
+        (b'{"version": 2, "command": "pause"}\n', "expected version 1"),
+        (b'{"version": 1, "command": "Pause"}\n', "expected the command pause, go-on, stop or state"),
+        (b'{"version": 1, "command": ["stop"]}\n', "expected the command"),
+        (b"\xff" * 5000, "expected one line of JSON"),
+    ],
+)
+def test_what_is_no_request_changes_nothing_and_is_told_what_was_expected(
+    served: Served, line: bytes, says: str
+) -> None:
+    assert says in str(say(line)["error"])
+    assert not served.control.pause.is_set()
+    assert not served.control.stop.is_set()
+    assert ask(served.run, "state")["state"] == "running"
+
+
+def test_a_client_that_says_nothing_holds_up_no_other(served: Served) -> None:
+    (path,) = socket_folder().glob("*.sock")
+    with socket.socket(socket.AF_UNIX) as silent:
+        silent.connect(str(path))
+        assert ask(served.run, "stop")["state"] == "stopping"
+
+
+def test_nobody_else_can_enter(served: Served) -> None:
+    (path,) = socket_folder().glob("*.sock")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    socket_folder().chmod(0o755)
+    with pytest.raises(InputError, match="nobody else may enter"):
+        ask(served.run, "pause")
+
+
+def test_another_user_gets_no_answer(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_control, "_peer_uid", lambda _: os.getuid() + 1)
+    with pytest.raises(InputError, match="does not answer"):
+        ask(served.run, "stop")
+    assert served.halted == 0
+
+
+def test_a_run_that_nobody_acquires_is_told_and_a_killed_ones_socket_is_taken_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with pytest.raises(InputError, match="no process of this user acquires into this run"):
+        ask(tmp_path, "pause")
+    with socket.socket(socket.AF_UNIX) as left_over:
+        left_over.bind(str(socket_folder() / "0123.sock"))
+    assert running() == []
+    assert list(socket_folder().iterdir()) == []
+
+
+def test_without_a_folder_for_its_socket_a_run_is_acquired_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / ("long" * 30)))
+    with RunControl(tmp_path, Control(), lambda: None, lambda: None) as control:
+        assert "will not reach this run" in control.trouble

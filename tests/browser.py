@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import suppress
 from typing import Any
 
 import cells
+import psutil
 import pytest
 from selenium import webdriver
 from selenium.webdriver.common.by import By
@@ -60,6 +62,16 @@ class Browser:
 
     def run(self, script: str) -> Any:
         return self.driver.execute_script(f"return {script}")
+
+    def cpu_s(self) -> float:
+        """CPU time that its processes have taken."""
+        driver = psutil.Process(self.driver.service.process.pid)
+        taken = 0.0
+        for process in driver.children(recursive=True):
+            with suppress(psutil.Error):  # one that has just ended
+                times = process.cpu_times()
+                taken += times.user + times.system
+        return taken
 
     def troubles(self) -> list[str]:
         """What the page wrote to the console as an error: failed scripts and missing pictures."""

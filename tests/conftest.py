@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy comes: the tests' own workers are enough
 
@@ -13,6 +14,7 @@ from cells import CellFolder
 from hypothesis import settings
 from nursery import Nursery
 from skip_budget import over_budget
+from xdist.scheduler.loadscope import LoadScopeScheduling
 
 from sim.world import client
 
@@ -71,6 +73,22 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if not item.get_closest_marker("full")]
+
+
+TOGETHER = "tests/exchange/page/"
+"""A folder whose tests share a browser: one worker has them all."""
+
+
+class _Scopes(LoadScopeScheduling):
+    """Modules and classes, each for one worker."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return TOGETHER if nodeid.startswith(TOGETHER) else super()._split_scope(nodeid)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadScopeScheduling | None:
+    return _Scopes(config, log) if config.getoption("dist") == "loadscope" else None
 
 
 _skipped: dict[str, str] = {}

@@ -12,6 +12,7 @@ import OpenEXR
 
 from coupole.calibration.optics import Intrinsics
 from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.extraction.lamp_sight import REACHED
 from coupole.reflectance.extraction.seen_surface import seen_surface
 from coupole.reflectance.material_uncertainty import MaterialUncertainty
 from coupole.reflectance.run_result import OBJECT, SCHEMA, RunResult
@@ -37,6 +38,9 @@ class Coat:
     kd: tuple[float, float, float] = (0.2, 0.15, 0.1)
     ks: tuple[float, float, float] = (0.0, 0.0, 0.0)
     alpha: float = 0.3
+
+
+GLOSSY = Coat((0.05, 0.04, 0.03), (0.4, 0.3, 0.2), 0.15)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -97,6 +101,7 @@ def write_result(
         file["led_normals"] = unit(moved(BASE_FROM_SUPPORT, LED_TARGET_MM) - led_mm)[None]
         file["full_scales"] = FULL_SCALE[None, channels]
         file["f"] = np.full((len(mine), 1, len(FULL_SCALE[channels])), np.nan, np.float32)
+        write_sources(file, {})
     count = len(mine)
     same = [np.tile(values[channels], (count, 1)) for values in (coat.kd, coat.ks)]
     materials = TriangleMaterials(normals[mine], *same, np.full(count, coat.alpha), np.zeros(count))
@@ -114,6 +119,20 @@ def write_result(
     }
     (folder / "result.json").write_text(json.dumps(about))
     return RunResult(folder)
+
+
+def write_sources(file: h5py.File, u: dict[str, float]) -> None:
+    """Put uncertainties of samples into a view's file: relative `u_own`, `u_response`, `led_u_own` and
+    `led_u_shared`, and `lateral_u_mm`, `led_u_mm`; 0 of those that are not named."""
+    triangles, leds, channels = file["f"].shape
+    file.attrs.update({name: u.get(name, 0.0) for name in ("lateral_u_mm", "led_u_mm")})
+    shapes = {"u_own": file["f"].shape, "u_response": (triangles, channels)}
+    shapes |= dict.fromkeys(("led_u_own", "led_u_shared"), (leds, channels))
+    for name in ("codes", *shapes):
+        file.pop(name, None)
+    file["codes"] = np.full((triangles, leds), REACHED, np.uint8)
+    for name, shape in shapes.items():
+        file[name] = np.full(shape, u.get(name, 0.0))
 
 
 def write_exr(path: Path, radiance: np.ndarray) -> Path:

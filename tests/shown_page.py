@@ -12,13 +12,18 @@ from typing import Any
 import cells
 import numpy as np
 from browser import Browser
+from lazily import lazily
 from selenium.webdriver.common.action_chains import ActionChains
 
 from coupole.reflectance.new_light.pictured_surface import FreeCamera
 
+colour: Any = lazily("colour")
+
 FIELD_DEG = 24.0
 """Of the page's camera, along the shorter side."""
 WIDTH, HEIGHT = 160, 120
+SMALL = 780, 440
+"""Of the window: quick to draw, and wide enough for the panel beside the picture."""
 CONTROLS = "a[href], button, input, select, summary, canvas[tabindex]"
 
 
@@ -87,10 +92,22 @@ class Page:
         self.driver.execute_async_script("coupole.whole().then(arguments[0])")
 
 
+def difference(picture: np.ndarray, other: np.ndarray, white: float) -> np.ndarray:
+    """CIEDE2000 of two linear pictures, shown as sRGB with a white."""
+    lab = [
+        colour.XYZ_to_Lab(
+            colour.sRGB_to_XYZ(colour.cctf_encoding(np.clip(one / white, 0.0, 1.0))), [0.3127, 0.329]
+        )
+        for one in (picture, other)
+    ]
+    found: np.ndarray = colour.delta_E(*lab, method="CIE 2000")
+    return found
+
+
 @contextmanager
 def opened_page() -> Iterator[Page]:
     browser = Browser()
-    browser.driver.set_window_size(780, 440)  # quick to draw, and wide enough for the panel beside the picture
+    browser.driver.set_window_size(*SMALL)
     browser.driver.set_network_conditions(offline=True, latency=0, throughput=0)
     yield Page(browser)
     browser.driver.quit()

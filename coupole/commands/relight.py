@@ -11,6 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coupole.commands.common import JsonOption, ResultArgument, fail
+from coupole.commands.relight_for_the_eye import (
+    PEAK_QUANTILE,
+    EyeOption,
+    SensorOption,
+    SpectrumOption,
+    bright,
+    colour_asked,
+    write_relit_for_the_eye,
+)
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -21,7 +30,6 @@ if TYPE_CHECKING:
     from coupole.reflectance.new_light.pictured_surface import FreeCamera
 
 Say = Callable[[int, int], None]
-PEAK_QUANTILE = 0.999
 _LOOKED_AT = 8
 """Pictures of a video that its white is found by."""
 
@@ -36,6 +44,8 @@ class Relit:
     """What `--json` and a video's comment say of it."""
     uncertainty: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]] | None = None
     """[h, w, 3] standard uncertainty of the picture of lights, if it can be stated."""
+    has_colours: bool = True
+    """False of a camera with one channel."""
 
 
 Several = list[str] | None
@@ -47,7 +57,11 @@ def _option(name: str, help_text: str, **limits: Any) -> Any:
 
 ToOption = Annotated[
     Path,
-    _option("--to", "picture.npy or .exr: float32, linear; .png: 16 bit, linear; with --turn video.mp4: sRGB."),
+    _option(
+        "--to",
+        "picture.npy or .exr: float32, linear; .png: 16 bit, linear; with --turn video.mp4: sRGB; with "
+        "--for-the-eye .png (8 bit) or .tiff (16 bit): sRGB.",
+    ),
 ]
 DirectionOption = Annotated[
     Several,
@@ -104,7 +118,12 @@ TurnOption = Annotated[
     int | None, _option("--turn", "Frames of a video in which the lights turn once about z.", min=2, max=100_000)
 ]
 WhiteOption = Annotated[
-    float | None, _option("--white", "Of a video: shown as white; its 99.9 % quantile without it.", min=1e-9)
+    float | None,
+    _option(
+        "--white",
+        "Of a video, or a picture for the eye: shown as white; its 99.9 % quantile without it.",
+        min=1e-9,
+    ),
 ]
 
 
@@ -127,6 +146,9 @@ def relight(
     uncertainty: UncertaintyOption = None,
     turn: TurnOption = None,
     white: WhiteOption = None,
+    for_the_eye: EyeOption = False,
+    sensor_spectra: SensorOption = None,
+    led_spectrum: SpectrumOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make the picture that lights which were not there would give. Lights that are named together are summed."""
@@ -134,13 +156,17 @@ def relight(
 
     console = make_console(quiet=as_json)
     try:
-        _refuse_target(to, uncertainty, turn, white)
+        _refuse_target(to, uncertainty, turn, white, for_the_eye=for_the_eye)
+        colour = colour_asked(sensor_spectra, led_spectrum, for_the_eye=for_the_eye)
         wanted = _lights(direction or [], led or [], light_at or [], area or [], environment or [], lights)
         camera = _camera(from_, look_at, size, field_of_view)
         with step_bars(console) as bars:
             bars("read", 0, 1)
             relit = _open(result, view, fit, camera, samples, uncertain=uncertainty is not None)
-            said = _write(relit, wanted, to, turn, white, bars)
+            if colour is not None:
+                said = write_relit_for_the_eye(relit, wanted, to, colour, white, bars)
+            else:
+                said = _write(relit, wanted, to, turn, white, bars)
             if uncertainty is not None:
                 said |= _write_uncertainty(relit, wanted, uncertainty, bars)
     except CoupoleError as error:
@@ -175,17 +201,25 @@ def _lights(
     return found
 
 
-def _refuse_target(to: Path, uncertainty: Path | None, turn: int | None, white: float | None) -> None:
-    from coupole.exchange import picture_files, video_files
+def _refuse_target(
+    to: Path, uncertainty: Path | None, turn: int | None, white: float | None, *, for_the_eye: bool
+) -> None:
+    from coupole.exchange import picture_files, picture_for_the_eye, video_files
 
     if uncertainty is not None:
         picture_files.refuse_unknown(uncertainty)
         if turn is not None:
             raise InputError("--uncertainty: belongs to a picture, not to a video (--turn)")
-    if turn is None:
+    if for_the_eye:
+        picture_for_the_eye.refuse_unknown(to)
+        if turn is not None:
+            raise InputError("--for-the-eye: belongs to a picture, not to a video (--turn)")
+    elif turn is None:
         picture_files.refuse_unknown(to)
         if white is not None:
-            raise InputError("--white: belongs to a video (--turn); pictures are linear and hold all values")
+            raise InputError(
+                "--white: belongs to a video (--turn) or to --for-the-eye; other pictures hold all values"
+            )
     else:
         video_files.refuse_unknown(to)
 
@@ -252,6 +286,7 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
         lambda lights, say: of_three(scene.picture(lights, samples, say=say)),
         {"fit": scene.fit, "simulated": simulated},
         lambda lights, say: of_three(relit_uncertainty.uncertainty_of_picture(scene, lights, samples, say=say)),
+        has_colours=folder.channels == 3,
     )
 
 
@@ -295,7 +330,7 @@ def _write(
         numbers = sorted({number * turn // _LOOKED_AT for number in range(_LOOKED_AT)})
         peaks = []
         for done, number in enumerate(numbers):
-            peaks.append(np.quantile(_bright(frame(number)), PEAK_QUANTILE))
+            peaks.append(np.quantile(bright(frame(number)), PEAK_QUANTILE))
             bars("exposure", done + 1, len(numbers))
         white = float(np.mean(peaks)) or 1.0
 
@@ -320,9 +355,3 @@ def _write_uncertainty(
     assert relit.uncertainty is not None
     write_picture(to, relit.uncertainty(lights, lambda done, of: bars("uncertainty", done, of)))
     return {"uncertainty": str(to.resolve())}
-
-
-def _bright(picture: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Values of the pixels that are not dark."""
-    lit = picture[picture.max(axis=2) > 0.0]
-    return lit if len(lit) else picture.reshape(-1, 3)

@@ -30,6 +30,16 @@ ViewOption = Annotated[
 SamplesOption = Annotated[
     bool, typer.Option("--samples", help="Of a result of runs: put all samples beside the page, for its plots.")
 ]
+PlanesOption = Annotated[
+    int | None,
+    typer.Option(
+        "--residual-planes",
+        help="Of a result of runs: planes for what GGX leaves of it, 0 for none; 9 without it.",
+        min=0,
+        max=29,
+        show_default=False,
+    ),
+]
 EnvironmentOption = Annotated[
     Path | None,
     typer.Option("--environment", help="Of a result: light from all around, .exr or .hdr, twice as wide as high."),
@@ -42,6 +52,7 @@ def show(
     view: ViewOption = None,
     samples: SamplesOption = False,
     environment: EnvironmentOption = None,
+    residual_planes: PlanesOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make a page to look at a measured object: turn it, light it anew, measure it, see how well it is known."""
@@ -56,7 +67,7 @@ def show(
             )
         with step_bars(console) as bars:
             bars("read", 0, 1)
-            look = _look(source, view or [], samples, environment, bars)
+            look = _look(source, view or [], samples, environment, residual_planes, bars)
             bars("write", 0, 1)
             title = source.stem if source.is_file() else source.resolve().name
             files = write_page(look, title, out)
@@ -69,33 +80,47 @@ def show(
         print(json.dumps(said))
     else:
         console.print(f"{files[0]}: {size_bytes / 1e6:.1f} MB in {len(files)} files; open it in a browser")
+        if told := look.about.get("residual"):
+            names = {name for view in told["views"] for name in view["blocks"]}
+            beside = sum(file.stem in names for file in files[1:])
+            where = f"; {beside} of {len(names)} files of it lie beside the page" if beside else ""
+            kept = f"{told['planes']} planes have {100 * told['kept']:.4g} % of its energy"
+            console.print(f"residual: {kept}{where}")
 
 
 def _look(
-    source: Path, views: list[str], samples: bool, environment: Path | None, say: Callable[[str, int, int], None]
+    source: Path,
+    views: list[str],
+    samples: bool,
+    environment: Path | None,
+    planes: int | None,
+    say: Callable[[str, int, int], None],
 ) -> Look:
     """By what the source is. Raises InputError if it is neither a scene, a run nor a whole result."""
     from coupole.exchange.look.look_environment import with_environment
     from coupole.exchange.look.look_of_frames import look_of_run
     from coupole.exchange.look.look_of_pictures import look_of_pictures
     from coupole.exchange.look.look_of_runs import look_of_result
+    from coupole.exchange.look.residual_planes import PLANES
     from coupole.reflectance import picture_result, run_result
     from coupole.reflectance.new_light.environment import OF_PICTURES, OF_RUNS
     from coupole.storage.run_json import RUN_JSON
 
+    of_runs: dict[str, object] = {"--samples": samples, "--residual-planes": planes is not None}
     if source.is_file():
-        _refuse({"--view": views, "--samples": samples, "--environment": environment}, f"{source} is a scene")
+        _refuse({"--view": views, **of_runs, "--environment": environment}, f"{source} is a scene")
         return _look_of_scene(source)
     try:
         if (source / RUN_JSON).exists():
-            _refuse({"--samples": samples, "--environment": environment}, f"{source} is a run")
+            _refuse({**of_runs, "--environment": environment}, f"{source} is a run")
             return look_of_run(source, views, say)
         if (source / picture_result.SAMPLES).exists():
-            _refuse({"--view": views, "--samples": samples}, f"{source} is a result of pictures")
+            _refuse({"--view": views, **of_runs}, f"{source} is a result of pictures")
             return with_environment(look_of_pictures(source), environment, OF_PICTURES)
         if (source / run_result.OBJECT).exists():
             _refuse({"--view": views}, f"{source} is a result")
-            return with_environment(look_of_result(source, say, with_samples=samples), environment, OF_RUNS)
+            look = look_of_result(source, say, with_samples=samples, planes=PLANES if planes is None else planes)
+            return with_environment(look, environment, OF_RUNS)
     except (OSError, KeyError) as error:
         raise InputError(f"{source}: is damaged ({error}); make the result again into another folder") from error
     raise InputError(f"{source}: holds no run or result (`coupole reflectance RUN --out FOLDER` makes one)")

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import io
 import json
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 import coupole
 from coupole.errors import InputError
@@ -30,8 +32,6 @@ def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
     """The whole file. 1 is the camera's range above black in the frame's own exposure, in the channel that gets
     most of white; the others are cut where that one is, so that what is saturated is white. Raises InputError for
     a camera without colours."""
-    import tifffile
-
     from coupole.appearance.spectra.light import linear_srgb
 
     if picture.pattern not in DEMOSAIC:
@@ -45,6 +45,13 @@ def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
     shown = np.clip(linear_srgb(balanced @ colour.xyz_from_balanced.T), 0.0, 1.0)
     codes = np.rint(65535.0 * (shown if linear else srgb(shown))).astype(np.uint16)
     about = {**picture.about, "colour": colour.told, "linear": linear}
+    return tiff_of(codes, about, linear_profile() if linear else srgb_profile())
+
+
+def tiff_of(codes: NDArray[np.uint16], about: dict[str, Any], profile: bytes) -> bytes:
+    """The whole file of [h, w, 3] red, green, blue by an ICC profile; `about` is its description."""
+    import tifffile
+
     buffer = io.BytesIO()
     tifffile.imwrite(
         buffer,
@@ -53,7 +60,7 @@ def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
         description=json.dumps(about),
         software=f"coupole {coupole.__version__}",
         metadata=None,
-        iccprofile=linear_profile() if linear else srgb_profile(),
+        iccprofile=profile,
     )
     return buffer.getvalue()
 

@@ -49,42 +49,53 @@ class ChannelSamples:
 
 
 def channel_samples(
-    result: RunResult, view: ViewSamples, rows: Integers, leds: Integers, channel: int, scan_noise_um: float
+    result: RunResult,
+    view: ViewSamples,
+    rows: Integers,
+    leds: Integers,
+    channel: int | None,
+    scan_noise_um: float,
+    beside: Beside | None = None,
 ) -> ChannelSamples:
-    """Of some rows of a view's file, rising, and some of its LEDs. Raises InputError for a file that an earlier
-    version made."""
+    """Of some rows of a view's file, rising, and some of its LEDs; without a channel, of the channels' mean, as if
+    all were off to the same side. `beside` saves finding the rows' `triangles_beside` anew. Raises InputError for
+    a file that an earlier version made."""
+    beside = beside or triangles_beside(result, view, rows)
     with h5py.File(view.path, "r") as file:
-        if "lateral_u_mm" not in file.attrs:
-            raise InputError(f"{view.path}: an earlier version made it; make the result anew")
         lateral_u_mm, led_u_mm = float(file.attrs["lateral_u_mm"]), float(file.attrs["led_u_mm"])
-        beside = _beside(view.path, rows, lateral_u_mm, result.areas_mm2[view.triangles])
         used = np.unique(np.append(rows, beside.rows))
+        channels = range(result.channels) if channel is None else (channel,)
 
-        def table(name: str) -> Floats:
-            return _table(file[name], used, leds, channel)
+        def tables(name: str) -> Floats:
+            return np.stack([_table(file[name], used, leds, one) for one in channels])
 
-        f, u_noise, own = table("f"), table("u_own"), np.searchsorted(used, rows)
+        each_f, own = tables("f"), np.searchsorted(used, rows)
+        f, shares = each_f.mean(axis=0), np.abs(each_f) / np.maximum(np.abs(each_f).sum(axis=0), 1e-30)
+        u_noise = np.sum(shares * tables("u_own"), axis=0)
         dark = _table(file["codes"], used, leds, None) != REACHED
         indirect = np.zeros(f.shape)
         if view.inter_reflection is not None:
-            indirect = u_inter_reflection(table(INTER_REFLECTION).astype(np.float16))
-        u_response = file["u_response"][:, channel][rows]
-        u_own, u_shared = (file[name][:, channel][leds] for name in ("led_u_own", "led_u_shared"))
+            taken = u_inter_reflection(tables(INTER_REFLECTION).astype(np.float16))
+            indirect = np.sum(shares * taken, axis=0)
+        u_response = file["u_response"][()][rows][:, channels].mean(axis=1)
+        u_own, u_shared = (
+            file[name][()][leds][:, channels].mean(axis=1) for name in ("led_u_own", "led_u_shared")
+        )
         incidence = _cosines(file["centres_mm"][:][used], file["normals"][:][used], view.led_mm[leds])
     signal, u_signal = np.where(dark, 0.0, f * incidence), np.where(dark, 0.0, u_noise)
     u_place = beside.uncertainty(signal, u_signal, own, np.searchsorted(used, beside.rows), lateral_u_mm)
     grid = (len(rows), len(leds))
 
-    def each(values: Floats, shape: tuple[int, ...]) -> Floats:
+    def along(values: Floats, shape: tuple[int, ...]) -> Floats:
         return np.broadcast_to(values.reshape(shape), grid).ravel().astype(np.float64)
 
     sources = Sources(
         u_noise[own].ravel(),
-        each(u_response, (-1, 1)),
+        along(u_response, (-1, 1)),
         indirect[own].ravel(),
         u_place.ravel(),
-        each(u_own, (1, -1)),
-        each(u_shared, (1, -1)),
+        along(u_own, (1, -1)),
+        along(u_shared, (1, -1)),
         np.full(grid, scan_noise_um).ravel(),
         np.full(grid, led_u_mm).ravel(),
     )
@@ -96,7 +107,7 @@ def channel_samples(
 
 
 @dataclass(frozen=True)
-class _Beside:
+class Beside:
     """Triangles that pixels may show in the place of others."""
 
     rows: Integers
@@ -133,10 +144,15 @@ def _centres(path: Path) -> tuple[Floats, Floats, cKDTree]:
         return centres_mm, file["camera_mm"][()], cKDTree(centres_mm)
 
 
-def _beside(path: Path, rows: Integers, lateral_u_mm: float, areas_mm2: Floats) -> _Beside:
+def triangles_beside(result: RunResult, view: ViewSamples, rows: Integers) -> Beside:
     """Triangles as far away as a picture is likely to be off, or the nearest ones, on all sides of `rows`, in the
-    plane across the line of sight."""
-    centres_mm, camera_mm, tree = _centres(path)
+    plane across the line of sight. Raises InputError for a file that an earlier version made."""
+    with h5py.File(view.path, "r") as file:
+        if "lateral_u_mm" not in file.attrs:
+            raise InputError(f"{view.path}: an earlier version made it; make the result anew")
+        lateral_u_mm = float(file.attrs["lateral_u_mm"])
+    areas_mm2 = result.areas_mm2[view.triangles]
+    centres_mm, camera_mm, tree = _centres(view.path)
     mine = centres_mm[rows]
     towards = camera_mm - mine
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
@@ -154,7 +170,7 @@ def _beside(path: Path, rows: Integers, lateral_u_mm: float, areas_mm2: Floats) 
         across = apart - np.sum(apart * towards, axis=1)[:, None] * towards
         there = away_mm < far_mm  # past the edge of what the view sees there is nothing
         square_mm2[:, side] = np.where(there, np.sum(across**2, axis=1), 0.0)
-    return _Beside(found, square_mm2)
+    return Beside(found, square_mm2)
 
 
 def _cosines(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:
@@ -169,4 +185,6 @@ def _table(data: h5py.Dataset, rows: Integers, leds: Integers, channel: int | No
     own = () if channel is None else (channel,)
     if len(rows) * data.shape[1] < len(leds) * data.shape[0]:
         return np.stack([data[(int(row), slice(None), *own)][leds] for row in rows]).astype(np.float64)
-    return np.stack([data[(slice(None), int(led), *own)][rows] for led in leds], axis=1).astype(np.float64)
+    first = int(rows[0])
+    some = slice(first, int(rows[-1]) + 1)
+    return np.stack([data[(some, int(led), *own)][rows - first] for led in leds], axis=1).astype(np.float64)

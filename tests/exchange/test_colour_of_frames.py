@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import rawpy
 import tifffile
+from colour_cases import D65, lamp, patches, sensor, write_tables
 from lazily import lazily
 from PIL import Image, ImageCms
 
@@ -25,41 +26,12 @@ colour: Any = lazily("colour")
 BLACK, WHITE = 256, 16383
 SIDE = 32
 """Of a patch, px."""
-D65 = (0.3127, 0.3290)
 RGB = {"R": 0, "G": 1, "B": 2}
-
-
-def shape() -> Any:
-    return colour.SpectralShape(380, 780, 5)
-
-
-def sensor() -> np.ndarray:
-    """[81, 3] of a camera that is known."""
-    return np.asarray(colour.MSDS_CAMERA_SENSITIVITIES["Nikon 5100 (NPL)"].copy().align(shape()).values)
-
-
-def lamp() -> np.ndarray:
-    """[81] of a white LED."""
-    return np.asarray(colour.SDS_ILLUMINANTS["LED-B3"].copy().align(shape()).values)
-
-
-def patches() -> tuple[np.ndarray, np.ndarray]:
-    """[25, 81] reflectances of a colour checker and the perfect white, and their [25, 3] XYZ under D65."""
-    chart = [one.copy().align(shape()) for one in colour.SDS_COLOURCHECKERS["BabelColor Average"].values()]
-    chart.append(colour.SpectralDistribution(np.ones(81), shape().wavelengths))
-    daylight = colour.SDS_ILLUMINANTS["D65"].copy().align(shape())
-    eye = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape())
-    truth = [colour.sd_to_XYZ(one, eye, daylight, method="Integration") / 100.0 for one in chart]
-    return np.stack([one.values for one in chart]), np.stack(truth)
 
 
 @pytest.fixture(scope="module")
 def tables(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    folder = tmp_path_factory.mktemp("spectra")
-    paths = folder / "sensor.csv", folder / "led.csv"
-    for path, values in zip(paths, (sensor(), lamp()[:, None]), strict=True):
-        np.savetxt(path, np.column_stack([shape().wavelengths, values]), delimiter=";", fmt="%.8g")
-    return paths
+    return write_tables(tmp_path_factory.mktemp("spectra"))
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import trimesh
+from checkers import gltf_messages, needs_checkers
 from lazily import lazily
 from relight_cases import BASE_FROM_SUPPORT, Coat, moved, unit, waves, write_result
 
@@ -84,6 +85,15 @@ def test_ply_has_the_mesh_and_each_triangles_material(result: RunResult, tmp_pat
     np.testing.assert_allclose(np.ravel(faces["ks_b"])[seen], 0.04, rtol=1e-6)
     assert np.isfinite(np.ravel(faces["alpha"])).sum() == len(seen)
     assert b"comment simulated with Coupole" in path.read_bytes()[:200]
+
+
+@needs_checkers
+def test_gltf_is_valid_to_the_validator_of_those_who_make_the_format(result: RunResult, tmp_path: Path) -> None:
+    (path,) = exported(result, "gltf", tmp_path)
+    assert gltf_messages(path) == []
+    broken = tmp_path / "broken.glb"
+    broken.write_bytes(path.read_bytes().replace(b'"VEC3"', b'"VEC2"', 1))
+    assert gltf_messages(broken)
 
 
 def test_gltf_has_the_materials_in_its_textures(result: RunResult, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import cells
 import h5py
 import numpy as np
 import pytest
-from relight_cases import waves, write_result
+from relight_cases import sheet, waves, write_result, write_sources
 
 from coupole.errors import InputError, StorageError
 from coupole.exchange.look.coarse_mesh import coarse_mesh
@@ -19,6 +19,7 @@ from coupole.exchange.look.look_blocks import block_of
 from coupole.exchange.look.look_of_runs import Look, welded
 from coupole.exchange.look.look_page import write_page
 from coupole.exchange.look.look_samples import samples_of_view
+from coupole.reflectance.sample_uncertainty import Places, Sources, drawn
 
 
 def small(numbers: int = 30) -> Look:
@@ -160,15 +161,59 @@ def test_an_option_that_does_not_fit_is_refused(result: Path, tmp_path: Path, op
     assert not list(tmp_path.iterdir())
 
 
-def test_bars_of_samples_hold_what_an_led_does_to_all_channels(tmp_path: Path) -> None:
-    result = write_result(tmp_path / "sheet", waves(8))
+def test_bars_of_samples_are_the_95_percent_of_all_that_is_uncertain(tmp_path: Path) -> None:
+    """Against draws of power, signal, vertices and LEDs, by numbers that do not come from the file."""
+    result = write_result(tmp_path / "sheet", sheet(np.zeros((4, 4)), 60.0), camera_mm=(0.0, 0.0, 330.0))
+    u = {"u_own": 0.02, "u_response": 0.015, "led_u_own": 0.01, "led_u_shared": 0.03, "led_u_mm": 4.0}
     with h5py.File(result.views[0].path, "a") as file:
-        file["f"][...] = 0.1
-        file["u_own"], file["led_u_own"] = np.zeros(file["f"].shape, np.float16), np.full((1, 3), 0.05)
-    _, blocks = samples_of_view(result, result.views[0], np.eye(4), lambda *_: None)
+        file["f"][...] = 0.1 * np.array([1.0, 0.8, 0.6])
+        write_sources(file, u)
+    scan_noise_um, (view,) = 400.0, result.views
+    _, blocks = samples_of_view(result, view, np.eye(4), scan_noise_um, lambda *_: None)
     packed = zlib.decompress(base64.b64decode(blocks[2].text))
-    u = 1e-4 * 1e5 ** ((np.frombuffer(packed, np.uint8).reshape(blocks[2].shape)[1] - 1.0) / 254)
-    np.testing.assert_allclose(u, 0.05, rtol=0.024)
+    value, below, above = 1e-4 * 1e5 ** ((np.frombuffer(packed, np.uint8).reshape(blocks[2].shape) - 1.0) / 254)
+    count = len(view.triangles)
+    assert value.shape == (count, 1)
+
+    def each(number: float) -> np.ndarray:
+        return np.full(count, number)
+
+    corners = result.corners_mm[view.triangles].astype(float)
+    places = Places(corners, np.tile(view.led_mm, (count, 1)), np.tile(view.led_normals, (count, 1)))
+    none = each(0.0)
+    of_signal = each(u["u_own"]), each(u["u_response"]), none, none
+    sources = Sources(
+        *of_signal, each(u["led_u_own"]), each(u["led_u_shared"]), each(scan_noise_um), each(u["led_u_mm"])
+    )
+    ratios = drawn(places, sources, 20_000, np.random.default_rng(1))
+    low, high = np.quantile(ratios, [0.025, 0.975], axis=1)
+    np.testing.assert_allclose(below[:, 0], 1 - low, rtol=0.06)
+    np.testing.assert_allclose(above[:, 0], high - 1, rtol=0.06)
+
+
+@pytest.mark.parametrize(
+    "source", ["u_own", "u_response", "led_u_own", "led_u_shared", "led_u_mm", "lateral_u_mm"]
+)
+def test_each_source_makes_bars_longer(tmp_path: Path, source: str) -> None:
+    result = write_result(tmp_path / "waves", waves(8))
+    ends = []
+    for u in (0.0, 0.05 if source.endswith(("own", "response", "shared")) else 5.0):
+        with h5py.File(result.views[0].path, "a") as file:
+            file["f"][...] = 0.1
+            write_sources(file, {source: u})
+        _, blocks = samples_of_view(result, result.views[0], np.eye(4), 30.0, lambda *_: None)
+        packed = zlib.decompress(base64.b64decode(blocks[2].text))
+        ends.append(np.frombuffer(packed, np.uint8).reshape(blocks[2].shape)[1:].astype(int))
+    assert np.median(ends[1] - ends[0]) > 3
+
+
+def test_samples_of_an_earlier_version_are_refused(tmp_path: Path) -> None:
+    result = write_result(tmp_path / "old", waves(8))
+    with h5py.File(result.views[0].path, "a") as file:
+        del file.attrs["lateral_u_mm"]
+    ended = cells.here("show", tmp_path / "old", "--samples", "--out", tmp_path / "look.html")
+    assert ended.code == 2
+    assert "make the result anew" in " ".join(ended.err.split())
 
 
 def test_a_page_of_another_name_is_refused(result: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from urllib.parse import unquote
 import cells
 import pytest
 from archives import MadeRun, make_run
+from checkers import crate_issues, needs_checkers
 from lazily import lazily
 from relight_cases import waves, write_result
 
@@ -65,6 +66,13 @@ def test_a_result_says_of_which_frames_it_was_made_and_may_be_described_in_place
     assert used == {"waves/run.json": f"sha256:{'ab' * 32}", "waves/views/top.h5": f"sha256:{'cd' * 32}"}
     assert crate.root_dataset["license"]["name"] == "ask the museum"
     assert len(crate.data_entities) == len(before)
+
+
+@needs_checkers
+def test_a_crate_is_valid_to_the_communitys_validator(made: MadeRun, tmp_path: Path) -> None:
+    out = tmp_path / "crate"
+    export(made.run.folder, "--licence", CC_BY, "--publisher", "Some House", "--out", out)
+    assert crate_issues(out, tmp_path) == []
 
 
 def test_people_and_files_of_any_name_have_ids_of_their_own_that_are_addresses(

@@ -14,7 +14,8 @@ from coupole.errors import InputError
 from coupole.exchange.look.coarse_mesh import MOST_TRIANGLES, coarse_mesh
 from coupole.exchange.look.look_blocks import Block, Look, block_of, halves, log_coded, octahedral
 from coupole.exchange.look.look_frames import frames_of_view
-from coupole.exchange.look.look_samples import samples_of_view
+from coupole.exchange.look.look_samples import samples_of_result
+from coupole.exchange.look.residual_planes import PLANES, residual_blocks, residual_fit
 from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.geometry import apply, inverse
 from coupole.reflectance.run_relighting import best_fit
@@ -28,15 +29,22 @@ PLACES = 65535
 
 
 def look_of_result(
-    folder: Path, say: Said = lambda *_: None, *, with_samples: bool = False, coarse_over: int = MOST_TRIANGLES
+    folder: Path,
+    say: Said = lambda *_: None,
+    *,
+    with_samples: bool = False,
+    coarse_over: int = MOST_TRIANGLES,
+    planes: int = PLANES,
 ) -> Look:
-    """Of a whole result; a mesh of more than `coarse_over` triangles has a coarse one for the first picture.
+    """Of a whole result; a mesh of more than `coarse_over` triangles has a coarse one for the first picture. With
+    `planes` of the residual, if there is one, the material is the one that it is added to.
 
     Raises InputError if it is none, or has no material.
     """
     known = read_about(folder)
     result = RunResult(folder)
-    fit = best_fit(result, MATERIALS)
+    left_of = residual_fit(result) if planes else None
+    fit = left_of or best_fit(result, MATERIALS)
     path = result.materials_path(fit)
     if not path.exists():
         raise InputError(f"{folder}: has no fit {fit}; `coupole reflectance fit {folder}` makes it")
@@ -70,15 +78,13 @@ def look_of_result(
         "origin_mm": origin_mm.tolist(),
         "step_mm": step_mm,
     }
-    later = [block for _, pictures in views for block in pictures]
+    later = _residuals(result, fit, planes, about, say) if left_of else []
+    later += [block for _, pictures in views for block in pictures]
     errors = _ERRORS | {"places": f"{0.5e3 * step_mm:.2g} um in each coordinate"}
     if with_samples:
-        about["samples"] = []
-        errors["samples"] = "2.3 % of their value, and of their uncertainty"
-        for view in result.views:
-            told, blocks_of_view = samples_of_view(result, view, support_from_base, say)
-            about["samples"].append(told)
-            later += blocks_of_view
+        errors["samples"] = "2.3 % of their value, and of how far the ends of their intervals are from it"
+        told = samples_of_result(result, support_from_base, known["scan_noise_um"], say)
+        about["samples"], later = told[0], later + told[1]
     return Look(about, blocks, tuple(later), _first(places, triangles, of_triangles, coarse_over), errors)
 
 
@@ -88,6 +94,16 @@ _ERRORS = {
     "uncertainties": "2.3 % of their value",
     "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
 }
+
+
+def _residuals(result: RunResult, fit: str, planes: int, about: dict[str, Any], say: Said) -> list[Block]:
+    """Blocks of what a fit leaves; what is known of it goes into `about`."""
+    about["residual"], blocks = residual_blocks(result, planes, say)
+    about["told"]["Residual"] = (
+        f"what {fit} leaves of each view's samples, as {planes} planes, which have "
+        f"{100 * about['residual']['kept']:.4g} % of its energy. It is of its view, and fades out beside it."
+    )
+    return blocks
 
 
 def _materials(result: RunResult, fit: str, support_from_base: Floats) -> tuple[dict[str, NDArray[Any]], int]:

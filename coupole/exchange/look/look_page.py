@@ -36,6 +36,7 @@ SCRIPTS = (
     "scene.js",
     "material.js",
     "frames.js",
+    "residual.js",
     "plot.js",
     "samples.js",
     "sphere.js",

@@ -11,35 +11,77 @@ from numpy.typing import NDArray
 from coupole.exchange.look.look_blocks import Block, block_of, log_coded
 from coupole.geometry import apply
 from coupole.reflectance.run_result import RunResult, ViewSamples
+from coupole.reflectance.sample_sources import channel_samples, triangles_beside
+from coupole.reflectance.sample_uncertainty import bounds
 
 ROWS = 64
 """Triangles of a block."""
+_BAND, _LEDS = 4096, 8
+"""Triangles and LEDs that are read together: as they lie in the file."""
+_QUANTILE_95 = 1.959964
+_FAR = 10.0
+"""Of an end that is not bounded: the greatest that is written."""
+
+
+def samples_of_result(
+    result: RunResult,
+    support_from_base: NDArray[np.float64],
+    scan_noise_um: float,
+    say: Callable[[str, int, int], None],
+) -> tuple[list[dict[str, Any]], list[Block]]:
+    """What the page knows of the samples of all views, and their blocks."""
+    told, blocks = [], []
+    for view in result.views:
+        of_view, mine = samples_of_view(result, view, support_from_base, scan_noise_um, say)
+        told.append(of_view)
+        blocks += mine
+    return told, blocks
 
 
 def samples_of_view(
     result: RunResult,
     view: ViewSamples,
     support_from_base: NDArray[np.float64],
+    scan_noise_um: float,
     say: Callable[[str, int, int], None],
 ) -> tuple[dict[str, Any], list[Block]]:
-    """What the page knows of a view's samples, and its blocks: the numbers of triangles, and of `ROWS` of them
-    [2, ROWS, leds] codes of the channels' mean f cos_i and of its relative standard uncertainty at most: by what
-    `view_noise` has, as if all channels were off to the same side, as they are by an LED's power."""
+    """What the page knows of a view's samples, and its blocks: the numbers of triangles, places of LEDs, and of
+    `ROWS` triangles [3, ROWS, leds] codes of the channels' mean f cos_i, and of how far below and above it, as
+    shares of it, its 95 % interval ends: by all sources, as if all channels were off to the same side.
+
+    Raises InputError for samples that an earlier version made.
+    """
     name, count = view.path.stem, len(view.triangles)
-    leds = np.ones(len(view.leds), bool)
     blocks = [
         block_of(f"samples-{name}-triangles", view.triangles.astype(np.uint32)),
         block_of(f"samples-{name}-leds", apply(support_from_base, view.led_mm).astype(np.float32)),
     ]
-    for first in range(0, count, ROWS):
-        rows = slice(first, min(first + ROWS, count))
-        values = result.view_samples(view, rows).values.astype(np.float64)
-        u = result.view_noise(view, rows, leds)
-        known = np.isfinite(values).all(axis=2)
-        mean = np.where(known, values.mean(axis=2), np.nan)
-        own = np.mean(np.abs(values) * u, axis=2) / np.maximum(np.abs(mean), 1e-12)
-        codes = np.stack([log_coded(np.where(mean > 0.0, mean, np.nan)), log_coded(own)])
-        blocks.append(block_of(f"samples-{name}-{first // ROWS}", codes))
-        say(f"samples of {view.view}", rows.stop, count)
+    for first in range(0, count, _BAND):
+        rows = np.arange(first, min(first + _BAND, count))
+        codes = _codes(result, view, rows, scan_noise_um)
+        blocks += [
+            block_of(f"samples-{name}-{(first + at) // ROWS}", codes[:, at : at + ROWS])
+            for at in range(0, len(rows), ROWS)
+        ]
+        say(f"samples of {view.view}", int(rows[-1]) + 1, count)
     camera_mm = apply(support_from_base, view.camera_mm).tolist()
     return {"view": view.view, "name": name, "rows": ROWS, "camera_mm": camera_mm}, blocks
+
+
+def _codes(
+    result: RunResult, view: ViewSamples, rows: NDArray[np.int64], scan_noise_um: float
+) -> NDArray[np.uint8]:
+    """[3, rows, leds]"""
+    beside = triangles_beside(result, view, rows)
+    mean = result.view_samples(view, slice(int(rows[0]), int(rows[-1]) + 1)).values.mean(axis=2, dtype=np.float64)
+    made = np.zeros((3, len(rows), len(view.leds)), np.uint8)
+    made[0] = log_coded(np.where(mean > 0.0, mean, np.nan))
+    for first in range(0, len(view.leds), _LEDS):
+        leds = np.arange(first, min(first + _LEDS, len(view.leds)))
+        samples = channel_samples(result, view, rows, leds, None, scan_noise_um, beside)
+        known = samples.at(samples.known)
+        low, high = bounds(known.places, known.sources, _QUANTILE_95)
+        ends = np.full((2, len(samples.f)), np.nan)
+        ends[:, samples.known] = 1.0 - low, np.minimum(high - 1.0, _FAR)
+        made[1:, :, leds] = log_coded(ends).reshape(2, len(rows), len(leds))
+    return made

@@ -82,25 +82,31 @@ class App {
     return this.renderer.banner(this.state);
   }
 
-  /** Fetch the frame that is shown, one at a time. */
-  async bringFrame() {
-    const wanted = this.missingFrame();
+  /** Fetch what the picture lacks, one at a time. */
+  async bring() {
+    const wanted = this.missing();
     if (!wanted || this.isBringing) return;
     this.isBringing = true;
     try {
-      this.renderer.keepFrame(wanted, await laterBlock(this.about, wanted.block));
+      await wanted.bring();
     } catch (error) {
-      this.lost.add(wanted.block);
+      this.lost.add(wanted.name);
       this.say(error.message);
     }
     this.isBringing = false;
     this.changed("light");
   }
 
-  /** The frame that is shown and has yet to come. */
-  missingFrame() {
-    const found = this.renderer.frameOf(this.state);
-    return !found || found.texture || this.lost.has(found.frame.block) ? null : found.frame;
+  /** The frame or the residual that is shown and has yet to come, and how. */
+  missing() {
+    const { renderer } = this, found = renderer.frameOf(this.state), view = renderer.missingResidual(this.state);
+    const wanted = [];
+    if (found && !found.texture) {
+      const { frame } = found, { block: name } = frame;
+      wanted.push({ name, bring: async () => renderer.keepFrame(frame, await laterBlock(this.about, name)) });
+    }
+    if (view) wanted.push({ name: view.blocks[0], bring: () => renderer.residual.bring(view) });
+    return wanted.find(({ name }) => !this.lost.has(name)) ?? null;
   }
 
   /** More of the picture has come, or has failed to. */
@@ -120,14 +126,14 @@ class App {
   /** Wait until all that the picture needs has come. */
   async whole() {
     do await this.tilesCome();
-    while (this.missingFrame());
+    while (this.missing());
   }
 
   /** Something of the state is new: all, or only how the mean is shown ("screen"). */
   changed(what) {
     if (what !== "screen") this.renderer.restart();
     this.controls.show();
-    this.bringFrame();
+    this.bring();
     byId("banner").textContent = this.banner();
     drawSphere(byId("sphere"), this.state.camera, this.state.lights, this.state.chosen, this.renderer.dome?.(this.state));
     this.showMarks();

@@ -65,6 +65,10 @@ class Controls {
       this.state.split = input.valueAsNumber;
       this.changed("light");
     });
+    this.on("with-residual", "change", (input) => {
+      this.state.withResidual = input.value === "yes";
+      this.changed("light");
+    });
     byId("stereo-row").hidden = !["mesh", "scene"].includes(this.app.about.kind);
     for (const name of ["kelvin", "colour"]) byId(name).closest("label").hidden = this.app.about.kind === "scene";
     this.on("stereo", "change", (input) => {
@@ -147,6 +151,8 @@ class Controls {
     byId("split").disabled = !state.view;
     byId("quantity-row").hidden = state.mode !== "uncertainty";
     byId("relief-row").hidden = state.mode !== "unsharp";
+    byId("residual-row").hidden = !this.app.about.residual || state.mode !== "relit";
+    byId("with-residual").value = state.withResidual ? "yes" : "no";
     byId("white-row").hidden = !isLit(state.mode) || Boolean(state.view && !this.isRun);
     if (document.activeElement !== byId("white")) byId("white").value = Number(state.white.toPrecision(4));
     byId("legend").innerHTML = ["roughness", "uncertainty", "residual"].includes(state.mode)

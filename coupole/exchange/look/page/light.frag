@@ -36,6 +36,13 @@ uniform vec3 view_mm;
 uniform mat3 view_from_way;
 uniform vec2 lens[21];
 
+// What GGX leaves of triangles, as one view saw it: three shares of GGX, then numbers of planes, four to a layer.
+uniform sampler2DArray residual;
+uniform sampler2DArray residual_planes;  // by the light's direction in the triangle's frame
+uniform int residual_count;  // planes, 0 for none
+uniform vec3 residual_mm;  // the camera of its view
+uniform vec2 residual_cosines;  // between the eye and that camera: all of it, none of it
+
 out uvec4 mean;
 
 struct Material {
@@ -73,22 +80,59 @@ vec4 measured_at(vec3 at_mm) {
   return vec4(measured_peak * linear, 1.0);
 }
 
+float residual_code(int triangle, int number) {
+  return 255.0 * texelFetch(residual, ivec3(cell(triangle), number / 4), 0)[number % 4];
+}
+
+// Share of the residual that is shown to the eye; 0 of triangles that have none.
+float residual_share(int triangle, vec3 view, vec3 at_mm) {
+  if (residual_count == 0 || residual_code(triangle, 0) == 0.0) return 0.0;
+  float cosine = dot(view, normalize(residual_mm - at_mm));
+  return smoothstep(residual_cosines.y, residual_cosines.x, cosine);
+}
+
+// Where the tables have a light's direction: Lambert's azimuthal projection in the frame of the mesh's normal and, along
+// the surface, the view's camera.
+vec2 residual_place(vec3 way, vec3 face, vec3 at_mm) {
+  vec3 along = residual_mm - at_mm;
+  along -= face * dot(along, face);
+  along = length(along) > 1e-6 ? normalize(along) : normalize(abs(face.x) < 0.6 ? vec3(1, 0, 0) - face * face.x : vec3(0, 1, 0) - face * face.y);
+  vec2 disk = vec2(dot(way, along), dot(way, cross(face, along))) / sqrt(1.0 + max(dot(way, face), 0.0));
+  float side = float(textureSize(residual_planes, 0).x);
+  return (0.5 * (disk + 1.0) * (side - 1.0) + 0.5) / side;
+}
+
+// Reflectance times cosine: a share of that of GGX, and the planes.
+vec3 with_residual(vec3 ggx, int triangle, vec3 way, vec3 face, vec3 at_mm) {
+  vec2 place = residual_place(way, face, at_mm);
+  vec3 shares, sum = vec3(0.0);
+  for (int k = 0; k < 3; k++) shares[k] = (residual_code(triangle, k) - 1.0) / 254.0;
+  for (int k = 0; k < residual_count; k++) {
+    float root = (residual_code(triangle, k + 3) - 128.0) / 127.0;
+    sum += root * abs(root) * texture(residual_planes, vec3(place, k)).rgb;
+  }
+  return max(shares * ggx + dot(way, face) * sum, 0.0);
+}
+
 // What comes from a place of a material, under all lights.
-vec3 radiance(Material material, vec3 at_mm, vec3 face) {
+vec3 radiance(Material material, int triangle, vec3 at_mm, vec3 face) {
   vec3 view = flat_one ? vec3(0.0, 0.0, 1.0) : normalize(eye_mm - at_mm);
+  float added = residual_share(triangle, view, at_mm);
   float nv = dot(material.normal, view);
   vec3 sum = vec3(0.0);
   for (int light = 0; light < lights; light++) {
     vec3 way = led ? normalize(led_mm - at_mm) : ways[light];
     float nl = dot(material.normal, way);
-    if (nl <= 0.0 || dot(face, way) <= 0.0) continue;
+    if (nl <= 0.0 && added == 0.0 || dot(face, way) <= 0.0) continue;
     vec3 value = mode == SPECULAR ? vec3(0.0) : material.kd;
-    if (nv > 0.0 && mode != DIFFUSE) {
+    if (nl > 0.0 && nv > 0.0 && mode != DIFFUSE) {
       value += material.ks * lobe(nl, nv, dot(material.normal, normalize(way + view)), material.alpha);
     }
     float share = flat_one ? 1.0 : reaching(light, at_mm + face * offset_mm[light]);
     if (led) share *= led_reach(at_mm, way);
-    sum += irradiances[light] * nl * value * share;
+    value *= max(nl, 0.0);
+    if (added > 0.0) value = mix(value, with_residual(value, triangle, way, face, at_mm), added);
+    sum += irradiances[light] * value * share;
   }
   return sum;
 }
@@ -121,7 +165,7 @@ vec4 looked_at(int triangle, vec3 at_mm) {
     return code == 0u ? vec4(0.0) : vec4(vec3(1e-4 * pow(1e5, (float(code) - 1.0) / 254.0)), 1.0);
   }
   if (mode > UNCERTAINTY) return vec4(vec3(shine.y), 1.0);
-  return vec4(radiance(material, at_mm, flat_one ? material.normal : face_of(triangle)), 1.0);
+  return vec4(radiance(material, triangle, at_mm, flat_one ? material.normal : face_of(triangle)), 1.0);
 }
 
 void main() {

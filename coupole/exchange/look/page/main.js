@@ -61,7 +61,7 @@ async function begin() {
   await app.whole();
   if (app.about.picture_px && app.isNew) app.fitWhite();
   Object.defineProperties(window.coupole, Object.getOwnPropertyDescriptors(interfaceOf(app)));
-  byId("status").textContent = "";
+  if (!app.lost.size) byId("status").textContent = "";
 }
 
 const ready = begin();

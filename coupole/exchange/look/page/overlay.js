@@ -67,12 +67,13 @@ function coloursTold(about, state) {
   return [`colours of lights are hypotheses in RGB, ${eye}`];
 }
 
-/** What has to be said of the picture, wherever it is seen; `compared` is the measured frame in it. */
-function bannerOf(about, state, compared) {
+/** What has to be said of the picture, wherever it is seen; `compared` is the measured frame in it, `left` what is
+ * said of the residual. */
+function bannerOf(about, state, compared, left) {
   const kinds = { true: "Simulated object", false: "Measured object", null: "Pictures of an object" };
   const told = [kinds[about.simulated]];
   if (isLit(state.mode)) {
-    told.push(`light computed from a fit (${about.fit})`);
+    told.push(`light computed from a fit (${[about.fit, ...left].join(", ")})`);
     if (about.environment && state.environment > 0) told.push(`surroundings ${about.environment.name}`);
     told.push(...coloursTold(about, state));
   }

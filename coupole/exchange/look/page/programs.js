@@ -108,6 +108,15 @@ function putFactors(gl, texture, rows) {
   });
 }
 
+/** Square tables of 16-bit floats [layers, side, side, 3], read between their numbers. */
+function tablesTexture(gl, halves, side, layers) {
+  const texture = plainTexture(gl, gl.TEXTURE_2D_ARRAY);
+  for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D_ARRAY, name, gl.LINEAR);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  gl.texImage3D(gl.TEXTURE_2D_ARRAY, 0, gl.RGB16F, side, side, layers, 0, gl.RGB, gl.HALF_FLOAT, halves);
+  return texture;
+}
+
 /** A texture of a picture of bytes [height, width, 3]. */
 function bytesTexture(gl, bytes, width, height) {
   const texture = plainTexture(gl, gl.TEXTURE_2D);

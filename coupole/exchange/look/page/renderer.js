@@ -5,7 +5,7 @@ const SHADOW_PX = [512, 2048];  // least and most
 const MODE_NUMBERS = {
   relit: 0, diffuse: 1, specular: 2, unsharp: 3, normals: 4, roughness: 5, uncertainty: 6, residual: 7,
 };
-const ARRAYS = ["shadows", "planes"];
+const ARRAYS = ["shadows", "planes", "residual", "residual_planes"];
 const RAMP = ["#2a2140", "#3b4f8f", "#2f8f8c", "#8fbf5a", "#f0c24b", "#fff4cf"];
 const TEXTURES = {
   places: ["uint16", 3], triangles: ["uint32", 3], normals: ["uint16", 2], kd: ["float16", 3], ks: ["float16", 3],
@@ -38,6 +38,7 @@ class Renderer {
     this.arrived = () => {};  // what is called when more has come
     this.measure();
     this.prepare(arrays);
+    this.residual = new Residual(this.gl, about, this.middle);
     this.drawnShadows = [];
     this.frames = {};
   }
@@ -57,7 +58,7 @@ class Renderer {
   }
 
   banner(state) {
-    return bannerOf(this.about, state, this.frameOf(state));
+    return bannerOf(this.about, state, this.frameOf(state), this.residual.told(state));
   }
 
   /** The material of what `seenAt` has found. */
@@ -78,6 +79,12 @@ class Renderer {
   /** Whether colours are shown to an eye that is used to the chosen light; never those of measured frames. */
   isAdapted(state) {
     return state.adapted && isLit(state.mode) && !this.frameOf(state);
+  }
+
+  /** The view whose residual belongs to the picture and is not at hand yet; null for none. */
+  missingResidual(state) {
+    const view = this.triangles === this.about.triangles ? this.residual.wantedFor(state)?.view : null;
+    return view && !this.residual.texturesOf(view) ? view : null;
   }
 
   keepFrame(frame, bytes) {
@@ -174,6 +181,7 @@ class Renderer {
   sample(state) {
     this.fit();
     const beams = this.beamsOf(state);
+    this.shownResidual = this.residual.wantedFor(state);
     this.drawShadows(beams);
     this.gl.enable(this.gl.SCISSOR_TEST);
     for (const part of this.parts(state)) {
@@ -274,14 +282,29 @@ class Renderer {
     const compared = this.frameOf(state);
     const at = this.use("light", {
       ...this.textures, seen: seen.texture, before: mean.texture, shadows: this.depths.texture,
-      measured: compared?.texture ?? this.textures.kd,
+      measured: compared?.texture ?? this.textures.kd, ...this.residualTextures(),
     });
+    this.setResidual(at);
     this.setLed(at, compared, state.split);
     gl.uniform1i(at("quantity"), Object.keys(UNCERTAIN).indexOf(state.quantity));
     gl.uniform1f(at("relief"), state.relief);
     gl.uniform1i(at("flat_one"), this.about.picture_px ? 1 : 0);
     gl.uniform3fv(at("irradiances"), beams.flatMap((beam) => beam.irradiance));
     this.drawMean(at, state, beams);
+  }
+
+  residualTextures() {
+    const wanted = this.shownResidual, none = this.depths.texture;
+    return wanted && this.residual.texturesOf(wanted.view) || { residual: none, residual_planes: none };
+  }
+
+  setResidual(at) {
+    const gl = this.gl, wanted = this.shownResidual;
+    const isThere = wanted && this.residual.texturesOf(wanted.view);
+    gl.uniform1i(at("residual_count"), isThere ? this.about.residual.planes : 0);
+    if (!isThere) return;
+    gl.uniform3fv(at("residual_mm"), wanted.view.camera_mm);
+    gl.uniform2fv(at("residual_cosines"), RESIDUAL_DEG.map((angle) => Math.cos(radians(angle))));
   }
 
   /** Draw the mean with one sample more, by a program of light: what all of them have in common. */

@@ -39,18 +39,19 @@ class Samples {
     const [leds, codes] = await Promise.all([
       this.block(`samples-${name}-leds`), laterBlock(this.about, `samples-${name}-${Math.floor(row / rows)}`),
     ]);
-    const count = leds.length / 3, half = codes.length / 2, first = (row % rows) * count;
+    const count = leds.length / 3, third = codes.length / 3, first = (row % rows) * count;
     const away = unit(minus(camera, centre)), found = [];
     for (let led = 0; led < count; led++) {
       const code = codes[first + led];
       if (!code) continue;
       const way = unit(minus([leds[3 * led], leds[3 * led + 1], leds[3 * led + 2]], centre));
       const nh = dot(material.normal, unit(add(way, away))), nl = dot(material.normal, way);
-      const nv = dot(material.normal, away), u = codes[half + first + led];
+      const nv = dot(material.normal, away);
+      const [below, above] = [1, 2].map((k) => codes[k * third + first + led]).map((one) => one ? codedValue(one) : null);
       if (nl <= LEAST_COSINE || nv <= 0) continue;
       const fitted = mean(material.kd) + mean(material.ks) * lobe(nl, nv, nh, material.alpha);
       const value = codedValue(code) / nl, angle = degrees(Math.acos(clamp(nh, -1, 1)));
-      found.push({ view, value, u: u ? codedValue(u) : null, fitted, angle });
+      found.push({ view, value, below, above, fitted, angle });
     }
     return found;
   }
@@ -64,14 +65,13 @@ function samplesPlotOf(samples) {
   const x = (angle) => (left + angle / widest * (width - left - right)).toFixed(1);
   const y = (value) => (height - bottom - clamp(value / most, 0, 1) * (height - top - bottom)).toFixed(1);
   const dots = (of) => samples.map((one) => `M${x(one.angle)} ${y(of(one))}h0`).join("");
-  const bars = samples.filter(({ u }) => u !== null).map(({ angle, value, u }) => {
-    const off = NORMAL_COVERAGE * u * value;
-    return `M${x(angle)} ${y(value - off)}V${y(value + off)}`;
-  });
+  const bars = samples.filter(({ below }) => below !== null).map(({ angle, value, below, above }) => (
+    `M${x(angle)} ${y(value * (1 - below))}V${y(value * (1 + above))}`
+  ));
   const step = niceStep(most, 4), digits = Math.max(0, -Math.floor(Math.log10(step)));
   const levels = Array.from({ length: Math.floor(most / step) + 1 }, (_, k) => k * step);
   return `<svg viewBox="0 0 ${width} ${height}" role="img" class="samples"
-    aria-label="Measured samples by the angle of the half vector to the normal, with bars of part of their uncertainty, and the fit">
+    aria-label="Measured samples by the angle of the half vector to the normal, with bars of their 95 % intervals, and the fit">
     ${levels.map((value) => `<line class="grid" x1="${left}" x2="${width - right}" y1="${y(value)}" y2="${y(value)}"/>
       <text x="${left - 4}" y="${Number(y(value)) + 3}" text-anchor="end">${value.toFixed(digits)}</text>`).join("")}
     <path class="bars" d="${bars.join("")}"/><path class="measured" d="${dots(({ value }) => value)}"/>
@@ -81,6 +81,17 @@ function samplesPlotOf(samples) {
     <text x="${(left + width) / 2}" y="${height - 3}" text-anchor="middle">half vector to normal</text></svg>`;
 }
 
+/** What bars are, and how long a typical one is. */
+function barsTold(samples) {
+  const known = samples.filter(({ below }) => below !== null);
+  if (!known.length) return "How uncertain they are is not known.";
+  const ends = ["below", "above"].map((side) => known.map((one) => one[side]).sort((one, other) => one - other));
+  const [below, above] = ends.map((sorted) => percent(sorted[sorted.length >> 1]));
+  return `Bars: 95 % intervals by all sources (noise, pixels' responses, inter-reflection taken off, where pixels
+    look, power of each LED and of all, the mesh's vertices, places of LEDs), as if the channels were off together;
+    in the median ${below} below, ${above} above. What samples share moves them together.`;
+}
+
 /** What is told of samples, as markup. */
 function samplesTold(samples) {
   if (!samples.length) return `<p class="small">None of its samples can be used.</p>`;
@@ -88,8 +99,6 @@ function samplesTold(samples) {
   const off = samples.map(({ value, fitted }) => Math.abs(fitted - value)).sort((one, other) => one - other);
   const told = percent(off[off.length >> 1] / mean(samples.map(({ value }) => value)));
   return `${samplesPlotOf(samples)}<p class="small">${samples.length} measured samples of ${views}: f,
-    1/sr, mean of the channels. Bars: 1.96 standard uncertainties by noise of the frames, each LED's own power and
-    inter-reflection taken off, as if the channels were off together. Not in them: where pixels look, their own
-    responses, the mesh's vertices, places of LEDs, and what all samples share. Orange: what the fit makes of the
+    1/sr, mean of the channels. ${barsTold(samples)} Orange: what the fit makes of the
     same directions; median difference ${told} of the samples' mean.</p>`;
 }

@@ -20,7 +20,7 @@ const startLight = () => ({
 
 const startState = () => ({
   mode: Object.keys(MODES)[0], quantity: "kd", white: 0, relief: 1, sky: 0, environment: ABOUT.environment ? 1 : 0, chosen: 0, lights: [startLight()],
-  camera: null, notes: [], view: "", split: 0.5, adapted: false, stereo: false, ...structuredClone(ABOUT.start ?? {}),
+  camera: null, notes: [], view: "", split: 0.5, adapted: false, stereo: false, withResidual: true, ...structuredClone(ABOUT.start ?? {}),
 });
 
 const rounded = (key, value) => typeof value === "number" ? Number(value.toPrecision(5)) : value;
@@ -70,6 +70,7 @@ function stateOf(address) {
     && Array.isArray(found.notes) && found.notes.every(isNote)
     && (found.skyIlluminant === undefined || found.skyIlluminant in ILLUMINANTS)
     && (found.stereo === undefined || typeof found.stereo === "boolean")
+    && (found.withResidual === undefined || typeof found.withResidual === "boolean")
     && (found.adapted === undefined || typeof found.adapted === "boolean")
     && (!found.view || viewOf(ABOUT, found.view)) && (found.split === undefined || isNumber(found.split, 0, 1));
   return fits ? { ...startState(), ...found } : null;

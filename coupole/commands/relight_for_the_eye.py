@@ -1,0 +1,85 @@
+"""`coupole reflectance relight --for-the-eye`: relit pictures in colours, by spectra of sensor and LEDs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coupole.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from coupole.commands.relight import Relit
+    from coupole.exchange.camera_colour import CameraColour
+    from coupole.reflectance.new_light.light_kinds import AnyLight
+
+PEAK_QUANTILE = 0.999
+
+EyeOption = Annotated[
+    bool,
+    typer.Option(
+        "--for-the-eye",
+        help="sRGB by spectra in place of the camera's channels; needs --sensor-spectra and --led-spectrum.",
+    ),
+]
+SensorOption = Annotated[
+    Path | None,
+    typer.Option("--sensor-spectra", help="Table of nm, red, green, blue: the sensor's sensitivities."),
+]
+SpectrumOption = Annotated[
+    Path | None,
+    typer.Option("--led-spectrum", help="Table of nm, power: that of the dome's LEDs."),
+]
+
+
+def colour_asked(sensor: Path | None, leds: Path | None, *, for_the_eye: bool) -> CameraColour | None:
+    """By tables of spectra; None if no picture for the eye is wanted. Raises InputError for what does not go
+    together, and as `camera_colour`."""
+    from coupole.exchange.camera_colour import camera_colour
+
+    tables = {"--sensor-spectra": sensor, "--led-spectrum": leds}
+    if not for_the_eye:
+        if given := [name for name, path in tables.items() if path is not None]:
+            raise InputError(f"{', '.join(given)}: is for --for-the-eye")
+        return None
+    if sensor is None or leds is None:
+        missing = ", ".join(name for name, path in tables.items() if path is None)
+        raise InputError(f"--for-the-eye: expected {missing} too, a table of what its maker has measured")
+    return camera_colour(sensor, leds)
+
+
+def write_relit_for_the_eye(
+    relit: Relit,
+    lights: Sequence[AnyLight],
+    to: Path,
+    colour: CameraColour,
+    white: float | None,
+    bars: Callable[[str, int, int], None],
+) -> dict[str, Any]:
+    """Make and write the picture as sRGB; what `--json` says."""
+    import numpy as np
+
+    from coupole.exchange.picture_for_the_eye import linear_colours, write_for_the_eye
+    from coupole.reflectance.new_light.light_kinds import LedLight
+
+    if not relit.has_colours:
+        raise InputError("--for-the-eye: the camera has one channel; it has no colours")
+    if any(isinstance(light, LedLight) for light in lights):
+        raise InputError(
+            "--for-the-eye: an LED's picture is in the camera's range; expected lights of other kinds"
+        )
+    linear = linear_colours(relit.picture(lights, lambda done, of: bars("light", done, of)), colour)
+    white = white or float(np.quantile(bright(linear), PEAK_QUANTILE)) or 1.0
+    about = {**relit.about, "colour": colour.told.partition("; white")[0], "white": white}
+    write_for_the_eye(to, linear, white, about)
+    return {"picture": str(to.resolve()), **about}
+
+
+def bright(picture: NDArray[Any]) -> NDArray[Any]:
+    """Values of the pixels that are not dark."""
+    lit = picture[picture.max(axis=2) > 0.0]
+    return lit if len(lit) else picture.reshape(-1, 3)

@@ -1,0 +1,199 @@
+"""What GGX leaves of each triangle, for a page: a few principal components of all residuals of a view.
+
+A result's fit `ggx_rbf` gives each triangle, seen by one view, a share of its GGX and a hundred radial functions
+of the light's direction (`coupole.reflectance.slice_fit`). These are taken apart into components in the metric of
+what a picture shows, f cos_i over the half sphere: planes, which are tables of reflectance by the light's
+direction in the triangle's own frame, and a number for each triangle and plane.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+from coupole.exchange.look.look_blocks import Block, block_of
+from coupole.exchange.material_values import red_green_blue
+from coupole.geometry import apply, inverse
+from coupole.reflectance.run_result import SLICES, RunResult, ViewSamples
+from coupole.reflectance.slice_basis import COUNT, functions
+from coupole.reflectance.slice_fit import slice_values
+from coupole.reflectance.triangle_fit import TriangleSamples, model_values
+
+Floats = NDArray[np.float64]
+
+FIT = "ggx_rbf"
+PLANES, MOST_PLANES = 9, 29
+"""By default, and at most: with three shares of GGX they fill whole groups of four bytes."""
+SIDE = 48
+"""Of a plane's table."""
+_STEPS = 127
+_SHARE_STEPS = 254
+_LEARNT, _JUDGED = 20_000, 1500
+"""Triangles of a view that planes are found by, and that they are judged by."""
+_BLOCK = 1 << 14
+_DIRECTIONS = 600
+"""Of lights all around, by which planes are judged."""
+_FAR_MM = 1e5
+
+
+@dataclass(frozen=True)
+class ResidualPlanes:
+    """Of a view's triangles: f cos_i = max(share f_GGX cos_i + z sum_k number_k plane_k(light), 0), with z the
+    cosine of the light to the mesh's normal."""
+
+    planes: NDArray[np.float16]
+    """[planes, SIDE, SIDE, 3] 1/sr by y and x of `table_directions`, times the greatest number of the plane."""
+    codes: NDArray[np.uint8]
+    """[3 + planes, n] of shares by channel (1 to 255: 0 to 1; 0: no residual), and of numbers: 128 + 127 times the
+    root of their share of the greatest one, with their sign."""
+    missed: float
+    """Sum of the squares of what pages leave of the fit, over some triangles, directions and channels."""
+    energy: float
+    """The same of what GGX alone leaves of it: of the residual."""
+
+
+def residual_fit(result: RunResult) -> str | None:
+    """The material that residuals are added to; None where a view has no such fit."""
+    whole = all(result.slices_path(FIT, view).exists() for view in result.views)
+    return SLICES[FIT].over if whole and result.views else None
+
+
+def residual_blocks(
+    result: RunResult, planes: int, say: Callable[[str, int, int], None]
+) -> tuple[dict[str, Any], list[Block]]:
+    """What a page knows of residuals, and two blocks of each view: codes [3 + planes, triangles of the mesh] and
+    planes. `kept` is the share of the energy of all views' residuals."""
+    views, blocks, missed, energy = [], [], 0.0, 0.0
+    support_from_base = inverse(result.base_from_support)
+    for number, view in enumerate(result.views):
+        found = residual_planes(result, view, planes)
+        codes = np.zeros((len(found.codes), len(result.corners_mm)), np.uint8)
+        codes[:, view.triangles] = found.codes
+        names = [f"residual-{view.path.stem}", f"planes-{view.path.stem}"]
+        blocks += [block_of(names[0], codes), block_of(names[1], found.planes)]
+        camera_mm = apply(support_from_base, view.camera_mm).tolist()
+        views.append({"name": view.view, "blocks": names, "camera_mm": camera_mm})
+        missed, energy = missed + found.missed, energy + found.energy
+        say("residuals", number + 1, len(result.views))
+    kept = 1.0 - missed / energy if energy > 0.0 else 1.0
+    return {"planes": planes, "side": SIDE, "kept": round(kept, 4), "views": views}, blocks
+
+
+def residual_planes(result: RunResult, view: ViewSamples, count: int) -> ResidualPlanes:
+    """`count` planes of a view's residuals."""
+    coefficients = result.slices(FIT, view)
+    known = np.flatnonzero(np.isfinite(coefficients).all(axis=(1, 2)))
+    channels = coefficients.shape[1]
+    some = np.random.default_rng(0).permutation(known)
+    learnt = coefficients[np.sort(some[:_LEARNT]), :, :COUNT].astype(np.float64)
+    rows, back = _components(learnt, count)
+    numbers = np.empty((count, len(known)), np.float32)
+    for first in range(0, len(known), _BLOCK):
+        part = coefficients[known[first : first + _BLOCK], :, :COUNT]
+        numbers[:, first : first + _BLOCK] = rows @ part.reshape(len(part), -1).T
+    peaks = np.maximum(np.abs(numbers).max(axis=1, initial=0.0), 1e-30)
+    codes = np.zeros((3 + count, len(coefficients)), np.uint8)
+    shares = np.clip(red_green_blue(coefficients[known, :, COUNT].astype(np.float64)), 0.0, 1.0)
+    codes[:3, known] = 1.0 + np.rint(_SHARE_STEPS * shares.T)
+    roots = np.sign(numbers) * np.sqrt(np.abs(numbers) / peaks[:, None])
+    codes[3:, known] = 128.0 + np.rint(_STEPS * roots)
+    scaled = (peaks[:, None] * back).reshape(count, channels, COUNT)
+    table = np.einsum("pck,kn->npc", scaled, _functions(table_directions().reshape(-1, 3)))
+    planes = red_green_blue(table.reshape(-1, channels)).reshape(SIDE, SIDE, count, 3).transpose(2, 0, 1, 3)
+    judged = np.sort(some[:_JUDGED])
+    missed, energy = _missed(result, view, coefficients[judged], codes[:, judged], scaled, judged)
+    return ResidualPlanes(planes.astype(np.float16), codes, missed, energy)
+
+
+def table_directions() -> Floats:
+    """[SIDE, SIDE, 3] of lights in the triangle's frame: Lambert's azimuthal projection of equal areas, x and y
+    from -1 to 1, in which the half sphere is a disk of radius 1; beside it, lights from below."""
+    line = np.linspace(-1.0, 1.0, SIDE)
+    u, v = np.meshgrid(line, line)
+    square = u * u + v * v
+    stretch = np.sqrt(2.0 - square)
+    return np.stack([u * stretch, v * stretch, 1.0 - square], axis=-1)
+
+
+def _components(learnt: Floats, count: int) -> tuple[Floats, Floats]:
+    """Of coefficients [n, channels, COUNT]: rows [count, channels * COUNT] that give numbers of components, and
+    back: coefficients of each component. Where there are fewer, the rest is 0."""
+    channels = learnt.shape[1]
+    root = _metric()
+    apart = (learnt @ root).reshape(len(learnt), -1)
+    size = apart.shape[1]
+    powers, axes = eigh(apart.T @ apart, subset_by_index=(max(0, size - count), size - 1))
+    axes = np.where(powers > 1e-12 * max(powers.max(initial=0.0), 1e-300), axes, 0.0)[:, ::-1].T
+    each = axes.reshape(-1, channels, COUNT)
+    rows, back = np.zeros((2, count, channels * COUNT))
+    rows[: len(each)] = (each @ root.T).reshape(len(each), -1)
+    back[: len(each)] = (each @ np.linalg.inv(root)).reshape(len(each), -1)
+    return rows, back
+
+
+@cache
+def _metric() -> Floats:
+    """[COUNT, COUNT] lower root of the integral over the half sphere of the squares of functions times cosine."""
+    directions = _half_sphere(4000)
+    values = _functions(directions) * directions[:, 2]
+    gram = values @ values.T * (2.0 * math.pi / len(directions))
+    root: Floats = np.linalg.cholesky(gram + 1e-10 * np.trace(gram) / COUNT * np.eye(COUNT))
+    return root
+
+
+def _functions(directions: Floats) -> Floats:
+    """[COUNT, n]"""
+    rows = np.empty((COUNT, len(directions)))
+    x, y, z = np.ascontiguousarray(directions.T)
+    functions(SLICES[FIT].basis.harmonic, x, y, z, rows)
+    return rows
+
+
+def _half_sphere(count: int) -> Floats:
+    """[count, 3] a Fibonacci spiral."""
+    number = np.arange(count) + 0.5
+    z = 1.0 - number / count
+    azimuth = number * math.pi * (3.0 - math.sqrt(5.0))
+    across = np.sqrt(1.0 - z * z)
+    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
+
+
+def _missed(
+    result: RunResult,
+    view: ViewSamples,
+    coefficients: NDArray[np.float32],
+    codes: NDArray[np.uint8],
+    scaled: Floats,
+    rows: NDArray[np.int64],
+) -> tuple[float, float]:
+    """`missed` and `energy` of `ResidualPlanes`, of some rows of the view's file, under distant lights."""
+    over = SLICES[FIT].over
+    assert over is not None
+    samples = result.view_samples(view, slice(None), np.zeros(len(view.leds), np.bool_))
+    half = _half_sphere(_DIRECTIONS // 2)
+    middle_mm = samples.centres_mm[rows].mean(axis=0) if len(rows) else np.zeros(3)
+    lights = TriangleSamples(
+        np.zeros((len(rows), _DIRECTIONS, coefficients.shape[1]), np.float32),
+        middle_mm + _FAR_MM * np.concatenate([half, -half]),
+        np.zeros(_DIRECTIONS, np.int64),
+        view.camera_mm[None],
+        samples.centres_mm[rows],
+        samples.normals[rows],
+        np.ones(len(rows)),
+    )
+    places = np.searchsorted(result.triangles, view.triangles[rows])
+    model = np.nan_to_num(model_values(lights, result.materials(over, places)))
+    fit = slice_values(lights, coefficients, SLICES[FIT].basis, model)
+    roots = (codes[3:].astype(np.float64) - 128.0) / _STEPS
+    short = np.einsum("pn,pck->nck", roots * np.abs(roots), scaled)
+    shares = (codes[: coefficients.shape[1]].T - 1.0) / _SHARE_STEPS
+    shown = np.concatenate([short, shares[:, :, None]], axis=2).astype(np.float32)
+    page = slice_values(lights, shown, SLICES[FIT].basis, model)
+    return float(np.sum((page - fit) ** 2)), float(np.sum((fit - model) ** 2))

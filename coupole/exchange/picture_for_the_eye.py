@@ -1,0 +1,66 @@
+"""Relit pictures for the eye: by CIE XYZ to sRGB (IEC 61966-2-1), with its profile.
+
+A relit picture has 1 in all channels where a white diffuser faces a light of strength 1: it is balanced, and the
+matrix of `coupole.exchange.camera_colour` makes of it what the surface has under daylight.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError, StorageError
+from coupole.exchange.camera_colour import CameraColour
+from coupole.exchange.srgb import srgb
+from coupole.exchange.tiff_for_the_eye import srgb_profile, tiff_of
+from coupole.storage.durable import write_synced
+
+SUFFIXES = (".png", ".tif", ".tiff")
+
+
+def refuse_unknown(path: Path) -> None:
+    """Raise InputError if there is no writer for such a file."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"--to {path}: for the eye expected a name that ends in {', '.join(SUFFIXES)}")
+
+
+def linear_colours(picture: NDArray[np.float32], colour: CameraColour) -> NDArray[np.float64]:
+    """[h, w, 3] linear sRGB under daylight of a relit picture in the camera's channels; out of gamut below 0."""
+    from coupole.appearance.spectra.light import linear_srgb
+
+    assert colour.xyz_from_balanced is not None
+    return np.asarray(linear_srgb(picture.astype(np.float64) @ colour.xyz_from_balanced.T))
+
+
+def write_for_the_eye(path: Path, linear: NDArray[np.float64], white: float, about: dict[str, Any]) -> None:
+    """Write linear sRGB, of which `white` is shown as white, whole or not at all: PNG of 8 bits or TIFF of 16,
+    with the profile of sRGB and `about`. What is brighter, or out of gamut, is cut.
+
+    Raises InputError for another kind of file, StorageError if it cannot be written.
+    """
+    refuse_unknown(path)
+    shown, profile = srgb(linear / white), srgb_profile()
+    if path.suffix.lower() == ".png":
+        content = _png(np.rint(255.0 * shown).astype(np.uint8), about, profile)
+    else:
+        content = tiff_of(np.rint(65535.0 * shown).astype(np.uint16), about, profile)
+    try:
+        write_synced(path, content)
+    except OSError as error:
+        raise StorageError(f"{path}: {error}") from error
+
+
+def _png(codes: NDArray[np.uint8], about: dict[str, Any], profile: bytes) -> bytes:
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    told = PngInfo()
+    told.add_text("Description", json.dumps(about))
+    buffer = io.BytesIO()
+    Image.fromarray(codes).save(buffer, "PNG", icc_profile=profile, pnginfo=told)
+    return buffer.getvalue()

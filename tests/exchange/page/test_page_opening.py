@@ -1,0 +1,121 @@
+"""The page opens from disk: without a network, at once, and with what is missing named."""
+
+from __future__ import annotations
+
+import re
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from threading import Event
+
+import cells
+import numpy as np
+from browser import needs_chromium
+from relight_cases import GLOSSY, waves, write_result
+from shown_page import SMALL, Page
+
+from coupole.exchange.look.look_blocks import block_of
+from coupole.exchange.look.look_of_runs import look_of_result
+from coupole.exchange.look.look_page import write_page
+
+pytestmark = needs_chromium
+
+
+def test_the_page_opens_from_disk_without_a_network_and_loads_nothing(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html")
+    assert page.run("coupole.readPicture().rgba.some(value => value > 0)")
+    assert page.run("performance.getEntriesByType('resource').length") == 0
+    assert "Simulated object" in page.browser.text("#banner")
+    assert page.browser.text("#status") == ""
+    assert page.browser.troubles() == []
+
+
+FIRST_PICTURE_S, TRIALS = 3.0, 3
+MARK = "performance.getEntriesByName('coupole: first picture')"
+
+
+def demo_sized(folder: Path) -> Path:
+    """A page of 19,602 triangles and 3 MB, as that of the demo: its frames and residuals are noise here."""
+    result = write_result(folder / "result", waves(100), GLOSSY)
+    look = look_of_result(result.folder)
+    more = block_of("frame-more", np.random.default_rng(0).integers(0, 256, 2_000_000).astype(np.uint8))
+    path, *beside = write_page(replace(look, later=(*look.later, more)), "waves", folder / "look.html")
+    assert not beside
+    assert path.stat().st_size > 2_900_000
+    return path
+
+
+def seconds_to_the_first_picture(page: Page, path: Path) -> tuple[float, float]:
+    """From the start of navigation: by the clock, and the CPU time that the browser took for it."""
+    taken: list[tuple[float, float]] = []
+    ended = Event()
+
+    def watch() -> None:
+        while not ended.wait(0.05):
+            taken.append((time.time(), page.browser.cpu_s()))
+
+    with ThreadPoolExecutor(1) as pool:
+        watched = pool.submit(watch)
+        page.browser.open(path.as_uri())
+        cells.wait_until(lambda: page.run(f"{MARK}.length"), "the first picture")
+        ended.set()
+        watched.result()
+    begun, lasted = page.run(f"[performance.timeOrigin / 1000, {MARK}[0].startTime / 1000]")
+    cpu = np.interp([begun, begun + lasted], *np.transpose(taken))
+    return lasted, float(cpu[1] - cpu[0])
+
+
+def test_the_first_picture_of_the_demo_comes_within_three_seconds(page: Page, tmp_path: Path) -> None:
+    """On a machine that others use too, a clock tells of them: then what counts is the CPU time that all processes
+    of the browser took until the picture stood there. The best of three, each with shaders that the browser has
+    not seen before, as it keeps what it has compiled."""
+    text = demo_sized(tmp_path).read_text()
+    page.opened = None
+    page.driver.set_window_size(1300, 960)
+    trials: list[tuple[float, float]] = []
+    while len(trials) < TRIALS and not any(min(trial) < FIRST_PICTURE_S for trial in trials):
+        path = tmp_path / f"{len(trials)}.html"
+        path.write_text(re.sub(r"(RELIEF_PX|HATCH_PX) = (\d)\.0", rf"\1 = \2.000{len(trials)}1", text))
+        trials.append(seconds_to_the_first_picture(page, path))
+    page.run("coupole.setSamples(1)")
+    page.driver.set_window_size(*SMALL)
+    assert min(map(min, trials)) < FIRST_PICTURE_S, trials
+
+
+def test_data_that_are_gone_from_beside_the_page_are_named(page: Page, tmp_path: Path) -> None:
+    write_result(tmp_path / "result", waves(16), GLOSSY)
+    files = write_page(look_of_result(tmp_path / "result"), "waves", tmp_path / "look.html", most_bytes=1000)
+    next(file for file in files if file.name == "kd.js").unlink()
+    page.opened = None
+    page.browser.open(f"file://{tmp_path / 'look.html'}")
+    told = cells.wait_until(lambda: page.browser.text("#status").replace("Reading…", ""), "what is missing")
+    assert "(kd): keep its .data folder beside it" in told
+
+
+def test_a_coarse_picture_comes_first_and_the_whole_mesh_takes_its_place(page: Page, folder: Path) -> None:
+    write_page(look_of_result(folder / "result", coarse_over=500), "waves", folder / "coarse.html")
+    page.open(folder / "coarse.html")
+    assert page.run("performance.getEntriesByName('coupole: first picture').length") == 1
+    page.small()
+    page.look(-70.0, 50.0, 150.0)
+    mine = page.picture(1)
+    page.open(folder / "look.html")
+    page.small()
+    page.look(-70.0, 50.0, 150.0)
+    np.testing.assert_array_equal(mine, page.picture(1))
+
+
+def test_the_coarse_picture_stays_where_the_rest_is_missing(page: Page, folder: Path, tmp_path: Path) -> None:
+    look = look_of_result(folder / "result", coarse_over=500)
+    files = write_page(look, "waves", tmp_path / "look.html", most_bytes=1000)
+    next(file for file in files if file.name == "kd.js").unlink()
+    page.opened = None
+    page.browser.open(f"file://{tmp_path / 'look.html'}")
+    cells.wait_until(lambda: "(kd)" in page.browser.text("#status"), "what is missing")
+    bright = """(() => {
+        const shown = Object.assign(document.createElement("canvas"), { width: 60, height: 60 }).getContext("2d");
+        shown.drawImage(document.getElementById("picture"), 0, 0, 60, 60);
+        return shown.getImageData(0, 0, 60, 60).data.filter((value, k) => k % 4 === 1 && value > 60).length;
+    })()"""
+    assert page.run(bright) > 300

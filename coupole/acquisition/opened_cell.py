@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from coupole.acquisition.runtime_folder import in_use
 from coupole.acquisition.signals import held
 from coupole.devices import Camera, Clock, Identity, LedBox, Robot, SystemClock
 from coupole.plan.cell import Cell
@@ -78,8 +79,8 @@ class Safeguard:
         self._thread = threading.Thread(target=self._run, name=what, daemon=True)
         self._thread.start()
 
-    def wait(self) -> None:
-        self._thread.join(_SAFE_WITHIN_S)
+    def wait(self, at_most_s: float = _SAFE_WITHIN_S) -> None:
+        self._thread.join(at_most_s)
 
     def _run(self) -> None:
         try:
@@ -104,6 +105,8 @@ def open_cell(
     Raises DeviceError if one cannot be opened; those opened before it are closed.
     """
     with contextlib.ExitStack() as stack:
+        if not dry_run:
+            stack.enter_context(in_use(cell.state_folder))
         clock: Clock = SystemClock()
         endpoints: Mapping[str, Any] | None = None
         sensor = coarse(cell.rig.sensor) if dry_run else cell.rig.sensor

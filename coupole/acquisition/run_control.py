@@ -7,27 +7,28 @@ JSON each::
     {"version": 1, "command": "pause"}      pause | go-on | stop | state
     {"version": 1, "run": "/runs/...", "pid": 4711, "state": "pausing", "view": "top", "proven": 52, ...}
 
-Each request is answered at once, by a thread of its own: `stop` has switched the lights off and commanded the arm
-to stop when its answer comes, and what the process still has to do (store, conclude) goes on after it.
+Each request is answered by a thread of its own, whatever the others do. `stop` is answered when the lights are off
+and the arm was told to stop, or after 4 s with what is not sure (`trouble`); what the process still has to do
+(store, conclude) goes on after that.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import signal
 import socket
-import stat
 import struct
-import tempfile
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from coupole.acquisition.observer import Control
+from coupole.acquisition.opened_cell import Safeguard
+from coupole.acquisition.runtime_folder import named_after, runtime_folder
 from coupole.errors import InputError
 from coupole.viewing.progress import Progress
 
@@ -35,24 +36,8 @@ VERSION = 1
 Command = Literal["pause", "go-on", "stop", "state"]
 State = dict[str, Any]
 """`run`, `rig`, `pid`, `state` (running, pausing, paused, stopping); from the first burst on `Progress` too."""
-_LONGEST_LINE_BYTES = 4096
-_PATIENCE_S = 5.0
-
-
-def socket_folder() -> Path:
-    """Folder of the sockets, made if it is missing: `$XDG_RUNTIME_DIR/coupole`, else one in the folder for
-    temporary files. Raises InputError: it is another user's, or others may enter it."""
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(base) / "coupole" if base else Path(tempfile.gettempdir()) / f"coupole-{os.getuid()}"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    found = folder.stat(follow_symlinks=False)
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise InputError(f"{folder}: expected a folder of this user that nobody else may enter (mode 0700)")
-    return folder
-
-
-def _socket_path(run: Path) -> Path:
-    return socket_folder() / f"{hashlib.sha256(os.fsencode(run.resolve())).hexdigest()[:24]}.sock"
+_LONGEST_LINE_BYTES = 65536
+_SAFE_WITHIN_S, _PATIENCE_S = 4.0, 10.0
 
 
 # -- the side of the acquisition ------------------------------------------------------------------------------
@@ -67,7 +52,7 @@ class RunControl:
         run: Path,
         rig: Path,
         control: Control,
-        halt: Callable[[], object],
+        halt: Callable[[], Sequence[Safeguard]],
         progress: Callable[[], Progress | None],
     ) -> None:
         """`halt` switches lights off and stops the arm, at once, from any thread; `progress` is the newest."""
@@ -78,12 +63,14 @@ class RunControl:
 
     def __enter__(self) -> RunControl:
         try:
-            path = _socket_path(self._run)
-            path.unlink(missing_ok=True)  # of a process that was killed: the run's lock is ours
+            path = named_after(self._run, "sock")
+            hidden = path.with_suffix(".new")
+            hidden.unlink(missing_ok=True)  # of a process that was killed: the run's lock is ours
             self._socket = socket.socket(socket.AF_UNIX)
-            self._socket.bind(str(path))
-            path.chmod(0o600)
+            self._socket.bind(str(hidden))
+            hidden.chmod(0o600)
             self._socket.listen(8)
+            hidden.replace(path)
         except (OSError, InputError) as error:
             self.trouble = f"`coupole pause` and `coupole stop` will not reach this run: {error}"
             self._close()
@@ -110,8 +97,9 @@ class RunControl:
     def state(self) -> State:
         """What is answered to every request."""
         control = self._control
-        state = "pausing" if control.pause.is_set() else "running"
-        state = "paused" if control.paused.is_set() else state
+        state = "running"
+        if control.pause.is_set():
+            state = "paused" if control.paused.is_set() else "pausing"
         state = "stopping" if control.stop.is_set() else state
         progress = self._progress()
         return {**self._about, "state": state, **(vars(progress) if progress else {})}
@@ -149,10 +137,18 @@ class RunControl:
                 self._control.pause.clear()
             case "stop":
                 self._control.stop_by(signal.SIGINT)
-                self._halt()
+                return {**self.state(), "trouble": _trouble(self._halt())}
             case _:
                 return {"version": VERSION, "error": "expected the command pause, go-on, stop or state"}
         return self.state()
+
+
+def _trouble(done: Sequence[Safeguard]) -> list[str]:
+    """What is not sure to be done of it after a while."""
+    end_s = time.monotonic() + _SAFE_WITHIN_S
+    for safeguard in done:
+        safeguard.wait(max(0.0, end_s - time.monotonic()))
+    return [f"not sure: {safeguard.what}: {safeguard.trouble}" for safeguard in done if safeguard.trouble]
 
 
 def _peer_uid(connection: socket.socket) -> int:
@@ -176,7 +172,7 @@ def ask(run: Path, command: Command) -> State:
     Raises InputError: none does, on this machine and by this user, or it does not answer.
     """
     try:
-        return _exchange(_socket_path(run), command)
+        return _exchange(named_after(run, "sock"), command)
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise InputError(f"{run}: no process of this user acquires into this run on this machine") from error
     except (OSError, ValueError) as error:
@@ -184,18 +180,19 @@ def ask(run: Path, command: Command) -> State:
 
 
 def running() -> list[State]:
-    """States of all acquisitions of this user on this machine, the newest last."""
+    """States of all acquisitions of this user on this machine, the newest last; one that does not answer is
+    `silent`."""
     return sorted(_running(), key=lambda state: str(Path(state["run"]).name))
 
 
 def _running() -> Iterator[State]:
-    for path in socket_folder().glob("*.sock"):
+    for path in runtime_folder().glob("*.sock"):
         try:
             yield _exchange(path, "state")
-        except ConnectionRefusedError:  # of a process that was killed
-            path.unlink(missing_ok=True)
-        except (OSError, ValueError):
+        except (ConnectionRefusedError, FileNotFoundError):  # of a process that was killed, or has just ended
             continue
+        except (OSError, ValueError) as error:
+            yield {"version": VERSION, "run": "", "rig": "", "pid": 0, "state": "silent", "trouble": [str(error)]}
 
 
 def _exchange(path: Path, command: Command) -> State:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +22,10 @@ def serve(
         "127.0.0.1"
     ),
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any.")] = 8640,
+    name: Annotated[
+        list[str] | None,
+        typer.Option("--name", help="Another name under which browsers know this machine.", show_default=False),
+    ] = None,
     plans: Annotated[
         Path | None,
         typer.Option("--plans", help="Folder of plans; without it `plans` beside the rig's folder, or the rig's."),
@@ -54,7 +59,15 @@ def serve(
 
     beside = rig.resolve().parent.parent / "plans"
     folder = plans or (beside if beside.is_dir() else rig.resolve().parent)
-    serve_cell(read_cell(rig), host=host, port=port, plans=folder, tls=tls, tell=tell)
+    serve_cell(
+        read_cell(rig),
+        host=host,
+        port=port,
+        names=[*(name or []), socket.gethostname()],
+        plans=folder,
+        tls=tls,
+        tell=tell,
+    )
 
 
 def queue(

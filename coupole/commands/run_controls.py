@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from coupole.acquisition.run_control import Command, State
+    from coupole.storage.run import Run
 
 RunningRun = Annotated[
     Path | None,
@@ -48,8 +49,6 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     Ends when its process has ended; exit code 4 if the journal says that the cell may not be safe. This is no
     emergency stop: that is the button at the cell.
     """
-    from coupole.storage import journal
-    from coupole.storage.journal_events import FaultNoted
     from coupole.storage.run import Run
     from coupole.storage.run_status import status
     from coupole.viewing.terminal import make_console, show_status
@@ -61,14 +60,8 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     found = status(stopped)
     if as_json:
         print(json.dumps(found.figures()))
-    session = found.sessions[-1].begun if found.sessions else ""
-    unsafe = [
-        event.message
-        for event in journal.read(stopped.journal_path)
-        if isinstance(event, FaultNoted) and event.kind == "unsafe" and event.t >= session
-    ]
     show_status(make_console(quiet=as_json), found)
-    if unsafe:
+    if unsafe := _unsafe(stopped):
         raise DeviceError(
             "cell",
             expected="lights off, the arm at rest and the camera disarmed",
@@ -76,6 +69,23 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
             remedy="Look at the cell.",
         )
     make_console(quiet=as_json).print("lights are off, the arm is at rest, the camera is disarmed")
+
+
+def _unsafe(run: Run) -> list[str]:
+    """Why it is not sure that the cell is safe after the last session, by the run's journal."""
+    from coupole.storage import journal
+    from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
+
+    found = ["the session has no end in its journal: its process was killed, or could not write it"]
+    ended = False
+    for event in journal.read(run.journal_path):
+        if isinstance(event, SessionStarted | SessionResumed):
+            found, ended = found[:1], False
+        elif isinstance(event, FaultNoted) and event.kind == "unsafe":
+            found.append(event.message)
+        elif isinstance(event, SessionStopped):
+            ended = True
+    return found[1:] if ended else found
 
 
 def follow(run: Path | None, console: Console) -> Path:
@@ -110,7 +120,7 @@ def running_run(run: Path | None) -> State:
 
     if run is not None:
         return ask(run, "state")
-    found = running()
+    found = [state for state in running() if state["run"]]
     if not found:
         raise InputError("no run is being acquired by this user on this machine")
     if len(found) > 1:

@@ -20,7 +20,7 @@ from coupole.storage.durable import make_folder, write_synced
 
 SHORTEST_PASSWORD, LONGEST_PASSWORD = 10, 200
 _NAME = re.compile(r"[^\W_][\w .'-]{0,63}", re.UNICODE)
-_MOST_FAILURES, _FORGOTTEN_AFTER_S = 5, 60.0
+_MOST_FAILURES, _MOST_FROM_ELSEWHERE, _MOST_KEPT, _FORGOTTEN_AFTER_S = 5, 30, 1000, 60.0
 
 
 class Role(IntEnum):
@@ -63,15 +63,14 @@ class Accounts:
         self._path, self._lock = path, threading.Lock()
         self._hasher = argon2.PasswordHasher()
         self._nobodys_hash = self._hasher.hash(secrets.token_hex())
-        self._failures: list[tuple[float, str]] = []
+        self._checking = threading.Lock()
+        self._failures: list[tuple[float, bool, str]] = []
         try:
             self._stored: dict[str, dict[str, Any]] = json.loads(path.read_bytes()) if path.exists() else {}
         except (OSError, ValueError) as error:
             raise StorageError(f"{path}: the console's accounts cannot be read: {error}") from error
-
-    @property
-    def are_none(self) -> bool:
-        return not self._stored
+        self.first_token = "" if self._stored else secrets.token_urlsafe(24)
+        """With which an engineer signs in while there is no account; empty if it does not hold (any more)."""
 
     def listed(self) -> list[Account]:
         """All, by name."""
@@ -88,6 +87,7 @@ class Accounts:
             if name in self._stored:
                 raise InputError(f"name: {name} has an account already")
             self._keep({**self._stored, name: {"role": role.word, "password": hashed}})
+            self.first_token = ""
         return Account(name, role)
 
     def remove(self, name: str) -> None:
@@ -100,22 +100,34 @@ class Accounts:
                 raise InputError("name: this is the last engineer; nobody could keep the accounts")
             self._keep(left)
 
-    def sign_in(self, name: str, password: str) -> Account | None:
+    def sign_in(self, name: str, password: str, *, here: bool) -> Account | None:
         """The account with this name and password; None if there is none, and for a minute after five failures.
-        It takes as long whether or not the name is known."""
-        with self._lock:
-            recent_s = time.monotonic() - _FORGOTTEN_AFTER_S
-            self._failures = [(t_s, who) for t_s, who in self._failures if t_s > recent_s]
-            kept = self._stored.get(name)
-            if sum(who == name for _, who in self._failures) >= _MOST_FAILURES:
+
+        It takes as long whether or not the name is known, and one is checked at a time: hashing is made to cost.
+        Failures from other machines keep out nobody who is `here`, and after thirty all who are not.
+        """
+        with self._checking:
+            now_s = time.monotonic()
+            recent = [one for one in self._failures if now_s - one[0] < _FORGOTTEN_AFTER_S and one[1] == here]
+            of_name = sum(failed == name for _, _, failed in recent)
+            if of_name >= _MOST_FAILURES or (len(recent) >= _MOST_FROM_ELSEWHERE and not here):
                 return None
-        try:
-            self._hasher.verify(kept["password"] if kept else self._nobodys_hash, password[:LONGEST_PASSWORD])
-        except (argon2.exceptions.VerificationError, argon2.exceptions.InvalidHashError):
-            with self._lock:
-                self._failures.append((time.monotonic(), name))
-            return None
+            kept = self._stored.get(name)
+            try:
+                self._hasher.verify(kept["password"] if kept else self._nobodys_hash, password[:LONGEST_PASSWORD])
+            except (argon2.exceptions.VerificationError, argon2.exceptions.InvalidHashError):
+                others = [one for one in self._failures if now_s - one[0] < _FORGOTTEN_AFTER_S]
+                self._failures = [*others[-_MOST_KEPT:], (now_s, here, name)]
+                return None
         return Account(name, Role.of(kept["role"])) if kept else None
+
+    def sign_in_first(self, token: str) -> Account | None:
+        """An engineer with the token of a start without accounts; once."""
+        with self._lock:
+            if not self.first_token or not hmac.compare_digest(token.encode(), self.first_token.encode()):
+                return None
+            self.first_token = ""
+        return Account("first engineer", Role.ENGINEER)
 
     def _keep(self, stored: dict[str, dict[str, Any]]) -> None:
         try:
@@ -127,8 +139,3 @@ class Accounts:
         except OSError as error:
             raise StorageError(f"{self._path}: the account cannot be kept: {error.strerror}") from error
         self._stored = stored
-
-
-def same(one: str, other: str) -> bool:
-    """Whether two secrets are equal, in a time that does not tell where they differ."""
-    return hmac.compare_digest(one.encode(), other.encode())

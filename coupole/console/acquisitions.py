@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import signal
 import subprocess
 import sys
 import threading
@@ -15,8 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from coupole.acquisition.run_control import Command, State, ask, running
+from coupole.acquisition.runtime_folder import is_in_use
 from coupole.console.plan_queue import Entry, PlanQueue
 from coupole.errors import CoupoleError, InputError
+from coupole.plan.cell import Cell
 from coupole.storage.line_file import utc_now
 
 _LOOK_EVERY_S = 0.2
@@ -27,9 +31,10 @@ _STOPPED = (129, 130, 143)
 class Acquisitions:
     """The thread that begins what waits in a queue, and watches what runs."""
 
-    def __init__(self, queue: PlanQueue, rig: Path, folder: Path) -> None:
+    def __init__(self, queue: PlanQueue, cell: Cell, folder: Path) -> None:
         """`folder`: for what processes print."""
-        self._queue, self._rig, self._folder = queue, str(rig.resolve()), folder
+        self._queue, self._cell, self._folder = queue, cell, folder
+        self._rig = str(cell.document.path.resolve())
         self._ended = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
         self.state: State | None = None
@@ -48,39 +53,63 @@ class Acquisitions:
 
     def tell(self, run: str, command: Command) -> State:
         """`pause`, `go-on` or `stop` to the run with this name. Raises InputError: it is not being acquired."""
-        for state in running():
+        for state in [self.state] if self.state and Path(self.state["run"]).name == run else running():
             if Path(state["run"]).name == run and state["rig"] == self._rig:
                 return ask(Path(state["run"]), command)
         raise InputError(f"{run}: is not being acquired in this cell")
+
+    def stop(self, entry: Entry) -> None:
+        """Stop what an entry has begun, also before its run has a name: as Ctrl-C does. Raises InputError."""
+        if entry.state != "running" or not entry.pid or not self._is_alive(entry):
+            raise InputError(f"queue: {entry.id} is not running")
+        os.kill(entry.pid, signal.SIGINT)
 
     def _watch(self) -> None:
         while not self._ended.wait(_LOOK_EVERY_S):
             try:
                 self._look()
-            except CoupoleError as error:  # of the disk: the queue must not go on without its file
+            except Exception as error:  # noqa: BLE001  it must go on to watch, and tell what it cannot
+                self.state = None
                 with contextlib.suppress(CoupoleError):
-                    self._queue.halt(str(error))
+                    self._queue.halt(f"{type(error).__name__}: {error}")
 
     def _look(self) -> None:
         entry = self._queue.running
         self.state = next((state for state in running() if state["rig"] == self._rig), None)
         if entry is not None:
             self._look_after(entry)
-        elif self.state is None and (following := self._queue.following) is not None:
+        elif (following := self._queue.following) is not None and not self._is_occupied():
             if following.hold:
-                self._queue.change(following.id, state="done", begun=utc_now(), ended=utc_now())
-                self._queue.halt(f"hold: {following.hold}")
+                now = utc_now()
+                self._queue.conclude(
+                    following.id, halt=f"hold: {following.hold}", state="done", begun=now, ended=now
+                )
             else:
                 self._begin(following)
 
+    def _is_occupied(self) -> bool:
+        """Whether somebody else has opened the cell's devices."""
+        return self.state is not None or is_in_use(self._cell.state_folder)
+
     def _begin(self, entry: Entry) -> None:
+        self._queue.change(entry.id, state="running", begun=utc_now())  # first: it must never be begun twice
         said, figures = self._files(entry)
-        with said.open("wb") as errors, figures.open("wb") as found:
-            command = [sys.executable, "-m", "coupole.commands.cli", "acquire", entry.plan, "--yes", "--json"]
-            self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=found, stderr=errors, start_new_session=True
+        command = [sys.executable, "-m", "coupole.commands.cli", "acquire", entry.plan, "--rig", self._rig]
+        try:
+            with said.open("wb") as errors, figures.open("wb") as found:
+                self._process = subprocess.Popen(
+                    [*command, "--yes", "--json"],
+                    stdin=subprocess.DEVNULL,
+                    stdout=found,
+                    stderr=errors,
+                    start_new_session=True,
+                )
+        except OSError as error:
+            self._queue.conclude(
+                entry.id, halt=f"{entry.plan}: {error}", state="failed", ended=utc_now(), said=str(error)
             )
-        self._queue.change(entry.id, state="running", begun=utc_now(), pid=self._process.pid)
+            return
+        self._queue.change(entry.id, pid=self._process.pid)
 
     def _look_after(self, entry: Entry) -> None:
         if self.state is not None and self.state["pid"] == entry.pid and not entry.run:
@@ -105,13 +134,10 @@ class Acquisitions:
             code = self._process.returncode if self._process.returncode >= 0 else None
         self._process = None
         state = "done" if code == 0 else "stopped" if code in _STOPPED else "failed"
-        why = found.get("error") or _last_line(said) or "its process was killed"
-        self._queue.change(
-            entry.id, state=state, ended=utc_now(), exit_code=code, run=str(found.get("run", entry.run)),
-            said="" if code == 0 else why,
-        )  # fmt: skip
-        if code != 0:
-            self._queue.halt(f"{Path(entry.plan).name}: {why}")
+        why = "" if code == 0 else found.get("error") or _last_line(said) or "its process was killed"
+        halt = "" if code == 0 else f"{Path(entry.plan).name}: {why}"
+        run = str(found.get("run", entry.run))
+        self._queue.conclude(entry.id, halt=halt, state=state, ended=utc_now(), exit_code=code, run=run, said=why)
 
     def _files(self, entry: Entry) -> tuple[Path, Path]:
         return self._folder / f"{entry.id}.log", self._folder / f"{entry.id}.json"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import json
+import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,103 +11,21 @@ from typing import Annotated, Any, Literal
 
 from fastapi import Depends, FastAPI, HTTPException, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
 
 import coupole
-from coupole.console.accounts import Account, Accounts, Role, same
+from coupole.console.accounts import Account, Accounts, Role
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.audit import Audit
+from coupole.console.messages import Hand, NewAccount, NewEntry, SignIn, StateNow, Text
 from coupole.console.plan_queue import Entry, PlanQueue
 from coupole.console.sessions import Control, Session, Sessions
 from coupole.errors import CoupoleError, InputError
 
-COOKIE = "coupole_session"
-_EVENT_EVERY_S, _ALIVE_EVERY_S = 0.2, 15.0
+_EVENT_EVERY_S, _ALIVE_EVERY_S = 0.2, 1.0
+_READING, _MOST_BYTES = ("GET", "HEAD"), 65536
 _LOOPBACK = ("127.0.0.1", "::1")
 _SIGN_IN = Path(__file__).parent / "sign_in.html"
 _POLICY = "default-src 'self'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
-Text = Annotated[str, Field(max_length=2000)]
-
-
-class Asked(BaseModel):
-    """Unknown keys are errors."""
-
-    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
-
-
-class SignIn(Asked):
-    """A name and a password, or the token of the first start."""
-
-    name: Text = ""
-    """Of an account."""
-    password: Text = ""
-    """Of the account."""
-    token: Text = ""
-    """Printed at the first start; an engineer's, once, until there is an account."""
-
-
-class NewEntry(Asked):
-    """A plan, or a hold."""
-
-    plan: Text = ""
-    """File of the plan, relative to the folder of plans."""
-    hold: Text = ""
-    """What is to be done before the queue goes on."""
-
-
-class NewAccount(Asked):
-    """Of a person."""
-
-    name: Text
-    """With which they sign in."""
-    password: Text
-    """With at least ten characters."""
-    role: Literal["observer", "operator", "engineer"]
-    """What they may do."""
-
-
-class Hand(Asked):
-    """Control, given to who asked for it."""
-
-    to: Text = ""
-    """Who; empty: nobody."""
-
-
-class StateNow(BaseModel):
-    """The cell at this moment."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
-    state: Literal["idle", "starting", "running", "pausing", "paused", "stopping", "halted"]
-    """`halted`: the queue waits for a person; `starting`: a plan is checked, and devices are opened."""
-    rig: str
-    """Name of the rig."""
-    simulated: bool
-    """No real light, no real arm."""
-    run: str | None
-    """Name of the run that is being acquired."""
-    view: str | None
-    """View that is being acquired."""
-    proven: int
-    """Frames of the run that are proven."""
-    frames: int
-    """Frames of the run."""
-    dose: float
-    """Light of the run on the object, in lux hours."""
-    left_s: float | None
-    """Expected until the run is complete."""
-    halted: str
-    """Why the queue waits for a person; empty if it does not."""
-    arm_fault: str
-    """The fault of the arm that stands until a person confirms; empty if there is none."""
-    devices: dict[str, Any]
-    """Identities of the devices of the run."""
-    queue: list[Entry]
-    """All entries, in their order."""
-    in_control: str
-    """Who may act; empty: any operator."""
-    asked_by: str
-    """Who asks for control."""
 
 
 @dataclass(frozen=True)
@@ -121,12 +39,15 @@ class Service:
     queue: PlanQueue
     acquisitions: Acquisitions
     state: Callable[[], StateNow]
+    """As it is."""
+    newest: Callable[[], StateNow]
+    """As it was a moment ago; takes no time."""
     read_plan: Callable[[str], Path]
     """The file of a plan of this cell that can be run. Raises InputError."""
     origins: frozenset[str]
     """Of this service's own pages."""
-    first_token: list[str]
-    """Of the first start; empty once it is used."""
+    cookie: str
+    """Name of the sessions' cookie, which no other console of this machine has."""
     command_line: Session
     """Of the service's own user, on this machine."""
 
@@ -150,10 +71,21 @@ def make_app(service: Service) -> FastAPI:
 
 def _guard(app: FastAPI, service: Service) -> None:
     """Nothing but the sign-in page is served to who is not signed in; nothing is changed for another site's page,
-    or twice."""
+    or twice. What was asked and would change something is logged, with its answer."""
 
     @app.middleware("http")
+    async def logged(request: Request, call_next: Callable[[Request], Any]) -> Response:
+        response: Response = await check(request, call_next)
+        if request.method not in _READING:
+            session = getattr(request.state, "session", None)
+            name = session.account.name if session else ""
+            address = request.client.host if request.client else "command line"
+            service.audit.note(name, f"{request.method} {request.url.path}", response.status_code, address)
+        return response
+
     async def check(request: Request, call_next: Callable[[Request], Any]) -> Response:
+        if int(request.headers.get("content-length", "0") or 0) > _MOST_BYTES:
+            return _no(413, f"expected at most {_MOST_BYTES} bytes")
         hosts = {origin.partition("://")[2] for origin in service.origins}
         if not _is_command_line(request) and request.headers.get("host", "") not in hosts:
             return _no(400, "expected this console's own address as host")
@@ -165,7 +97,7 @@ def _guard(app: FastAPI, service: Service) -> None:
         public = request.url.path in ("/", "/api/v1/sign-in")
         if session is None and not public:
             return _no(401, "sign in first")
-        if request.method not in ("GET", "HEAD") and session is not None and not public:
+        if request.method not in _READING and session is not None and not public:
             ambient = not _is_command_line(request) and not _bearer(request)
             if ambient and not service.sessions.spend(session, request.headers.get("x-coupole-token", "")):
                 return _no(403, "expected in X-Coupole-Token a fresh token of /api/v1/token, good for once")
@@ -203,15 +135,23 @@ def _bearer(request: Request) -> str:
 def _session_of(request: Request, service: Service) -> Session | None:
     if _is_command_line(request):
         return service.command_line
-    secret = _bearer(request) or request.cookies.get(COOKIE, "")
-    return service.sessions.of(secret) if secret else None
+    if bearer := _bearer(request):
+        return service.sessions.of(bearer, script=True)
+    return service.sessions.of(request.cookies.get(service.cookie, ""), script=False)
+
+
+def _is_of_this_machine(request: Request) -> bool:
+    """A connection from an address of this machine itself: nobody else can have one."""
+    if _is_command_line(request) or request.client is None:
+        return _is_command_line(request)
+    return request.client.host in _LOOPBACK or request.client.host == request.scope["server"][0]
 
 
 def _account(request: Request) -> Account:
     """Whose session it is; from another machine everybody is an observer."""
     session: Session = request.state.session
     account = session.account
-    if _is_command_line(request) or (request.client and request.client.host in _LOOPBACK):
+    if _is_of_this_machine(request):
         return account
     return replace(account, role=min(account.role, Role.OBSERVER))
 
@@ -219,15 +159,12 @@ def _account(request: Request) -> Account:
 Who = Annotated[Account, Depends(_account)]
 
 
-def _allow(service: Service, who: Account, role: Role, action: str, *, acts: bool = False, **what: str) -> None:
-    """Log what somebody is about to do. Raises _Refused if their role or who is in control forbids it."""
+def _allow(service: Service, who: Account, role: Role, action: str, *, acts: bool = False) -> None:
+    """Raise _Refused if somebody's role, or who is in control, forbids an action."""
     if who.role < role:
-        service.audit.note(who.name, action, "refused: role", **what)
         raise _Refused(403, f"{action}: only for {role.word}s; {who.name} is {who.role.word}")
     if acts and not service.control.act(who):
-        service.audit.note(who.name, action, "refused: not in control", **what)
         raise _Refused(409, f"{action}: {service.control.now.name} is in control; ask for it first")
-    service.audit.note(who.name, action, "allowed", **what)
 
 
 # -- signing in -----------------------------------------------------------------------------------------------
@@ -242,26 +179,28 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
 
     @app.post("/api/v1/sign-in", responses={401: {"description": "Wrong, or tried too often."}})
     def sign_in(asked: SignIn, request: Request, response: Response) -> dict[str, str]:
-        """Begin a session: a cookie for browsers, and for scripts the same in `session`, to be sent as
-        `Authorization: Bearer`."""
-        account = service.accounts.sign_in(asked.name, asked.password) if asked.name else None
-        if asked.token and service.first_token and same(asked.token, service.first_token[0]):
-            service.first_token.clear()
-            account = Account("first engineer", Role.ENGINEER)
-        service.audit.note(asked.name or "token", "sign in", "allowed" if account else "refused")
+        """Begin a session: a cookie for browsers, or for a script `session`, to be sent as `Authorization:
+        Bearer`."""
+        here = _is_of_this_machine(request)
+        if asked.name:
+            account = service.accounts.sign_in(asked.name, asked.password, here=here)
+        else:
+            account = service.accounts.sign_in_first(asked.token) if here else None
         if account is None:
             raise _Refused(401, "name or password are wrong, or were wrong too often: try again in a minute")
-        secret = service.sessions.begin(account)
+        secret = service.sessions.begin(account, script=asked.script)
+        told = {"name": account.name, "role": account.role.word}
+        if asked.script:
+            return {**told, "session": secret}
         safe = request.url.scheme == "https"
-        response.set_cookie(COOKIE, secret, httponly=True, samesite="strict", secure=safe)
-        return {"name": account.name, "role": account.role.word, "session": secret}
+        response.set_cookie(service.cookie, secret, httponly=True, samesite="strict", secure=safe)
+        return told
 
     @app.post("/api/v1/sign-out")
     def sign_out(who: Who, request: Request, response: Response) -> dict[str, str]:
         """End this session."""
-        service.sessions.end(_bearer(request) or request.cookies.get(COOKIE, ""))
-        service.audit.note(who.name, "sign out", "allowed")
-        response.delete_cookie(COOKIE)
+        service.sessions.end(_bearer(request) or request.cookies.get(service.cookie, ""))
+        response.delete_cookie(service.cookie)
         return {"name": who.name}
 
     @app.get("/api/v1/token")
@@ -285,16 +224,17 @@ def _add_cell(app: FastAPI, service: Service) -> None:
         return service.state()
 
     @app.get("/api/v1/events", response_class=StreamingResponse)
-    async def events() -> StreamingResponse:
-        """The state whenever it has changed, as an event stream (`event: state`)."""
-        return StreamingResponse(_events(service), media_type="text/event-stream")
+    async def events(request: Request) -> StreamingResponse:
+        """The state whenever it has changed, and every second, as an event stream (`event: state`), until the
+        session is over."""
+        return StreamingResponse(_events(service, request), media_type="text/event-stream")
 
     @app.post("/api/v1/queue", responses=_REFUSALS)
     def add(asked: NewEntry, who: Who) -> Entry:
         """Enter a plan or a hold. A plan is read first; wrong ones are refused with all their problems."""
         if bool(asked.plan) == bool(asked.hold):
             raise InputError("expected either `plan` or `hold`")
-        _allow(service, who, Role.OPERATOR, "queue", acts=True, plan=asked.plan, hold=asked.hold)
+        _allow(service, who, Role.OPERATOR, "queue", acts=True)
         if asked.hold:
             return service.queue.add(who.name, hold=asked.hold)
         return service.queue.add(who.name, plan=str(service.read_plan(asked.plan)))
@@ -302,9 +242,16 @@ def _add_cell(app: FastAPI, service: Service) -> None:
     @app.delete("/api/v1/queue/{entry}", responses=_REFUSALS)
     def remove(entry: Text, who: Who) -> dict[str, str]:
         """Take out an entry that waits."""
-        _allow(service, who, Role.OPERATOR, "take out", acts=True, entry=entry)
+        _allow(service, who, Role.OPERATOR, "take out", acts=True)
         service.queue.remove(entry)
         return {"removed": entry}
+
+    @app.post("/api/v1/queue/{entry}/stop", responses=_REFUSALS)
+    def stop(entry: Text, who: Who) -> dict[str, str]:
+        """Stop what an entry has begun, at any time, also before its run has a name."""
+        _allow(service, who, Role.OPERATOR, "stop")
+        service.acquisitions.stop(service.queue.entry(entry))
+        return {"stopped": entry}
 
     @app.post("/api/v1/queue/go-on", responses=_REFUSALS)
     def go_on(who: Who) -> StateNow:
@@ -316,23 +263,20 @@ def _add_cell(app: FastAPI, service: Service) -> None:
     @app.post("/api/v1/runs/{run}/{command}", responses=_REFUSALS)
     def tell(run: Text, command: Literal["pause", "go-on", "stop"], who: Who) -> dict[str, Any]:
         """To the run that is being acquired. Any operator may pause and stop, whoever is in control: this never
-        harms. `stop` is answered when the lights were switched off and the arm was told to stop."""
-        _allow(service, who, Role.OPERATOR, command, acts=command == "go-on", run=run)
+        harms. `stop` is answered when the lights are off and the arm was told to stop, or with the `trouble`."""
+        _allow(service, who, Role.OPERATOR, command, acts=command == "go-on")
         return service.acquisitions.tell(run, command)
 
 
-async def _events(service: Service) -> AsyncIterator[str]:
-    before, quiet_s = "", 0.0
-    while True:
-        now = json.dumps(service.state().model_dump())
-        if now != before:
-            before, quiet_s = now, 0.0
-            yield f"event: state\ndata: {now}\n\n"
-        elif quiet_s > _ALIVE_EVERY_S:
-            quiet_s = 0.0
-            yield ": alive\n\n"
+async def _events(service: Service, request: Request) -> AsyncIterator[str]:
+    before, said_s = "", 0.0
+    while _session_of(request, service) is not None:
+        now = service.newest()
+        known = now.model_dump_json(exclude={"t"})
+        if known != before or time.monotonic() - said_s > _ALIVE_EVERY_S:
+            before, said_s = known, time.monotonic()
+            yield f"event: state\ndata: {now.model_dump_json()}\n\n"
         await asyncio.sleep(_EVENT_EVERY_S)
-        quiet_s += _EVENT_EVERY_S
 
 
 # -- people ---------------------------------------------------------------------------------------------------
@@ -348,7 +292,7 @@ def _add_people(app: FastAPI, service: Service) -> None:
     @app.post("/api/v1/control/give", responses=_REFUSALS)
     def give(asked: Hand, who: Who) -> dict[str, str]:
         """Hand control over to who asked for it, or give it up."""
-        _allow(service, who, Role.OPERATOR, "give control", to=asked.to)
+        _allow(service, who, Role.OPERATOR, "give control")
         return asdict(service.control.give(who, asked.to))
 
     @app.get("/api/v1/accounts", responses=_REFUSALS)
@@ -361,14 +305,14 @@ def _add_people(app: FastAPI, service: Service) -> None:
     @app.post("/api/v1/accounts", responses=_REFUSALS)
     def new_account(asked: NewAccount, who: Who) -> dict[str, str]:
         """A new account."""
-        _allow(service, who, Role.ENGINEER, "new account", account=f"{asked.name} ({asked.role})")
+        _allow(service, who, Role.ENGINEER, "new account")
         account = service.accounts.add(asked.name, asked.password, Role.of(asked.role))
         return {"name": account.name, "role": account.role.word}
 
     @app.delete("/api/v1/accounts/{name}", responses=_REFUSALS)
     def no_account(name: Text, who: Who) -> dict[str, str]:
         """Take an account away, and end its sessions."""
-        _allow(service, who, Role.ENGINEER, "remove account", account=name)
+        _allow(service, who, Role.ENGINEER, "remove account")
         service.accounts.remove(name)
         service.sessions.end_of(name)
         return {"removed": name}

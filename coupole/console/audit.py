@@ -1,26 +1,33 @@
-"""Who did what at the console: `audit.jsonl`, a line for each request that changes something, also if it was
-refused."""
+"""Who asked for what at the console: `audit.jsonl`, a line for each request that would change something, with its
+answer; also if it was refused."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
+from coupole.errors import StorageError
 from coupole.storage.durable import make_folder
 from coupole.storage.line_file import LineFile, utc_now
 
 
 class Audit:
-    """The log of one cell's console. Raises StorageError: what cannot be logged is not done."""
+    """The log of one cell's console. Raises StorageError when it is opened; later `trouble` says that it could not
+    be written, as a stop must not wait for a disk."""
 
     def __init__(self, path: Path) -> None:
         make_folder(path.parent)
         self._file = LineFile(path)
+        self.trouble = ""
 
-    def note(self, name: str, action: str, outcome: str, **what: str) -> None:
-        """`name` did `action`; on the disk when this returns."""
-        line = {"t": utc_now(), "name": name, "action": action, "outcome": outcome, **what}
-        self._file.append([json.dumps(line, ensure_ascii=False) + "\n"])
+    def note(self, name: str, asked: str, status: int, address: str) -> None:
+        """`name` (empty: nobody who is signed in) at `address` asked for something, and got this HTTP status."""
+        line = {"t": utc_now(), "name": name, "asked": asked, "status": status, "from": address}
+        try:
+            self._file.append([json.dumps(line, ensure_ascii=False) + "\n"])
+            self.trouble = ""
+        except StorageError as error:
+            self.trouble = f"the log cannot be written: {error}"
 
     def close(self) -> None:
         self._file.close()

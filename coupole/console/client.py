@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import http.client
 import json
-import os
 import socket
 from pathlib import Path
 from typing import Any
 
-from coupole.acquisition.run_control import socket_folder
+from coupole.acquisition.runtime_folder import named_after
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
 
@@ -19,8 +17,7 @@ _PATIENCE_S = 30.0
 
 def service_socket(cell: Cell) -> Path:
     """The Unix socket at which the service of a cell hears the command line."""
-    digest = hashlib.sha256(os.fsencode(cell.document.path.resolve())).hexdigest()[:24]
-    return socket_folder() / f"console-{digest}"
+    return named_after(cell.document.path, "console")
 
 
 class _Local(http.client.HTTPConnection):

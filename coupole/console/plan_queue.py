@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import secrets
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -60,9 +59,9 @@ class _Kept(BaseModel):
 class PlanQueue:
     """Entries in their order. Every change is on the disk when the call returns."""
 
-    def __init__(self, path: Path, on_change: Callable[[], object] = lambda: None) -> None:
+    def __init__(self, path: Path) -> None:
         """Raises StorageError: the file cannot be read."""
-        self._path, self._lock, self._on_change = path, threading.RLock(), on_change
+        self._path, self._lock = path, threading.RLock()
         try:
             self._kept = _Kept.model_validate_json(path.read_bytes()) if path.exists() else _Kept()
         except (OSError, ValidationError) as error:
@@ -117,11 +116,21 @@ class PlanQueue:
         with self._lock:
             changed = self.entry(number).model_copy(update=fields)
             self._keep(tuple(changed if other.id == number else other for other in self.entries), self.halted)
-        return changed
+            return changed
+
+    def conclude(self, number: str, *, halt: str = "", **fields: object) -> None:
+        """An entry with other fields, and why nothing more begins, in one change. Raises InputError, StorageError:
+        nothing more begins all the same."""
+        with self._lock:
+            changed = self.entry(number).model_copy(update=fields)
+            entries = tuple(changed if other.id == number else other for other in self.entries)
+            self._keep(entries, halt or self.halted)
 
     def halt(self, why: str) -> None:
-        """Begin nothing more until somebody goes on with it."""
+        """Begin nothing more until somebody goes on with it, also if that cannot be written. Raises
+        StorageError."""
         with self._lock:
+            self._kept = self._kept.model_copy(update={"halted": why})
             self._keep(self.entries, why)
 
     def go_on(self) -> None:
@@ -137,4 +146,3 @@ class PlanQueue:
         except OSError as error:
             raise StorageError(f"{self._path}: the queue cannot be kept: {error.strerror}") from error
         self._kept = kept
-        self._on_change()

@@ -10,10 +10,12 @@ import getpass
 import ipaddress
 import json
 import os
-import secrets
 import socket
+import ssl
 import struct
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +25,10 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from coupole.console.accounts import Account, Accounts, Role
 from coupole.console.acquisitions import Acquisitions
-from coupole.console.api import Service, StateNow, make_app
+from coupole.console.api import Service, make_app
 from coupole.console.audit import Audit
 from coupole.console.client import service_socket
+from coupole.console.messages import StateNow
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.sessions import Control, Session, Sessions
 from coupole.errors import InputError
@@ -35,46 +38,81 @@ from coupole.plan.yamlfile import read
 from coupole.preflight.job import read_job
 from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.durable import make_folder
+from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
 
-_STOP_WITHIN_S = 2
+_STOP_WITHIN_S, _NEWEST_S = 2, 0.1
 
 
-def serve(cell: Cell, *, host: str, port: int, plans: Path, tls: tuple[Path, Path] | None, tell: Any) -> None:
-    """Serve a cell's console until a signal ends it; runs that are being acquired go on. `tell` is called with
-    `url`, `token` and `pid` when it listens.
+def serve(
+    cell: Cell,
+    *,
+    host: str,
+    port: int,
+    names: Sequence[str],
+    plans: Path,
+    tls: tuple[Path, Path] | None,
+    tell: Callable[[dict[str, Any]], object],
+) -> None:
+    """Serve a cell's console until a signal ends it; runs that are being acquired go on. `names` are other names
+    under which browsers know this machine; `tell` is called with `url`, `token` and `pid` when it listens.
 
     Raises InputError: another service owns the cell, an address without TLS that others can reach, no such
     address; StorageError.
     """
-    if not _is_loopback(host) and tls is None:
+    if not _is_here(host) and tls is None:
         raise InputError(f"--host {host}: others can reach this address: give --tls-certificate and --tls-key")
     folder = cell.state_folder / "console"
     make_folder(folder)
     with _owned(folder), contextlib.closing(Audit(folder / "audit.jsonl")) as audit:
         queue = PlanQueue(folder / "queue.json")
         accounts = Accounts(folder / "accounts.json")
-        first_token = [secrets.token_urlsafe(24)] if accounts.are_none else []
+        context = _tls_context(tls)
         listening = _listen(host, port)
-        url = f"{'https' if tls else 'http'}://{_name(host)}:{listening.getsockname()[1]}"
-        with Acquisitions(queue, cell.document.path, folder / "output") as acquisitions:
+        port = listening.getsockname()[1]
+        url = f"{'https' if tls else 'http'}://{_in_url(host)}:{port}"
+        with Acquisitions(queue, cell, folder / "output") as acquisitions:
             control = Control()
             service = Service(
                 accounts, Sessions(), control, audit, queue, acquisitions,
-                state=lambda: state_of(cell, queue, acquisitions, control),
+                state=lambda: state_of(cell, queue, acquisitions, control, audit),
+                newest=Newest(lambda: state_of(cell, queue, acquisitions, control, audit)),
                 read_plan=lambda name: read_plan(cell, plans, name),
-                origins=frozenset({url, *_other_names(url)}),
-                first_token=first_token,
-                command_line=Session(Account(f"{getpass.getuser()} (command line)", Role.ENGINEER), 0.0, 0),
+                origins=_origins(url, [host, *names, *(["localhost", "127.0.0.1"] if _is_here(host) else [])]),
+                cookie=f"coupole_session_{port}",
+                command_line=Session(
+                    Account(f"{getpass.getuser()} (command line)", Role.ENGINEER), 0.0, script=True
+                ),
             )  # fmt: skip
-            tell({"url": url, "token": first_token[0] if first_token else "", "pid": os.getpid()})
-            asyncio.run(_run(service, listening, service_socket(cell), tls))
+            tell({"url": url, "token": accounts.first_token, "pid": os.getpid()})
+            asyncio.run(_run(service, listening, service_socket(cell), context))
 
 
-def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: Control) -> StateNow:
+class Newest:
+    """A state that is made anew by a thread of its own, however many ask for it."""
+
+    def __init__(self, make: Callable[[], StateNow]) -> None:
+        self._make, self._state = make, make()
+        threading.Thread(target=self._renew, name="newest state", daemon=True).start()
+
+    def __call__(self) -> StateNow:
+        return self._state
+
+    def _renew(self) -> None:
+        while True:
+            time.sleep(_NEWEST_S)
+            try:
+                self._state = self._make()
+            except Exception as error:  # noqa: BLE001  the old one must not be taken for what is so
+                self._state = self._state.model_copy(update={"trouble": str(error), "t": utc_now()})
+
+
+def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: Control, audit: Audit) -> StateNow:
     """The cell at this moment."""
-    at_work = acquisitions.state or {}
-    begun = "starting" if queue.running else "halted" if queue.halted else "idle"
+    at_work, entry = acquisitions.state or {}, queue.running
+    begun = "halted" if queue.halted else "idle"
+    if entry is not None:
+        begun = "concluding" if entry.run else "starting"
     faults = ArmFaults(cell.state_folder).standing()
     return StateNow(
         state=at_work.get("state", begun),
@@ -92,6 +130,8 @@ def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: 
         queue=list(queue.entries),
         in_control=control.now.name,
         asked_by=control.now.asked_by,
+        trouble=audit.trouble,
+        t=utc_now(),
     )
 
 
@@ -133,10 +173,10 @@ class _OfThisUser(H11Protocol):
         super().connection_made(transport)
 
 
-async def _run(service: Service, listening: socket.socket, path: Path, tls: tuple[Path, Path] | None) -> None:
+async def _run(service: Service, listening: socket.socket, path: Path, tls: ssl.SSLContext | None) -> None:
     app = make_app(service)
     page, line = uvicorn.Server(_config(app)), uvicorn.Server(_config(app))
-    page.config.ssl_certfile, page.config.ssl_keyfile = tls or (None, None)
+    page.config.ssl_context_factory = (lambda *_: tls) if tls else None
     line.config.http = _OfThisUser
     path.unlink(missing_ok=True)
     with socket.socket(socket.AF_UNIX) as local:
@@ -176,22 +216,35 @@ def _listen(host: str, port: int) -> socket.socket:
     return listening
 
 
-def _is_loopback(host: str) -> bool:
+def _tls_context(tls: tuple[Path, Path] | None) -> ssl.SSLContext | None:
+    """Raises InputError: the files are no certificate with its key."""
+    if tls is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(*tls)
+    except (OSError, ssl.SSLError) as error:
+        raise InputError(f"{tls[0]}, {tls[1]}: expected a certificate and its key as PEM: {error}") from error
+    return context
+
+
+def _is_here(host: str) -> bool:
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
 
 
-def _name(host: str) -> str:
+def _in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def _other_names(url: str) -> list[str]:
-    """`localhost` for an address of this machine."""
-    scheme, _, rest = url.partition("://")
-    host, _, port = rest.rpartition(":")
-    return [f"{scheme}://localhost:{port}"] if _is_loopback(host.strip("[]")) else []
+def _origins(url: str, hosts: Sequence[str]) -> frozenset[str]:
+    """Of pages at these hosts; browsers leave out the port that is their scheme's own."""
+    scheme, port = url.partition("://")[0], url.rpartition(":")[2]
+    places = {f"{scheme}://{_in_url(host)}" for host in hosts}
+    own = port == {"http": "80", "https": "443"}[scheme]
+    return frozenset({f"{place}:{port}" for place in places} | (places if own else set()))
 
 
 @contextlib.contextmanager

@@ -25,7 +25,8 @@ class Session:
 
     account: Account
     seen_s: float
-    number: int
+    script: bool
+    """Its secret comes as a bearer, which no browser adds by itself."""
     tokens: set[str] = field(default_factory=set)
     """For one request that changes something each."""
 
@@ -36,21 +37,21 @@ class Sessions:
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s, self._lock = now_s, threading.Lock()
         self._by_hash: dict[str, Session] = {}
-        self._count = 0
 
-    def begin(self, account: Account) -> str:
-        """A new session's secret, which only its browser keeps."""
+    def begin(self, account: Account, *, script: bool) -> str:
+        """A new session's secret, which only its browser or script keeps."""
         secret = secrets.token_urlsafe(32)
         with self._lock:
-            self._count += 1
-            self._by_hash[_hash(secret)] = Session(account, self._now_s(), self._count)
+            self._by_hash[_hash(secret)] = Session(account, self._now_s(), script)
         return secret
 
-    def of(self, secret: str) -> Session | None:
-        """The session with this secret, if it is not over; it counts as used."""
+    def of(self, secret: str, *, script: bool) -> Session | None:
+        """The session of this kind with this secret, if it is not over; it counts as used."""
         with self._lock:
             session = self._by_hash.get(_hash(secret))
-            if session is None or self._now_s() - session.seen_s > IDLE_S:
+            if session is None or session.script is not script:
+                return None
+            if self._now_s() - session.seen_s > IDLE_S:
                 self._by_hash.pop(_hash(secret), None)
                 return None
             session.seen_s = self._now_s()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
+import signal
 import sys
 import termios
 import threading
@@ -11,51 +13,64 @@ import tty
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
+_MOST_BYTES, _NAP_S = 64, 0.5
+
 
 @contextmanager
 def obeyed(actions: Mapping[str, Callable[[], object]]) -> Iterator[bool]:
-    """Call what belongs to a key when it is pressed, in another thread; True if keys are read.
+    """Call what belongs to a key when it is pressed alone (or with Enter), in another thread; True if any is
+    read.
 
-    They are where standard input is a terminal and this process in its foreground. Ctrl-C and its like stay
-    signals; the terminal's modes are as before when this ends.
+    They are where standard input is a terminal and this process in its foreground; in the background nothing is
+    read, and the process is not stopped for it. Several characters at once, as of function keys and of text that
+    is pasted, do nothing. Ctrl-C and its like stay signals; the terminal's modes are as before when this ends.
     """
-    if not _is_ours():
+    if not _is_ours() or threading.current_thread() is not threading.main_thread():
         yield False
         return
     terminal = sys.stdin.fileno()
-    before = termios.tcgetattr(terminal)
+    modes = termios.tcgetattr(terminal)
+    handlers = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGTTIN, signal.SIGTTOU)}
     ended, end = os.pipe()
-
-    def read() -> None:
-        while True:
-            ready, _, _ = select.select([terminal, ended], [], [])
-            if ended in ready:
-                return
-            pressed = os.read(terminal, 1).decode(errors="replace").lower()
-            if not pressed:
-                return
-            if pressed in actions:
-                actions[pressed]()
-
-    thread = threading.Thread(target=read, name="keys", daemon=True)
-    tty.setcbreak(terminal, termios.TCSANOW)
-    thread.start()
+    thread = threading.Thread(target=_read, args=(terminal, ended, actions), name="keys", daemon=True)
     try:
+        tty.setcbreak(terminal, termios.TCSANOW)
+        thread.start()
         yield True
     finally:
         os.close(end)
-        thread.join()
+        if thread.ident is not None:
+            thread.join()
         os.close(ended)
-        termios.tcsetattr(terminal, termios.TCSANOW, before)
+        if _is_ours():
+            with contextlib.suppress(termios.error):  # the terminal may be gone
+                termios.tcsetattr(terminal, termios.TCSANOW, modes)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def _read(terminal: int, ended: int, actions: Mapping[str, Callable[[], object]]) -> None:
+    while True:
+        ready, _, _ = select.select([terminal, ended], [], [])
+        if ended in ready:
+            return
+        try:
+            pressed = os.read(terminal, _MOST_BYTES)
+        except OSError:  # in the background, or the terminal is gone
+            if select.select([ended], [], [], _NAP_S)[0]:
+                return
+            continue
+        if not pressed:
+            return
+        key = pressed.rstrip(b"\r\n").decode(errors="replace").lower()
+        if key in actions:
+            actions[key]()
 
 
 def _is_ours() -> bool:
+    """Whether standard input is a terminal, and this process in its foreground."""
     try:
         terminal = sys.stdin.fileno()
         return os.isatty(terminal) and os.tcgetpgrp(terminal) == os.getpgrp()
-    except (
-        OSError,
-        ValueError,
-        AttributeError,
-    ):  # no standard input, or not its own terminal
+    except (OSError, ValueError, AttributeError):
         return False

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -103,7 +104,7 @@ def test_whatever_ends_the_use_of_a_cell_it_is_made_safe_before_its_devices_are_
     )
     monkeypatch.setattr(opened_cell, "in_world", lambda rig, dry_run: False)
     monkeypatch.setattr(opened_cell, "_open_device", lambda *arguments, **named: device)
-    cell: Any = SimpleNamespace(rig=SimpleNamespace(sensor=None))
+    cell: Any = SimpleNamespace(rig=SimpleNamespace(sensor=None), state_folder=Path("state"))
     with pytest.raises(LookupError), opened_cell.open_cell(cell):
         raise LookupError
     assert sorted(done[:2]) == ["arm stopped", "lights off"]

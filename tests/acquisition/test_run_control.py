@@ -6,14 +6,17 @@ import json
 import os
 import socket
 import stat
-from collections.abc import Iterator
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from coupole.acquisition import run_control
+from coupole.acquisition import run_control, runtime_folder
 from coupole.acquisition.observer import Control
-from coupole.acquisition.run_control import RunControl, ask, running, socket_folder
+from coupole.acquisition.opened_cell import Safeguard
+from coupole.acquisition.run_control import RunControl, ask, running
 from coupole.errors import InputError
 from coupole.viewing.progress import Progress
 
@@ -25,15 +28,24 @@ class Served:
 
     def __init__(self, folder: Path) -> None:
         self.run, self.control, self.halted = folder, Control(), 0
+        self.lights_off: Callable[[], None] = lambda: None
 
-    def halt(self) -> None:
+    def halt(self) -> list[Safeguard]:
         assert self.control.stop.is_set(), "else the sequencer would light the next"
         self.halted += 1
+        return [Safeguard("lights off", self.lights_off)]
+
+
+@pytest.fixture(autouse=True)
+def base(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Its path is short: a socket's may have 107 characters."""
+    with tempfile.TemporaryDirectory() as folder:
+        monkeypatch.setattr(runtime_folder, "_BASE", Path(folder))
+        yield Path(folder)
 
 
 @pytest.fixture
-def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def served(tmp_path: Path) -> Iterator[Served]:
     found = Served(tmp_path / "run")
     with RunControl(found.run, tmp_path / "rig.yaml", found.control, found.halt, lambda: PROGRESS) as control:
         assert control.trouble == ""
@@ -41,7 +53,7 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
 
 
 def say(line: bytes) -> dict[str, object]:
-    (path,) = socket_folder().glob("*.sock")
+    (path,) = runtime_folder.runtime_folder().glob("*.sock")
     with socket.socket(socket.AF_UNIX) as connection:
         connection.connect(str(path))
         connection.sendall(line)
@@ -64,8 +76,11 @@ def test_it_pauses_goes_on_and_stops_and_tells_its_state_each_time(served: Serve
     assert ask(served.run, "go-on")["state"] == "running"
     assert not served.control.pause.is_set()
     assert served.halted == 0
-    assert ask(served.run, "stop")["state"] == "stopping"
-    assert served.halted == 1
+    served.control.paused.set()
+    assert ask(served.run, "go-on")["state"] == "running", "before the sequencer has seen it, too"
+    served.control.paused.clear()
+    stopped = ask(served.run, "stop")
+    assert (stopped["state"], stopped["trouble"], served.halted) == ("stopping", [], 1)
     assert served.control.interrupted().exit_code == 130
 
 
@@ -78,7 +93,7 @@ def test_it_pauses_goes_on_and_stops_and_tells_its_state_each_time(served: Serve
         (b'{"version": 2, "command": "pause"}\n', "expected version 1"),
         (b'{"version": 1, "command": "Pause"}\n', "expected the command pause, go-on, stop or state"),
         (b'{"version": 1, "command": ["stop"]}\n', "expected the command"),
-        (b"\xff" * 5000, "expected one line of JSON"),
+        (b"\xff" * 70_000, "expected one line of JSON"),
     ],
 )
 def test_what_is_no_request_changes_nothing_and_is_told_what_was_expected(
@@ -91,16 +106,24 @@ def test_what_is_no_request_changes_nothing_and_is_told_what_was_expected(
 
 
 def test_a_client_that_says_nothing_holds_up_no_other(served: Served) -> None:
-    (path,) = socket_folder().glob("*.sock")
+    (path,) = runtime_folder.runtime_folder().glob("*.sock")
     with socket.socket(socket.AF_UNIX) as silent:
         silent.connect(str(path))
         assert ask(served.run, "stop")["state"] == "stopping"
 
 
+def test_a_stop_of_which_it_is_not_sure_says_so(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_control, "_SAFE_WITHIN_S", 0.1)
+    hangs = threading.Event()
+    served.lights_off = lambda: hangs.wait(30.0) and None
+    assert ask(served.run, "stop")["trouble"] == ["not sure: lights off: no answer within 15 s"]
+    hangs.set()
+
+
 def test_nobody_else_can_enter(served: Served) -> None:
-    (path,) = socket_folder().glob("*.sock")
+    (path,) = runtime_folder.runtime_folder().glob("*.sock")
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    socket_folder().chmod(0o755)
+    runtime_folder.runtime_folder().chmod(0o755)
     with pytest.raises(InputError, match="nobody else may enter"):
         ask(served.run, "pause")
 
@@ -112,21 +135,24 @@ def test_another_user_gets_no_answer(served: Served, monkeypatch: pytest.MonkeyP
     assert served.halted == 0
 
 
-def test_a_run_that_nobody_acquires_is_told_and_a_killed_ones_socket_is_taken_away(
+def test_a_run_that_nobody_acquires_is_told_and_a_killed_one_is_told_from_one_that_hangs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with pytest.raises(InputError, match="no process of this user acquires into this run"):
         ask(tmp_path, "pause")
     with socket.socket(socket.AF_UNIX) as left_over:
-        left_over.bind(str(socket_folder() / "0123.sock"))
+        left_over.bind(str(runtime_folder.runtime_folder() / "0123.sock"))
     assert running() == []
-    assert list(socket_folder().iterdir()) == []
+    with socket.socket(socket.AF_UNIX) as hung:
+        monkeypatch.setattr(run_control, "_PATIENCE_S", 0.1)
+        hung.bind(str(runtime_folder.runtime_folder() / "4567.sock"))
+        hung.listen()
+        assert [state["state"] for state in running()] == ["silent"], "it may be at work"
 
 
 def test_without_a_folder_for_its_socket_a_run_is_acquired_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / ("long" * 30)))
-    with RunControl(tmp_path, tmp_path / "rig.yaml", Control(), lambda: None, lambda: None) as control:
+    monkeypatch.setattr(runtime_folder, "_BASE", tmp_path / ("long" * 30))
+    with RunControl(tmp_path, tmp_path / "rig.yaml", Control(), list, lambda: None) as control:
         assert "will not reach this run" in control.trouble

@@ -59,7 +59,7 @@ class Browser:
     def post(self, path: str, body: Any = None, method: str = "POST") -> Reply:
         return self.ask(method, path, body, **{"X-Coupole-Token": self.token()})
 
-    def sign_in(self, **who: str) -> Reply:
+    def sign_in(self, **who: Any) -> Reply:
         return self.ask("POST", "/api/v1/sign-in", who)
 
     def state(self) -> dict[str, Any]:
@@ -75,7 +75,7 @@ class Served:
     url: str
     token: str
 
-    def browser(self, **who: str) -> Browser:
+    def browser(self, **who: Any) -> Browser:
         """Somebody who has signed in, if it is said who."""
         found = Browser(self.url)
         if who:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import signal
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 import cells
 import pytest
 from cells import CellFolder
 from served import Browser, Served, served
 
-from coupole.acquisition.run_control import socket_folder
+from coupole.acquisition.runtime_folder import runtime_folder
 
 PASSWORD = "a long password"
 
@@ -30,7 +33,7 @@ class Staffed:
     def signed_in(self, name: str) -> Browser:
         return self.served.browser(name=name, password=PASSWORD)
 
-    def audit(self) -> list[dict[str, str]]:
+    def audit(self) -> list[dict[str, Any]]:
         lines = (self.cell.folder / "storage/state/console/audit.jsonl").read_text().splitlines()
         return [json.loads(line) for line in lines]
 
@@ -101,6 +104,38 @@ def test_cookies_are_kept_from_scripts_and_other_sites_and_answers_from_caches(s
     assert (staffed.cell.folder / "storage/state/console/accounts.json").stat().st_mode & 0o077 == 0
 
 
+def test_a_script_has_a_bearer_and_a_cookie_is_none(staffed: Staffed) -> None:
+    script = staffed.served.browser()
+    session = script.sign_in(name="Ada", password=PASSWORD, script=True).document["session"]
+    assert script.cookie == ""
+    script.headers = {"Authorization": f"Bearer {session}"}
+    assert script.ask("POST", "/api/v1/control/take").document["name"] == "Ada"
+    ada = staffed.signed_in("Ada")
+    stolen = staffed.served.browser()
+    stolen.headers = {"Authorization": f"Bearer {ada.cookie.partition('=')[2]}"}
+    assert stolen.get("/api/v1/state").status == 401
+    stolen.headers, stolen.cookie = {}, f"{ada.cookie.partition('=')[0]}={session}"
+    assert stolen.get("/api/v1/state").status == 401
+
+
+def test_the_event_stream_tells_the_state_and_ends_with_its_session(staffed: Staffed) -> None:
+    eve = staffed.signed_in("Eve")
+    place = urlsplit(eve.url)
+    connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=cells.PATIENCE_S)
+    connection.request("GET", "/api/v1/events", headers={"Cookie": eve.cookie})
+    stream = connection.getresponse()
+    assert stream.headers["Content-Type"].startswith("text/event-stream")
+    assert stream.readline() == b"event: state\n"
+    assert json.loads(stream.readline().removeprefix(b"data: "))["state"] == "idle"
+    assert eve.post("/api/v1/sign-out").status == 200
+    stream.read()
+    connection.close()
+
+
+def test_a_body_that_is_too_large_is_not_read(staffed: Staffed) -> None:
+    assert staffed.served.browser().sign_in(name="Eve", password="x" * 100_000).status == 413
+
+
 def test_a_session_that_has_signed_out_and_those_of_a_removed_account_are_over(staffed: Staffed) -> None:
     eve = staffed.signed_in("Eve")
     assert eve.post("/api/v1/sign-out").status == 200
@@ -158,8 +193,8 @@ def test_an_observer_looks_and_changes_nothing(staffed: Staffed) -> None:
         assert refused.status == 403, path
         assert "Eve is observer" in refused.document["detail"]
     assert eve.get("/api/v1/accounts").status == 403
-    assert staffed.audit()[-1]["name"] == "Eve"
-    assert staffed.audit()[-1]["outcome"] == "refused: role"
+    last = staffed.audit()[-1]
+    assert (last["name"], last["asked"], last["status"]) == ("Eve", "POST /api/v1/accounts", 403)
 
 
 def test_one_is_in_control_another_looks_until_it_is_handed_over(staffed: Staffed) -> None:
@@ -210,7 +245,7 @@ def test_the_command_line_is_heard_by_its_users_socket_alone(staffed: Staffed) -
     assert entry["by"].endswith("(command line)")
     cells.wait_until(lambda: staffed.engineer.state()["state"] == "halted", "the hold")
     assert cells.here("queue", staffed.cell.rig, "--go-on").code == 0
-    assert all(path.stat().st_mode & 0o077 == 0 for path in socket_folder().glob("console-*"))
+    assert all(path.stat().st_mode & 0o077 == 0 for path in runtime_folder().glob("*.console"))
     second = cells.here("serve", staffed.cell.rig, "--port", "0")
     assert second.code == 2
     assert "another `coupole serve` has this cell" in second.err

@@ -86,6 +86,8 @@ def _guard(app: FastAPI, service: Service) -> None:
     async def check(request: Request, call_next: Callable[[Request], Any]) -> Response:
         if int(request.headers.get("content-length", "0") or 0) > _MOST_BYTES:
             return _no(413, f"expected at most {_MOST_BYTES} bytes")
+        if "transfer-encoding" in request.headers:
+            return _no(411, "expected a body with its length")
         hosts = {origin.partition("://")[2] for origin in service.origins}
         if not _is_command_line(request) and request.headers.get("host", "") not in hosts:
             return _no(400, "expected this console's own address as host")

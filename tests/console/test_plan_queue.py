@@ -105,12 +105,14 @@ def test_a_plan_waits_while_somebody_else_has_the_devices(
     queue: PlanQueue, begun: list[list[str]], running: Acquisitions, tmp_path: Path
 ) -> None:
     live = cells.start("live", tmp_path / "rig.yaml", "--yes")
-    cells.wait_until(lambda: module.is_in_use(tmp_path / "storage/state"), "the live view")
-    queue.add("Ada", plan="one.yaml")
-    time.sleep(1.0)
-    assert begun == []
-    live.terminate()
-    cells.finish(live)
+    try:
+        cells.wait_until(lambda: module.is_in_use(tmp_path / "storage/state"), "the live view")
+        queue.add("Ada", plan="one.yaml")
+        time.sleep(1.0)
+        assert begun == []
+    finally:
+        live.terminate()
+        cells.finish(live)
     cells.wait_until(lambda: begun, "the plan")
 
 

@@ -133,7 +133,9 @@ def test_the_event_stream_tells_the_state_and_ends_with_its_session(staffed: Sta
 
 
 def test_a_body_that_is_too_large_is_not_read(staffed: Staffed) -> None:
-    assert staffed.served.browser().sign_in(name="Eve", password="x" * 100_000).status == 413
+    somebody = staffed.served.browser()
+    assert somebody.sign_in(name="Eve", password="x" * 100_000).status == 413
+    assert somebody.ask("POST", "/api/v1/sign-in", **{"Transfer-Encoding": "chunked"}).status == 411
 
 
 def test_a_session_that_has_signed_out_and_those_of_a_removed_account_are_over(staffed: Staffed) -> None:

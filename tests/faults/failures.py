@@ -23,7 +23,7 @@ def fail_in_a_burst(cell: CellFolder, fault: dict[str, Any]) -> Ended:
 def assert_told(cell: CellFolder, ended: Ended, device: str) -> None:
     """Exit code, message, JSON and journal name the device that failed."""
     assert ended.code == 4, ended
-    assert f": {device}: expected " in ended.err
+    assert f"{device}: expected " in ended.err
     assert ended.document["error"].startswith(f"{device}: expected ")
     assert cells.events(cell.run_folder, "stop")[-1]["outcome"] == "failed"
     assert device in {fault["device"] for fault in cells.events(cell.run_folder, "fault")}

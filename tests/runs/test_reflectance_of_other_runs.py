@@ -13,6 +13,7 @@ from cells import CellFolder
 from relief_cells import RECORDS, shipped_cell
 
 
+@pytest.mark.timeout(900)  # many kernels are compiled here first, while others want the machine too
 def test_brackets_are_merged(tmp_path: Path) -> None:
     """Some pixels are saturated in the longer exposure, some lost in the noise of the shorter. Six LEDs are enough
     for samples, and too few for a material."""

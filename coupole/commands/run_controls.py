@@ -51,9 +51,11 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     """
     from coupole.storage.run import Run
     from coupole.storage.run_status import status
-    from coupole.viewing.terminal import make_console, show_status
+    from coupole.viewing.terminal import alarm, make_console, show_status
 
     sent = _sent(run, "stop")
+    for trouble in sent["trouble"]:
+        alarm(trouble)
     stopped = Run(Path(sent["run"]))
     while stopped.in_use:
         time.sleep(_LOOK_EVERY_S)

@@ -69,8 +69,8 @@ class Accounts:
             self._stored: dict[str, dict[str, Any]] = json.loads(path.read_bytes()) if path.exists() else {}
         except (OSError, ValueError) as error:
             raise StorageError(f"{path}: the console's accounts cannot be read: {error}") from error
-        self.first_token = "" if self._stored else secrets.token_urlsafe(24)
-        """With which an engineer signs in while there is no account; empty if it does not hold (any more)."""
+        self.first_token = "" if _has_engineer(self._stored) else secrets.token_urlsafe(24)
+        """With which an engineer signs in while no engineer has an account; empty if it does not hold."""
 
     def listed(self) -> list[Account]:
         """All, by name."""
@@ -87,7 +87,8 @@ class Accounts:
             if name in self._stored:
                 raise InputError(f"name: {name} has an account already")
             self._keep({**self._stored, name: {"role": role.word, "password": hashed}})
-            self.first_token = ""
+            if role is Role.ENGINEER:
+                self.first_token = ""
         return Account(name, role)
 
     def remove(self, name: str) -> None:
@@ -96,7 +97,7 @@ class Accounts:
             if name not in self._stored:
                 raise InputError(f"name: {name} has no account")
             left = {other: kept for other, kept in self._stored.items() if other != name}
-            if not any(kept["role"] == Role.ENGINEER.word for kept in left.values()):
+            if _has_engineer(self._stored) and not _has_engineer(left):
                 raise InputError("name: this is the last engineer; nobody could keep the accounts")
             self._keep(left)
 
@@ -122,7 +123,7 @@ class Accounts:
         return Account(name, Role.of(kept["role"])) if kept else None
 
     def sign_in_first(self, token: str) -> Account | None:
-        """An engineer with the token of a start without accounts; once."""
+        """An engineer with the token of a start without an engineer's account; once."""
         with self._lock:
             if not self.first_token or not hmac.compare_digest(token.encode(), self.first_token.encode()):
                 return None
@@ -139,3 +140,7 @@ class Accounts:
         except OSError as error:
             raise StorageError(f"{self._path}: the account cannot be kept: {error.strerror}") from error
         self._stored = stored
+
+
+def _has_engineer(stored: dict[str, dict[str, Any]]) -> bool:
+    return any(kept["role"] == Role.ENGINEER.word for kept in stored.values())

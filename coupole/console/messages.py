@@ -25,7 +25,7 @@ class SignIn(Asked):
     password: Text = ""
     """Of the account."""
     token: Text = ""
-    """Printed at a start without accounts; an engineer's, once, on the same machine."""
+    """Printed at a start without an engineer's account; an engineer's, once, on the same machine."""
     script: bool = False
     """The session is returned in `session`, to be sent as a bearer, in place of a cookie."""
 

@@ -64,6 +64,7 @@ def serve(
         raise InputError(f"--host {host}: others can reach this address: give --tls-certificate and --tls-key")
     folder = cell.state_folder / "console"
     make_folder(folder)
+    folder.chmod(0o700)  # hashes of passwords, and who did what
     with _owned(folder), contextlib.closing(Audit(folder / "audit.jsonl")) as audit:
         queue = PlanQueue(folder / "queue.json")
         accounts = Accounts(folder / "accounts.json")

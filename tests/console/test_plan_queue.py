@@ -122,6 +122,19 @@ def test_a_damaged_queue_is_refused(tmp_path: Path) -> None:
         PlanQueue(tmp_path / "queue.json")
 
 
+def test_the_token_of_the_first_start_holds_until_an_engineer_has_an_account(tmp_path: Path) -> None:
+    path = tmp_path / "accounts.json"
+    first = Accounts(path)
+    first.add("Ada", "a long password", Role.OPERATOR)
+    again = Accounts(path)
+    assert first.first_token
+    assert again.first_token not in ("", first.first_token)
+    again.remove("Ada")
+    again.add("Ida", "a long password", Role.ENGINEER)
+    assert again.first_token == Accounts(path).first_token == ""
+    assert again.sign_in_first("") is None
+
+
 def test_control_passes_to_another_when_its_holder_is_gone_for_five_minutes(tmp_path: Path) -> None:
     now_s = [0.0]
     accounts = Accounts(tmp_path / "accounts.json")

@@ -142,7 +142,7 @@ def test_a_session_that_has_signed_out_and_those_of_a_removed_account_are_over(s
     eve = staffed.signed_in("Eve")
     assert eve.post("/api/v1/sign-out").status == 200
     assert eve.get("/api/v1/state").status == 401
-    staffed.engineer.post("/api/v1/accounts", {"name": "Tom", "password": PASSWORD, "role": "engineer"})
+    staffed.engineer.post("/api/v1/accounts", {"name": "Tom", "password": PASSWORD, "role": "operator"})
     tom = staffed.signed_in("Tom")
     assert staffed.engineer.post("/api/v1/accounts/Tom", method="DELETE").status == 200
     assert tom.get("/api/v1/state").status == 401

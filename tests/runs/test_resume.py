@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -343,65 +342,3 @@ def test_the_arm_comes_to_rest_when_the_controller_is_killed_in_a_motion(
     process.kill()
     cells.finish(process)
     cells.wait_until(lambda: cells.safe(world), "the arm at rest")
-
-
-# -- the operator pauses it -----------------------------------------------------------------------------------
-
-
-def test_a_run_pauses_between_bursts_and_goes_on(standing: tuple[CellFolder, World]) -> None:
-    cell, world = standing
-    cell.write(lights=cells.SOME_LIGHTS, repeats=4)
-    process = cell.start_acquire()
-    run = cell.run_folder
-    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
-    process.send_signal(signal.SIGUSR1)
-    cells.wait_until(lambda: cells.events(run, "pause"), "the pause")
-    assert cells.here("status", run, "--json").document["state"] == "paused"
-    paused_at = cells.frame_lines(run)
-    assert cells.safe(world)
-    time.sleep(0.5)
-    assert cells.frame_lines(run) == paused_at < 4 * 54
-    process.send_signal(signal.SIGUSR1)
-    assert cells.finish(process).code == 0
-    kinds = [event["event"] for event in cells.events(run)]
-    assert kinds.index("pause") < kinds.index("continue") < kinds.index("stop")
-    cells.assert_each_shot_proven_once(run)
-
-
-def test_a_paused_run_can_be_stopped(standing: tuple[CellFolder, World]) -> None:
-    cell, world = standing
-    cell.write(lights=cells.SOME_LIGHTS, repeats=4)
-    process = cell.start_acquire()
-    run = cell.run_folder
-    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
-    paused = cells.here("pause", run, "--json")
-    assert (paused.code, paused.document["state"], paused.document["pid"]) == (0, "paused", process.pid)
-    assert cells.events(run, "pause")
-    assert cells.safe(world)
-    stopped = cells.here("stop", run, "--json")
-    assert (stopped.code, stopped.document["state"]) == (0, "interrupted"), stopped.err
-    assert cells.safe(world)
-    assert cells.finish(process).code == 130
-    ended = cells.here("go-on", run)
-    assert ended.code == 2
-    assert "no process of this user acquires into this run" in ended.err
-
-
-def test_a_run_is_followed_from_another_terminal_and_stopped_in_a_burst(
-    standing: tuple[CellFolder, World],
-) -> None:
-    cell, world = standing
-    cell.write(lights=cells.SOME_LIGHTS, repeats=4)
-    process = cell.start_acquire()
-    run = cell.run_folder
-    follower = cells.start("status", run, "--follow")
-    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
-    stopped = cells.here("stop", run)
-    assert stopped.code == 0, stopped.err
-    assert "lights are off, the arm is at rest, the camera is disarmed" in stopped.err
-    assert cells.safe(world)
-    assert cells.finish(process).code == 130
-    seen = cells.finish(follower)
-    assert seen.code == 0
-    assert "interrupted: " in seen.err
-    assert f"--resume {run}" in " ".join(seen.err.split())

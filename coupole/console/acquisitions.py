@@ -1,8 +1,8 @@
 """Runs the queue: each plan in a process of its own, `coupole acquire`, which no fault of the service touches.
 
-The process is asked and told by its run's socket (`acquisition.run_control`), as by any other client; before it has
-one it can be interrupted, as by Ctrl-C. It goes on if the service dies, and a new service finds it by the number of
-its process in the queue.
+The process is asked and told by its run's socket (`acquisition.run_control`), as by any other client; before it
+has one it can be interrupted, as by Ctrl-C. It goes on if the service dies, and a new service finds it by the
+number of its process in the queue.
 """
 
 from __future__ import annotations

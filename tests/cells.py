@@ -212,7 +212,7 @@ def start(*arguments: str | Path, **popen: Any) -> subprocess.Popen[str]:
 def finish(process: subprocess.Popen[str]) -> Ended:
     """Wait for a process that `start` started."""
     with process:
-        out, err = process.communicate(timeout=PATIENCE_S)
+        out, err = process.communicate(timeout=2 * PATIENCE_S)  # the first of all compiles the kernels
     return Ended(process.returncode, out or "", err or "")
 
 

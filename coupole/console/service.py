@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import uvicorn
 from fastapi import FastAPI
@@ -25,19 +25,25 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from coupole.console.accounts import Account, Accounts, Role
 from coupole.console.acquisitions import Acquisitions
-from coupole.console.api import Service, make_app
+from coupole.console.api import make_app
 from coupole.console.audit import Audit
 from coupole.console.client import service_socket
 from coupole.console.messages import StateNow
 from coupole.console.plan_queue import PlanQueue
+from coupole.console.run_files import RunFiles
+from coupole.console.run_watch import RunWatch
+from coupole.console.screens.all_screens import add_screens
+from coupole.console.service_parts import Service
 from coupole.console.sessions import Control, Session, Sessions
-from coupole.errors import InputError
+from coupole.console.tasks import Tasks
+from coupole.errors import CoupoleError, InputError
+from coupole.plan import yamlfile
 from coupole.plan.cell import Cell
 from coupole.plan.rig_devices import in_world
-from coupole.plan.yamlfile import read
 from coupole.preflight.job import read_job
 from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.durable import make_folder
+from coupole.storage.ledger import History, Ledger
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
 
@@ -74,8 +80,11 @@ def serve(
         url = f"{'https' if tls else 'http'}://{_in_url(host)}:{port}"
         with Acquisitions(queue, cell, folder / "output") as acquisitions:
             control = Control()
+            runs = RunFiles(cell.storage_folder, folder / "verified")
+            tasks = Tasks(folder / "commands")
             service = Service(
-                accounts, Sessions(), control, audit, queue, acquisitions,
+                cell, plans, accounts, Sessions(), control, audit, queue, acquisitions,
+                runs, RunWatch(runs), tasks,
                 state=lambda: state_of(cell, queue, acquisitions, control, audit),
                 newest=Newest(lambda: state_of(cell, queue, acquisitions, control, audit)),
                 read_plan=lambda name: read_plan(cell, plans, name),
@@ -86,7 +95,10 @@ def serve(
                 ),
             )  # fmt: skip
             tell({"url": url, "token": accounts.first_token, "pid": os.getpid()})
-            asyncio.run(_run(service, listening, service_socket(cell), context))
+            try:
+                asyncio.run(_run(service, listening, service_socket(cell), context))
+            finally:
+                tasks.close()
 
 
 class Newest:
@@ -124,6 +136,7 @@ def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: 
         proven=at_work.get("proven", 0),
         frames=at_work.get("frames", 0),
         dose=at_work.get("dose_lux_h", 0.0),
+        **(_object_of(cell, at_work["run"]) if at_work else _NO_OBJECT),
         left_s=at_work.get("left_s"),
         halted=queue.halted,
         arm_fault=faults[-1].message if faults else "",
@@ -145,12 +158,35 @@ def _devices(run: str) -> dict[str, Any]:
         return {}
 
 
+_NO_OBJECT = {"object": "", "dose_before": 0.0, "dose_budget": None}
+
+
+def _object_of(cell: Cell, run: str) -> dict[str, Any]:
+    """Of a run that is being acquired."""
+    return _object_when(cell.ledger_folder, cell.former_ledger_folder, run)
+
+
+@functools.lru_cache(4)
+def _object_when(ledgers: Path, former: Path, run: str) -> dict[str, Any]:
+    """A run's object, the light on it that is not this run's, and its budget; they do not change while it runs."""
+    try:
+        opened = Run(Path(run))
+        named = opened.about.get("object") or ""
+        plan = yamlfile.read(opened.plan_path).data
+        history = Ledger(ledgers, named, former).read() if named else History()
+    except CoupoleError:
+        return _NO_OBJECT
+    before = sum(entry.dose_lux_h for entry in history.entries if entry.run != opened.folder.name)
+    budget = (plan.get("object") or {}).get("dose_budget_lux_h")
+    return {"object": named, "dose_before": before, "dose_budget": budget}
+
+
 def read_plan(cell: Cell, plans: Path, name: str) -> Path:
     """The file of a plan in the folder of plans, if it is whole and for this cell. Raises InputError."""
     path = (plans / name).resolve()
     if not path.is_relative_to(plans.resolve()):
         raise InputError(f"plan: expected a file below {plans}; found {name!r}")
-    if "views" not in read(path).data:
+    if "views" not in yamlfile.read(path).data:
         raise InputError(f"{path}: expected a plan, with `views`")
     job = read_job(path)
     if job.cell.document.path.resolve() != cell.document.path.resolve():
@@ -176,7 +212,8 @@ class _OfThisUser(H11Protocol):
 
 async def _run(service: Service, listening: socket.socket, path: Path, tls: ssl.SSLContext | None) -> None:
     app = make_app(service)
-    page, line = uvicorn.Server(_config(app)), uvicorn.Server(_config(app))
+    add_screens(app, service)
+    page, line = uvicorn.Server(_config(app, lifespan="on")), uvicorn.Server(_config(app, lifespan="off"))
     page.config.ssl_context_factory = (lambda *_: tls) if tls else None
     line.config.http = _OfThisUser
     path.unlink(missing_ok=True)
@@ -193,13 +230,13 @@ async def _run(service: Service, listening: socket.socket, path: Path, tls: ssl.
             path.unlink(missing_ok=True)
 
 
-def _config(app: FastAPI) -> uvicorn.Config:
+def _config(app: FastAPI, lifespan: Literal["on", "off"]) -> uvicorn.Config:
     return uvicorn.Config(
         app,
         log_level="warning",
         access_log=False,
         timeout_graceful_shutdown=_STOP_WITHIN_S,
-        lifespan="off",
+        lifespan=lifespan,
         proxy_headers=False,
         server_header=False,
     )

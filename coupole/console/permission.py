@@ -1,0 +1,22 @@
+"""Whether somebody may do something: by role, and by who is in control."""
+
+from __future__ import annotations
+
+from coupole.console.accounts import Account, Role
+from coupole.console.sessions import Control
+
+
+class NotAllowed(Exception):
+    """With the HTTP status and the words for whoever asked."""
+
+    def __init__(self, status: int, words: str) -> None:
+        super().__init__(words)
+        self.status = status
+
+
+def allow(control: Control, who: Account, role: Role, action: str, *, acts: bool = False) -> None:
+    """Raise NotAllowed if somebody's role, or who is in control, forbids an action."""
+    if who.role < role:
+        raise NotAllowed(403, f"{action}: only for {role.word}s; {who.name} is {who.role.word}")
+    if acts and not control.act(who):
+        raise NotAllowed(409, f"{action}: {control.now.name} is in control; ask for it first")

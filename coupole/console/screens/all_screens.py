@@ -1,0 +1,47 @@
+"""Puts the screens before a console's interface."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+from fastapi import FastAPI, Request
+from nicegui import app as nicegui_app
+from nicegui import ui
+
+from coupole.console.screens import run_screen
+from coupole.console.screens.frame import Place, framed
+from coupole.console.screens.visit import Visit
+from coupole.console.service_parts import Service
+
+Build = Callable[[Visit], Awaitable[None] | None]
+SCREENS: dict[Place, Build] = {
+    Place("/run", "Run", "play_circle"): run_screen.build,
+}
+
+
+def add_screens(app: FastAPI, service: Service) -> None:
+    """Serve all screens of a cell's console. Everything they need comes from this machine."""
+    nicegui_app.colors(primary="var(--accent)", negative="#b00020", positive="#1b6e3c")
+    ui.add_css(Path(__file__).parent / "screens.css", shared=True)
+    for place, build in SCREENS.items():
+        _add(service, place, build)
+    ui.run_with(
+        app,
+        title="Coupole",
+        dark=None,
+        language="en-GB",
+        tailwind=False,
+        reconnect_timeout=30.0,
+        show_welcome_message=False,
+    )
+
+
+def _add(service: Service, place: Place, build: Build) -> None:
+    @ui.page(place.path, title=f"{place.title} · Coupole")
+    async def page(request: Request) -> None:
+        visit = Visit(service, request)
+        with framed(visit, place, tuple(SCREENS)):
+            built = build(visit)
+            if built is not None:
+                await built

@@ -17,6 +17,7 @@ from coupole.console.guard import account_here, bearer_of, guard, is_of_this_mac
 from coupole.console.messages import Hand, NewAccount, NewEntry, SignIn, StateNow, Text
 from coupole.console.permission import NotAllowed, allow
 from coupole.console.plan_queue import Entry
+from coupole.console.plan_routes import add_plan_routes
 from coupole.console.run_files import RunRow
 from coupole.console.service_parts import Service
 from coupole.console.sessions import Session
@@ -33,6 +34,7 @@ def make_app(service: Service) -> FastAPI:
     _add_cell(app, service)
     _add_runs(app, service)
     _add_people(app, service)
+    add_plan_routes(app, service)
     return app
 
 

@@ -28,7 +28,9 @@ from coupole.console.acquisitions import Acquisitions
 from coupole.console.api import make_app
 from coupole.console.audit import Audit
 from coupole.console.client import service_socket
+from coupole.console.drafts import Desk
 from coupole.console.messages import StateNow
+from coupole.console.plan_files import PlanFiles
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.run_files import RunFiles
 from coupole.console.run_watch import RunWatch
@@ -81,10 +83,10 @@ def serve(
         with Acquisitions(queue, cell, folder / "output") as acquisitions:
             control = Control()
             runs = RunFiles(cell.storage_folder, folder / "verified")
-            tasks = Tasks(folder / "commands")
+            tasks, desk = Tasks(folder / "commands"), Desk()
             service = Service(
                 cell, plans, accounts, Sessions(), control, audit, queue, acquisitions,
-                runs, RunWatch(runs), tasks,
+                PlanFiles(plans, cell.document.path, folder / "drawings"), desk, runs, RunWatch(runs), tasks,
                 state=lambda: state_of(cell, queue, acquisitions, control, audit),
                 newest=Newest(lambda: state_of(cell, queue, acquisitions, control, audit)),
                 read_plan=lambda name: read_plan(cell, plans, name),
@@ -99,6 +101,7 @@ def serve(
                 asyncio.run(_run(service, listening, service_socket(cell), context))
             finally:
                 tasks.close()
+                desk.close()
 
 
 class Newest:

@@ -9,7 +9,9 @@ from pathlib import Path
 from coupole.console.accounts import Accounts
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.audit import Audit
+from coupole.console.drafts import Desk
 from coupole.console.messages import StateNow
+from coupole.console.plan_files import PlanFiles
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.run_files import RunFiles
 from coupole.console.run_watch import RunWatch
@@ -31,6 +33,9 @@ class Service:
     audit: Audit
     queue: PlanQueue
     acquisitions: Acquisitions
+    plan_files: PlanFiles
+    desk: Desk
+    """Checks and draws plans while they are written."""
     runs: RunFiles
     watch: RunWatch
     """Of the run at work."""

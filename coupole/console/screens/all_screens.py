@@ -9,7 +9,7 @@ from fastapi import FastAPI, Request
 from nicegui import app as nicegui_app
 from nicegui import ui
 
-from coupole.console.screens import run_screen
+from coupole.console.screens import plan_screen, run_screen
 from coupole.console.screens.frame import Place, framed
 from coupole.console.screens.visit import Visit
 from coupole.console.service_parts import Service
@@ -17,6 +17,7 @@ from coupole.console.service_parts import Service
 Build = Callable[[Visit], Awaitable[None] | None]
 SCREENS: dict[Place, Build] = {
     Place("/run", "Run", "play_circle"): run_screen.build,
+    Place("/plan", "Plan", "edit_note"): plan_screen.build,
 }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, TypeVar
 from urllib.parse import quote
 
-from nicegui import ui
+from nicegui import events, ui
 
 from coupole.viewing.raw_preview import BINS
 
@@ -31,6 +31,43 @@ def button(
 def named(element: E, name: str) -> E:
     """The element, with a `data-name` in the page."""
     return element.props(f"data-name={name}")
+
+
+class Choice:
+    """One of several, as a list to choose from: the browser's own, which keyboards and screen readers know."""
+
+    def __init__(self, label: str, name: str, on_change: Callable[[], object] = lambda: None) -> None:
+        self.value = ""
+        self._options: dict[str, str] = {}
+        self._on_change = on_change
+        with ui.element("label").classes("choice"):
+            ui.label(label)
+            self._select = named(ui.html("", sanitize=False, tag="select"), name)
+        self._select.on("change", self._changed, js_handler="event => emit(event.target.value)")
+
+    def offer(self, options: Mapping[str, str], value: str) -> None:
+        """Values with their words; `value` is chosen (nobody is told)."""
+        self._options, self.value = dict(options), value
+        self._draw()
+
+    def choose(self, value: str) -> None:
+        """Nobody is told."""
+        self.value = value
+        self._draw()
+
+    def _draw(self) -> None:
+        self._select.set_content(
+            "".join(
+                f'<option value="{html.escape(value)}"{" selected" * (value == self.value)}>{html.escape(words)}'
+                "</option>"
+                for value, words in self._options.items()
+            )
+        )
+
+    def _changed(self, event: events.GenericEventArguments) -> object:
+        self.value = str(event.args)
+        self._draw()
+        return self._on_change()
 
 
 def panel(title: str = "") -> ui.column:

@@ -8,19 +8,20 @@ from collections.abc import AsyncIterator
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
-from fastapi import Depends, FastAPI, Query, Request, Response
+from fastapi import FastAPI, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 
 import coupole
-from coupole.console.accounts import Account, Role
-from coupole.console.guard import account_here, bearer_of, guard, is_of_this_machine, session_of, sign_in_page
+from coupole.console.accounts import Role
+from coupole.console.asking import REFUSALS, Who
+from coupole.console.guard import bearer_of, guard, is_of_this_machine, session_of, sign_in_page
 from coupole.console.messages import Hand, NewAccount, NewEntry, SignIn, StateNow, Text
+from coupole.console.object_routes import add_object_routes
 from coupole.console.permission import NotAllowed, allow
 from coupole.console.plan_queue import Entry
 from coupole.console.plan_routes import add_plan_routes
 from coupole.console.run_files import RunRow
 from coupole.console.service_parts import Service
-from coupole.console.sessions import Session
 from coupole.errors import InputError
 
 _EVENT_EVERY_S, _ALIVE_EVERY_S = 0.2, 1.0
@@ -35,16 +36,8 @@ def make_app(service: Service) -> FastAPI:
     _add_runs(app, service)
     _add_people(app, service)
     add_plan_routes(app, service)
+    add_object_routes(app, service)
     return app
-
-
-def _account(request: Request) -> Account:
-    """Whose session it is."""
-    session: Session = request.state.session
-    return account_here(session.account, of_this_machine=is_of_this_machine(request))
-
-
-Who = Annotated[Account, Depends(_account)]
 
 
 # -- signing in -----------------------------------------------------------------------------------------------
@@ -91,11 +84,6 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
 
 # -- the cell -------------------------------------------------------------------------------------------------
 
-_REFUSALS: dict[int | str, dict[str, Any]] = {
-    403: {"description": "Not for this role, or without a fresh token."},
-    409: {"description": "Somebody else is in control, or the cell cannot."},
-}
-
 
 def _add_cell(app: FastAPI, service: Service) -> None:
     @app.get("/api/v1/state")
@@ -109,7 +97,7 @@ def _add_cell(app: FastAPI, service: Service) -> None:
         session is over."""
         return StreamingResponse(_events(service, request), media_type="text/event-stream")
 
-    @app.post("/api/v1/queue", responses=_REFUSALS)
+    @app.post("/api/v1/queue", responses=REFUSALS)
     def add(asked: NewEntry, who: Who) -> Entry:
         """Enter a plan or a hold. A plan is read first; wrong ones are refused with all their problems."""
         if bool(asked.plan) == bool(asked.hold):
@@ -119,28 +107,28 @@ def _add_cell(app: FastAPI, service: Service) -> None:
             return service.queue.add(who.name, hold=asked.hold)
         return service.queue.add(who.name, plan=str(service.read_plan(asked.plan)))
 
-    @app.delete("/api/v1/queue/{entry}", responses=_REFUSALS)
+    @app.delete("/api/v1/queue/{entry}", responses=REFUSALS)
     def remove(entry: Text, who: Who) -> dict[str, str]:
         """Take out an entry that waits."""
         allow(service.control, who, Role.OPERATOR, "take out", acts=True)
         service.queue.remove(entry)
         return {"removed": entry}
 
-    @app.post("/api/v1/queue/{entry}/stop", responses=_REFUSALS)
+    @app.post("/api/v1/queue/{entry}/stop", responses=REFUSALS)
     def stop(entry: Text, who: Who) -> dict[str, str]:
         """Stop what an entry has begun, at any time, also before its run has a name."""
         allow(service.control, who, Role.OPERATOR, "stop")
         service.acquisitions.stop(service.queue.entry(entry))
         return {"stopped": entry}
 
-    @app.post("/api/v1/queue/go-on", responses=_REFUSALS)
+    @app.post("/api/v1/queue/go-on", responses=REFUSALS)
     def go_on(who: Who) -> StateNow:
         """Go on with the queue after a hold, a fault or a stop."""
         allow(service.control, who, Role.OPERATOR, "go on with the queue", acts=True)
         service.queue.go_on()
         return service.state()
 
-    @app.post("/api/v1/runs/{run}/{command}", responses=_REFUSALS)
+    @app.post("/api/v1/runs/{run}/{command}", responses=REFUSALS)
     def tell(run: Text, command: Literal["pause", "go-on", "stop"], who: Who) -> dict[str, Any]:
         """To the run that is being acquired. Any operator may pause and stop, whoever is in control: this never
         harms. `stop` is answered when the lights are off and the arm was told to stop, or with the `trouble`."""
@@ -178,33 +166,33 @@ async def _events(service: Service, request: Request) -> AsyncIterator[str]:
 
 
 def _add_people(app: FastAPI, service: Service) -> None:
-    @app.post("/api/v1/control/take", responses=_REFUSALS)
+    @app.post("/api/v1/control/take", responses=REFUSALS)
     def take(who: Who) -> dict[str, str]:
         """Take control, or ask for it; an engineer, and anybody after five minutes without a sign, takes it."""
         allow(service.control, who, Role.OPERATOR, "take control")
         return asdict(service.control.take(who))
 
-    @app.post("/api/v1/control/give", responses=_REFUSALS)
+    @app.post("/api/v1/control/give", responses=REFUSALS)
     def give(asked: Hand, who: Who) -> dict[str, str]:
         """Hand control over to who asked for it, or give it up."""
         allow(service.control, who, Role.OPERATOR, "give control")
         return asdict(service.control.give(who, asked.to))
 
-    @app.get("/api/v1/accounts", responses=_REFUSALS)
+    @app.get("/api/v1/accounts", responses=REFUSALS)
     def accounts(who: Who) -> list[dict[str, str]]:
         """All accounts, for engineers."""
         if who.role < Role.ENGINEER:
             raise NotAllowed(403, "accounts: only for engineers")
         return [{"name": one.name, "role": one.role.word} for one in service.accounts.listed()]
 
-    @app.post("/api/v1/accounts", responses=_REFUSALS)
+    @app.post("/api/v1/accounts", responses=REFUSALS)
     def new_account(asked: NewAccount, who: Who) -> dict[str, str]:
         """A new account."""
         allow(service.control, who, Role.ENGINEER, "new account")
         account = service.accounts.add(asked.name, asked.password, Role.of(asked.role))
         return {"name": account.name, "role": account.role.word}
 
-    @app.delete("/api/v1/accounts/{name}", responses=_REFUSALS)
+    @app.delete("/api/v1/accounts/{name}", responses=REFUSALS)
     def no_account(name: Text, who: Who) -> dict[str, str]:
         """Take an account away, and end its sessions."""
         allow(service.control, who, Role.ENGINEER, "remove account")

@@ -65,6 +65,17 @@ def draw_draft(draft: Draft, folder: Path) -> tuple[Path, Path]:
     return look_at_plan(read_job(draft.path, text=draft.text), folder, make_console(quiet=True), paths=True)
 
 
+def draw_object(draft: Draft, path: Path) -> Path:
+    """Picture of the object as it lies on the support. Raises InputError: the plan names no mesh."""
+    from coupole.preflight.job import read_job
+    from coupole.viewing.object_picture import write_object_picture
+
+    job = read_job(draft.path, text=draft.text)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_object_picture(job, path)
+    return path
+
+
 def bounds_of_mesh(draft: Draft) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Corners of the box round the draft's object in the support frame, mm. Raises InputError: there is none."""
     from coupole.preflight.job import read_job
@@ -89,6 +100,11 @@ class Desk:
     async def draw(self, draft: Draft, folder: Path) -> tuple[Path, Path]:
         """Raises InputError."""
         found: tuple[Path, Path] = await self._do(draw_draft, draft, folder)
+        return found
+
+    async def draw_object(self, draft: Draft, path: Path) -> Path:
+        """Raises InputError."""
+        found: Path = await self._do(draw_object, draft, path)
         return found
 
     async def bounds(self, draft: Draft) -> tuple[tuple[float, ...], tuple[float, ...]]:

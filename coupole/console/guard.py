@@ -19,6 +19,7 @@ from coupole.console.sessions import Session
 from coupole.errors import CoupoleError, InputError
 
 _READING, _MOST_BYTES = ("GET", "HEAD"), 65536
+_MOST_BYTES_OF_A_PICTURE = 20_000_000
 _LOOPBACK = ("127.0.0.1", "::1")
 _SIGN_IN = Path(__file__).parent / "sign_in.html"
 _STATIC = "/_nicegui/"
@@ -47,8 +48,9 @@ def guard(app: FastAPI, service: Service) -> None:
         return response
 
     async def check(request: Request, call_next: Callable[[Request], Any]) -> Response:
-        if int(request.headers.get("content-length", "0") or 0) > _MOST_BYTES:
-            return _no(413, f"expected at most {_MOST_BYTES} bytes")
+        most = _MOST_BYTES_OF_A_PICTURE if request.url.path.endswith("/photograph") else _MOST_BYTES
+        if int(request.headers.get("content-length", "0") or 0) > most:
+            return _no(413, f"expected at most {most} bytes")
         if "transfer-encoding" in request.headers:
             return _no(411, "expected a body with its length")
         if why := _foreign(request, service):

@@ -30,6 +30,7 @@ from coupole.console.audit import Audit
 from coupole.console.client import service_socket
 from coupole.console.drafts import Desk
 from coupole.console.messages import StateNow
+from coupole.console.object_files import ObjectFiles
 from coupole.console.plan_files import PlanFiles
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.run_files import RunFiles
@@ -83,10 +84,12 @@ def serve(
         with Acquisitions(queue, cell, folder / "output") as acquisitions:
             control = Control()
             runs = RunFiles(cell.storage_folder, folder / "verified")
+            plan_files = PlanFiles(plans, cell.document.path, folder / "drawings")
+            objects = ObjectFiles(cell, plan_files, runs, cell.state_folder / "objects")
             tasks, desk = Tasks(folder / "commands"), Desk()
             service = Service(
                 cell, plans, accounts, Sessions(), control, audit, queue, acquisitions,
-                PlanFiles(plans, cell.document.path, folder / "drawings"), desk, runs, RunWatch(runs), tasks,
+                plan_files, desk, runs, RunWatch(runs), objects, tasks,
                 state=lambda: state_of(cell, queue, acquisitions, control, audit),
                 newest=Newest(lambda: state_of(cell, queue, acquisitions, control, audit)),
                 read_plan=lambda name: read_plan(cell, plans, name),

@@ -11,6 +11,7 @@ from coupole.console.acquisitions import Acquisitions
 from coupole.console.audit import Audit
 from coupole.console.drafts import Desk
 from coupole.console.messages import StateNow
+from coupole.console.object_files import ObjectFiles
 from coupole.console.plan_files import PlanFiles
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.run_files import RunFiles
@@ -39,6 +40,7 @@ class Service:
     runs: RunFiles
     watch: RunWatch
     """Of the run at work."""
+    objects: ObjectFiles
     tasks: Tasks
     state: Callable[[], StateNow]
     """As it is."""

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from pathlib import Path
 
 from fastapi import FastAPI, Request
 from nicegui import app as nicegui_app
 from nicegui import ui
 
-from coupole.console.screens import plan_screen, run_screen
+from coupole.console.screens import object_screen, plan_screen, run_screen
 from coupole.console.screens.frame import Place, framed
 from coupole.console.screens.visit import Visit
 from coupole.console.service_parts import Service
 
-Build = Callable[[Visit], Awaitable[None] | None]
+Build = Callable[[Visit], None]
+"""Quick: what takes time is begun by a timer."""
 SCREENS: dict[Place, Build] = {
     Place("/run", "Run", "play_circle"): run_screen.build,
     Place("/plan", "Plan", "edit_note"): plan_screen.build,
+    Place("/object", "Object and dose", "category"): object_screen.build,
 }
 
 
@@ -40,9 +42,7 @@ def add_screens(app: FastAPI, service: Service) -> None:
 
 def _add(service: Service, place: Place, build: Build) -> None:
     @ui.page(place.path, title=f"{place.title} · Coupole")
-    async def page(request: Request) -> None:
+    def page(request: Request) -> None:
         visit = Visit(service, request)
         with framed(visit, place, tuple(SCREENS)):
-            built = build(visit)
-            if built is not None:
-                await built
+            build(visit)

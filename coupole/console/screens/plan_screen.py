@@ -28,9 +28,9 @@ _KINDS = {
 }
 
 
-async def build(visit: Visit) -> None:
+def build(visit: Visit) -> None:
     """Build the screen."""
-    await _Screen(visit).open_first()
+    ui.timer(0.0, _Screen(visit).open_first, once=True)
 
 
 class _Screen:

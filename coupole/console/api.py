@@ -6,9 +6,11 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from anyio import to_thread
 from fastapi import Depends, FastAPI, HTTPException, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
 
@@ -16,6 +18,7 @@ import coupole
 from coupole.console.accounts import Account, Accounts, Role
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.audit import Audit
+from coupole.console.entering import Entering
 from coupole.console.messages import Hand, NewAccount, NewEntry, SignIn, StateNow, Text
 from coupole.console.plan_queue import Entry, PlanQueue
 from coupole.console.sessions import Control, Session, Sessions
@@ -42,8 +45,7 @@ class Service:
     """As it is."""
     newest: Callable[[], StateNow]
     """As it was a moment ago; takes no time."""
-    read_plan: Callable[[str], Path]
-    """The file of a plan of this cell that can be run. Raises InputError."""
+    entering: Entering
     origins: frozenset[str]
     """Of this service's own pages."""
     cookie: str
@@ -52,7 +54,7 @@ class Service:
     """Of the service's own user, on this machine."""
 
 
-class _Refused(HTTPException):
+class Refused(HTTPException):
     """With the words for whoever asked."""
 
 
@@ -80,7 +82,8 @@ def _guard(app: FastAPI, service: Service) -> None:
             session = getattr(request.state, "session", None)
             name = session.account.name if session else ""
             address = request.client.host if request.client else "command line"
-            service.audit.note(name, f"{request.method} {request.url.path}", response.status_code, address)
+            about = getattr(request.state, "about", "")
+            service.audit.note(name, f"{request.method} {request.url.path}", response.status_code, address, about)
         return response
 
     async def check(request: Request, call_next: Callable[[Request], Any]) -> Response:
@@ -89,7 +92,7 @@ def _guard(app: FastAPI, service: Service) -> None:
         if "transfer-encoding" in request.headers:
             return _no(411, "expected a body with its length")
         hosts = {origin.partition("://")[2] for origin in service.origins}
-        if not _is_command_line(request) and request.headers.get("host", "") not in hosts:
+        if not is_command_line(request) and request.headers.get("host", "") not in hosts:
             return _no(400, "expected this console's own address as host")
         origin = request.headers.get("origin")
         if origin is not None and origin not in service.origins:
@@ -100,7 +103,7 @@ def _guard(app: FastAPI, service: Service) -> None:
         if session is None and not public:
             return _no(401, "sign in first")
         if request.method not in _READING and session is not None and not public:
-            ambient = not _is_command_line(request) and not _bearer(request)
+            ambient = not is_command_line(request) and not _bearer(request)
             if ambient and not service.sessions.spend(session, request.headers.get("x-coupole-token", "")):
                 return _no(403, "expected in X-Coupole-Token a fresh token of /api/v1/token, good for once")
         response: Response = await call_next(request)
@@ -123,7 +126,7 @@ def _no(code: int, why: str) -> Response:
     return JSONResponse({"detail": why}, code)
 
 
-def _is_command_line(request: Request) -> bool:
+def is_command_line(request: Request) -> bool:
     """By the service's Unix socket, at which only processes of its own user are heard."""
     server = request.scope.get("server")
     return server is not None and server[1] is None
@@ -135,7 +138,7 @@ def _bearer(request: Request) -> str:
 
 
 def _session_of(request: Request, service: Service) -> Session | None:
-    if _is_command_line(request):
+    if is_command_line(request):
         return service.command_line
     if bearer := _bearer(request):
         return service.sessions.of(bearer, script=True)
@@ -144,8 +147,8 @@ def _session_of(request: Request, service: Service) -> Session | None:
 
 def _is_of_this_machine(request: Request) -> bool:
     """A connection from an address of this machine itself: nobody else can have one."""
-    if _is_command_line(request) or request.client is None:
-        return _is_command_line(request)
+    if is_command_line(request) or request.client is None:
+        return is_command_line(request)
     return request.client.host in _LOOPBACK or request.client.host == request.scope["server"][0]
 
 
@@ -161,12 +164,12 @@ def _account(request: Request) -> Account:
 Who = Annotated[Account, Depends(_account)]
 
 
-def _allow(service: Service, who: Account, role: Role, action: str, *, acts: bool = False) -> None:
-    """Raise _Refused if somebody's role, or who is in control, forbids an action."""
+def allow(service: Service, who: Account, role: Role, action: str, *, acts: bool = False) -> None:
+    """Raise Refused if somebody's role, or who is in control, forbids an action."""
     if who.role < role:
-        raise _Refused(403, f"{action}: only for {role.word}s; {who.name} is {who.role.word}")
-    if acts and not service.control.act(who):
-        raise _Refused(409, f"{action}: {service.control.now.name} is in control; ask for it first")
+        raise Refused(403, f"{action}: only for {role.word}s; {who.name} is {who.role.word}")
+    if acts and not service.control.act(who, keep=who is not service.command_line.account):
+        raise Refused(409, f"{action}: {service.control.now.name} is in control; ask for it first")
 
 
 # -- signing in -----------------------------------------------------------------------------------------------
@@ -189,7 +192,7 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
         else:
             account = service.accounts.sign_in_first(asked.token) if here else None
         if account is None:
-            raise _Refused(401, "name or password are wrong, or were wrong too often: try again in a minute")
+            raise Refused(401, "name or password are wrong, or were wrong too often: try again in a minute")
         secret = service.sessions.begin(account, script=asked.script)
         told = {"name": account.name, "role": account.role.word}
         if asked.script:
@@ -213,7 +216,7 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
 
 # -- the cell -------------------------------------------------------------------------------------------------
 
-_REFUSALS: dict[int | str, dict[str, Any]] = {
+REFUSALS: dict[int | str, dict[str, Any]] = {
     403: {"description": "Not for this role, or without a fresh token."},
     409: {"description": "Somebody else is in control, or the cell cannot."},
 }
@@ -231,42 +234,44 @@ def _add_cell(app: FastAPI, service: Service) -> None:
         session is over."""
         return StreamingResponse(_events(service, request), media_type="text/event-stream")
 
-    @app.post("/api/v1/queue", responses=_REFUSALS)
-    def add(asked: NewEntry, who: Who) -> Entry:
-        """Enter a plan or a hold. A plan is read first; wrong ones are refused with all their problems."""
-        if bool(asked.plan) == bool(asked.hold):
-            raise InputError("expected either `plan` or `hold`")
-        _allow(service, who, Role.OPERATOR, "queue", acts=True)
-        if asked.hold:
-            return service.queue.add(who.name, hold=asked.hold)
-        return service.queue.add(who.name, plan=str(service.read_plan(asked.plan)))
+    @app.post("/api/v1/queue", responses=REFUSALS)
+    async def add(asked: NewEntry, who: Who, request: Request) -> Entry:
+        """Enter a plan, a run to be resumed, or a hold. Preflight is made first, for which this waits; what cannot
+        be run with what runs and waits before it is refused with all its problems."""
+        allow(service, who, Role.OPERATOR, "queue", acts=True)
+        request.state.about = asked.plan or asked.resume or asked.hold
+        here = is_command_line(request)
+        enter = partial(service.entering.enter, asked, who.name, by_command_line=here)
+        quick = asked.now or bool(asked.hold)
+        limiter = None if quick else service.entering.one_at_a_time
+        return await to_thread.run_sync(enter, limiter=limiter, abandon_on_cancel=True)
 
-    @app.delete("/api/v1/queue/{entry}", responses=_REFUSALS)
+    @app.delete("/api/v1/queue/{entry}", responses=REFUSALS)
     def remove(entry: Text, who: Who) -> dict[str, str]:
         """Take out an entry that waits."""
-        _allow(service, who, Role.OPERATOR, "take out", acts=True)
+        allow(service, who, Role.OPERATOR, "take out", acts=True)
         service.queue.remove(entry)
         return {"removed": entry}
 
-    @app.post("/api/v1/queue/{entry}/stop", responses=_REFUSALS)
+    @app.post("/api/v1/queue/{entry}/stop", responses=REFUSALS)
     def stop(entry: Text, who: Who) -> dict[str, str]:
         """Stop what an entry has begun, at any time, also before its run has a name."""
-        _allow(service, who, Role.OPERATOR, "stop")
+        allow(service, who, Role.OPERATOR, "stop")
         service.acquisitions.stop(service.queue.entry(entry))
         return {"stopped": entry}
 
-    @app.post("/api/v1/queue/go-on", responses=_REFUSALS)
+    @app.post("/api/v1/queue/go-on", responses=REFUSALS)
     def go_on(who: Who) -> StateNow:
         """Go on with the queue after a hold, a fault or a stop."""
-        _allow(service, who, Role.OPERATOR, "go on with the queue", acts=True)
+        allow(service, who, Role.OPERATOR, "go on with the queue", acts=True)
         service.queue.go_on()
         return service.state()
 
-    @app.post("/api/v1/runs/{run}/{command}", responses=_REFUSALS)
+    @app.post("/api/v1/runs/{run}/{command}", responses=REFUSALS)
     def tell(run: Text, command: Literal["pause", "go-on", "stop"], who: Who) -> dict[str, Any]:
         """To the run that is being acquired. Any operator may pause and stop, whoever is in control: this never
         harms. `stop` is answered when the lights are off and the arm was told to stop, or with the `trouble`."""
-        _allow(service, who, Role.OPERATOR, command, acts=command == "go-on")
+        allow(service, who, Role.OPERATOR, command, acts=command == "go-on")
         return service.acquisitions.tell(run, command)
 
 
@@ -285,36 +290,36 @@ async def _events(service: Service, request: Request) -> AsyncIterator[str]:
 
 
 def _add_people(app: FastAPI, service: Service) -> None:
-    @app.post("/api/v1/control/take", responses=_REFUSALS)
+    @app.post("/api/v1/control/take", responses=REFUSALS)
     def take(who: Who) -> dict[str, str]:
         """Take control, or ask for it; an engineer, and anybody after five minutes without a sign, takes it."""
-        _allow(service, who, Role.OPERATOR, "take control")
+        allow(service, who, Role.OPERATOR, "take control")
         return asdict(service.control.take(who))
 
-    @app.post("/api/v1/control/give", responses=_REFUSALS)
+    @app.post("/api/v1/control/give", responses=REFUSALS)
     def give(asked: Hand, who: Who) -> dict[str, str]:
         """Hand control over to who asked for it, or give it up."""
-        _allow(service, who, Role.OPERATOR, "give control")
+        allow(service, who, Role.OPERATOR, "give control")
         return asdict(service.control.give(who, asked.to))
 
-    @app.get("/api/v1/accounts", responses=_REFUSALS)
+    @app.get("/api/v1/accounts", responses=REFUSALS)
     def accounts(who: Who) -> list[dict[str, str]]:
         """All accounts, for engineers."""
         if who.role < Role.ENGINEER:
-            raise _Refused(403, "accounts: only for engineers")
+            raise Refused(403, "accounts: only for engineers")
         return [{"name": one.name, "role": one.role.word} for one in service.accounts.listed()]
 
-    @app.post("/api/v1/accounts", responses=_REFUSALS)
+    @app.post("/api/v1/accounts", responses=REFUSALS)
     def new_account(asked: NewAccount, who: Who) -> dict[str, str]:
         """A new account."""
-        _allow(service, who, Role.ENGINEER, "new account")
+        allow(service, who, Role.ENGINEER, "new account")
         account = service.accounts.add(asked.name, asked.password, Role.of(asked.role))
         return {"name": account.name, "role": account.role.word}
 
-    @app.delete("/api/v1/accounts/{name}", responses=_REFUSALS)
+    @app.delete("/api/v1/accounts/{name}", responses=REFUSALS)
     def no_account(name: Text, who: Who) -> dict[str, str]:
         """Take an account away, and end its sessions."""
-        _allow(service, who, Role.ENGINEER, "remove account")
+        allow(service, who, Role.ENGINEER, "remove account")
         service.accounts.remove(name)
         service.sessions.end_of(name)
         return {"removed": name}

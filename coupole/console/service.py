@@ -16,6 +16,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +27,20 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from coupole.console.accounts import Account, Accounts, Role
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.api import Service, make_app
+from coupole.console.api_at_the_cell import add_routes_at_the_cell
 from coupole.console.audit import Audit
 from coupole.console.client import service_socket
-from coupole.console.messages import StateNow
+from coupole.console.entering import Entering
+from coupole.console.messages import EntryNow, StateNow
+from coupole.console.outlook import expected_times
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.sessions import Control, Session, Sessions
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
 from coupole.plan.rig_devices import in_world
-from coupole.plan.yamlfile import read
-from coupole.preflight.job import read_job
 from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.durable import make_folder
-from coupole.storage.line_file import utc_now
+from coupole.storage.line_file import utc_now, utc_text
 from coupole.storage.run import Run
 
 _STOP_WITHIN_S, _NEWEST_S = 2, 0.1
@@ -72,13 +74,16 @@ def serve(
         listening = _listen(host, port)
         port = listening.getsockname()[1]
         url = f"{'https' if tls else 'http'}://{_in_url(host)}:{port}"
-        with Acquisitions(queue, cell, folder / "output") as acquisitions:
+        with (
+            Acquisitions(queue, cell, folder / "output") as acquisitions,
+            contextlib.closing(Entering(cell, plans, queue, acquisitions)) as entering,
+        ):
             control = Control()
             service = Service(
                 accounts, Sessions(), control, audit, queue, acquisitions,
                 state=lambda: state_of(cell, queue, acquisitions, control, audit),
                 newest=Newest(lambda: state_of(cell, queue, acquisitions, control, audit)),
-                read_plan=lambda name: read_plan(cell, plans, name),
+                entering=entering,
                 origins=_origins(url, [host, *names, *(["localhost", "127.0.0.1"] if _is_here(host) else [])]),
                 cookie=f"coupole_session_{port}",
                 command_line=Session(
@@ -86,7 +91,9 @@ def serve(
                 ),
             )  # fmt: skip
             tell({"url": url, "token": accounts.first_token, "pid": os.getpid()})
-            asyncio.run(_run(service, listening, service_socket(cell), context))
+            app = make_app(service)
+            add_routes_at_the_cell(app, service, cell)
+            asyncio.run(_run(app, listening, service_socket(cell), context))
 
 
 class Newest:
@@ -128,12 +135,22 @@ def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: 
         halted=queue.halted,
         arm_fault=faults[-1].message if faults else "",
         devices=_devices(at_work["run"]) if at_work else {},
-        queue=list(queue.entries),
+        lent_to=acquisitions.lending.lent_to,
+        queue=_entries_now(queue, at_work.get("left_s")),
         in_control=control.now.name,
         asked_by=control.now.asked_by,
         trouble=audit.trouble,
         t=utc_now(),
     )
+
+
+def _entries_now(queue: PlanQueue, left_s: float | None) -> list[EntryNow]:
+    times = expected_times(queue.entries, datetime.now(UTC), left_s=left_s, halted=bool(queue.halted))
+    found = []
+    for entry in queue.entries:
+        begin, end = (utc_text(time) if time else None for time in times.get(entry.id, (None, None)))
+        found.append(EntryNow(**dict(entry), expected_begin=begin, expected_end=end))
+    return found
 
 
 @functools.lru_cache(4)
@@ -145,37 +162,25 @@ def _devices(run: str) -> dict[str, Any]:
         return {}
 
 
-def read_plan(cell: Cell, plans: Path, name: str) -> Path:
-    """The file of a plan in the folder of plans, if it is whole and for this cell. Raises InputError."""
-    path = (plans / name).resolve()
-    if not path.is_relative_to(plans.resolve()):
-        raise InputError(f"plan: expected a file below {plans}; found {name!r}")
-    if "views" not in read(path).data:
-        raise InputError(f"{path}: expected a plan, with `views`")
-    job = read_job(path)
-    if job.cell.document.path.resolve() != cell.document.path.resolve():
-        raise InputError(f"{path}: its rig is {job.cell.document.path}; this console's is {cell.document.path}")
-    return path
-
-
 # -- sockets --------------------------------------------------------------------------------------------------
 
 
 class _OfThisUser(H11Protocol):
-    """HTTP on a Unix socket, with processes of this user alone."""
+    """HTTP on a Unix socket, with processes of this user alone. Their number stands for the client's port."""
 
     def connection_made(self, transport: Any) -> None:
         peer = transport.get_extra_info("socket").getsockopt(
             socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")
         )
-        if struct.unpack("3i", peer)[1] not in (os.getuid(), 0):
+        pid, uid, _ = struct.unpack("3i", peer)
+        if uid not in (os.getuid(), 0):
             transport.abort()
             return
         super().connection_made(transport)
+        self.client = "command line", pid
 
 
-async def _run(service: Service, listening: socket.socket, path: Path, tls: ssl.SSLContext | None) -> None:
-    app = make_app(service)
+async def _run(app: FastAPI, listening: socket.socket, path: Path, tls: ssl.SSLContext | None) -> None:
     page, line = uvicorn.Server(_config(app)), uvicorn.Server(_config(app))
     page.config.ssl_context_factory = (lambda *_: tls) if tls else None
     line.config.http = _OfThisUser

@@ -47,7 +47,9 @@ def base(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Served]:
     found = Served(tmp_path / "run")
-    with RunControl(found.run, tmp_path / "rig.yaml", found.control, found.halt, lambda: PROGRESS) as control:
+    with RunControl(
+        found.run, tmp_path / "rig.yaml", found.control, found.halt, lambda: PROGRESS, {"relief": 4.5}
+    ) as control:
         assert control.trouble == ""
         yield found
 

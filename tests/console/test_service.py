@@ -272,11 +272,15 @@ def long(tmp_path: Path) -> CellFolder:
 def test_plans_wait_for_each_other_and_a_run_is_paused_and_stopped_from_its_page(long: CellFolder) -> None:
     with served(long) as service:
         engineer = service.browser(token=service.token)
-        for _ in range(2):
-            assert engineer.post("/api/v1/queue", {"plan": "plan.yaml"}).status == 200
+        assert engineer.post("/api/v1/queue", {"plan": "plan.yaml", "now": True}).status == 200
+        assert engineer.post("/api/v1/queue", {"plan": "plan.yaml", "now": True}).status == 422
+        assert engineer.post("/api/v1/queue", {"plan": "plan.yaml"}).status == 200
         cells.wait_until(lambda: engineer.state()["proven"] > 0, "proven frames")
         state = engineer.state()
         assert [entry["state"] for entry in state["queue"]] == ["running", "waiting"]
+        needs = state["queue"][1]["needs"]
+        assert (needs["frames"], needs["object"]) == (state["frames"], "relief")
+        assert state["queue"][0]["expected_end"] == state["queue"][1]["expected_begin"] > state["t"]
         assert (state["state"], state["run"], state["view"]) == ("running", long.run_folder.name, "top")
         assert state["devices"]["camera"]["simulated"] is True
         assert state["dose"] > 0
@@ -299,7 +303,7 @@ def test_plans_wait_for_each_other_and_a_run_is_paused_and_stopped_from_its_page
 def test_a_killed_console_touches_no_run_and_comes_back_with_what_is_true(long: CellFolder) -> None:
     with served(long) as service:
         engineer = service.browser(token=service.token)
-        engineer.post("/api/v1/queue", {"plan": "plan.yaml"})
+        engineer.post("/api/v1/queue", {"plan": "plan.yaml", "now": True})
         cells.wait_until(lambda: engineer.state()["proven"] > 0, "proven frames")
         service.process.kill()
         service.process.wait()

@@ -22,8 +22,9 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from coupole.acquisition.observer import Control
@@ -35,7 +36,8 @@ from coupole.viewing.progress import Progress
 VERSION = 1
 Command = Literal["pause", "go-on", "stop", "state"]
 State = dict[str, Any]
-"""`run`, `rig`, `pid`, `state` (running, pausing, paused, stopping); from the first burst on `Progress` too."""
+"""`run`, `rig`, `pid`, `light_after_lux_h`, `state` (running, pausing, paused, stopping); from the first burst on
+`Progress` too."""
 _LONGEST_LINE_BYTES = 65536
 _SAFE_WITHIN_S, _PATIENCE_S = 4.0, 10.0
 
@@ -54,9 +56,12 @@ class RunControl:
         control: Control,
         halt: Callable[[], Sequence[Safeguard]],
         progress: Callable[[], Progress | None],
+        light_after_lux_h: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
-        """`halt` switches lights off and stops the arm, at once, from any thread; `progress` is the newest."""
-        self._about = {"version": VERSION, "run": str(run), "rig": str(rig.resolve()), "pid": os.getpid()}
+        """`halt` switches lights off and stops the arm, at once, from any thread; `progress` is the newest;
+        `light_after_lux_h` is all light of the object (by its id) when the run is complete, by its preflight."""
+        self._about: State = {"version": VERSION, "run": str(run), "rig": str(rig.resolve()), "pid": os.getpid()}
+        self._about["light_after_lux_h"] = dict(light_after_lux_h)
         self._run, self._control, self._halt, self._progress = run, control, halt, progress
         self._socket: socket.socket | None = None
         self.trouble = ""

@@ -7,6 +7,7 @@ import os
 import signal
 import time
 import traceback
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -131,7 +132,9 @@ def _acquire_into(
             begun = SessionResumed if resumed else SessionStarted
             acknowledged = faults.begin_session(run.folder.name)
             recorder.note(begun(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledged))
-            _acquire(job, cell, run, recorder, console, faults, found=found)
+            after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
+            light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
+            _acquire(job, cell, run, recorder, console, faults, light, found=found)
         finally:
             recorder.close()
 
@@ -212,17 +215,18 @@ def _acquire(
     recorder: RunRecorder,
     console: Console,
     faults: ArmFaults,
+    light: Mapping[str, float],
     *,
     found: dict[str, Any],
 ) -> None:
-    """The session itself. First the cell is made safe, whatever ended it; then the disk hears of it."""
+    """The session itself; its object will have received `light`, lux hours by id. First the cell is made safe,
+    whatever ended it; then the disk hears of it."""
     control = Control()
     observer = RunObserver(console, job.cell.rig.frame_bytes, len(recorder.proven()))
     sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
-    outcome = sequencer.outcome
     ended: Literal["done", "interrupted", "failed"] = "failed"
     failure: BaseException | None = None
-    remote = RunControl(run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest)
+    remote = RunControl(run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest, light)
 
     def stop() -> None:
         control.stop_by(signal.SIGINT)
@@ -262,8 +266,8 @@ def _acquire(
                 )
             )
             recorder.close_quietly()
-            found.update({**_figures(run, job, outcome), "unsafe": cell.trouble})
-            _say_outcome(console, run, outcome, ended)
+            found.update({**_figures(run, job, sequencer.outcome), "unsafe": cell.trouble})
+            _say_outcome(console, run, sequencer.outcome, ended)
 
 
 def _refuse_unsafe_end(cell: OpenedCell) -> None:

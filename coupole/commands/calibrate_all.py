@@ -43,15 +43,16 @@ def calibrate_all(
     For a real cell it prints what must be on the support, and waits; a simulated one has its own object and
     scanner.
     """
+    from coupole.console.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.plan.rig_devices import in_world
     from coupole.viewing.terminal import make_console
 
-    console = make_console(quiet=as_json)
+    console, cell = make_console(quiet=as_json), read_cell(rig)
     known = [step.name for step in STEPS]
     if unknown := [name for name in only or [] if name not in known]:
         raise InputError(f"--only {unknown[0]}: expected one of {', '.join(known)}")
-    simulated = in_world(read_cell(rig).rig, dry_run=False)
+    simulated = in_world(cell.rig, dry_run=False)
     if not simulated and scan is None:
         if MESH in (only or []):
             raise InputError(f"--only {MESH}: needs the object's scan, as `coupole scan` writes it: --scan FOLDER")
@@ -62,9 +63,8 @@ def calibrate_all(
         rig, out, scan, stated, simulated=simulated, ask=ask, console=console, valid_days=valid_days
     )
     try:
-        for step in STEPS:
-            if step.name in (only or known):
-                campaign.do(step)
+        with borrowed(cell, "calibrate all"):
+            campaign.do_all(only or known)
     except CoupoleError as error:
         fail(error, as_json=as_json, found={"records": campaign.found()})
         raise

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -109,6 +109,12 @@ class Campaign:
         """Existing records, by kind."""
         kinds = [kind for step in STEPS for kind in step.records]
         return {kind: str(self._record(kind)) for kind in kinds if self._record(kind).is_file()}
+
+    def do_all(self, names: Collection[str]) -> None:
+        """The steps with these names, in their order."""
+        for step in STEPS:
+            if step.name in names:
+                self.do(step)
 
     def do(self, step: Step) -> None:
         """Acquire the missing frames of a step, and make its missing records."""

@@ -36,6 +36,7 @@ def commission(
     """
     from coupole.acquisition.commissioning.persons import PersonAtTerminal, SimulatedPerson
     from coupole.acquisition.commissioning.session import commission as commission_cell
+    from coupole.console.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.plan.rig_devices import in_world
     from coupole.preflight.commissioned import STEPS, record_path
@@ -51,17 +52,18 @@ def commission(
         raise InputError(f"--yes: {rig} is a real cell, where a person must see and answer; leave it out")
 
     try:
-        record = commission_cell(
-            cell,
-            console,
-            name=name.strip(),
-            only=step,
-            person_at=lambda opened: (
-                SimulatedPerson(console, opened.world_endpoints)
-                if yes and opened.world_endpoints is not None
-                else PersonAtTerminal()
-            ),
-        )
+        with borrowed(cell, f"commission, {name.strip()}"):
+            record = commission_cell(
+                cell,
+                console,
+                name=name.strip(),
+                only=step,
+                person_at=lambda opened: (
+                    SimulatedPerson(console, opened.world_endpoints)
+                    if yes and opened.world_endpoints is not None
+                    else PersonAtTerminal()
+                ),
+            )
     except CoupoleError as error:
         fail(error, as_json=as_json, found=None if isinstance(error, InputError) else _figures(cell))
         raise

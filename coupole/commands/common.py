@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from coupole.commands.completion import plans, runs
 from coupole.errors import CoupoleError, InputError
+
+if TYPE_CHECKING:
+    from coupole.plan.cell import Cell
 
 PlanPath = Annotated[Path, typer.Argument(help="The plan (YAML).", show_default=False, autocompletion=plans)]
 RigOption = Annotated[Path | None, typer.Option("--rig", help="Another rig than the plan names.")]
@@ -39,6 +42,34 @@ def shipped_rig() -> Path:
     if not path.is_file():
         raise InputError("name a rig with --rig: the simulated cell comes with a checkout of Coupole only")
     return Path(os.path.relpath(path)) if Path.cwd().is_relative_to(project) else path
+
+
+def plan_of(resumed: Path | None) -> Path:
+    """The plan of a run that is resumed without naming it."""
+    from coupole.storage.run import Run
+
+    if resumed is None:
+        raise typer.BadParameter("expected the plan (YAML), or --resume with a run's folder")
+    return Run(resumed).plan_path
+
+
+def served_cell(plan: Path | None, rig: Path | None, resume: Path | None) -> Cell | None:
+    """The cell of a plan, or of a run that is resumed, if a console owns it; None if none does."""
+    from coupole.console.client import is_served
+    from coupole.plan.cell import read_cell
+    from coupole.plan.reading import read_plan
+    from coupole.storage.run import Run
+
+    if plan is not None:
+        cell = read_plan(plan, rig).cell
+    elif resume is not None:
+        begun_with = rig or Path(Run(resume).about["rig"]["path"])
+        if not begun_with.is_file():
+            return None
+        cell = read_cell(begun_with)
+    else:
+        return None
+    return cell if is_served(cell) else None
 
 
 def fail(error: CoupoleError, *, as_json: bool, found: dict[str, Any] | None = None) -> None:

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 import socket
+from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from coupole.commands.common import JsonOption
 from coupole.commands.completion import plans as some_plans
+from coupole.commands.completion import runs
 from coupole.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
 
 RigPath = Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)]
 
@@ -76,35 +81,81 @@ def queue(
         list[Path] | None,
         typer.Argument(help="Plans to enter, in this order.", show_default=False, autocompletion=some_plans),
     ] = None,
+    resume: Annotated[
+        list[Path] | None,
+        typer.Option("--resume", help="Go on with this run after them; again for more.", autocompletion=runs),
+    ] = None,
     hold: Annotated[
         str, typer.Option("--hold", help="After them wait for a person, who is to do this.", show_default=False)
     ] = "",
+    before: Annotated[
+        str, typer.Option("--before", help="Enter, or --move, before this entry.", show_default=False)
+    ] = "",
+    move: Annotated[
+        str, typer.Option("--move", help="Move this entry to the end, or --before another.", show_default=False)
+    ] = "",
     take_out: Annotated[str, typer.Option("--take-out", help="Take out this entry.", show_default=False)] = "",
     go_on: Annotated[bool, typer.Option("--go-on", help="Go on after a hold or a fault.")] = False,
+    take_control: Annotated[
+        bool, typer.Option("--take-control", help="Take control from whoever has it, first of all.")
+    ] = False,
+    give_control: Annotated[bool, typer.Option("--give-control", help="Give control up, last of all.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Enter plans in the queue of a cell whose console is served on this machine; without plans show it."""
-    from coupole.console.client import call
+    """Enter plans in the queue of a cell whose console is served on this machine; without plans show it.
+
+    Preflight is made of each as it is entered, counted with what runs and waits before it.
+    """
+    from coupole.console.client import PREFLIGHT_S, call
     from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
 
-    cell = read_cell(rig)
+    cell, console = read_cell(rig), make_console(quiet=as_json)
+    if take_control:
+        call(cell, "POST", "/api/v1/control/take")
     if take_out:
         call(cell, "DELETE", f"/api/v1/queue/{take_out}")
-    for one in plan or []:
-        call(cell, "POST", "/api/v1/queue", {"plan": str(one.resolve())})
-    if hold:
-        call(cell, "POST", "/api/v1/queue", {"hold": hold})
+    if move:
+        call(cell, "POST", f"/api/v1/queue/{move}/move", {"before": before})
+    for one in _named(plan or [], resume or [], hold):
+        with console.status("preflight ..."):
+            call(cell, "POST", "/api/v1/queue", {**one, "before": before}, patience_s=PREFLIGHT_S)
     if go_on:
         call(cell, "POST", "/api/v1/queue/go-on")
+    if give_control:
+        call(cell, "POST", "/api/v1/control/give", {})
     state = call(cell, "GET", "/api/v1/state")
-    console = make_console(quiet=as_json)
-    console.print(
-        f"{state['rig']}: {state['state']}" + (f": {state['halted']}" if state["halted"] else ""), markup=False
-    )
-    for entry in state["queue"]:
-        words = entry["plan"] or f"hold: {entry['hold']}"
-        why = f" ({entry['said']})" if entry["said"] else ""
-        console.print(f"  {entry['id']}  {entry['state']:8}  {words}{why}", markup=False)
+    _show_queue(console, state)
     if as_json:
         print(json.dumps(state))
+
+
+def _named(plans: list[Path], resumed: list[Path], hold: str) -> list[dict[str, str]]:
+    """What is to be entered, in order."""
+    found = [{"plan": str(one.resolve())} for one in plans] + [{"resume": str(one.resolve())} for one in resumed]
+    return [*found, *([{"hold": hold}] if hold else [])]
+
+
+def _show_queue(console: RichConsole, state: dict[str, Any]) -> None:
+    why = state["halted"] or (f"lent to {state['lent_to']}" if state["lent_to"] else "")
+    console.print(f"{state['rig']}: {state['state']}" + (f": {why}" if why else ""), markup=False)
+    for entry in state["queue"]:
+        words = f"hold: {entry['hold']}" if entry["hold"] else entry["plan"]
+        words = words or f"resume {entry['resume']}"
+        said = f" ({entry['said']})" if entry["said"] else ""
+        console.print(f"  {entry['id']}  {entry['state']:8}  {words}{said}{_outlook(entry)}", markup=False)
+
+
+def _outlook(entry: dict[str, Any]) -> str:
+    """When it is expected, and what it needs; empty if it has ended."""
+    from coupole.viewing.terminal import bytes_text, duration_text
+
+    begin, end = (
+        f"{datetime.fromisoformat(entry[key]).astimezone():%a %H:%M}" if entry[key] else ""
+        for key in ("expected_begin", "expected_end")
+    )
+    found = f"  {begin} to {end or 'not known'}" if begin else ""
+    if (needs := entry["needs"]) is not None and entry["state"] in ("waiting", "running"):
+        size = f"{duration_text(needs['duration_s'])}, {bytes_text(needs['bytes'])}"
+        found += f"  {size}, {needs['dose_lux_h']:.3f} lux.h"
+    return found

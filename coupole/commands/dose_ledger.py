@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from coupole.commands.common import JsonOption
 from coupole.errors import InputError
+
+if TYPE_CHECKING:
+    from coupole.plan.cell import Cell
 
 
 def dose(
@@ -34,12 +37,26 @@ def dose(
 
     if (add is not None) != bool(note.strip()):
         raise InputError("--add and --note belong together: how many lux hours, and what that light was")
-    ledger = ledger_of(read_cell(rig), object_id) if rig else Ledger(users_ledger_folder(), object_id)
-    if add is not None:
+    cell = read_cell(rig) if rig else None
+    ledger = ledger_of(cell, object_id) if cell else Ledger(users_ledger_folder(), object_id)
+    if add is not None and not _sent(cell, object_id, "light", {"dose_lux_h": add, "note": note.strip()}):
         ledger.enter(add, note.strip())
-    if warn_above is not None:
+    if warn_above is not None and not _sent(cell, object_id, "warning", {"above_lux_h": warn_above}):
         ledger.warn_above(warn_above)
     history, others = ledger.read(), similar_ids(ledger.folder, object_id)
     show_dose(make_console(quiet=as_json), ledger, history, others)
     if as_json:
         print(json.dumps(document(ledger, history, others)))
+
+
+def _sent(cell: Cell | None, object_id: str, what: str, asked: dict[str, Any]) -> bool:
+    """Whether the cell's console has entered it, and so knows who did; False if none is served. Raises InputError:
+    it refuses."""
+    from coupole.console.client import NotServed, call
+
+    try:
+        if cell is not None:
+            call(cell, "POST", f"/api/v1/objects/{object_id}/{what}", asked)
+    except NotServed:
+        return False
+    return cell is not None

@@ -10,34 +10,54 @@ from typing import Annotated
 
 import typer
 
-from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, shipped_rig
-from coupole.commands.completion import schemas, templates
+from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, plan_of, shipped_rig
+from coupole.commands.completion import plans, runs, schemas, templates
 from coupole.errors import InputError, PreflightRefused
 
 
 def check(
-    plan: PlanPath,
+    plan: Annotated[
+        Path | None,
+        typer.Argument(
+            help="The plan (YAML); not needed with --resume.", show_default=False, autocompletion=plans
+        ),
+    ] = None,
     rig: RigOption = None,
+    output: Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")] = None,
+    resume: Annotated[
+        Path | None, typer.Option("--resume", help="What is left of this run.", autocompletion=runs)
+    ] = None,
     no_paths: Annotated[
         bool, typer.Option("--no-paths", help="Leave out path planning and swept collisions.")
+    ] = False,
+    no_disk_speed: Annotated[
+        bool, typer.Option("--no-disk-speed", help="Do not measure the disk's speed, as a run writes to it.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Check everything about a plan that can be checked without devices."""
     from coupole.preflight.checking import preflight_of
     from coupole.preflight.job import read_job, without_hidden
+    from coupole.storage.run import Run
     from coupole.viewing.preflight_table import document_of, show_preflight, show_views
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     try:
-        job = read_job(plan, rig)
+        job = read_job(plan or plan_of(resume), rig)
+        run = Run(resume) if resume else None
+        if run is not None:
+            run.refuse_changes(job.inputs)
     except InputError as error:
         fail(error, as_json=as_json, found={"ok": False, "refusals": []})
         raise
-    if not no_paths:
-        job = without_hidden(job)
-    job, report = preflight_of(job, job.cell.storage_folder, paths=not no_paths)
+    if run is not None or not no_paths:
+        job = without_hidden(job, run.hidden_leds if run else None)
+    folder = run.folder if run else output or job.cell.storage_folder
+    allocated_bytes, proven = (run.allocated_bytes(), run.proven()) if run else (0, {})
+    job, report = preflight_of(
+        job, folder, paths=not no_paths, allocated_bytes=allocated_bytes, proven=proven, measure=not no_disk_speed
+    )
     show_preflight(console, report, name=job.plan.name, rig=job.cell.rig.name)
     show_views(console, report)
     if as_json:

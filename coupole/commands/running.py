@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, shipped_rig
+from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, plan_of, served_cell, shipped_rig
 from coupole.commands.completion import plans, runs
 from coupole.errors import CoupoleError
 
@@ -31,12 +31,14 @@ def acquire(
         bool, typer.Option("--with-mesh", help="Copy the mesh into the run even if it has more than 100 MB.")
     ] = False,
     as_json: JsonOption = False,
+    begun_by_console: Annotated[bool, typer.Option("--begun-by-console", hidden=True)] = False,
 ) -> None:
     """Run a plan: check it, move, trigger, prove the frames, store them.
 
     Ctrl-C stops safely (lights off, arm still) and the run can be resumed: `acquire --resume RUN`, with the run's
     own copies of plan and rig, or with the plan again, whose comments alone may have changed. On a terminal the
-    key p pauses between bursts and goes on, q stops; from elsewhere `coupole pause`, `go-on` and `stop` do.
+    key p pauses between bursts and goes on, q stops; from elsewhere `coupole pause`, `go-on` and `stop` do. Where
+    a console owns the cell (`coupole serve`) it acquires in its name, if nothing runs or waits there.
     """
     from coupole.acquisition.session import acquire_plan, rehearse
     from coupole.preflight.job import read_job
@@ -46,13 +48,20 @@ def acquire(
         raise typer.BadParameter("a dry run stores nothing: --dry-run excludes --resume and --output")
     if resume and output:
         raise typer.BadParameter("a resumed run keeps its folder: --resume excludes --output")
-    console = make_console(quiet=as_json)
+    console = make_console(quiet=as_json and not begun_by_console)
     found: dict[str, Any] = {}
     try:
-        job = read_job(plan or _plan_of(resume), rig)
-        if dry_run:
-            rehearse(job, console, speed=speed, found=found)
+        served = None if dry_run or begun_by_console else served_cell(plan, rig, resume)
+        if served is not None:
+            from coupole.console.following import acquire_by_console
+
+            named = {"plan": plan or (plan_of(resume) if rig else None), "output": output, "resume": resume}
+            asked = {key: str(path.resolve()) for key, path in named.items() if path is not None}
+            acquire_by_console(served, console, {**asked, "with_mesh": with_mesh}, confirm=not yes, found=found)
+        elif dry_run:
+            rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, found=found)
         else:
+            job = read_job(plan or plan_of(resume), rig)
             acquire_plan(
                 job, console, parent=output, resume=resume, confirm=not yes, found=found, with_mesh=with_mesh
             )
@@ -61,15 +70,6 @@ def acquire(
         raise
     if as_json:
         print(json.dumps(found))
-
-
-def _plan_of(resumed: Path | None) -> Path:
-    """The plan of a run that is resumed without naming it."""
-    from coupole.storage.run import Run
-
-    if resumed is None:
-        raise typer.BadParameter("expected the plan (YAML), or --resume with a run's folder")
-    return Run(resumed).plan_path
 
 
 def devices(
@@ -83,6 +83,7 @@ def devices(
     from rich.table import Table
 
     from coupole.acquisition.opened_cell import open_cell
+    from coupole.console.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
 
@@ -90,7 +91,7 @@ def devices(
     cell = read_cell(rig or shipped_rig())
     found: dict[str, Any] = {}
     table = Table("device", "identity", "self-test", box=None)
-    with open_cell(cell) as opened:
+    with borrowed(cell, "devices"), open_cell(cell) as opened:
         for kind in ("ledbox", "camera", "robot"):
             identity, tested = opened.identities[kind], getattr(opened, kind).self_test()
             found[kind] = {**vars(identity), "self_test": dict(tested)}
@@ -123,13 +124,16 @@ def meter(
 ) -> None:
     """Advise on a plan's exposure, by a few pictures of each view under a few lights, which are not stored."""
     from coupole.acquisition.looking import meter as meter_plan
+    from coupole.console.client import borrowed
     from coupole.preflight.exposure_advice import Request, write_plan
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console, show_advice
 
     console = make_console(quiet=as_json)
     try:
-        advice = meter_plan(read_job(plan, rig), console, Request(saturated, snr, share), confirm=not yes)
+        job = read_job(plan, rig)
+        with borrowed(job.cell, f"meter {plan.name}"):
+            advice = meter_plan(job, console, Request(saturated, snr, share), confirm=not yes)
         if write is not None:
             write_plan(plan, write, advice.exposure)
     except CoupoleError as error:
@@ -166,7 +170,8 @@ def live(
     entered in the ledger) the camera is opened; the arm is not moved.
     """
     from coupole.acquisition.looking import watch_cell, watch_run
-    from coupole.plan.cell import read_cell
+    from coupole.console.client import borrowed
+    from coupole.plan.cell import Cell, read_cell
     from coupole.plan.yamlfile import read
     from coupole.preflight.job import read_job
     from coupole.viewing.live import Choice
@@ -178,7 +183,8 @@ def live(
         return
     source = read_job(what) if "views" in read(what).data else read_cell(what)
     choice = Choice(led, exposure_us)
-    watch_cell(source, console, choice, frames_per_s=frames_per_s, port=port, confirm=not yes)
+    with borrowed(source if isinstance(source, Cell) else source.cell, "live"):
+        watch_cell(source, console, choice, frames_per_s=frames_per_s, port=port, confirm=not yes)
 
 
 def confirm(

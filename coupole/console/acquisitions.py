@@ -19,6 +19,7 @@ from typing import Any
 
 from coupole.acquisition.run_control import Command, State, ask, running
 from coupole.acquisition.runtime_folder import is_in_use
+from coupole.console.lending import Lending
 from coupole.console.plan_queue import Entry, PlanQueue
 from coupole.errors import CoupoleError, InputError
 from coupole.plan.cell import Cell
@@ -27,6 +28,7 @@ from coupole.storage.line_file import utc_now
 _LOOK_EVERY_S = 0.2
 _STOPPED = (129, 130, 143)
 """Exit codes of a session that somebody stopped."""
+_MOST_SAID_BYTES = 65536
 
 
 class Acquisitions:
@@ -40,6 +42,8 @@ class Acquisitions:
         self._process: subprocess.Popen[bytes] | None = None
         self.state: State | None = None
         """Of the run at work, as its process tells it; None if there is none."""
+        self.lending = Lending()
+        self._beginning = threading.Lock()
         self._thread = threading.Thread(target=self._watch, name="acquisitions", daemon=True)
 
     def __enter__(self) -> Acquisitions:
@@ -55,7 +59,7 @@ class Acquisitions:
     def tell(self, run: str, command: Command) -> State:
         """`pause`, `go-on` or `stop` to the run with this name. Raises InputError: it is not being acquired."""
         for state in [self.state] if self.state and Path(self.state["run"]).name == run else running():
-            if Path(state["run"]).name == run and state["rig"] == self._rig:
+            if Path(state["run"]).name == run and self._is_ours(state):
                 return ask(Path(state["run"]), command)
         raise InputError(f"{run}: is not being acquired in this cell")
 
@@ -64,6 +68,44 @@ class Acquisitions:
         if entry.state != "running" or not entry.pid or not self._is_alive(entry):
             raise InputError(f"queue: {entry.id} is not running")
         os.kill(entry.pid, signal.SIGINT)
+
+    def begin_at_once(self, by: str, **fields: Any) -> Entry:
+        """A new entry that begins now. Raises InputError: something has the cell or waits for it; StorageError."""
+        with self._beginning:
+            if why := self._had_by():
+                raise InputError(why)
+            return self._queue.add(by, at_once=True, **fields)
+
+    def lend(self, pid: int, who: str, what: str) -> None:
+        """Give the cell to a process for its work, until it gives it back or ends; nothing begins meanwhile.
+        Raises InputError: something has the cell."""
+        with self._beginning:
+            if why := self._had_by() or ("the queue is about to begin a plan" if self._queue.following else ""):
+                raise InputError(why)
+            self.lending.lend(pid, who, what)
+
+    def output(self, entry: Entry) -> tuple[str, dict[str, Any]]:
+        """What an entry's process has printed (the last 64 KiB), and its figures as of `acquire --json`, once they
+        are there."""
+        said, figures = self._files(entry)
+        text = said.read_bytes()[-_MOST_SAID_BYTES:].decode(errors="replace") if said.is_file() else ""
+        return text, _last_document(figures)
+
+    def _had_by(self) -> str:
+        """Who has the cell; empty if nobody."""
+        if self._queue.running is not None:
+            return f"{self._queue.running.words} is being acquired"
+        if self.state is not None:
+            return f"{Path(self.state['run']).name} is being acquired"
+        if self.lending.lent_to:
+            return f"the cell is lent to {self.lending.lent_to}"
+        return "another process of this user has its devices open" if is_in_use(self._cell.state_folder) else ""
+
+    def _is_ours(self, state: State) -> bool:
+        """Whether a run is one of this cell: it names its rig, or the queue has begun it (a resumed run names its
+        own copy of the rig)."""
+        entry = self._queue.running
+        return state["rig"] == self._rig or (entry is not None and bool(entry.pid) and state["pid"] == entry.pid)
 
     def _watch(self) -> None:
         while not self._ended.wait(_LOOK_EVERY_S):
@@ -76,30 +118,28 @@ class Acquisitions:
 
     def _look(self) -> None:
         entry = self._queue.running
-        self.state = next((state for state in running() if state["rig"] == self._rig), None)
+        self.state = next((state for state in running() if self._is_ours(state)), None)
         if entry is not None:
             self._look_after(entry)
-        elif (following := self._queue.following) is not None and not self._is_occupied():
+            return
+        with self._beginning:
+            following = self._queue.following
+            if following is None or self._had_by():
+                return
             if following.hold:
                 now = utc_now()
-                self._queue.conclude(
-                    following.id, halt=f"hold: {following.hold}", state="done", begun=now, ended=now
-                )
+                self._queue.conclude(following.id, halt=following.words, state="done", begun=now, ended=now)
             else:
                 self._begin(following)
-
-    def _is_occupied(self) -> bool:
-        """Whether somebody else has opened the cell's devices."""
-        return self.state is not None or is_in_use(self._cell.state_folder)
 
     def _begin(self, entry: Entry) -> None:
         self._queue.change(entry.id, state="running", begun=utc_now())  # first: it must never be begun twice
         said, figures = self._files(entry)
-        command = [sys.executable, "-m", "coupole.commands.cli", "acquire", entry.plan, "--rig", self._rig]
+        command = [sys.executable, "-m", "coupole.commands.cli", "acquire", *self._arguments(entry)]
         try:
             with said.open("wb") as errors, figures.open("wb") as found:
                 self._process = subprocess.Popen(
-                    [*command, "--yes", "--json"],
+                    [*command, "--yes", "--json", "--begun-by-console"],
                     stdin=subprocess.DEVNULL,
                     stdout=found,
                     stderr=errors,
@@ -107,10 +147,16 @@ class Acquisitions:
                 )
         except OSError as error:
             self._queue.conclude(
-                entry.id, halt=f"{entry.plan}: {error}", state="failed", ended=utc_now(), said=str(error)
+                entry.id, halt=f"{entry.words}: {error}", state="failed", ended=utc_now(), said=str(error)
             )
             return
         self._queue.change(entry.id, pid=self._process.pid)
+
+    def _arguments(self, entry: Entry) -> list[str]:
+        plan = [entry.plan, "--rig", self._rig] if entry.plan else []
+        resume = ["--resume", entry.resume] if entry.resume else []
+        output = ["--output", entry.output] if entry.output else []
+        return [*plan, *resume, *output, *(["--with-mesh"] if entry.with_mesh else [])]
 
     def _look_after(self, entry: Entry) -> None:
         if self.state is not None and self.state["pid"] == entry.pid and not entry.run:
@@ -125,18 +171,21 @@ class Acquisitions:
             words = Path(f"/proc/{entry.pid}/cmdline").read_bytes().split(b"\0")
         except OSError:
             return False
-        return b"acquire" in words and entry.plan.encode() in words
+        return b"acquire" in words and (entry.plan or entry.resume).encode() in words
 
     def _conclude(self, entry: Entry) -> None:
         said, figures = self._files(entry)
         found = _last_document(figures)
         code = found.get("exit_code", 0 if "proven" in found else None)
         if self._process is not None and self._process.pid == entry.pid:
-            code = self._process.returncode if self._process.returncode >= 0 else None
+            code = self._process.returncode
+            if code < 0:  # by a signal: those that end a session may come before the process obeys them
+                code = 128 - code if 128 - code in _STOPPED else None
         self._process = None
         state = "done" if code == 0 else "stopped" if code in _STOPPED else "failed"
-        why = "" if code == 0 else found.get("error") or _last_line(said) or "its process was killed"
-        halt = "" if code == 0 else f"{Path(entry.plan).name}: {why}"
+        last = _last_line(said) if code is not None else ""
+        why = "" if code == 0 else found.get("error") or last or "its process was killed"
+        halt = "" if code == 0 else f"{entry.words}: {why}"
         run = str(found.get("run", entry.run))
         self._queue.conclude(entry.id, halt=halt, state=state, ended=utc_now(), exit_code=code, run=run, said=why)
 

@@ -6,15 +6,17 @@ import asyncio
 import time
 from collections.abc import AsyncIterator
 from dataclasses import asdict
+from functools import partial
 from typing import Annotated, Any, Literal
 
+from anyio import to_thread
 from fastapi import FastAPI, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 
 import coupole
 from coupole.console.accounts import Role
 from coupole.console.asking import REFUSALS, Who
-from coupole.console.guard import bearer_of, guard, is_of_this_machine, session_of, sign_in_page
+from coupole.console.guard import bearer_of, guard, is_command_line, is_of_this_machine, session_of, sign_in_page
 from coupole.console.messages import Hand, NewAccount, NewEntry, SignIn, StateNow, Text
 from coupole.console.object_routes import add_object_routes
 from coupole.console.permission import NotAllowed, allow
@@ -22,7 +24,6 @@ from coupole.console.plan_queue import Entry
 from coupole.console.plan_routes import add_plan_routes
 from coupole.console.run_files import RunRow
 from coupole.console.service_parts import Service
-from coupole.errors import InputError
 
 _EVENT_EVERY_S, _ALIVE_EVERY_S = 0.2, 1.0
 
@@ -98,33 +99,35 @@ def _add_cell(app: FastAPI, service: Service) -> None:
         return StreamingResponse(_events(service, request), media_type="text/event-stream")
 
     @app.post("/api/v1/queue", responses=REFUSALS)
-    def add(asked: NewEntry, who: Who) -> Entry:
-        """Enter a plan or a hold. A plan is read first; wrong ones are refused with all their problems."""
-        if bool(asked.plan) == bool(asked.hold):
-            raise InputError("expected either `plan` or `hold`")
-        allow(service.control, who, Role.OPERATOR, "queue", acts=True)
-        if asked.hold:
-            return service.queue.add(who.name, hold=asked.hold)
-        return service.queue.add(who.name, plan=str(service.read_plan(asked.plan)))
+    async def add(asked: NewEntry, who: Who, request: Request) -> Entry:
+        """Enter a plan, a run to be resumed, or a hold. Preflight is made first, for which this waits; what cannot
+        be run with what runs and waits before it is refused with all its problems."""
+        allow(service, who, Role.OPERATOR, "queue", acts=True)
+        request.state.about = asked.plan or asked.resume or asked.hold
+        here = is_command_line(request)
+        enter = partial(service.entering.enter, asked, who.name, by_command_line=here)
+        quick = asked.now or bool(asked.hold)
+        limiter = None if quick else service.entering.one_at_a_time
+        return await to_thread.run_sync(enter, limiter=limiter, abandon_on_cancel=True)
 
     @app.delete("/api/v1/queue/{entry}", responses=REFUSALS)
     def remove(entry: Text, who: Who) -> dict[str, str]:
         """Take out an entry that waits."""
-        allow(service.control, who, Role.OPERATOR, "take out", acts=True)
+        allow(service, who, Role.OPERATOR, "take out", acts=True)
         service.queue.remove(entry)
         return {"removed": entry}
 
     @app.post("/api/v1/queue/{entry}/stop", responses=REFUSALS)
     def stop(entry: Text, who: Who) -> dict[str, str]:
         """Stop what an entry has begun, at any time, also before its run has a name."""
-        allow(service.control, who, Role.OPERATOR, "stop")
+        allow(service, who, Role.OPERATOR, "stop")
         service.acquisitions.stop(service.queue.entry(entry))
         return {"stopped": entry}
 
     @app.post("/api/v1/queue/go-on", responses=REFUSALS)
     def go_on(who: Who) -> StateNow:
         """Go on with the queue after a hold, a fault or a stop."""
-        allow(service.control, who, Role.OPERATOR, "go on with the queue", acts=True)
+        allow(service, who, Role.OPERATOR, "go on with the queue", acts=True)
         service.queue.go_on()
         return service.state()
 
@@ -132,7 +135,7 @@ def _add_cell(app: FastAPI, service: Service) -> None:
     def tell(run: Text, command: Literal["pause", "go-on", "stop"], who: Who) -> dict[str, Any]:
         """To the run that is being acquired. Any operator may pause and stop, whoever is in control: this never
         harms. `stop` is answered when the lights are off and the arm was told to stop, or with the `trouble`."""
-        allow(service.control, who, Role.OPERATOR, command, acts=command == "go-on")
+        allow(service, who, Role.OPERATOR, command, acts=command == "go-on")
         return service.acquisitions.tell(run, command)
 
 
@@ -169,13 +172,13 @@ def _add_people(app: FastAPI, service: Service) -> None:
     @app.post("/api/v1/control/take", responses=REFUSALS)
     def take(who: Who) -> dict[str, str]:
         """Take control, or ask for it; an engineer, and anybody after five minutes without a sign, takes it."""
-        allow(service.control, who, Role.OPERATOR, "take control")
+        allow(service, who, Role.OPERATOR, "take control")
         return asdict(service.control.take(who))
 
     @app.post("/api/v1/control/give", responses=REFUSALS)
     def give(asked: Hand, who: Who) -> dict[str, str]:
         """Hand control over to who asked for it, or give it up."""
-        allow(service.control, who, Role.OPERATOR, "give control")
+        allow(service, who, Role.OPERATOR, "give control")
         return asdict(service.control.give(who, asked.to))
 
     @app.get("/api/v1/accounts", responses=REFUSALS)
@@ -188,14 +191,14 @@ def _add_people(app: FastAPI, service: Service) -> None:
     @app.post("/api/v1/accounts", responses=REFUSALS)
     def new_account(asked: NewAccount, who: Who) -> dict[str, str]:
         """A new account."""
-        allow(service.control, who, Role.ENGINEER, "new account")
+        allow(service, who, Role.ENGINEER, "new account")
         account = service.accounts.add(asked.name, asked.password, Role.of(asked.role))
         return {"name": account.name, "role": account.role.word}
 
     @app.delete("/api/v1/accounts/{name}", responses=REFUSALS)
     def no_account(name: Text, who: Who) -> dict[str, str]:
         """Take an account away, and end its sessions."""
-        allow(service.control, who, Role.ENGINEER, "remove account")
+        allow(service, who, Role.ENGINEER, "remove account")
         service.accounts.remove(name)
         service.sessions.end_of(name)
         return {"removed": name}

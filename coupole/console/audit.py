@@ -20,9 +20,12 @@ class Audit:
         self._file = LineFile(path)
         self.trouble = ""
 
-    def note(self, name: str, asked: str, status: int, address: str) -> None:
-        """`name` (empty: nobody who is signed in) at `address` asked for something, and got this HTTP status."""
+    def note(self, name: str, asked: str, status: int, address: str, about: str = "") -> None:
+        """`name` (empty: nobody who is signed in) at `address` asked for something, and got this HTTP status;
+        `about`: what of it the path does not say."""
         line = {"t": utc_now(), "name": name, "asked": asked, "status": status, "from": address}
+        if about:
+            line["about"] = about
         try:
             self._file.append([json.dumps(line, ensure_ascii=False) + "\n"])
             self.trouble = ""

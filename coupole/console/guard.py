@@ -42,9 +42,8 @@ def guard(app: FastAPI, service: Service) -> None:
         if request.method not in _READING:
             session = getattr(request.state, "session", None)
             name = session.account.name if session else ""
-            service.audit.note(
-                name, f"{request.method} {request.url.path}", response.status_code, address_of(request)
-            )
+            asked, about = f"{request.method} {request.url.path}", getattr(request.state, "about", "")
+            service.audit.note(name, asked, response.status_code, address_of(request), about)
         return response
 
     async def check(request: Request, call_next: Callable[[Request], Any]) -> Response:
@@ -70,7 +69,7 @@ def guard(app: FastAPI, service: Service) -> None:
         response.headers.setdefault("Content-Security-Policy", _SCREEN_POLICY)
         response.headers["X-Content-Type-Options"] = "nosniff"
         response.headers["Referrer-Policy"] = "no-referrer"
-        response.headers["X-Frame-Options"] = "SAMEORIGIN"
+        response.headers.setdefault("X-Frame-Options", "DENY")
         return response
 
     app.add_middleware(_WebSocketGuard, service=service)

@@ -31,12 +31,75 @@ class SignIn(Asked):
 
 
 class NewEntry(Asked):
-    """A plan, or a hold."""
+    """A plan, a run to be resumed, or a hold."""
 
     plan: Text = ""
     """File of the plan, relative to the folder of plans."""
+    resume: Text = ""
+    """Folder of the run to be resumed, relative to the cell's storage folder."""
     hold: Text = ""
     """What is to be done before the queue goes on."""
+    before: Text = ""
+    """Id of the waiting entry before which it comes; empty: at the end."""
+    now: bool = False
+    """Begin at once, with preflight only then; refused if something runs, waits or has the cell."""
+    output: Text = ""
+    """Folder for the run, if not the rig's; for the command line."""
+    with_mesh: bool = False
+    """Copy the mesh into the run even if it is large; for the command line."""
+
+
+class Move(Asked):
+    """A place in the queue."""
+
+    before: Text = ""
+    """Id of the waiting entry before which it comes; empty: at the end."""
+
+
+class Lease(Asked):
+    """What the cell is wanted for."""
+
+    what: Annotated[str, Field(min_length=1, max_length=200)]
+    """In words."""
+
+
+class Light(Asked):
+    """Light that an object was given elsewhere."""
+
+    dose_lux_h: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    """In lux hours."""
+    note: Annotated[str, Field(min_length=1, max_length=2000)]
+    """What that light was."""
+
+
+class Warn(Asked):
+    """When an object's ledger warns."""
+
+    above_lux_h: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None
+    """Of a total above this; null: of none."""
+
+
+class EntryNow(Entry):
+    """An entry of the queue at this moment."""
+
+    expected_begin: str | None = None
+    """UTC; null if it has ended, if a person decides (a hold before it, a queue that is halted), or if it is not
+    known."""
+    expected_end: str | None = None
+    """Likewise."""
+
+
+class Output(BaseModel):
+    """What an entry's process has told."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    entry: Entry
+    """As it is."""
+    said: str
+    """The last 64 KiB of what it printed."""
+    figures: dict[str, Any]
+    """As of `coupole acquire --json`; empty until it has ended."""
 
 
 class NewAccount(Asked):
@@ -95,7 +158,9 @@ class StateNow(BaseModel):
     """The fault of the arm that stands until a person confirms; empty if there is none."""
     devices: dict[str, Any]
     """Identities of the devices of the run."""
-    queue: list[Entry]
+    lent_to: str
+    """To whom the cell is lent, and for what; empty if it is not. Nothing begins meanwhile."""
+    queue: list[EntryNow]
     """All entries, in their order."""
     in_control: str
     """Who may act; empty: any operator."""

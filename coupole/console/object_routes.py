@@ -35,6 +35,6 @@ def add_object_routes(app: FastAPI, service: Service) -> None:
         object_id: Text, picture: Annotated[bytes, Body(media_type="application/octet-stream")], who: Who
     ) -> dict[str, str]:
         """Keep a picture (JPEG, PNG or TIFF, at most 20 MB) in place of the one before."""
-        allow(service.control, who, Role.OPERATOR, "photograph")
+        allow(service, who, Role.OPERATOR, "photograph")
         service.objects.keep_photograph(object_id, picture)
         return {"object": object_id}

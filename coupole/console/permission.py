@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from coupole.console.accounts import Account, Role
-from coupole.console.sessions import Control
+from coupole.console.service_parts import Service
 
 
 class NotAllowed(Exception):
@@ -14,9 +14,9 @@ class NotAllowed(Exception):
         self.status = status
 
 
-def allow(control: Control, who: Account, role: Role, action: str, *, acts: bool = False) -> None:
+def allow(service: Service, who: Account, role: Role, action: str, *, acts: bool = False) -> None:
     """Raise NotAllowed if somebody's role, or who is in control, forbids an action."""
     if who.role < role:
         raise NotAllowed(403, f"{action}: only for {role.word}s; {who.name} is {who.role.word}")
-    if acts and not control.act(who):
-        raise NotAllowed(409, f"{action}: {control.now.name} is in control; ask for it first")
+    if acts and not service.control.act(who, keep=who is not service.command_line.account):
+        raise NotAllowed(409, f"{action}: {service.control.now.name} is in control; ask for it first")

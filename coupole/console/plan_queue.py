@@ -6,7 +6,7 @@ import json
 import secrets
 import threading
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -18,17 +18,50 @@ EntryState = Literal["waiting", "running", "done", "failed", "stopped"]
 MOST_WAITING = 200
 
 
+class Needs(BaseModel):
+    """What preflight said of an entry when it was entered; of a run that is resumed, of what is left of it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    duration_s: float
+    """Of the acquisition."""
+    preparation_s: float
+    """Time that preflight took; it is made again when the entry begins."""
+    dose_lux_h: float
+    """Light on the object, in lux hours."""
+    bytes: int
+    """On the disk."""
+    frames: int
+    """Dark frames included."""
+    object: str | None = None
+    """Its id; None if the plan names none."""
+    dose_budget_lux_h: float | None = None
+    """All light that the object may receive, in lux hours, with what it has received; None: no limit."""
+    folder: str = ""
+    """In which the run will be."""
+    warnings: tuple[str, ...] = ()
+    """What the operator should know."""
+
+
 class Entry(BaseModel):
-    """A plan to be run, or a hold: the queue stops there until somebody goes on with it."""
+    """A plan to be run, a run to be resumed, or a hold: the queue stops there until somebody goes on with it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     id: str
     """Of this entry."""
     plan: str = ""
-    """File of the plan; empty for a hold."""
+    """File of the plan; empty for a hold, and for a run that goes on with its own copy."""
     hold: str = ""
     """What is to be done before the queue goes on; empty for a plan."""
+    resume: str = ""
+    """Folder of the run to be resumed; empty for a new one."""
+    output: str = ""
+    """Folder for the run, if not the rig's."""
+    with_mesh: bool = False
+    """Copy the mesh into the run even if it is large."""
+    needs: Needs | None = None
+    """None for a hold, and for what began at once."""
     by: str
     """Who entered it."""
     entered: str
@@ -47,6 +80,11 @@ class Entry(BaseModel):
     """Of the process; None until it has ended, and if it was killed."""
     said: str = ""
     """Why it failed."""
+
+    @property
+    def words(self) -> str:
+        """What it is, for people."""
+        return f"hold: {self.hold}" if self.hold else Path(self.plan or self.resume).name
 
 
 class _Kept(BaseModel):
@@ -87,22 +125,64 @@ class PlanQueue:
             return None
         return next((entry for entry in self.entries if entry.state == "waiting"), None)
 
-    def add(self, by: str, *, plan: str = "", hold: str = "") -> Entry:
-        """A new entry at the end. Raises InputError: too many wait; StorageError."""
+    @property
+    def waiting(self) -> tuple[Entry, ...]:
+        return tuple(entry for entry in self.entries if entry.state == "waiting")
+
+    def add(self, by: str, *, before: str = "", at_once: bool = False, **fields: Any) -> Entry:
+        """A new entry with these fields, before another that waits or at the end.
+
+        `at_once`: to begin now, whatever the last plan ended with. Raises InputError: too many wait, or (if
+        `at_once`) something runs, waits or holds; StorageError.
+        """
         with self._lock:
-            if sum(entry.state == "waiting" for entry in self.entries) >= MOST_WAITING:
+            if len(self.waiting) >= MOST_WAITING:
                 raise InputError(f"queue: at most {MOST_WAITING} entries may wait")
-            entry = Entry(id=secrets.token_hex(6), plan=plan, hold=hold, by=by, entered=utc_now())
-            self._keep((*self.entries, entry), self.halted)
+            if at_once and (why := self._in_the_way()):
+                raise InputError(why)
+            entry = Entry(id=secrets.token_hex(6), by=by, entered=utc_now(), **fields)
+            self._keep(self._with(entry, before, self.entries), "" if at_once else self.halted)
         return entry
+
+    def move(self, number: str, before: str) -> None:
+        """Put an entry that waits before another one, or at the end. Raises InputError, StorageError."""
+        with self._lock:
+            self._keep(self.order_after(number, before), self.halted)
+
+    def order_after(self, number: str, before: str) -> tuple[Entry, ...]:
+        """All entries as they would be after `move`. Raises InputError."""
+        entry = self.waiting_entry(number)
+        if before == number:
+            raise InputError(f"queue: {number} cannot be put before itself")
+        return self._with(entry, before, tuple(other for other in self.entries if other.id != number))
 
     def remove(self, number: str) -> None:
         """Take out an entry that waits. Raises InputError, StorageError."""
         with self._lock:
-            entry = self.entry(number)
-            if entry.state != "waiting":
-                raise InputError(f"queue: {number} is {entry.state}; only what waits can be taken out")
+            self.waiting_entry(number)
             self._keep(tuple(other for other in self.entries if other.id != number), self.halted)
+
+    def waiting_entry(self, number: str) -> Entry:
+        """Raises InputError: none with this id waits."""
+        entry = self.entry(number)
+        if entry.state != "waiting":
+            raise InputError(f"queue: {number} is {entry.state}; only what waits can be taken out or moved")
+        return entry
+
+    def _with(self, entry: Entry, before: str, entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
+        if not before:
+            return (*entries, entry)
+        place = entries.index(self.waiting_entry(before))
+        return (*entries[:place], entry, *entries[place:])
+
+    def _in_the_way(self) -> str:
+        """Why nothing can begin at once; empty if it can. A plan that failed is not in the way of another one."""
+        if self.running is not None:
+            return f"{self.running.words} is being acquired"
+        if self.waiting:
+            return f"{self.waiting[0].words} waits" + (f": {self.halted}" if self.halted else "")
+        ended = [entry for entry in self.entries if entry.ended]
+        return self.halted if self.halted and ended and ended[-1].hold else ""
 
     def entry(self, number: str) -> Entry:
         """Raises InputError: there is none with this id."""

@@ -28,4 +28,6 @@ def add_plan_routes(app: FastAPI, service: Service) -> None:
             raise InputError("no such drawing")
         if not path.is_file():
             raise InputError("this drawing is gone: draw again")
-        return FileResponse(path, headers={"Content-Security-Policy": _PAGE_POLICY})
+        return FileResponse(
+            path, headers={"Content-Security-Policy": _PAGE_POLICY, "X-Frame-Options": "SAMEORIGIN"}
+        )

@@ -10,6 +10,7 @@ from coupole.console.accounts import Accounts
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.audit import Audit
 from coupole.console.drafts import Desk
+from coupole.console.entering import Entering
 from coupole.console.messages import StateNow
 from coupole.console.object_files import ObjectFiles
 from coupole.console.plan_files import PlanFiles
@@ -46,8 +47,7 @@ class Service:
     """As it is."""
     newest: Callable[[], StateNow]
     """As it was a moment ago; takes no time."""
-    read_plan: Callable[[str], Path]
-    """The file of a plan of this cell that can be run. Raises InputError."""
+    entering: Entering
     origins: frozenset[str]
     """Of this service's own pages."""
     cookie: str

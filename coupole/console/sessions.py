@@ -127,10 +127,13 @@ class Control:
             self._now, self._acted_s = InControl(to), self._now_s()
             return self._now
 
-    def act(self, account: Account) -> bool:
-        """Whether somebody may act now: who is in control, or an operator where nobody is, who then has it."""
+    def act(self, account: Account, *, keep: bool = True) -> bool:
+        """Whether somebody may act now: who is in control, or an operator where nobody is, who then has it, unless
+        he does not `keep` it."""
         with self._lock:
             if self._now.name not in ("", account.name):
                 return False
+            if not keep and not self._now.name:
+                return True
             self._now, self._acted_s = replace(self._now, name=account.name), self._now_s()
             return True

@@ -37,29 +37,30 @@ def preflight_of(
     paths: bool = True,
     allocated_bytes: int = 0,
     proven: Collection[ShotId] = (),
+    measure: bool = True,
 ) -> tuple[Job, Report]:
     """Preflight's report on a job whose run would be in `folder`, and the job at the pace that LEDs and the
     measured speed of that disk allow.
 
     Without `paths` collisions are not checked. For a resumed run, `allocated_bytes` are already on the disk
-    and the `proven` frames are not taken again.
+    and the `proven` frames are not taken again. The disk's speed is not known unless it is to `measure`.
     """
-    storage = storage_of(folder, job.cell.rig, allocated_bytes)
+    storage = storage_of(folder, job.cell.rig, allocated_bytes, measure=measure)
     job, report = check_job(job, storage, paths=paths, proven=proven)
-    if not storage.write_bytes_s and not storage.trouble:
+    if measure and not storage.write_bytes_s and not storage.trouble:
         report.warnings.append(f"storage {folder}: too little room to measure the disk's speed; none is assumed")
     report.refusals += commissioning_refusals(job.cell)
     return job, report
 
 
-def storage_of(folder: Path, rig: Rig, allocated_bytes: int = 0) -> StorageFacts:
+def storage_of(folder: Path, rig: Rig, allocated_bytes: int = 0, *, measure: bool = True) -> StorageFacts:
     """State of the disk on which `folder` is, or would be."""
     existing = folder
     while not existing.exists():
         existing = existing.parent
     write_bytes_s, trouble = 0.0, "" if existing.is_dir() else f"{existing} is a file"
     free_bytes = shutil.disk_usage(existing).free
-    if not trouble:
+    if measure and not trouble:
         try:
             write_bytes_s = measure_write_speed(
                 existing, frame_bytes=rig.frame_bytes, room_bytes=free_bytes - rig.storage.reserve_bytes

@@ -47,7 +47,9 @@ def base(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Served]:
     found = Served(tmp_path / "run")
-    with RunControl(found.run, tmp_path / "rig.yaml", found.control, found.halt, lambda: PROGRESS) as control:
+    with RunControl(
+        found.run, tmp_path / "rig.yaml", found.control, found.halt, lambda: PROGRESS, {"relief": 4.5}
+    ) as control:
         assert control.trouble == ""
         yield found
 
@@ -65,7 +67,7 @@ def test_it_pauses_goes_on_and_stops_and_tells_its_state_each_time(served: Serve
         "version": 1, "run": str(served.run), "rig": str(served.run.parent / "rig.yaml"), "pid": os.getpid(),
         "state": "running", "view": "top",
         "view_number": 0, "views": 2, "proven": 52, "frames": 132, "light": "led0417", "dose_lux_h": 0.125,
-        "left_s": 33.5,
+        "left_s": 33.5, "light_after_lux_h": {"relief": 4.5},
     }  # fmt: skip
     assert say(b'{"version": 1, "command": "pause"}\n')["state"] == "pausing"
     assert served.control.pause.is_set()

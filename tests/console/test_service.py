@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
-import signal
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -225,6 +223,9 @@ def test_one_is_in_control_another_looks_until_it_is_handed_over(staffed: Staffe
         ({"plan": "nothing.yaml"}, "nothing.yaml"),
         ({"plan": "wrong.yaml"}, "exposure"),
         ({"plan": "other.yaml"}, "its rig is"),
+        ({"plan": "budget.yaml"}, "its budget is 0.01 lux.h"),
+        ({"resume": "../../etc"}, "expected a run below"),
+        ({"plan": "plan.yaml", "output": "/tmp"}, "for the command line"),
         ({}, "either `plan` or `hold`"),
         ({"plan": "plan.yaml", "hold": "both"}, "either `plan` or `hold`"),
     ],
@@ -233,6 +234,8 @@ def test_one_is_in_control_another_looks_until_it_is_handed_over(staffed: Staffe
 def test_what_cannot_be_run_is_not_queued(staffed: Staffed, asked: dict[str, str], says: str) -> None:
     folder, plan = staffed.cell.folder, staffed.cell.plan_data
     (folder / "wrong.yaml").write_text(json.dumps({**plan, "exposure": {"kind": "fixed"}}))
+    poor = {**plan, "object": {**plan["object"], "dose_budget_lux_h": 0.01}}
+    (folder / "budget.yaml").write_text(json.dumps(poor))
     (folder / "other.yaml").write_text(json.dumps({**plan, "rig": str(cells.REPO / "configs/rigs/sim.yaml")}))
     refused = staffed.signed_in("Ada").post("/api/v1/queue", asked)
     assert refused.status == 422
@@ -269,14 +272,29 @@ def long(tmp_path: Path) -> CellFolder:
     return cell
 
 
-def test_plans_wait_for_each_other_and_a_run_is_paused_and_stopped_from_its_page(long: CellFolder) -> None:
+def test_a_plan_is_checked_when_it_is_entered_and_its_run_paused_and_stopped_from_its_page(
+    long: CellFolder,
+) -> None:
     with served(long) as service:
         engineer = service.browser(token=service.token)
-        for _ in range(2):
-            assert engineer.post("/api/v1/queue", {"plan": "plan.yaml"}).status == 200
+        engineer.post("/api/v1/queue", {"hold": "dust the object"})
+        cells.wait_until(lambda: engineer.state()["state"] == "halted", "the hold")
+        entered = engineer.post("/api/v1/queue", {"plan": "plan.yaml"}).document
+        checked = cells.here("check", long.plan, "--json").document
+        assert {name: entered["needs"][name] for name in ("frames", "bytes", "dose_lux_h", "object")} == {
+            **{name: checked[name] for name in ("frames", "bytes", "dose_lux_h")},
+            "object": "relief",
+        }
+        last = engineer.post("/api/v1/queue", {"hold": "turn it"}).document
+        assert engineer.state()["queue"][1]["expected_begin"] is None, "a person decides"
+        engineer.post("/api/v1/queue/go-on")
+        assert engineer.post("/api/v1/queue", {"plan": "plan.yaml", "now": True}).status == 422
         cells.wait_until(lambda: engineer.state()["proven"] > 0, "proven frames")
         state = engineer.state()
-        assert [entry["state"] for entry in state["queue"]] == ["running", "waiting"]
+        _, first, second = state["queue"]
+        assert (first["state"], second["state"]) == ("running", "waiting")
+        assert first["expected_end"] == second["expected_begin"] > state["t"]
+        assert second["expected_end"] is None
         assert (state["state"], state["run"], state["view"]) == ("running", long.run_folder.name, "top")
         assert state["devices"]["camera"]["simulated"] is True
         assert state["dose"] > 0
@@ -289,9 +307,9 @@ def test_plans_wait_for_each_other_and_a_run_is_paused_and_stopped_from_its_page
         cells.wait_until(lambda: engineer.state()["state"] == "running", "the end of the pause")
         assert engineer.post(f"{run}/stop").document["state"] == "stopping"
         cells.wait_until(lambda: engineer.state()["state"] == "halted", "the queue's halt")
-        first, second = engineer.state()["queue"]
+        _, first, second = engineer.state()["queue"]
         assert (first["state"], first["exit_code"], second["state"]) == ("stopped", 130, "waiting")
-        assert engineer.post(f"/api/v1/queue/{second['id']}", method="DELETE").status == 200
+        assert engineer.post(f"/api/v1/queue/{last['id']}", method="DELETE").status == 200
         assert engineer.post(f"/api/v1/queue/{first['id']}", method="DELETE").status == 422
     assert cells.events(long.run_folder, "stop")[-1]["outcome"] == "interrupted"
 
@@ -299,7 +317,7 @@ def test_plans_wait_for_each_other_and_a_run_is_paused_and_stopped_from_its_page
 def test_a_killed_console_touches_no_run_and_comes_back_with_what_is_true(long: CellFolder) -> None:
     with served(long) as service:
         engineer = service.browser(token=service.token)
-        engineer.post("/api/v1/queue", {"plan": "plan.yaml"})
+        engineer.post("/api/v1/queue", {"plan": "plan.yaml", "now": True})
         cells.wait_until(lambda: engineer.state()["proven"] > 0, "proven frames")
         service.process.kill()
         service.process.wait()
@@ -311,18 +329,3 @@ def test_a_killed_console_touches_no_run_and_comes_back_with_what_is_true(long: 
         assert (entry["run"], entry["exit_code"]) == (str(run), 0)
     cells.assert_each_shot_proven_once(run)
     assert cells.events(run, "stop")[-1]["outcome"] == "done"
-
-
-def test_of_a_killed_run_the_console_says_so_and_begins_nothing_else(long: CellFolder) -> None:
-    with served(long) as service:
-        engineer = service.browser(token=service.token)
-        for _ in range(2):
-            engineer.post("/api/v1/queue", {"plan": "plan.yaml"})
-        cells.wait_until(lambda: engineer.state()["proven"] > 0, "proven frames")
-        os.kill(engineer.state()["queue"][0]["pid"], signal.SIGKILL)
-        cells.wait_until(lambda: engineer.state()["state"] == "halted", "the halt")
-        state = engineer.state()
-        assert [entry["state"] for entry in state["queue"]] == ["failed", "waiting"]
-        assert "its process was killed" in state["halted"]
-        assert state["run"] is None
-    assert cells.here("status", long.run_folder, "--json").document["go_on"]

@@ -9,7 +9,7 @@ from fastapi import FastAPI, Request
 from nicegui import app as nicegui_app
 from nicegui import ui
 
-from coupole.console.screens import object_screen, plan_screen, run_screen
+from coupole.console.screens import object_screen, plan_screen, queue_screen, run_screen
 from coupole.console.screens.frame import Place, framed
 from coupole.console.screens.visit import Visit
 from coupole.console.service_parts import Service
@@ -18,6 +18,7 @@ Build = Callable[[Visit], None]
 """Quick: what takes time is begun by a timer."""
 SCREENS: dict[Place, Build] = {
     Place("/run", "Run", "play_circle"): run_screen.build,
+    Place("/queue", "Queue", "format_list_numbered"): queue_screen.build,
     Place("/plan", "Plan", "edit_note"): plan_screen.build,
     Place("/object", "Object and dose", "category"): object_screen.build,
 }

@@ -12,10 +12,10 @@ from pathlib import Path
 from nicegui import ui
 
 from coupole.console.drafts import Checked, Draft
-from coupole.console.messages import StateNow
+from coupole.console.messages import NewEntry, StateNow
 from coupole.console.plan_fields import PlanFields, fields_of, text_with
 from coupole.console.screens.parts import Choice, button, facts_html, heading, named, panel, table_html
-from coupole.console.screens.visit import Visit, in_background, in_thread
+from coupole.console.screens.visit import Visit, enter, in_background, in_thread
 from coupole.errors import InputError, Problem
 from coupole.viewing.terminal import bytes_text, duration_text
 
@@ -121,13 +121,7 @@ class _Screen:
     async def _enter_plan(self) -> None:
         if self._text != self._saved and not await self._save_plan():
             return
-        service, name, account = self._visit.service, self._name, self._visit.account
-        by = account.name if account else ""
-        await self._visit.act(
-            f"queue {name}",
-            lambda: service.queue.add(by, plan=str(service.read_plan(name))),
-            done=f"{name} is in the queue",
-        )
+        await enter(self._visit, NewEntry(plan=self._name), self._name)
 
     def _state(self, _: StateNow) -> None:
         may = self._visit.may_act and bool(self._name)

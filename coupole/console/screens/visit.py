@@ -11,7 +11,7 @@ from nicegui import Client, run, ui
 
 from coupole.console.accounts import Account, Role
 from coupole.console.guard import account_here, address_of, is_of_this_machine
-from coupole.console.messages import StateNow
+from coupole.console.messages import NewEntry, StateNow
 from coupole.console.permission import NotAllowed, allow
 from coupole.console.service_parts import Service
 from coupole.errors import CoupoleError, InputError
@@ -95,7 +95,7 @@ class Visit:
         try:
             if account is None:
                 raise NotAllowed(401, "the session is over: sign in again")
-            allow(self.service.control, account, role, action, acts=acts)
+            allow(self.service, account, role, action, acts=acts)
             found = await in_thread(do)
         except NotAllowed as refusal:
             status = refusal.status
@@ -117,6 +117,20 @@ class Visit:
             with self._client:
                 kind: Any = "negative" if bad else "positive"
                 ui.notify(words, type=kind, multi_line=True, close_button="close", timeout=0 if bad else 4000)
+
+
+async def enter(visit: Visit, asked: NewEntry, words: str) -> bool:
+    """Put something in the queue; preflight is made first. Whether it is in."""
+    service, account = visit.service, visit.account
+    if not asked.hold:
+        visit.say(f"{words}: preflight is made, then it is in the queue")
+    async with service.entering.one_at_a_time:
+        entered = await visit.act(
+            f"queue {words}",
+            lambda: service.entering.enter(asked, account.name if account else "", by_command_line=False),
+            done=f"{words} is in the queue",
+        )
+    return entered is not None
 
 
 async def in_thread(do: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:

@@ -1,0 +1,182 @@
+"""Reads and checks what is to be acquired, and enters it in the queue.
+
+Preflight is a process of its own at the lowest priority, `coupole check --json`: what it computes must not take
+time from a run. While something is acquired it does not measure the disk's speed either, as that takes all of it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from anyio import CapacityLimiter
+
+from coupole.console.acquisitions import Acquisitions
+from coupole.console.messages import NewEntry
+from coupole.console.outlook import at_work_of, too_little_disk, too_much_light
+from coupole.console.plan_queue import Entry, Needs, PlanQueue
+from coupole.errors import InputError, Problem
+from coupole.plan.cell import Cell, read_cell
+from coupole.plan.reading import PlanFiles, read_plan
+from coupole.plan.yamlfile import read
+from coupole.storage.ledger import ledger_of
+from coupole.storage.run import Run
+
+_LOWEST_PRIORITY = 19
+
+
+class Entering:
+    """What may enter one cell's queue."""
+
+    def __init__(self, cell: Cell, plans: Path, queue: PlanQueue, acquisitions: Acquisitions) -> None:
+        self._cell, self._plans, self._queue, self._acquisitions = cell, plans, queue, acquisitions
+        self._rig = cell.document.path.resolve()
+        self._checking: subprocess.Popen[str] | None = None
+        self.one_at_a_time = CapacityLimiter(1)
+        """For threads that call `enter` and `move`: each counts what the ones before have entered."""
+
+    def close(self) -> None:
+        """End what is being checked."""
+        if self._checking is not None:
+            self._checking.kill()
+
+    def enter(self, asked: NewEntry, by: str, *, by_command_line: bool) -> Entry:
+        """A new entry. The command line may name files anywhere, other people only plans and runs of this cell's
+        folders. Raises InputError: it cannot be run, with all problems; StorageError."""
+        if bool(asked.plan or asked.resume) == bool(asked.hold):
+            raise InputError("expected either `plan` or `hold`, or `resume`")
+        if asked.hold:
+            if asked.now:
+                raise InputError("`now`: a hold does not begin")
+            return self._queue.add(by, before=asked.before, hold=asked.hold)
+        if not by_command_line and (asked.output or asked.with_mesh or (asked.plan and asked.resume)):
+            raise InputError("`output`, `with_mesh` and `plan` with `resume` are for the command line")
+        run = self._run(asked.resume, anywhere=by_command_line) if asked.resume else None
+        plan = self._plan(asked.plan, anywhere=by_command_line) if asked.plan else None
+        fields: dict[str, Any] = {
+            "plan": str(plan.document.path.resolve()) if plan else "",
+            "resume": str(run.folder) if run else "",
+            "output": str(Path(asked.output).resolve()) if asked.output else "",
+            "with_mesh": asked.with_mesh,
+        }
+        if asked.now:
+            return self._acquisitions.begin_at_once(by, **fields)
+        files = plan or (read_plan(run.plan_path) if run else None)
+        assert files is not None
+        fields["needs"] = self._needs(files, fields)
+        self._refuse(Entry(id="new", by=by, entered="", **fields), asked.before)
+        return self._queue.add(by, before=asked.before, **fields)
+
+    def move(self, number: str, before: str) -> None:
+        """Raises InputError: it does not wait, or another order exceeds an object's budget; StorageError."""
+        moved = self._queue.order_after(number, before)
+        if more := self._more_light(moved):
+            raise InputError([_problem(entry.words, more[entry.id]) for entry in moved if entry.id in more])
+        self._queue.move(number, before)
+
+    def _plan(self, name: str, *, anywhere: bool) -> PlanFiles:
+        path = (self._plans / name).resolve()
+        if not anywhere and not path.is_relative_to(self._plans.resolve()):
+            raise InputError(f"plan: expected a file below {self._plans}; found {name!r}")
+        if "views" not in read(path).data:
+            raise InputError(f"{path}: expected a plan, with `views`")
+        files = read_plan(path, self._rig if anywhere else None)
+        if files.cell.document.path.resolve() != self._rig:
+            raise InputError(f"{path}: its rig is {files.cell.document.path}; this console's is {self._rig}")
+        return files
+
+    def _run(self, name: str, *, anywhere: bool) -> Run:
+        folder = self._cell.storage_folder.resolve()
+        path = (folder / name).resolve()
+        if not anywhere and not path.is_relative_to(folder):
+            raise InputError(f"resume: expected a run below {folder}; found {name!r}")
+        run = Run(path)
+        begun_on = read_cell(run.rig_path)
+        if begun_on.state_folder.resolve() != self._cell.state_folder.resolve():
+            raise InputError(f"{path}: was begun in another cell, {begun_on.rig.name}")
+        return run
+
+    # -- preflight --------------------------------------------------------------------------------------------
+
+    def _needs(self, files: PlanFiles, fields: dict[str, Any]) -> Needs:
+        """Raises InputError: preflight refuses it, with all refusals."""
+        asked = ["--rig", str(self._rig), fields["plan"]] if fields["plan"] else []
+        asked += ["--resume", fields["resume"]] if fields["resume"] else []
+        asked += ["--output", fields["output"]] if fields["output"] else []
+        if self._acquisitions.state is not None:
+            asked.append("--no-disk-speed")
+        begun_s = time.monotonic()
+        found = self._checked(asked)
+        named = fields["plan"] or fields["resume"]
+        if found.get("refusals"):
+            raise InputError([_problem(named, refusal) for refusal in found["refusals"]])
+        if "error" in found:
+            raise InputError(found["error"])
+        thing = files.plan.object
+        return Needs(
+            duration_s=found["duration_s"],
+            preparation_s=time.monotonic() - begun_s,
+            dose_lux_h=found["dose_lux_h"],
+            bytes=found["bytes"],
+            frames=found["frames"],
+            object=thing.id if thing else None,
+            dose_budget_lux_h=thing.dose_budget_lux_h if thing else None,
+            folder=fields["resume"] or fields["output"] or str(self._cell.storage_folder.resolve()),
+            warnings=tuple(found["warnings"]),
+        )
+
+    def _checked(self, asked: list[str]) -> dict[str, Any]:
+        command = [sys.executable, "-m", "coupole.commands.cli", "check", *asked, "--json"]
+        with subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as self._checking:
+            os.setpriority(os.PRIO_PROCESS, self._checking.pid, _LOWEST_PRIORITY)
+            out, err = self._checking.communicate()
+        try:
+            found: dict[str, Any] = json.loads(out)
+        except ValueError as error:
+            last = (err.strip().splitlines() or ["it was killed"])[-1]
+            raise InputError(f"preflight ended without a result: {last}") from error
+        return found
+
+    # -- with what runs and waits before ------------------------------------------------------------------------
+
+    def _refuse(self, new: Entry, before: str) -> None:
+        named = new.plan or new.resume
+        waiting = list(self._queue.waiting)
+        place = waiting.index(self._queue.waiting_entry(before)) if before else len(waiting)
+        entries = [*waiting[:place], new, *waiting[place:]]
+        problems = [_problem(named, refusal) for refusal in self._more_light(entries).values()]
+        rig = self._cell.rig
+        problems += [
+            _problem(named, refusal)
+            for refusal in too_little_disk(
+                entries,
+                at_work_of(self._acquisitions.state, rig.frame_bytes),
+                free_bytes=lambda folder: shutil.disk_usage(folder).free,
+                reserve_bytes=rig.storage.reserve_bytes,
+            )
+        ]
+        if problems:
+            raise InputError(problems)
+
+    def _more_light(self, entries: tuple[Entry, ...] | list[Entry]) -> dict[str, str]:
+        """Refusals of light that these entries have in this order, and have not as they are."""
+        at_work = at_work_of(self._acquisitions.state, self._cell.rig.frame_bytes)
+
+        def received_lux_h(name: str) -> float:
+            return ledger_of(self._cell, name).read().total_lux_h
+
+        now = too_much_light(self._queue.waiting, received_lux_h, at_work)
+        found = too_much_light(entries, received_lux_h, at_work)
+        return {number: refusal for number, refusal in found.items() if number not in now}
+
+
+def _problem(named: str, refusal: str) -> Problem:
+    return Problem(named, 0, 0, "", refusal)

@@ -1,0 +1,58 @@
+"""To whom the cell is lent: one process of the service's user at a time, for what needs no run."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+from dataclasses import dataclass
+
+from coupole.errors import InputError
+
+
+@dataclass(frozen=True)
+class _Loan:
+    pid: int
+    process: int
+    """A file descriptor of the process, which can be read when it has ended: numbers of processes are used
+    again."""
+    words: str
+
+
+class Lending:
+    """The loan there is, if there is one. It ends when the process gives the cell back, or ends."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._loan: _Loan | None = None
+
+    @property
+    def lent_to(self) -> str:
+        """Who has the cell and what for; empty if it is not lent."""
+        with self._lock:
+            if self._loan is not None and select.select([self._loan.process], [], [], 0)[0]:
+                self._end()
+            return self._loan.words if self._loan else ""
+
+    def lend(self, pid: int, who: str, what: str) -> None:
+        """Raises InputError: it is lent, or there is no such process."""
+        with self._lock:
+            if self.lent_to:
+                raise InputError(f"the cell is lent to {self.lent_to}")
+            try:
+                process = os.pidfd_open(pid)
+            except OSError as error:
+                raise InputError(f"process {pid}: {error.strerror}") from error
+            self._loan = _Loan(pid, process, f"{who}: {what}")
+
+    def give_back(self, pid: int) -> None:
+        """Raises InputError: this process has not borrowed it."""
+        with self._lock:
+            if self._loan is None or self._loan.pid != pid:
+                raise InputError("the cell is not lent to this process")
+            self._end()
+
+    def _end(self) -> None:
+        assert self._loan is not None
+        os.close(self._loan.process)
+        self._loan = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
@@ -16,6 +17,7 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.remote.webelement import WebElement
 
 WIDE, NARROW = (1400, 900), (400, 800)
+_SETTLES_S = 3.0
 _SERIOUS = ("serious", "critical")
 
 
@@ -24,6 +26,7 @@ class Visitor:
 
     def __init__(self, browser: Browser, url: str) -> None:
         self.browser, self.driver, self.url = browser, browser.driver, url
+        self.prefers("light")
 
     def goes_to(self, path: str) -> None:
         self.driver.get(self.url + path)
@@ -97,9 +100,15 @@ class Visitor:
         )
 
     def prefers(self, scheme: str) -> None:
-        """`light` or `dark`."""
+        """`light` or `dark`; and nothing moves."""
         self.driver.execute_cdp_cmd(
-            "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+            "Emulation.setEmulatedMedia",
+            {
+                "features": [
+                    {"name": "prefers-color-scheme", "value": scheme},
+                    {"name": "prefers-reduced-motion", "value": "reduce"},
+                ]
+            },
         )
 
     def picture(self, path: Path) -> None:
@@ -107,9 +116,25 @@ class Visitor:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.driver.save_screenshot(str(path))
 
+    def fits(self) -> bool:
+        """The page is not wider than its window, as soon as it has settled."""
+        end_s = time.monotonic() + _SETTLES_S
+        while self.overflows() and time.monotonic() < end_s:
+            time.sleep(0.1)
+        return not self.overflows()
+
     def overflows(self) -> int:
         """Pixels by which the page is wider than its window."""
-        return int(self.browser.run("document.documentElement.scrollWidth - document.documentElement.clientWidth"))
+        page = "document.documentElement"
+        return int(self.browser.run(f"{page}.scrollWidth - {page}.clientWidth"))
+
+    def too_wide(self) -> list[str]:
+        """What reaches beyond the window's right edge."""
+        found: list[str] = self.browser.run(
+            "[...document.querySelectorAll('main *, header *')].filter(one => one.getBoundingClientRect().right > "
+            "document.documentElement.clientWidth + 1).map(one => one.outerHTML.slice(0, 120)).slice(0, 8)"
+        )
+        return found
 
     def barriers(self) -> list[str]:
         """Serious violations of accessibility that axe-core finds on this page."""

@@ -84,12 +84,15 @@ class _Screen:
             for number, entry in enumerate(waiting):
                 self._row(entry, "waits", waiting, number)
             if not now.queue or not (waiting or any(entry.state == "running" for entry in now.queue)):
-                ui.label("Nothing waits.").classes("hint")
+                ui.label("Nothing waits.").classes("hint").props("role=listitem")
         self._sum.text = _sum_of(waiting)
         self._ended.clear()
         with self._ended:
-            for entry in [one for one in reversed(now.queue) if one.state in _KINDS][:_ENDED_SHOWN]:
+            ended = [one for one in reversed(now.queue) if one.state in _KINDS]
+            for entry in ended[:_ENDED_SHOWN]:
                 self._row(entry, entry.state)
+            if not ended:
+                ui.label("None yet.").classes("hint").props("role=listitem")
 
     def _row(self, entry: EntryNow, state: str, waiting: list[EntryNow] | None = None, number: int = 0) -> None:
         with ui.row().classes("entry").props("role=listitem"):

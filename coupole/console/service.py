@@ -32,6 +32,8 @@ from coupole.console.audit import Audit
 from coupole.console.client import service_socket
 from coupole.console.entering import Entering
 from coupole.console.messages import EntryNow, StateNow
+from coupole.console.notifications import console_folder, read_settings
+from coupole.console.notifier import Notifier, Occurrences
 from coupole.console.outlook import expected_times
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.sessions import Control, Session, Sessions
@@ -64,25 +66,33 @@ def serve(
     """
     if not _is_here(host) and tls is None:
         raise InputError(f"--host {host}: others can reach this address: give --tls-certificate and --tls-key")
-    folder = cell.state_folder / "console"
+    folder = console_folder(cell)
     make_folder(folder)
     folder.chmod(0o700)  # hashes of passwords, and who did what
     with _owned(folder), contextlib.closing(Audit(folder / "audit.jsonl")) as audit:
         queue = PlanQueue(folder / "queue.json")
+        settings = read_settings(folder)
+        occurrences = Occurrences(cell, queue, settings.disk_low_gb if settings else 0.0)
         accounts = Accounts(folder / "accounts.json")
         context = _tls_context(tls)
         listening = _listen(host, port)
         port = listening.getsockname()[1]
         url = f"{'https' if tls else 'http'}://{_in_url(host)}:{port}"
         with (
+            Notifier(settings, occurrences, folder) as notifier,
             Acquisitions(queue, cell, folder / "output") as acquisitions,
             contextlib.closing(Entering(cell, plans, queue, acquisitions)) as entering,
         ):
             control = Control()
+
+            def state() -> StateNow:
+                trouble = "; ".join(filter(None, (audit.trouble, notifier.trouble)))
+                return state_of(cell, queue, acquisitions, control, trouble)
+
             service = Service(
                 accounts, Sessions(), control, audit, queue, acquisitions,
-                state=lambda: state_of(cell, queue, acquisitions, control, audit),
-                newest=Newest(lambda: state_of(cell, queue, acquisitions, control, audit)),
+                state=state,
+                newest=Newest(state),
                 entering=entering,
                 origins=_origins(url, [host, *names, *(["localhost", "127.0.0.1"] if _is_here(host) else [])]),
                 cookie=f"coupole_session_{port}",
@@ -115,7 +125,7 @@ class Newest:
                 self._state = self._state.model_copy(update={"trouble": str(error), "t": utc_now()})
 
 
-def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: Control, audit: Audit) -> StateNow:
+def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: Control, trouble: str) -> StateNow:
     """The cell at this moment."""
     at_work, entry = acquisitions.state or {}, queue.running
     begun = "halted" if queue.halted else "idle"
@@ -139,7 +149,7 @@ def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: 
         queue=_entries_now(queue, at_work.get("left_s")),
         in_control=control.now.name,
         asked_by=control.now.asked_by,
-        trouble=audit.trouble,
+        trouble=trouble,
         t=utc_now(),
     )
 

@@ -107,6 +107,10 @@ def test_what_preflight_refuses_or_cannot_say_is_not_entered(desk: Desk) -> None
     desk.needs = {"error": "relief.ply: is no mesh"}
     with pytest.raises(InputError, match="is no mesh"):
         desk.enter(plan="free.yaml")
+    for name in ("\0", "free.yaml/below", "x" * 2000, "."):
+        for asked in ({"plan": name}, {"resume": name}):
+            with pytest.raises(InputError):
+                desk.enter(**asked)
     assert desk.names == []
 
 

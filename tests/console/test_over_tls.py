@@ -46,19 +46,8 @@ class Reached:
 def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reached]:
     folder = tmp_path_factory.mktemp("tls")
     certificate, key = folder / "certificate.pem", folder / "key.pem"
-    asked = [
-        "req",
-        "-x509",
-        "-newkey",
-        "ec",
-        "-pkeyopt",
-        "ec_paramgen_curve:prime256v1",
-        "-nodes",
-        "-days",
-        "2",
-        "-subj",
-        "/CN=dome",
-    ]
+    curve = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
+    asked = ["req", "-x509", *curve, "-days", "2", "-subj", "/CN=dome"]
     names = ["-addext", f"subjectAltName=IP:{HERE}", "-keyout", str(key), "-out", str(certificate)]
     subprocess.run(["openssl", *asked, *names], check=True, capture_output=True)
     options = ("--host", "0.0.0.0", "--name", HERE, "--tls-certificate", certificate, "--tls-key", key)

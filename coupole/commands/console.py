@@ -37,6 +37,9 @@ def serve(
     ] = None,
     tls_certificate: Annotated[Path | None, typer.Option("--tls-certificate", help="PEM file.")] = None,
     tls_key: Annotated[Path | None, typer.Option("--tls-key", help="PEM file.")] = None,
+    test_notifications: Annotated[
+        bool, typer.Option("--test-notifications", help="Send a message by each way that is set up, and end.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Own a cell's queue and serve its console, until Ctrl-C. Runs that are being acquired go on without it.
@@ -50,6 +53,9 @@ def serve(
     from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
 
+    if test_notifications:
+        _test_notifications(rig, as_json=as_json)
+        return
     if (tls_certificate is None) != (tls_key is None):
         raise InputError("--tls-certificate and --tls-key go together")
     tls = (tls_certificate, tls_key) if tls_certificate and tls_key else None
@@ -73,6 +79,30 @@ def serve(
         tls=tls,
         tell=tell,
     )
+
+
+def _test_notifications(rig: Path, *, as_json: bool) -> None:
+    """Raises InputError: nothing is set up, or something could not be sent."""
+    from coupole.console.notifications import NAME, console_folder, read_settings
+    from coupole.console.notifier import send_test
+    from coupole.plan.cell import read_cell
+    from coupole.viewing.terminal import make_console
+
+    cell, console = read_cell(rig), make_console(quiet=as_json)
+    folder = console_folder(cell)
+    settings = read_settings(folder)
+    if settings is None:
+        raise InputError(
+            f"{folder / NAME}: no such file, so nobody is told of anything; docs/reference/console.md says what "
+            "is in it"
+        )
+    found = send_test(settings, cell.rig.name)
+    for way, trouble in found.items():
+        console.print(f"{way}: {trouble or 'sent'}", markup=False)
+    if as_json:
+        print(json.dumps(found))
+    if troubles := [f"{way}: {trouble}" for way, trouble in found.items() if trouble]:
+        raise InputError("not sent: " + "; ".join(troubles))
 
 
 def queue(

@@ -23,6 +23,7 @@ from coupole.console.outlook import at_work_of, too_little_disk, too_much_light
 from coupole.console.plan_queue import Entry, Needs, PlanQueue
 from coupole.errors import InputError, Problem
 from coupole.plan.cell import Cell, read_cell
+from coupole.plan.plan import possible_path
 from coupole.plan.reading import PlanFiles, read_plan
 from coupole.plan.yamlfile import read
 from coupole.storage.ledger import ledger_of
@@ -81,9 +82,7 @@ class Entering:
         self._queue.move(number, before)
 
     def _plan(self, name: str, *, anywhere: bool) -> PlanFiles:
-        path = (self._plans / name).resolve()
-        if not anywhere and not path.is_relative_to(self._plans.resolve()):
-            raise InputError(f"plan: expected a file below {self._plans}; found {name!r}")
+        path = _place("plan", self._plans, name, anywhere=anywhere)
         if "views" not in read(path).data:
             raise InputError(f"{path}: expected a plan, with `views`")
         files = read_plan(path, self._rig if anywhere else None)
@@ -92,10 +91,7 @@ class Entering:
         return files
 
     def _run(self, name: str, *, anywhere: bool) -> Run:
-        folder = self._cell.storage_folder.resolve()
-        path = (folder / name).resolve()
-        if not anywhere and not path.is_relative_to(folder):
-            raise InputError(f"resume: expected a run below {folder}; found {name!r}")
+        path = _place("resume", self._cell.storage_folder, name, anywhere=anywhere)
         run = Run(path)
         begun_on = read_cell(run.rig_path)
         if begun_on.state_folder.resolve() != self._cell.state_folder.resolve():
@@ -176,6 +172,17 @@ class Entering:
         now = too_much_light(self._queue.waiting, received_lux_h, at_work)
         found = too_much_light(entries, received_lux_h, at_work)
         return {number: refusal for number, refusal in found.items() if number not in now}
+
+
+def _place(key: str, folder: Path, name: str, *, anywhere: bool) -> Path:
+    """Raises InputError: no path, or not below the folder."""
+    try:
+        path = (folder / possible_path(Path(name))).resolve()
+    except ValueError as error:
+        raise InputError(f"{key}: expected {error}") from error
+    if not anywhere and not path.is_relative_to(folder.resolve()):
+        raise InputError(f"{key}: expected a place below {folder}; found {name!r}")
+    return path
 
 
 def _problem(named: str, refusal: str) -> Problem:

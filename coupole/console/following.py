@@ -126,14 +126,17 @@ class _Followed:
         self._conclude(figures, found)
 
     def _outputs(self) -> Iterator[dict[str, Any]]:
-        """Until the entry has ended. Raises Interrupted: it was taken out before it began; NotServed: the console
-        has ended, and what it began after it."""
+        """Until the entry has ended. Raises Interrupted: it was taken out before it began; InputError: the console
+        has ended, and after it what it had begun."""
         while not self._ended:
             try:
                 yield call(self._cell, "GET", f"/api/v1/queue/{self._entry['id']}/output")
-            except NotServed:
+            except NotServed as error:
                 if self._state() is None:
-                    raise
+                    run = self._entry["run"] or "RUN"
+                    raise InputError(
+                        f"the console has ended: `coupole status {run}` says what became of the run"
+                    ) from error
                 self._show_progress()
             except InputError:
                 if self._control.stop.is_set():

@@ -28,6 +28,9 @@ from coupole.console.audit import Audit
 from coupole.console.client import service_socket
 from coupole.console.drafts import Desk
 from coupole.console.entering import Entering
+from coupole.console.messages import StateNow
+from coupole.console.notifications import console_folder, read_settings
+from coupole.console.notifier import Notifier, Occurrences
 from coupole.console.object_files import ObjectFiles
 from coupole.console.plan_files import PlanFiles
 from coupole.console.plan_queue import PlanQueue
@@ -63,17 +66,20 @@ def serve(
     """
     if not _is_here(host) and tls is None:
         raise InputError(f"--host {host}: others can reach this address: give --tls-certificate and --tls-key")
-    folder = cell.state_folder / "console"
+    folder = console_folder(cell)
     make_folder(folder)
     folder.chmod(0o700)  # hashes of passwords, and who did what
     with _owned(folder), contextlib.closing(Audit(folder / "audit.jsonl")) as audit:
         queue = PlanQueue(folder / "queue.json")
+        settings = read_settings(folder)
+        occurrences = Occurrences(cell, queue, settings.disk_low_gb if settings else 0.0)
         accounts = Accounts(folder / "accounts.json")
         context = _tls_context(tls)
         listening = _listen(host, port)
         port = listening.getsockname()[1]
         url = f"{'https' if tls else 'http'}://{_in_url(host)}:{port}"
         with (
+            Notifier(settings, occurrences, folder) as notifier,
             Acquisitions(queue, cell, folder / "output") as acquisitions,
             contextlib.closing(Entering(cell, plans, queue, acquisitions)) as entering,
         ):
@@ -82,11 +88,16 @@ def serve(
             plan_files = PlanFiles(plans, cell.document.path, folder / "drawings")
             objects = ObjectFiles(cell, plan_files, runs, cell.state_folder / "objects")
             tasks, desk = Tasks(folder / "commands"), Desk()
+
+            def state() -> StateNow:
+                trouble = "; ".join(filter(None, (audit.trouble, notifier.trouble)))
+                return state_of(cell, queue, acquisitions, control, trouble)
+
             service = Service(
                 cell, plans, accounts, Sessions(), control, audit, queue, acquisitions,
                 plan_files, desk, runs, RunWatch(runs), objects, tasks,
-                state=lambda: state_of(cell, queue, acquisitions, control, audit),
-                newest=Newest(lambda: state_of(cell, queue, acquisitions, control, audit)),
+                state=state,
+                newest=Newest(state),
                 entering=entering,
                 origins=_origins(url, [host, *names, *(["localhost", "127.0.0.1"] if _is_here(host) else [])]),
                 cookie=f"coupole_session_{port}",

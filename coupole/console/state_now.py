@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from coupole.console.acquisitions import Acquisitions
-from coupole.console.audit import Audit
 from coupole.console.messages import EntryNow, StateNow
 from coupole.console.outlook import expected_times
 from coupole.console.plan_queue import PlanQueue
@@ -47,7 +46,7 @@ class Newest:
                 self._state = self._state.model_copy(update={"trouble": str(error), "t": utc_now()})
 
 
-def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: Control, audit: Audit) -> StateNow:
+def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: Control, trouble: str) -> StateNow:
     """The cell at this moment."""
     at_work, entry = acquisitions.state or {}, queue.running
     begun = "halted" if queue.halted else "idle"
@@ -72,7 +71,7 @@ def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: 
         queue=_entries_now(queue, at_work.get("left_s")),
         in_control=control.now.name,
         asked_by=control.now.asked_by,
-        trouble=audit.trouble,
+        trouble=trouble,
         t=utc_now(),
     )
 

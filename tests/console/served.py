@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import http.client
 import json
+import ssl
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -35,10 +37,19 @@ class Browser:
     url: str
     cookie: str = ""
     headers: dict[str, str] = field(default_factory=dict)
+    trusted: ssl.SSLContext | None = None
+    """For a console with TLS."""
+    address: str | None = None
+    """From which to connect."""
 
     def ask(self, method: str, path: str, body: Any = None, **headers: str) -> Reply:
         place = urlsplit(self.url)
-        connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=cells.PATIENCE_S)
+        from_here = {"timeout": cells.PATIENCE_S, "source_address": self.address and (self.address, 0)}
+        connection = (
+            http.client.HTTPConnection(place.hostname or "", place.port, **from_here)
+            if place.scheme == "http"
+            else http.client.HTTPSConnection(place.hostname or "", place.port, **from_here, context=self.trusted)
+        )
         sent = {**({"Cookie": self.cookie} if self.cookie else {}), **self.headers, **headers}
         data = None if body is None else json.dumps(body)
         connection.request(method, path, data, {"Content-Type": "application/json", **sent})
@@ -84,9 +95,9 @@ class Served:
 
 
 @contextmanager
-def served(cell: CellFolder) -> Iterator[Served]:
+def served(cell: CellFolder, *options: str | Path) -> Iterator[Served]:
     """The console of a cell, until the context ends. Whatever it has begun goes on."""
-    process = cells.start("serve", cell.rig, "--port", "0", "--json", "--plans", cell.folder)
+    process = cells.start("serve", cell.rig, "--port", "0", "--json", "--plans", cell.folder, *options)
     assert process.stdout is not None
     line = process.stdout.readline()
     assert line, cells.finish(process).err

@@ -118,8 +118,15 @@ def test_the_cell_is_lent_to_a_process_until_that_ends(standing: Standing) -> No
         assert borrower.stdout.readline() == "mine\n"
         lent_to = standing.state()["lent_to"]
         assert lent_to.endswith("(command line): look at the focus")
-        refused = cells.here("live", standing.cell.rig)
-        assert (refused.code, f"live: the cell is lent to {lent_to}" in refused.err) == (2, True)
+        for what, *named in (
+            ("live", standing.cell.rig),
+            ("meter", standing.cell.plan),
+            ("devices", "--rig", standing.cell.rig),
+            ("commission", standing.cell.rig, "--name", "Ada", "--yes"),
+            ("calibrate", "all", "--rig", standing.cell.rig, "--out", standing.cell.folder / "calibrations"),
+        ):
+            refused = cells.here(what, *named)
+            assert (refused.code, f": the cell is lent to {lent_to}" in refused.err) == (2, True), what
         asked = {"plan": str(standing.cell.plan), "now": True}
         assert lent_to in standing.engineer.post("/api/v1/queue", asked | {"plan": "plan.yaml"}).document["detail"]
         with pytest.raises(InputError, match="not lent to this process"):

@@ -217,14 +217,14 @@ def test_one_is_in_control_another_looks_until_it_is_handed_over(staffed: Staffe
 @pytest.mark.parametrize(
     ("asked", "says"),
     [
-        ({"plan": "../../etc/passwd"}, "expected a file below"),
-        ({"plan": "/etc/passwd"}, "expected a file below"),
+        ({"plan": "../../etc/passwd"}, "expected a place below"),
+        ({"plan": "/etc/passwd"}, "expected a place below"),
         ({"plan": "rig.yaml"}, "expected a plan"),
         ({"plan": "nothing.yaml"}, "nothing.yaml"),
         ({"plan": "wrong.yaml"}, "exposure"),
         ({"plan": "other.yaml"}, "its rig is"),
         ({"plan": "budget.yaml"}, "its budget is 0.01 lux.h"),
-        ({"resume": "../../etc"}, "expected a run below"),
+        ({"resume": "../../etc"}, "expected a place below"),
         ({"plan": "plan.yaml", "output": "/tmp"}, "for the command line"),
         ({}, "either `plan` or `hold`"),
         ({"plan": "plan.yaml", "hold": "both"}, "either `plan` or `hold`"),

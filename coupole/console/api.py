@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
-from fastapi import Depends, FastAPI, Query, Request, Response
+from fastapi import Depends, FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 
 import coupole
@@ -17,7 +17,7 @@ from coupole.console.guard import account_here, bearer_of, guard, is_of_this_mac
 from coupole.console.messages import Hand, NewAccount, NewEntry, SignIn, StateNow, Text
 from coupole.console.permission import NotAllowed, allow
 from coupole.console.plan_queue import Entry
-from coupole.console.run_files import RunRow
+from coupole.console.run_routes import add_run_routes
 from coupole.console.service_parts import Service
 from coupole.console.sessions import Session
 from coupole.errors import InputError
@@ -31,7 +31,7 @@ def make_app(service: Service) -> FastAPI:
     guard(app, service)
     _add_sign_in(app, service)
     _add_cell(app, service)
-    _add_runs(app, service)
+    add_run_routes(app, service)
     _add_people(app, service)
     return app
 
@@ -144,21 +144,6 @@ def _add_cell(app: FastAPI, service: Service) -> None:
         harms. `stop` is answered when the lights are off and the arm was told to stop, or with the `trouble`."""
         allow(service.control, who, Role.OPERATOR, command, acts=command == "go-on")
         return service.acquisitions.tell(run, command)
-
-
-def _add_runs(app: FastAPI, service: Service) -> None:
-    @app.get("/api/v1/runs")
-    def runs() -> list[RunRow]:
-        """The cell's runs, the newest first."""
-        return service.runs.rows()
-
-    @app.get("/api/v1/runs/{run}/picture", response_class=Response)
-    def picture(
-        run: Text, shot: Text, width: Annotated[int, Query(ge=1, le=2048)] = 640, saturation: bool = False
-    ) -> Response:
-        """A proven shot as JPEG, developed for the eye; with `saturation` clipped pixels are red."""
-        jpeg = service.runs.picture(run, shot, width, saturation=saturation)
-        return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
 
 
 async def _events(service: Service, request: Request) -> AsyncIterator[str]:

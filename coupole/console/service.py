@@ -28,6 +28,7 @@ from coupole.console.acquisitions import Acquisitions
 from coupole.console.api import make_app
 from coupole.console.audit import Audit
 from coupole.console.client import service_socket
+from coupole.console.frame_sheets import FrameSheets
 from coupole.console.messages import StateNow
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.run_files import RunFiles
@@ -84,7 +85,7 @@ def serve(
             tasks = Tasks(folder / "commands")
             service = Service(
                 cell, plans, accounts, Sessions(), control, audit, queue, acquisitions,
-                runs, RunWatch(runs), tasks,
+                runs, FrameSheets(runs, folder / "means"), RunWatch(runs), tasks,
                 state=lambda: state_of(cell, queue, acquisitions, control, audit),
                 newest=Newest(lambda: state_of(cell, queue, acquisitions, control, audit)),
                 read_plan=lambda name: read_plan(cell, plans, name),

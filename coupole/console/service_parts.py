@@ -9,6 +9,7 @@ from pathlib import Path
 from coupole.console.accounts import Accounts
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.audit import Audit
+from coupole.console.frame_sheets import FrameSheets
 from coupole.console.messages import StateNow
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.run_files import RunFiles
@@ -32,6 +33,7 @@ class Service:
     queue: PlanQueue
     acquisitions: Acquisitions
     runs: RunFiles
+    sheets: FrameSheets
     watch: RunWatch
     """Of the run at work."""
     tasks: Tasks

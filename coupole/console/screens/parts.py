@@ -8,6 +8,7 @@ from typing import Literal, TypeVar
 from urllib.parse import quote
 
 from nicegui import ui
+from nicegui.events import GenericEventArguments
 
 from coupole.viewing.raw_preview import BINS
 
@@ -105,3 +106,68 @@ def histogram_svg(histograms: Mapping[str, Sequence[int]]) -> str:
 def clipping_words(saturated: Mapping[str, float]) -> dict[str, str]:
     """Share of pixels at full scale by channel."""
     return {f"{name} clipped": f"{share:.3%}" if share else "none" for name, share in saturated.items()}
+
+
+async def sure(title: str, words: str, yes: str) -> bool:
+    """Ask before something that cannot be undone, or takes long."""
+    with ui.dialog().props(f'aria-label="{html.escape(title)}"') as dialog, ui.column().classes("panel ask"):
+        heading(title)
+        ui.label(words)
+        with ui.row():
+            button(yes, lambda: dialog.submit(True), name="yes", kind="main")
+            button("Cancel", lambda: dialog.submit(False), name="cancel")
+    said = await dialog
+    dialog.delete()
+    return bool(said)
+
+
+def link(words: str, target: str, *, name: str, new_tab: bool = True) -> ui.link:
+    """To a page of this console."""
+    return ui.link(words, target, new_tab=new_tab).props(f"data-name={name}")
+
+
+def moment(t: str) -> str:
+    """A time of UTC, ISO 8601, for people: `2026-11-23 15:04`."""
+    return t[:16].replace("T", " ")
+
+
+class Choice:
+    """One of several values, as the browser's own list: by keyboard, finger and screen reader."""
+
+    def __init__(
+        self,
+        words: str,
+        options: Mapping[str, str],
+        on_change: Callable[[], object] = lambda: None,
+        *,
+        name: str,
+        value: str = "",
+    ) -> None:
+        """`options`: words of each value; `name` is the list's `data-name` in the page."""
+        self._words, self._name, self._on_change = words, name, on_change
+        self._options, self.value = dict(options), value or next(iter(options), "")
+        self._box = ui.html("", sanitize=False).classes("choice")
+        self._box.on("change", self._changed, js_handler="(e) => emit(e.target.value)")
+        self.set_options(options, self.value)
+
+    def set_options(self, options: Mapping[str, str], value: str = "") -> None:
+        """Others; nobody is told."""
+        self._options, self.value = dict(options), value or next(iter(options), "")
+        inner = "".join(
+            f'<option value="{html.escape(one)}"{" selected" if one == self.value else ""}>{html.escape(words)}'
+            "</option>"
+            for one, words in self._options.items()
+        )
+        words = html.escape(self._words)
+        self._box.set_content(
+            f'<label><span>{words}</span><select data-name="{self._name}">{inner}</select></label>'
+        )
+
+    def set_visibility(self, visible: bool) -> None:
+        self._box.set_visibility(visible)
+
+    def _changed(self, event: GenericEventArguments) -> object:
+        if event.args not in self._options:
+            return None
+        self.value = str(event.args)
+        return self._on_change()

@@ -106,6 +106,9 @@ def duration_text(seconds: float) -> str:
 
 
 def bytes_text(count: float) -> str:
+    """`1.25 GB`, `39.3 MB`, `12 kB`."""
+    if count < 1e5:
+        return f"{count / 1e3:.0f} kB"
     return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
 
 

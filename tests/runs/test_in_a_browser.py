@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cells
 import pytest
+from axe_selenium_python import Axe
 from browser import Browser, needs_chromium
 from cells import CellFolder
 from selenium.webdriver.common.action_chains import ActionChains
@@ -16,6 +17,7 @@ from selenium.webdriver.common.keys import Keys
 from test_live import live
 
 pytestmark = needs_chromium
+TELEPHONE = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": False}
 
 
 @pytest.fixture(scope="module")
@@ -88,11 +90,31 @@ def test_the_page_says_when_the_live_view_has_ended(browser: Browser, shown_cell
         cells.wait_until(lambda: "ended" in browser.text("#error"), "word that it has ended")
 
 
-def test_all_pictures_of_a_run_s_report_are_there(browser: Browser, tmp_path: Path) -> None:
+def test_a_run_s_report_is_whole_and_for_everybody(browser: Browser, tmp_path: Path) -> None:
+    """All pictures and links lead somewhere; on a telephone nothing sticks out; axe-core finds nothing."""
     cell = CellFolder(tmp_path)
     assert cell.acquire().code == 0
-    browser.open(f"file://{cell.run_folder / 'report.html'}")
-    pictures = browser.driver.find_elements(By.TAG_NAME, "img")
+    driver = browser.driver
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", TELEPHONE)
+    try:
+        for scheme in ("light", "dark"):
+            features = [{"name": "prefers-color-scheme", "value": scheme}]
+            driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+            browser.open(f"file://{cell.run_folder / 'report.html'}")
+            axe = Axe(driver)
+            axe.inject()
+            assert [f"{found['id']}: {found['nodes'][0]['html']}" for found in axe.run()["violations"]] == []
+        assert browser.run("document.documentElement.scrollWidth <= window.innerWidth")
+    finally:
+        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    pictures = driver.find_elements(By.TAG_NAME, "img")
     assert pictures
     assert all(int(picture.get_property("naturalWidth")) > 0 for picture in pictures)
+    places = [str(link.get_dom_attribute("href")) for link in driver.find_elements(By.TAG_NAME, "a")]
+    files = {place for place in places if not place.startswith("#")}
+    assert {"journal.jsonl", "views/top.h5", "inputs/plan.yaml"} <= files
+    assert [name for name in files if not (cell.run_folder / name).is_file()] == []
+    anchors = {place[1:] for place in places} - {name[1:] for name in files}
+    assert [name for name in anchors if not driver.find_elements(By.ID, name)] == []
     assert browser.troubles() == []

@@ -19,7 +19,7 @@ def page(title: str, body: str) -> str:
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f'<title>{text(title)}</title><link rel="icon" href="data:,"><style>{style}</style></head>'
+        f"<title>{text(title)}</title><style>{style}</style></head>"
         f"<body>{body}</body></html>\n"
     )
 

@@ -32,20 +32,22 @@ def shown_cell(tmp_path_factory: pytest.TempPathFactory) -> CellFolder:
     return CellFolder(tmp_path_factory.mktemp("shown"))
 
 
-def test_a_plan_is_drawn_and_its_slider_goes_from_view_to_view(browser: Browser, shown_cell: CellFolder) -> None:
+def test_a_plan_is_drawn_and_keys_go_from_view_to_view(browser: Browser, shown_cell: CellFolder) -> None:
     ended = cells.here("view", shown_cell.plan, "--out", shown_cell.folder, "--json")
     assert ended.code == 0, ended.err
     browser.open(f"file://{ended.document['html']}")
     browser.at(".gl-container canvas")
-    assert browser.text(".gtitle") == "all views"
-    rail = browser.at(".slider-rail-touch-rect")
-    end = rail.size["width"] // 2 - 8
-    ActionChains(browser.driver).move_to_element_with_offset(rail, end, 0).click().perform()
-    cells.wait_until(lambda: browser.text(".gtitle") != "all views", "the last view's title")
-    labels = browser.driver.find_elements(By.CSS_SELECTOR, ".slider-label")
-    figure = browser.at(".plotly-graph-div").rect
-    lowest = max(label.rect["y"] + label.rect["height"] for label in labels)
-    assert lowest <= figure["y"] + figure["height"], "labels are cut off"
+    assert browser.text("#view") == "all views"
+    shown = "document.querySelector('.plotly-graph-div').data.map(trace => trace.visible)"
+    before = browser.run(shown)
+    ActionChains(browser.driver).send_keys(Keys.TAB, Keys.ARROW_RIGHT).perform()
+    cells.wait_until(lambda: browser.text("#view").startswith("1 "), "the first view's words")
+    assert browser.at("#step").get_attribute("aria-valuetext") == "1 top"
+    assert browser.run(shown) != before
+    buttons = browser.driver.find_elements(By.CSS_SELECTOR, ".modebar-btn")
+    assert len(buttons) == 6
+    assert [button for button in buttons if "hare" in str(button.get_dom_attribute("data-title"))] == []
+    assert browser.run("document.documentElement.scrollWidth <= window.innerWidth")
     assert browser.troubles() == []
 
 

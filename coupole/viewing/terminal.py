@@ -261,10 +261,12 @@ class LiveFigures:
         seen = shown.figures
         best = self._best[shown.title] = max(self._best.get(shown.title, 0.0), seen.sharpness)
         saturated = ", ".join(f"{name} {share:.2%}" for name, share in seen.saturated.items())
-        sharpness = f"sharpness {seen.sharpness / best:.0%} of the best" if best else "nothing but noise"
+        told = f"sharpness {seen.sharpness / best:.0%} of the best" if best else "nothing but noise"
+        if shown.run:  # its frames are under different lights: their sharpness cannot be compared
+            told = f"{shown.run}, {shown.dose_lux_h:.3f} lux.h"
         line = (
             f"{shown.title}, {shown.exposure_us} us: brightest {seen.brightest:.0%}; saturated {saturated}; "
-            f"{sharpness}; {shown.frames_per_s:.1f} frames/s"
+            f"{told}; {shown.frames_per_s:.1f} frames/s"
         )
         if self._live is not None:
             self._live.update("\n".join([line, *(_bars(name, bins) for name, bins in seen.histograms.items())]))

@@ -30,7 +30,7 @@ from typing import Any, Literal
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import Safeguard
 from coupole.acquisition.runtime_folder import named_after, runtime_folder
-from coupole.errors import InputError
+from coupole.errors import InputError, reason
 from coupole.viewing.progress import Progress
 
 VERSION = 1
@@ -77,7 +77,7 @@ class RunControl:
             self._socket.listen(8)
             hidden.replace(path)
         except (OSError, InputError) as error:
-            self.trouble = f"`coupole pause` and `coupole stop` will not reach this run: {error}"
+            self.trouble = f"`coupole pause` and `coupole stop` will not reach this run: {reason(error)}"
             self._close()
             return self
         self._path = path
@@ -181,7 +181,7 @@ def ask(run: Path, command: Command) -> State:
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise InputError(f"{run}: no process of this user acquires into this run on this machine") from error
     except (OSError, ValueError) as error:
-        raise InputError(f"{run}: the process that acquires into it does not answer: {error}") from error
+        raise InputError(f"{run}: the process that acquires into it does not answer: {reason(error)}") from error
 
 
 def running() -> list[State]:

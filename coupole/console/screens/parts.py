@@ -142,8 +142,8 @@ class Choice:
         name: str,
         value: str = "",
     ) -> None:
-        """`options`: words of each value; `value` is chosen, or else the first; `name` is the list's `data-name` in
-        the page."""
+        """`options`: words of each value; `value` is chosen, or else the first; `name` is its `data-name` in the
+        page."""
         self._words, self._name, self._on_change = words, name, on_change
         self._options, self.value = dict(options), value or next(iter(options), "")
         self._box = ui.html("", sanitize=False).classes("choice")

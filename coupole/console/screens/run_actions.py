@@ -6,15 +6,15 @@ import asyncio
 import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from nicegui import ui
 
+from coupole.console.messages import NewEntry
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.run_results import export_folder, look_page, reflectance_folder, stands_alone
 from coupole.console.screens.export_dialog import ExportDialog
 from coupole.console.screens.parts import button, link, sure
-from coupole.console.screens.visit import Visit, in_background
+from coupole.console.screens.visit import Visit, enter, in_background
 from coupole.console.tasks import Task
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
@@ -30,14 +30,7 @@ def can_resume() -> bool:
 
 async def resume(visit: Visit, name: str) -> None:
     """Enter a run in the queue, to take what is left of it."""
-    run = visit.service.runs.run(name)
-    entry: dict[str, Any] = {"resume": str(run.folder)}
-    account = visit.account
-    await visit.act(
-        f"resume {name}",
-        lambda: visit.service.queue.add(account.name if account else "", **entry),
-        done=f"{name} waits in the queue",
-    )
+    await enter(visit, NewEntry(resume=name), name)
 
 
 class RunActions:

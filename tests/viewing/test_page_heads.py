@@ -24,5 +24,5 @@ def test_every_page_has_its_language_and_fits_a_telephone() -> None:
 def test_messages_have_the_systems_words_and_not_its_numbers() -> None:
     assert reason(BlockingIOError(11, "Resource temporarily unavailable")) == "Resource temporarily unavailable"
     assert reason(ValueError("no JSON")) == "no JSON"
-    with pytest.raises(InputError, match="nowhere: not a run folder: it has no run.json"):
+    with pytest.raises(InputError, match=r"nowhere: not a run folder: it has no run\.json"):
         Run(REPO / "nowhere")

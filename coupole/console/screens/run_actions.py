@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -23,11 +22,6 @@ from coupole.viewing import report
 _LOOK_EVERY_S = 0.3
 
 
-def can_resume() -> bool:
-    """Whether the queue takes runs to be resumed."""
-    return "resume" in inspect.signature(PlanQueue.add).parameters
-
-
 async def resume(visit: Visit, name: str) -> None:
     """Enter a run in the queue, to take what is left of it."""
     await enter(visit, NewEntry(resume=name), name)
@@ -43,7 +37,7 @@ class RunActions:
         self._cell = visit.service.cell
         self._frames = frames
         with ui.row().classes("actions"):
-            if left and can_resume():
+            if left:
                 button("Resume", lambda: resume(visit, name), name="resume", icon="play_arrow", kind="main")
             for words, icon, do in (
                 ("Verify", "fact_check", self._verify),

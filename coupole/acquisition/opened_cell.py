@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -89,6 +90,14 @@ class Safeguard:
             self.trouble = str(error) or type(error).__name__
         else:
             self.trouble = ""
+
+
+def unsure(done: Sequence[Safeguard], within_s: float) -> list[str]:
+    """What is not sure to be done of it after a while."""
+    end_s = time.monotonic() + within_s
+    for safeguard in done:
+        safeguard.wait(max(0.0, end_s - time.monotonic()))
+    return [f"not sure: {safeguard.what}: {safeguard.trouble}" for safeguard in done if safeguard.trouble]
 
 
 @contextmanager

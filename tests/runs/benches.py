@@ -75,6 +75,15 @@ def bench(rig: Path, *options: str | Path) -> Iterator[Bench]:
         cells.finish(found.process)
 
 
+ASKS = """
+import json, socket, sys
+with socket.socket(socket.AF_UNIX) as connection:
+    connection.connect(sys.argv[1])
+    request = {"version": 1, "command": "frame", **json.loads(sys.argv[2])}
+    connection.sendall(json.dumps(request).encode() + b"\\n")
+    connection.makefile().readline()
+"""
+"""A client that asks for a picture: the socket's path, the fields."""
 _HOLDING = """
 import json, socket, sys, time
 path, fields = sys.argv[1], json.loads(sys.argv[2])

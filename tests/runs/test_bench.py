@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -10,8 +12,9 @@ from typing import Any
 import cells
 import numpy as np
 import pytest
-from benches import HERE, Bench, bench, holding
+from benches import ASKS, HERE, Bench, begun, bench, holding
 from cells import CellFolder
+from PIL import Image
 
 from sim.devices.kuka_kinematics import flange_pose as flange_by_the_simulation
 from sim.world.client import World
@@ -20,6 +23,7 @@ PARK_DEG = [60.0, -170.0, 150.0, 0.0, -70.0, 0.0]
 HOME_DEG = [0.0, -170.0, 150.0, 0.0, -70.0, 0.0]
 SUPPORT_MM, KEEP_OUT_MM = 1450.0, 20.0
 """The disk in the base frame of an arm that hangs above it, and the height that the rig keeps free."""
+BUDGET_LUX_H = 0.14
 TIP_MM, TIP_RADIUS_MM = 100.0, 60.0
 """Of the camera's capsule, in front of the flange."""
 
@@ -30,6 +34,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> CellFolder:
     found.rig_data["console"] = {"at_the_cell": [HERE]}
     found.rig_data["motion"]["park_joints_deg"] = PARK_DEG
     found.rig_data["ledbox"]["settings"]["watchdog_s"] = 2.0
+    found.plan_data["object"]["dose_budget_lux_h"] = BUDGET_LUX_H
     found.join()
     return found
 
@@ -177,3 +182,165 @@ def test_towards_the_support_it_stops_before_it(asked: Bench, cell: CellFolder, 
     assert end_mm[2] > start_mm[2] + 50.0, "it went as far as it could"
     assert np.linalg.norm((end_mm - start_mm)[:2]) < 3.0, "straight down"
     asked.drive("home")
+
+
+# -- pictures -------------------------------------------------------------------------------------------------
+
+
+def raw(frame: dict[str, Any]) -> np.ndarray:
+    found: np.ndarray = np.load(frame["raw"])
+    return found
+
+
+def dark(world: World) -> bool:
+    state = world.ask("state")
+    return not state["shining"] and not state["panels"]
+
+
+def test_a_picture_has_its_figures_and_its_light_is_counted_and_off_again(
+    asked: Bench, cell: CellFolder, world: World
+) -> None:
+    asked.drive({"view": "top", "plan": str(cell.plan)})
+    before = asked.done("state")["dose"]
+    given_s = world.ask("light")["leds_s"].get("500", 0.0)
+    frame = asked.done("frame", lights=[500], exposure_us=8000, region=[21, 11, 89, 79], width_px=64)
+    assert dark(world)
+    on_s = world.ask("light")["leds_s"]["500"] - given_s
+    assert 0.008 < on_s < 0.012
+    dose = asked.done("state")["dose"]
+    assert dose["bench_lux_h"] - before["bench_lux_h"] == pytest.approx(frame["dose_lux_h"])
+    assert before["left_lux_h"] - dose["left_lux_h"] == pytest.approx(frame["dose_lux_h"])
+    pixels = raw(frame)
+    assert pixels.shape == (96, 128)
+    blue = pixels[0::2, 1::2]
+    assert frame["pattern"] == "GBRG"
+    assert sum(frame["histograms"]["B"]) == blue.size
+    assert frame["saturated"]["B"] == np.mean(blue >= frame["white_dn"])
+    with Image.open(frame["picture"]) as picture:
+        assert picture.size == (64, 48)
+    region = pixels[10:90, 20:110].astype(float) - frame["black_dn"]  # whole Bayer cells
+    gains = frame["region"]["white_point"]
+    green = 0.5 * (region[0::2, 0::2].mean() + region[1::2, 1::2].mean())
+    assert gains == pytest.approx([green / region[1::2, 0::2].mean(), 1.0, green / region[0::2, 1::2].mean()])
+    assert frame["region"]["sharpness"] > 0.0
+    unlit = asked.done("frame", exposure_us=8000, region=[21, 11, 89, 79])
+    assert (unlit["dose_lux_h"], unlit["region"]["sharpness"]) == (0.0, 0.0), "noise is not sharp"
+    assert unlit["region"]["white_point"] is None, "too dark to tell"
+
+
+def test_several_lights_are_as_one_picture_under_all_of_them(asked: Bench) -> None:
+    one, other = (raw(asked.done("frame", lights=[led], exposure_us=8000)).astype(int) for led in (500, 700))
+    both = asked.done("frame", lights=[500, 700], exposure_us=8000)
+    difference = raw(both) - (one + other - both["black_dn"])
+    unsaturated = raw(both) < both["white_dn"]
+    assert abs(difference[unsaturated].mean()) < 1.0, "DN; noise alone"
+    assert raw(both).mean() > max(one.mean(), other.mean()) + 10.0
+
+
+def test_a_panel_is_on_for_its_picture_only(asked: Bench, world: World) -> None:
+    before_s = world.ask("light")["panels_s"]
+    frame = asked.done("frame", panels=[2], exposure_us=20_000)
+    after_s = world.ask("light")["panels_s"]
+    assert dark(world)
+    on_s = after_s["2"] - before_s.get("2", 0.0)
+    assert on_s > 0.02
+    assert frame["dose_lux_h"] == pytest.approx(180 * on_s / 3600, rel=0.3, abs=1e-3), (
+        "from command to confirmation"
+    )
+    assert raw(frame).mean() > frame["black_dn"] + 5.0
+
+
+def test_the_loupe_shows_the_last_picture_pixel_by_pixel_without_light(asked: Bench, world: World) -> None:
+    frame = asked.done("frame", lights=[500], exposure_us=8000)
+    light = world.ask("light")
+    found = asked.done("loupe", region=[10, 8, 20, 12])
+    assert world.ask("light") == light
+    assert found["region"] == [10, 8, 20, 12]
+    with Image.open(found["picture"]) as picture:
+        shown = np.asarray(picture).astype(int)
+    part = np.clip((raw(frame)[8:20, 10:30].astype(float) - frame["black_dn"]) / 4031, 0, 1)
+    assert shown.shape == (12, 20, 3)
+    for channel, at in ((1, np.s_[0::2, 0::2]), (2, np.s_[0::2, 1::2]), (0, np.s_[1::2, 0::2])):
+        assert np.abs(shown[(*at, channel)] - 255 * part[at] ** (1 / 2.2)).max() <= 1.0, "GBRG"
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"lights": [5000]}, "LEDs of the dome"),
+        ({"panels": [9]}, "from 1 to 4"),
+        ({"lights": [500], "region": [120, 0, 20, 20]}, "within 128 x 96 px"),
+        ({"lights": [500], "exposure_us": 30_000_000}, "exposure_us"),
+        ({"lights": [500], "gains": [1, 0, 1]}, "gains"),
+    ],
+)
+def test_a_picture_that_cannot_be_gives_no_light(
+    asked: Bench, world: World, fields: dict[str, Any], says: str
+) -> None:
+    light = world.ask("light")
+    assert says in asked.ask("frame", **{"exposure_us": 8000, **fields})["error"]
+    assert world.ask("light") == light
+
+
+def test_light_beyond_the_objects_budget_is_not_given(asked: Bench, world: World) -> None:
+    a_little = asked.done("frame", lights=[500], exposure_us=8000)
+    left_lux_h = asked.done("state")["dose"]["left_lux_h"]
+    too_long_us = int(1.2 * left_lux_h / a_little["dose_lux_h"] * 8000)
+    light = world.ask("light")
+    refused = asked.ask("frame", lights=[500], exposure_us=too_long_us)
+    assert refused["kind"] == "DoseBudgetReached", refused
+    assert world.ask("light") == light
+    assert asked.done("frame", lights=[500], exposure_us=8000)["dose_lux_h"] > 0.0
+
+
+def test_it_meters_as_the_command_does_and_goes_on_after_it(asked: Bench, cell: CellFolder, world: World) -> None:
+    asked.done("meter", plan=str(cell.plan))
+    assert "metering" in asked.ask("frame", exposure_us=8000)["error"]
+    work = asked.ended_work()
+    assert work["state"] == "done", work["why"]
+    assert work["exposure"]["kind"] in ("fixed", "bracket")
+    assert all(value > 0 for value in work["noise"].values()), work["noise"]
+    assert work["views"]["top"]["view"] == "top"
+    assert dark(world)
+    assert asked.done("frame", lights=[500], exposure_us=8000)["dose_lux_h"] > 0.0
+    asked.drive("home")
+
+
+def test_while_a_bench_holds_the_cell_no_other_does_and_the_command_asks_it(
+    asked: Bench, cell: CellFolder, world: World
+) -> None:
+    refused = cells.here("bench", cell.rig, "--yes")
+    assert refused.code == 2
+    assert "another process has this cell's devices open" in refused.err
+    driven = cells.here("arm", cell.rig, "park", "--json", typed="y\n")
+    assert driven.code == 0, driven
+    assert "park: 1." in driven.err
+    assert np.allclose(joints_deg(world), PARK_DEG, atol=0.01)
+    declined = cells.here("arm", cell.rig, "home", typed="n\n")
+    assert declined.code == 130
+    assert np.allclose(joints_deg(world), PARK_DEG, atol=0.01)
+
+
+def test_asked_to_close_it_makes_all_safe_and_ends(asked: Bench, world: World) -> None:
+    assert asked.done("close")["trouble"] == []
+    assert asked.process.wait(cells.PATIENCE_S) == 0
+    assert cells.safe(world)
+    assert not asked.path.exists()
+
+
+def test_no_light_outlasts_a_bench_that_is_killed(asked: Bench, cell: CellFolder, world: World) -> None:
+    if asked.path.exists():
+        asked.done("close")
+    asked.process.wait(cells.PATIENCE_S)
+    doomed = begun(cell.rig)
+    client = subprocess.Popen(
+        [sys.executable, "-c", ASKS, str(doomed.path), json.dumps({"exposure_us": 1_500_000, "panels": [1]})],
+        stderr=subprocess.DEVNULL,
+    )
+    with client:
+        cells.wait_until(lambda: not dark(world), "the light")
+        doomed.process.kill()
+        killed_s = world.ask("state")["t_s"]
+        cells.finish(doomed.process)
+        dark_s = cells.wait_until(lambda: dark(world) and world.ask("state")["t_s"], "the dark")
+    assert dark_s - killed_s < 3.0, "the box's watchdog of 2 s"

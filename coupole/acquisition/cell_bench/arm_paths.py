@@ -49,7 +49,7 @@ class ArmPaths:
         """A path to home, park, a view or joint angles. Raises InputError if there is none, and for a plan of
         another cell or object."""
         if isinstance(to, ViewOf):
-            job = self._job_of(Path(to.plan))
+            job = self.job_of(Path(to.plan))
             view = next((one for one in job.schedule.views if one.name == to.view), None)
             if view is None:
                 names = ", ".join(one.name for one in job.schedule.views[:20])
@@ -112,7 +112,7 @@ class ArmPaths:
             raise InputError(f"{name}: no path to it was found from where the arm stands: {leg.contact}")
         return Visit(goal_deg, leg)
 
-    def _job_of(self, plan: Path) -> Job:
+    def job_of(self, plan: Path) -> Job:
         """The plan's job in this cell. Raises InputError if its object is not the bench's."""
         if not plan.is_absolute():
             raise InputError(f"{plan}: expected an absolute path")

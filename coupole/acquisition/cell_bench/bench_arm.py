@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -81,7 +82,7 @@ class BenchArm:
         path = self._shown.get(number)
         if path is None:
             raise InputError(f"path: expected one that `plan_path` has shown, found {number!r}")
-        self._refuse_motion()
+        self.refuse_motion()
         here_deg = np.array(self._opened.robot.measured().joints_deg)
         off_deg = float(np.abs(here_deg - path.start_deg).max())
         if off_deg > _SAME_PLACE_DEG:
@@ -102,7 +103,7 @@ class BenchArm:
             )
         if asked.hold is not None:
             return self._renew(asked)
-        self._refuse_motion()
+        self.refuse_motion()
         self._numbers += 1
         hold = _Hold(self._numbers, asked)
         about = {"hold": hold.number, "axis": asked.axis, "direction": asked.direction}
@@ -110,6 +111,10 @@ class BenchArm:
         self._works.begin(work)
         self._hold, hold.work = hold, work
         return work.figures()
+
+    def job_of(self, plan: Path) -> Job:
+        """The plan's job in this cell. Raises InputError if its object is not the bench's."""
+        return self._paths.job_of(plan)
 
     def _renew(self, asked: JogAsked) -> dict[str, Any]:
         hold = self._hold
@@ -122,7 +127,7 @@ class BenchArm:
         assert hold.work is not None
         return hold.work.figures()
 
-    def _refuse_motion(self) -> None:
+    def refuse_motion(self) -> None:
         """Raise DeviceFault or InputError if the arm may not move at all."""
         self._faults.refuse(self._cell.document.path)
         try:

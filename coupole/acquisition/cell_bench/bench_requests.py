@@ -79,11 +79,61 @@ class JogAsked(_Request):
     """Where the request comes from: an address in the rig's `console: at_the_cell:`."""
 
 
+_Gain = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
+_Gains = Annotated[list[_Gain], Field(min_length=3, max_length=3)]
+_Region = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=4, max_length=4)]
+"""x, y, width, height in the sensor's pixels."""
+
+
+class FrameAsked(_Request):
+    command: Literal["frame"]
+    lights: Annotated[list[int], Field(max_length=16)] = []
+    """Ids of LEDs; each gives a picture, and these are added up."""
+    panels: Annotated[list[int], Field(max_length=4)] = []
+    """Numbers of panels, from 1; in the same way."""
+    exposure_us: Annotated[int, Field(ge=10)]
+    """Of each picture."""
+    gain_db: Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)] = 0.0
+    region: _Region | None = None
+    """With figures of its own."""
+    width_px: Annotated[int, Field(ge=16, le=8192)] = 960
+    """Of the JPEG, at most."""
+    marks: list[Literal["saturation", "focus"]] = []
+    gains: _Gains = [1.0, 1.0, 1.0]
+    """White point: of R, G, B in the JPEG."""
+
+
+class LoupeAsked(_Request):
+    command: Literal["loupe"]
+    region: _Region
+    gains: _Gains = [1.0, 1.0, 1.0]
+
+
+class MeterAsked(_Request):
+    command: Literal["meter"]
+    plan: str
+    """The plan's file, an absolute path."""
+    saturated: Annotated[float, Field(ge=0, le=0.5)] = 1e-3
+    snr: Annotated[float, Field(ge=1, le=10_000)] = 30.0
+    share: Annotated[float, Field(ge=0.01, le=1)] = 0.9
+
+
 class CloseAsked(_Request):
     command: Literal["close"]
 
 
-Request = StateAsked | SelfTestAsked | PathAsked | DriveAsked | StopAsked | JogAsked | CloseAsked
+Request = (
+    StateAsked
+    | SelfTestAsked
+    | PathAsked
+    | DriveAsked
+    | StopAsked
+    | JogAsked
+    | FrameAsked
+    | LoupeAsked
+    | MeterAsked
+    | CloseAsked
+)
 _REQUEST: TypeAdapter[Request] = TypeAdapter(Annotated[Request, Field(discriminator="command")])
 
 

@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -22,11 +23,15 @@ from rich.console import Console
 from coupole.acquisition.cell_bench.bench_arm import BenchArm
 from coupole.acquisition.cell_bench.bench_client import bench_socket
 from coupole.acquisition.cell_bench.bench_devices import BenchDevices
+from coupole.acquisition.cell_bench.bench_frames import BenchFrames
 from coupole.acquisition.cell_bench.bench_requests import (
     VERSION,
     CloseAsked,
     DriveAsked,
+    FrameAsked,
     JogAsked,
+    LoupeAsked,
+    MeterAsked,
     PathAsked,
     Request,
     SelfTestAsked,
@@ -34,7 +39,8 @@ from coupole.acquisition.cell_bench.bench_requests import (
     StopAsked,
     read_request,
 )
-from coupole.acquisition.cell_bench.bench_work import Works
+from coupole.acquisition.cell_bench.bench_work import Work, Works
+from coupole.acquisition.looking import metered, metering_job
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell, open_cell, unsure
 from coupole.acquisition.operator import ask_to_begin, identity_printer
@@ -43,13 +49,13 @@ from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.user_socket import UserSocket
 from coupole.errors import CoupoleError, DeviceError, InputError
 from coupole.plan.cell import Cell
+from coupole.preflight import exposure_advice
 from coupole.preflight.job import Job
 from coupole.storage.arm_faults import ArmFaults
 from coupole.viewing.terminal import alarm
 
 _LOOK_EVERY_S = 0.1
 _STOPPED_WITHIN_S = 4.0
-_ENDED_WITHIN_S = 15.0
 
 
 class BenchService:
@@ -61,7 +67,13 @@ class BenchService:
         self.closing = threading.Event()
         self._devices = BenchDevices(cell, opened)
         self._arm = BenchArm(cell, opened, job, self.works)
+        self._frames = BenchFrames(cell, opened, job, self._devices)
         self._asked_s = time.monotonic()
+
+    @property
+    def is_spent(self) -> bool:
+        """A failure has made the cell safe: nothing can be lit or moved any more."""
+        return self._opened.made_safe and self.works.running is None
 
     @property
     def idle_s(self) -> float:
@@ -111,6 +123,14 @@ class BenchService:
                 return self._arm.drive(request.path)
             case JogAsked():
                 return self._arm.jog(request)
+            case FrameAsked():
+                if (work := self.works.running) is not None and work.kind == "meter":
+                    raise InputError("box and camera are metering; stop it or let it end")
+                return {**self._frames.frame(request), "dose": self._frames.dose()}
+            case LoupeAsked():
+                return self._frames.loupe(request)
+            case MeterAsked():
+                return self._begin_metering(request)
             case StopAsked():
                 return {"trouble": self._stop(), **self._state()}
             case CloseAsked():
@@ -118,10 +138,37 @@ class BenchService:
                 self.closing.set()
                 return {"trouble": trouble}
 
+    def _begin_metering(self, asked: MeterAsked) -> dict[str, Any]:
+        small = metering_job(self._arm.job_of(Path(asked.plan)))
+        self._arm.refuse_motion()
+        wanted = exposure_advice.Request(asked.saturated, asked.snr, asked.share)
+
+        def meter(control: Control) -> dict[str, Any]:
+            with self._devices.in_use:
+                self._frames.release()
+                try:
+                    advice = metered(small, self._opened, wanted, control)
+                finally:
+                    self._frames.begin_counting()
+            return advice.figures()
+
+        work = Work("meter", {"plan": asked.plan}, meter)
+        self.works.begin(work)
+        return work.figures()
+
     def _stop(self) -> list[str]:
+        """What is not sure then. Pictures that are under way have ended, with their light, when this returns."""
+        self._frames.stop()
         if self.works.last is not None:
             self.works.last.stop()
-        return unsure(self._opened.halt(), _STOPPED_WITHIN_S)
+        trouble = unsure(self._opened.halt(), _STOPPED_WITHIN_S)
+        if self.works.last is not None:
+            self.works.last.join(_STOPPED_WITHIN_S)
+        if self._devices.in_use.acquire(timeout=_STOPPED_WITHIN_S):
+            self._devices.in_use.release()
+        else:
+            trouble.append("not sure: box and camera are still at work")
+        return trouble
 
     def _state(self) -> dict[str, Any]:
         arm: dict[str, Any] | None = None
@@ -137,14 +184,16 @@ class BenchService:
             "object": measured.id if measured else None,
             "devices": self._devices.state(arm["heard_s_ago"] if arm else None),
             "arm": arm,
+            "dose": self._frames.dose(),
             "work": self.works.last.figures() if self.works.last else None,
         }
 
     def end(self) -> None:
-        """Stop what is under way and wait for its thread."""
-        if self.works.last is not None:
-            self.works.last.stop()
-            self.works.last.join(_ENDED_WITHIN_S)
+        """Stop what is under way, make the cell safe, enter the light that was given."""
+        self.closing.set()
+        self._stop()
+        self._opened.make_safe()
+        self._frames.end()
 
 
 @contextmanager
@@ -168,7 +217,6 @@ def bench_of(what: Job | Cell, console: Console, control: Control, *, confirm: b
                 yield service
             finally:
                 service.end()
-                opened.make_safe()
                 for trouble in opened.trouble:
                     alarm(trouble)
                 if not opened.arm_confirmed:
@@ -191,6 +239,13 @@ def serve_bench(what: Job | Cell, console: Console, *, confirm: bool, leave_afte
         if as_json:
             print(json.dumps({"version": VERSION, "socket": str(path), "pid": os.getpid()}), flush=True)
         while not (control.stop.wait(_LOOK_EVERY_S) or service.closing.is_set()):
+            if service.is_spent:
+                raise DeviceError(
+                    "cell",
+                    expected="a metering that ends as it should",
+                    happened=service.works.last.figures()["why"] if service.works.last else "it failed",
+                    remedy="The cell was made safe; begin the bench anew.",
+                )
             if service.idle_s > leave_after_s:
                 console.print(f"nobody has asked for {leave_after_s:g} s: closed")
                 break

@@ -9,7 +9,6 @@ from pathlib import Path
 from nicegui import ui
 
 from coupole.console.messages import NewEntry
-from coupole.console.plan_queue import PlanQueue
 from coupole.console.run_results import export_folder, look_page, reflectance_folder, stands_alone
 from coupole.console.screens.export_dialog import ExportDialog
 from coupole.console.screens.parts import button, link, sure

@@ -118,7 +118,8 @@ def test_a_run_of_a_terminal_is_the_consoles_and_is_stopped_resumed_killed_and_o
     again = standing.engineer.post("/api/v1/queue", {"resume": run.name}).document
     left = cells.here("status", run, "--json").document
     assert left["go_on"]
-    assert again["needs"]["frames"] == cells.about(run)["expected"]["frames"] - cells.frame_lines(run)
+    whole = cells.about(run)["expected"]["frames"]
+    assert whole - cells.frame_lines(run) <= again["needs"]["frames"] < whole
     assert standing.engineer.post(f"/api/v1/queue/{again['id']}", method="DELETE").status == 200
 
 

@@ -4,197 +4,64 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import AsyncIterator
+from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from anyio import to_thread
-from fastapi import Depends, FastAPI, HTTPException, Request, Response
-from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
+from fastapi import FastAPI, Query, Request, Response
+from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 
 import coupole
-from coupole.console.accounts import Account, Accounts, Role
-from coupole.console.acquisitions import Acquisitions
-from coupole.console.audit import Audit
-from coupole.console.entering import Entering
+from coupole.console.accounts import Role
+from coupole.console.asking import REFUSALS, Who
+from coupole.console.guard import bearer_of, guard, is_command_line, is_of_this_machine, session_of, sign_in_page
 from coupole.console.messages import Hand, NewAccount, NewEntry, SignIn, StateNow, Text
-from coupole.console.plan_queue import Entry, PlanQueue
-from coupole.console.sessions import Control, Session, Sessions
-from coupole.errors import CoupoleError, InputError
+from coupole.console.object_routes import add_object_routes
+from coupole.console.permission import NotAllowed, allow
+from coupole.console.plan_queue import Entry
+from coupole.console.plan_routes import add_plan_routes
+from coupole.console.run_files import RunRow
+from coupole.console.service_parts import Service
 
 _EVENT_EVERY_S, _ALIVE_EVERY_S = 0.2, 1.0
-_READING, _MOST_BYTES = ("GET", "HEAD"), 65536
-_LOOPBACK = ("127.0.0.1", "::1")
-_SIGN_IN = Path(__file__).parent / "sign_in.html"
-_POLICY = "default-src 'self'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
-
-
-@dataclass(frozen=True)
-class Service:
-    """What the interface stands in front of."""
-
-    accounts: Accounts
-    sessions: Sessions
-    control: Control
-    audit: Audit
-    queue: PlanQueue
-    acquisitions: Acquisitions
-    state: Callable[[], StateNow]
-    """As it is."""
-    newest: Callable[[], StateNow]
-    """As it was a moment ago; takes no time."""
-    entering: Entering
-    origins: frozenset[str]
-    """Of this service's own pages."""
-    cookie: str
-    """Name of the sessions' cookie, which no other console of this machine has."""
-    command_line: Session
-    """Of the service's own user, on this machine."""
-
-
-class Refused(HTTPException):
-    """With the words for whoever asked."""
 
 
 def make_app(service: Service) -> FastAPI:
     """The interface, and its schema at /openapi.json."""
     app = FastAPI(title="Coupole console", version=coupole.__version__, docs_url=None, redoc_url=None)
-    _guard(app, service)
+    guard(app, service)
     _add_sign_in(app, service)
     _add_cell(app, service)
+    _add_runs(app, service)
     _add_people(app, service)
+    add_plan_routes(app, service)
+    add_object_routes(app, service)
     return app
-
-
-# -- who asks -------------------------------------------------------------------------------------------------
-
-
-def _guard(app: FastAPI, service: Service) -> None:
-    """Nothing but the sign-in page is served to who is not signed in; nothing is changed for another site's page,
-    or twice. What was asked and would change something is logged, with its answer."""
-
-    @app.middleware("http")
-    async def logged(request: Request, call_next: Callable[[Request], Any]) -> Response:
-        response: Response = await check(request, call_next)
-        if request.method not in _READING:
-            session = getattr(request.state, "session", None)
-            name = session.account.name if session else ""
-            address = request.client.host if request.client else "command line"
-            about = getattr(request.state, "about", "")
-            service.audit.note(name, f"{request.method} {request.url.path}", response.status_code, address, about)
-        return response
-
-    async def check(request: Request, call_next: Callable[[Request], Any]) -> Response:
-        if int(request.headers.get("content-length", "0") or 0) > _MOST_BYTES:
-            return _no(413, f"expected at most {_MOST_BYTES} bytes")
-        if "transfer-encoding" in request.headers:
-            return _no(411, "expected a body with its length")
-        hosts = {origin.partition("://")[2] for origin in service.origins}
-        if not is_command_line(request) and request.headers.get("host", "") not in hosts:
-            return _no(400, "expected this console's own address as host")
-        origin = request.headers.get("origin")
-        if origin is not None and origin not in service.origins:
-            return _no(403, "asked by the page of another site")
-        session = _session_of(request, service)
-        request.state.session = session
-        public = request.url.path in ("/", "/api/v1/sign-in")
-        if session is None and not public:
-            return _no(401, "sign in first")
-        if request.method not in _READING and session is not None and not public:
-            ambient = not is_command_line(request) and not _bearer(request)
-            if ambient and not service.sessions.spend(session, request.headers.get("x-coupole-token", "")):
-                return _no(403, "expected in X-Coupole-Token a fresh token of /api/v1/token, good for once")
-        response: Response = await call_next(request)
-        response.headers["Cache-Control"] = "no-store"
-        response.headers["X-Content-Type-Options"] = "nosniff"
-        response.headers["Referrer-Policy"] = "no-referrer"
-        response.headers["X-Frame-Options"] = "DENY"
-        return response
-
-    @app.exception_handler(InputError)
-    async def wrong(_: Request, error: InputError) -> Response:
-        return JSONResponse({"detail": str(error), "problems": [asdict(one) for one in error.problems]}, 422)
-
-    @app.exception_handler(CoupoleError)
-    async def failed(_: Request, error: CoupoleError) -> Response:
-        return _no(409, str(error))
-
-
-def _no(code: int, why: str) -> Response:
-    return JSONResponse({"detail": why}, code)
-
-
-def is_command_line(request: Request) -> bool:
-    """By the service's Unix socket, at which only processes of its own user are heard."""
-    server = request.scope.get("server")
-    return server is not None and server[1] is None
-
-
-def _bearer(request: Request) -> str:
-    kind, _, secret = request.headers.get("authorization", "").partition(" ")
-    return secret if kind == "Bearer" else ""
-
-
-def _session_of(request: Request, service: Service) -> Session | None:
-    if is_command_line(request):
-        return service.command_line
-    if bearer := _bearer(request):
-        return service.sessions.of(bearer, script=True)
-    return service.sessions.of(request.cookies.get(service.cookie, ""), script=False)
-
-
-def _is_of_this_machine(request: Request) -> bool:
-    """A connection from an address of this machine itself: nobody else can have one."""
-    if is_command_line(request) or request.client is None:
-        return is_command_line(request)
-    return request.client.host in _LOOPBACK or request.client.host == request.scope["server"][0]
-
-
-def _account(request: Request) -> Account:
-    """Whose session it is; from another machine everybody is an observer."""
-    session: Session = request.state.session
-    account = session.account
-    if _is_of_this_machine(request):
-        return account
-    return replace(account, role=min(account.role, Role.OBSERVER))
-
-
-Who = Annotated[Account, Depends(_account)]
-
-
-def allow(service: Service, who: Account, role: Role, action: str, *, acts: bool = False) -> None:
-    """Raise Refused if somebody's role, or who is in control, forbids an action."""
-    if who.role < role:
-        raise Refused(403, f"{action}: only for {role.word}s; {who.name} is {who.role.word}")
-    of_command_line = who is service.command_line.account
-    if acts and not service.control.act(who, keep=not of_command_line):
-        how = "`coupole queue RIG --take-control` takes it" if of_command_line else "ask for it first"
-        raise Refused(409, f"{action}: {service.control.now.name} is in control; {how}")
 
 
 # -- signing in -----------------------------------------------------------------------------------------------
 
 
 def _add_sign_in(app: FastAPI, service: Service) -> None:
-    page = _SIGN_IN.read_text(encoding="utf-8")
-
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)
-    def front() -> HTMLResponse:
-        return HTMLResponse(page, headers={"Content-Security-Policy": _POLICY})
+    def front(request: Request) -> Response:
+        if request.state.session is None:
+            return sign_in_page()
+        return RedirectResponse("/run", 303)
 
     @app.post("/api/v1/sign-in", responses={401: {"description": "Wrong, or tried too often."}})
     def sign_in(asked: SignIn, request: Request, response: Response) -> dict[str, str]:
         """Begin a session: a cookie for browsers, or for a script `session`, to be sent as `Authorization:
         Bearer`."""
-        here = _is_of_this_machine(request)
+        here = is_of_this_machine(request)
         if asked.name:
             account = service.accounts.sign_in(asked.name, asked.password, here=here)
         else:
             account = service.accounts.sign_in_first(asked.token) if here else None
         if account is None:
-            raise Refused(401, "name or password are wrong, or were wrong too often: try again in a minute")
+            raise NotAllowed(401, "name or password are wrong, or were wrong too often: try again in a minute")
         secret = service.sessions.begin(account, script=asked.script)
         told = {"name": account.name, "role": account.role.word}
         if asked.script:
@@ -206,7 +73,7 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
     @app.post("/api/v1/sign-out")
     def sign_out(who: Who, request: Request, response: Response) -> dict[str, str]:
         """End this session."""
-        service.sessions.end(_bearer(request) or request.cookies.get(service.cookie, ""))
+        service.sessions.end(bearer_of(request) or request.cookies.get(service.cookie, ""))
         response.delete_cookie(service.cookie)
         return {"name": who.name}
 
@@ -217,11 +84,6 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
 
 
 # -- the cell -------------------------------------------------------------------------------------------------
-
-REFUSALS: dict[int | str, dict[str, Any]] = {
-    403: {"description": "Not for this role, or without a fresh token."},
-    409: {"description": "Somebody else is in control, or the cell cannot."},
-}
 
 
 def _add_cell(app: FastAPI, service: Service) -> None:
@@ -277,9 +139,24 @@ def _add_cell(app: FastAPI, service: Service) -> None:
         return service.acquisitions.tell(run, command)
 
 
+def _add_runs(app: FastAPI, service: Service) -> None:
+    @app.get("/api/v1/runs")
+    def runs() -> list[RunRow]:
+        """The cell's runs, the newest first."""
+        return service.runs.rows()
+
+    @app.get("/api/v1/runs/{run}/picture", response_class=Response)
+    def picture(
+        run: Text, shot: Text, width: Annotated[int, Query(ge=1, le=2048)] = 640, saturation: bool = False
+    ) -> Response:
+        """A proven shot as JPEG, developed for the eye; with `saturation` clipped pixels are red."""
+        jpeg = service.runs.picture(run, shot, width, saturation=saturation)
+        return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
+
+
 async def _events(service: Service, request: Request) -> AsyncIterator[str]:
     before, said_s = "", 0.0
-    while _session_of(request, service) is not None:
+    while session_of(request, service) is not None:
         now = service.newest()
         known = now.model_dump_json(exclude={"t"})
         if known != before or time.monotonic() - said_s > _ALIVE_EVERY_S:
@@ -308,7 +185,7 @@ def _add_people(app: FastAPI, service: Service) -> None:
     def accounts(who: Who) -> list[dict[str, str]]:
         """All accounts, for engineers."""
         if who.role < Role.ENGINEER:
-            raise Refused(403, "accounts: only for engineers")
+            raise NotAllowed(403, "accounts: only for engineers")
         return [{"name": one.name, "role": one.role.word} for one in service.accounts.listed()]
 
     @app.post("/api/v1/accounts", responses=REFUSALS)

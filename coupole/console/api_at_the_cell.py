@@ -9,8 +9,11 @@ from anyio import to_thread
 from fastapi import FastAPI, Request
 
 from coupole.console.accounts import Role
-from coupole.console.api import REFUSALS, Refused, Service, Who, allow, is_command_line
+from coupole.console.asking import REFUSALS, Who
+from coupole.console.guard import is_command_line
 from coupole.console.messages import Lease, Light, Move, Output, StateNow, Text, Warn
+from coupole.console.permission import NotAllowed, allow
+from coupole.console.service_parts import Service
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
 from coupole.storage.ledger import Ledger, ledger_of, similar_ids
@@ -40,7 +43,7 @@ def add_routes_at_the_cell(app: FastAPI, service: Service, cell: Cell) -> None:
 def _add_loan(app: FastAPI, service: Service) -> None:
     def borrower(request: Request) -> int:
         if not is_command_line(request) or request.client is None:
-            raise Refused(403, "the cell is lent to commands on this machine, by the console's own socket")
+            raise NotAllowed(403, "the cell is lent to commands on this machine, by the console's own socket")
         return request.client.port
 
     @app.post("/api/v1/cell/lease", responses=REFUSALS)
@@ -53,7 +56,7 @@ def _add_loan(app: FastAPI, service: Service) -> None:
         try:
             service.acquisitions.lend(pid, who.name, asked.what)
         except InputError as error:
-            raise Refused(409, f"{asked.what}: {error}") from error
+            raise NotAllowed(409, f"{asked.what}: {error}") from error
         return {"lent_to": service.acquisitions.lending.lent_to}
 
     @app.delete("/api/v1/cell/lease", responses=REFUSALS)

@@ -144,6 +144,12 @@ class StateNow(BaseModel):
     """Frames of the run."""
     dose: float
     """Light of the run on the object, in lux hours."""
+    object: str
+    """Id of the object of the run; empty if none is named."""
+    dose_before: float
+    """Light on the object before the run, in lux hours."""
+    dose_budget: float | None
+    """Light that the object may receive in its life, by the run's plan."""
     left_s: float | None
     """Expected until the run is complete."""
     halted: str

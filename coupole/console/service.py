@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import fcntl
-import functools
 import getpass
 import ipaddress
 import json
@@ -13,12 +12,9 @@ import os
 import socket
 import ssl
 import struct
-import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import uvicorn
 from fastapi import FastAPI
@@ -26,26 +22,30 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from coupole.console.accounts import Account, Accounts, Role
 from coupole.console.acquisitions import Acquisitions
-from coupole.console.api import Service, make_app
+from coupole.console.api import make_app
 from coupole.console.api_at_the_cell import add_routes_at_the_cell
 from coupole.console.audit import Audit
 from coupole.console.client import service_socket
+from coupole.console.drafts import Desk
 from coupole.console.entering import Entering
-from coupole.console.messages import EntryNow, StateNow
+from coupole.console.messages import StateNow
 from coupole.console.notifications import console_folder, read_settings
 from coupole.console.notifier import Notifier, Occurrences
-from coupole.console.outlook import expected_times
+from coupole.console.object_files import ObjectFiles
+from coupole.console.plan_files import PlanFiles
 from coupole.console.plan_queue import PlanQueue
+from coupole.console.run_files import RunFiles
+from coupole.console.run_watch import RunWatch
+from coupole.console.screens.all_screens import add_screens
+from coupole.console.service_parts import Service
 from coupole.console.sessions import Control, Session, Sessions
+from coupole.console.state_now import Newest, state_of
+from coupole.console.tasks import Tasks
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
-from coupole.plan.rig_devices import in_world
-from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.durable import make_folder
-from coupole.storage.line_file import utc_now, utc_text
-from coupole.storage.run import Run
 
-_STOP_WITHIN_S, _NEWEST_S = 2, 0.1
+_STOP_WITHIN_S = 2
 
 
 def serve(
@@ -84,13 +84,18 @@ def serve(
             contextlib.closing(Entering(cell, plans, queue, acquisitions)) as entering,
         ):
             control = Control()
+            runs = RunFiles(cell.storage_folder, folder / "verified")
+            plan_files = PlanFiles(plans, cell.document.path, folder / "drawings")
+            objects = ObjectFiles(cell, plan_files, runs, cell.state_folder / "objects")
+            tasks, desk = Tasks(folder / "commands"), Desk()
 
             def state() -> StateNow:
                 trouble = "; ".join(filter(None, (audit.trouble, notifier.trouble)))
                 return state_of(cell, queue, acquisitions, control, trouble)
 
             service = Service(
-                accounts, Sessions(), control, audit, queue, acquisitions,
+                cell, plans, accounts, Sessions(), control, audit, queue, acquisitions,
+                plan_files, desk, runs, RunWatch(runs), objects, tasks,
                 state=state,
                 newest=Newest(state),
                 entering=entering,
@@ -103,73 +108,12 @@ def serve(
             tell({"url": url, "token": accounts.first_token, "pid": os.getpid()})
             app = make_app(service)
             add_routes_at_the_cell(app, service, cell)
-            asyncio.run(_run(app, listening, service_socket(cell), context))
-
-
-class Newest:
-    """A state that is made anew by a thread of its own, however many ask for it."""
-
-    def __init__(self, make: Callable[[], StateNow]) -> None:
-        self._make, self._state = make, make()
-        threading.Thread(target=self._renew, name="newest state", daemon=True).start()
-
-    def __call__(self) -> StateNow:
-        return self._state
-
-    def _renew(self) -> None:
-        while True:
-            time.sleep(_NEWEST_S)
+            add_screens(app, service)
             try:
-                self._state = self._make()
-            except Exception as error:  # noqa: BLE001  the old one must not be taken for what is so
-                self._state = self._state.model_copy(update={"trouble": str(error), "t": utc_now()})
-
-
-def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: Control, trouble: str) -> StateNow:
-    """The cell at this moment."""
-    at_work, entry = acquisitions.state or {}, queue.running
-    begun = "halted" if queue.halted else "idle"
-    if entry is not None:
-        begun = "concluding" if entry.run else "starting"
-    faults = ArmFaults(cell.state_folder).standing()
-    return StateNow(
-        state=at_work.get("state", begun),
-        rig=cell.rig.name,
-        simulated=in_world(cell.rig, dry_run=False),
-        run=Path(at_work["run"]).name if at_work else None,
-        view=at_work.get("view"),
-        proven=at_work.get("proven", 0),
-        frames=at_work.get("frames", 0),
-        dose=at_work.get("dose_lux_h", 0.0),
-        left_s=at_work.get("left_s"),
-        halted=queue.halted,
-        arm_fault=faults[-1].message if faults else "",
-        devices=_devices(at_work["run"]) if at_work else {},
-        lent_to=acquisitions.lending.lent_to,
-        queue=_entries_now(queue, at_work.get("left_s")),
-        in_control=control.now.name,
-        asked_by=control.now.asked_by,
-        trouble=trouble,
-        t=utc_now(),
-    )
-
-
-def _entries_now(queue: PlanQueue, left_s: float | None) -> list[EntryNow]:
-    times = expected_times(queue.entries, datetime.now(UTC), left_s=left_s, halted=bool(queue.halted))
-    found = []
-    for entry in queue.entries:
-        begin, end = (utc_text(time) if time else None for time in times.get(entry.id, (None, None)))
-        found.append(EntryNow(**dict(entry), expected_begin=begin, expected_end=end))
-    return found
-
-
-@functools.lru_cache(4)
-def _devices(run: str) -> dict[str, Any]:
-    """Identities of a run's devices, which do not change."""
-    try:
-        return dict(Run(Path(run)).about["devices"])
-    except (InputError, KeyError):
-        return {}
+                asyncio.run(_run(app, listening, service_socket(cell), context))
+            finally:
+                tasks.close()
+                desk.close()
 
 
 # -- sockets --------------------------------------------------------------------------------------------------
@@ -191,7 +135,7 @@ class _OfThisUser(H11Protocol):
 
 
 async def _run(app: FastAPI, listening: socket.socket, path: Path, tls: ssl.SSLContext | None) -> None:
-    page, line = uvicorn.Server(_config(app)), uvicorn.Server(_config(app))
+    page, line = uvicorn.Server(_config(app, lifespan="on")), uvicorn.Server(_config(app, lifespan="off"))
     page.config.ssl_context_factory = (lambda *_: tls) if tls else None
     line.config.http = _OfThisUser
     path.unlink(missing_ok=True)
@@ -208,13 +152,13 @@ async def _run(app: FastAPI, listening: socket.socket, path: Path, tls: ssl.SSLC
             path.unlink(missing_ok=True)
 
 
-def _config(app: FastAPI) -> uvicorn.Config:
+def _config(app: FastAPI, lifespan: Literal["on", "off"]) -> uvicorn.Config:
     return uvicorn.Config(
         app,
         log_level="warning",
         access_log=False,
         timeout_graceful_shutdown=_STOP_WITHIN_S,
-        lifespan="off",
+        lifespan=lifespan,
         proxy_headers=False,
         server_header=False,
     )

@@ -28,9 +28,10 @@ class PlanFiles:
     """The calibrations that plan or rig name as in force; None if `none`."""
 
 
-def read_plan(plan_path: Path, rig_path: Path | None = None) -> PlanFiles:
-    """Read a plan with its rig, or with another one. Raises InputError with all problems of all files."""
-    document = yamlfile.read(plan_path)
+def read_plan(plan_path: Path, rig_path: Path | None = None, *, text: str | None = None) -> PlanFiles:
+    """Read a plan with its rig, or with another one; `text` is read in place of the plan's file. Raises InputError
+    with all problems of all files."""
+    document = yamlfile.read(plan_path) if text is None else yamlfile.parse(plan_path, text)
     plan, problems = document.problems(Plan)
     cell: Cell | None = None
     rig_path = rig_path or _named_rig(document)

@@ -55,9 +55,10 @@ class Job:
         return Inputs(self.document.path, self.cell.document.path, tuple(others), described_arm(self.cell.rig))
 
 
-def read_job(plan_path: Path, rig_path: Path | None = None) -> Job:
-    """Read a plan and all files that it names. Raises InputError with all problems of all files."""
-    files = read_plan(plan_path, rig_path)
+def read_job(plan_path: Path, rig_path: Path | None = None, *, text: str | None = None) -> Job:
+    """Read a plan and all files that it names; `text` is read in place of the plan's file. Raises InputError with
+    all problems of all files."""
+    files = read_plan(plan_path, rig_path, text=text)
     shape = read_object(files)
     calibrations = None
     if files.record_paths is not None:

@@ -89,6 +89,26 @@ def tail(path: Path, most_bytes: int) -> list[Event]:
     return list(_events(path, lines[1:] if begun else lines))
 
 
+class Follower:
+    """Reads what a journal gains, while another process writes it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._read = path, 0
+
+    def news(self) -> list[Event]:
+        """The events since the last call; at first all. Raises StorageError."""
+        try:
+            with self._path.open("rb") as file:
+                file.seek(self._read)
+                whole, newline, _ = file.read().rpartition(b"\n")
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise StorageError(f"{self._path}: cannot read the journal: {error.strerror}") from error
+        self._read += len(whole) + len(newline)
+        return list(_events(self._path, whole.splitlines()))
+
+
 def version(path: Path) -> int:
     """Version of a journal; the current one if it does not exist yet."""
     first = next(read(path), None)

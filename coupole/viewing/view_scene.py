@@ -152,10 +152,6 @@ def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals
         else:
             why = _refusal(view, itinerary.refusals)
             stops.append(_refused(number, view, why, (place_deg, home_deg), rig, bodies, shadows))
-    measured = None
-    if len(corners_mm):
-        vertices, faces = np.unique(corners_mm.reshape(-1, 3), axis=0, return_inverse=True)
-        measured = Solid("object", vertices, faces.reshape(-1, 3))
     used = np.zeros(len(job.cell.leds.ids), np.bool_)
     used[leds_of_plan(job.plan, job.cell.leds, rig.support.base_from_support.matrix())] = True
     return Scene(
@@ -163,7 +159,7 @@ def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals
         rig,
         tuple(stops),
         tuple(refusals),
-        measured,
+        measured_solid(job) if len(corners_mm) else None,
         shadows.patches.of_triangles(len(corners_mm)),
         tuple(map(_keep_out_solid, rig.keep_out)),
         shadows.leds_mm,
@@ -172,6 +168,12 @@ def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals
         bodies is not None,
         capsules_of(shadows.arm),
     )
+
+
+def measured_solid(job: Job) -> Solid:
+    """The object's mesh, in the support frame."""
+    vertices, faces = np.unique(job.shape.corners_mm.reshape(-1, 3), axis=0, return_inverse=True)
+    return Solid("object", vertices, faces.reshape(-1, 3))
 
 
 def _refusal(view: ViewPose, refusals: Sequence[str]) -> str:

@@ -1,0 +1,65 @@
+"""A run's journal in plain words, for people who did not write it."""
+
+from __future__ import annotations
+
+from typing import assert_never
+
+from coupole.storage.journal_events import (
+    ArmSettled,
+    BurstBegun,
+    BurstEnded,
+    Continued,
+    Event,
+    FaultNoted,
+    FrameProven,
+    GapFound,
+    JournalBegun,
+    MoveBegun,
+    Paused,
+    ReshootBegun,
+    SessionResumed,
+    SessionStarted,
+    SessionStopped,
+    ViewBegun,
+    ViewSealed,
+)
+
+
+def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
+    """What happened; empty for what a person does not need to read (each proven frame, and the file's head)."""
+    match event:
+        case JournalBegun() | FrameProven() | ArmSettled():
+            return ""
+        case SessionStarted():
+            return "began: the devices are open"
+        case SessionResumed():
+            return "resumed: the devices are open"
+        case ViewBegun():
+            hidden = f"; {len(event.hidden_leds)} LEDs are hidden from it" if event.hidden_leds else ""
+            return f"view {event.view}{hidden}"
+        case MoveBegun():
+            return f"the arm moves to {event.view}"
+        case BurstBegun():
+            return f"{event.view}: a burst begins, at most {max(event.planned_lux_h, default=0.0):.3f} lux h"
+        case BurstEnded():
+            hot = f", hottest board {event.hottest_board_c:.0f} C" if event.hottest_board_c is not None else ""
+            return f"{event.view}: {event.frames} frames of {event.steps} steps{hot}"
+        case GapFound():
+            why = f" ({event.reason})" if event.reason else ""
+            dead = f"; {len(event.dead_leds)} LEDs drew no current" if event.dead_leds else ""
+            return f"{event.view}: {len(event.shots)} frames are not proven{why}{dead}"
+        case ReshootBegun():
+            return f"{event.view}: {len(event.shots)} shots are taken again"
+        case FaultNoted():
+            return f"fault: {event.message}"
+        case Paused():
+            return "paused: lights off, arm still"
+        case Continued():
+            return "went on"
+        case ViewSealed():
+            return f"view {event.view} is finished"
+        case SessionStopped():
+            why = f": {event.reason}" if event.reason else ""
+            return {"done": "done", "interrupted": "stopped", "failed": "failed"}[event.outcome] + why
+        case _:
+            assert_never(event)

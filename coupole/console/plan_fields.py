@@ -1,0 +1,192 @@
+"""The commonest parts of a plan as fields of a form, and a plan's text with other values in them.
+
+Comments and everything that no field stands for stay as they are written.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+
+from coupole.errors import InputError
+from coupole.plan import yamlfile
+
+ALL_ROUND = "round"
+"""Name of the views that the form makes."""
+
+
+@dataclass(frozen=True)
+class PlanFields:
+    """Empty text, or None: the plan does not say, or says it in a way that only its text shows."""
+
+    object_id: str = ""
+    mesh: str = ""
+    mesh_unit: str = "mm"
+    budget_lux_h: float | None = None
+    distance_mm: float | None = None
+    elevations_deg: tuple[float, ...] = ()
+    azimuths: int | None = None
+    """Views at each elevation, evenly round the object."""
+    exposures_us: tuple[int, ...] = ()
+    every_led: int | None = None
+    """1: all LEDs; 4: each fourth."""
+    darks_per_view: int | None = None
+    own_views: bool = False
+    """The views are not those of the form."""
+    own_lights: bool = False
+    """The lights are not those of the form."""
+
+
+def fields_of(path: Path, text: str) -> PlanFields:
+    """Raises InputError: not YAML."""
+    data = yamlfile.parse(path, text).data
+    measured = data.get("object") if isinstance(data.get("object"), dict) else {}
+    assert isinstance(measured, dict)
+    fields = PlanFields(
+        object_id=str(measured.get("id", "")),
+        mesh=str(measured.get("mesh") or ""),
+        mesh_unit=str(measured.get("mesh_unit", "mm")),
+        budget_lux_h=_number(measured.get("dose_budget_lux_h")),
+        darks_per_view=_whole(data.get("darks_per_view")),
+        exposures_us=_exposures(data.get("exposure")),
+    )
+    return _with_lights(_with_views(fields, data.get("views")), data.get("lights"))
+
+
+def text_with(path: Path, text: str, fields: PlanFields, target_mm: tuple[float, ...] | None = None) -> str:
+    """A plan's text with these fields; `target_mm` is where its views look, if they are the form's. Raises
+    InputError: not YAML."""
+    yamlfile.parse(path, text)
+    before = fields_of(path, text)
+    yaml = YAML(typ="rt")
+    yaml.width, yaml.preserve_quotes = 110, True
+    data = yaml.load(text)
+    measured = data.get("object")
+    if measured is None and (fields.object_id or fields.mesh):
+        measured = data["object"] = CommentedMap()
+    if measured is not None:
+        _set(measured, "id", fields.object_id or None, before.object_id or None)
+        _set(measured, "mesh", fields.mesh or None, before.mesh or None)
+        _set(measured, "mesh_unit", fields.mesh_unit, before.mesh_unit)
+        _set(measured, "dose_budget_lux_h", fields.budget_lux_h, before.budget_lux_h)
+    _set(data, "darks_per_view", fields.darks_per_view, before.darks_per_view)
+    if fields.exposures_us and fields.exposures_us != before.exposures_us:
+        data["exposure"] = _flow(_exposure(fields.exposures_us))
+    if fields.every_led and not fields.own_lights and fields.every_led != before.every_led:
+        every = fields.every_led
+        data["lights"] = _flow({"kind": "all"} if every == 1 else {"kind": "every", "every": every})
+    if not fields.own_views and (target_mm is not None or not _same_views(fields, before)):
+        data["views"] = _views(fields, target_mm or _target(data.get("views")))
+    out = io.StringIO()
+    yaml.dump(data, out)
+    return out.getvalue()
+
+
+def _same_views(one: PlanFields, other: PlanFields) -> bool:
+    return all(
+        getattr(one, name) == getattr(other, name)
+        for name in ("distance_mm", "elevations_deg", "azimuths", "own_views")
+    )
+
+
+def _set(mapping: Any, key: str, value: Any, before: Any) -> None:
+    """Only what has changed; None takes it out."""
+    if value == before:
+        return
+    if value is None:
+        mapping.pop(key, None)
+    else:
+        mapping[key] = value
+
+
+def _flow(mapping: dict[str, Any]) -> CommentedMap:
+    made = CommentedMap(mapping)
+    made.fa.set_flow_style()
+    return made
+
+
+def _listed(values: Any) -> CommentedSeq:
+    made = CommentedSeq(values)
+    made.fa.set_flow_style()
+    return made
+
+
+def _exposure(exposures_us: tuple[int, ...]) -> dict[str, Any]:
+    if len(exposures_us) == 1:
+        return {"kind": "fixed", "exposure_us": exposures_us[0]}
+    return {"kind": "bracket", "exposures_us": _listed(sorted(exposures_us))}
+
+
+def _exposures(exposure: Any) -> tuple[int, ...]:
+    if not isinstance(exposure, dict):
+        return ()
+    several = exposure.get("exposures_us")
+    found = several if isinstance(several, list) else [exposure.get("exposure_us")]
+    whole = [value for value in found if isinstance(value, int) and not isinstance(value, bool)]
+    return tuple(whole) if len(whole) == len(found) else ()
+
+
+def _with_lights(fields: PlanFields, lights: Any) -> PlanFields:
+    if isinstance(lights, dict):
+        if lights == {"kind": "all"}:
+            return replace(fields, every_led=1)
+        if set(lights) == {"kind", "every"} and lights["kind"] == "every":
+            return replace(fields, every_led=_whole(lights["every"]))
+    return replace(fields, own_lights=lights is not None)
+
+
+def _with_views(fields: PlanFields, views: Any) -> PlanFields:
+    if isinstance(views, list) and len(views) == 1 and isinstance(views[0], dict):
+        grid = views[0]
+        azimuths, elevations = grid.get("azimuths_deg"), grid.get("elevations_deg")
+        known = {"kind", "name", "target_mm", "distance_mm", "azimuths_deg", "elevations_deg"}
+        if grid.get("kind") == "grid" and set(grid) == known and isinstance(azimuths, list):
+            even = azimuths == list(_azimuths(len(azimuths)))
+            if even and isinstance(elevations, list) and all(_number(one) is not None for one in elevations):
+                return replace(
+                    fields,
+                    azimuths=len(azimuths),
+                    elevations_deg=tuple(elevations),
+                    distance_mm=_number(grid.get("distance_mm")),
+                )
+    return replace(fields, own_views=views is not None)
+
+
+def _views(fields: PlanFields, target_mm: tuple[float, ...]) -> CommentedSeq:
+    if not (fields.azimuths and fields.elevations_deg and fields.distance_mm):
+        raise InputError("views all round want a distance, elevations and how many at each")
+    grid = CommentedMap(
+        kind="grid",
+        name=ALL_ROUND,
+        target_mm=_listed([round(float(value), 1) for value in target_mm]),
+        distance_mm=fields.distance_mm,
+        azimuths_deg=_listed(_azimuths(fields.azimuths)),
+        elevations_deg=_listed(fields.elevations_deg),
+    )
+    return CommentedSeq([grid])
+
+
+def _azimuths(count: int) -> tuple[float, ...]:
+    """Evenly round the object, beginning at -90: towards who stands before the cell."""
+    found = [round((-90.0 + 360.0 * number / count + 180.0) % 360.0 - 180.0, 3) for number in range(count)]
+    return tuple(int(angle) if angle == int(angle) else angle for angle in found)
+
+
+def _target(views: Any) -> tuple[float, ...]:
+    for view in views or []:
+        if isinstance(view, dict) and isinstance(view.get("target_mm"), list):
+            return tuple(view["target_mm"])
+    return (0.0, 0.0, 0.0)
+
+
+def _number(value: Any) -> float | None:
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _whole(value: Any) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) else None

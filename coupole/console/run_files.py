@@ -1,0 +1,210 @@
+"""The runs of a cell as its console shows them, read from their folders alone."""
+
+from __future__ import annotations
+
+import functools
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+from coupole.errors import CoupoleError, InputError, StorageError
+from coupole.plan.shot_id import Led, ShotId
+from coupole.storage import frame_file
+from coupole.storage.journal_events import FrameProven
+from coupole.storage.run import Run
+from coupole.storage.run_json import RUN_JSON
+from coupole.storage.run_status import Status, status
+from coupole.storage.view_reader import View, read_view
+from coupole.viewing.raw_preview import Coding, Figures, figures, look
+
+PICTURE_WIDTHS = (160, 320, 640, 1280, 2048)
+_PICTURES_KEPT = 600
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """A run in a table."""
+
+    name: str
+    state: str
+    """As `run_status.Status.state`, or `damaged`."""
+    object: str
+    created: str
+    operator: str
+    simulated: bool
+    proven: int
+    frames: int
+    bytes: int
+    archived: bool
+    """All views are compressed."""
+    verified: str
+    """When it was last read back without a fault and has not changed since, UTC; empty if never."""
+    thumbnail: str
+    """A shot to be shown; empty without one."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame to be looked at."""
+
+    shot: str
+    exposure_us: int
+    led: int
+    frame_id: int
+    t_trigger_ns: int
+    board_c: float
+    current_ma: int
+    joints_deg: tuple[float, ...]
+    figures: Figures
+    coding: Coding
+
+
+class RunFiles:
+    """Runs in a cell's storage folder, by the names of their folders."""
+
+    def __init__(self, folder: Path, notes: Path) -> None:
+        """`notes`: folder for what is noted of runs, such as when they were verified."""
+        self.folder, self._notes, self._lock = folder, notes, threading.Lock()
+        self._rows: dict[str, tuple[float, RunRow]] = {}
+        self._proven: dict[str, tuple[float, dict[ShotId, FrameProven]]] = {}
+        self._pictures = functools.lru_cache(_PICTURES_KEPT)(self._picture)
+
+    def names(self) -> list[str]:
+        """The newest first."""
+        if not self.folder.is_dir():
+            return []
+        found = [path.parent.name for path in self.folder.glob(f"*/{RUN_JSON}")]
+        return sorted(found, reverse=True)
+
+    def run(self, name: str) -> Run:
+        """Raises InputError: no run of this cell has this name."""
+        if not name or "/" in name or name.startswith(".") or not (self.folder / name / RUN_JSON).is_file():
+            raise InputError(f"{name!r}: no run of this cell")
+        return Run(self.folder / name)
+
+    def rows(self) -> list[RunRow]:
+        """All runs; read anew only where something has changed."""
+        return [self._row(name) for name in self.names()]
+
+    def status(self, name: str) -> Status:
+        """Raises InputError, StorageError."""
+        return status(self.run(name))
+
+    def proven(self, name: str) -> dict[ShotId, FrameProven]:
+        """Raises InputError, StorageError."""
+        run, changed_s = self.run(name), self._changed_s(name)
+        with self._lock:
+            known_s, found = self._proven.get(name, (0.0, {}))
+            if known_s != changed_s:
+                found = run.proven()
+                self._proven[name] = changed_s, found
+        return found
+
+    def picture(self, name: str, shot: str, width_px: int, *, saturation: bool = False) -> bytes:
+        """JPEG of a proven shot, at most `width_px` wide (rounded up to one of PICTURE_WIDTHS). Raises InputError,
+        StorageError."""
+        width_px = next((width for width in PICTURE_WIDTHS if width >= width_px), PICTURE_WIDTHS[-1])
+        event = self._event(name, shot)
+        return self._pictures(name, shot, event.xxh3, width_px, saturation)
+
+    def frame(self, name: str, shot: str) -> Frame:
+        """Figures of one frame. Raises InputError, StorageError."""
+        event = self._event(name, shot)
+        view = self._view(name, event)
+        record = view.records[event.index]
+        coding = Coding(view.pattern, view.black_dn, view.white_dn)
+        pose = view.poses[record["pose"]] if len(view.poses) else None
+        return Frame(
+            shot=shot,
+            exposure_us=int(record["exposure_us"]),
+            led=int(record["led"]),
+            frame_id=int(record["frame_id"]),
+            t_trigger_ns=int(record["t_trigger_ns"]),
+            board_c=int(record["board_temperature_dc"]) / 10,
+            current_ma=int(record["led_current_ma"]),
+            joints_deg=() if pose is None else tuple(float(angle) for angle in pose["joints_deg"]),
+            figures=figures(view.pixels(event.index), coding),
+            coding=coding,
+        )
+
+    def note_verified(self, name: str, t: str) -> None:
+        """It was read back at `t` without a fault."""
+        self._notes.mkdir(parents=True, exist_ok=True)
+        (self._notes / name).write_text(f"{t} {self._changed_s(name)!r}", encoding="utf-8")
+
+    def _verified(self, name: str) -> str:
+        try:
+            t, changed_s = (self._notes / name).read_text(encoding="utf-8").split()
+        except (OSError, ValueError):
+            return ""
+        return t if changed_s == repr(self._changed_s(name)) else ""
+
+    def _changed_s(self, name: str) -> float:
+        """When the newest of a run's journal and views was written."""
+        folder = self.folder / name
+        paths = [folder / "journal.jsonl", *(folder / "views").glob("*.h5")]
+        return max((path.stat().st_mtime for path in paths if path.exists()), default=0.0)
+
+    def _row(self, name: str) -> RunRow:
+        changed_s = self._changed_s(name)
+        known_s, row = self._rows.get(name, (-1.0, None))
+        if row is None or known_s != changed_s or row.state in ("running", "paused", "created"):
+            row = self._read_row(name)
+            self._rows[name] = changed_s, row
+        verified = self._verified(name)
+        return row if verified == row.verified else RunRow(**{**vars(row), "verified": verified})
+
+    def _read_row(self, name: str) -> RunRow:
+        try:
+            run = self.run(name)
+            found, proven = status(run), self.proven(name)
+            thumbnail = str(_typical(proven) or "")
+            archived = bool(proven) and all(
+                frame_file.read_layout(run.view_path(view)).archived for view in run.about["views"]
+            )
+        except (CoupoleError, KeyError, OSError) as error:
+            return RunRow(name, "damaged", "", "", str(error), False, 0, 0, 0, False, "", "")
+        views = (run.folder / "views").glob("*.h5")
+        return RunRow(
+            name=name,
+            state=found.state,
+            object=run.about.get("object") or "",
+            created=run.about["created"],
+            operator=str(run.about.get("operator", "")),
+            simulated=run.simulated,
+            proven=sum(count for count, _ in found.views.values()),
+            frames=sum(count for _, count in found.views.values()),
+            bytes=sum(path.stat().st_blocks * 512 for path in views),
+            archived=archived,
+            verified=self._verified(name),
+            thumbnail=thumbnail,
+        )
+
+    def _event(self, name: str, shot: str) -> FrameProven:
+        try:
+            wanted = ShotId.parse(shot)
+        except ValueError as error:
+            raise InputError(f"{shot!r}: expected a shot such as top/led0417/e0") from error
+        event = self.proven(name).get(wanted)
+        if event is None:
+            raise InputError(f"{shot}: not proven in {name}")
+        return event
+
+    def _view(self, name: str, event: FrameProven) -> View:
+        path = self.run(name).folder / event.file
+        if not path.is_file():
+            raise StorageError(f"{path}: no such file")
+        return read_view(path, [event])
+
+    def _picture(self, name: str, shot: str, _: str, width_px: int, saturation: bool) -> bytes:
+        event = self._event(name, shot)
+        view = self._view(name, event)
+        coding = Coding(view.pattern, view.black_dn, view.white_dn)
+        return look(view.pixels(event.index), coding, width_px, saturation=saturation, focus=False)
+
+
+def _typical(proven: dict[ShotId, FrameProven]) -> ShotId | None:
+    """A shot with light from the middle of a run's first view."""
+    lit = [shot for shot in proven if shot.is_shot and isinstance(shot.light, Led)]
+    lit = [shot for shot in lit if shot.view == lit[0].view]
+    return lit[len(lit) // 2] if lit else None

@@ -1,0 +1,175 @@
+"""The object: is it this one, how it lies on the support, and all light that it has received."""
+
+from __future__ import annotations
+
+import html
+import math
+import secrets
+from urllib.parse import quote
+
+from nicegui import ui
+
+from coupole.console.drafts import Draft
+from coupole.console.screens.parts import Choice, button, facts_html, named, panel, table_html
+from coupole.console.screens.visit import Visit, in_thread
+from coupole.errors import CoupoleError, InputError
+from coupole.storage.ledger import History
+
+_SEND = """async event => {
+  const file = event.target.files[0];
+  if (!file) return;
+  const {token} = await (await fetch("/api/v1/token")).json();
+  const reply = await fetch(ADDRESS, {method: "PUT", body: file,
+    headers: {"X-Coupole-Token": token, "Content-Type": "application/octet-stream"}});
+  emit(reply.ok ? "" : ((await reply.json()).detail || "refused"));
+}"""
+
+
+def build(visit: Visit) -> None:
+    """Build the screen."""
+    ui.timer(0.0, _Screen(visit).open_first, once=True)
+
+
+class _Screen:
+    def __init__(self, visit: Visit) -> None:
+        self._visit, self._objects = visit, visit.service.objects
+        with ui.row().classes("bar"):
+            self._chooser = Choice("Object", "object", self._show)
+        with ui.element("div").classes("columns"):
+            with panel("Is this your object?"):
+                self._photograph = ui.column().classes("cell")
+                self._lies = named(ui.html("", sanitize=False), "lies").style("width:100%")
+                self._plans = Choice("As this plan has it", "by-plan", self._draw)
+            with panel("Light on it"):
+                self._sums = named(ui.html("", sanitize=False), "light").style("width:100%")
+                self._bar = ui.linear_progress(0.0, show_value=False).props('aria-label="light of its budget"')
+                self._runs = ui.html("", sanitize=False).style("width:100%")
+                self._by_hand()
+
+    async def open_first(self) -> None:
+        """The object of the run at work, or else the first."""
+        ids = await in_thread(self._objects.ids)
+        if not ids:
+            self._sums.set_content("<p>No plan, run or ledger names an object yet.</p>")
+            return
+        here = self._visit.now.object
+        self._chooser.offer(dict(zip(ids, ids, strict=True)), here if here in ids else ids[0])
+        await self._show()
+
+    async def _show(self) -> None:
+        object_id = self._chooser.value
+        try:
+            history = await in_thread(self._objects.history, object_id)
+            plans = await in_thread(self._objects.plans_of, object_id)
+            similar = await in_thread(self._objects.similar, object_id)
+            runs = await in_thread(self._objects.runs_of, object_id)
+            photograph = await in_thread(self._objects.photograph, object_id)
+        except CoupoleError as error:
+            self._visit.say(str(error), bad=True)
+            return
+        budget = min((one.budget_lux_h for one in plans if one.budget_lux_h is not None), default=None)
+        self._show_light(history, budget, similar)
+        operators = {row.name: row.operator for row in runs}
+        self._runs.set_content(_light_table(history, operators))
+        self._show_photograph(object_id, there=photograph is not None)
+        with_mesh = [one.plan for one in plans if one.mesh]
+        self._plans.offer({name: name for name in with_mesh}, with_mesh[0] if with_mesh else "")
+        await self._draw()
+
+    def _show_light(self, history: History, budget: float | None, similar: list[str]) -> None:
+        total = history.total_lux_h
+        figures = {"in its life": f"{total:.3f} lux h"}
+        if budget is not None:
+            figures["it may receive"] = f"{budget:g} lux h, by its plans"
+            figures["left"] = f"{max(0.0, budget - total):.3f} lux h"
+        if history.unsettled_lux_h:
+            figures["of which at most"] = f"{history.unsettled_lux_h:.3f} lux h: how a burst ended is not known"
+        if history.of_unknown_spectrum_lux_h < total:
+            figures["damaging, 300 to 780 nm"] = f"{1e3 * history.damage_wh_m2:.4f} mW h/m2 weighted"
+        said = facts_html(figures)
+        if self._visit.now.simulated:
+            said += '<p class="hint">Light of a simulated cell is none: its runs enter nothing here.</p>'
+        for other in similar:
+            said += f'<p class="warm">There is also an object {html.escape(other)}: is it the same?</p>'
+        if history.unreadable:
+            said += f'<p class="bad">{history.unreadable} lines of the ledger cannot be read.</p>'
+        self._sums.set_content(said)
+        self._bar.set_visibility(budget is not None)
+        self._bar.set_value(min(1.0, total / budget) if budget else 0.0)
+
+    def _by_hand(self) -> None:
+        with ui.row().classes("bar"):
+            amount = named(ui.number("Light given elsewhere, lux h", min=0).classes("field"), "amount")
+            note = named(
+                ui.input("What it was", placeholder="photographed, 20 min at 500 lux").classes("field"), "note"
+            )
+
+            async def enter() -> None:
+                object_id, account = self._chooser.value, self._visit.account
+                said = f"{note.value or ''}".strip()
+                by = f" (entered by {account.name})" if account else ""
+                dose = float(amount.value) if amount.value else math.nan
+
+                def do() -> bool:
+                    if not said:
+                        raise InputError("expected what that light was")
+                    self._objects.enter_light(object_id, dose, said + by)
+                    return True
+
+                if await self._visit.act(
+                    f"dose {object_id}: {dose:g} lux h, {said}", do, acts=False, done="entered"
+                ):
+                    amount.set_value(None)
+                    note.set_value("")
+                    await self._show()
+
+            button("Enter", enter, name="enter-light").set_enabled(self._visit.may_act)
+
+    def _show_photograph(self, object_id: str, *, there: bool) -> None:
+        self._photograph.clear()
+        address = f"/api/v1/objects/{quote(object_id)}/photograph"
+        with self._photograph:
+            if there:
+                fresh = f"{address}?{secrets.token_hex(4)}"
+                ui.html(
+                    f'<img class="frame-picture" src="{fresh}" alt="photograph of {html.escape(object_id)}">',
+                    sanitize=False,
+                ).style("width:100%")
+            if self._visit.may_act:
+                with ui.element("label").classes("choice"):
+                    ui.label("Another photograph" if there else "A photograph of it: JPEG, PNG or TIFF")
+                    chooser = named(ui.element("input").props('type=file accept="image/*"'), "photograph")
+                    chooser.on("change", self._sent, js_handler=_SEND.replace("ADDRESS", f'"{address}"'))
+
+    async def _sent(self, event: object) -> None:
+        if refusal := str(getattr(event, "args", "")):
+            self._visit.say(refusal, bad=True)
+        await self._show()
+
+    async def _draw(self) -> None:
+        name, service = self._plans.value, self._visit.service
+        if not name:
+            self._lies.set_content('<p class="hint">No plan names a mesh of it.</p>')
+            return
+        self._lies.set_content('<p class="hint">drawing</p>')
+        path = service.plan_files.drawings / secrets.token_hex(8) / "object.png"
+        try:
+            text = await in_thread(service.plan_files.read, name)
+            await service.desk.draw_object(Draft(service.plan_files.path(name), text), path)
+        except CoupoleError as error:
+            self._lies.set_content(f'<p class="bad">{html.escape(str(error))}</p>')
+            return
+        self._lies.set_content(
+            f'<img class="frame-picture" src="/drawings/{path.parent.name}/object.png" alt="the mesh of '
+            f'{html.escape(self._chooser.value)} on the support, from above and from the front">'
+        )
+
+
+def _light_table(history: History, operators: dict[str, str]) -> str:
+    rows = []
+    for run in history.runs:
+        part = history.of_run(run)
+        notes = "; ".join(entry.note for entry in part.entries if entry.note)
+        first = part.entries[0].t[:16].replace("T", " ")
+        rows.append((first, run or "by hand", operators.get(run, ""), f"{part.total_lux_h:.3f}", notes))
+    return table_html(("UTC", "run", "by", "lux h", "remark"), rows) if rows else "<p>None is recorded.</p>"

@@ -1,0 +1,393 @@
+"""Plans: form and YAML side by side, mistakes at their lines, preflight as one types, the cell with the views."""
+
+from __future__ import annotations
+
+import asyncio
+import html
+import secrets
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from nicegui import ui
+
+from coupole.console.drafts import Checked, Draft
+from coupole.console.messages import NewEntry, StateNow
+from coupole.console.plan_fields import PlanFields, fields_of, text_with
+from coupole.console.screens.parts import Choice, button, facts_html, heading, named, panel, table_html
+from coupole.console.screens.visit import Visit, enter, in_background, in_thread
+from coupole.errors import InputError, Problem
+from coupole.viewing.terminal import bytes_text, duration_text
+
+_AFTER_TYPING_S = 0.6
+_UNITS = ["mm", "m", "um"]
+_KINDS = {
+    "round": "views all round an object",
+    "views": "a view from above and a ring",
+    "darks": "dark frames only",
+}
+
+
+def build(visit: Visit) -> None:
+    """Build the screen."""
+    ui.timer(0.0, _Screen(visit).open_first, once=True)
+
+
+class _Screen:
+    def __init__(self, visit: Visit) -> None:
+        self._visit, self._plans = visit, visit.service.plan_files
+        self._name, self._text, self._saved = "", "", ""
+        self._fields = PlanFields()
+        self._filling = False
+        self._turn = 0
+        with ui.row().classes("bar"):
+            self._chooser = Choice("Plan", "plan", self._chosen)
+            button("New plan", self._ask_new, icon="add", name="new-plan")
+            self._save = button("Save", self._save_plan, icon="save", name="save", kind="main")
+            self._enter = button("Put in the queue", self._enter_plan, icon="playlist_add", name="enter")
+        with ui.element("div").classes("columns"):
+            with panel("Form"):
+                self._form()
+            with panel("YAML"):
+                self._editor = named(
+                    ui.codemirror(language="YAML", on_change=self._typed, line_wrapping=True), "yaml"
+                ).classes("editor")
+                self._problems = named(ui.html("", sanitize=False), "problems").props("role=status")
+        with ui.element("div").classes("columns"):
+            with panel("Preflight"):
+                self._verdict = named(ui.html("", sanitize=False), "verdict").props("role=status")
+            with panel("Views"):
+                self._views = ui.html("", sanitize=False).style("width:100%")
+        with panel("The cell"):
+            with ui.row().classes("bar"):
+                self._draw = button("Draw with paths", self._draw_cell, icon="view_in_ar", name="draw")
+                self._drawing = ui.label("Plans the arm's paths, which may take a minute.").classes("hint")
+            self._cell = ui.column().classes("cell")
+        visit.follow(self._state)
+
+    # -- which plan ---------------------------------------------------------------------------------------------
+
+    async def open_first(self) -> None:
+        names = await in_thread(self._plans.names)
+        if names:
+            self._chooser.offer(dict(zip(names, names, strict=True)), names[0])
+            await self._chosen()
+        else:
+            self._show_text("")
+
+    async def _chosen(self) -> None:
+        name = self._chooser.value
+        if not name or name == self._name:
+            return
+        try:
+            text = await in_thread(self._plans.read, name)
+        except InputError as error:
+            self._visit.say(str(error), bad=True)
+            return
+        self._name, self._saved = name, text
+        self._cell.clear()
+        self._show_text(text)
+
+    async def _ask_new(self) -> None:
+        with ui.dialog() as dialog, ui.card().classes("dialog"):
+            heading("New plan")
+            name = named(ui.input("Name", placeholder="vase-1").classes("field"), "new-name")
+            kind = Choice("Begin with", "kind")
+            kind.offer(_KINDS, "round")
+            with ui.row():
+                button("Make", lambda: dialog.submit(True), name="make", kind="main")
+                button("Cancel", lambda: dialog.submit(False), name="cancel")
+        if not await dialog:
+            return
+        visit, plans = self._visit, self._plans
+        made = await visit.act(
+            f"new plan {name.value}", lambda: plans.create(str(name.value or ""), kind.value), acts=False
+        )
+        if made is not None:
+            names = await in_thread(plans.names)
+            self._chooser.offer(dict(zip(names, names, strict=True)), made)
+            await self._chosen()
+
+    async def _save_plan(self) -> bool:
+        name, text, saved = self._name, self._text, self._saved
+        done = await self._visit.act(
+            f"save plan {name}", lambda: self._plans.write(name, text, saved), acts=False, done="saved"
+        )
+        if done:
+            self._saved = text
+            self._state(self._visit.now)
+        return bool(done)
+
+    async def _enter_plan(self) -> None:
+        if self._text != self._saved and not await self._save_plan():
+            return
+        await enter(self._visit, NewEntry(plan=self._name), self._name)
+
+    def _state(self, _: StateNow) -> None:
+        may = self._visit.may_act and bool(self._name)
+        self._save.set_enabled(may and self._text != self._saved)
+        self._enter.set_enabled(may)
+        self._draw.set_enabled(bool(self._name))
+
+    # -- the form -----------------------------------------------------------------------------------------------
+
+    def _form(self) -> None:
+        with ui.element("div").classes("fields"):
+            self._object = named(ui.input("Object: its accession number").classes("field"), "object")
+            self._mesh = named(ui.input("Mesh: PLY, STL or OBJ").classes("field"), "mesh")
+            self._unit = Choice("Unit of the mesh", "mesh-unit", self._filled)
+            self._budget = named(ui.number("Light in its life at most, lux h", min=0).classes("field"), "budget")
+            self._distance = ui.number("Distance of the camera, mm", min=1, max=3000).classes("field")
+            self._elevations = named(ui.input("Elevations, degrees").classes("field"), "elevations")
+            self._azimuths = named(ui.number("Views at each elevation", min=1, max=360, precision=0), "azimuths")
+            self._azimuths.classes("field")
+            self._exposures = named(ui.input("Exposures, us").classes("field"), "exposures")
+            self._every = named(ui.number("LEDs: every n-th", min=1, precision=0).classes("field"), "every")
+            self._darks = ui.number("Dark frames for each view", min=0, precision=0).classes("field")
+        inputs = [
+            self._object, self._mesh, self._budget, self._distance, self._elevations, self._azimuths,
+            self._exposures, self._every, self._darks,
+        ]  # fmt: skip
+        for field in inputs:
+            field.on("blur", self._filled)
+            field.on("keydown.enter", self._filled)
+        self._round = button("Views all round the mesh", self._all_round, icon="360", name="all-round")
+        self._form_says = named(ui.label().classes("hint"), "form-says")
+
+    def _show_fields(self, fields: PlanFields) -> None:
+        self._filling = True
+        self._fields = fields
+        self._object.set_value(fields.object_id)
+        self._mesh.set_value(fields.mesh)
+        self._unit.offer(dict(zip(_UNITS, _UNITS, strict=True)), fields.mesh_unit)
+        self._budget.set_value(fields.budget_lux_h)
+        self._distance.set_value(fields.distance_mm)
+        self._elevations.set_value(_joined(fields.elevations_deg))
+        self._azimuths.set_value(fields.azimuths)
+        self._exposures.set_value(_joined(fields.exposures_us))
+        self._every.set_value(fields.every_led)
+        self._darks.set_value(fields.darks_per_view)
+        for field in (self._distance, self._elevations, self._azimuths):
+            field.set_enabled(not fields.own_views)
+        self._every.set_enabled(not fields.own_lights)
+        said = [
+            words
+            for own, words in (
+                (fields.own_views, "the views are as the YAML has them"),
+                (fields.own_lights, "the lights are as the YAML has them"),
+            )
+            if own
+        ]
+        self._form_says.set_text("; ".join(said))
+        self._filling = False
+
+    def _filled_fields(self) -> PlanFields:
+        """Raises InputError: not numbers."""
+        return replace(
+            self._fields,
+            object_id=str(self._object.value or "").strip(),
+            mesh=str(self._mesh.value or "").strip(),
+            mesh_unit=self._unit.value,
+            budget_lux_h=self._budget.value,
+            distance_mm=self._distance.value,
+            elevations_deg=tuple(map(_tidy, _numbers(self._elevations.value, "Elevations"))),
+            azimuths=_whole(self._azimuths.value),
+            exposures_us=tuple(int(value) for value in _numbers(self._exposures.value, "Exposures")),
+            every_led=_whole(self._every.value),
+            darks_per_view=_whole(self._darks.value),
+        )
+
+    def _filled(self) -> None:
+        """A field was left: its value goes into the text."""
+        if self._filling or not self._name:
+            return
+        try:
+            fields = self._filled_fields()
+            if fields == self._fields:
+                return
+            self._show_text(text_with(self._plans.path(self._name), self._text, fields))
+        except InputError as error:
+            self._form_says.set_text(str(error))
+
+    async def _all_round(self) -> None:
+        """Views at three elevations, looking at the middle of the mesh, from where the lens is focused."""
+        path, rig = self._plans.path(self._name), self._visit.service.cell.rig
+        try:
+            low, high = await self._visit.service.desk.bounds(Draft(path, self._text))
+            fields = replace(
+                self._filled_fields(),
+                own_views=False,
+                distance_mm=self._fields.distance_mm or rig.lens.focus_distance_mm,
+                elevations_deg=self._fields.elevations_deg or (35, 55, 75),
+                azimuths=self._fields.azimuths or 8,
+            )
+            middle = tuple((a + b) / 2 for a, b in zip(low, high, strict=True))
+            self._show_text(text_with(path, self._text, fields, middle))
+        except InputError as error:
+            self._form_says.set_text(str(error))
+
+    # -- the text -----------------------------------------------------------------------------------------------
+
+    def _show_text(self, text: str) -> None:
+        self._text = text
+        self._editor.set_value(text)
+        self._read()
+
+    def _typed(self) -> None:
+        if self._editor.value != self._text:
+            self._text = self._editor.value
+            self._read()
+
+    def _read(self) -> None:
+        """Show what the text says; preflight follows once nobody types."""
+        self._state(self._visit.now)
+        if not self._name:
+            return
+        try:
+            self._show_fields(fields_of(self._plans.path(self._name), self._text))
+        except InputError as error:
+            self._show_problems(error.problems)
+            return
+        self._turn += 1
+        turn = self._turn
+
+        async def check() -> None:
+            await asyncio.sleep(_AFTER_TYPING_S)
+            if turn != self._turn:
+                return
+            self._verdict.set_content('<p class="hint">checking</p>')
+            try:
+                found = await self._visit.service.desk.check(Draft(self._plans.path(self._name), self._text))
+            except InputError as error:
+                found = Checked(problems=(Problem(self._name, 0, 0, "", str(error)),))
+            if turn == self._turn:
+                self._show_checked(found)
+
+        in_background(check)
+
+    def _show_checked(self, found: Checked) -> None:
+        self._show_problems(found.problems)
+        if found.problems:
+            self._verdict.set_content('<p class="bad">Not checked: the plan has mistakes.</p>')
+            self._views.set_content("")
+            return
+        report = found.report
+        said = "".join(f'<p class="bad">refused: {html.escape(words)}</p>' for words in report["refusals"])
+        said = (
+            said or '<p class="good">The plan can be run (paths and collisions are checked when it is drawn, and '
+        )
+        said += "" if report["refusals"] else "before it begins).</p>"
+        said += "".join(f'<p class="warm">{html.escape(words)}</p>' for words in report["warnings"])
+        self._verdict.set_content(said + facts_html(_figures(found)))
+        self._views.set_content(_view_table(found))
+
+    def _show_problems(self, problems: Sequence[Problem]) -> None:
+        lines = self._text.splitlines()
+        own = str(self._plans.path(self._name)) if self._name else ""
+        rows = []
+        for one in problems:
+            here = one.file == own and 0 < one.line <= len(lines)
+            place = f"line {one.line}" if here else Path(one.file).name
+            said = f"{one.key}: {one.message}" if one.key else one.message
+            excerpt = f"<code>{html.escape(lines[one.line - 1].strip())}</code>" if here else ""
+            rows.append(f'<li><b class="bad">{html.escape(place)}</b> {html.escape(said)} {excerpt}</li>')
+        self._problems.set_content(f'<ul class="problems">{"".join(rows)}</ul>' if rows else "")
+        self._editor.line_tooltips = {
+            one.line: one.message for one in problems if one.file == own and 0 < one.line <= len(lines)
+        }
+        self._editor.decorations = [
+            {"kind": "line", "line": line, "class": "wrong-line"} for line in self._editor.line_tooltips
+        ]
+
+    # -- the cell -----------------------------------------------------------------------------------------------
+
+    async def _draw_cell(self) -> None:
+        service, draft = self._visit.service, Draft(self._plans.path(self._name), self._text)
+        self._draw.set_enabled(False)
+        self._drawing.set_text("drawing: paths are planned")
+        folder = service.plan_files.drawings / secrets.token_hex(8)
+        try:
+            png, page = await service.desk.draw(draft, folder)
+        except InputError as error:
+            self._drawing.set_text("")
+            self._visit.say(str(error), bad=True)
+            return
+        finally:
+            self._draw.set_enabled(True)
+        self._drawing.set_text(
+            "The slider shows one view after the other, with its picture, field and hidden LEDs."
+        )
+        self._cell.clear()
+        with self._cell:
+            address = f"/drawings/{folder.name}/"
+            ui.element("iframe").props(
+                f'src="{address}{page.name}" title="the cell with the plan\'s views" sandbox="allow-scripts"'
+            ).classes("drawn")
+            ui.html(
+                f'<img class="frame-picture" src="{address}{png.name}" '
+                'alt="the cell from three sides, and what the camera sees">',
+                sanitize=False,
+            ).style("width:100%")
+
+
+def _figures(found: Checked) -> dict[str, str]:
+    report = found.report
+    dose = f"{report['dose_lux_h']:.3f} lux h"
+    if report["dose_before_lux_h"]:
+        dose += f" after {report['dose_before_lux_h']:.3f}"
+    if found.budget_lux_h is not None:
+        dose += f" of {found.budget_lux_h:g} in its life"
+    figures = {
+        "views, shots, frames": f"{report['views']}, {report['shots']}, {report['frames']}",
+        "duration": duration_text(report["duration_s"]),
+        "light on the object": dose,
+        "on disk": bytes_text(report["bytes"]),
+        "hottest LED board": f"{report['peak_board_c']:.1f} C",
+        "white is exposed to": "; ".join(
+            f"{white['brightest']:.0%} at {white['exposure_us'] / 1e3:g} ms ({white['verdict']})"
+            for white in report["white"]
+        )
+        or "not known: press Meter in Focus",
+    }
+    if (placed := report["object"]) is not None:
+        sides = zip(placed["low_mm"], placed["high_mm"], strict=True)
+        figures["object"] = " x ".join(f"{high - low:.0f}" for low, high in sides) + " mm"
+        lowest = placed["lowest_over_disk_mm"]
+        figures["it stands"] = "beside the disk" if lowest is None else f"{lowest:.1f} mm above the disk"
+    return figures
+
+
+def _view_table(found: Checked) -> str:
+    framed = {one["view"]: one for one in (found.report["object"] or {}).get("views", [])}
+    rows = []
+    for view in found.views:
+        seen = framed.get(view["name"])
+        field = "-" if seen is None else f"{seen['in_field']:.0%}"
+        sharp = "-" if seen is None or seen["in_focus"] is None else f"{seen['in_focus']:.0%}"
+        times = duration_text(view["duration_s"]), f"{view['dose_lux_h']:.3f}"
+        rows.append((view["name"], *times, _judged(field), _judged(sharp)))
+    return table_html(("view", "time", "lux h", "object in field", "of it sharp"), rows)
+
+
+def _judged(share: str) -> str:
+    return share if share in ("-", "100%") else f"warm|{share}"
+
+
+def _joined(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:g}" for value in values)
+
+
+def _numbers(text: str | None, what: str) -> list[float]:
+    """Raises InputError."""
+    try:
+        return [float(word) for word in str(text or "").replace(",", " ").split()]
+    except ValueError as error:
+        raise InputError(f"{what}: expected numbers, with commas between; found {text!r}") from error
+
+
+def _tidy(value: float) -> float:
+    return int(value) if value == int(value) else value
+
+
+def _whole(value: float | None) -> int | None:
+    return None if value is None else int(value)

@@ -1,0 +1,127 @@
+"""The run at work: its newest frame and how well that is exposed, progress by view, and what happened."""
+
+from __future__ import annotations
+
+import html
+
+from nicegui import ui
+
+from coupole.console.messages import StateNow
+from coupole.console.run_files import Frame
+from coupole.console.run_watch import Watched
+from coupole.console.screens.parts import (
+    clipping_words,
+    facts_html,
+    histogram_svg,
+    panel,
+    picture_address,
+    table_html,
+)
+from coupole.console.screens.visit import Visit, in_thread
+from coupole.errors import CoupoleError
+from coupole.viewing.terminal import duration_text
+
+_LOOK_EVERY_S = 0.5
+
+
+def build(visit: Visit) -> None:
+    """Build the screen."""
+    _Screen(visit)
+
+
+class _Screen:
+    def __init__(self, visit: Visit) -> None:
+        self._visit = visit
+        self._shown = ""
+        self._idle = panel()
+        with self._idle:
+            self._idle_words = ui.label()
+            self._resume = ui.row()
+        with ui.element("div").classes("columns") as self._work:
+            with panel("Newest frame"):
+                self._picture = ui.html("", sanitize=False).style("width:100%")
+                self._histogram = ui.html("", sanitize=False).style("width:100%")
+                self._exposure = ui.html("", sanitize=False).style("width:100%")
+            with ui.column().classes("gap"):
+                with panel("Progress"):
+                    self._facts = ui.html("", sanitize=False).style("width:100%")
+                    self._views = ui.html("", sanitize=False).style("width:100%")
+                with panel("What happened"):
+                    self._events = ui.html("", sanitize=False).style("width:100%").props("data-name=events")
+        visit.follow(self._state)
+        ui.timer(_LOOK_EVERY_S, self._look)
+
+    def _state(self, now: StateNow) -> None:
+        at_work = now.run is not None
+        self._work.set_visibility(at_work)
+        self._idle.set_visibility(not at_work)
+        waiting = sum(entry.state == "waiting" for entry in now.queue)
+        self._idle_words.text = (
+            f"{'A plan is checked and devices are opened' if now.state == 'starting' else 'No run is at work'}. "
+            f"{waiting} plans wait in the queue."
+        )
+
+    async def _look(self) -> None:
+        now = self._visit.now
+        if now.run is None:
+            return
+        service, name = self._visit.service, now.run
+        try:
+            watched = await in_thread(service.watch.of, name)
+            self._show(now, watched)
+            if watched.newest is not None and str(watched.newest.shot) != self._shown:
+                shot = str(watched.newest.shot)
+                frame = await in_thread(service.runs.frame, name, shot)
+                self._show_frame(name, frame)
+                self._shown = shot
+        except CoupoleError as error:
+            self._events.set_content(f'<p class="bad">{html.escape(str(error))}</p>')
+
+    def _show(self, now: StateNow, watched: Watched) -> None:
+        hot = "-" if watched.hottest_board_c is None else f"{watched.hottest_board_c:.1f} C"
+        self._facts.set_content(
+            facts_html(
+                {
+                    "run": watched.run,
+                    "frames proven": f"{now.proven} of {now.frames}",
+                    "time left": "-" if now.left_s is None else duration_text(now.left_s),
+                    "light on the object": f"{now.dose:.3f} lux h in this run",
+                    "taken again": f"{watched.reshot} shots",
+                    "hottest LED board": hot,
+                }
+            )
+        )
+        self._views.set_content(_bars(watched, now.view))
+        self._events.set_content(
+            table_html(("UTC", "what"), [(t[11:19], words) for t, words in watched.events[:40]])
+        )
+
+    def _show_frame(self, name: str, frame: Frame) -> None:
+        address = picture_address(name, frame.shot, 1280, saturation=True)
+        self._picture.set_content(
+            f'<img class="frame-picture" src="{address}" alt="{html.escape(frame.shot)}; clipped pixels are red">'
+        )
+        self._histogram.set_content(histogram_svg(frame.figures.histograms))
+        self._exposure.set_content(
+            facts_html(
+                {
+                    "shot": frame.shot,
+                    "exposure": f"{frame.exposure_us / 1000:g} ms",
+                    "brightest": f"{frame.figures.brightest:.0%} of full scale",
+                    **clipping_words(frame.figures.saturated),
+                }
+            )
+        )
+
+
+def _bars(watched: Watched, current: str | None) -> str:
+    rows = []
+    for view, proven, expected in watched.views:
+        share = proven / expected if expected else 1.0
+        mark = ' style="font-weight:650"' if view == current else ""
+        rows.append(
+            f'<tr><td{mark}>{html.escape(view)}</td><td style="width:60%"><progress max="1" value="{share:.4f}" '
+            f'aria-label="{html.escape(view)}" style="width:100%"></progress></td>'
+            f"<td>{proven} of {expected}</td></tr>"
+        )
+    return f'<table class="plain"><tbody>{"".join(rows)}</tbody></table>'

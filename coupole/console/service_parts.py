@@ -1,0 +1,56 @@
+"""What a console's interface and its screens stand in front of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from coupole.console.accounts import Accounts
+from coupole.console.acquisitions import Acquisitions
+from coupole.console.audit import Audit
+from coupole.console.drafts import Desk
+from coupole.console.entering import Entering
+from coupole.console.messages import StateNow
+from coupole.console.object_files import ObjectFiles
+from coupole.console.plan_files import PlanFiles
+from coupole.console.plan_queue import PlanQueue
+from coupole.console.run_files import RunFiles
+from coupole.console.run_watch import RunWatch
+from coupole.console.sessions import Control, Session, Sessions
+from coupole.console.tasks import Tasks
+from coupole.plan.cell import Cell
+
+
+@dataclass(frozen=True)
+class Service:
+    """The parts of one cell's console."""
+
+    cell: Cell
+    plans: Path
+    """Folder of the plans that may be entered."""
+    accounts: Accounts
+    sessions: Sessions
+    control: Control
+    audit: Audit
+    queue: PlanQueue
+    acquisitions: Acquisitions
+    plan_files: PlanFiles
+    desk: Desk
+    """Checks and draws plans while they are written."""
+    runs: RunFiles
+    watch: RunWatch
+    """Of the run at work."""
+    objects: ObjectFiles
+    tasks: Tasks
+    state: Callable[[], StateNow]
+    """As it is."""
+    newest: Callable[[], StateNow]
+    """As it was a moment ago; takes no time."""
+    entering: Entering
+    origins: frozenset[str]
+    """Of this service's own pages."""
+    cookie: str
+    """Name of the sessions' cookie, which no other console of this machine has."""
+    command_line: Session
+    """Of the service's own user, on this machine."""

@@ -1,0 +1,159 @@
+"""Somebody who sits before a console in a real browser: looks, clicks, types, and is checked for by axe-core."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cells
+from browser import Browser
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.remote.webelement import WebElement
+
+WIDE, NARROW = (1400, 900), (400, 800)
+_SETTLES_S = 3.0
+_SERIOUS = ("serious", "critical")
+
+
+class Visitor:
+    """A person in a window."""
+
+    def __init__(self, browser: Browser, url: str) -> None:
+        self.browser, self.driver, self.url = browser, browser.driver, url
+        self.prefers("light")
+
+    def goes_to(self, path: str) -> None:
+        self.driver.get(self.url + path)
+
+    def signs_in(self, name: str, password: str) -> None:
+        self.goes_to("/")
+        self.types("#name", name)
+        self.types("#password", password + Keys.ENTER)
+        self.sees("[data-name=state]")
+
+    def at(self, selector: str) -> WebElement:
+        return self.browser.at(selector)
+
+    def all(self, selector: str) -> list[WebElement]:
+        return list(self.driver.find_elements(By.CSS_SELECTOR, selector))
+
+    def sees(self, selector: str, words: str = "") -> str:
+        """Wait until there is such an element with these words."""
+
+        def there() -> str:
+            texts: str = self.driver.execute_script(
+                "return [...document.querySelectorAll(arguments[0])].map(one => one.innerText || one.value || ' ')"
+                ".join('\\n')",
+                selector,
+            )
+            return texts if texts and words in texts else ""
+
+        return str(cells.wait_until(there, f"{words!r} in {selector}"))
+
+    def clicks(self, selector: str, words: str = "") -> None:
+        """On the first such element that says these words, as soon as it can be clicked."""
+
+        def clicked() -> bool:
+            for one in self.all(selector):
+                if words in one.text and one.is_displayed() and one.is_enabled():
+                    self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", one)
+                    one.click()
+                    return True
+            return False
+
+        self._patiently(clicked, f"{words!r} in {selector} to click")
+
+    def types(self, selector: str, words: str) -> None:
+        """Into a field, in place of what stands there."""
+
+        def typed() -> bool:
+            field = self.at(selector)
+            field.send_keys(Keys.CONTROL, "a")
+            field.send_keys(words)
+            return True
+
+        self._patiently(typed, f"{selector} to type into")
+
+    def _patiently(self, do: Callable[[], bool], what: str) -> None:
+        """Elements are made anew while one looks at them."""
+        from selenium.common.exceptions import WebDriverException
+
+        def done() -> bool:
+            try:
+                return do()
+            except WebDriverException:
+                return False
+
+        cells.wait_until(done, what)
+
+    def resizes(self, size: tuple[int, int]) -> None:
+        """The page's own size, without the window's frame."""
+        self.driver.execute_cdp_cmd(
+            "Emulation.setDeviceMetricsOverride",
+            {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False},
+        )
+
+    def prefers(self, scheme: str) -> None:
+        """`light` or `dark`; and nothing moves."""
+        self.driver.execute_cdp_cmd(
+            "Emulation.setEmulatedMedia",
+            {
+                "features": [
+                    {"name": "prefers-color-scheme", "value": scheme},
+                    {"name": "prefers-reduced-motion", "value": "reduce"},
+                ]
+            },
+        )
+
+    def picture(self, path: Path) -> None:
+        """What is seen now, as PNG."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.driver.save_screenshot(str(path))
+
+    def fits(self) -> bool:
+        """The page is not wider than its window, as soon as it has settled."""
+        end_s = time.monotonic() + _SETTLES_S
+        while self.overflows() and time.monotonic() < end_s:
+            time.sleep(0.1)
+        return not self.overflows()
+
+    def overflows(self) -> int:
+        """Pixels by which the page is wider than its window."""
+        page = "document.documentElement"
+        return int(self.browser.run(f"{page}.scrollWidth - {page}.clientWidth"))
+
+    def too_wide(self) -> list[str]:
+        """What reaches beyond the window's right edge."""
+        found: list[str] = self.browser.run(
+            "[...document.querySelectorAll('main *, header *')].filter(one => one.getBoundingClientRect().right > "
+            "document.documentElement.clientWidth + 1).map(one => one.outerHTML.slice(0, 120)).slice(0, 8)"
+        )
+        return found
+
+    def barriers(self) -> list[str]:
+        """Serious violations of accessibility that axe-core finds on this page."""
+        self.driver.execute_script(_axe())
+        found: dict[str, Any] = json.loads(
+            self.driver.execute_async_script(
+                "const done = arguments[0]; axe.run({resultTypes: ['violations']})"
+                ".then(found => done(JSON.stringify(found)));"
+            )
+        )
+        return [
+            f"{one['id']}: {node['html'][:160]} {node['failureSummary'][:300]}"
+            for one in found["violations"]
+            if one["impact"] in _SERIOUS
+            for node in one["nodes"]
+        ]
+
+
+@cache
+def _axe() -> str:
+    package = files("axe_selenium_python")
+    return package.joinpath("node_modules", "axe-core", "axe.min.js").read_text(encoding="utf-8")

@@ -1,0 +1,175 @@
+"""A new user's day at the console of a simulated cell, in a real browser: from a mesh to an archived run.
+
+Each step's picture is kept for the docs, in the folder that COUPOLE_SCREENSHOTS names (`tools/make_screenshots`).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cells
+import pytest
+from at_the_console import NARROW, WIDE, Visitor
+from browser import Browser, needs_chromium
+from cells import REPO, CellFolder
+from served import Served, served
+
+PASSWORD = "a long password"
+
+
+class Day:
+    """What all steps share."""
+
+    def __init__(self, folder: Path, service: Served) -> None:
+        self.folder, self.service = folder, service
+        kept = os.environ.get("COUPOLE_SCREENSHOTS")
+        self._pictures = Path(kept) if kept else folder / "pictures"
+        self._taken = 0
+        self.engineer = service.browser(token=service.token)
+        for name, role in (("Ada", "operator"), ("Eve", "observer")):
+            account = {"name": name, "password": PASSWORD, "role": role}
+            assert self.engineer.post("/api/v1/accounts", account).status == 200
+        self.visitor = self.comes()
+
+    def comes(self) -> Visitor:
+        visitor = Visitor(Browser(), self.service.url)
+        visitor.resizes(WIDE)
+        return visitor
+
+    def picture(self, name: str) -> None:
+        """Of this moment, which no serious barrier may mar; and the same on a telephone."""
+        self._taken += 1
+        visitor = self.visitor
+        visitor.picture(self._pictures / f"{self._taken:02d}-{name}.png")
+        assert visitor.barriers() == []
+        visitor.resizes(NARROW)
+        assert visitor.fits(), f"{name}: {visitor.too_wide()}"
+        visitor.resizes(WIDE)
+
+    def state(self) -> dict[str, Any]:
+        return self.engineer.state()
+
+    def until(self, *states: str) -> dict[str, Any]:
+        """The state, once it is one of these."""
+        found: dict[str, Any] = cells.wait_until(
+            lambda: now if (now := self.state())["state"] in states else None, f"{states}"
+        )
+        return found
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Day]:
+    cell = CellFolder(tmp_path_factory.mktemp("day"), speed=0.4)
+    cell.plan.unlink()
+    with served(cell) as service:
+        day = Day(cell.folder, service)
+        try:
+            yield day
+        finally:
+            day.visitor.driver.quit()
+
+
+@needs_chromium
+def test_a_day_at_the_console(day: Day) -> None:
+    _signs_in(day)
+    _writes_a_plan(day)
+    _queues_two(day)
+    _pauses_and_goes_on(day)
+    _loses_the_browser(day)
+    _stops(day)
+
+
+def _signs_in(day: Day) -> None:
+    ada = day.visitor
+    ada.goes_to("/plan")
+    assert "Sign in" in ada.sees("h1, button")
+    day.picture("sign-in")
+    ada.types("#name", "Ada")
+    ada.types("#password", "not this one")
+    ada.clicks("button", "Sign in")
+    ada.sees("#error", "wrong")
+    ada.types("#password", PASSWORD)
+    ada.clicks("button", "Sign in")
+    ada.sees("h1", "Plan")
+
+
+def _writes_a_plan(day: Day) -> None:
+    ada = day.visitor
+    ada.clicks("[data-name=new-plan]")
+    ada.types("input[data-name=new-name]", "vase")
+    ada.clicks("[data-name=make]")
+    ada.sees("[data-name=verdict]", "can be run")
+    _fills(ada, "object", "2019.17")
+    _fills(ada, "mesh", str(REPO / "configs/objects/relief.ply"))
+    _fills(ada, "azimuths", "2")
+    _fills(ada, "elevations", "60")
+    _fills(ada, "every", "5")
+    ada.clicks("[data-name=all-round]")
+    _fills(ada, "budget", "0.01")
+    ada.sees("[data-name=verdict]", "budget")
+    day.picture("a-plan-refused")
+    _fills(ada, "budget", "5")
+    ada.sees("[data-name=verdict]", "can be run")
+    _fills(ada, "exposures", "0")
+    ada.sees("[data-name=problems]", "line")
+    day.picture("a-mistake-at-its-line")
+    _fills(ada, "exposures", "8000")
+    ada.sees("[data-name=verdict]", "can be run")
+    ada.clicks("[data-name=draw]")
+    ada.sees(".cell img")
+    day.picture("a-plan-drawn")
+    ada.clicks("[data-name=save]")
+    ada.sees(".q-notification", "saved")
+    text = (day.folder / "vase.yaml").read_text()
+    assert "azimuths_deg: [-90, 90]" in text
+    assert "every: 5" in text
+
+
+def _fills(visitor: Visitor, name: str, words: str) -> None:
+    visitor.types(f"input[data-name={name}]", words + "\n")
+
+
+def _queues_two(day: Day) -> None:
+    ada = day.visitor
+    ada.clicks("[data-name=enter]")
+    ada.sees(".q-notification", "is in the queue")
+    ada.goes_to("/queue")
+    ada.clicks("[data-name=enter]")
+    cells.wait_until(lambda: len(day.state()["queue"]) == 2, "two entries")
+    day.picture("the-queue")
+
+
+def _pauses_and_goes_on(day: Day) -> None:
+    ada = day.visitor
+    ada.goes_to("/run")
+    day.until("running")
+    ada.sees("dd", "/led")
+    day.picture("a-run")
+    ada.clicks("[data-name=pause]")
+    day.until("paused")
+    ada.sees("[data-name=state]", "paused: lights off, arm still")
+    day.picture("paused")
+    ada.clicks("[data-name=pause]", "Go on")
+    day.until("running")
+
+
+def _loses_the_browser(day: Day) -> None:
+    before = day.state()
+    day.visitor.driver.quit()
+    day.visitor = day.comes()
+    day.visitor.signs_in("Ada", PASSWORD)
+    assert "running" in day.visitor.sees("[data-name=state]", "running")
+    assert day.state()["run"] == before["run"]
+
+
+def _stops(day: Day) -> None:
+    ada = day.visitor
+    ada.clicks("[data-name=stop]")
+    ada.sees(".q-notification", "lights off")
+    now = day.until("halted")
+    assert [entry["state"] for entry in now["queue"]] == ["stopped", "waiting"]
+    ada.sees("[data-name=alarm]", "vase.yaml")
+    day.picture("stopped")

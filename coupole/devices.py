@@ -331,6 +331,20 @@ class Camera(Protocol):
 
 
 @dataclass(frozen=True)
+class ArmCondition:
+    """What the arm's controller tells of its safety. None, or an empty mode: it does not tell."""
+
+    mode: str = ""
+    """Operating mode in the controller's own word: `T1`, `automatic`, `running`."""
+    emergency_stop: bool | None = None
+    """An emergency stop is in force."""
+    protective_stop: bool | None = None
+    """A protective or safeguard stop is in force: collision, safety gate, enabling switch."""
+    brakes_released: bool | None = None
+    """The drives are on and hold the arm."""
+
+
+@dataclass(frozen=True)
 class ArmState:
     """The arm's state, as measured by its controller."""
 
@@ -341,6 +355,7 @@ class ArmState:
     moving: bool
     fault: str = ""
     """Name and reason of a latched fault; empty when there is none."""
+    condition: ArmCondition = ArmCondition()
 
 
 class Robot(Protocol):
@@ -350,9 +365,9 @@ class Robot(Protocol):
 
     def self_test(self) -> Mapping[str, str]: ...
 
-    def move_to(self, joints_deg: NDArray[np.float64]) -> None:
+    def move_to(self, joints_deg: NDArray[np.float64], speed: float = 1.0) -> None:
         """Start a jerk-limited motion to joint angles [6]; returns at once. During a motion the arm first comes to
-        rest.
+        rest. `speed` (above 0, at most 1) is the share of the driver's speeds that no axis exceeds.
 
         Raises DeviceRefused out of limits, or if another thread called `stop` since this call began: no motion is
         then started.

@@ -163,3 +163,8 @@ class Interrupted(CoupoleError):
     def __init__(self, message: str, signal_number: int = signal.SIGINT) -> None:
         super().__init__(message)
         self.exit_code = 128 + signal_number
+
+
+def reason(error: BaseException) -> str:
+    """Why something failed, in words: of the system's errors without their numbers."""
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)

@@ -46,6 +46,13 @@ def checked_target(
     return a1, a2, a3, a4, a5, a6
 
 
+def checked_speed(speed: float) -> float:
+    """A share of the driver's speeds; raises DeviceRefused for any other number."""
+    if not 0.0 < speed <= 1.0:
+        raise refused("a speed above 0, at most 1, as a share of the arm's", f"got {speed!r}")
+    return float(speed)
+
+
 def longest_stop_s(velocity_deg_s: Sequence[float], acceleration_deg_s2: float, jerk_deg_s3: float) -> float:
     """Longest time that any axis needs to come to rest: v/a, and twice a/jerk to build it up."""
     return max(velocity_deg_s) / acceleration_deg_s2 + 2.0 * acceleration_deg_s2 / jerk_deg_s3

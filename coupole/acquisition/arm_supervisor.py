@@ -18,11 +18,12 @@ from coupole.devices import ArmState, Deadline
 from coupole.errors import DeviceFault, DeviceLost, PreflightRefused
 from coupole.geometry import Transform
 from coupole.kinematics import move_duration_s
+from coupole.motion.cell_motion import CellMotion
 from coupole.motion.itinerary import Itinerary, Visit, arm_of
 from coupole.motion.path_deviation import PATH_TOLERANCE_MM, deviation_at_rest_mm
 from coupole.motion.path_planner import Joints
+from coupole.plan.rig import Rig
 from coupole.plan.schedule import ViewPose
-from coupole.preflight.job import Job
 
 _POLL_S = 0.01
 _SPEED_OVER_NS = 30_000_000
@@ -47,10 +48,10 @@ class SettledPose:
 class ArmSupervisor:
     """One session's motions. Every method that waits can be ended by the operator's stop or a fault of the arm."""
 
-    def __init__(self, job: Job, cell: OpenedCell, control: Control) -> None:
-        self._job, self._robot, self._clock, self._control = job, cell.robot, cell.clock, control
-        self._motion = job.cell.rig.motion
-        self._arm = arm_of(job.cell.rig)
+    def __init__(self, rig: Rig, motion: CellMotion, cell: OpenedCell, control: Control) -> None:
+        self._rig, self._robot, self._clock, self._control = rig, cell.robot, cell.clock, control
+        self._motion, self._paths = rig.motion, motion
+        self._arm = arm_of(rig)
         self._settled: SettledPose | None = None
         self._from_deg = np.zeros(6)
         """Joint angles at which the next leg begins."""
@@ -63,19 +64,24 @@ class ArmSupervisor:
 
     def itinerary(self, views: Sequence[ViewPose]) -> Itinerary:
         """Paths to views from the arm's actual posture. Raises PreflightRefused if there is none."""
-        self._from_deg = np.array(self._robot.measured().joints_deg)
-        found = self._job.motion.itinerary(views, self._from_deg.tolist())
+        self.begin_here()
+        found = self._paths.itinerary(views, self._from_deg.tolist())
         if found.refusals:
             raise PreflightRefused(found.refusals)
         return found
+
+    def begin_here(self) -> Joints:
+        """The next leg begins where the arm stands; returns its joint angles."""
+        self._from_deg = np.array(self._robot.measured().joints_deg)
+        return self._from_deg
 
     def attend(self) -> None:
         """Raise Interrupted after the operator's stop, DeviceFault if the arm is in a fault."""
         self._watched()
 
-    def go(self, visit: Visit, meanwhile: Callable[[], None] = lambda: None) -> SettledPose:
+    def go(self, visit: Visit, meanwhile: Callable[[], None] = lambda: None, speed: float = 1.0) -> SettledPose:
         """Follow the leg of a visit; returns the measured pose. What `meanwhile`, called every 10 ms, raises is
-        raised at once, while the arm still moves: the caller stops it."""
+        raised at once, while the arm still moves: the caller stops it. `speed`: share of the arm's speeds."""
         self._settled = None
         self._before = None
         path = (self._from_deg, *visit.leg.waypoints)
@@ -83,8 +89,8 @@ class ArmSupervisor:
         for here_deg, there_deg in pairwise(path):
             self._control.go_on()
             self._before = None
-            self._robot.move_to(there_deg)
-            self.hurry(move_duration_s(self._arm, here_deg, there_deg) + self._motion.settle_dwell_s)
+            self._robot.move_to(there_deg, speed)
+            self.hurry(move_duration_s(self._arm, here_deg, there_deg) / speed + self._motion.settle_dwell_s)
             while (arm := self._watched()).moving:
                 self._keep_to((here_deg, there_deg), arm, "during its motion")
                 meanwhile()
@@ -163,7 +169,7 @@ class ArmSupervisor:
             path,
             np.array(arm.joints_deg),
             self._speeds_deg_s(arm),
-            self._job.motion.bodies.reach_mm,
+            self._paths.bodies.reach_mm,
             self._stopping_s,
         )
         if off_mm <= PATH_TOLERANCE_MM:
@@ -191,5 +197,5 @@ class ArmSupervisor:
 
     def _settle(self) -> SettledPose:
         arm = self._robot.wait_settled()
-        self._settled = SettledPose(arm, arm.base_from_flange @ self._job.cell.rig.flange_from_camera.matrix())
+        self._settled = SettledPose(arm, arm.base_from_flange @ self._rig.flange_from_camera.matrix())
         return self._settled

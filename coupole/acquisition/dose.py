@@ -127,7 +127,7 @@ class FlashMeter:
 
     def __init__(self, job: Job, cell: OpenedCell, what_for: str, flashes_per_s: float) -> None:
         self._light = LightOnObject(job, cell, what_for)
-        self._cell, self._w_per_lm = cell, job.cell.led_damage_w_per_lm
+        self._cell = cell
         self._at_once = max(1, round(flashes_per_s))
         self._flash_lux_h: LuxHours | None = None
         self._left = 0
@@ -137,13 +137,24 @@ class FlashMeter:
     def warning(self) -> str:
         return self._light.warning
 
-    def begin(self, lux_h: LuxHours, at_most_lux_h: LuxHours) -> None:
+    @property
+    def total_lux_h(self) -> float:
+        """Of the object's life, by its ledger, with what is planned."""
+        return self._light.total_lux_h + float(self._given_lux_h.max())
+
+    @property
+    def left_lux_h(self) -> float:
+        """Until the object's budget is reached; infinite without one."""
+        return self._light.left_lux_h
+
+    def begin(self, lux_h: LuxHours, at_most_lux_h: LuxHours, w_per_lm: float | None = None) -> None:
         """A flash of `lux_h` [points] is about to be given; should this process be killed, the box may give
-        `at_most_lux_h` instead. Raises DoseBudgetReached and StorageError: it may then not be given."""
+        `at_most_lux_h` instead. `w_per_lm`: its damaging power, if known. Raises DoseBudgetReached and
+        StorageError: it may then not be given."""
         if not self._left or self._flash_lux_h is None or not np.array_equal(lux_h, self._flash_lux_h):
             self.settle()
             count = self._at_once if self._at_once * lux_h.max() <= self._light.left_lux_h else 1
-            self._light.begin(count * lux_h + (at_most_lux_h - lux_h), count * lux_h, self._w_per_lm)
+            self._light.begin(count * lux_h + (at_most_lux_h - lux_h), count * lux_h, w_per_lm)
             self._flash_lux_h, self._left = lux_h, count
         self._left -= 1
         self._given_lux_h = self._given_lux_h + lux_h

@@ -8,13 +8,15 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
 from coupole.acquisition.dose import FlashMeter
 from coupole.acquisition.live_cell import CellSource
 from coupole.acquisition.memory_recorder import MeterRecorder
-from coupole.acquisition.observer import Control
-from coupole.acquisition.opened_cell import open_cell
+from coupole.acquisition.observer import Control, Observer
+from coupole.acquisition.opened_cell import OpenedCell, open_cell
 from coupole.acquisition.operator import (
     UNLIMITED_BYTES,
     ask_to_begin,
@@ -25,6 +27,7 @@ from coupole.acquisition.operator import (
 )
 from coupole.acquisition.sequencer import Sequencer
 from coupole.acquisition.signals import obeyed_by
+from coupole.acquisition.single_shots import SingleShots
 from coupole.errors import InputError, PreflightRefused
 from coupole.geometry import apply
 from coupole.plan.cell import Cell
@@ -50,25 +53,42 @@ def meter(
     The light on the object is entered in its dose ledger. Raises PreflightRefused, DeviceError, Interrupted, and
     UnprovenError if pictures remain missing.
     """
-    cell_leds, base_from_support = job.cell.leds, job.cell.rig.support.base_from_support.matrix()
-    few = exposure_advice.metering_plan(job.plan, cell_leds, leds_of_plan(job.plan, cell_leds, base_from_support))
-    small = replace(job, plan=few, schedule=schedule_of(few, job.cell))
-    small, preflight = check_job(small, StorageFacts(UNLIMITED_BYTES))
-    refuse(preflight)
+    small = metering_job(job)
     refuse_uncommissioned(job.cell)
     ArmFaults(job.cell.state_folder).refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)
-    recorder, control = MeterRecorder(), Control()
+    control = Control()
     with open_cell(job.cell, job=small, on_opened=identity_printer(console)) as cell:
         refuse_uncommissioned(job.cell, cell.identities)
         observer = RunObserver(console, job.cell.rig.frame_bytes, 0)
-        sequencer = Sequencer(small, cell, recorder, observer=observer, control=control)
         try:
             with obeyed_by(control, cell.halt), observer.showing(small.schedule.frames, len(small.schedule.views)):
-                sequencer.acquire()
+                return metered(small, cell, request, control, observer)
         finally:
             cell.make_safe()
-    return exposure_advice.advise(recorder.views, request, longest_us=longest_exposure_us(job.cell.rig))
+
+
+def metering_job(job: Job) -> Job:
+    """The same job with a few pictures of each view. Raises PreflightRefused."""
+    leds, base_from_support = job.cell.leds, job.cell.rig.support.base_from_support.matrix()
+    few = exposure_advice.metering_plan(job.plan, leds, leds_of_plan(job.plan, leds, base_from_support))
+    small = replace(job, plan=few, schedule=schedule_of(few, job.cell))
+    small, preflight = check_job(small, StorageFacts(UNLIMITED_BYTES))
+    refuse(preflight)
+    return small
+
+
+def metered(
+    small: Job,
+    cell: OpenedCell,
+    request: exposure_advice.Request,
+    control: Control,
+    observer: Observer | None = None,
+) -> exposure_advice.Advice:
+    """Advice by the pictures of a metering job. When this raises the cell is safe and cannot be used any more."""
+    recorder = MeterRecorder()
+    Sequencer(small, cell, recorder, observer=observer, control=control).acquire()
+    return exposure_advice.advise(recorder.views, request, longest_us=longest_exposure_us(small.cell.rig))
 
 
 def watch_cell(
@@ -82,9 +102,6 @@ def watch_cell(
     job = job_or_cell if isinstance(job_or_cell, Job) else None
     rig_cell = job_or_cell.cell if isinstance(job_or_cell, Job) else job_or_cell
     rig, leds = rig_cell.rig, rig_cell.leds
-    base_from_support = rig.support.base_from_support.matrix()
-    points = apply(base_from_support, job.shape.dose_points_mm) if job else base_from_support[None, :3, 3]
-    lux = leds.illuminance_lux(points, emission=rig.dome.emission)
     longest_us = longest_exposure_us(rig)
     wanted = Wanted(led=choice.led, exposure_us=choice.exposure_us)
     studio = Studio(choice_from(wanted, choice, tuple(leds.ids.tolist()), longest_us))
@@ -96,8 +113,16 @@ def watch_cell(
     ask_to_begin(rig_cell, confirm=confirm)
     with open_cell(rig_cell, job=job, on_opened=identity_printer(console)) as cell:
         meter = FlashMeter(job, cell, "live", frames_per_s) if job else None
-        source = CellSource(cell, rig, leds, lux, meter, frames_per_s=frames_per_s)
+        shots = SingleShots(rig_cell, cell, lux_of_leds(rig_cell, job), meter, 1.0 / frames_per_s)
+        source = CellSource(cell, shots, tuple(leds.ids.tolist()), meter)
         _show_live(source, studio, console, port, longest_us=longest_us, halt=cell.halt)
+
+
+def lux_of_leds(cell: Cell, job: Job | None) -> NDArray[np.float64]:
+    """[points, LEDs of the table] at the object's dose points; without a job at the support's centre."""
+    base_from_support = cell.rig.support.base_from_support.matrix()
+    points = apply(base_from_support, job.shape.dose_points_mm) if job else base_from_support[None, :3, 3]
+    return cell.leds.illuminance_lux(points, emission=cell.rig.dome.emission)
 
 
 def _ask_the_ledger(job: Job, console: Console) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -42,7 +43,8 @@ class OpenedCell:
     """False if the arm was not confirmed to be at rest at the end."""
     lights_confirmed: bool = True
     """False if the lights were not confirmed to be off at the end."""
-    _made_safe: bool = False
+    made_safe: bool = False
+    """`make_safe` was called: nothing may be lit or moved any more."""
 
     def halt(self) -> list[Safeguard]:
         """Begin to switch the lights off and to stop the arm, side by side; returns at once. From any thread."""
@@ -54,9 +56,9 @@ class OpenedCell:
     def make_safe(self) -> None:
         """Lights off and arm stopped, side by side, then the camera disarmed; each is tried even if another fails
         or hangs. Signals wait. Only the first call acts: nothing may be lit or moved after it."""
-        if self._made_safe:
+        if self.made_safe:
             return
-        self._made_safe = True
+        self.made_safe = True
         with held():
             done = self.halt()
             for safeguard in done:
@@ -89,6 +91,14 @@ class Safeguard:
             self.trouble = str(error) or type(error).__name__
         else:
             self.trouble = ""
+
+
+def unsure(done: Sequence[Safeguard], within_s: float) -> list[str]:
+    """What is not sure to be done of it after a while."""
+    end_s = time.monotonic() + within_s
+    for safeguard in done:
+        safeguard.wait(max(0.0, end_s - time.monotonic()))
+    return [f"not sure: {safeguard.what}: {safeguard.trouble}" for safeguard in done if safeguard.trouble]
 
 
 @contextmanager

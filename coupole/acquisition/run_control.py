@@ -1,13 +1,12 @@
 """Pause, stop and state of a running acquisition, for other processes of the same user on the same machine.
 
 Whoever acquires serves a Unix socket (`RunControl`), named after its run's folder, in a folder that only this user
-can enter; commands and consoles ask it (`ask`, `running`). One connection is one request and one answer, a line of
-JSON each::
+can enter (`user_socket`); commands and consoles ask it (`ask`, `running`)::
 
     {"version": 1, "command": "pause"}      pause | go-on | stop | state
     {"version": 1, "run": "/runs/...", "pid": 4711, "state": "pausing", "view": "top", "proven": 52, ...}
 
-Each request is answered by a thread of its own, whatever the others do. `stop` is answered when the lights are off
+`stop` is answered when the lights are off
 and the arm was told to stop, or after 4 s with what is not sure (`trouble`); what the process still has to do
 (store, conclude) goes on after that.
 """
@@ -18,19 +17,16 @@ import contextlib
 import json
 import os
 import signal
-import socket
-import struct
-import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
 from coupole.acquisition.observer import Control
-from coupole.acquisition.opened_cell import Safeguard
+from coupole.acquisition.opened_cell import Safeguard, unsure
 from coupole.acquisition.runtime_folder import named_after, runtime_folder
-from coupole.errors import InputError
+from coupole.acquisition.user_socket import UserSocket, exchange
+from coupole.errors import InputError, reason
 from coupole.viewing.progress import Progress
 
 VERSION = 1
@@ -38,8 +34,7 @@ Command = Literal["pause", "go-on", "stop", "state"]
 State = dict[str, Any]
 """`run`, `rig`, `pid`, `light_after_lux_h`, `state` (running, pausing, paused, stopping); from the first burst on
 `Progress` too."""
-_LONGEST_LINE_BYTES = 65536
-_SAFE_WITHIN_S, _PATIENCE_S = 4.0, 10.0
+_SAFE_WITHIN_S = 4.0
 
 
 # -- the side of the acquisition ------------------------------------------------------------------------------
@@ -63,41 +58,19 @@ class RunControl:
         self._about: State = {"version": VERSION, "run": str(run), "rig": str(rig.resolve()), "pid": os.getpid()}
         self._about["light_after_lux_h"] = dict(light_after_lux_h)
         self._run, self._control, self._halt, self._progress = run, control, halt, progress
-        self._socket: socket.socket | None = None
         self.trouble = ""
 
     def __enter__(self) -> RunControl:
+        served = contextlib.ExitStack()
         try:
-            path = named_after(self._run, "sock")
-            hidden = path.with_suffix(".new")
-            hidden.unlink(missing_ok=True)  # of a process that was killed: the run's lock is ours
-            self._socket = socket.socket(socket.AF_UNIX)
-            self._socket.bind(str(hidden))
-            hidden.chmod(0o600)
-            self._socket.listen(8)
-            hidden.replace(path)
+            served.enter_context(UserSocket(named_after(self._run, "sock"), self._answer))
         except (OSError, InputError) as error:
-            self.trouble = f"`coupole pause` and `coupole stop` will not reach this run: {error}"
-            self._close()
-            return self
-        self._path = path
-        self._thread = threading.Thread(target=self._serve, name="run control", daemon=True)
-        self._thread.start()
+            self.trouble = f"`coupole pause` and `coupole stop` will not reach this run: {reason(error)}"
+        self._served = served
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._socket is None:
-            return
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)  # ends `accept`
-        self._thread.join()
-        self._close()
-        self._path.unlink(missing_ok=True)
-
-    def _close(self) -> None:
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+        self._served.close()
 
     def state(self) -> State:
         """What is answered to every request."""
@@ -108,22 +81,6 @@ class RunControl:
         state = "stopping" if control.stop.is_set() else state
         progress = self._progress()
         return {**self._about, "state": state, **(vars(progress) if progress else {})}
-
-    def _serve(self) -> None:
-        while True:
-            assert self._socket is not None
-            try:
-                connection, _ = self._socket.accept()
-            except OSError:
-                return
-            threading.Thread(target=self._obey, args=(connection,), daemon=True).start()
-
-    def _obey(self, connection: socket.socket) -> None:
-        with connection, contextlib.suppress(OSError):
-            connection.settimeout(_PATIENCE_S)
-            if _peer_uid(connection) in (os.getuid(), 0):
-                answer = self._answer(_line(connection))
-                connection.sendall(json.dumps(answer).encode() + b"\n")
 
     def _answer(self, line: bytes) -> State:
         try:
@@ -142,30 +99,10 @@ class RunControl:
                 self._control.pause.clear()
             case "stop":
                 self._control.stop_by(signal.SIGINT)
-                return {**self.state(), "trouble": _trouble(self._halt())}
+                return {**self.state(), "trouble": unsure(self._halt(), _SAFE_WITHIN_S)}
             case _:
                 return {"version": VERSION, "error": "expected the command pause, go-on, stop or state"}
         return self.state()
-
-
-def _trouble(done: Sequence[Safeguard]) -> list[str]:
-    """What is not sure to be done of it after a while."""
-    end_s = time.monotonic() + _SAFE_WITHIN_S
-    for safeguard in done:
-        safeguard.wait(max(0.0, end_s - time.monotonic()))
-    return [f"not sure: {safeguard.what}: {safeguard.trouble}" for safeguard in done if safeguard.trouble]
-
-
-def _peer_uid(connection: socket.socket) -> int:
-    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-    return int(struct.unpack("3i", credentials)[1])
-
-
-def _line(connection: socket.socket) -> bytes:
-    found = b""
-    while b"\n" not in found and len(found) < _LONGEST_LINE_BYTES and (more := connection.recv(4096)):
-        found += more
-    return found
 
 
 # -- the side of whoever asks ---------------------------------------------------------------------------------
@@ -181,7 +118,7 @@ def ask(run: Path, command: Command) -> State:
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise InputError(f"{run}: no process of this user acquires into this run on this machine") from error
     except (OSError, ValueError) as error:
-        raise InputError(f"{run}: the process that acquires into it does not answer: {error}") from error
+        raise InputError(f"{run}: the process that acquires into it does not answer: {reason(error)}") from error
 
 
 def running() -> list[State]:
@@ -201,11 +138,7 @@ def _running() -> Iterator[State]:
 
 
 def _exchange(path: Path, command: Command) -> State:
-    with socket.socket(socket.AF_UNIX) as connection:
-        connection.settimeout(_PATIENCE_S)
-        connection.connect(str(path))
-        connection.sendall(json.dumps({"version": VERSION, "command": command}).encode() + b"\n")
-        found: State = json.loads(_line(connection))
+    found = exchange(path, {"version": VERSION, "command": command})
     if "error" in found:
         raise ValueError(found["error"])
     return found

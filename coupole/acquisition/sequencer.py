@@ -63,7 +63,7 @@ class Sequencer:
         self._view_number = 0
         self._view_name = ""
         self.outcome = Outcome(shots=job.schedule.shots)
-        self._arm = ArmSupervisor(job, cell, self._control)
+        self._arm = ArmSupervisor(job.cell.rig, job.motion, cell, self._control)
         self._burst_runner = BurstRunner(
             cell,
             recorder,

@@ -19,6 +19,11 @@ from coupole.errors import StorageError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+HEAD = (
+    '<!doctype html><html lang="en"><meta charset="utf-8">'
+    '<meta name="viewport" content="width=device-width,initial-scale=1">'
+)
+"""First words of every page of results."""
 STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:.5em 0}td,th{padding:.15em 1em .15em 0;text-align:left}
@@ -90,7 +95,7 @@ def _page(record: Record, picture: bytes) -> str:
     data = base64.b64encode(picture).decode()
     remarks = "".join(f"<li>{html.escape(remark)}" for remark in record.remarks)
     return (
-        f"<!doctype html><meta charset=utf-8><title>{name}</title><style>{STYLE}</style><h1>{name}</h1>"
+        f"{HEAD}<title>{name}</title><style>{STYLE}</style><h1>{name}</h1>"
         f"{simulated}{_limits(record)}<h2>Result</h2>{_transforms(record)}{_parameters(record)}{_noise(record)}"
         + (f"<h2>Remarks</h2><ul>{remarks}</ul>" if remarks else "")
         + f'<h2>Residuals</h2><img src="data:image/png;base64,{data}" alt="residuals">{_validity(record)}'

@@ -193,7 +193,7 @@ def _show(console: Console, record: Record) -> None:
     for name, pose in record.transforms.items():
         shift = " ".join(f"{v:.4f}" for v in pose.translation_mm)
         console.print(f"{name}: {shift} mm, A B C {' '.join(f'{v:.5f}' for v in pose.abc_deg)} deg")
-    table = Table("parameter", "value", "u", "most of it from", box=None)
+    table = Table("parameter", "value", "u (k = 1)", "most of it from", box=None)
     for p in record.parameters:
         table.add_row(p.name, "" if p.value is None else f"{p.value:.6g}", f"{p.u:.2g}", p.dominated_by)
     console.print(table)

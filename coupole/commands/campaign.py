@@ -10,25 +10,12 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from coupole.commands import calibrate_geometry, calibrate_lens, calibrate_light
+from coupole.commands.simulated_support import BOARD, CERTIFICATE_OF_SIMULATED_TILE, TILE, with_things
 from coupole.errors import CalibrationRefused, Interrupted
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-BOARD = """\
-schema_version: 1
-kind: charuco
-corners: [11, 8]
-square_mm: 16.0
-marker_mm: 9.6
-dictionary: DICT_5X5_250
-"""
-TILE = """\
-schema_version: 1
-side_mm: 50.0
-support_from_tile: {translation_mm: [0, 0, 10]}
-"""
-CERTIFICATE_OF_SIMULATED_TILE = "minnaert: 1.0\n"
 OBJECT: Mapping[str, Any] = {
     "kind": "sculpted_relief",
     "translation_mm": [6.0, -4.0, 0.5],
@@ -196,17 +183,7 @@ class Campaign:
             return self._rig
         if path.exists():
             return path
-        from ruamel.yaml import YAML
-
-        yaml = YAML()
-        content = yaml.load(self._rig.read_text(encoding="utf-8"))
-        folder = self._rig.parent
-        content["dome"]["leds"] = str((folder / content["dome"]["leds"]).resolve())
-        content["storage"]["folder"] = str(self._out / "runs")
-        settings = content["world"].setdefault("settings", {})
-        settings["things"] = [*settings.get("things", ()), *(dict(thing) for thing in step.things)]
-        with path.open("w", encoding="utf-8") as file:
-            yaml.dump(content, file)
+        with_things(self._rig, step.things, path, self._out / "runs")
         return path
 
     def _scan(self) -> Path:

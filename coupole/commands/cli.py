@@ -11,7 +11,7 @@ import typer
 
 import coupole
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
-from coupole.commands import console, exporting, keeping, planning, run_controls, running
+from coupole.commands import benching, console, exporting, keeping, planning, run_controls, running
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
 from coupole.commands.dose_ledger import dose
@@ -40,6 +40,8 @@ for command in (
     running.meter,
     running.live,
     running.devices,
+    benching.bench,
+    benching.arm,
     running.confirm,
     commission,
     running.sim,

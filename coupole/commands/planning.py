@@ -173,7 +173,11 @@ def plan_new(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the views of `leds`, which are drawn.")] = 1,
 ) -> None:
-    """Write a plan to start from. The views of `leds` are chosen for the rig's dome: a minute or two."""
+    """Write a plan to start from. The views of `leds` are chosen for the rig's dome: a minute or two.
+
+    For a calibration in a simulated cell also NAME-rig.yaml, the rig with the board, card or tile on its support,
+    and NAME-board.yaml or NAME-tile.yaml, its description for `coupole calibrate`.
+    """
     from coupole.plan.plan import NAME_PATTERN
     from coupole.plan.templates import LEDS, TEMPLATES
     from coupole.viewing.terminal import make_console
@@ -200,6 +204,26 @@ def plan_new(
         with make_console(quiet=False).status("reading the rig") as status:
             text = led_plan(read_cell(rig), name=name, rig=str(rig), seed=seed, tell=status.update)
     else:
-        text = TEMPLATES[template].format(name=name, rig=rig)
+        text = TEMPLATES[template].format(name=name, rig=_on_the_support(template, rig, name))
     path.write_text(text, encoding="utf-8")
     print(path)
+
+
+def _on_the_support(template: str, rig: Path, name: str) -> Path:
+    """The rig; for a simulated cell whose support a calibration needs something on, a copy that has it."""
+    from coupole.commands.campaign import STEPS
+    from coupole.commands.simulated_support import place_for
+    from coupole.plan.cell import read_cell
+    from coupole.plan.rig_devices import in_world
+    from coupole.viewing.terminal import make_console
+
+    step = next((step for step in STEPS if step.name == template and step.things), None)
+    if step is None or not in_world(read_cell(rig).rig, dry_run=False):
+        return rig
+    made = place_for(template, step.things, rig, name)
+    make_console(quiet=False).print(
+        f"this cell is simulated: {made[0]} has on its support {step.stands}"
+        + "".join(f"; {described} describes it" for described in made[1:]),
+        markup=False,
+    )
+    return made[0]

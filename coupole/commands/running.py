@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -141,17 +140,7 @@ def meter(
         raise
     show_advice(console, advice)
     if as_json:
-        print(
-            json.dumps(
-                {
-                    "exposure": advice.exposure.model_dump(mode="json"),
-                    "remarks": advice.remarks,
-                    "noise": asdict(advice.noise),
-                    "views": {seen.view: asdict(seen) for seen in advice.views},
-                    "plan": str(write) if write else None,
-                }
-            )
-        )
+        print(json.dumps({**advice.figures(), "plan": str(write) if write else None}))
 
 
 def live(

@@ -7,10 +7,10 @@ import time
 from collections.abc import AsyncIterator
 from dataclasses import asdict
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from anyio import to_thread
-from fastapi import FastAPI, Query, Request, Response
+from fastapi import FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 
 import coupole
@@ -22,7 +22,7 @@ from coupole.console.object_routes import add_object_routes
 from coupole.console.permission import NotAllowed, allow
 from coupole.console.plan_queue import Entry
 from coupole.console.plan_routes import add_plan_routes
-from coupole.console.run_files import RunRow
+from coupole.console.run_routes import add_run_routes
 from coupole.console.service_parts import Service
 
 _EVENT_EVERY_S, _ALIVE_EVERY_S = 0.2, 1.0
@@ -34,7 +34,7 @@ def make_app(service: Service) -> FastAPI:
     guard(app, service)
     _add_sign_in(app, service)
     _add_cell(app, service)
-    _add_runs(app, service)
+    add_run_routes(app, service)
     _add_people(app, service)
     add_plan_routes(app, service)
     add_object_routes(app, service)
@@ -137,21 +137,6 @@ def _add_cell(app: FastAPI, service: Service) -> None:
         harms. `stop` is answered when the lights are off and the arm was told to stop, or with the `trouble`."""
         allow(service, who, Role.OPERATOR, command, acts=command == "go-on")
         return service.acquisitions.tell(run, command)
-
-
-def _add_runs(app: FastAPI, service: Service) -> None:
-    @app.get("/api/v1/runs")
-    def runs() -> list[RunRow]:
-        """The cell's runs, the newest first."""
-        return service.runs.rows()
-
-    @app.get("/api/v1/runs/{run}/picture", response_class=Response)
-    def picture(
-        run: Text, shot: Text, width: Annotated[int, Query(ge=1, le=2048)] = 640, saturation: bool = False
-    ) -> Response:
-        """A proven shot as JPEG, developed for the eye; with `saturation` clipped pixels are red."""
-        jpeg = service.runs.picture(run, shot, width, saturation=saturation)
-        return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
 
 
 async def _events(service: Service, request: Request) -> AsyncIterator[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,7 +85,7 @@ class RunFiles:
 
     def rows(self) -> list[RunRow]:
         """All runs; read anew only where something has changed."""
-        return [self._row(name) for name in self.names()]
+        return [self.row(name) for name in self.names()]
 
     def status(self, name: str) -> Status:
         """Raises InputError, StorageError."""
@@ -100,6 +101,13 @@ class RunFiles:
                 self._proven[name] = changed_s, found
         return found
 
+    def view(self, name: str, events: Sequence[FrameProven]) -> View:
+        """The file that has these frames, of one view. Raises InputError, StorageError."""
+        path = self.run(name).folder / events[0].file
+        if not path.is_file():
+            raise StorageError(f"{path}: no such file")
+        return read_view(path, events)
+
     def picture(self, name: str, shot: str, width_px: int, *, saturation: bool = False) -> bytes:
         """JPEG of a proven shot, at most `width_px` wide (rounded up to one of PICTURE_WIDTHS). Raises InputError,
         StorageError."""
@@ -110,7 +118,7 @@ class RunFiles:
     def frame(self, name: str, shot: str) -> Frame:
         """Figures of one frame. Raises InputError, StorageError."""
         event = self._event(name, shot)
-        view = self._view(name, event)
+        view = self.view(name, [event])
         record = view.records[event.index]
         coding = Coding(view.pattern, view.black_dn, view.white_dn)
         pose = view.poses[record["pose"]] if len(view.poses) else None
@@ -145,7 +153,8 @@ class RunFiles:
         paths = [folder / "journal.jsonl", *(folder / "views").glob("*.h5")]
         return max((path.stat().st_mtime for path in paths if path.exists()), default=0.0)
 
-    def _row(self, name: str) -> RunRow:
+    def row(self, name: str) -> RunRow:
+        """One of them."""
         changed_s = self._changed_s(name)
         known_s, row = self._rows.get(name, (-1.0, None))
         if row is None or known_s != changed_s or row.state in ("running", "paused", "created"):
@@ -190,15 +199,9 @@ class RunFiles:
             raise InputError(f"{shot}: not proven in {name}")
         return event
 
-    def _view(self, name: str, event: FrameProven) -> View:
-        path = self.run(name).folder / event.file
-        if not path.is_file():
-            raise StorageError(f"{path}: no such file")
-        return read_view(path, [event])
-
     def _picture(self, name: str, shot: str, _: str, width_px: int, saturation: bool) -> bytes:
         event = self._event(name, shot)
-        view = self._view(name, event)
+        view = self.view(name, [event])
         coding = Coding(view.pattern, view.black_dn, view.white_dn)
         return look(view.pixels(event.index), coding, width_px, saturation=saturation, focus=False)
 

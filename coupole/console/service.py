@@ -28,6 +28,7 @@ from coupole.console.audit import Audit
 from coupole.console.client import service_socket
 from coupole.console.drafts import Desk
 from coupole.console.entering import Entering
+from coupole.console.frame_sheets import FrameSheets
 from coupole.console.messages import StateNow
 from coupole.console.notifications import console_folder, read_settings
 from coupole.console.notifier import Notifier, Occurrences
@@ -95,7 +96,7 @@ def serve(
 
             service = Service(
                 cell, plans, accounts, Sessions(), control, audit, queue, acquisitions,
-                plan_files, desk, runs, RunWatch(runs), objects, tasks,
+                plan_files, desk, runs, FrameSheets(runs, folder / "means"), RunWatch(runs), objects, tasks,
                 state=state,
                 newest=Newest(state),
                 entering=entering,

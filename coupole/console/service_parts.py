@@ -11,6 +11,7 @@ from coupole.console.acquisitions import Acquisitions
 from coupole.console.audit import Audit
 from coupole.console.drafts import Desk
 from coupole.console.entering import Entering
+from coupole.console.frame_sheets import FrameSheets
 from coupole.console.messages import StateNow
 from coupole.console.object_files import ObjectFiles
 from coupole.console.plan_files import PlanFiles
@@ -39,6 +40,7 @@ class Service:
     desk: Desk
     """Checks and draws plans while they are written."""
     runs: RunFiles
+    sheets: FrameSheets
     watch: RunWatch
     """Of the run at work."""
     objects: ObjectFiles

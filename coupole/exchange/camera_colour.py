@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError
+from coupole.errors import InputError, reason
 
 Floats = NDArray[np.float64]
 Neutral = Callable[[int | None], Floats]
@@ -103,7 +103,7 @@ def _spectrum(path: Path, column: int) -> Floats:
     try:
         found = on_grid(read_spectrum(path, unit="power", column=column)).values
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot read the table of spectra: {error}") from error
+        raise InputError(f"{path}: cannot read the table of spectra: {reason(error)}") from error
     values: Floats = np.nan_to_num(found)
     if values.min() < -_NOISE * values.max():
         raise InputError(f"{path}: column {column} goes below 0; expected relative sensitivities or power")

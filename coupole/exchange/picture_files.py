@@ -9,7 +9,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from coupole.errors import InputError, StorageError
+from coupole.errors import InputError, StorageError, reason
 
 SUFFIXES = (".npy", ".exr", ".png")
 _PNG_WHITE = 65535
@@ -42,6 +42,6 @@ def write_picture(path: Path, picture: NDArray[np.float32]) -> None:
                 part.write_bytes(cv2.imencode(".png", scaled[..., ::-1])[1].tobytes())
         part.replace(path)
     except (OSError, RuntimeError) as error:
-        raise StorageError(f"{path}: {error}") from error
+        raise StorageError(f"{path}: {reason(error)}") from error
     finally:
         part.unlink(missing_ok=True)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError, StorageError
+from coupole.errors import InputError, StorageError, reason
 from coupole.exchange.camera_colour import CameraColour
 from coupole.exchange.srgb import srgb
 from coupole.exchange.tiff_for_the_eye import srgb_profile, tiff_of
@@ -52,7 +52,7 @@ def write_for_the_eye(path: Path, linear: NDArray[np.float64], white: float, abo
     try:
         write_synced(path, content)
     except OSError as error:
-        raise StorageError(f"{path}: {error}") from error
+        raise StorageError(f"{path}: {reason(error)}") from error
 
 
 def _png(codes: NDArray[np.uint8], about: dict[str, Any], profile: bytes) -> bytes:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError, StorageError
+from coupole.errors import InputError, StorageError, reason
 from coupole.exchange.srgb import srgb
 from coupole.storage.durable import write_synced
 
@@ -63,4 +63,4 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.float32]], *, white: f
     try:
         write_synced(path, whole.getvalue())
     except OSError as error:
-        raise StorageError(f"{path}: {error}") from error
+        raise StorageError(f"{path}: {reason(error)}") from error

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from coupole.errors import InputError, Problem
+from coupole.errors import InputError, Problem, reason
 from coupole.plan import yamlfile
 from coupole.plan.arm_description import arm_named
 from coupole.plan.led_table import LedTable, read_led_table
@@ -115,7 +115,7 @@ def _damage_w_per_lm(document: Document, key: str, given: Path | None, problems:
     try:
         return damage_w_per_lm(read_spectrum(path, unit="power"))
     except (OSError, UnicodeDecodeError) as error:
-        problems.append(document.problem(("dome", key), f"cannot read the spectrum {path}: {error}"))
+        problems.append(document.problem(("dome", key), f"cannot read the spectrum {path}: {reason(error)}"))
     except InputError as error:
         problems += error.problems or [document.problem(("dome", key), str(error))]
     return None

@@ -167,6 +167,8 @@ class Motion(Model):
         0.0,
     )
     """Assumed start posture when a plan is checked without the arm."""
+    park_joints_deg: Posture | None = None
+    """Where the arm is left when nobody works with it. Without it the arm cannot be sent to park."""
 
 
 class Support(Model):
@@ -251,6 +253,14 @@ class Storage(Model):
     use the cell. `state` in `folder` if not given."""
 
 
+class Consoles(Model):
+    """The consoles from which people work with the cell."""
+
+    at_the_cell: Annotated[tuple[Words, ...], Field(max_length=100)] = ()
+    """Addresses of those whose user sees the arm and reaches its emergency stop: only from these it is moved by
+    hand."""
+
+
 class WorldSection(Model):
     """The stand-ins: started with the rig (or for dry runs only), or joined if they already run."""
 
@@ -311,6 +321,8 @@ class Rig(Model):
     user's data folder (XDG) if not given."""
     calibrations: Literal["none"] | tuple[FilePath, ...] = "none"
     """Records that must be in force for plans without a list of their own."""
+    console: Consoles = Consoles()
+    """Which consoles stand at the cell."""
     world: WorldSection | None = None
     """The stand-ins of a simulated rig; none on a real one."""
     licence: Words | None = None

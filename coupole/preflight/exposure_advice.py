@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,15 @@ class Advice:
     views: tuple[ViewAdvice, ...]
     exposure: FixedExposure | BracketExposure
     remarks: tuple[str, ...]
+
+    def figures(self) -> dict[str, Any]:
+        """JSON's values only."""
+        return {
+            "exposure": self.exposure.model_dump(mode="json"),
+            "remarks": self.remarks,
+            "noise": asdict(self.noise),
+            "views": {seen.view: asdict(seen) for seen in self.views},
+        }
 
 
 def metering_plan(plan: Plan, leds: LedTable, rows: NDArray[np.int64]) -> Plan:

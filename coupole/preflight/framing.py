@@ -146,16 +146,16 @@ def framing_of(
 ) -> Framing:
     """What a camera sees of an object: a `ray_mesh`, and points [n, 3] on its surface."""
     depth_mm = seen_depths_mm(sight, mesh)
-    in_field, depth_of_points_mm = _in_field(sight, mesh, points_mm)
+    visible, inside, depth_of_points_mm = points_shown(sight, mesh, points_mm)
     near_mm, far_mm = sharp_mm
     shown = depth_mm[np.isfinite(depth_mm)]
     if len(shown) == 0:  # too small for the raster, or nothing
-        shown = depth_of_points_mm
+        shown = depth_of_points_mm[inside]
     nothing = len(shown) == 0
     nearest, farthest = (np.nan, np.nan) if nothing else (float(shown.min()), float(shown.max()))
     return Framing(
         view,
-        in_field,
+        float(inside.sum() / max(1, visible.sum())),
         float(np.isfinite(depth_mm).mean()),
         nearest,
         farthest,
@@ -179,16 +179,18 @@ def seen_depths_mm(sight: Sight, mesh: Any) -> NDArray[np.float64]:
     return found
 
 
-def _in_field(sight: Sight, mesh: Any, points_mm: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-    """Of the points [n, 3] that nothing hides from the camera, the share inside the picture, and their depths."""
+def points_shown(
+    sight: Sight, mesh: Any, points_mm: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
+    """Of points [n, 3] on the surface of a `ray_mesh`: which nothing of it hides from the camera's place, which of
+    these are inside the picture, and all their depths along the axis; [n] each."""
     eye_mm = sight.support_from_camera[:3, 3]
     away_mm = np.linalg.norm(eye_mm - points_mm, axis=1)
     starts_mm = points_mm + (eye_mm - points_mm) * (RAY_START_MM / np.maximum(away_mm, RAY_START_MM))[:, None]
     visible = ~blocked(mesh, starts_mm, np.tile(eye_mm, (len(starts_mm), 1)))
     pixels, depth_mm = sight.project(points_mm)
     inside = (pixels >= -0.5) & (pixels <= np.array((sight.width_px, sight.height_px)) - 0.5)
-    shown = inside.all(axis=1) & (depth_mm > 0) & visible
-    return float(shown.sum() / max(1, visible.sum())), depth_mm[shown]
+    return visible, inside.all(axis=1) & (depth_mm > 0) & visible, depth_mm
 
 
 def _camera_pose(view: ViewPose, number: int, rig: Rig, itinerary: Itinerary) -> Transform:

@@ -8,6 +8,7 @@ other and with numbers, rounding as single numbers do. They live in compiled cod
 from __future__ import annotations
 
 import operator
+from collections.abc import Iterator
 from typing import Any
 
 from llvmlite import ir
@@ -224,6 +225,89 @@ def gathered(_context, arrays, rows, place):  # type: ignore[no-untyped-def]
         return vector if single else builder.fptrunc(vector, _vector(types.float32))
 
     return _KINDS[types.float32](arrays, rows, types.intp), generate
+
+
+def _mixed(builder: Any, one: Any, other: Any, chosen: list[int]) -> Any:
+    """A vector of chosen numbers of two, those of the other numbered after those of the one."""
+    return builder.shuffle_vector(one, other, ir.Constant(ir.VectorType(_INT, len(chosen)), chosen))
+
+
+def _vectors_at(builder: Any, address: Any, kind: Any, count: int) -> Iterator[Any]:
+    """Pointers to as many vectors of a kind, one behind the other, that are aligned as their numbers are."""
+    size = kind.count * 4
+    for number in range(count):
+        yield builder.inttoptr(builder.add(address, ir.IntType(64)(number * size)), kind.as_pointer())
+
+
+@_compiled
+def four_gathered(_context, arrays, rows, first):  # type: ignore[no-untyped-def]
+    """Four lanes: what is at the places `first` to `first` + 3 of eight `rows` [8] of `arrays` [m, n] in C order
+    and single precision. Rows are read whole and transposed in two steps, faster than number by number."""
+    _refuse_but_singles(arrays)
+    four = ir.VectorType(ir.FloatType(), 4)
+
+    def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
+        of_arrays, of_rows = signature.args[:2]
+        fours = []
+        for lane in range(LANES):
+            where = _address(context, builder, of_rows, values[1], ir.IntType(64)(lane))
+            row = builder.load(builder.inttoptr(where, ir.IntType(64).as_pointer()))
+            address = _address(context, builder, of_arrays, values[0], row, values[2])
+            fours.append(builder.load(next(_vectors_at(builder, address, four, 1)), align=4))
+        rows = [_mixed(builder, fours[n], fours[n + 4], list(range(8))) for n in range(4)]
+        low, high = [0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]
+        pairs = [_mixed(builder, rows[n], rows[n + 2], half) for half in (low, high) for n in (0, 1)]
+        made = [_mixed(builder, pairs[n], pairs[n + 1], half) for n in (0, 2) for half in (low, high)]
+        return context.make_tuple(builder, signature.return_type, made)
+
+    return _several(4)(arrays, rows, types.intp), generate
+
+
+@_compiled
+def in_turns(_context, array, row):  # type: ignore[no-untyped-def]
+    """Three lanes whose numbers take turns in a row of 24 of an array [n, 24] in C order and single precision."""
+    _refuse_but_singles(array)
+
+    def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
+        address = _address(context, builder, signature.args[0], *values)
+        places = _vectors_at(builder, address, _vector(types.float32), 3)
+        first, second, third = (builder.load(place, align=4) for place in places)
+        made = []
+        for lane in range(3):
+            wanted = [3 * n + lane for n in range(LANES)]
+            early = _mixed(builder, first, second, [min(n, 15) for n in wanted])
+            late = [k if n < 16 else n - 8 for k, n in enumerate(wanted)]
+            made.append(_mixed(builder, early, third, late))
+        return context.make_tuple(builder, signature.return_type, made)
+
+    return _several(3)(array, types.intp), generate
+
+
+@_compiled
+def add_in_turns(_context, one, two, three, array, row):  # type: ignore[no-untyped-def]
+    """Add three lanes to a row of 24 in which their numbers take turns, of an array as `in_turns` has it."""
+    _refuse_but_singles(array)
+
+    def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
+        address = _address(context, builder, signature.args[3], *values[3:])
+        for number, place in enumerate(_vectors_at(builder, address, _vector(types.float32), 3)):
+            wanted = [divmod(8 * number + n, 3) for n in range(LANES)]
+            early = _mixed(builder, values[0], values[1], [lane + 8 * (of % 2) for lane, of in wanted])
+            late = [8 + lane if of == 2 else n for n, (lane, of) in enumerate(wanted)]
+            summed = builder.fadd(builder.load(place, align=4), _mixed(builder, early, values[2], late))
+            builder.store(summed, place, align=4)
+        return context.get_dummy_value()
+
+    return types.void(one, two, three, array, types.intp), generate
+
+
+def _several(count: int) -> Any:
+    return types.UniTuple(_KINDS[types.float32], count)  # type: ignore[no-untyped-call]
+
+
+def _refuse_but_singles(array: Any) -> None:
+    if array.layout != "C" or array.dtype != types.float32:
+        raise errors.TypingError(f"expected an array of float32 in C order, got {array}")
 
 
 @_compiled

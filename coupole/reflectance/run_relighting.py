@@ -6,13 +6,12 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from coupole.motion.occlusion import ray_mesh
+from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.beams import Beam, Lighting, lighting_of
 from coupole.reflectance.new_light.light_kinds import AnyLight
@@ -84,8 +83,8 @@ class RelitScene:
     """Of the surface's triangles."""
     views: tuple[ViewSamples, ...]
     """In the order in which LEDs are looked for."""
-    rays: Any
-    """The mesh's `ray_mesh`."""
+    mesh: PacketMesh
+    """What throws shadows."""
 
     def picture(
         self, lights: Sequence[AnyLight], samples: int = SAMPLES, *, say: Say = lambda done, of: None
@@ -110,22 +109,25 @@ class RelitScene:
         codes = np.zeros((LANES, *self.surface.seen.shape), np.uint8)
         done = 0
         for beams in alike(lighting.beams):
+            alone = len(beams) == 1 and beams[0].density == 0.0
             for lane, beam in enumerate(beams):
-                codes[lane] = reached(self.rays, self.surface, beam)
+                found = reached(self.mesh, self.surface, beam)
+                if alone:
+                    add_beam(picture, self.surface, coats, found, beam)
+                else:
+                    codes[lane] = found
                 done += 1
                 say(done, work)
-            if len(beams) == 1 and beams[0].density == 0.0:
-                add_beam(picture, self.surface, coats, codes[0], beams[0])
-            else:
+            if not alone:
                 add_beams(picture, self.surface, coats, codes, beams, lobe_rays)
         for number, emitter in enumerate(lighting.emitters):
-            add_mirrored(picture, self.surface, coats, self.rays, emitter, lobe_rays)
+            add_mirrored(picture, self.surface, coats, self.mesh, emitter, lobe_rays)
             say(len(lighting.beams) + number + 1, work)
 
     def _by_values(self, picture: Picture, lighting: Lighting, reflecting: Slices | Pairs, say: Say) -> None:
         for number, beam in enumerate(lighting.beams):
             values = self._triangle_values(reflecting, beam)
-            add_values(picture, self.surface, values, reached(self.rays, self.surface, beam), beam)
+            add_values(picture, self.surface, values, reached(self.mesh, self.surface, beam), beam)
             say(number + 1, len(lighting.beams))
 
     def _triangle_values(self, reflecting: Slices | Pairs, beam: Beam) -> NDArray[np.float32]:
@@ -174,16 +176,16 @@ def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = 
     name = fit or best_fit(result)
     surface = surface_of_view(result, mine)
     order = (mine, *(one for one in result.views if one is not mine))
-    rays = ray_mesh(result.corners_mm.astype(np.float64))
+    mesh = PacketMesh(result.corners_mm, compact=False)
     if name in ANYWHERE:
-        return RelitScene(result, name, surface, _from_anywhere(result, name, surface), order, rays)
+        return RelitScene(result, name, surface, _from_anywhere(result, name, surface), order, mesh)
     if not result.slices_path(name, mine).exists():
         raise InputError(f"{result.folder}: has no fit {name}; `coupole reflectance fit {result.folder}` makes it")
     over, coefficients = SLICES[name].over, result.slices(name, mine)
     slices = Slices(name, coefficients, None)
     if over is not None:
         slices = Slices(name, coefficients, materials_of(result, over, surface))
-    return RelitScene(result, name, surface, slices, order, rays)
+    return RelitScene(result, name, surface, slices, order, mesh)
 
 
 def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) -> RelitScene:
@@ -195,9 +197,9 @@ def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) ->
             f"--fit: {fit} holds for the view that it was fitted to; with --from expected {', '.join(ANYWHERE)}"
         )
     name = fit or best_fit(result, MATERIALS)
-    rays = ray_mesh(result.corners_mm.astype(np.float64))
-    surface = surface_from(result, rays, camera)
-    return RelitScene(result, name, surface, _from_anywhere(result, name, surface), result.views, rays)
+    mesh = PacketMesh(result.corners_mm, compact=False)
+    surface = surface_from(result, mesh, camera)
+    return RelitScene(result, name, surface, _from_anywhere(result, name, surface), result.views, mesh)
 
 
 def _refuse_unknown(fit: str | None) -> None:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from coupole.errors import StorageError
+from coupole.errors import StorageError, reason
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256, write_synced
 from coupole.storage.inner_path import inner
@@ -42,7 +42,7 @@ def read(run: Path) -> dict[str, str]:
     except FileNotFoundError:
         return {}
     except (OSError, UnicodeDecodeError) as error:
-        raise StorageError(f"{path}: cannot be read: {error}") from error
+        raise StorageError(f"{path}: cannot be read: {reason(error)}") from error
     found = {}
     for number, line in enumerate(lines, 1):
         digest, _, name = line.partition("  ")

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from coupole.errors import InputError
+from coupole.errors import InputError, reason
 from coupole.plan.shot_id import ShotLabel
 from coupole.storage.inner_path import InnerPath
 
@@ -90,8 +90,10 @@ def read_description(folder: Path) -> dict[str, Any]:
     path = folder / RUN_JSON
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{folder}: not a run folder: it has no {RUN_JSON}") from error
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not a run folder: {error}") from error
+        raise InputError(f"{path}: not a run folder: {reason(error)}") from error
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != SCHEMA_VERSION:
         raise InputError(f"{path}: expected run.json of schema version {SCHEMA_VERSION}, found {version!r:.40}")

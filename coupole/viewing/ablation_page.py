@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from coupole.calibration.report import HEAD
 from coupole.errors import StorageError
 from coupole.storage.durable import write_synced
 from coupole.viewing.reflectance_page import STYLE
@@ -31,7 +32,7 @@ def write(folder: Path, told: dict[str, Any]) -> Path:
 
 def _page(name: str, told: dict[str, Any]) -> Iterator[str]:
     title = f"{html.escape(name)}: fewer LEDs, samples, coefficients"
-    yield f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
+    yield f"{HEAD}<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
     yield (
         "<p>Mean absolute error under the LEDs kept for the check, in % of the camera's range, of "
         f"{told['triangles']} triangles spread over the object. All fits are compared by the same samples."

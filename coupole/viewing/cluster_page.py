@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from coupole.calibration.report import HEAD
 from coupole.errors import StorageError
 from coupole.reflectance.run_result import RunResult
 from coupole.storage.durable import write_synced
@@ -36,7 +37,7 @@ def write(folder: Path, told: dict[str, Any]) -> Path:
 
 def _page(folder: Path, told: dict[str, Any]) -> Iterator[str]:
     title = f"{html.escape(folder.resolve().name)}: clusters"
-    yield f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
+    yield f"{HEAD}<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
     yield f"<p>{told['clusters']} materials for {told['triangles']} triangles, {told['borrowed']} of which had "
     yield f"too few samples for one of their own; {told['without']} have none."
     yield "<table><tr><th><th>mean error under LEDs left out, % of range"

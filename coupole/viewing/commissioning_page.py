@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from pathlib import Path
 
-from coupole.calibration.report import STYLE, table
+from coupole.calibration.report import HEAD, STYLE, table
 from coupole.errors import StorageError
 from coupole.preflight.commissioned import STEPS, CommissioningRecord, StepResult
 
@@ -30,7 +30,7 @@ def page(record: CommissioningRecord) -> str:
         result = record.result(step)
         parts.append(f"<h2>{step}</h2><p class=bad>Not done." if result is None else _step(result))
     return (
-        f"<!doctype html><meta charset=utf-8><title>{name}</title><style>{STYLE}</style><h1>{name}</h1>"
+        f"{HEAD}<title>{name}</title><style>{STYLE}</style><h1>{name}</h1>"
         f"{verdict}{simulated}{''.join(parts)}<p>Made by {html.escape(record.software)}; record "
         f"<code>{record.sha256}</code>"
     )

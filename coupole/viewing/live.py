@@ -22,10 +22,13 @@ from coupole.plan.shot_id import Led
 from coupole.storage import journal
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
+from coupole.storage.run_status import CREATED, PAUSED, RUNNING, Status, status
 from coupole.storage.view_reader import read_view
 from coupole.viewing.raw_preview import Coding, Figures, figures
 
 _POLL_S = 0.2
+_STATUS_S, _STATUS_REST = 1.0, 20.0
+"""A run's status is read at most so often, and rests so many times as long as it takes to read."""
 UNWATCHED_S = 5.0
 """A source of light stops when no page has asked for so long; an open page asks five times a second, one in the
 background once."""
@@ -53,6 +56,8 @@ class Shown:
     figures: Figures
     frames_per_s: float
     dose_lux_h: float
+    run: str = ""
+    """State and progress of the run that the frame is of; empty for a camera's frame."""
 
 
 class Source(Protocol):
@@ -125,17 +130,43 @@ class RunSource:
 
     def __init__(self, folder: Path) -> None:
         self._run = Run(folder)
+        self._status = Status()
+        self._next_status_s = 0.0
 
     def frames(self, studio: Studio) -> None:
         pace, number = FrameRate(), 0
         newest: FrameProven | None = None
         while not studio.closing.is_set():
-            last = self._newest()
+            changed = self._ask_status(studio)
+            last, shown = self._newest(), studio.shown
             if last is not None and last != newest:
                 newest = last
                 number += 1
-                studio.show(replace(self._read(last, number), frames_per_s=pace.beat()))
+                shown = replace(self._read(last, number), frames_per_s=pace.beat())
+                studio.show(self._with_status(shown))
+            elif changed and shown is not None:
+                number += 1
+                studio.show(self._with_status(replace(shown, number=number)))
             studio.closing.wait(_POLL_S)
+
+    def _ask_status(self, studio: Studio) -> bool:
+        """Read how far the run is, from time to time: a small part of this thread's time. True if it is news."""
+        begun_s = time.monotonic()
+        if begun_s < self._next_status_s:
+            return False
+        before, self._status = self._status, status(self._run)
+        took_s = time.monotonic() - begun_s
+        self._next_status_s = begun_s + max(_STATUS_S, _STATUS_REST * took_s)
+        if self._status.state not in (CREATED, RUNNING, PAUSED):
+            studio.remark = f"the run is not being acquired ({self._status.state}): this is its last frame"
+        elif studio.remark:
+            studio.remark = "the run goes on"
+        return self._status != before
+
+    def _with_status(self, shown: Shown) -> Shown:
+        now = self._status
+        said = f"{now.state}, {now.proven} of {now.shots} shots proven"
+        return replace(shown, run=said, dose_lux_h=now.dose_lux_h)
 
     def _newest(self) -> FrameProven | None:
         found = None

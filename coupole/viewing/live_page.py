@@ -278,6 +278,7 @@ def _figures(studio: Studio, leds: tuple[int, ...]) -> dict[str, Any]:
             "exposure_us": shown.exposure_us,
             "frames_per_s": round(shown.frames_per_s, 2),
             "dose_lux_h": shown.dose_lux_h,
+            "run": shown.run,
             **asdict(shown.figures),
         }
     return {

@@ -15,6 +15,8 @@ from coupole.preflight.framing import SHARP_PX, Framing, Placement
 from coupole.preflight.preflight import Report
 from coupole.viewing.terminal import bytes_text, duration_text
 
+_ON_THE_DISK_MM = 0.05
+
 
 def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> None:
     """Print the summary of a preflight. For a resumed run figures are what is left, beside the whole."""
@@ -27,8 +29,9 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
         size += f" left of {bytes_text(whole.bytes)}"
         duration += f" left of {duration_text(whole.duration_s)}"
     table.add_row("views, shots, frames", counts)
-    table.add_row("on disk", f"{size} at {bytes_text(report.asked_bytes_s)}/s" + _disk(report))
-    table.add_row("a frame every", "; ".join(map(_pace, report.timings)))
+    table.add_row("on disk", size + (_speeds(report) if report.frames else ""))
+    if report.timings:
+        table.add_row("a frame every", "; ".join(map(_pace, report.timings)))
     table.add_row("duration", f"{duration} (at best {duration_text(report.ideal_s)})")
     table.add_row("light on the object", _dose(report))
     table.add_row("hottest LED board", f"{report.peak_board_c:.1f} C")
@@ -110,8 +113,9 @@ def _pace(timing: BurstTiming) -> str:
     )
 
 
-def _disk(report: Report) -> str:
-    return f"; the disk takes {bytes_text(report.disk_bytes_s)}/s" if report.disk_bytes_s else ""
+def _speeds(report: Report) -> str:
+    disk = f"; the disk takes {bytes_text(report.disk_bytes_s)}/s" if report.disk_bytes_s else ""
+    return f" at {bytes_text(report.asked_bytes_s)}/s{disk}"
 
 
 def _white(report: Report) -> str:
@@ -126,8 +130,14 @@ def _white(report: Report) -> str:
 def _placed(placed: Placement) -> str:
     size = " x ".join(f"{high - low:.0f}" for low, high in zip(placed.low_mm, placed.high_mm, strict=True))
     lowest = placed.lowest_over_disk_mm
-    where = "beside the disk" if lowest is None else f"lowest point {lowest:.1f} mm above the disk"
+    where = "beside the disk" if lowest is None else f"its lowest point {_height(lowest)}"
     return f"{size} mm, {where}, up to {placed.reach_mm:.0f} mm from its centre"
+
+
+def _height(over_disk_mm: float) -> str:
+    if abs(over_disk_mm) < _ON_THE_DISK_MM:
+        return "on the disk"
+    return f"{abs(over_disk_mm):.1f} mm {'above the disk' if over_disk_mm > 0 else 'inside the disk'}"
 
 
 def _framed(seen: Framing) -> list[str]:

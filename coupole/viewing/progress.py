@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from coupole.plan.shot_id import ShotId
 
+OVER_EXPOSED, UNDER_EXPOSED = 1e-3, 0.05
+"""Share of a frame's pixels that may saturate; share of full scale that the bright pixels of most frames reach."""
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -75,6 +78,6 @@ class ViewExposure:
 
     def verdict(self) -> str:
         """`over-exposed`, `under-exposed` or `well exposed`."""
-        if self.saturated > 1e-3:
+        if self.saturated > OVER_EXPOSED:
             return "over-exposed"
-        return "under-exposed" if self.median_bright < 0.05 else "well exposed"
+        return "under-exposed" if self.median_bright < UNDER_EXPOSED else "well exposed"

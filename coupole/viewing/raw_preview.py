@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,8 @@ _SHARP_GRADIENT = 0.25
 """Relative change of brightness from one cell to the next, above which an edge is in focus."""
 _BEYOND_NOISE = 5.0
 """Of the standard error of a frame's mean product of gradients, below which noise may have made it."""
+_CLIPPED = 0.001
+"""Share of a region's pixels at full scale, above which it says nothing about the white point."""
 _DARK = 0.02
 """Share of full scale below which an edge is noise."""
 
@@ -46,19 +49,27 @@ class Figures:
     the same scene under the same light."""
 
 
-def develop(raw: NDArray[np.uint16], *, pattern: str, black_dn: int, white_dn: int) -> NDArray[np.uint8]:
-    """A preview [h/2, w/2, 3] of a RAW frame: one pixel for each Bayer cell, gamma 2.2."""
+def develop(
+    raw: NDArray[np.uint16],
+    *,
+    pattern: str,
+    black_dn: int,
+    white_dn: int,
+    gains: Sequence[float] = (1.0, 1.0, 1.0),
+) -> NDArray[np.uint8]:
+    """A preview [h/2, w/2, 3] of a RAW frame: one pixel for each Bayer cell, times `gains` of R, G, B; gamma
+    2.2."""
     scaled = np.clip((raw.astype(np.float32) - black_dn) / (white_dn - black_dn), 0, 1)
     cell = [scaled[0::2, 0::2], scaled[0::2, 1::2], scaled[1::2, 0::2], scaled[1::2, 1::2]]
     letters = pattern if pattern != "MONO" else "GGGG"
     planes = []
-    for colour in "RGB":
+    for colour, gain in zip("RGB", gains, strict=True):
         mine = [
             plane
             for plane, letter in zip(cell, letters, strict=True)
             if letter in (colour, "G" * (pattern == "MONO"))
         ]
-        planes.append(np.mean(mine, axis=0))
+        planes.append(np.minimum(gain * np.mean(mine, axis=0), 1.0))
     picture: NDArray[np.uint8] = (255 * np.stack(planes, axis=-1) ** _GAMMA + 0.5).astype(np.uint8)
     return picture
 
@@ -112,7 +123,44 @@ def _sharpness(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
     return energy / level if energy > _BEYOND_NOISE * noise and level > 0 else 0.0
 
 
-def look(raw: NDArray[np.uint16], coding: Coding, width_px: int, *, saturation: bool, focus: bool) -> bytes:
+def white_point(raw: NDArray[np.uint16], coding: Coding) -> tuple[float, float, float] | None:
+    """Gains of R, G, B that make the mean of a region neutral, green unchanged. None if the region is saturated or
+    too dark to tell, or has no colours."""
+    planes = channels(raw, coding.pattern)
+    span = coding.white_dn - coding.black_dn
+    mean = {name: (float(plane.mean()) - coding.black_dn) / span for name, plane in planes.items()}
+    full = max(float(np.mean(plane >= coding.white_dn)) for plane in planes.values())
+    if "R" not in mean or full > _CLIPPED or min(mean.values()) < _DARK:
+        return None
+    green = 0.5 * (mean["G1"] + mean["G2"])
+    return green / mean["R"], 1.0, green / mean["B"]
+
+
+def loupe(raw: NDArray[np.uint16], coding: Coding, gains: Sequence[float] = (1.0, 1.0, 1.0)) -> bytes:
+    """A region of a RAW frame that begins on a Bayer cell, as PNG with one pixel for each of the sensor's: each
+    has its own value, the other two colours are those of its cell."""
+    cells = develop(raw, pattern=coding.pattern, black_dn=coding.black_dn, white_dn=coding.white_dn, gains=gains)
+    picture = np.repeat(np.repeat(cells, 2, axis=0), 2, axis=1)
+    letters = coding.pattern if coding.pattern != "MONO" else "GGGG"
+    for place, letter in enumerate(letters):
+        at = np.s_[place // 2 :: 2, place % 2 :: 2]
+        channel = "RGB".index(letter)
+        share = np.clip((raw[at].astype(np.float32) - coding.black_dn) / (coding.white_dn - coding.black_dn), 0, 1)
+        own = (255 * np.minimum(gains[channel] * share, 1.0) ** _GAMMA + 0.5).astype(np.uint8)
+        for colour in range(3) if coding.pattern == "MONO" else (channel,):
+            picture[(*at, colour)] = own
+    return png(picture)
+
+
+def look(
+    raw: NDArray[np.uint16],
+    coding: Coding,
+    width_px: int,
+    *,
+    saturation: bool,
+    focus: bool,
+    gains: Sequence[float] = (1.0, 1.0, 1.0),
+) -> bytes:
     """A JPEG of a RAW frame, at most `width_px` wide; on request with saturated cells in red and edges in focus in
     green."""
     from PIL import Image
@@ -121,7 +169,7 @@ def look(raw: NDArray[np.uint16], coding: Coding, width_px: int, *, saturation: 
     height, width = (size // (2 * stride) * 2 * stride for size in raw.shape)
     cells = raw[:height, :width].reshape(height // (2 * stride), 2 * stride, width // (2 * stride), 2 * stride)
     few = np.ascontiguousarray(cells[:, :2, :, :2]).reshape(height // stride, width // stride)
-    picture = develop(few, pattern=coding.pattern, black_dn=coding.black_dn, white_dn=coding.white_dn)
+    picture = develop(few, pattern=coding.pattern, black_dn=coding.black_dn, white_dn=coding.white_dn, gains=gains)
     if focus:
         picture[_any_of(_in_focus(_two_greens(raw[:height, :width], coding)[0]), stride)] = _SHARP
     if saturation:

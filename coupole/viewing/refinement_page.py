@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from coupole.calibration.report import HEAD
 from coupole.errors import InputError, StorageError
 from coupole.reflectance.alignment.refined_geometry import ABOUT, REFINED
 from coupole.storage.durable import write_synced
@@ -67,7 +68,7 @@ def surprising(about: dict[str, Any]) -> bool:
 
 def _page(folder: Path, about: dict[str, Any]) -> Iterator[str]:
     title = f"{html.escape(folder.resolve().name)}: views refined"
-    yield f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>"
+    yield f"{HEAD}<title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>"
     for remark in remarks(about):
         yield f"<p>{html.escape(remark)}"
     yield "<h2>Disagreement</h2><p>From a spot of the surface to where another view puts it, in the picture of "

@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.calibration.report import HEAD
 from coupole.errors import StorageError
 from coupole.reflectance.picture_job import PEAK_QUANTILE
 from coupole.reflectance.picture_result import MATERIALS, REPORT, PictureResult
@@ -69,7 +70,7 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
 def _page(result: PictureResult) -> Iterator[str]:
     about = result.about
     title = html.escape(result.folder.resolve().name)
-    yield f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
+    yield f"{HEAD}<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
     for remark in remarks(about):
         yield f"<p>{html.escape(remark)}"
     with h5py.File(result.folder / MATERIALS) as file:

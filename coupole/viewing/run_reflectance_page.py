@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.calibration.report import HEAD
 from coupole.errors import StorageError
 from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.run_fits import predicted
@@ -89,7 +90,7 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
 def _page(folder: Path) -> Iterator[str]:
     about = read_about(folder)
     title = html.escape(folder.resolve().name)
-    yield f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
+    yield f"{HEAD}<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
     for remark in remarks(about):
         yield f"<p>{html.escape(remark)}"
     yield from _missed(about)

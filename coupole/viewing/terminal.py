@@ -106,6 +106,9 @@ def duration_text(seconds: float) -> str:
 
 
 def bytes_text(count: float) -> str:
+    """`1.25 GB`, `39.3 MB`, `12 kB`."""
+    if count < 1e5:
+        return f"{count / 1e3:.0f} kB"
     return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
 
 
@@ -258,10 +261,12 @@ class LiveFigures:
         seen = shown.figures
         best = self._best[shown.title] = max(self._best.get(shown.title, 0.0), seen.sharpness)
         saturated = ", ".join(f"{name} {share:.2%}" for name, share in seen.saturated.items())
-        sharpness = f"sharpness {seen.sharpness / best:.0%} of the best" if best else "nothing but noise"
+        told = f"sharpness {seen.sharpness / best:.0%} of the best" if best else "nothing but noise"
+        if shown.run:  # its frames are under different lights: their sharpness cannot be compared
+            told = f"{shown.run}, {shown.dose_lux_h:.3f} lux.h"
         line = (
             f"{shown.title}, {shown.exposure_us} us: brightest {seen.brightest:.0%}; saturated {saturated}; "
-            f"{sharpness}; {shown.frames_per_s:.1f} frames/s"
+            f"{told}; {shown.frames_per_s:.1f} frames/s"
         )
         if self._live is not None:
             self._live.update("\n".join([line, *(_bars(name, bins) for name, bins in seen.histograms.items())]))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from coupole.errors import InputError
+from coupole.errors import InputError, reason
 from coupole.motion.itinerary import plan_itinerary
 from coupole.preflight.checking import check_job
 from coupole.preflight.job import Job, without_hidden
@@ -33,7 +33,9 @@ def look_at_plan(job: Job, folder: Path, console: Console, *, paths: bool) -> tu
             write_picture(scene, png)
             write_page(scene, html)
         except OSError as error:
-            raise InputError(f"--out {folder}: cannot write there: {error}; name another folder") from error
+            raise InputError(
+                f"--out {folder}: cannot write there: {reason(error)}; name another folder"
+            ) from error
     for refusal in scene.refusals:
         console.print(f"[red]refused:[/] {refusal}")
     console.print(f"{png}\n{html}", markup=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
@@ -27,18 +28,41 @@ _OVERVIEW, _ALWAYS = 0, -1
 """Steps of the slider, beside the views' numbers, at which a part of the drawing is shown."""
 
 _PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-body {{ font-family: sans-serif; color: #22262d; margin: 1.2em; }}
-h1 {{ font-size: 1.5em; font-weight: normal; margin: 0 0 .2em; }}
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width,initial-scale=1">
+<title>{title}</title><style>
+:root {{ color-scheme: light; }}
+body {{ font-family: system-ui, sans-serif; color: #22262d; background: #fff; margin: 1.2em; }}
+h1 {{ font-size: 1.5em; font-weight: normal; margin: 0 0 .2em; overflow-wrap: anywhere; }}
 p, ol {{ margin: .2em 0; }}
 .refused {{ color: {red}; }}
-</style></head><body>
+.views {{ display: flex; flex-wrap: wrap; gap: .2em 1em; align-items: center; margin: .6em 0; }}
+.views input {{ flex: 1 1 16em; max-width: 40em; }}
+#view {{ display: block; min-height: 3em; }}
+</style></head><body><main>
 <h1>{title}</h1>
 <p>{about}</p>
 {refusals}
+<div class="views"><label for="step">view</label>
+<input id="step" type="range" min="0" max="{last}" value="0"></div>
+<output id="view" for="step"></output>
 {figure}
-</body></html>
+</main></body></html>
 """
+_SCRIPT = """
+const steps = %s, slider = document.getElementById("step");
+function show() {
+  const step = steps[+slider.value];
+  slider.setAttribute("aria-valuetext", step.name);
+  document.getElementById("view").innerHTML = step.words;
+  Plotly.restyle("{plot_id}", {visible: step.visible});
+}
+slider.addEventListener("input", show);
+show();
+"""
+"""`{plot_id}` is Plotly's."""
+_BUTTONS = [["toImage"], ["orbitRotation", "tableRotation", "pan3d", "zoom3d"], ["resetCameraDefault3d"]]
+"""None of those that would send the drawing to a server."""
 
 
 def write_page(scene: Scene, path: Path) -> None:
@@ -46,24 +70,28 @@ def write_page(scene: Scene, path: Path) -> None:
     clear = sum(not stop.refusal for stop in scene.stops)
     checked = "" if scene.paths_checked else " Paths were not checked for collisions."
     why = "".join(f"<li>{escape(refusal)}</li>" for refusal in scene.refusals)
+    figure, steps = _figure(scene)
     page = _PAGE.format(
         title=escape(scene.plan),
         red=css(colours.RED),
         about=f"{len(scene.stops)} views on {escape(scene.rig.name)}, {clear} of them clear.{checked} "
-        "Drag to rotate, scroll to zoom, point at a part for its name; the slider goes from view to "
-        "view. LEDs are lighter the more they reach of what the camera sees.",
+        "Drag to rotate, scroll to zoom, point at a part for its name; the slider (arrow keys) goes from view "
+        "to view. LEDs are lighter the more they reach of what the camera sees.",
         refusals=f'<p class="refused">The plan is refused:</p><ol class="refused">{why}</ol>' if why else "",
-        figure=_figure(scene).to_html(
+        last=len(scene.stops),
+        figure=figure.to_html(
             full_html=False,
             include_plotlyjs=True,
-            default_height="82vh",
-            config={"displaylogo": False, "responsive": True},
+            default_height="75vh",
+            config={"displaylogo": False, "responsive": True, "modeBarButtons": _BUTTONS},
+            post_script=_SCRIPT % json.dumps(steps).replace("<", "\\u003c"),
         ),
     )
     path.write_text(page, encoding="utf-8")
 
 
-def _figure(scene: Scene) -> Any:
+def _figure(scene: Scene) -> tuple[Any, list[dict[str, Any]]]:
+    """The drawing, and for each step of the slider what is visible, its name and words in HTML."""
     import plotly.graph_objects as go
 
     shown: list[tuple[int, Any]] = [(_ALWAYS, trace) for trace in _cell(scene)]
@@ -79,23 +107,17 @@ def _figure(scene: Scene) -> Any:
         shown.append((stop.number, _leds(scene, share, stop)))
     traces = [trace.update(visible=step in (_ALWAYS, _OVERVIEW)) for step, trace in shown]
     titles = ["all views", *(_title(scene, stop) for stop in scene.stops)]
-    labels = ["all", *(f"{stop.number} {stop.name}" for stop in scene.stops)]
+    names = ["all views", *(f"{stop.number} {stop.name}" for stop in scene.stops)]
     steps = [
-        {
-            "method": "update",
-            "label": label,
-            "args": [{"visible": [step in (_ALWAYS, k) for step, _ in shown]}, {"title.text": title}],
-        }
-        for k, (label, title) in enumerate(zip(labels, titles, strict=True))
+        {"name": name, "words": words, "visible": [step in (_ALWAYS, k) for step, _ in shown]}
+        for k, (name, words) in enumerate(zip(names, titles, strict=True))
     ]
     axis = {"showbackground": False, "gridcolor": "#dddddd", "zeroline": False}
-    return go.Figure(
+    figure = go.Figure(
         traces,
         {
-            "title": {"text": titles[0], "font": {"size": 15}},
-            "margin": {"l": 0, "r": 0, "t": 70, "b": 0},
+            "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
             "showlegend": False,
-            "sliders": [{"steps": steps, "currentvalue": {"prefix": "view: "}, "pad": {"t": 10, "b": 30}}],
             "scene": {
                 "aspectmode": "data",
                 "camera": {"eye": {"x": 0.7, "y": -1.2, "z": 0.5}, "center": {"x": 0, "y": 0, "z": -0.15}},
@@ -103,11 +125,12 @@ def _figure(scene: Scene) -> Any:
             },
         },
     )
+    return figure, steps
 
 
 def _title(scene: Scene, stop: Stop) -> str:
     return (
-        f"{stop.number} {stop.name}: {stop.refusal}"
+        f"<b>{stop.number} {stop.name}</b>: {escape(stop.refusal)}"
         if stop.refusal
         else _words_on(scene, stop).replace("<br>", "; ")
     )

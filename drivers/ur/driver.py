@@ -22,12 +22,23 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from coupole import geometry
-from coupole.devices import ArmState, Clock, Deadline, Identity
+from coupole.devices import ArmCondition, ArmState, Clock, Deadline, Identity
 from coupole.errors import DeviceLost, DeviceRefused
 from coupole.kinematics import Arm
-from drivers.arm_motion import MessageTime, checked_target, overtaken, refused, wait_for
+from drivers.arm_motion import MessageTime, checked_speed, checked_target, overtaken, refused, wait_for
 from drivers.fair_lock import FairLock
-from drivers.ur.messages import Ask, Config, Six, State
+from drivers.ur.messages import (
+    BACKDRIVE,
+    EMERGENCY_STOP_BITS,
+    PROTECTIVE_STOP_BIT,
+    ROBOT_MODES,
+    RUNNING,
+    SAFEGUARD_STOP_BIT,
+    Ask,
+    Config,
+    Six,
+    State,
+)
 from drivers.ur.process import UrProcess, raise_fault
 
 _POLL_S = 0.008
@@ -152,18 +163,18 @@ class UrRobot:
             "speed slider": f"{100 * state.speed_fraction:.0f} %",
         }
 
-    def move_to(self, joints_deg: NDArray[np.float64]) -> None:
+    def move_to(self, joints_deg: NDArray[np.float64], speed: float = 1.0) -> None:
         """Start movej; a moving arm is first brought to rest. Raises DeviceRefused for a target out of limits."""
-        stops = self._stops
+        stops, speed = self._stops, checked_speed(speed)
         target_deg = checked_target(joints_deg, self.settings.limits_deg)
-        state = self._command("move", target_deg, stops)
+        state = self._command("move", target_deg, stops, speed)
         raise_fault(state)
         if state.speed_fraction <= 0.0:
             raise refused("a speed slider above 0 %", "it is at 0 %: the arm will not move")
         turn_deg = float(np.max(np.abs(np.subtract(target_deg, state.joints_deg))))
         # A moving arm brakes first, and may turn away from the target while it does.
         turn_deg += self.settings.speed_deg_s * self.settings.stop_s
-        self._motion_s = _movej_s(self.settings, turn_deg) / state.speed_fraction + self._rest_s()
+        self._motion_s = _movej_s(self.settings, turn_deg) / speed / state.speed_fraction + self._rest_s()
 
     def wait_settled(self) -> ArmState:
         settings, number = self.settings, self._number
@@ -184,6 +195,7 @@ class UrRobot:
             t_ns=self._message_time.since_ns(state.samples),
             moving=state.still_samples < self.settings.settle_samples,
             fault=state.fault,
+            condition=_condition(state),
         )
 
     def stop(self) -> None:
@@ -223,7 +235,9 @@ class UrRobot:
             self._stops += 1
             self._process.close()
 
-    def _command(self, verb: Literal["move", "stop"], target_deg: Six | None = None, stops: int = 0) -> State:
+    def _command(
+        self, verb: Literal["move", "stop"], target_deg: Six | None = None, stops: int = 0, speed: float = 1.0
+    ) -> State:
         """`stops` is the count of stops when the call of a motion began."""
         with self._asking:
             if verb == "stop":
@@ -231,7 +245,7 @@ class UrRobot:
             elif self._stops != stops:  # by another thread, since that call began
                 raise overtaken()
             self._number += 1
-            return self._process.ask(Ask(verb, self._number, target_deg))
+            return self._process.ask(Ask(verb, self._number, target_deg, speed))
 
     def _state(self) -> State:
         with self._asking:
@@ -273,6 +287,16 @@ def _movej_s(settings: Settings, turn_deg: float) -> float:
     if turn_deg < speed**2 / acceleration:
         return 2.0 * math.sqrt(turn_deg / acceleration)
     return turn_deg / speed + speed / acceleration
+
+
+def _condition(state: State) -> ArmCondition:
+    bits = state.safety_bits
+    return ArmCondition(
+        mode=ROBOT_MODES.get(state.robot_mode, f"robot mode {state.robot_mode}"),
+        emergency_stop=bool(bits & EMERGENCY_STOP_BITS),
+        protective_stop=bool(bits & (PROTECTIVE_STOP_BIT | SAFEGUARD_STOP_BIT)),
+        brakes_released=state.robot_mode in (BACKDRIVE, RUNNING),
+    )
 
 
 def _transform(pose_m_rad: Six) -> geometry.Transform:

@@ -13,6 +13,23 @@ from typing import Any, Literal
 
 DATAGRAM_BYTES = 65536
 
+EMERGENCY_STOP_BITS, PROTECTIVE_STOP_BIT, SAFEGUARD_STOP_BIT = 0x0E0, 0x004, 0x010
+"""Of RTDE's safety_status_bits."""
+BACKDRIVE, RUNNING = 6, 7
+"""Of RTDE's robot_mode: those in which the brakes are released."""
+ROBOT_MODES = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "confirm safety",
+    2: "booting",
+    3: "power off",
+    4: "power on",
+    5: "idle",
+    BACKDRIVE: "backdrive",
+    RUNNING: "running",
+    8: "updating firmware",
+}
+
 Six = tuple[float, float, float, float, float, float]
 
 
@@ -41,6 +58,8 @@ class Ask:
     verb: Literal["state", "move", "stop", "leave"]
     number: int = 0
     target_deg: Six | None = None
+    speed: float = 1.0
+    """Share of the configured speed."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +86,10 @@ class State:
     model: str
     serial: str
     firmware: str
+    robot_mode: int = -1
+    """RTDE's robot_mode."""
+    safety_bits: int = 0
+    """RTDE's safety_status_bits."""
     fault: str = ""
     """Name and reason of the latched fault; empty when there is none."""
     lost: bool = False

@@ -26,7 +26,18 @@ from dataclasses import replace
 from typing import Any
 
 from drivers.ur.dashboard import CannotBegin, end_program, ready_controller, why_ended
-from drivers.ur.messages import Ask, Config, Six, State, receive, send
+from drivers.ur.messages import (
+    EMERGENCY_STOP_BITS,
+    PROTECTIVE_STOP_BIT,
+    RUNNING,
+    SAFEGUARD_STOP_BIT,
+    Ask,
+    Config,
+    Six,
+    State,
+    receive,
+    send,
+)
 
 _VARIABLES = [
     "timestamp",
@@ -39,12 +50,11 @@ _VARIABLES = [
     "runtime_state",
     "target_speed_fraction",
 ]
-_ROBOT_MODE_RUNNING = 7
 _RUNTIME_PLAYING = 2
 _SAFETY_FAULTS = (
-    (0x0E0, "emergency stop"),
-    (0x004, "protective stop"),
-    (0x010, "safeguard stop"),
+    (EMERGENCY_STOP_BITS, "emergency stop"),
+    (PROTECTIVE_STOP_BIT, "protective stop"),
+    (SAFEGUARD_STOP_BIT, "safeguard stop"),
     (0x300, "safety fault"),
 )
 """Bits of RTDE's safety_status_bits, most serious first."""
@@ -78,6 +88,7 @@ class Link:
             raise CannotBegin("fault", "a watched program", "it took no watchdog", "See the controller's log")
         self._goal_deg: Six | None = None
         self._pending_deg: Six | None = None
+        self._pending_speed = 1.0
         """A target that waits until the arm is at rest: the effect of movej on a moving arm is not documented."""
         self._quiet_samples = self._astray_samples = self._ended_samples = 0
         self._timestamp_s = -1.0
@@ -109,7 +120,7 @@ class Link:
             self._kicked_s = now_s
             self._call(self._control.kickWatchdog)
         if self._pending_deg is not None and self._quiet_samples >= self.config.settle_samples:
-            self._start(self._pending_deg)
+            self._start(self._pending_deg, self._pending_speed)
 
     def obey(self, ask: Ask) -> None:
         """Begin a command; after a fault, nothing. The answer is `state`."""
@@ -119,10 +130,10 @@ class Link:
         self.state = replace(self.state, command=ask.number, still_samples=0)
         self._quiet_samples, self._goal_deg = 0, None
         if ask.verb == "move" and ask.target_deg is not None and stands:
-            self._start(ask.target_deg)
+            self._start(ask.target_deg, ask.speed)
             return
         self._call(lambda: self._control.stopJ(math.radians(self.config.stop_deg_s2), True))
-        self._pending_deg = ask.target_deg
+        self._pending_deg, self._pending_speed = ask.target_deg, ask.speed
 
     def leave(self) -> None:
         """Bring the arm to rest and end the program. A hang here ends the process by SIGALRM."""
@@ -137,12 +148,13 @@ class Link:
     def _settled(self) -> bool:
         return self.state.still_samples >= self.config.settle_samples
 
-    def _start(self, target_deg: Six) -> None:
+    def _start(self, target_deg: Six, share: float) -> None:
         config = self.config
         self._goal_deg, self._pending_deg = target_deg, None
         self.state = replace(self.state, still_samples=0)
         target = [math.radians(angle) for angle in target_deg]
-        speed, acceleration = math.radians(config.speed_deg_s), math.radians(config.acceleration_deg_s2)
+        speed = math.radians(share * config.speed_deg_s)
+        acceleration = math.radians(config.acceleration_deg_s2)
         if not self._call(lambda: self._control.moveJ(target, speed, acceleration, True)):
             time.sleep(_NAMING_SAMPLES / config.frequency_hz)
             self._look()  # so that a safety stop is reported as such
@@ -183,6 +195,8 @@ class Link:
             still_samples=self.state.still_samples + 1 if still else 0,
             samples=self.state.samples + 1,
             max_gap_s=max(self.state.max_gap_s, age_s),
+            robot_mode=self._receive.getRobotMode(),
+            safety_bits=self._receive.getSafetyStatusBits(),
         )
         if not self.state.fault:
             self._evaluate(_apart(joints_deg, wanted_deg))
@@ -193,12 +207,12 @@ class Link:
         self._astray_samples = self._astray_samples + 1 if astray_deg > config.follow_deg else 0
         plays = self._receive.getRuntimeState() == _RUNTIME_PLAYING
         self._ended_samples = 0 if plays else self._ended_samples + 1
-        bits, mode = self._receive.getSafetyStatusBits(), self._receive.getRobotMode()
+        bits, mode = self.state.safety_bits, self.state.robot_mode
         for mask, name in _SAFETY_FAULTS:
             if bits & mask:
                 self._latch(f"{name} (safety status {bits:#x})")
                 return
-        if mode != _ROBOT_MODE_RUNNING:
+        if mode != RUNNING:
             self._latch(f"arm not running (robot mode {mode})")
         elif self._astray_samples >= config.follow_samples:
             self._latch(f"the arm does not follow: it is {astray_deg:.2f} deg off")

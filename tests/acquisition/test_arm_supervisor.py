@@ -45,7 +45,7 @@ class Arm:
     def stopping_deg(self) -> Any:
         return np.zeros(6)
 
-    def move_to(self, joints_deg: Any) -> None:
+    def move_to(self, joints_deg: Any, speed: float = 1.0) -> None:
         self.done.append("move")
         self.from_deg, self.to_deg, self.share = self.still_deg, joints_deg, 0.0
 
@@ -82,7 +82,7 @@ def supervised(monkeypatch: pytest.MonkeyPatch) -> Callable[[Arm], ArmSupervisor
         motion = SimpleNamespace(bodies=bodies, itinerary=lambda views, start_deg: found)
         job: Any = SimpleNamespace(cell=SimpleNamespace(rig=rig), motion=motion)
         cell: Any = SimpleNamespace(robot=arm, clock=arm)
-        supervisor = ArmSupervisor(job, cell, Control())
+        supervisor = ArmSupervisor(job.cell.rig, job.motion, cell, Control())
         supervisor.itinerary([])
         return supervisor
 

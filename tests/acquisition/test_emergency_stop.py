@@ -68,7 +68,7 @@ class ScriptedArm:
         fault = "emergency stop" if self.pressed_at is not None and self.tells else ""
         return ArmState((angle_deg, 0, 0, 0, 0, 0), np.eye(4), self.clock.now_ns(), moving, fault)
 
-    def move_to(self, joints_deg: Any) -> None:
+    def move_to(self, joints_deg: Any, speed: float = 1.0) -> None:
         if self.pressed_at is not None:
             if self.obeys_after:
                 return

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from coupole.acquisition import run_control, runtime_folder
+from coupole.acquisition import run_control, runtime_folder, user_socket
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import Safeguard
 from coupole.acquisition.run_control import RunControl, ask, running
@@ -131,7 +131,7 @@ def test_nobody_else_can_enter(served: Served) -> None:
 
 
 def test_another_user_gets_no_answer(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_control, "_peer_uid", lambda _: os.getuid() + 1)
+    monkeypatch.setattr(user_socket, "peer_uid", lambda _: os.getuid() + 1)
     with pytest.raises(InputError, match="does not answer"):
         ask(served.run, "stop")
     assert served.halted == 0
@@ -146,7 +146,7 @@ def test_a_run_that_nobody_acquires_is_told_and_a_killed_one_is_told_from_one_th
         left_over.bind(str(runtime_folder.runtime_folder() / "0123.sock"))
     assert running() == []
     with socket.socket(socket.AF_UNIX) as hung:
-        monkeypatch.setattr(run_control, "_PATIENCE_S", 0.1)
+        monkeypatch.setattr(user_socket.exchange, "__defaults__", (0.1,))
         hung.bind(str(runtime_folder.runtime_folder() / "4567.sock"))
         hung.listen()
         assert [state["state"] for state in running()] == ["silent"], "it may be at work"

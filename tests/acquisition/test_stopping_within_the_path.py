@@ -49,7 +49,7 @@ class Drifting:
         pose = forward(self.arm, joints)
         return ArmState((a, b, c, d, e, f), pose, int(self.now_s * 1e9), self.moving)
 
-    def move_to(self, joints_deg: NDArray[np.float64]) -> None:
+    def move_to(self, joints_deg: NDArray[np.float64], speed: float = 1.0) -> None:
         self.moving = True
 
     def stop(self) -> None:
@@ -76,7 +76,7 @@ def supervised(job: Job, drift_deg_s: float) -> tuple[Drifting, float]:
     arm = Drifting(job, drift_deg_s)
     goal = arm.home_deg - np.array((0.0, 0.0, 60.0, 0.0, 0.0, 0.0))
     cell: Any = SimpleNamespace(robot=arm, clock=arm)
-    supervisor = ArmSupervisor(job, cell, Control())
+    supervisor = ArmSupervisor(job.cell.rig, job.motion, cell, Control())
     supervisor._from_deg = arm.home_deg
     with pytest.raises(DeviceFault, match="comes to rest"):
         supervisor.go(Visit(goal, Leg((goal,), 3.0)))

@@ -84,6 +84,11 @@ class RobotCell(ABC):
         self.trace_deg.append(self.controller.joints_deg)
         self.reactor.after(self.cycle_ms / 1e3, self._sample)
 
+    @property
+    def velocity_deg_s(self) -> NDArray[np.float64]:
+        """[6] greatest speeds of the driver's motions."""
+        return np.array(self.settings.arm().velocity_deg_s)
+
     def assert_smooth(self) -> None:
         """Speed, acceleration and jerk of all that was sampled are within the driver's limits. In real time a late
         answer halts the arm for a cycle, so there nothing is asserted."""
@@ -181,6 +186,16 @@ class RobotConformance:
         robot.move_to(AWAY_DEG)
         robot.wait_settled()
         cell.assert_smooth()
+
+    def test_at_a_share_of_its_speeds_no_axis_is_faster(self, cell: RobotCell, robot: Robot) -> None:
+        robot.move_to(AWAY_DEG, 0.25)
+        assert np.allclose(robot.wait_settled().joints_deg, AWAY_DEG, atol=1e-3)
+        speeds_deg_s = np.abs(np.diff(cell.trace_deg, axis=0)).max(axis=0) / (cell.cycle_ms / 1e3)
+        assert 0.15 < (speeds_deg_s / cell.velocity_deg_s).max() < 0.26
+        for share in (0.0, 1.1, float("nan")):
+            with pytest.raises(DeviceRefused, match="a speed above 0"):
+                robot.move_to(HOME_DEG, share)
+        cell.assert_stands()
 
     def test_a_new_target_in_mid_motion_is_reached_smoothly(self, cell: RobotCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)

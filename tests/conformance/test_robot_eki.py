@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from robot_conformance import AWAY_DEG, HOME_DEG, RobotCell, RobotConformance
 
+from coupole.devices import ArmCondition
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from coupole.kinematics import move_duration_s
 from drivers.kuka.eki.driver import KukaEki, Settings
@@ -123,12 +124,14 @@ def robot(cell: EkiCell) -> KukaEki:
 
 
 def test_an_emergency_stop_is_named_and_the_arm_stands_when_it_is_told(cell: EkiCell, robot: KukaEki) -> None:
+    assert robot.measured().condition == ArmCondition("automatic or T2", False, None, True)
     robot.move_to(AWAY_DEG)
     cell.wait_until_under_way()
     cell.in_world(cell.controller.estop)
     with pytest.raises(DeviceFault, match="emergency stop"):
         robot.wait_settled()
     assert not robot.measured().moving
+    assert robot.measured().condition == ArmCondition("automatic or T2", True, None, False)
     cell.assert_stands()
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from robot_conformance import AWAY_DEG, HOME_DEG, RobotCell, RobotConformance
 from ur import needs_ur_rtde
 
+from coupole.devices import ArmCondition
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout, InputError
 from drivers.ur.driver import Settings, UrRobot
 from sim.devices.ur_arm import flange_pose, rotation_vector
@@ -53,6 +54,10 @@ class UrCell(RobotCell):
 
     def open(self) -> UrRobot:
         return self._drivers.enter_context(closing(UrRobot(self.settings, self.clock)))
+
+    @property
+    def velocity_deg_s(self) -> NDArray[np.float64]:
+        return np.full(6, self.settings.speed_deg_s)
 
     def assert_smooth(self) -> None:
         """Speed and acceleration of all that was sampled are within the driver's limits."""
@@ -90,6 +95,7 @@ class TestUrRobot(RobotConformance):
         assert robot.identify().model == "UR10"
         assert robot.identify().simulated
         assert robot.self_test()["tool offset"] == "0.00, 0.00, 100.00 mm"
+        assert robot.measured().condition == ArmCondition("running", False, False, True)
 
     def test_it_reaches_poses_and_measures_them_right(
         self, cell: UrCell, robot: UrRobot, scale: Callable[[int, int], int]
@@ -123,6 +129,12 @@ def _assert_latched(cell: UrCell, robot: UrRobot, happens: Callable[[], None], n
     with pytest.raises(DeviceFault, match=name):
         robot.wait_settled()
     cell.wait_until(lambda: not cell.controller.moving)
+    told = robot.measured().condition
+    assert (told.emergency_stop, told.protective_stop) == (
+        name == "emergency stop",
+        name in ("protective stop", "safeguard stop"),
+    )
+    assert told.brakes_released == (told.mode == "running")
     cell.in_world(cell.controller.reset)
     with pytest.raises(DeviceFault, match=name):
         robot.move_to(HOME_DEG)

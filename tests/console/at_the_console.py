@@ -12,6 +12,7 @@ from typing import Any
 
 import cells
 from browser import Browser
+from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.remote.webelement import WebElement
@@ -79,6 +80,10 @@ class Visitor:
             return True
 
         self._patiently(typed, f"{selector} to type into")
+
+    def presses(self, key: str) -> None:
+        """A key, wherever the focus is."""
+        ActionChains(self.driver).send_keys(key).perform()
 
     def _patiently(self, do: Callable[[], bool], what: str) -> None:
         """Elements are made anew while one looks at them."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import re
 from types import ModuleType
@@ -30,6 +31,38 @@ def test_the_reference_names_every_key(module: ModuleType, page: str) -> None:
     ]
     keys = {f"{model.__name__}.{key}" for model in models for key in model.model_fields}
     assert sorted(key for key in keys if not re.search(rf"\b{key.split('.')[1]}\b", text)) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "driver"),
+    [
+        ("drivers.ledbox.driver", "drivers.ledbox:LedBox"),
+        ("drivers.camera.gentl.settings", "drivers.camera.gentl:GenTLCamera"),
+        ("drivers.camera.raw.driver", "drivers.camera.raw:RawFiles"),
+        ("drivers.kuka.rsi.settings", "drivers.kuka.rsi:KukaRsi"),
+        ("drivers.kuka.eki.driver", "drivers.kuka.eki:KukaEki"),
+        ("drivers.ur.driver", "drivers.ur:UrRobot"),
+    ],
+)
+def test_the_reference_has_every_setting_of_a_driver_with_its_default(module: str, driver: str) -> None:
+    section = (
+        (REFERENCE / "drivers.md").read_text(encoding="utf-8").partition(f"`{driver}`\n")[2].partition("\n## ")[0]
+    )
+    rows = {
+        key: row.split(" | ")[-1]
+        for row in section.splitlines()
+        for key in re.findall(r"`(\w+)`", row.split(" | ")[0])
+    }
+    fields = importlib.import_module(module).Settings.model_fields
+    assert sorted(rows) == sorted(fields)
+    numbers = {
+        key: f"{field.default:g}"
+        for key, field in fields.items()
+        if isinstance(field.default, int | float) and not isinstance(field.default, bool)
+    }
+    from_the_rig = {"speed_fraction", "acceleration_deg_s2", "jerk_deg_s3"}
+    wrong = [key for key, number in numbers.items() if number not in re.findall(r"[\d.]+", rows[key])]
+    assert sorted(set(wrong) - from_the_rig) == []
 
 
 def test_exports_of_results_have_a_row_and_figures_each() -> None:

@@ -8,8 +8,11 @@ import pytest
 
 from coupole.reflectance.lanes import (
     absolute,
+    add_in_turns,
+    four_gathered,
     gathered,
     if_less,
+    in_turns,
     lanes,
     larger,
     loaded,
@@ -92,6 +95,41 @@ def test_lanes_are_gathered_from_eight_rows() -> None:
     rows, found = np.array([3, 1, 10, 0, 7, 7, 2, 5]), np.empty(8, np.uint16)
     picked(frames[:, ::5], rows, 6, found)
     np.testing.assert_array_equal(found.view(np.float16), frames[rows, 30])
+
+
+@numba.njit
+def four_of(arrays, rows, first, found):  # type: ignore[no-untyped-def]
+    one, two, three, four = four_gathered(arrays, rows, first)
+    store(one, found, 0)
+    store(two, found, 1)
+    store(three, found, 2)
+    store(four, found, 3)
+
+
+def test_four_numbers_of_eight_rows_become_four_lanes() -> None:
+    numbers, found = (
+        np.random.default_rng(6).normal(0, 1, (11, 7)).astype(np.float32),
+        np.empty((4, 8), np.float32),
+    )
+    rows = np.array([3, 1, 10, 0, 7, 7, 2, 5])
+    four_of(numbers, rows, 3, found)
+    np.testing.assert_array_equal(found, numbers[rows, 3:].T)
+
+
+@numba.njit
+def twice_and_next(points, found):  # type: ignore[no-untyped-def]
+    x, y, z = in_turns(points, 1)
+    add_in_turns(x + x, y + y, z + z, found, 2)
+    add_in_turns(y, z, x, found, 2)
+
+
+def test_three_lanes_take_turns_in_a_row() -> None:
+    points = np.random.default_rng(7).normal(0, 1, (2, 24)).astype(np.float32)
+    found = np.ones((4, 24), np.float32)
+    twice_and_next(points, found)
+    x = points[1].reshape(8, 3)
+    np.testing.assert_array_equal(found[2].reshape(8, 3), 1 + 2 * x + np.roll(x, -1, axis=1))
+    assert (found[[0, 1, 3]] == 1).all()
 
 
 def test_rows_that_are_not_contiguous_are_refused() -> None:

@@ -11,7 +11,7 @@ import relight_cases as cases
 from relief_in_mitsuba import Mitsuba
 from relight_cases import Coat, moved, sheet, unit, waves, write_exr, write_result
 
-from coupole.motion.occlusion import blocked
+from coupole.motion.occlusion import blocked, ray_mesh
 from coupole.reflectance.new_light.beams import Beam
 from coupole.reflectance.new_light.light_kinds import (
     AnyLight,
@@ -189,23 +189,55 @@ def test_an_led_gives_shares_of_the_cameras_range(plane: RelitScene) -> None:
     np.testing.assert_allclose(shown(plane, LedLight(number=cases.LED)), wanted, rtol=1e-4)
 
 
-def reached_and_traced(scene: RelitScene, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[pixels] codes, and whether a ray from each pixel says that it is lit."""
+@pytest.mark.parametrize("channels", [slice(0, 3), slice(1, 2)])
+def test_a_light_alone_gives_what_its_two_halves_give_together(tmp_path: Path, channels: slice) -> None:
+    """Eight pixels at once against eight lights of one pixel at once, in pictures of any number of pixels."""
+    result = write_result(tmp_path / "result", waves(30), GLOSSY, channels=channels)
+    for size in ((13, 11), (16, 9), (3, 2)):
+        scene = scene_from(result, FreeCamera(np.array([30.0, -40.0, 60.0]), np.zeros(3), size, 20.0))
+        assert (scene.surface.seen >= 0).reshape(-1)[-5:].all()
+        for light in (DistantLight(towards=(0, 1, 2)), PointLight(at_mm=(5, 20, 40))):
+            half = light.model_copy(update={"strength": 0.5})
+            found, wanted = scene.picture([light]), scene.picture([half, half])
+            assert wanted.max() > 2 * wanted.mean()
+            np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-7)
+
+
+def reached_and_traced(scene: RelitScene, beam: Beam) -> tuple[np.ndarray, np.ndarray]:
+    """[pixels] codes, and whether a ray from each pixel, one after the other, says that it is lit."""
     surface, seen = scene.surface, scene.surface.seen >= 0
+    codes = reached(scene.mesh, surface, beam)[seen]
+    normals, places_mm = surface.normals[surface.seen[seen]], surface.places_mm[seen]
+    starts = places_mm + 0.1 * normals
+    ends = np.broadcast_to(beam.place, starts.shape) if beam.near else starts + 3000.0 * beam.place
+    facing = np.sum((ends - places_mm) * normals, axis=1) > 0
+    if beam.exponent:
+        facing &= (places_mm - beam.place) @ beam.axis > 0
+    return codes, ~blocked(ray_mesh(scene.result.corners_mm), starts, ends) & facing
+
+
+def distant(scene: RelitScene, towards: np.ndarray) -> Beam:
     way = unit(scene.result.base_from_support[:3, :3] @ towards)
-    codes = reached(scene.rays, surface, Beam(False, way, -way, 0, np.ones(3)))[seen]
-    normals = surface.normals[surface.seen[seen]]
-    starts = surface.places_mm[seen] + 0.1 * normals
-    return codes, ~blocked(scene.rays, starts, starts + 3000.0 * way) & (normals @ way > 0)
+    return Beam(False, way, -way, 0, np.ones(3))
 
 
 @pytest.mark.parametrize("towards", [(1.0, 0.4, 0.35), (-0.3, 1.0, 0.2)])
 def test_shadows_are_those_of_a_ray_for_each_pixel(
     relief: RelitScene, towards: tuple[float, float, float]
 ) -> None:
-    codes, lit = reached_and_traced(relief, np.array(towards))
+    codes, lit = reached_and_traced(relief, distant(relief, np.array(towards)))
     assert 0.05 < lit.mean() < 0.95
     assert np.mean((codes == LIT) != lit) < 2e-4
+
+
+@pytest.mark.parametrize("exponent", [0, 1])
+def test_shadows_of_a_near_light_are_those_of_a_ray_for_each_pixel(relief: RelitScene, exponent: int) -> None:
+    """It stands low and, with an exponent, looks away from a part of the surface."""
+    pose = relief.result.base_from_support
+    place, axis = moved(pose, np.array([12.0, -9.0, 5.0])), pose[:3, :3] @ unit(np.array([-1.0, 0.3, -0.2]))
+    codes, lit = reached_and_traced(relief, Beam(True, place, axis, exponent, np.ones(3)))
+    assert (0.3, 0.2)[exponent] < lit.mean() < (0.9, 0.6)[exponent]
+    assert np.mean((codes == LIT) != lit) < 5e-4
 
 
 def test_thin_shadows_are_followed_along_their_edges(tmp_path: Path) -> None:
@@ -218,7 +250,7 @@ def test_thin_shadows_are_followed_along_their_edges(tmp_path: Path) -> None:
         middle = np.array([8.0 * number + 60.0, 0.0, 60.0])
         corners.append(wire[..., :1] * 0.6 * across + wire[..., 1:2] * 60.0 * along + middle)
     scene = scene_of_view(write_result(tmp_path / "result", np.concatenate(corners), WHITE))
-    codes, lit = reached_and_traced(scene, unit(np.array([80.0, 0.0, 60.0])))
+    codes, lit = reached_and_traced(scene, distant(scene, np.array([80.0, 0.0, 60.0])))
     assert 0.01 < np.mean(~lit) < 0.1
     assert np.count_nonzero((codes == LIT) != lit) < 0.02 * np.count_nonzero(~lit)
 

@@ -212,7 +212,7 @@ def test_a_run_goes_on_after_its_complete_views_were_archived(half_done: tuple[C
     assert resumed.code == 0, resumed.err
     assert file.read_bytes() == kept
     cells.assert_each_shot_proven_once(run)
-    assert "data:image/png" in (run / "report.html").read_text()
+    assert "data:image/jpeg" in (run / "report.html").read_text()
     assert cells.here("archive", run).code == 0
     assert archived(run) == ["side", "top"]
     cells.assert_each_shot_proven_once(run)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cells
 import pytest
+from axe_selenium_python import Axe
 from browser import Browser, needs_chromium
 from cells import CellFolder
 from selenium.webdriver.common.action_chains import ActionChains
@@ -16,6 +17,7 @@ from selenium.webdriver.common.keys import Keys
 from test_live import live
 
 pytestmark = needs_chromium
+TELEPHONE = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": False}
 
 
 @pytest.fixture(scope="module")
@@ -30,20 +32,22 @@ def shown_cell(tmp_path_factory: pytest.TempPathFactory) -> CellFolder:
     return CellFolder(tmp_path_factory.mktemp("shown"))
 
 
-def test_a_plan_is_drawn_and_its_slider_goes_from_view_to_view(browser: Browser, shown_cell: CellFolder) -> None:
+def test_a_plan_is_drawn_and_keys_go_from_view_to_view(browser: Browser, shown_cell: CellFolder) -> None:
     ended = cells.here("view", shown_cell.plan, "--out", shown_cell.folder, "--json")
     assert ended.code == 0, ended.err
     browser.open(f"file://{ended.document['html']}")
     browser.at(".gl-container canvas")
-    assert browser.text(".gtitle") == "all views"
-    rail = browser.at(".slider-rail-touch-rect")
-    end = rail.size["width"] // 2 - 8
-    ActionChains(browser.driver).move_to_element_with_offset(rail, end, 0).click().perform()
-    cells.wait_until(lambda: browser.text(".gtitle") != "all views", "the last view's title")
-    labels = browser.driver.find_elements(By.CSS_SELECTOR, ".slider-label")
-    figure = browser.at(".plotly-graph-div").rect
-    lowest = max(label.rect["y"] + label.rect["height"] for label in labels)
-    assert lowest <= figure["y"] + figure["height"], "labels are cut off"
+    assert browser.text("#view") == "all views"
+    shown = "document.querySelector('.plotly-graph-div').data.map(trace => trace.visible)"
+    before = browser.run(shown)
+    ActionChains(browser.driver).send_keys(Keys.TAB, Keys.ARROW_RIGHT).perform()
+    cells.wait_until(lambda: browser.text("#view").startswith("1 "), "the first view's words")
+    assert browser.at("#step").get_attribute("aria-valuetext") == "1 top"
+    assert browser.run(shown) != before
+    buttons = browser.driver.find_elements(By.CSS_SELECTOR, ".modebar-btn")
+    assert len(buttons) == 6
+    assert [button for button in buttons if "hare" in str(button.get_dom_attribute("data-title"))] == []
+    assert browser.run("document.documentElement.scrollWidth <= window.innerWidth")
     assert browser.troubles() == []
 
 
@@ -88,11 +92,31 @@ def test_the_page_says_when_the_live_view_has_ended(browser: Browser, shown_cell
         cells.wait_until(lambda: "ended" in browser.text("#error"), "word that it has ended")
 
 
-def test_all_pictures_of_a_run_s_report_are_there(browser: Browser, tmp_path: Path) -> None:
+def test_a_run_s_report_is_whole_and_for_everybody(browser: Browser, tmp_path: Path) -> None:
+    """All pictures and links lead somewhere; on a telephone nothing sticks out; axe-core finds nothing."""
     cell = CellFolder(tmp_path)
     assert cell.acquire().code == 0
-    browser.open(f"file://{cell.run_folder / 'report.html'}")
-    pictures = browser.driver.find_elements(By.TAG_NAME, "img")
+    driver = browser.driver
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", TELEPHONE)
+    try:
+        for scheme in ("light", "dark"):
+            features = [{"name": "prefers-color-scheme", "value": scheme}]
+            driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+            browser.open(f"file://{cell.run_folder / 'report.html'}")
+            axe = Axe(driver)
+            axe.inject()
+            assert [f"{found['id']}: {found['nodes'][0]['html']}" for found in axe.run()["violations"]] == []
+        assert browser.run("document.documentElement.scrollWidth <= window.innerWidth")
+    finally:
+        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    pictures = driver.find_elements(By.TAG_NAME, "img")
     assert pictures
     assert all(int(picture.get_property("naturalWidth")) > 0 for picture in pictures)
+    places = [str(link.get_dom_attribute("href")) for link in driver.find_elements(By.TAG_NAME, "a")]
+    files = {place for place in places if not place.startswith("#")}
+    assert {"journal.jsonl", "views/top.h5", "inputs/plan.yaml"} <= files
+    assert [name for name in files if not (cell.run_folder / name).is_file()] == []
+    anchors = {place[1:] for place in places} - {name[1:] for name in files}
+    assert [name for name in anchors if not driver.find_elements(By.ID, name)] == []
     assert browser.troubles() == []

@@ -188,6 +188,10 @@ def _title(viewer: Viewer) -> str:
     return str(shown["title"]) if shown else ""
 
 
+def _if_done(shown: dict[str, Any]) -> dict[str, Any] | None:
+    return shown if shown["run"].startswith("done") else None
+
+
 def test_a_run_is_watched_through_its_folder_and_never_slowed(cell: CellFolder) -> None:
     cell.write(lights={"kind": "every", "every": 3})
     acquiring = cell.start_acquire()
@@ -196,10 +200,15 @@ def test_a_run_is_watched_through_its_folder_and_never_slowed(cell: CellFolder) 
         shown = cells.wait_until(lambda: viewer.figures()["shown"], "a frame of the run")
         assert shown["title"].startswith("top/led")
         assert viewer.picture().std() > 5
+        assert re.fullmatch(r"(running|done), \d+ of 360 shots proven", shown["run"])
         with pytest.raises(HTTPError) as refused:
             viewer.choose({"led": 3})
         refused.value.close()
         ended = cells.finish(acquiring)
+        cells.wait_until(lambda: "last frame" in viewer.figures()["remark"], "word that the run has ended")
+        last = cells.wait_until(lambda: _if_done(viewer.figures()["shown"]), "the end in the figures")
+        assert last["run"] == "done, 360 of 360 shots proven"
+        assert last["dose_lux_h"] == pytest.approx(ended.document["dose_lux_h"])
     assert ended.code == 0, ended.err
     assert ended.document["proven"] == 360
 

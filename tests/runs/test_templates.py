@@ -7,6 +7,8 @@ from pathlib import Path
 import cells
 import pytest
 
+from coupole.calibration.lens.board import read_board
+from coupole.plan.cell import read_cell
 from coupole.plan.templates import TEMPLATES
 
 RIG = cells.REPO / "configs/rigs/sim.yaml"
@@ -36,6 +38,22 @@ def test_a_name_that_no_plan_may_have_is_refused(
     assert ended.code == 2
     assert "expected a name of letters, digits" in ended.err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_simulated_cell_has_on_its_support_what_is_to_be_photographed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cells.here("plan", "new", "mine", "--template", "charuco", "--rig", RIG).code == 0
+    rig = read_cell(tmp_path / "mine-rig.yaml").rig
+    assert rig.world is not None
+    (thing,) = rig.world.settings["things"]
+    described = read_board(tmp_path / "mine-board.yaml")
+    assert thing["kind"] == "charuco_board"
+    assert (thing["square_mm"], thing["marker_mm"]) == (described.square_mm, described.marker_mm)
+    real = cells.REPO / "configs/rigs/la-coupole.yaml"
+    assert cells.here("plan", "new", "real", "--template", "charuco", "--rig", real).code == 0
+    assert not (tmp_path / "real-rig.yaml").exists()
 
 
 def test_a_plan_with_the_name_of_a_template_is_made_from_it(

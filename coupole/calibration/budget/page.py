@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from coupole.calibration.budget.accuracy import PAPER_SPREAD, SPREAD_WORDS, Accuracy, Case
 from coupole.calibration.budget.budget import Budget, Spread
 from coupole.calibration.budget.propagation import Validation
-from coupole.calibration.report import STYLE, table
+from coupole.calibration.report import HEAD, STYLE, table
 
 
 def page(
@@ -24,7 +24,7 @@ def page(
     data = base64.b64encode(picture).decode()
     warned = "".join(f"<p class=bad>{html.escape(doubt)}" for doubt in doubts)
     return (
-        f"<!doctype html><meta charset=utf-8><title>Uncertainty budget</title><style>{STYLE}</style>"
+        f"{HEAD}<title>Uncertainty budget</title><style>{STYLE}</style>"
         f"<h1>Uncertainty of a reflectance</h1>"
         f"<p>Light at {budget.geometry.incidence_deg:g} deg; relative to the value. {budget.numeric.trials} trials"
         f"{'' if budget.numeric.stable else ', too few for two digits of u'}.{warned}{_result(budget)}"

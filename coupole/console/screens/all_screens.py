@@ -9,19 +9,25 @@ from fastapi import FastAPI, Request
 from nicegui import app as nicegui_app
 from nicegui import ui
 
-from coupole.console.screens import object_screen, plan_screen, queue_screen, run_screen
+from coupole.console.screens import object_screen, plan_screen, queue_screen, run_page, run_screen, runs_screen
 from coupole.console.screens.frame import Place, framed
 from coupole.console.screens.visit import Visit
 from coupole.console.service_parts import Service
 
-Build = Callable[[Visit], None]
-"""Quick: what takes time is begun by a timer."""
+Build = Callable[..., None]
+"""Called with the visit, and the parts of the path by their names. Quick: what takes time is begun by a timer."""
+RUNS = Place("/runs", "Runs", "photo_library")
 SCREENS: dict[Place, Build] = {
     Place("/run", "Run", "play_circle"): run_screen.build,
     Place("/queue", "Queue", "format_list_numbered"): queue_screen.build,
     Place("/plan", "Plan", "edit_note"): plan_screen.build,
     Place("/object", "Object and dose", "category"): object_screen.build,
+    RUNS: runs_screen.build,
 }
+PAGES_BELOW: dict[str, tuple[Place, Build]] = {
+    "/runs/{name}": (RUNS, run_page.build),
+}
+"""Pages that the navigation does not have, and what they belong to."""
 
 
 def add_screens(app: FastAPI, service: Service) -> None:
@@ -29,7 +35,9 @@ def add_screens(app: FastAPI, service: Service) -> None:
     nicegui_app.colors(primary="var(--accent)", negative="#b00020", positive="#1b6e3c")
     ui.add_css(Path(__file__).parent / "screens.css", shared=True)
     for place, build in SCREENS.items():
-        _add(service, place, build)
+        _add(service, place.path, place, build)
+    for path, (place, build) in PAGES_BELOW.items():
+        _add(service, path, place, build)
     ui.run_with(
         app,
         title="Coupole",
@@ -41,9 +49,9 @@ def add_screens(app: FastAPI, service: Service) -> None:
     )
 
 
-def _add(service: Service, place: Place, build: Build) -> None:
-    @ui.page(place.path, title=f"{place.title} · Coupole")
+def _add(service: Service, path: str, place: Place, build: Build) -> None:
+    @ui.page(path, title=f"{place.title} · Coupole")
     def page(request: Request) -> None:
         visit = Visit(service, request)
         with framed(visit, place, tuple(SCREENS)):
-            build(visit)
+            build(visit, **request.path_params)

@@ -34,12 +34,12 @@ class _Screen:
     def __init__(self, visit: Visit) -> None:
         self._visit, self._objects = visit, visit.service.objects
         with ui.row().classes("bar"):
-            self._chooser = Choice("Object", "object", self._show)
+            self._chooser = Choice("Object", {}, self._show, name="object")
         with ui.element("div").classes("columns"):
             with panel("Is this your object?"):
                 self._photograph = ui.column().classes("cell")
                 self._lies = named(ui.html("", sanitize=False), "lies").style("width:100%")
-                self._plans = Choice("As this plan has it", "by-plan", self._draw)
+                self._plans = Choice("As this plan has it", {}, self._draw, name="by-plan")
             with panel("Light on it"):
                 self._sums = named(ui.html("", sanitize=False), "light").style("width:100%")
                 self._bar = ui.linear_progress(0.0, show_value=False).props('aria-label="light of its budget"')
@@ -53,7 +53,7 @@ class _Screen:
             self._sums.set_content("<p>No plan, run or ledger names an object yet.</p>")
             return
         here = self._visit.now.object
-        self._chooser.offer(dict(zip(ids, ids, strict=True)), here if here in ids else ids[0])
+        self._chooser.set_options({one: one for one in ids}, here if here in ids else "")
         await self._show()
 
     async def _show(self) -> None:
@@ -73,7 +73,7 @@ class _Screen:
         self._runs.set_content(_light_table(history, operators))
         self._show_photograph(object_id, there=photograph is not None)
         with_mesh = [one.plan for one in plans if one.mesh]
-        self._plans.offer({name: name for name in with_mesh}, with_mesh[0] if with_mesh else "")
+        self._plans.set_options({name: name for name in with_mesh})
         await self._draw()
 
     def _show_light(self, history: History, budget: float | None, similar: list[str]) -> None:

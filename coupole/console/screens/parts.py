@@ -33,43 +33,6 @@ def named(element: E, name: str) -> E:
     return element.props(f"data-name={name}")
 
 
-class Choice:
-    """One of several, as a list to choose from: the browser's own, which keyboards and screen readers know."""
-
-    def __init__(self, label: str, name: str, on_change: Callable[[], object] = lambda: None) -> None:
-        self.value = ""
-        self._options: dict[str, str] = {}
-        self._on_change = on_change
-        with ui.element("label").classes("choice"):
-            ui.label(label)
-            self._select = named(ui.html("", sanitize=False, tag="select"), name)
-        self._select.on("change", self._changed, js_handler="event => emit(event.target.value)")
-
-    def offer(self, options: Mapping[str, str], value: str) -> None:
-        """Values with their words; `value` is chosen (nobody is told)."""
-        self._options, self.value = dict(options), value
-        self._draw()
-
-    def choose(self, value: str) -> None:
-        """Nobody is told."""
-        self.value = value
-        self._draw()
-
-    def _draw(self) -> None:
-        self._select.set_content(
-            "".join(
-                f'<option value="{html.escape(value)}"{" selected" * (value == self.value)}>{html.escape(words)}'
-                "</option>"
-                for value, words in self._options.items()
-            )
-        )
-
-    def _changed(self, event: events.GenericEventArguments) -> object:
-        self.value = str(event.args)
-        self._draw()
-        return self._on_change()
-
-
 def panel(title: str = "") -> ui.column:
     """A box for one thing."""
     box = ui.column().classes("panel")
@@ -142,3 +105,69 @@ def histogram_svg(histograms: Mapping[str, Sequence[int]]) -> str:
 def clipping_words(saturated: Mapping[str, float]) -> dict[str, str]:
     """Share of pixels at full scale by channel."""
     return {f"{name} clipped": f"{share:.3%}" if share else "none" for name, share in saturated.items()}
+
+
+async def sure(title: str, words: str, yes: str) -> bool:
+    """Ask before something that cannot be undone, or takes long."""
+    with ui.dialog().props(f'aria-label="{html.escape(title)}"') as dialog, ui.column().classes("panel ask"):
+        heading(title)
+        ui.label(words)
+        with ui.row():
+            button(yes, lambda: dialog.submit(True), name="yes", kind="main")
+            button("Cancel", lambda: dialog.submit(False), name="cancel")
+    said = await dialog
+    dialog.delete()
+    return bool(said)
+
+
+def link(words: str, target: str, *, name: str, new_tab: bool = True) -> ui.link:
+    """To a page of this console."""
+    return ui.link(words, target, new_tab=new_tab).props(f"data-name={name}")
+
+
+def moment(t: str) -> str:
+    """A time of UTC, ISO 8601, for people: `2026-11-23 15:04`."""
+    return t[:16].replace("T", " ")
+
+
+class Choice:
+    """One of several values, as the browser's own list: by keyboard, finger and screen reader."""
+
+    def __init__(
+        self,
+        words: str,
+        options: Mapping[str, str],
+        on_change: Callable[[], object] = lambda: None,
+        *,
+        name: str,
+        value: str = "",
+    ) -> None:
+        """`options`: words of each value; `value` is chosen, or else the first; `name` is its `data-name` in the
+        page."""
+        self._words, self._name, self._on_change = words, name, on_change
+        self._options, self.value = dict(options), value or next(iter(options), "")
+        self._box = ui.html("", sanitize=False).classes("choice")
+        self._box.on("change", self._changed, js_handler="(e) => emit(e.target.value)")
+        self.set_options(options, self.value)
+
+    def set_options(self, options: Mapping[str, str], value: str = "") -> None:
+        """Others; nobody is told."""
+        self._options, self.value = dict(options), value or next(iter(options), "")
+        inner = "".join(
+            f'<option value="{html.escape(one)}"{" selected" if one == self.value else ""}>{html.escape(words)}'
+            "</option>"
+            for one, words in self._options.items()
+        )
+        words = html.escape(self._words)
+        self._box.set_content(
+            f'<label><span>{words}</span><select data-name="{self._name}">{inner}</select></label>'
+        )
+
+    def set_visibility(self, visible: bool) -> None:
+        self._box.set_visibility(visible)
+
+    def _changed(self, event: events.GenericEventArguments) -> object:
+        if event.args not in self._options:
+            return None
+        self.value = str(event.args)
+        return self._on_change()

@@ -20,7 +20,7 @@ from coupole.errors import InputError, Problem
 from coupole.viewing.terminal import bytes_text, duration_text
 
 _AFTER_TYPING_S = 0.6
-_UNITS = ["mm", "m", "um"]
+_UNITS = {"mm": "mm", "m": "m", "um": "um"}
 _KINDS = {
     "round": "views all round an object",
     "views": "a view from above and a ring",
@@ -41,7 +41,7 @@ class _Screen:
         self._filling = False
         self._turn = 0
         with ui.row().classes("bar"):
-            self._chooser = Choice("Plan", "plan", self._chosen)
+            self._chooser = Choice("Plan", {}, self._chosen, name="plan")
             button("New plan", self._ask_new, icon="add", name="new-plan")
             self._save = button("Save", self._save_plan, icon="save", name="save", kind="main")
             self._enter = button("Put in the queue", self._enter_plan, icon="playlist_add", name="enter")
@@ -70,7 +70,7 @@ class _Screen:
     async def open_first(self) -> None:
         names = await in_thread(self._plans.names)
         if names:
-            self._chooser.offer(dict(zip(names, names, strict=True)), names[0])
+            self._chooser.set_options({name: name for name in names})
             await self._chosen()
         else:
             self._show_text("")
@@ -92,8 +92,7 @@ class _Screen:
         with ui.dialog() as dialog, ui.card().classes("dialog"):
             heading("New plan")
             name = named(ui.input("Name", placeholder="vase-1").classes("field"), "new-name")
-            kind = Choice("Begin with", "kind")
-            kind.offer(_KINDS, "round")
+            kind = Choice("Begin with", _KINDS, name="kind")
             with ui.row():
                 button("Make", lambda: dialog.submit(True), name="make", kind="main")
                 button("Cancel", lambda: dialog.submit(False), name="cancel")
@@ -105,7 +104,7 @@ class _Screen:
         )
         if made is not None:
             names = await in_thread(plans.names)
-            self._chooser.offer(dict(zip(names, names, strict=True)), made)
+            self._chooser.set_options({name: name for name in names}, made)
             await self._chosen()
 
     async def _save_plan(self) -> bool:
@@ -135,7 +134,7 @@ class _Screen:
         with ui.element("div").classes("fields"):
             self._object = named(ui.input("Object: its accession number").classes("field"), "object")
             self._mesh = named(ui.input("Mesh: PLY, STL or OBJ").classes("field"), "mesh")
-            self._unit = Choice("Unit of the mesh", "mesh-unit", self._filled)
+            self._unit = Choice("Unit of the mesh", _UNITS, self._filled, name="mesh-unit")
             self._budget = named(ui.number("Light in its life at most, lux h", min=0).classes("field"), "budget")
             self._distance = ui.number("Distance of the camera, mm", min=1, max=3000).classes("field")
             self._elevations = named(ui.input("Elevations, degrees").classes("field"), "elevations")
@@ -159,7 +158,7 @@ class _Screen:
         self._fields = fields
         self._object.set_value(fields.object_id)
         self._mesh.set_value(fields.mesh)
-        self._unit.offer(dict(zip(_UNITS, _UNITS, strict=True)), fields.mesh_unit)
+        self._unit.set_options(_UNITS, fields.mesh_unit)
         self._budget.set_value(fields.budget_lux_h)
         self._distance.set_value(fields.distance_mm)
         self._elevations.set_value(_joined(fields.elevations_deg))

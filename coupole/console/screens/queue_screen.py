@@ -27,7 +27,7 @@ class _Screen:
         self._shown: object = None
         with panel():
             with ui.row().classes("bar"):
-                self._plan = Choice("Plan", "plan")
+                self._plan = Choice("Plan", {}, name="plan")
                 button("Put in the queue", self._enter, icon="playlist_add", name="enter", kind="main")
                 self._hold = named(
                     ui.input("Or what is to be done there", placeholder="change the object"), "hold"
@@ -47,7 +47,7 @@ class _Screen:
     async def offer_plans(self) -> None:
         """The plans of the folder, to choose from."""
         names = await in_thread(self._visit.service.plan_files.names)
-        self._plan.offer(dict(zip(names, names, strict=True)), names[0] if names else "")
+        self._plan.set_options({name: name for name in names})
 
     async def _enter(self) -> None:
         if self._plan.value:

@@ -8,7 +8,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from coupole.errors import StorageError
+from coupole.errors import StorageError, reason
 from coupole.exchange.of_results.measured_surface import MeasuredSurface
 from coupole.geometry import apply, inverse
 from coupole.reflectance.new_light.pictured_surface import surface_of_view
@@ -53,7 +53,7 @@ def _write(path: Path, parts: dict[str, dict[str, NDArray[np.float32]]], remark:
         OpenEXR.File(found).write(str(partial))
         partial.replace(path)
     except (OSError, RuntimeError) as error:
-        raise StorageError(f"{path}: {error}") from error
+        raise StorageError(f"{path}: {reason(error)}") from error
     finally:
         partial.unlink(missing_ok=True)
     return path

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 
-from coupole.errors import StorageError
+from coupole.errors import StorageError, reason
 from coupole.exchange.of_results.measured_surface import Y_UP_FROM_SUPPORT, Floats, MeasuredSurface
 from coupole.exchange.of_results.texel_layout import middles, texture
 from coupole.storage.durable import write_synced
@@ -96,7 +96,7 @@ def _write_texture(path: Path, values: Floats) -> Path:
         OpenEXR.File(header, channels).write(str(partial))
         partial.replace(path)
     except (OSError, RuntimeError) as error:
-        raise StorageError(f"{path}: {error}") from error
+        raise StorageError(f"{path}: {reason(error)}") from error
     finally:
         partial.unlink(missing_ok=True)
     return path

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.optics import NAMES, Intrinsics
-from coupole.errors import InputError
+from coupole.errors import InputError, reason
 from coupole.reflectance.alignment.refinement import Refined
 from coupole.reflectance.alignment.unknowns import renumbered
 from coupole.reflectance.extraction.measured_run import MeasuredRun
@@ -108,7 +108,9 @@ def read_refined(folder: Path) -> RefinedGeometry:
             covariance, middle_mm = file["covariance"][()], file["middle_mm"][()]
             pointings = _pointings(list(file["names"].asstr()[()]), covariance, middle_mm, views)
     except (OSError, KeyError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: expected the result of `coupole reflectance refine`: {error}") from error
+        raise InputError(
+            f"{path}: expected the result of `coupole reflectance refine`: {reason(error)}"
+        ) from error
     return RefinedGeometry(path, lens, poses, vertices_mm, digest, _told(folder, "inputs"), pointings)
 
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numba
 import numpy as np
 
-from coupole.motion.occlusion import RAY_START_MM, blocked
+from coupole.motion.occlusion import RAY_START_MM
+from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.ggx import drawn, reflected, shine
 from coupole.reflectance.new_light.beams import Emitter
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
-from coupole.reflectance.new_light.shading import MIRROR_SHARE, Coats, Picture, shines
+from coupole.reflectance.new_light.shading import KD, KS, MIRROR_SHARE, Coats, Picture, shines
 from coupole.reflectance.new_light.shadow_edges import DISTANT_MM
 
 _R2 = (0.7548776662466927, 0.5698402909980532)
@@ -23,11 +23,11 @@ def add_mirrored(
     picture: Picture,
     surface: Surface,
     coats: Coats,
-    rays: Any,
+    mesh: PacketMesh,
     emitter: Emitter,
     lobe_rays: int,
 ) -> None:
-    """Add what rays drawn from the materials' lobes meet of an emitter; `rays` is the mesh's `ray_mesh`."""
+    """Add what rays drawn from the materials' lobes meet of an emitter; `mesh` is what throws shadows."""
     of_emitter = (
         emitter.near, emitter.axes, emitter.centre_mm, emitter.halves_mm, emitter.radiance, emitter.density
     )  # fmt: skip
@@ -40,16 +40,15 @@ def add_mirrored(
         if not len(row):
             return
         pixels = np.stack([row, column], axis=1)
-        starts_mm = places_mm[row, column] + RAY_START_MM * surface.normals[seen[row, column]]
-        met, ways_mm = np.empty(len(pixels), np.int64), np.empty((len(pixels), 3))
+        starts_mm = places_mm[row, column] + RAY_START_MM * surface.normals[seen[row, column]].astype(np.float32)
+        met, ways_mm = np.empty(len(pixels), np.int64), np.empty((len(pixels), 3), np.float32)
         gains, sums = np.empty((len(pixels), part.shape[2])), np.zeros((len(pixels), part.shape[2]), np.float32)
         for ray in range(lobe_rays):
             count = _mirror(
                 pixels, rows.start, seen, places_mm, surface.camera_mm, surface.normals, coats, *of_emitter, ray,
                 lobe_rays, met, gains, ways_mm,
             )  # fmt: skip
-            starts = starts_mm[met[:count]]
-            free = ~blocked(rays, starts, starts + ways_mm[:count])
+            free = ~mesh.blocked_along(starts_mm[met[:count]], ways_mm[:count], alike=False)
             sums[met[:count][free]] += gains[:count][free]
         part[row, column] += sums
 
@@ -88,7 +87,7 @@ def _mirror(  # type: ignore[no-untyped-def]
         lobe = shine(nl, nv, nh, coat[3])
         share = nl / (among + lobe_rays * drawn(nv, nh, coat[3]))
         for channel in range(channels):
-            value = coat[4 + channel] + coat[4 + channels + channel] * lobe
+            value = coat[KD + channel] + coat[KS + channel] * lobe
             gains[count, channel] = radiance[x, y, channel] * value * share
         for k in range(3):
             ways_mm[count, k] = far_mm * way[k]

@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import h5py
 import numba
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.geometry import apply
+from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.run_result import RunResult, ViewSamples
 
 Floats = NDArray[np.float64]
@@ -51,6 +52,12 @@ class Surface:
     normals: Floats
     """[triangles, 3] of the mesh."""
 
+    @cached_property
+    def offsets_mm(self) -> Floats:
+        """[triangles] of their planes from the origin, along the normals."""
+        offsets: Floats = np.einsum("tk,tk->t", self.centres_mm, self.normals)
+        return offsets
+
 
 @dataclass(frozen=True)
 class FreeCamera:
@@ -79,9 +86,9 @@ def surface_of_view(result: RunResult, view: ViewSamples) -> Surface:
     return Surface(seen, places_mm, view.camera_mm, view.triangles, centres_mm, normals)
 
 
-def surface_from(result: RunResult, rays: Any, camera: FreeCamera) -> Surface:
-    """Of the triangles that any view has seen, from a camera anywhere; others hide what is behind them. `rays` is
-    the mesh's `ray_mesh`. Raises InputError if the camera sees none."""
+def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Surface:
+    """Of the triangles that any view has seen, from a camera anywhere; others hide what is behind them, as do
+    those of `mesh` that none has seen. Raises InputError if the camera sees none."""
     triangles = result.triangles
     corners_mm = result.corners_mm[triangles].astype(np.float64)
     normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
@@ -99,12 +106,8 @@ def surface_from(result: RunResult, rays: Any, camera: FreeCamera) -> Surface:
         local = [(x - (width - 1) / 2) / focal_px, (y - (height - 1) / 2) / focal_px, np.ones(x.shape)]
         ways = np.stack(local, axis=-1) @ base_from_camera[:3, :3].T
         ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
-        starts = np.broadcast_to(camera_mm.astype(np.float32), ways.shape).reshape(-1, 3)
-        met = rays.run(
-            np.ascontiguousarray(starts), ways.reshape(-1, 3).astype(np.float32), query="INTERSECT", output=1
-        )
-        number = np.asarray(met["primID"], dtype=np.int64).reshape(x.shape)
-        distance = np.asarray(met["tfar"], dtype=np.float64).reshape(x.shape)
+        met = mesh.first_met(camera_mm, ways.reshape(-1, 3).astype(np.float32))
+        number, distance = (one.reshape(x.shape) for one in met)
         here = np.where(number >= 0, places[number], -1)
         here[np.einsum("hwk,hwk->hw", normals[here], ways) >= 0.0] = -1
         seen[rows] = here

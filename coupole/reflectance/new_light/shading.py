@@ -12,13 +12,28 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.reflectance.ggx import drawn
-from coupole.reflectance.lanes import LANES, absolute, gathered, if_less, lanes, larger, loaded, root, store, total
+from coupole.reflectance.lanes import (
+    LANES,
+    absolute,
+    add_in_turns,
+    four_gathered,
+    gathered,
+    if_less,
+    in_turns,
+    lanes,
+    larger,
+    loaded,
+    root,
+    store,
+    total,
+)
 from coupole.reflectance.new_light.beams import Beam
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 from coupole.reflectance.new_light.shadow_edges import LIT, Codes
@@ -29,15 +44,19 @@ Picture = NDArray[np.float32]
 """[h, w, channels]; what is added to it is radiance."""
 
 Coats = NDArray[np.float32]
-"""[triangles, 4 + 2 channels]: normal, alpha (0 for no material), kd, ks, side by side in memory."""
+"""[triangles, 12], in fours: normal and alpha (0 for no material), then `KD` and `KS`, 0 behind their channels."""
+KD, KS = 4, 8
 MIRROR_SHARE = 4
 """Rays from a lobe are one for so many beams of an emitter."""
 
 
 def coats_of(materials: TriangleMaterials) -> Coats:
     """Materials as they are read pixel by pixel."""
-    alpha = np.nan_to_num(materials.alpha)[:, None]
-    return np.hstack([materials.normals, alpha, materials.kd, materials.ks]).astype(np.float32)
+    coats = np.zeros((len(materials.alpha), 12), np.float32)
+    coats[:, :3], coats[:, 3] = materials.normals, np.nan_to_num(materials.alpha)
+    for first, part in ((KD, materials.kd), (KS, materials.ks)):
+        coats[:, first : first + part.shape[1]] = part
+    return coats
 
 
 def alike(beams: Iterable[Beam]) -> Iterator[list[Beam]]:
@@ -75,16 +94,23 @@ def add_beams(
 
 
 def add_beam(picture: Picture, surface: Surface, coats: Coats, codes: Codes, beam: Beam) -> None:
-    """As `add_beams` of a single one that is no part of an emitter, where `codes` [h, w] say that it reaches."""
-    single = (values.astype(np.float32) for values in (surface.camera_mm, beam.place, beam.axis, beam.strength))
+    """As `add_beams` of a single one that is no part of an emitter, where `codes` [h, w] say that it reaches;
+    the picture lies in C order."""
+    three = np.resize(beam.strength, 3)
+    single = (values.astype(np.float32) for values in (surface.camera_mm, beam.place, beam.axis, three))
     camera_mm, place, axis, strength = single
-    in_strips(
-        len(picture),
-        lambda rows: _add_beam(
-            surface.seen[rows], surface.places_mm[rows].reshape(-1, 3), codes[rows], camera_mm, coats, beam.near,
-            place, axis, beam.exponent, strength, picture[rows],
-        ),
-    )  # fmt: skip
+    flat = [one.reshape(codes.size, -1) for one in (surface.seen, surface.places_mm, codes, picture)]
+
+    def add(pixels: list[NDArray[Any]]) -> None:
+        seen, places_mm, here, part = (one.reshape(len(one) // LANES, -1) for one in pixels)
+        _add_beam(seen, places_mm, here, coats, camera_mm, beam.near, place, axis, beam.exponent, strength, part)
+
+    eights, rest = divmod(codes.size, LANES)
+    in_strips(eights, lambda part: add([one[part.start * LANES : part.stop * LANES] for one in flat]))
+    if rest:
+        last = [np.resize(one[-rest:], (LANES, one.shape[1])) for one in flat]
+        add(last)
+        flat[-1][-rest:] = last[-1][:rest]
 
 
 def add_values(picture: Picture, surface: Surface, values: NDArray[np.float32], codes: Codes, beam: Beam) -> None:
@@ -167,44 +193,39 @@ def _add_beams(  # type: ignore[no-untyped-def]
             reach = if_less(lit, half, reach * nl, none)
             for channel in range(channels):
                 light = reach * loaded(strengths, channel)
-                shining = coat[4 + channels + channel] * total(light * lobe)
-                picture[row, column, channel] += coat[4 + channel] * total(light) + shining
+                shining = coat[KS + channel] * total(light * lobe)
+                picture[row, column, channel] += coat[KD + channel] * total(light) + shining
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_beam(  # type: ignore[no-untyped-def]
-    seen, places_mm, codes, camera_mm, coats, near, place, axis, exponent, strength, picture
-):
-    """Eight neighbouring pixels of a row in the lanes."""
-    (height, width), channels, none, half = seen.shape, picture.shape[2], np.float32(0.0), np.float32(0.5)
-    pixel, triangle = np.zeros(LANES, np.int64), np.zeros(LANES, np.int64)
-    on, added = np.zeros((1, LANES), np.float32), np.empty((channels, LANES), np.float32)
-    for row in range(height):
-        for first in range(0, width, LANES):
-            count = min(LANES, width - first)
-            on[:] = none
-            for k in range(count):
-                mine = seen[row, first + k]
-                pixel[k], triangle[k] = row * width + first + k, max(mine, 0)
-                on[0, k] = mine >= 0 and codes[row, first + k] == LIT and coats[max(mine, 0), 3] > none
-            if not on.any():
-                continue
-            lit = loaded(on, 0)
-            x, y, z = gathered(places_mm, pixel, 0), gathered(places_mm, pixel, 1), gathered(places_mm, pixel, 2)
-            n0, n1, n2 = gathered(coats, triangle, 0), gathered(coats, triangle, 1), gathered(coats, triangle, 2)
-            l0, l1, l2, reach = _reach_from(near, place, axis, exponent, x, y, z)
-            v0, v1, v2 = camera_mm[0] - x, camera_mm[1] - y, camera_mm[2] - z
-            inverse = np.float32(1.0) / root(v0 * v0 + v1 * v1 + v2 * v2)
-            v0, v1, v2 = v0 * inverse, v1 * inverse, v2 * inverse
-            nl, nv = larger(n0 * l0 + n1 * l1 + n2 * l2, none), n0 * v0 + n1 * v1 + n2 * v2
-            lobe = _lobe(n0, n1, n2, l0 + v0, l1 + v1, l2 + v2, nl, nv, gathered(coats, triangle, 3))
-            reach = if_less(half, lit, reach * nl, none)
-            for channel in range(channels):
-                kd, ks = gathered(coats, triangle, 4 + channel), gathered(coats, triangle, 4 + channels + channel)
-                store(if_less(half, lit, reach * strength[channel] * (kd + ks * lobe), none), added, channel)
-            for k in range(count):
-                for channel in range(channels):
-                    picture[row, first + k, channel] += added[channel, k]
+def _add_beam(seen, places_mm, codes, coats, camera_mm, near, place, axis, exponent, strength, picture):  # type: ignore[no-untyped-def]
+    """Eight neighbouring pixels in the lanes: arrays [n, 8], [n, 8 coordinates], [n, 8 channels]."""
+    triangle, one, none, half = np.zeros(LANES, np.int64), np.float32(1.0), np.float32(0.0), np.float32(0.5)
+    for eight in range(len(seen)):
+        lit = if_less(absolute(loaded(codes, eight) - np.float32(LIT)), half, one, none)
+        if total(lit) == none:
+            continue
+        for k in range(LANES):
+            triangle[k] = max(seen[eight, k], 0)
+        n0, n1, n2, alpha = four_gathered(coats, triangle, 0)
+        lit = if_less(none, alpha, lit, none)
+        x, y, z = in_turns(places_mm, eight)
+        l0, l1, l2, reach = _reach_from(near, place, axis, exponent, x, y, z)
+        v0, v1, v2 = camera_mm[0] - x, camera_mm[1] - y, camera_mm[2] - z
+        inverse = one / root(v0 * v0 + v1 * v1 + v2 * v2)
+        v0, v1, v2 = v0 * inverse, v1 * inverse, v2 * inverse
+        nl, nv = larger(n0 * l0 + n1 * l1 + n2 * l2, none), n0 * v0 + n1 * v1 + n2 * v2
+        lobe = _lobe(n0, n1, n2, l0 + v0, l1 + v1, l2 + v2, nl, nv, alpha)
+        reach = if_less(half, lit, reach * nl, none)
+        d0, d1, d2, _ = four_gathered(coats, triangle, KD)
+        s0, s1, s2, _ = four_gathered(coats, triangle, KS)
+        first = if_less(half, lit, reach * strength[0] * (d0 + s0 * lobe), none)
+        if picture.shape[1] == LANES:
+            store(loaded(picture, eight) + first, picture, eight)
+        else:
+            second = if_less(half, lit, reach * strength[1] * (d1 + s1 * lobe), none)
+            third = if_less(half, lit, reach * strength[2] * (d2 + s2 * lobe), none)
+            add_in_turns(first, second, third, picture, eight)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -270,6 +291,6 @@ def _add_values(seen, places_mm, codes, values, near, place, axis, exponent, str
 def shines(coat):  # type: ignore[no-untyped-def]
     """Whether a material has a lobe at all."""
     found = False
-    for number in range(4 + (len(coat) - 4) // 2, len(coat)):
+    for number in range(KS, len(coat)):
         found |= coat[number] > 0.0
     return found

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.motion.occlusion import RAY_START_MM, blocked_along
+from coupole.motion.occlusion import RAY_START_MM
+from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.new_light.beams import Beam
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 
@@ -26,32 +26,36 @@ NONE, AWAY, LIT, SHADED, ASKED = range(5)
 CELL_PX = 4
 DISTANT_MM = 3000.0
 """What is farther casts no shadow of distant light."""
-_RAYS = 1 << 17
+_RAYS = 1 << 15
+_PACKET = 4
+"""Rays of the grid down and across that go together."""
 
 
-def reached(rays: Any, surface: Surface, beam: Beam) -> Codes:
-    """[h, w] codes; `rays` is the mesh's `ray_mesh`."""
+def reached(mesh: PacketMesh, surface: Surface, beam: Beam) -> Codes:
+    """[h, w] codes; `mesh` is what throws shadows."""
     codes = np.empty(surface.seen.shape, np.uint8)
-    facing = surface.seen, surface.places_mm, surface.normals, beam.near, beam.place, beam.axis, beam.exponent
-    in_strips(len(codes), lambda rows: _begin(facing[0][rows], facing[1][rows], *facing[2:], codes[rows]))
-    _trace(rays, surface, beam, _asked_on_grid(codes), codes)
-    open_cells = _open_cells(codes)
+    by = _facing(surface, beam), beam.place, beam.axis, beam.exponent
+    in_strips(len(codes), lambda rows: _begin(surface.seen[rows], surface.places_mm[rows], *by, codes[rows]))
+    _trace(mesh, surface, beam, _asked_on_grid(codes), codes)
+    open_cells = np.ones(codes[::CELL_PX, ::CELL_PX].shape, np.bool_)
+    in_strips(len(open_cells) - 1, lambda cells: _close_cells(codes, cells.start, open_cells[cells]))
     fresh = np.argwhere(open_cells)
     while len(fresh):
-        _trace(rays, surface, beam, _asked_in(codes, fresh), codes)
+        _trace(mesh, surface, beam, _asked_in(codes, fresh), codes)
         fresh = _spread(codes, open_cells, fresh)
-    _fill(codes)
+    in_strips(len(codes), lambda rows: _fill(codes, rows.start, rows.stop))
     return codes
 
 
-def _trace(rays: Any, surface: Surface, beam: Beam, pixels: NDArray[np.int64], codes: Codes) -> None:
+def _trace(mesh: PacketMesh, surface: Surface, beam: Beam, pixels: NDArray[np.int64], codes: Codes) -> None:
     seen, places_mm, flat = surface.seen.reshape(-1), surface.places_mm.reshape(-1, 3), codes.reshape(-1)
 
     def trace(first: int) -> None:
         mine = pixels[first : first + _RAYS]
-        starts_mm, ways_mm = np.empty((2, len(mine), 3), np.float32)
+        starts_mm = np.empty((len(mine), 3), np.float32)
+        ways_mm = np.empty_like(starts_mm[: None if beam.near else 1])
         _begin_rays(mine, seen, places_mm, surface.normals, beam.near, beam.place, starts_mm, ways_mm)
-        flat[mine] = np.where(blocked_along(rays, starts_mm, ways_mm), SHADED, LIT)
+        flat[mine] = np.where(mesh.blocked_along(starts_mm, ways_mm), SHADED, LIT)
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         list(pool.map(trace, range(0, len(pixels), _RAYS)))
@@ -64,53 +68,70 @@ def _begin_rays(pixels, seen, places_mm, normals, near, place, starts_mm, ways_m
         for k in range(3):
             start_mm = places_mm[pixels[n], k] + RAY_START_MM * normals[triangle, k]
             starts_mm[n, k] = start_mm
-            ways_mm[n, k] = place[k] - start_mm if near else DISTANT_MM * place[k]
-
-
-def _asked_on_grid(codes: Codes) -> NDArray[np.int64]:
-    rows, columns = np.nonzero(codes[::CELL_PX, ::CELL_PX] == ASKED)
-    found: NDArray[np.int64] = (rows * codes.shape[1] + columns) * CELL_PX
-    return found
+            if near:
+                ways_mm[n, k] = place[k] - start_mm
+    if not near:
+        ways_mm[0] = DISTANT_MM * place
 
 
 @numba.njit(cache=True, nogil=True)
-def _begin(seen, places_mm, normals, near, place, axis, exponent, codes):  # type: ignore[no-untyped-def]
-    """Codes by the normals alone."""
+def _asked_on_grid(codes):  # type: ignore[no-untyped-def]
+    """Pixels, by squares whose rays go together."""
+    (height, width), side = codes.shape, _PACKET * CELL_PX
+    found = np.empty(((height + CELL_PX - 1) // CELL_PX) * ((width + CELL_PX - 1) // CELL_PX), np.int64)
+    count = 0
+    for top in range(0, height, side):
+        for left in range(0, width, side):
+            for row in range(top, min(top + side, height), CELL_PX):
+                for column in range(left, min(left + side, width), CELL_PX):
+                    if codes[row, column] == ASKED:
+                        found[count] = row * width + column
+                        count += 1
+    return found[:count]
+
+
+def _facing(surface: Surface, beam: Beam) -> NDArray[np.bool_]:
+    """[triangles] whether they look towards a beam, which from all places of a plane is on the same side of it."""
+    if not beam.near:
+        return surface.normals @ beam.place > 0.0
+    return surface.normals @ beam.place > surface.offsets_mm
+
+
+@numba.njit(cache=True, nogil=True)
+def _begin(seen, places_mm, facing, place, axis, exponent, codes):  # type: ignore[no-untyped-def]
+    """Codes by the normals of triangles and emitter alone."""
     for row in range(seen.shape[0]):
         for column in range(seen.shape[1]):
             triangle = seen[row, column]
-            if triangle < 0:
-                codes[row, column] = NONE
-                continue
-            facing, leaving = 0.0, 0.0
+            codes[row, column] = NONE if triangle < 0 else ASKED if facing[triangle] else AWAY
+        if exponent == 0:
+            continue
+        for column in range(seen.shape[1]):
+            leaving = 0.0
             for k in range(3):
-                way = place[k] - places_mm[row, column, k] if near else place[k]
-                facing += way * normals[triangle, k]
-                leaving -= way * axis[k]
-            dark = facing <= 0.0 or (exponent > 0 and leaving <= 0.0)
-            codes[row, column] = AWAY if dark else ASKED
+                leaving += (places_mm[row, column, k] - place[k]) * axis[k]
+            if leaving <= 0.0:
+                codes[row, column] = min(codes[row, column], AWAY)
 
 
 @numba.njit(cache=True, nogil=True)
-def _open_cells(codes):  # type: ignore[no-untyped-def]
-    """[cells down, cells across] True where rays at the corners are missing or differ, or the surface ends."""
-    height, width = codes.shape
-    down, across = (height + CELL_PX - 1) // CELL_PX, (width + CELL_PX - 1) // CELL_PX
-    found = np.ones((down, across), np.bool_)
-    for i in range(down - 1):
+def _close_cells(codes, first, open_cells):  # type: ignore[no-untyped-def]
+    """Of rows of cells [n, cells across] from a first one on, which have others below and to the right: those stay
+    open whose rays at the corners are missing or differ, or where the surface ends."""
+    down, across = open_cells.shape
+    for i in range(down):
         for j in range(across - 1):
-            row, column = i * CELL_PX, j * CELL_PX
+            row, column = (first + i) * CELL_PX, j * CELL_PX
             one = codes[row, column]
             if one not in (LIT, SHADED) or codes[row, column + CELL_PX] != one:
                 continue
             if codes[row + CELL_PX, column] != one or codes[row + CELL_PX, column + CELL_PX] != one:
                 continue
-            whole = True
+            ends = False
             for y in range(row, row + CELL_PX):
                 for x in range(column, column + CELL_PX):
-                    whole &= codes[y, x] != NONE
-            found[i, j] = not whole
-    return found
+                    ends |= codes[y, x] == NONE
+            open_cells[i, j] = ends
 
 
 @numba.njit(cache=True, nogil=True)
@@ -162,9 +183,9 @@ def _differs(codes, row, column, down, across, one):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(codes):  # type: ignore[no-untyped-def]
-    """What is still asked lies in closed cells and is as their corners."""
-    for row in range(codes.shape[0]):
+def _fill(codes, first, end):  # type: ignore[no-untyped-def]
+    """What is still asked in some rows lies in closed cells and is as their corners."""
+    for row in range(first, end):
         for column in range(codes.shape[1]):
             if codes[row, column] == ASKED:
                 codes[row, column] = codes[row - row % CELL_PX, column - column % CELL_PX]

@@ -17,11 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from coupole.devices import ArmState, Clock, Identity
+from coupole.devices import ArmCondition, ArmState, Clock, Identity
 from coupole.errors import DeviceError, DeviceLost, DeviceTimeout
 from coupole.geometry import transform
 from coupole.kinematics import Arm, forward, move_duration_s, slowed
-from drivers.arm_motion import MessageTime, checked_target, farthest_stop_deg, longest_stop_s, overtaken, refused
+from drivers.arm_motion import (
+    MessageTime,
+    checked_speed,
+    checked_target,
+    farthest_stop_deg,
+    longest_stop_s,
+    overtaken,
+    refused,
+)
 from drivers.kuka.eki import wire
 from drivers.kuka.eki.link import Link, connect
 from drivers.kuka.eki.watch import Tolerances, Watch
@@ -162,20 +170,21 @@ class KukaEki:
             "mode": "T1: slow, for tests" if status.t1 else "automatic or T2",
         }
 
-    def move_to(self, joints_deg: NDArray[np.float64]) -> None:
-        stops = self._stops
+    def move_to(self, joints_deg: NDArray[np.float64], speed: float = 1.0) -> None:
+        stops, percent = self._stops, self._percent(checked_speed(speed))
         target_deg = checked_target(joints_deg, self.arm.limits_deg)
         self._raise_fault()
         status = self._status()
         if status.override_percent <= 0:
             raise refused("an override above 0 %", "the controller's program override is at 0 %")
         # If the arm is moving it brakes first, which lengthens the motion by up to twice the braking time.
-        move_s = move_duration_s(self.arm, status.joints_deg, target_deg) + self._stop_s()
+        slower = self.settings.velocity_percent() / percent
+        move_s = move_duration_s(self.arm, status.joints_deg, target_deg) * slower + self._stop_s()
         with self._sending:
             if self._stops != stops:  # by another thread, since this call began
                 raise overtaken()
             self._motion_s = move_s * _slower(status)
-            self._order(wire.MOVE, target_deg)
+            self._order(wire.MOVE, target_deg, percent)
 
     def wait_settled(self) -> ArmState:
         settings, watch = self.settings, self._watch
@@ -212,6 +221,7 @@ class KukaEki:
                 t_ns=self._message_time.since_ns(self._watch.statuses),
                 moving=self._watch.moving,
                 fault=fault.text if fault else "",
+                condition=_condition(status),
             )
 
     def stop(self) -> None:
@@ -273,13 +283,23 @@ class KukaEki:
                 remedy="Restart the controller's programs, and check that they are those of configs/kuka/eki",
             )
 
-    def _order(self, verb: int, target_deg: Six | None) -> None:
+    def _percent(self, speed: float) -> int:
+        """Of the controller's own speeds. Raises DeviceRefused below its slowest."""
+        percent = int(round(speed * self.settings.velocity_percent(), 6))
+        if percent < 1:
+            raise refused(
+                "at least 1 % of the controller's speeds, its slowest",
+                f"{speed:.3g} of the {self.settings.velocity_percent()} % of the rig is less",
+            )
+        return percent
+
+    def _order(self, verb: int, target_deg: Six | None, percent: int | None = None) -> None:
         """Send a STOP or a MOVE; `_sending` must be held."""
         with self._link.changed:
             self._watch.ordered(self._number + 1, target_deg)
-        self._send(verb, target_deg)
+        self._send(verb, target_deg, percent)
 
-    def _send(self, verb: int, target_deg: Six | None = None) -> None:
+    def _send(self, verb: int, target_deg: Six | None = None, percent: int | None = None) -> None:
         self._number += 1
         settings, status = self.settings, self._watch.status
         here_deg = status.joints_deg if status else (0.0,) * 6
@@ -288,7 +308,7 @@ class KukaEki:
                 session=self._watch.session,
                 number=self._number,
                 verb=verb,
-                velocity_percent=settings.velocity_percent(),
+                velocity_percent=percent or settings.velocity_percent(),
                 acceleration_percent=settings.acceleration_percent(),
                 joints_deg=target_deg or here_deg,
             )
@@ -369,3 +389,10 @@ class KukaEki:
 def _slower(status: Status) -> float:
     """Factor by which the controller slows motions down (override, T1)."""
     return 100.0 / status.override_percent * (_T1_SLOWER if status.t1 else 1.0)
+
+
+def _condition(status: Status) -> ArmCondition:
+    """Of the one fault that the controller's program reports, the most serious."""
+    mode = "T1" if status.t1 else "automatic or T2"
+    released = status.fault not in (wire.EMERGENCY_STOP, wire.DRIVES_OFF)
+    return ArmCondition(mode, emergency_stop=status.fault == wire.EMERGENCY_STOP, brakes_released=released)

@@ -25,7 +25,15 @@ from numpy.typing import NDArray
 from coupole.devices import ArmState, Clock, Deadline, Identity
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceTimeout
 from coupole.kinematics import Arm, forward, move_duration_s
-from drivers.arm_motion import MessageTime, checked_target, longest_stop_s, overtaken, refused, wait_for
+from drivers.arm_motion import (
+    MessageTime,
+    checked_speed,
+    checked_target,
+    longest_stop_s,
+    overtaken,
+    refused,
+    wait_for,
+)
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.limits import correction_violations
 from drivers.kuka.rsi.pose import Geometry
@@ -90,8 +98,8 @@ class KukaRsi:
             "scheduling": "SCHED_FIFO" if state.realtime else "normal: answers may be late on a busy machine",
         }
 
-    def move_to(self, joints_deg: NDArray[np.float64]) -> None:
-        stops = self._stops
+    def move_to(self, joints_deg: NDArray[np.float64], speed: float = 1.0) -> None:
+        stops, speed = self._stops, checked_speed(speed)
         target_deg = checked_target(joints_deg, self.arm.limits_deg)
         state = self._state()
         self._raise_fault(state)
@@ -102,12 +110,12 @@ class KukaRsi:
         ):
             raise refused("a motion within the limits of corrections", violations)
         # If the arm is moving it brakes first, which lengthens the motion by up to twice the braking time.
-        motion_s = move_duration_s(self.arm, state.measured_deg, target_deg) + self._stop_s()
+        motion_s = move_duration_s(self.arm, state.measured_deg, target_deg) / speed + self._stop_s()
         with self._sending:
             if self._stops != stops:  # by another thread, since this call began
                 raise overtaken()
             self._target_deg, self._motion_s = target_deg, motion_s
-            self._send(shared_state.MOVE, target_deg)
+            self._send(shared_state.MOVE, target_deg, speed)
 
     def wait_settled(self) -> ArmState:
         command = self._command
@@ -198,8 +206,8 @@ class KukaRsi:
             time.sleep(_POLL_S)
         self._raise_fault(state)
 
-    def _send(self, verb: int, target_deg: tuple[float, ...] = (0.0,) * 6) -> None:
-        self._command = shared_state.Command(self._command.number + 1, verb, target_deg)
+    def _send(self, verb: int, target_deg: tuple[float, ...] = (0.0,) * 6, speed: float = 1.0) -> None:
+        self._command = shared_state.Command(self._command.number + 1, verb, target_deg, speed)
         self._block.write_command(self._command)
 
     def _state(self) -> shared_state.State:

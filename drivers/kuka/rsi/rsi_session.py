@@ -114,7 +114,7 @@ class RsiSession:
         self.command = command.number
         self.settled_cycles = 0
         if command.verb == shared_state.MOVE and self.fault == shared_state.NO_FAULT:
-            self.motion.move_to(command.target_deg)
+            self.motion.move_to(command.target_deg, command.speed)
         elif command.verb == shared_state.STOP:
             self.motion.stop()
         elif command.verb == shared_state.LEAVE:

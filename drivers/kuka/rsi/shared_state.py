@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 BLOCK_BYTES = 4096
 _COMMAND_AT, _STATE_AT = 0, 1024
 _SEQUENCE = struct.Struct("=Q")
-_COMMAND = struct.Struct("=QQ6d")
+_COMMAND = struct.Struct("=QQ7d")
 _STATE = struct.Struct("=16Q24d32s32s32s200s")
 _WORDS = 16
 """Integers of a state."""
@@ -37,6 +37,8 @@ class Command(NamedTuple):
     """Increases by one with every command."""
     verb: int = HOLD
     target_deg: Six = _ZEROS
+    speed: float = 1.0
+    """Share of the axes' highest speeds."""
 
 
 class State(NamedTuple):
@@ -91,11 +93,11 @@ class Block:
         self._memory = mmap.mmap(fd, BLOCK_BYTES)
 
     def write_command(self, command: Command) -> None:
-        self._write(_COMMAND_AT, _COMMAND.pack(command.number, command.verb, *command.target_deg))
+        self._write(_COMMAND_AT, _COMMAND.pack(command.number, command.verb, *command.target_deg, command.speed))
 
     def read_command(self) -> Command:
-        number, verb, *target = self._read(_COMMAND_AT, _COMMAND)
-        return Command(number, verb, tuple(target))
+        number, verb, *target, speed = self._read(_COMMAND_AT, _COMMAND)
+        return Command(number, verb, tuple(target), speed)
 
     def command_number(self) -> int:
         """The number alone, which is quick: 8 aligned bytes, so never torn."""

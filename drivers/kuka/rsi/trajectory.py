@@ -34,6 +34,7 @@ class Motion:
         self._line_deg: Six = (0.0,) * 6
         """From start to target; the profile's position goes from 0 to 1 of it."""
         self._next_target_deg: Six | None = None
+        self._next_speed = 1.0
 
     def stand_at(self, joints_deg: Six) -> None:
         """Set the commanded axes to `joints_deg`, at rest."""
@@ -45,10 +46,11 @@ class Motion:
         self.velocity_deg_s = (0.0,) * 6
         self._input.current_velocity = self._input.current_acceleration = [0.0]
 
-    def move_to(self, target_deg: Six) -> None:
+    def move_to(self, target_deg: Six, speed: float = 1.0) -> None:
+        """`speed`: share of the axes' highest speeds."""
         if self.phase != shared_state.STANDING:
             self.stop()
-            self._next_target_deg = target_deg
+            self._next_target_deg, self._next_speed = target_deg, speed
             return
         line_deg = tuple(map(float.__sub__, target_deg, self.commanded_deg))
         if max(map(abs, line_deg)) < _LEAST_MOTION_DEG:
@@ -59,6 +61,7 @@ class Motion:
             min(limit / abs(turn) for limit, turn in zip(limits, line_deg, strict=True) if turn)
             for limits in self._limits
         ]
+        highest[0] *= speed
         self._input.max_velocity, self._input.max_acceleration, self._input.max_jerk = ([h] for h in highest)
         self._input.current_position = self._input.current_velocity = self._input.current_acceleration = [0.0]
         self._input.target_position = [1.0]
@@ -95,5 +98,5 @@ class Motion:
             following = self._next_target_deg
             self.stand_at(self.commanded_deg)
             if following is not None:
-                self.move_to(following)
+                self.move_to(following, self._next_speed)
         return True

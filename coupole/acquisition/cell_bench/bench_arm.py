@@ -1,0 +1,197 @@
+"""The arm of a bench: its state, paths that are shown before they are driven, and motions by hand."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coupole.acquisition.arm_supervisor import ArmSupervisor
+from coupole.acquisition.cell_bench.arm_paths import ArmPaths, ShownPath, links_mm
+from coupole.acquisition.cell_bench.bench_requests import JogAsked, PathAsked
+from coupole.acquisition.cell_bench.bench_work import Work, Works
+from coupole.acquisition.cell_bench.jog_steps import jog_step
+from coupole.acquisition.observer import Control
+from coupole.acquisition.opened_cell import OpenedCell
+from coupole.acquisition.operator import refuse_uncommissioned
+from coupole.errors import DeviceError, DeviceRefused, InputError, PreflightRefused
+from coupole.plan.cell import Cell
+from coupole.preflight.job import Job
+from coupole.storage.arm_faults import ArmFaults
+
+HOLD_S = 0.3
+"""A motion by hand ends so long after its last renewal."""
+_KEPT_PATHS = 16
+_SAME_PLACE_DEG = 0.05
+
+
+class HoldLostError(Exception):
+    """A button was let go, or its renewals have ended."""
+
+
+class BenchArm:
+    """One arm at a time does one thing: a path, or a motion by hand."""
+
+    def __init__(self, cell: Cell, opened: OpenedCell, job: Job | None, works: Works) -> None:
+        self._cell, self._opened, self._works = cell, opened, works
+        self._faults = ArmFaults(cell.state_folder)
+        self._paths = ArmPaths(cell, job)
+        self._shown: dict[str, ShownPath] = {}
+        self._numbers = 0
+        self._hold: _Hold | None = None
+        home_deg = np.array(cell.rig.motion.home_joints_deg)
+        self._paths.motion.bodies.is_clear(home_deg, home_deg + 0.1)  # compiled before anybody waits for it
+
+    def state(self) -> dict[str, Any]:
+        """Posture, motion and what the controller tells of its safety."""
+        arm = self._opened.robot.measured()
+        joints_deg = np.array(arm.joints_deg)
+        return {
+            "joints_deg": np.round(joints_deg, 4).tolist(),
+            "links_mm": links_mm(self._paths.arm, joints_deg),
+            "base_from_camera": self._paths.base_from_camera(joints_deg).tolist(),
+            "limits_deg": [list(pair) for pair in self._paths.arm.limits_deg],
+            "moving": arm.moving,
+            "fault": arm.fault,
+            "faults_to_confirm": [fault.message for fault in self._faults.standing()],
+            "mode": arm.condition.mode,
+            "emergency_stop": arm.condition.emergency_stop,
+            "protective_stop": arm.condition.protective_stop,
+            "brakes_released": arm.condition.brakes_released,
+            "heard_s_ago": round((self._opened.clock.now_ns() - arm.t_ns) / 1e9, 3),
+        }
+
+    def plan_path(self, asked: PathAsked) -> dict[str, Any]:
+        """A path from where the arm stands. Raises InputError if it moves, or there is none."""
+        state = self._opened.robot.measured()
+        if state.moving:
+            raise InputError("the arm moves: a path is planned from where it stands")
+        self._numbers += 1
+        path = self._paths.plan(str(self._numbers), asked.to, np.array(state.joints_deg))
+        self._shown[path.id] = path
+        for old in list(self._shown)[:-_KEPT_PATHS]:
+            del self._shown[old]
+        return self._paths.figures(path)
+
+    def drive(self, number: str) -> dict[str, Any]:
+        """Begin to follow a path that was shown. Raises InputError if the arm is not where it begins."""
+        path = self._shown.get(number)
+        if path is None:
+            raise InputError(f"path: expected one that `plan_path` has shown, found {number!r}")
+        self.refuse_motion()
+        here_deg = np.array(self._opened.robot.measured().joints_deg)
+        off_deg = float(np.abs(here_deg - path.start_deg).max())
+        if off_deg > _SAME_PLACE_DEG:
+            raise InputError(
+                f"path {number} begins {off_deg:.2f} deg from where the arm stands: plan it anew and look at it"
+            )
+        work = Work("drive", {"path": path.id, "to": path.to}, lambda control: self._follow(path, control))
+        self._works.begin(work)
+        return work.figures()
+
+    def jog(self, asked: JogAsked) -> dict[str, Any]:
+        """Begin a motion by hand, or renew it. Raises InputError if it must not be."""
+        consoles = self._cell.rig.console.at_the_cell
+        if asked.at not in consoles:
+            raise InputError(
+                f"from: the arm is moved by hand only from a console at the cell; {asked.at!r} is not in "
+                f"`console: at_the_cell:` of {self._cell.document.path}"
+            )
+        if asked.hold is not None:
+            return self._renew(asked)
+        self.refuse_motion()
+        self._numbers += 1
+        hold = _Hold(self._numbers, asked)
+        about = {"hold": hold.number, "axis": asked.axis, "direction": asked.direction}
+        work = Work("jog", about, lambda control: self._go_on(hold, control))
+        self._works.begin(work)
+        self._hold, hold.work = hold, work
+        return work.figures()
+
+    def job_of(self, plan: Path) -> Job:
+        """The plan's job in this cell. Raises InputError if its object is not the bench's."""
+        return self._paths.job_of(plan)
+
+    def _renew(self, asked: JogAsked) -> dict[str, Any]:
+        hold = self._hold
+        if hold is None or hold.number != asked.hold:
+            raise InputError(f"hold: {asked.hold} has ended; let the button go and press it anew")
+        if (asked.axis, asked.direction) == (hold.asked.axis, hold.asked.direction):
+            hold.renew()
+        else:
+            hold.let_go()
+        assert hold.work is not None
+        return hold.work.figures()
+
+    def refuse_motion(self) -> None:
+        """Raise DeviceFault or InputError if the arm may not move at all."""
+        self._faults.refuse(self._cell.document.path)
+        try:
+            refuse_uncommissioned(self._cell, self._opened.identities)
+        except PreflightRefused as refused:
+            raise InputError(str(refused)) from refused
+
+    def _follow(self, path: ShownPath, control: Control) -> dict[str, Any]:
+        supervisor = ArmSupervisor(self._cell.rig, path.motion, self._opened, control)
+        with self._stopped_at_the_end():
+            supervisor.begin_here()
+            supervisor.go(path.visit)
+        return {}
+
+    def _go_on(self, hold: _Hold, control: Control) -> dict[str, Any]:
+        """Step after step while the button is held."""
+        rig, bodies = self._cell.rig, self._paths.motion.bodies
+        supervisor = ArmSupervisor(rig, self._paths.motion, self._opened, control)
+
+        camera, asked = rig.flange_from_camera.matrix(), hold.asked
+        try:
+            with self._stopped_at_the_end():
+                while True:
+                    here_deg = supervisor.begin_here()
+                    step = jog_step(
+                        self._paths.arm, bodies, camera, here_deg, asked.axis, asked.direction, asked.share
+                    )
+                    hold.check()
+                    supervisor.go(step.visit, meanwhile=hold.check, speed=step.speed)
+        except (HoldLostError, InputError) as end:
+            return {"ended": str(end)}
+
+    @contextmanager
+    def _stopped_at_the_end(self) -> Iterator[None]:
+        """Whatever ends it the arm is stopped; its faults stay with the cell."""
+        try:
+            try:
+                yield
+            finally:
+                self._opened.robot.stop()
+        except DeviceError as error:
+            if error.device == "robot" and not isinstance(error, DeviceRefused):
+                self._faults.note(str(error), "bench")
+            raise
+
+
+class _Hold:
+    """A button that is held."""
+
+    def __init__(self, number: int, asked: JogAsked) -> None:
+        self.number, self.asked = number, asked
+        self.work: Work | None = None
+        self._ended = ""
+        self.renew()
+
+    def renew(self) -> None:
+        self._renewed_s = time.monotonic()
+
+    def let_go(self) -> None:
+        self._ended = "the button was let go"
+
+    def check(self) -> None:
+        """Raise HoldLostError unless it is still held."""
+        if not self._ended and time.monotonic() - self._renewed_s > HOLD_S:
+            self._ended = f"it was not renewed for {1e3 * HOLD_S:g} ms"
+        if self._ended:
+            raise HoldLostError(self._ended)

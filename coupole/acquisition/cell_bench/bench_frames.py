@@ -1,0 +1,201 @@
+"""Pictures of a bench: exposed on request, with the figures by which one focuses and exposes."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.acquisition.cell_bench.bench_devices import BenchDevices
+from coupole.acquisition.cell_bench.bench_requests import FrameAsked, LoupeAsked
+from coupole.acquisition.dose import FlashMeter
+from coupole.acquisition.looking import lux_of_leds
+from coupole.acquisition.opened_cell import OpenedCell
+from coupole.acquisition.operator import longest_exposure_us
+from coupole.acquisition.runtime_folder import named_after
+from coupole.acquisition.single_shots import Shot, SingleShots
+from coupole.devices import NO_LED
+from coupole.errors import DeviceError, InputError
+from coupole.plan.cell import Cell
+from coupole.preflight.job import Job
+from coupole.viewing.raw_preview import figures, look, loupe, white_point
+
+_KEPT_FRAMES = 4
+_MOST_LOUPE_PX = 2048
+
+
+class BenchFrames:
+    """Takes one picture at a time; the last ones lie in a folder that only this user can enter."""
+
+    def __init__(self, cell: Cell, opened: OpenedCell, job: Job | None, devices: BenchDevices) -> None:
+        self._cell, self._opened, self._devices = cell, opened, devices
+        self._job = job
+        self._lux = lux_of_leds(cell, job)
+        self.begin_counting()
+        self._last: Shot | None = None
+        self._number = self._stops = 0
+        self._folder = named_after(cell.state_folder, "frames")
+        shutil.rmtree(self._folder, ignore_errors=True)  # of a bench that was killed
+        self._folder.mkdir(mode=0o700)
+
+    def frame(self, asked: FrameAsked) -> dict[str, Any]:
+        """Expose under each light in turn, and add up. Raises InputError, DoseBudgetReached, DeviceError."""
+        self._refuse_what_there_is_not(asked)
+        stops = self._stops
+        with self._devices.in_use:
+            before_lux_h = self._shots.given_lux_h
+            shot = self._exposed(asked, stops)
+            self._devices.heard("ledbox", "camera")
+            self._last = shot
+            self._number += 1
+            number, given_lux_h = self._number, float((self._shots.given_lux_h - before_lux_h).max())
+        coding, marks = shot.coding, asked.marks
+        jpeg = look(
+            shot.raw,
+            coding,
+            asked.width_px,
+            saturation="saturation" in marks,
+            focus="focus" in marks,
+            gains=asked.gains,
+        )
+        return {
+            "number": number,
+            "width_px": shot.raw.shape[1],
+            "height_px": shot.raw.shape[0],
+            **vars(coding),
+            "picture": str(self._keep(f"{number}.jpg", jpeg)),
+            "raw": str(self._keep_raw(number, shot.raw)),
+            **vars(figures(shot.raw, coding)),
+            "region": self._figures_of(shot, asked.region) if asked.region else None,
+            "dose_lux_h": given_lux_h,
+        }
+
+    def loupe(self, asked: LoupeAsked) -> dict[str, Any]:
+        """A region of the last picture, pixel by pixel, without another exposure. Raises InputError."""
+        shot, number = self._last, self._number
+        if shot is None:
+            raise InputError("loupe: expected a `frame` before it")
+        if max(asked.region[2:]) > _MOST_LOUPE_PX:
+            raise InputError(f"region: expected at most {_MOST_LOUPE_PX} x {_MOST_LOUPE_PX} px")
+        region, at_px = _region(shot, asked.region)
+        picture = self._keep("loupe.png", loupe(region, shot.coding, asked.gains))
+        height_px, width_px = region.shape
+        return {"number": number, "region": [*at_px, width_px, height_px], "picture": str(picture)}
+
+    def dose(self) -> dict[str, Any]:
+        """Of this bench, and of the object if it is known."""
+        meter = self._meter
+        left_lux_h = meter.left_lux_h if meter else math.inf
+        return {
+            "bench_lux_h": float(self._shots.given_lux_h.max()),
+            "total_lux_h": meter.total_lux_h if meter else None,
+            "left_lux_h": left_lux_h if math.isfinite(left_lux_h) else None,
+            "warning": meter.warning if meter else "",
+        }
+
+    def begin_counting(self) -> None:
+        """From what the object's ledger says now. Raises StorageError."""
+        job = self._job
+        self._meter = FlashMeter(job, self._opened, "bench", 1.0) if job and job.plan.object else None
+        self._shots = SingleShots(self._cell, self._opened, self._lux, self._meter)
+
+    def stop(self) -> None:
+        """Pictures that are under way, or wait, light nothing more."""
+        self._stops += 1
+
+    def release(self) -> None:
+        """The camera is free for others."""
+        self._shots.disarm()
+
+    def end(self) -> None:
+        """Once the cell is safe: enter what was given, remove the pictures."""
+        self._settle()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _exposed(self, asked: FrameAsked, stops: int) -> Shot:
+        lights = [(led, 0) for led in asked.lights] + [(NO_LED, panel) for panel in asked.panels]
+        shots = []
+        try:
+            for led, panel in lights or [(NO_LED, 0)]:
+                if self._stops != stops or self._opened.made_safe:
+                    raise InputError("frame: it was stopped before its last light")
+                shots.append(self._shots.take(led, asked.exposure_us, asked.gain_db, panel))
+                self._shots.rest()
+        except DeviceError:
+            with contextlib.suppress(DeviceError):
+                self._opened.ledbox.lights_off()
+                self._settle()
+            self.release()
+            raise
+        self._settle()
+        return _added_up(shots)
+
+    def _settle(self) -> None:
+        if self._meter is not None:
+            self._meter.settle()
+
+    def _figures_of(self, shot: Shot, region: Sequence[int]) -> dict[str, Any]:
+        found, _ = _region(shot, region)
+        return {**vars(figures(found, shot.coding)), "white_point": white_point(found, shot.coding)}
+
+    def _refuse_what_there_is_not(self, asked: FrameAsked) -> None:
+        leds, panels = set(self._cell.leds.ids.tolist()), self._opened.ledbox.panel_count
+        if strange := [led for led in asked.lights if led not in leds]:
+            raise InputError(f"lights: expected LEDs of the dome, found {strange[0]}")
+        if strange := [panel for panel in asked.panels if not 1 <= panel <= panels]:
+            raise InputError(f"panels: expected numbers from 1 to {panels}, found {strange[0]}")
+        longest_us = longest_exposure_us(self._cell.rig)
+        if asked.exposure_us > longest_us:
+            raise InputError(f"exposure_us: expected at most {longest_us}, found {asked.exposure_us}")
+        sensor = self._cell.rig.sensor
+        if asked.region:
+            _within(asked.region, sensor.width_px, sensor.height_px)
+
+    def _keep(self, name: str, content: bytes) -> Path:
+        path = self._folder / name
+        path.write_bytes(content)
+        return path
+
+    def _keep_raw(self, number: int, raw: NDArray[np.uint16]) -> Path:
+        path = self._folder / f"{number}.npy"
+        np.save(path, raw)
+        for suffix in ("npy", "jpg"):
+            (self._folder / f"{number - _KEPT_FRAMES}.{suffix}").unlink(missing_ok=True)
+        return path
+
+
+def _region(shot: Shot, region: Sequence[int]) -> tuple[NDArray[np.uint16], tuple[int, int]]:
+    """[h, w], widened to whole Bayer cells; and x, y of its first pixel."""
+    height_px, width_px = shot.raw.shape
+    x, y, width, height = _within(region, width_px, height_px)
+    left, top = x - x % 2, y - y % 2
+    right, bottom = (-(-(at) // 2) * 2 for at in (x + width, y + height))
+    return shot.raw[top:bottom, left:right], (left, top)
+
+
+def _within(region: Sequence[int], width_px: int, height_px: int) -> tuple[int, int, int, int]:
+    """Raises InputError for a region that is not within a picture of this size, or has no two Bayer cells."""
+    x, y, width, height = region
+    if min(width, height) < 4 or x + width > width_px or y + height > height_px:
+        raise InputError(
+            f"region: expected x, y, width, height of at least 4 px within {width_px} x {height_px} px, "
+            f"found {list(region)}"
+        )
+    return x, y, width, height
+
+
+def _added_up(shots: Sequence[Shot]) -> Shot:
+    """What one exposure under all lights at once would give, but for its noise; full where one of them is."""
+    if len(shots) == 1:
+        return shots[0]
+    coding = shots[0].coding
+    light = np.sum([shot.raw.astype(np.int64) - coding.black_dn for shot in shots], axis=0)
+    full = np.any([shot.raw >= coding.white_dn for shot in shots], axis=0)
+    raw = np.where(full, coding.white_dn, np.clip(light + coding.black_dn, 0, coding.white_dn))
+    return Shot(raw.astype(np.uint16), coding)

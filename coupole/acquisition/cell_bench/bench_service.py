@@ -1,0 +1,254 @@
+"""`coupole bench`: holds a cell's devices while no run is at work, and answers at a socket.
+
+The process that draws a console never touches a device; it asks this one, as any other client of the same user
+can. Whatever becomes of the clients, nothing moves by hand longer than it is held, and no light outlasts its
+picture.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from coupole.acquisition.cell_bench.bench_arm import BenchArm
+from coupole.acquisition.cell_bench.bench_client import bench_socket
+from coupole.acquisition.cell_bench.bench_devices import BenchDevices
+from coupole.acquisition.cell_bench.bench_frames import BenchFrames
+from coupole.acquisition.cell_bench.bench_requests import (
+    VERSION,
+    CloseAsked,
+    DriveAsked,
+    FrameAsked,
+    JogAsked,
+    LoupeAsked,
+    MeterAsked,
+    PathAsked,
+    Request,
+    SelfTestAsked,
+    StateAsked,
+    StopAsked,
+    read_request,
+)
+from coupole.acquisition.cell_bench.bench_work import Work, Works
+from coupole.acquisition.looking import metered, metering_job
+from coupole.acquisition.observer import Control
+from coupole.acquisition.opened_cell import OpenedCell, open_cell, unsure
+from coupole.acquisition.operator import ask_to_begin, identity_printer
+from coupole.acquisition.runtime_folder import is_in_use
+from coupole.acquisition.signals import obeyed_by
+from coupole.acquisition.user_socket import UserSocket
+from coupole.errors import CoupoleError, DeviceError, InputError
+from coupole.plan.cell import Cell
+from coupole.preflight import exposure_advice
+from coupole.preflight.job import Job
+from coupole.storage.arm_faults import ArmFaults
+from coupole.viewing.terminal import alarm
+
+_LOOK_EVERY_S = 0.1
+_STOPPED_WITHIN_S = 4.0
+
+
+class BenchService:
+    """Answers requests; each is called in a thread of its own."""
+
+    def __init__(self, cell: Cell, opened: OpenedCell, job: Job | None) -> None:
+        self._cell, self._opened, self._job = cell, opened, job
+        self.works = Works()
+        self.closing = threading.Event()
+        self._devices = BenchDevices(cell, opened)
+        self._arm = BenchArm(cell, opened, job, self.works)
+        self._frames = BenchFrames(cell, opened, job, self._devices)
+        self._asked_s = time.monotonic()
+
+    @property
+    def is_spent(self) -> bool:
+        """A failure has made the cell safe: nothing can be lit or moved any more."""
+        return self._opened.made_safe and self.works.running is None
+
+    @property
+    def idle_s(self) -> float:
+        """Since the last request, or the end of the last work."""
+        if self.works.running is not None:
+            self._asked_s = time.monotonic()
+        return time.monotonic() - self._asked_s
+
+    def answer(self, line: bytes) -> dict[str, Any]:
+        """The answer to a request; an `error` with its `kind` where it was not obeyed."""
+        try:
+            request = read_request(line)
+            self._asked_s = time.monotonic()
+            if self.closing.is_set():
+                raise InputError("the bench is closing")
+            return {"version": VERSION, **self._obey(request)}
+        except CoupoleError as error:
+            if isinstance(error, DeviceError):
+                self._devices.failed(error)
+            return {
+                "version": VERSION,
+                "error": str(error),
+                "kind": type(error).__name__,
+                "exit_code": error.exit_code,
+            }
+        except Exception as error:  # noqa: BLE001  the one who asks is told; the bench goes on
+            return {
+                "version": VERSION,
+                "error": f"{type(error).__name__}: {error}",
+                "kind": "defect",
+                "exit_code": 1,
+            }
+
+    def ask(self, command: str, **fields: Any) -> dict[str, Any]:
+        """The same for a caller in this process."""
+        return self.answer(json.dumps({"version": VERSION, "command": command, **fields}).encode())
+
+    def _obey(self, request: Request) -> dict[str, Any]:
+        match request:
+            case StateAsked():
+                return self._state()
+            case SelfTestAsked():
+                return self._devices.self_test(request.device)
+            case PathAsked():
+                return self._arm.plan_path(request)
+            case DriveAsked():
+                return self._arm.drive(request.path)
+            case JogAsked():
+                return self._arm.jog(request)
+            case FrameAsked():
+                if (work := self.works.running) is not None and work.kind == "meter":
+                    raise InputError("box and camera are metering; stop it or let it end")
+                return {**self._frames.frame(request), "dose": self._frames.dose()}
+            case LoupeAsked():
+                return self._frames.loupe(request)
+            case MeterAsked():
+                return self._begin_metering(request)
+            case StopAsked():
+                return {"trouble": self._stop(), **self._state()}
+            case CloseAsked():
+                trouble = self._stop()
+                self.closing.set()
+                return {"trouble": trouble}
+
+    def _begin_metering(self, asked: MeterAsked) -> dict[str, Any]:
+        small = metering_job(self._arm.job_of(Path(asked.plan)))
+        self._arm.refuse_motion()
+        wanted = exposure_advice.Request(asked.saturated, asked.snr, asked.share)
+
+        def meter(control: Control) -> dict[str, Any]:
+            with self._devices.in_use:
+                self._frames.release()
+                try:
+                    advice = metered(small, self._opened, wanted, control)
+                finally:
+                    self._frames.begin_counting()
+            return advice.figures()
+
+        work = Work("meter", {"plan": asked.plan}, meter)
+        self.works.begin(work)
+        return work.figures()
+
+    def _stop(self) -> list[str]:
+        """What is not sure then. Pictures that are under way have ended, with their light, when this returns."""
+        self._frames.stop()
+        if self.works.last is not None:
+            self.works.last.stop()
+        trouble = unsure(self._opened.halt(), _STOPPED_WITHIN_S)
+        if self.works.last is not None:
+            self.works.last.join(_STOPPED_WITHIN_S)
+        if self._devices.in_use.acquire(timeout=_STOPPED_WITHIN_S):
+            self._devices.in_use.release()
+        else:
+            trouble.append("not sure: box and camera are still at work")
+        return trouble
+
+    def _state(self) -> dict[str, Any]:
+        arm: dict[str, Any] | None = None
+        try:
+            arm = self._arm.state()
+        except DeviceError as error:
+            self._devices.failed(error)
+        measured = self._job.plan.object if self._job else None
+        return {
+            "rig": str(self._cell.document.path.resolve()),
+            "pid": os.getpid(),
+            "simulated": self._opened.simulated,
+            "object": measured.id if measured else None,
+            "devices": self._devices.state(arm["heard_s_ago"] if arm else None),
+            "arm": arm,
+            "dose": self._frames.dose(),
+            "work": self.works.last.figures() if self.works.last else None,
+        }
+
+    def end(self) -> None:
+        """Stop what is under way, make the cell safe, enter the light that was given."""
+        self.closing.set()
+        self._stop()
+        self._opened.make_safe()
+        self._frames.end()
+
+
+@contextmanager
+def bench_of(what: Job | Cell, console: Console, control: Control, *, confirm: bool) -> Iterator[BenchService]:
+    """A bench that holds the cell's devices while the context lasts, and then makes all safe; signals are obeyed.
+
+    With a job its object lies on the support. Raises InputError if somebody uses the cell already, DeviceError.
+    """
+    job = what if isinstance(what, Job) else None
+    cell = what.cell if isinstance(what, Job) else what
+    if is_in_use(cell.state_folder):
+        raise InputError(
+            f"{cell.document.path}: another process has this cell's devices open (acquire, live, meter, bench, "
+            "calibrate, commission); end it first"
+        )
+    ask_to_begin(cell, confirm=confirm)
+    with open_cell(cell, job=job, on_opened=identity_printer(console)) as opened:
+        service = BenchService(cell, opened, job)
+        with obeyed_by(control, opened.halt):
+            try:
+                yield service
+            finally:
+                service.end()
+                for trouble in opened.trouble:
+                    alarm(trouble)
+                if not opened.arm_confirmed:
+                    ArmFaults(cell.state_folder).note("; ".join(opened.trouble), "bench")
+
+
+def serve_bench(what: Job | Cell, console: Console, *, confirm: bool, leave_after_s: float, as_json: bool) -> None:
+    """Hold the cell's devices until `close` is asked, a signal comes, or nobody has asked for a while.
+
+    Raises InputError, DeviceError, Interrupted (SIGTERM, SIGHUP).
+    """
+    control = Control()
+    path = bench_socket(what.cell if isinstance(what, Job) else what)
+    with bench_of(what, console, control, confirm=confirm) as service, contextlib.ExitStack() as served:
+        try:
+            served.enter_context(UserSocket(path, service.answer))
+        except OSError as error:
+            raise InputError(f"{path}: cannot serve the bench there: {error}") from error
+        console.print(f"bench at {path}  (Ctrl-C ends it)", soft_wrap=True)
+        if as_json:
+            print(json.dumps({"version": VERSION, "socket": str(path), "pid": os.getpid()}), flush=True)
+        while not (control.stop.wait(_LOOK_EVERY_S) or service.closing.is_set()):
+            if service.is_spent:
+                raise DeviceError(
+                    "cell",
+                    expected="a metering that ends as it should",
+                    happened=service.works.last.figures()["why"] if service.works.last else "it failed",
+                    remedy="The cell was made safe; begin the bench anew.",
+                )
+            if service.idle_s > leave_after_s:
+                console.print(f"nobody has asked for {leave_after_s:g} s: closed")
+                break
+        service.closing.set()
+    if control.stop.is_set() and control.signal_number != signal.SIGINT:  # Ctrl-C is how a bench ends
+        raise control.interrupted()

@@ -1,0 +1,75 @@
+"""What a bench does by and by, in a thread of its own, one at a time; it can be stopped from any thread."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from coupole.acquisition.observer import Control
+from coupole.errors import CoupoleError, InputError, Interrupted
+
+
+class Work:
+    """One piece of work, and what has become of it."""
+
+    def __init__(self, kind: str, about: dict[str, Any], act: Callable[[Control], dict[str, Any]]) -> None:
+        """`act` returns what was found; it raises Interrupted after `Control.stop`."""
+        self.kind, self._about, self._act = kind, about, act
+        self.control = Control()
+        self._state, self._found, self._why = "running", {}, ""  # type: tuple[str, dict[str, Any], str]
+        self._thread = threading.Thread(target=self._run, name=kind, daemon=True)
+
+    @property
+    def is_running(self) -> bool:
+        return self._state == "running"
+
+    def begin(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Returns at once; nothing new is moved or lit after this."""
+        self.control.stop_by(signal.SIGINT)
+
+    def join(self, seconds: float) -> None:
+        self._thread.join(seconds)
+
+    def figures(self) -> dict[str, Any]:
+        """`kind`, `state` (running, done, stopped, failed), what it is about, what it found, and `why` not."""
+        return {"kind": self.kind, "state": self._state, **self._about, **self._found, "why": self._why}
+
+    def _run(self) -> None:
+        try:
+            self._found = self._act(self.control)
+        except Interrupted as error:
+            self._why = str(error)
+            self._state = "stopped"
+        except CoupoleError as error:
+            self._why = str(error)
+            self._state = "stopped" if self.control.stop.is_set() else "failed"
+        except Exception as error:  # noqa: BLE001  told to whoever asks; the bench itself goes on
+            self._why = f"{type(error).__name__}: {error}"
+            self._state = "failed"
+        else:
+            self._state = "done"
+
+
+class Works:
+    """The work under way, or the last one."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.last: Work | None = None
+
+    def begin(self, work: Work) -> None:
+        """Raises InputError while another is under way."""
+        with self._lock:
+            if self.last is not None and self.last.is_running:
+                raise InputError(f"{self.last.kind} is under way; stop it or let it end")
+            self.last = work
+            work.begin()
+
+    @property
+    def running(self) -> Work | None:
+        return self.last if self.last is not None and self.last.is_running else None

@@ -1,0 +1,193 @@
+"""One picture at a time under one light, for who focuses and exposes: the live view and the bench.
+
+A light is on for one exposure only, and off before the next; nothing has to be switched off later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.acquisition.dose import FlashMeter
+from coupole.acquisition.opened_cell import OpenedCell
+from coupole.devices import NO_LED, STEP_DTYPE, Deadline, Exposure, Frame, Step, table_box
+from coupole.errors import DeviceTimeout
+from coupole.plan.bursts import BurstTiming, burst_timing
+from coupole.plan.cell import Cell
+from coupole.plan.rig_devices import longest_light_s, watchdog_s
+from coupole.viewing.raw_preview import Coding
+
+_FRAME_S = 2.0
+"""Longest time from the end of an exposure until the frame reaches the host."""
+_BUFFERS = 8
+_PANEL_OVERHEAD_S = 1.0
+"""Expected of a panel's light beyond the exposure."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A RAW picture [height_px, width_px]."""
+
+    raw: NDArray[np.uint16]
+    coding: Coding
+
+
+class SingleShots:
+    """Pictures of a cell's camera, each under one LED, one panel or no light; the light is counted before it is
+    given. Of several threads the caller lets only one in."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        opened: OpenedCell,
+        lux: NDArray[np.float64],
+        meter: FlashMeter | None,
+        every_s: float = 0.0,
+    ) -> None:
+        """`lux` [points, LEDs of the table]; `meter` for an object whose light is counted; LEDs are lit every
+        `every_s` at most."""
+        self._cell, self._rig, self._opened = cell, cell.rig, opened
+        self._lux, self._meter, self._every_s = lux, meter, every_s
+        self._row_of_led = {int(led): row for row, led in enumerate(cell.leds.ids)}
+        self._armed_for: Exposure | None = None
+        self._coding = Coding("MONO", 0, 1)
+        self._rest_until_ns, self._period_s = 0, 0.0
+        self.given_lux_h = np.zeros(len(lux))
+        """[points] by all pictures so far."""
+
+    def take(self, led: int, exposure_us: int, gain_db: float = 0.0, panel: int = 0) -> Shot:
+        """A picture under an LED (NO_LED: none) or a panel (0: none), not both. Raises DeviceError, and
+        DoseBudgetReached or StorageError before the light is given."""
+        opened, timing = self._opened, self._timing(exposure_us)
+        self._arm(Exposure(exposure_us, gain_db, opened.ledbox.runs_tables))
+        cooling_us = int(timing.on_us * (1.0 + self._rig.led_limits.cooldown_ratio)) if not panel else 0
+        period_us = max(timing.period_us, cooling_us, int(self._every_s * 1e6) if not panel else 0)
+        self._period_s = period_us * 1e-6
+        self._rest_until_ns = opened.clock.now_ns() + period_us * 1000
+        fire = self._by_cable if opened.ledbox.runs_tables else self._by_host
+        if panel:
+            frame = self._under_panel(panel, lambda: fire(NO_LED, timing, period_us), timing)
+        else:
+            self._enter(led, timing)
+            frame = fire(led, timing, period_us)
+        raw = frame.pixels.copy()
+        frame.release()
+        return Shot(raw, self._coding)
+
+    def rest(self) -> None:
+        """Wait until the box has ended its step, and the LED may be lit again."""
+        if self._opened.ledbox.runs_tables:
+            self._wait_for_the_box()
+        else:
+            clock = self._opened.clock
+            clock.sleep(max(0.0, (self._rest_until_ns - clock.now_ns()) / 1e9))
+
+    def disarm(self) -> None:
+        """The camera is free for others."""
+        self._opened.camera.disarm()
+        self._armed_for = None
+
+    def _arm(self, exposure: Exposure) -> None:
+        if exposure == self._armed_for:
+            return
+        camera = self._opened.camera
+        self.disarm()
+        made = camera.configure(exposure)
+        self._coding = Coding(made.bayer_pattern, made.black_dn, made.white_dn)
+        camera.arm(_BUFFERS)
+        self._armed_for = exposure
+
+    def _timing(self, exposure_us: int) -> BurstTiming:
+        sensor = self._rig.sensor
+        return burst_timing(
+            exposure_us,
+            rise_us=self._rig.led_limits.rise_us,
+            readout_us=1e6 / sensor.max_frames_per_s,
+            exposure_gap_us=sensor.exposure_gap_us,
+            hardware=self._opened.ledbox.runs_tables,
+        )
+
+    def _enter(self, led: int, timing: BurstTiming) -> None:
+        """Count a flash that is about to be given."""
+        if led == NO_LED:
+            return
+        lux = self._lux[:, self._row_of_led[led]]
+        lux_h = lux * timing.on_us / 3.6e9
+        if self._meter is not None:
+            longest_s = longest_light_s(self._rig, timing.on_us)
+            at_most = lux * max(longest_s, timing.on_us * 1e-6) / 3600.0
+            self._meter.begin(lux_h, at_most, self._cell.led_damage_w_per_lm)
+        self.given_lux_h = self.given_lux_h + lux_h
+
+    def _under_panel(self, panel: int, fire: Callable[[], Frame], timing: BurstTiming) -> Frame:
+        """The picture while a panel is on, whose light is counted from command to confirmation."""
+        box, clock = self._opened.ledbox, self._opened.clock
+        points, lux = len(self._lux), self._rig.dome.panel_lux
+        expected = np.full(points, lux * (timing.on_us * 1e-6 + _PANEL_OVERHEAD_S) / 3600.0)
+        if self._meter is not None:
+            at_most = expected + lux * watchdog_s(self._rig) / 3600.0
+            self._meter.begin(expected, at_most, self._cell.panel_damage_w_per_lm)
+        since_ns = clock.now_ns()
+        try:
+            box.panel(panel, True)
+            frame = fire()
+            if box.runs_tables:
+                self._wait_for_the_box()
+            return frame
+        finally:
+            box.panel(panel, False)
+            given = np.full(points, lux * (clock.now_ns() - since_ns) / 3.6e12)
+            if self._meter is not None:
+                self._meter.add(given - expected)
+            self.given_lux_h = self.given_lux_h + given
+
+    def _by_cable(self, led: int, timing: BurstTiming, period_us: int) -> Frame:
+        """The box lights the LED and triggers the camera."""
+        box = table_box(self._opened.ledbox)
+        step = Step(led, timing.on_us, timing.trigger_delay_us, period_us)
+        table = np.array([astuple(step)], STEP_DTYPE)
+        box.load(table)
+        box.start(table)
+        return self._frame(timing, "Check the trigger cable.")
+
+    def _by_host(self, led: int, timing: BurstTiming, period_us: int) -> Frame:
+        """The box switches the LED on command, and the host triggers the camera."""
+        opened = self._opened
+        opened.ledbox.flash(led, timing.on_us)
+        opened.clock.sleep(timing.trigger_delay_us * 1e-6)
+        opened.camera.trigger()
+        frame = self._frame(timing, "Check the camera.")
+        over_us = opened.ledbox.end_flash().on_us - timing.on_us
+        if self._meter is not None and led != NO_LED and over_us > 0:
+            self._meter.add(self._lux[:, self._row_of_led[led]] * over_us / 3.6e9)
+        return frame
+
+    def _frame(self, timing: BurstTiming, remedy: str) -> Frame:
+        seconds = timing.on_us * 1e-6 + _FRAME_S
+        frame = self._opened.camera.next_frame(seconds)
+        if frame is None:
+            raise DeviceTimeout(
+                "camera",
+                expected=f"a frame within {seconds:.1f} s of its trigger",
+                happened="none came",
+                remedy=remedy,
+            )
+        return frame
+
+    def _wait_for_the_box(self) -> None:
+        box = table_box(self._opened.ledbox)
+        deadline = Deadline(self._opened.clock, 2.0 * self._period_s + _FRAME_S)
+        while box.running():
+            box.poll_log()
+            if deadline.expired:
+                raise DeviceTimeout(
+                    "led box",
+                    expected=f"a step of {self._period_s:.3f} s to end within {deadline.seconds:.1f} s",
+                    happened="the box reports that it is still running",
+                    remedy="Check the box.",
+                )
+            self._opened.clock.sleep(0.01)
+        box.poll_log()

@@ -1,0 +1,91 @@
+"""A Unix socket by which processes of one user on one machine ask another: a line of JSON each way.
+
+One connection is one request and one answer. Each is obeyed by a thread of its own, whatever the others do. Nobody
+but the user (and root) can enter the socket's folder, open the socket, or is answered.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import struct
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+LONGEST_REQUEST_BYTES = 65536
+PATIENCE_S = 10.0
+_LONGEST_ANSWER_BYTES = 16 * 1024**2
+
+
+class UserSocket:
+    """Serves a socket at a path while a context lasts. Raises OSError if it cannot."""
+
+    def __init__(self, path: Path, answer: Callable[[bytes], Mapping[str, Any]]) -> None:
+        """`answer` makes an answer of a request's line. What lies at the path was left by a process that was
+        killed: the caller knows that none is alive."""
+        self.path, self._answer = path, answer
+
+    def __enter__(self) -> UserSocket:
+        hidden = self.path.with_suffix(".new")
+        hidden.unlink(missing_ok=True)
+        self._socket = socket.socket(socket.AF_UNIX)
+        try:
+            self._socket.bind(str(hidden))
+            hidden.chmod(0o600)
+            self._socket.listen(16)
+            hidden.replace(self.path)
+        except BaseException:
+            self._socket.close()
+            raise
+        self._thread = threading.Thread(target=self._serve, name="user socket", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)  # ends `accept`
+        self._thread.join()
+        self._socket.close()
+        self.path.unlink(missing_ok=True)
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                connection, _ = self._socket.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._obey, args=(connection,), daemon=True).start()
+
+    def _obey(self, connection: socket.socket) -> None:
+        with connection, contextlib.suppress(OSError):
+            connection.settimeout(PATIENCE_S)
+            if peer_uid(connection) in (os.getuid(), 0):
+                answer = self._answer(_line(connection, LONGEST_REQUEST_BYTES))
+                connection.sendall(json.dumps(answer).encode() + b"\n")
+
+
+def peer_uid(connection: socket.socket) -> int:
+    """The user at the other end."""
+    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    return int(struct.unpack("3i", credentials)[1])
+
+
+def exchange(path: Path, request: Mapping[str, Any], patience_s: float = PATIENCE_S) -> dict[str, Any]:
+    """The answer to a request. Raises OSError, and ValueError for what is no answer."""
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(patience_s)
+        connection.connect(str(path))
+        connection.sendall(json.dumps(request).encode() + b"\n")
+        found: dict[str, Any] = json.loads(_line(connection, _LONGEST_ANSWER_BYTES))
+    return found
+
+
+def _line(connection: socket.socket, longest_bytes: int) -> bytes:
+    found = bytearray()
+    while b"\n" not in found and len(found) < longest_bytes and (more := connection.recv(65536)):
+        found += more
+    return bytes(found)

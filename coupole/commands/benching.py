@@ -1,0 +1,123 @@
+"""Commands that hold a cell's devices without a run: bench, arm."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from coupole.commands.common import JsonOption, fail
+from coupole.errors import CoupoleError, DeviceError, InputError, Interrupted
+
+if TYPE_CHECKING:
+    from coupole.acquisition.observer import Control
+
+_LOOK_EVERY_S = 0.1
+Asked = Callable[..., dict[str, Any]]
+
+
+def bench(
+    rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
+    object_of: Annotated[
+        Path | None,
+        typer.Option("--object", help="The plan whose object lies on the support; without it nothing does."),
+    ] = None,
+    leave_after_s: Annotated[
+        float, typer.Option("--leave-after-s", min=1, help="End when nobody has asked for so long.")
+    ] = 600.0,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell is held.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Hold a cell's devices for a console while no run is at work: state, go-to, moving by hand, pictures.
+
+    Clients of the same user ask it at a Unix socket, whose path `--json` prints at the beginning. Ends by Ctrl-C,
+    or when a client asks for it; the cell is then safe.
+    """
+    from coupole.acquisition.cell_bench.bench_service import serve_bench
+    from coupole.plan.cell import read_cell
+    from coupole.preflight.job import read_job
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    try:
+        what = read_job(object_of, rig) if object_of else read_cell(rig)
+        serve_bench(what, console, confirm=not yes, leave_after_s=leave_after_s, as_json=as_json)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+
+
+def arm(
+    rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
+    to: Annotated[Literal["home", "park", "view"], typer.Argument(help="Where to.", show_default=False)],
+    plan: Annotated[Path | None, typer.Argument(help="With view: the plan.", show_default=False)] = None,
+    view: Annotated[str | None, typer.Argument(help="With view: its name.", show_default=False)] = None,
+    object_of: Annotated[
+        Path | None, typer.Option("--object", help="The plan whose object lies on the support (default: PLAN).")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Drive the arm to home, park or a plan's view on a collision-free path, which is shown first.
+
+    Without a plan nothing is taken to lie on the support. If a bench holds the cell it is asked; else the devices
+    are opened and closed.
+    """
+    from coupole.acquisition.cell_bench.bench_client import ask_bench
+    from coupole.acquisition.cell_bench.bench_service import bench_of
+    from coupole.acquisition.observer import Control
+    from coupole.acquisition.runtime_folder import is_in_use
+    from coupole.plan.cell import read_cell
+    from coupole.preflight.job import read_job
+    from coupole.viewing.terminal import make_console
+
+    if (to == "view") != (plan is not None and view is not None):
+        raise InputError("expected home, park, or view with a plan and the name of one of its views")
+    goal: Any = {"view": view, "plan": str(plan.resolve())} if plan else to
+    console, control = make_console(quiet=as_json), Control()
+    try:
+        cell = read_cell(rig)
+        if is_in_use(cell.state_folder):
+            found = _driven(lambda command, **fields: ask_bench(cell, command, **fields), goal, control, yes=yes)
+        else:
+            lies = object_of or plan
+            what = read_job(lies, rig) if lies else cell
+            with bench_of(what, console, control, confirm=False) as service:
+                found = _driven(service.ask, goal, control, yes=yes)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    console.print(f"the arm is at {found['to']}", markup=False)
+    if as_json:
+        print(json.dumps(found))
+
+
+def _driven(asked: Asked, goal: Any, control: Control, *, yes: bool) -> dict[str, Any]:
+    """Plan, show, ask, drive; the work's figures when the arm has arrived."""
+    from coupole.acquisition.cell_bench.bench_client import obeyed
+    from coupole.viewing.terminal import ask
+
+    path = obeyed(asked("plan_path", to=goal))
+    steps = len(path["waypoints_deg"]) - 1
+    print(f"{path['to']}: {path['duration_s']:.1f} s, {steps} straight motion(s)", file=sys.stderr)
+    if not yes and not ask("Drive the arm along this path?"):
+        raise Interrupted("not driven: answer the question, or say `--yes`")
+    try:
+        work = obeyed(asked("drive", path=path["path"]))
+        while work["state"] == "running":
+            control.go_on()
+            time.sleep(_LOOK_EVERY_S)
+            work = obeyed(asked("state"))["work"]
+    except BaseException:
+        asked("stop")
+        raise
+    if work["state"] != "done":
+        raise DeviceError(
+            "robot", expected=f"the arm to arrive at {work['to']}", happened=work["why"], remedy="See its state."
+        )
+    return {**work, "duration_s": path["duration_s"], "waypoints_deg": path["waypoints_deg"]}

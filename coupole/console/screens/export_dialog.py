@@ -1,0 +1,59 @@
+"""What a run is to be exported to, asked in a dialog."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from nicegui import ui
+
+from coupole.console.screens.parts import Choice, button, heading
+from coupole.exchange import COLMAP, CRATE, FORMATS
+from coupole.exchange.rti import FORMATS as OF_VIEWS
+from coupole.storage.run import Run
+
+FRAMES = dict(zip(FORMATS, ("RAW frames as DNG, for RAW converters", "frames as TIFF"), strict=True))
+EXPORTS = {
+    **FRAMES,
+    **OF_VIEWS,
+    COLMAP: "views with their poses, for COLMAP",
+    CRATE: "the whole run as a research crate (RO-Crate), with a licence",
+}
+
+
+class ExportDialog:
+    """The format, and what it needs to be told."""
+
+    def __init__(self, run: Run, folder: Callable[[str], Path]) -> None:
+        """`folder`: where each format goes."""
+        self._run, self._folder = run, folder
+        with ui.dialog().props('aria-label="Export"') as self._dialog, ui.column().classes("panel ask"):
+            heading(f"Export {run.folder.name}")
+            self._form = Choice("format", EXPORTS, self._tell, name="format")
+            views = {"": "all views"} | {view: view for view in run.about["views"]}
+            self._view = Choice("views", views, name="views")
+            self._licence = ui.input("licence, such as CC-BY-4.0").props("outlined dense").style("width:100%")
+            self._again = ui.checkbox("overwrite what was exported before")
+            self._told = ui.label().classes("hint")
+            with ui.row():
+                button("Export", lambda: self._dialog.submit(True), name="yes", kind="main")
+                button("Cancel", lambda: self._dialog.submit(False), name="cancel")
+        self._tell()
+
+    def _tell(self) -> None:
+        form = self._form.value
+        self._told.text = f"Into {self._folder(form)} on this machine."
+        self._licence.set_visibility(form == CRATE)
+        self._view.set_visibility(form not in (CRATE, COLMAP))
+
+    async def command(self) -> list[str]:
+        """The arguments of `coupole` that do it; none if it was cancelled."""
+        said = await self._dialog
+        form, licence, view = self._form.value, self._licence.value, self._view.value
+        self._dialog.delete()
+        if not said:
+            return []
+        command = ["export", str(self._run.folder), "--to", form, "--out", str(self._folder(form))]
+        command += ["--licence", licence] if form == CRATE and licence else []
+        command += ["--views", view] if form not in (CRATE, COLMAP) and view else []
+        return command + (["--overwrite"] if self._again.value else [])

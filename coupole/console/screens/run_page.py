@@ -1,0 +1,247 @@
+"""One run: what it is, its frames on a contact sheet and on the dome, one of them large, and what happened."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from nicegui import events, ui
+
+from coupole.console.event_words import words_of
+from coupole.console.frame_sheets import LedPlace, SheetFrame, led_places
+from coupole.console.run_files import RunRow
+from coupole.console.screens.contact_sheet import ContactSheet
+from coupole.console.screens.dome_picture import DomePicture
+from coupole.console.screens.frame_viewer import FrameViewer
+from coupole.console.screens.parts import (
+    Choice,
+    button,
+    facts,
+    heading,
+    moment,
+    named,
+    panel,
+    table_html,
+)
+from coupole.console.screens.run_actions import RunActions
+from coupole.console.screens.runs_screen import STATE_KINDS
+from coupole.console.screens.task_list import TaskList
+from coupole.console.screens.visit import Visit, in_thread
+from coupole.console.service_parts import Service
+from coupole.errors import CoupoleError
+from coupole.storage import journal
+from coupole.storage.run import Run
+from coupole.storage.run_status import Status
+from coupole.viewing.terminal import bytes_text, duration_text
+
+_EVENTS_SHOWN = 200
+_READ_UNASKED_BYTES = 2_000_000_000
+"""Of frames whose means are read without being asked for."""
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What is read of a run before it is shown."""
+
+    run: Run
+    row: RunRow
+    status: Status
+    places: dict[int, LedPlace]
+    events: list[tuple[str, str]]
+
+
+def build(visit: Visit, name: str) -> None:
+    """Build the page."""
+    ui.link("← All runs", "/runs")
+    waiting = ui.label("Reading the run …").classes("hint")
+    box = ui.column().classes("gap").style("width:100%")
+
+    async def fill() -> None:
+        try:
+            known = await in_thread(_read, visit.service, name)
+        except CoupoleError as error:
+            waiting.set_text(str(error))
+            return
+        waiting.delete()
+        with box:
+            page = _Page(visit, known)
+        await page.choose()
+
+    ui.timer(0.01, fill, once=True)
+
+
+def _read(service: Service, name: str) -> _Known:
+    run = service.runs.run(name)
+    happened = [(event.t, words) for event in journal.read(run.journal_path) if (words := words_of(event))]
+    row = service.runs.row(name)
+    return _Known(run, row, service.runs.status(name), led_places(service.sheets, name), happened[::-1])
+
+
+class _Page:
+    def __init__(self, visit: Visit, known: _Known) -> None:
+        self._visit, self._known, self._name = visit, known, known.row.name
+        self._frames: list[SheetFrame] = []
+        self._current = ""
+        self._of_view: dict[str, list[SheetFrame]] = {}
+        self._head()
+        with panel():
+            self._choosers()
+        with ui.element("div").classes("columns"):
+            with panel("Frame"):
+                self._viewer = FrameViewer(visit, self._name, self._step)
+            with panel("The dome, by mean signal"):
+                self._dome = DomePicture(self._pick)
+                self._means_words = ui.label("").classes("hint").props("role=status data-name=means")
+                self._read_means = button("Read them", self._fill_means, name="read-means")
+                self._read_means.set_visibility(False)
+        with panel("Contact sheet"):
+            self._sheet = ContactSheet(self._name, self._pick)
+        self._foot()
+        ui.keyboard(self._key, ignore=["input", "select", "textarea"])
+
+    def _head(self) -> None:
+        row, status = self._known.row, self._known.status
+        with panel():
+            with ui.row().classes("bar"):
+                heading(row.name)
+                ui.label(status.state).classes(f"chip {STATE_KINDS.get(status.state, '')}")
+                if row.simulated:
+                    ui.label("simulated").classes("chip simulated")
+            left = status.frames_left
+            duration_s = sum(session.duration_s for session in status.sessions)
+            facts(
+                {
+                    "object": row.object or "not named",
+                    "begun": f"{moment(row.created)} UTC by {row.operator or 'nobody named'}",
+                    "took": f"{duration_text(duration_s)} in {_count(len(status.sessions), 'session')}",
+                    "frames": f"{row.proven} of {row.frames} proven" + (f", {left} are missing" if left else ""),
+                    "taken again": f"{status.reshot} shots",
+                    "light on the object": f"{status.dose_lux_h:.3f} lux h",
+                    "size": bytes_text(row.bytes) + (", archived" if row.archived else ""),
+                    "verified": f"{moment(row.verified)} UTC" if row.verified else "not since it last changed",
+                    **({"why it ended": status.reason} if status.reason and status.state != "done" else {}),
+                }
+            ).classes("two-columns")
+            RunActions(self._visit, row.name, left=bool(status.frames_left), frames=row.proven)
+            TaskList(self._visit, lambda task: task.words.endswith(f" {self._name}"), empty="", most=4)
+
+    def _choosers(self) -> None:
+        views = list(self._known.run.about["views"])
+        with ui.row().classes("bar"):
+            self._view = Choice("view", {view: view for view in views}, self.choose, name="view")
+            self._exposure = Choice("exposure", {"0": "-"}, self._choose_exposure, name="exposure")
+
+    def _foot(self) -> None:
+        run, status, happened = self._known.run, self._known.status, self._known.events
+        with panel("What happened"):
+            lines = [(moment(t) + t[16:19], words) for t, words in happened[:_EVENTS_SHOWN]]
+            named(ui.html(table_html(("UTC", "what"), lines), sanitize=False), "events").style("width:100%")
+            if len(happened) > _EVENTS_SHOWN:
+                ui.label(f"The newest {_EVENTS_SHOWN} of {len(happened)}; all are in the report.").classes("hint")
+            with ui.expansion("Numbers").classes("printed"):
+                facts(_numbers(run.about, status, str(run.folder)))
+
+    async def choose(self) -> None:
+        """Show the chosen view, at its first exposure."""
+        view = self._view.value
+        if not view:
+            return
+        try:
+            if view not in self._of_view:
+                self._of_view[view] = await in_thread(self._visit.service.sheets.frames, self._name, view)
+        except CoupoleError as error:
+            self._means_words.set_text(str(error))
+            return
+        exposures = {frame.exposure: frame.exposure_us for frame in reversed(self._of_view[view])}
+        options = {str(number): f"{exposure_us / 1000:g} ms" for number, exposure_us in sorted(exposures.items())}
+        self._exposure.set_options(options or {"0": "-"})
+        await self._choose_exposure()
+
+    async def _choose_exposure(self) -> None:
+        of_view = self._of_view.get(self._view.value, [])
+        self._frames = [frame for frame in of_view if str(frame.exposure) == self._exposure.value]
+        self._sheet.show(self._frames)
+        lit = self._lit()
+        known = await in_thread(self._visit.service.sheets.known_means, self._name, lit)
+        self._dome.show(self._known.places, self._frames, known)
+        if self._frames:
+            await self._pick(self._frames[len(lit) // 2].shot)
+        unread = len(lit) - len(known)
+        bytes_unread = unread * self._known.row.bytes / max(1, self._known.row.proven)
+        asks = bytes_unread > _READ_UNASKED_BYTES
+        self._read_means.set_visibility(asks)
+        self._means_words.set_text(f"{unread} frames are to be read: {bytes_text(bytes_unread)}." if asks else "")
+        if unread and not asks:
+            await self._fill_means()
+
+    def _lit(self) -> list[str]:
+        return [frame.shot for frame in self._frames if frame.led is not None]
+
+    async def _fill_means(self) -> None:
+        """Read what is not known yet, and colour the dome."""
+        lit, frames, done = self._lit(), self._frames, [0, 0]
+        self._read_means.set_visibility(False)
+
+        def count() -> None:
+            self._means_words.set_text(f"reading: {done[0]} of {done[1]} frames" if done[1] else "")
+
+        counting = ui.timer(0.5, count)
+        try:
+            means = await in_thread(
+                self._visit.service.sheets.means, self._name, lit, lambda *now: done.__setitem__(slice(None), now)
+            )
+        except CoupoleError as error:
+            counting.cancel()
+            self._means_words.set_text(str(error))
+            return
+        counting.cancel()
+        self._means_words.set_text("")
+        if frames is self._frames:
+            self._dome.show(self._known.places, frames, means)
+            self._dome.mark(self._current)
+
+    async def _pick(self, shot: str) -> None:
+        frame = next((frame for frame in self._frames if frame.shot == shot), None)
+        if frame is None:
+            return
+        self._current = shot
+        self._sheet.mark(shot)
+        self._dome.mark(shot)
+        await self._viewer.show(shot, frame.light)
+
+    async def _step(self, by: int) -> None:
+        place = next((k for k, frame in enumerate(self._frames) if frame.shot == self._current), 0) + by
+        if 0 <= place < len(self._frames):
+            await self._pick(self._frames[place].shot)
+
+    async def _key(self, event: events.KeyEventArguments) -> None:
+        plain = not (event.modifiers.alt or event.modifiers.ctrl or event.modifiers.meta or event.modifiers.shift)
+        if event.action.keydown and plain and event.key.name in ("ArrowLeft", "ArrowRight"):
+            await self._step(1 if event.key.name == "ArrowRight" else -1)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _numbers(about: dict[str, Any], status: Status, folder: str) -> dict[str, str]:
+    devices = {
+        kind: " ".join(str(one.get(key, "")) for key in ("vendor", "model", "serial", "firmware"))
+        for kind, one in about.get("devices", {}).items()
+    }
+    records = about.get("calibrations")
+    records = records if isinstance(records, dict) else {}
+    return {
+        "folder": folder,
+        "software": " ".join(map(str, about.get("software", {}).values())),
+        "machine": str(about.get("host", "")),
+        "identity of frames rests on": status.proof,
+        **devices,
+        **(
+            {f"record {kind}": str(digest)[:16] for kind, digest in records.items()}
+            if isinstance(records, dict)
+            else {}
+        ),
+        "licence": str(about.get("licence") or "not stated"),
+        "faults": "; ".join(status.faults) or "none",
+    }

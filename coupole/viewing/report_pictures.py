@@ -1,0 +1,146 @@
+"""What a run's pictures show, as sections of its report: exposure, coverage of the mesh, the pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from coupole.preflight.framing import SHARP_PX
+from coupole.viewing.page_parts import anchor, facts, picture, table, text
+from coupole.viewing.progress import OVER_EXPOSED, UNDER_EXPOSED
+from coupole.viewing.raw_preview import BINS
+from coupole.viewing.run_coverage import MOST, Coverage
+from coupole.viewing.run_sample import SampledExposure, SampledView
+from coupole.viewing.view_colours import css, of_share
+
+_WIDTH, _HEIGHT = 192, 56
+_SPOKEN = {"R": "red", "G": "green", "B": "blue", "Y": "grey"}
+
+
+def exposure_in_words(views: Sequence[SampledView]) -> str:
+    """How many views are well exposed; empty without pictures."""
+    verdicts = [verdict for view in views if (verdict := view.verdict())]
+    counts = {verdict: verdicts.count(verdict) for verdict in ("well exposed", "over-exposed", "under-exposed")}
+    told = [f"{count} of {len(verdicts)} views {verdict}" for verdict, count in counts.items() if count]
+    return ", ".join(told)
+
+
+def exposures(views: Sequence[SampledView], scaling: str) -> str:
+    """A row for each exposure of each view. `scaling`: how a simulated cell chose its light; else empty."""
+    rows = [
+        (
+            f'<a href="#view-{anchor(view.name)}">{text(view.name)}</a>',
+            f"{one.exposure_us / 1e3:g} ms",
+            f"{one.seen.pictures} of {one.frames}",
+            f"{one.seen.brightest:.0%}",
+            f"{one.seen.saturated:.2%}" + (f"<br>{text(one.worst)}" if one.worst else ""),
+            _histogram(view.name, one),
+            one.seen.verdict(),
+        )
+        for view in views
+        for one in view.exposures
+        if one.seen.pictures
+    ]
+    if not rows:
+        return ""
+    head = ("view", "exposure", "pictures looked at", "brightest", "saturated", "histogram", "verdict")
+    colours = {name for view in views for one in view.exposures for name in one.histograms}
+    lines = ", ".join(f"{_SPOKEN.get(name, name)}" for name in sorted(colours, key="RGBY".find))
+    simulated = f"<p>The light is simulated: {text(scaling)}. A real cell's may differ.</p>" if scaling else ""
+    return (
+        simulated
+        + table("Exposure of each view, by pictures spread over its lights", head, rows)
+        + '<p class="note">Brightest: the highest 99.9 % quantile of a picture, as a share of full scale above '
+        "black. Saturated: the largest share of a picture's pixels at full scale, and the shot that has it. "
+        f"Over-exposed: more than {OVER_EXPOSED:.1%} saturated; under-exposed: the brightest of half of the "
+        f"pictures is below {UNDER_EXPOSED:.0%}. Histograms: pixels (logarithmic) "
+        f"from 0 to full scale, {lines}; dashed: black.</p>"
+    )
+
+
+def _histogram(view: str, one: SampledExposure) -> str:
+    most = math.log1p(max((int(counts.max()) for counts in one.histograms.values()), default=1)) or 1.0
+    lines = []
+    for name, counts in one.histograms.items():
+        heights = _HEIGHT * (1 - np.log1p(counts) / most)
+        points = " ".join(f"{(n + 0.5) * _WIDTH / BINS:.1f},{y:.1f}" for n, y in enumerate(heights))
+        lines.append(f'<polyline class="{name}" points="{points}"/>')
+    black = one.black_share * _WIDTH
+    lines.append(f'<line x1="{black:.1f}" x2="{black:.1f}" y1="0" y2="{_HEIGHT}"/>')
+    said = f"Histogram of view {view} at {one.exposure_us / 1e3:g} ms"
+    return (
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}" role="img" '
+        f'aria-label="{text(said)}">{"".join(lines)}</svg>'
+    )
+
+
+def coverage_in_words(found: Coverage) -> str:
+    """The share of the surface that is in the pictures at all."""
+    return f"{found.shares[0]:.0%} of the surface that can be seen from above the disk is in a view"
+
+
+def coverages(found: Coverage) -> str:
+    """Shares of the surface by number of views, drawings, and what each view has of the object."""
+    size = " x ".join(
+        f"{high - low:.0f}" for low, high in zip(found.placement.low_mm, found.placement.high_mm, strict=True)
+    )
+    at_least = ", ".join(
+        f"{share:.0%} in {'one view' if n == 0 else f'{n + 1} views'} or more"
+        for n, share in enumerate(found.shares)
+    )
+    near, far = found.sharp_mm
+    drawings = "".join(
+        f"<figure>{picture('png', data, f'The object {whence}, coloured by the number of views')}"
+        f"<figcaption>{whence}</figcaption></figure>"
+        for whence, data in found.drawings.items()
+    )
+    return (
+        facts(
+            {
+                "surface": f"{at_least}; of what can be seen from above the disk ({found.reachable:.0%} of all)",
+                "object": f"{size} mm",
+                "sharp": f"{near:.0f} mm to {f'{far:.0f} mm' if math.isfinite(far) else 'infinity'} from the lens "
+                f"(blurred over at most {SHARP_PX:g} pixels)",
+            }
+        )
+        + f'<div class="drawings">{drawings}</div>{_legend()}'
+        + table("What each view has of the object", _FRAMED, _framings(found))
+        + '<p class="note">By the mesh, the measured poses and the rig\'s lens. Of the arm, which may stand in a '
+        "view's way, nothing is counted; nor which lights reach a point.</p>"
+    )
+
+
+_FRAMED = ("view", "object in field", "of the field", "mm away", "sharp", "px per mm")
+
+
+def _framings(found: Coverage) -> Iterable[Sequence[str]]:
+    for seen in found.views:
+        away = f"{seen.nearest_mm:.0f} to {seen.farthest_mm:.0f}" if math.isfinite(seen.nearest_mm) else "-"
+        scale = f"{seen.px_per_mm[0]:.1f} to {seen.px_per_mm[1]:.1f}" if math.isfinite(seen.px_per_mm[0]) else "-"
+        shares = f"{seen.in_field:.0%}", f"{seen.fills:.0%}"
+        yield text(seen.view), *shares, away, f"{seen.in_focus:.0%}", scale
+
+
+def _legend() -> str:
+    names = ("no view", "1 view", *(f"{n} views" for n in range(2, MOST)), f"{MOST} views or more")
+    items = "".join(
+        f'<li><span class="swatch" style="background:{css(of_share(n / MOST))}"></span>{name}</li>'
+        for n, name in enumerate(names)
+    )
+    return f'<ul class="legend">{items}</ul>'
+
+
+def pictures(views: Iterable[SampledView]) -> str:
+    """The sampled pictures of each view; a view whose file cannot be read says so."""
+    parts = []
+    for view in views:
+        heading = f'<h3 id="view-{anchor(view.name)}">{text(view.name)}</h3>'
+        figures = "".join(
+            f"<figure>{picture('jpeg', data, shot)}<figcaption>{text(shot)}</figcaption></figure>"
+            for shot, data in view.pictures
+        )
+        trouble = f"<p class=bad>{text(view.trouble)}</p>" if view.trouble else ""
+        parts.append(f'{heading}{trouble}<div class="pictures">{figures}</div>')
+    return '<p class="note">Previews; saturated pixels are red.</p>' + "".join(parts) if parts else ""

@@ -1,0 +1,124 @@
+"""What a sample of a run's proven frames shows, view by view: exposure, histograms, small pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import StorageError
+from coupole.geometry import Transform
+from coupole.plan.shot_id import Led
+from coupole.storage.journal_events import FrameProven
+from coupole.storage.run import Run
+from coupole.storage.view_reader import View, read_view
+from coupole.viewing.progress import OVER_EXPOSED, ViewExposure
+from coupole.viewing.raw_preview import BINS, Coding, channels, look
+
+PICTURES_PER_VIEW = 12
+_PICTURES_PER_EXPOSURE = 4
+"""At least, of a bracket."""
+_PICTURE_WIDTH_PX = 320
+
+
+@dataclass
+class SampledExposure:
+    """One exposure time of a view, by some of its frames, which are spread evenly over its lights."""
+
+    exposure_us: int
+    frames: int
+    """Proven shots; the sample is `seen.pictures` of them."""
+    seen: ViewExposure = field(default_factory=ViewExposure)
+    worst: str = ""
+    """The sampled shot with the largest share of saturated pixels; empty if none has any."""
+    histograms: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    """By colour (R, G, B; Y for MONO): pixels of all sampled frames in `BINS` equal steps from 0 to full scale."""
+    black_share: float = 0.0
+    """The black level as a share of full scale."""
+
+    def add(self, shot: str, raw: NDArray[np.uint16], coding: Coding) -> None:
+        """Count a frame [H, W], DN."""
+        before = self.seen.saturated
+        self.seen.add(raw, black_dn=coding.black_dn, white_dn=coding.white_dn)
+        self.worst = shot if self.seen.saturated > before else self.worst
+        self.black_share = coding.black_dn / coding.white_dn
+        for name, plane in channels(raw, coding.pattern).items():
+            steps = (plane.ravel().astype(np.uint32) * BINS) // (coding.white_dn + 1)
+            counts = np.bincount(np.minimum(steps, BINS - 1), minlength=BINS)
+            self.histograms[name[0]] = self.histograms.get(name[0], 0) + counts
+
+
+@dataclass
+class SampledView:
+    """A view's proven frames, and what a sample of them shows."""
+
+    name: str
+    expected: int = 0
+    """Frames that the plan asks for, dark ones included."""
+    proven: int = 0
+    darks: int = 0
+    leds: int = 0
+    """Different LEDs among the proven shots."""
+    exposures: list[SampledExposure] = field(default_factory=list)
+    """Shortest first."""
+    pictures: list[tuple[str, bytes]] = field(default_factory=list)
+    """Name of the shot, and a JPEG with saturated pixels in red."""
+    base_from_camera: Transform | None = None
+    """Measured; None if the view has no frame, or its file no pose."""
+    trouble: str = ""
+    """Why its file cannot be read; empty if it can."""
+
+    def verdict(self) -> str:
+        """`over-exposed` if even the shortest exposure saturates, `under-exposed` if even the longest is dark,
+        else `well exposed`; empty without pictures."""
+        seen = [one.seen for one in self.exposures if one.seen.pictures]
+        if not seen:
+            return ""
+        if seen[0].saturated > OVER_EXPOSED:
+            return seen[0].verdict()
+        return "well exposed" if len(seen) > 1 and seen[-1].saturated > OVER_EXPOSED else seen[-1].verdict()
+
+
+def sampled_views(run: Run, proven: Iterable[FrameProven]) -> list[SampledView]:
+    """All views of a run, in the plan's order. A file that cannot be read is told of in its view's `trouble`."""
+    frames: dict[str, list[FrameProven]] = {name: [] for name in run.about["views"]}
+    expected = dict.fromkeys(frames, 0)
+    for event in proven:
+        frames.setdefault(event.shot.view, []).append(event)
+    for shot in run.expected_shots():
+        expected[shot.view] += 1
+    return [_sampled(run, name, of_view, expected.get(name, 0)) for name, of_view in frames.items()]
+
+
+def _sampled(run: Run, name: str, proven: Sequence[FrameProven], expected: int) -> SampledView:
+    shots = sorted((event for event in proven if event.shot.is_shot), key=lambda event: str(event.shot))
+    leds = {event.shot.light for event in shots if isinstance(event.shot.light, Led)}
+    view = SampledView(name, expected, len(proven), len(proven) - len(shots), len(leds))
+    if shots:
+        try:
+            _look_into(view, read_view(run.view_path(name), shots), shots)
+        except (StorageError, IndexError, ValueError) as error:
+            view.trouble = str(error)
+    return view
+
+
+def _look_into(view: SampledView, file: View, shots: Sequence[FrameProven]) -> None:
+    coding = Coding(file.pattern, file.black_dn, file.white_dn)
+    if len(file.poses):
+        pose = np.asarray(file.poses["base_from_camera"][file.records[shots[0].index]["pose"]], np.float64)
+        view.base_from_camera = pose if pose.shape == (4, 4) and np.isfinite(pose).all() else None
+    by_exposure: dict[int, list[FrameProven]] = {}
+    for event in shots:
+        by_exposure.setdefault(int(file.records[event.index]["exposure_us"]), []).append(event)
+    wanted = max(_PICTURES_PER_EXPOSURE, PICTURES_PER_VIEW // len(by_exposure))
+    for exposure_us, of_exposure in sorted(by_exposure.items()):
+        found = SampledExposure(exposure_us, len(of_exposure))
+        view.exposures.append(found)
+        chosen = np.unique(np.linspace(0, len(of_exposure) - 1, wanted).round().astype(int))
+        for event in (of_exposure[place] for place in chosen):
+            raw = file.pixels(event.index)
+            found.add(str(event.shot), raw, coding)
+            picture = look(raw, coding, _PICTURE_WIDTH_PX, saturation=True, focus=False)
+            view.pictures.append((str(event.shot), picture))

@@ -39,14 +39,16 @@ def bench(
     or when a client asks for it; the cell is then safe.
     """
     from coupole.acquisition.cell_bench.bench_service import serve_bench
-    from coupole.plan.cell import read_cell
+    from coupole.console.client import borrowed
+    from coupole.plan.cell import Cell, read_cell
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     try:
         what = read_job(object_of, rig) if object_of else read_cell(rig)
-        serve_bench(what, console, confirm=not yes, leave_after_s=leave_after_s, as_json=as_json)
+        with borrowed(what if isinstance(what, Cell) else what.cell, "bench"):
+            serve_bench(what, console, confirm=not yes, leave_after_s=leave_after_s, as_json=as_json)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -72,6 +74,7 @@ def arm(
     from coupole.acquisition.cell_bench.bench_service import bench_of
     from coupole.acquisition.observer import Control
     from coupole.acquisition.runtime_folder import is_in_use
+    from coupole.console.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
@@ -87,7 +90,7 @@ def arm(
         else:
             lies = object_of or plan
             what = read_job(lies, rig) if lies else cell
-            with bench_of(what, console, control, confirm=False) as service:
+            with borrowed(cell, "arm"), bench_of(what, console, control, confirm=False) as service:
                 found = _driven(service.ask, goal, control, yes=yes)
     except CoupoleError as error:
         fail(error, as_json=as_json)

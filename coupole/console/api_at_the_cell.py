@@ -11,6 +11,7 @@ from fastapi import FastAPI, Request
 from coupole.console.accounts import Role
 from coupole.console.asking import REFUSALS, Who
 from coupole.console.guard import is_command_line
+from coupole.console.lending import begun_here
 from coupole.console.messages import Lease, Light, Move, Output, StateNow, Text, Warn
 from coupole.console.permission import NotAllowed, allow
 from coupole.console.service_parts import Service
@@ -49,10 +50,12 @@ def _add_loan(app: FastAPI, service: Service) -> None:
     @app.post("/api/v1/cell/lease", responses=REFUSALS)
     def lend(asked: Lease, who: Who, request: Request) -> dict[str, str]:
         """Lend the cell to the process that asks, by the Unix socket, until it gives it back or ends. The queue
-        waits meanwhile."""
-        allow(service, who, Role.OPERATOR, asked.what, acts=True)
-        request.state.about = asked.what
+        waits meanwhile. A process that the console itself has begun acts for whoever asked for it there."""
+        allow(service, who, Role.OPERATOR, asked.what)
         pid = borrower(request)
+        if not begun_here(pid):
+            allow(service, who, Role.OPERATOR, asked.what, acts=True)
+        request.state.about = asked.what
         try:
             service.acquisitions.lend(pid, who.name, asked.what)
         except InputError as error:

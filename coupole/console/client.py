@@ -43,7 +43,11 @@ def call(
     cell: Cell, method: str, path: str, asked: dict[str, Any] | None = None, *, patience_s: float = _PATIENCE_S
 ) -> Any:
     """What the service answers. Raises NotServed; InputError: it refuses, with its words, or does not answer."""
-    connection = _Local(str(service_socket(cell)), patience_s)
+    try:
+        place = str(service_socket(cell))
+    except (OSError, InputError) as error:
+        raise NotServed(f"{cell.document.path}: no console can be served here: {error}") from error
+    connection = _Local(place, patience_s)
     try:
         body = None if asked is None else json.dumps(asked)
         connection.request(method, path, body, {"Content-Type": "application/json"} if body else {})

@@ -6,8 +6,18 @@ import os
 import select
 import threading
 from dataclasses import dataclass
+from pathlib import Path
 
 from coupole.errors import InputError
+
+
+def begun_here(pid: int) -> bool:
+    """Whether this process has begun that one."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return False
+    return int(stat.rpartition(")")[2].split()[1]) == os.getpid()
 
 
 @dataclass(frozen=True)

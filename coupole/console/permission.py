@@ -18,5 +18,7 @@ def allow(service: Service, who: Account, role: Role, action: str, *, acts: bool
     """Raise NotAllowed if somebody's role, or who is in control, forbids an action."""
     if who.role < role:
         raise NotAllowed(403, f"{action}: only for {role.word}s; {who.name} is {who.role.word}")
-    if acts and not service.control.act(who, keep=who is not service.command_line.account):
-        raise NotAllowed(409, f"{action}: {service.control.now.name} is in control; ask for it first")
+    of_command_line = who is service.command_line.account
+    if acts and not service.control.act(who, keep=not of_command_line):
+        how = "`coupole queue RIG --take-control` takes it" if of_command_line else "ask for it first"
+        raise NotAllowed(409, f"{action}: {service.control.now.name} is in control; {how}")

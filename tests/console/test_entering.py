@@ -4,6 +4,9 @@ given."""
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -13,6 +16,7 @@ from cells import CellFolder
 
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.entering import Entering
+from coupole.console.lending import begun_here
 from coupole.console.messages import NewEntry
 from coupole.console.outlook import expected_times
 from coupole.console.plan_queue import Entry, PlanQueue
@@ -155,3 +159,12 @@ def test_times_are_expected_up_to_what_a_person_decides(desk: Desk) -> None:
     assert found[second.id][0] == now + timedelta(seconds=30)
     halted = expected_times(desk.queue.entries, now, left_s=30.0, halted=True)
     assert (halted[first.id][1], halted[second.id]) == (now + timedelta(seconds=30), (None, None))
+
+
+def test_a_process_of_the_consoles_own_is_told_from_others() -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        assert begun_here(child.pid)
+        child.communicate(b"\n")
+    assert not begun_here(os.getppid())
+    assert not begun_here(os.getpid())
+    assert not begun_here(2**22 + 1)

@@ -15,6 +15,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 
 import coupole
 from coupole.console.accounts import Role
+from coupole.console.api_at_the_cell import add_routes_at_the_cell
 from coupole.console.asking import REFUSALS, Who
 from coupole.console.guard import bearer_of, guard, is_command_line, is_of_this_machine, session_of, sign_in_page
 from coupole.console.messages import Hand, NewAccount, NewEntry, SignIn, StateNow, Text
@@ -38,6 +39,7 @@ def make_app(service: Service) -> FastAPI:
     _add_people(app, service)
     add_plan_routes(app, service)
     add_object_routes(app, service)
+    add_routes_at_the_cell(app, service)
     return app
 
 

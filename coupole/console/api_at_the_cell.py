@@ -21,9 +21,9 @@ from coupole.storage.ledger import Ledger, ledger_of, similar_ids
 from coupole.viewing import dose_table
 
 
-def add_routes_at_the_cell(app: FastAPI, service: Service, cell: Cell) -> None:
+def add_routes_at_the_cell(app: FastAPI, service: Service) -> None:
     _add_loan(app, service)
-    _add_light(app, service, cell)
+    _add_light(app, service, service.cell)
 
     @app.post("/api/v1/queue/{entry}/move", responses=REFUSALS)
     async def move(entry: Text, asked: Move, who: Who) -> StateNow:

@@ -7,11 +7,13 @@ import re
 import threading
 from pathlib import Path
 
+from coupole.console.retaking import name_of_retake, retaking_plan
 from coupole.errors import InputError, StorageError
 from coupole.plan import yamlfile
 from coupole.plan.plan import NAME_PATTERN
 from coupole.plan.templates import TEMPLATES
 from coupole.storage.durable import write_synced
+from coupole.storage.run import Run
 
 _DEEPEST = 3
 _LONGEST = 1_000_000
@@ -64,6 +66,14 @@ class PlanFiles:
             if path.exists():
                 raise InputError(f"{path.name}: exists already; choose another name")
             self._write(path, text.format(name=name, rig=rig))
+        return path.name
+
+    def retake(self, run: Run, view: str) -> str:
+        """A new plan that takes one view of a run again; its name. Raises InputError, StorageError."""
+        with self._lock:
+            taken = {Path(name).stem for name in self.names()}
+            path = self.path(f"{name_of_retake(run, view, taken)}.yaml")
+            self._write(path, retaking_plan(run, view, path.stem, self._rig))
         return path.name
 
     def write(self, name: str, text: str, before: str) -> str:

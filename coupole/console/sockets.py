@@ -1,4 +1,4 @@
-"""Where a console listens: a port for browsers, with TLS where others can reach it, and a Unix socket for commands."""
+"""Where a console listens: a port for browsers, by TLS if others can reach it, and a Unix socket for commands."""
 
 from __future__ import annotations
 

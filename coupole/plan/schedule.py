@@ -79,6 +79,22 @@ def bursts_left(bursts: Sequence[Burst], proven: Collection[ShotId]) -> list[Bur
     return left
 
 
+def views_of_grid(grid: Grid) -> list[LookAt]:
+    """Each of its views, named."""
+    given = grid.model_dump(exclude={"kind", "name", "azimuths_deg", "elevations_deg"}, exclude_unset=True)
+    return [
+        LookAt(
+            kind="look_at",
+            name=f"{grid.name}-az{azimuth:g}-el{elevation:g}",
+            azimuth_deg=azimuth,
+            elevation_deg=elevation,
+            **given,
+        )
+        for elevation in grid.elevations_deg
+        for azimuth in grid.azimuths_deg
+    ]
+
+
 def expand_view(view: View) -> list[ViewPose]:
     """The poses of one entry of a plan's views: a grid has many."""
     match view:
@@ -86,16 +102,7 @@ def expand_view(view: View) -> list[ViewPose]:
             pose = look_at(view.target_mm, view.distance_mm, view.azimuth_deg, view.elevation_deg, view.roll_deg)
             return [ViewPose(view.name, pose, None, view.target_mm)]
         case Grid():
-            return [
-                ViewPose(
-                    f"{view.name}-az{azimuth:g}-el{elevation:g}",
-                    look_at(view.target_mm, view.distance_mm, azimuth, elevation, view.roll_deg),
-                    None,
-                    view.target_mm,
-                )
-                for elevation in view.elevations_deg
-                for azimuth in view.azimuths_deg
-            ]
+            return [pose for one in views_of_grid(view) for pose in expand_view(one)]
         case Joints():
             return [ViewPose(view.name, None, view.joints_deg, None)]
         case _:

@@ -17,14 +17,16 @@ from browser import Browser, needs_chromium
 from cells import REPO, CellFolder
 from served import Served, served
 
+from sim.world.client import World
+
 PASSWORD = "a long password"
 
 
 class Day:
     """What all steps share."""
 
-    def __init__(self, folder: Path, service: Served) -> None:
-        self.folder, self.service = folder, service
+    def __init__(self, folder: Path, service: Served, world: World) -> None:
+        self.folder, self.service, self.world = folder, service, world
         kept = os.environ.get("COUPOLE_SCREENSHOTS")
         self._pictures = Path(kept) if kept else folder / "pictures"
         self._taken = 0
@@ -39,12 +41,13 @@ class Day:
         visitor.resizes(WIDE)
         return visitor
 
-    def picture(self, name: str) -> None:
-        """Of this moment, which no serious barrier may mar; and the same on a telephone."""
+    def picture(self, name: str, *, of_screen: bool = True) -> None:
+        """Of this moment, which no serious barrier may mar; and the same on a telephone. Only on a screen may
+        axe-core run."""
         self._taken += 1
         visitor = self.visitor
         visitor.picture(self._pictures / f"{self._taken:02d}-{name}.png")
-        assert visitor.barriers() == []
+        assert not of_screen or visitor.barriers() == []
         visitor.resizes(NARROW)
         assert visitor.fits(), f"{name}: {visitor.too_wide()}"
         visitor.resizes(WIDE)
@@ -63,9 +66,11 @@ class Day:
 @pytest.fixture(scope="module")
 def day(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Day]:
     cell = CellFolder(tmp_path_factory.mktemp("day"), speed=0.4)
-    cell.plan.unlink()
-    with served(cell) as service:
-        day = Day(cell.folder, service)
+    cell.join()
+    cell.write()
+    with cell.world() as world, served(cell) as service:
+        cell.plan.unlink()
+        day = Day(cell.folder, service, world)
         try:
             yield day
         finally:
@@ -80,6 +85,11 @@ def test_a_day_at_the_console(day: Day) -> None:
     _pauses_and_goes_on(day)
     _loses_the_browser(day)
     _stops(day)
+    _resumes(day)
+    _looks_at_frames(day)
+    _takes_a_view_again(day)
+    _archives(day)
+    _reads_the_report(day)
 
 
 def _signs_in(day: Day) -> None:
@@ -171,5 +181,62 @@ def _stops(day: Day) -> None:
     ada.sees(".q-notification", "lights off")
     now = day.until("halted")
     assert [entry["state"] for entry in now["queue"]] == ["stopped", "waiting"]
+    assert cells.safe(day.world)
     ada.sees("[data-name=alarm]", "vase.yaml")
     day.picture("stopped")
+
+
+def _resumes(day: Day) -> None:
+    ada, stopped = day.visitor, day.state()["queue"][0]
+    ada.clicks("[data-name=resume]")
+    resumed = cells.wait_until(lambda: _entry(day, resume=stopped["run"]), "the resume in the queue")
+    assert resumed["needs"]["frames"] < stopped["needs"]["frames"]
+    cells.wait_until(lambda: _entry(day, resume=stopped["run"])["state"] == "done", "the resumed run's end")
+    cells.assert_each_shot_proven_once(Path(stopped["run"]))
+
+
+def _entry(day: Day, **fields: str) -> dict[str, Any]:
+    """The first entry of the queue with these fields; empty without one."""
+    queue: list[dict[str, Any]] = day.state()["queue"]
+    return next((one for one in queue if all(one[key] == value for key, value in fields.items())), {})
+
+
+def _looks_at_frames(day: Day) -> None:
+    ada, run = day.visitor, Path(day.state()["queue"][0]["run"]).name
+    ada.goes_to("/runs")
+    ada.sees("[data-name=runs]", run)
+    day.picture("the-runs")
+    ada.goes_to(f"/runs/{run}")
+    ada.sees(".dome .scale", "of full scale")
+    ada.clicks("[data-name=sheet] [data-shot]")
+    ada.sees("[data-name=frame-facts]", "8 ms")
+    day.picture("a-runs-frames")
+
+
+def _takes_a_view_again(day: Day) -> None:
+    ada = day.visitor
+    before = len(day.state()["queue"])
+    ada.clicks("[data-name=retake]")
+    cells.wait_until(lambda: len(day.state()["queue"]) > before, "the view in the queue")
+    again = day.state()["queue"][-1]
+    assert again["needs"]["frames"] * 2 == day.state()["queue"][0]["needs"]["frames"]
+
+
+def _archives(day: Day) -> None:
+    ada, run = day.visitor, Path(day.state()["queue"][0]["run"])
+    size = sum(path.stat().st_size for path in run.glob("views/*.h5"))
+    ada.clicks("[data-name=archive]")
+    ada.clicks("[role=dialog] button", "Archive")
+    ada.sees("[data-name=tasks] .state", "done")
+    assert sum(path.stat().st_size for path in run.glob("views/*.h5")) < size
+    cells.assert_each_shot_proven_once(run)
+
+
+def _reads_the_report(day: Day) -> None:
+    ada = day.visitor
+    address = ada.at("[data-name=open-report]").get_attribute("href")
+    assert address is not None
+    assert address.startswith(ada.url)
+    ada.driver.get(address)
+    ada.sees("h1, h2", "Exposure")
+    day.picture("the-report", of_screen=False)

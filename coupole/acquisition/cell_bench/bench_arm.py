@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,7 +43,8 @@ class BenchArm:
         self._faults = ArmFaults(cell.state_folder)
         self._paths = ArmPaths(cell, job)
         self._shown: dict[str, ShownPath] = {}
-        self._numbers = 0
+        self._numbers = itertools.count(1)
+        self._planning = threading.Lock()
         self._hold: _Hold | None = None
         home_deg = np.array(cell.rig.motion.home_joints_deg)
         self._paths.motion.bodies.is_clear(home_deg, home_deg + 0.1)  # compiled before anybody waits for it
@@ -70,11 +73,11 @@ class BenchArm:
         state = self._opened.robot.measured()
         if state.moving:
             raise InputError("the arm moves: a path is planned from where it stands")
-        self._numbers += 1
-        path = self._paths.plan(str(self._numbers), asked.to, np.array(state.joints_deg))
-        self._shown[path.id] = path
-        for old in list(self._shown)[:-_KEPT_PATHS]:
-            del self._shown[old]
+        with self._planning:
+            path = self._paths.plan(str(next(self._numbers)), asked.to, np.array(state.joints_deg))
+            self._shown[path.id] = path
+            for old in list(self._shown)[:-_KEPT_PATHS]:
+                del self._shown[old]
         return self._paths.figures(path)
 
     def drive(self, number: str) -> dict[str, Any]:
@@ -104,8 +107,7 @@ class BenchArm:
         if asked.hold is not None:
             return self._renew(asked)
         self.refuse_motion()
-        self._numbers += 1
-        hold = _Hold(self._numbers, asked)
+        hold = _Hold(next(self._numbers), asked)
         about = {"hold": hold.number, "axis": asked.axis, "direction": asked.direction}
         work = Work("jog", about, lambda control: self._go_on(hold, control))
         self._works.begin(work)

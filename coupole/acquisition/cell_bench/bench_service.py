@@ -116,6 +116,7 @@ class BenchService:
             case StateAsked():
                 return self._state()
             case SelfTestAsked():
+                self._refuse_while_metering()
                 return self._devices.self_test(request.device)
             case PathAsked():
                 return self._arm.plan_path(request)
@@ -124,8 +125,7 @@ class BenchService:
             case JogAsked():
                 return self._arm.jog(request)
             case FrameAsked():
-                if (work := self.works.running) is not None and work.kind == "meter":
-                    raise InputError("box and camera are metering; stop it or let it end")
+                self._refuse_while_metering()
                 return {**self._frames.frame(request), "dose": self._frames.dose()}
             case LoupeAsked():
                 return self._frames.loupe(request)
@@ -137,6 +137,10 @@ class BenchService:
                 trouble = self._stop()
                 self.closing.set()
                 return {"trouble": trouble}
+
+    def _refuse_while_metering(self) -> None:
+        if (work := self.works.running) is not None and work.kind == "meter":
+            raise InputError("box and camera are metering; stop it or let it end")
 
     def _begin_metering(self, asked: MeterAsked) -> dict[str, Any]:
         small = metering_job(self._arm.job_of(Path(asked.plan)))

@@ -9,6 +9,7 @@ from nicegui import events, ui
 
 from coupole.console.event_words import words_of
 from coupole.console.frame_sheets import LedPlace, SheetFrame, led_places
+from coupole.console.messages import NewEntry
 from coupole.console.run_files import RunRow
 from coupole.console.screens.contact_sheet import ContactSheet
 from coupole.console.screens.dome_picture import DomePicture
@@ -26,7 +27,7 @@ from coupole.console.screens.parts import (
 from coupole.console.screens.run_actions import RunActions
 from coupole.console.screens.runs_screen import STATE_KINDS
 from coupole.console.screens.task_list import TaskList
-from coupole.console.screens.visit import Visit, in_thread
+from coupole.console.screens.visit import Visit, enter, in_thread
 from coupole.console.service_parts import Service
 from coupole.errors import CoupoleError
 from coupole.storage import journal
@@ -130,6 +131,17 @@ class _Page:
         with ui.row().classes("bar"):
             self._view = Choice("view", {view: view for view in views}, self.choose, name="view")
             self._exposure = Choice("exposure", {"0": "-"}, self._choose_exposure, name="exposure")
+            if self._visit.may_act:
+                button("Take this view again", self._retake, icon="replay", name="retake")
+
+    async def _retake(self) -> None:
+        """A new plan with this view alone, as it was; in the queue."""
+        service, view, run = self._visit.service, self._view.value, self._known.run
+        made = await self._visit.act(
+            f"plan for {view} again", lambda: service.plan_files.retake(run, view), acts=False
+        )
+        if made is not None:
+            await enter(self._visit, NewEntry(plan=made), made)
 
     def _foot(self) -> None:
         run, status, happened = self._known.run, self._known.status, self._known.events

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import html
+from pathlib import Path
 
 from nicegui import ui
 
-from coupole.console.messages import StateNow
+from coupole.console.messages import EntryNow, NewEntry, StateNow
 from coupole.console.run_files import Frame
 from coupole.console.run_watch import Watched
+from coupole.console.screens.fault_of_arm import FaultOfArm
 from coupole.console.screens.parts import (
+    button,
     clipping_words,
     facts_html,
     histogram_svg,
+    named,
     panel,
     picture_address,
     table_html,
 )
-from coupole.console.screens.visit import Visit, in_thread
+from coupole.console.screens.visit import Visit, enter, in_thread
 from coupole.errors import CoupoleError
 from coupole.viewing.terminal import duration_text
 
@@ -36,7 +40,9 @@ class _Screen:
         self._idle = panel()
         with self._idle:
             self._idle_words = ui.label()
-            self._resume = ui.row()
+            self._after = named(ui.column(), "after").style("width:100%")
+            self._said = ""
+        self._fault = FaultOfArm(visit)
         with ui.element("div").classes("columns") as self._work:
             with panel("Newest frame"):
                 self._picture = ui.html("", sanitize=False).style("width:100%")
@@ -60,6 +66,33 @@ class _Screen:
             f"{'A plan is checked and devices are opened' if now.state == 'starting' else 'No run is at work'}. "
             f"{waiting} plans wait in the queue."
         )
+        self._fault.show(now.arm_fault)
+        last = next((one for one in reversed(now.queue) if one.state in ("done", "failed", "stopped")), None)
+        known = last.model_dump_json() if last else ""
+        if known != self._said:
+            self._said = known
+            self._show_last(last)
+
+    def _show_last(self, last: EntryNow | None) -> None:
+        """How the last one ended, and what can be done about it."""
+        self._after.clear()
+        if last is None:
+            return
+        run, visit = Path(last.run).name, self._visit
+
+        async def resume() -> None:
+            first = next((one.id for one in visit.now.queue if one.state == "waiting"), "")
+            if await enter(visit, NewEntry(resume=run, before=first), f"the rest of {run}"):
+                await visit.act("go on with the queue", visit.service.queue.go_on)
+
+        with self._after:
+            ended = {"done": "is complete", "failed": "failed", "stopped": "was stopped"}[last.state]
+            ui.label(f"{run or last.words} {ended}" + (f": {last.said}" if last.said else "."))
+            with ui.row().classes("bar"):
+                if last.state != "done" and run and visit.may_act:
+                    button("Resume it", resume, icon="play_arrow", name="resume", kind="main")
+                if run:
+                    ui.link("look at it", f"/runs/{run}")
 
     async def _look(self) -> None:
         now = self._visit.now

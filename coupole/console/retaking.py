@@ -1,0 +1,57 @@
+"""A plan that takes one view of a run again, as it was taken."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from coupole.errors import InputError
+from coupole.plan.plan import Grid, Plan, View
+from coupole.plan.reading import read_plan
+from coupole.plan.rewriting import named_paths
+from coupole.plan.schedule import views_of_grid
+from coupole.storage.run import Run
+
+
+def retaking_plan(run: Run, view: str, name: str, rig: Path) -> str:
+    """Text of a plan called `name` with one view of a run, on this rig; the other files are those that the run
+    keeps. Raises InputError: there is no such view, or the run's plan cannot be read."""
+    files = read_plan(run.plan_path)
+    plan = files.plan
+    chosen = next((one for one in map(_single, _expanded(plan)) if one["name"] == view), None)
+    if chosen is None:
+        raise InputError(f"{view!r}: no view of {run.folder.name}")
+    whole = plan.model_dump(mode="json", exclude_unset=True)
+    for key_path, path in named_paths(plan):
+        *parents, last = key_path
+        part: Any = whole
+        for key in parents:
+            part = part[key]
+        part[last] = str(files.document.resolve(path))
+    whole |= {"name": name, "rig": str(rig.resolve()), "views": [chosen]}
+    return (
+        f"# View {view} of {run.folder.name}, once more.\n"
+        + json.dumps(whole, indent=1, ensure_ascii=False)
+        + "\n"
+    )
+
+
+def name_of_retake(run: Run, view: str, taken: set[str]) -> str:
+    """A name for the plan that no other one has."""
+    run_name = run.folder.name.partition("-")[2]
+    stem = re.sub(r"[^\w.-]", "-", f"{run_name}-{view}")[:48]
+    return next(name for k in range(1, len(taken) + 2) if (name := f"{stem}-again{k}") not in taken)
+
+
+def _expanded(plan: Plan) -> list[View]:
+    found: list[View] = []
+    for view in plan.views:
+        found += views_of_grid(view) if isinstance(view, Grid) else [view]
+    return found
+
+
+def _single(view: View) -> dict[str, Any]:
+    found: dict[str, Any] = view.model_dump(mode="json", exclude_unset=True)
+    return found

@@ -1,0 +1,42 @@
+"""After a fault of the arm: the word of a named person who has been to the cell."""
+
+from __future__ import annotations
+
+from nicegui import ui
+
+from coupole.console.screens.parts import button, named, panel
+from coupole.console.screens.visit import Visit
+from coupole.errors import InputError
+from coupole.storage.arm_faults import ArmFaults
+
+
+class FaultOfArm:
+    """Is there while a fault stands."""
+
+    def __init__(self, visit: Visit) -> None:
+        self._visit = visit
+        self._panel = panel("A fault of the arm stands")
+        with self._panel:
+            self._words = ui.label().classes("bad")
+            ui.label("Find its cause, see that the cell is clear; then say so, with your name.").classes("hint")
+            self._cause = named(ui.input("What the cause was").classes("field"), "cause")
+            self._confirm = button("I was at the cell: the arm may move", self._said, name="confirm", kind="main")
+
+    def show(self, fault: str) -> None:
+        """`fault` is empty if none stands."""
+        self._panel.set_visibility(bool(fault))
+        self._words.text = fault
+        self._confirm.set_enabled(self._visit.may_act)
+
+    async def _said(self) -> None:
+        account, cause = self._visit.account, str(self._cause.value or "").strip()
+        faults = ArmFaults(self._visit.service.cell.state_folder)
+
+        def confirm() -> bool:
+            if not cause or account is None:
+                raise InputError("expected what the cause was")
+            faults.confirm(account.name, cause)
+            return True
+
+        if await self._visit.act(f"confirm the arm: {cause}", confirm, done="confirmed: the arm may move again"):
+            self._cause.set_value("")

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import cells
+import numpy as np
 import pytest
 from at_the_console import Visitor
 from browser import Browser, needs_chromium
@@ -45,6 +48,45 @@ class Two:
             lambda: now if (now := self.state())["proven"] > 20 else None, "a run"
         )
         return found
+
+
+class Watch:
+    """Looks at a world as often as it can: this machine's time, the world's, and the light that was given until
+    then."""
+
+    def __init__(self, world: World) -> None:
+        self._world, self._ended = world, threading.Event()
+        self._seen: list[tuple[float, float, float]] = []
+        self._thread = threading.Thread(target=self._look, daemon=True)
+
+    def __enter__(self) -> Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        while not self._ended.is_set():
+            before_s = time.time()
+            light, state = self._world.ask("light"), self._world.ask("state")
+            given_s = sum(map(float, light["leds_s"].values()))
+            self._seen.append(((before_s + time.time()) / 2, float(state["t_s"]), given_s))
+            time.sleep(0.002)
+
+    def until_dark(self) -> None:
+        """Until no light was given for three times as long as a stop may take."""
+        cells.wait_until(lambda: self._seen[-1][1] - self._last_light_s() > 3 * STOPS_WITHIN_S, "no more light")
+
+    def _last_light_s(self) -> float:
+        """The world's time at which light was last seen to have been given."""
+        return next((one[1] for one in self._seen if one[2] >= self._seen[-1][2]), 0.0)
+
+    def light_after(self, machine_s: float) -> float:
+        """Time on the world's clock from a moment on this machine's until no light was given any more."""
+        machine, world = [one[0] for one in self._seen], [one[1] for one in self._seen]
+        return self._last_light_s() - float(np.interp(machine_s, machine, world))
 
 
 @pytest.fixture(scope="module")
@@ -103,31 +145,21 @@ def test_a_stop_by_who_watches_puts_the_light_out_at_once(two: Two) -> None:
     two.begins()
     two.max.goes_to("/queue")
     two.max.sees("[data-name=state]", "running")
-    pressed_s = float(two.world.ask("state")["t_s"])
-    two.max.clicks("[data-name=stop]")
-    last_s = _last_light(two)
-    two.max.sees(".q-notification", "lights off")
+    two.max.driver.execute_script(
+        "addEventListener('pointerdown', () => { window.pressed_s = Date.now() / 1000; }, {capture: true})"
+    )
+    with Watch(two.world) as watch:
+        two.max.clicks("[data-name=stop]")
+        two.max.sees(".q-notification", "lights off")
+        watch.until_dark()
     assert cells.safe(two.world)
-    assert last_s - pressed_s < STOPS_WITHIN_S
+    pressed_s = float(two.max.browser.run("window.pressed_s"))
+    assert watch.light_after(pressed_s) < STOPS_WITHIN_S
     two.max.sees("[data-name=alarm]", "stopped")
 
 
-def _last_light(two: Two) -> float:
-    """When light was last given, by the world's clock, once none has been for a while."""
-    given, last_s, now_s = -1.0, 0.0, 0.0
-    while now_s < last_s + 3 * STOPS_WITHIN_S:
-        light, now_s = two.world.ask("light"), float(two.world.ask("state")["t_s"])
-        total = sum(float(seconds) for seconds in _values(light["leds_s"]))
-        if total > given:
-            given, last_s = total, now_s
-    return last_s
-
-
-def _values(leds_s: Any) -> list[float]:
-    return list(leds_s.values()) if isinstance(leds_s, dict) else list(leds_s)
-
-
 def test_a_killed_acquisition_leaves_a_dark_cell_and_is_offered_to_be_resumed(two: Two) -> None:
+    _empty(two)
     now = two.begins()
     running = next(entry for entry in now["queue"] if entry["state"] == "running")
     os.kill(running["pid"], signal.SIGKILL)
@@ -150,6 +182,7 @@ def test_a_killed_acquisition_leaves_a_dark_cell_and_is_offered_to_be_resumed(tw
 
 
 def _empty(two: Two) -> None:
+    cells.wait_until(lambda: two.state()["state"] in ("idle", "halted"), "nothing runs")
     asked = two.service.browser(name="Ada", password=PASSWORD)
     for entry in asked.state()["queue"]:
         if entry["state"] == "waiting":

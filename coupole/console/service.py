@@ -27,6 +27,7 @@ from coupole.console.accounts import Account, Accounts, Role
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.api import make_app
 from coupole.console.audit import Audit
+from coupole.console.calibration_status import CalibrationStatus
 from coupole.console.client import service_socket
 from coupole.console.frame_sheets import FrameSheets
 from coupole.console.messages import StateNow
@@ -36,6 +37,7 @@ from coupole.console.run_watch import RunWatch
 from coupole.console.screens.all_screens import add_screens
 from coupole.console.service_parts import Service
 from coupole.console.sessions import Control, Session, Sessions
+from coupole.console.support_bundle import SupportBundles
 from coupole.console.tasks import Tasks
 from coupole.errors import CoupoleError, InputError
 from coupole.plan import yamlfile
@@ -84,8 +86,9 @@ def serve(
             runs = RunFiles(cell.storage_folder, folder / "verified")
             tasks = Tasks(folder / "commands")
             service = Service(
-                cell, plans, accounts, Sessions(), control, audit, queue, acquisitions,
-                runs, FrameSheets(runs, folder / "means"), RunWatch(runs), tasks,
+                cell, folder, plans, accounts, Sessions(), control, audit, queue, acquisitions,
+                runs, FrameSheets(runs, folder / "means"), CalibrationStatus(cell, plans),
+                SupportBundles(cell, plans, folder), RunWatch(runs), tasks,
                 state=lambda: state_of(cell, queue, acquisitions, control, audit),
                 newest=Newest(lambda: state_of(cell, queue, acquisitions, control, audit)),
                 read_plan=lambda name: read_plan(cell, plans, name),

@@ -15,6 +15,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.remote.webelement import WebElement
+from selenium.webdriver.support.select import Select
 
 WIDE, NARROW = (1400, 900), (400, 800)
 _SERIOUS = ("serious", "critical")
@@ -77,6 +78,15 @@ class Visitor:
             return True
 
         self._patiently(typed, f"{selector} to type into")
+
+    def signs_out(self) -> None:
+        self.clicks("[data-name=person]")
+        self.clicks("[data-name=sign-out]")
+        self.at("#password")
+
+    def chooses(self, selector: str, value: str) -> None:
+        """From a list."""
+        self._patiently(lambda: Select(self.at(selector)).select_by_value(value) is None, f"{value} of {selector}")
 
     def presses(self, key: str) -> None:
         """A key, wherever the focus is."""

@@ -9,7 +9,7 @@ from fastapi import FastAPI, Request
 from nicegui import app as nicegui_app
 from nicegui import ui
 
-from coupole.console.screens import run_page, run_screen, runs_screen
+from coupole.console.screens import calibration_screen, run_page, run_screen, runs_screen, system_screen
 from coupole.console.screens.frame import Place, framed
 from coupole.console.screens.visit import Visit
 from coupole.console.service_parts import Service
@@ -20,6 +20,8 @@ RUNS = Place("/runs", "Runs", "photo_library")
 SCREENS: dict[Place, Build] = {
     Place("/run", "Run", "play_circle"): run_screen.build,
     RUNS: runs_screen.build,
+    Place("/calibration", "Calibration", "straighten"): calibration_screen.build,
+    Place("/system", "System", "settings"): system_screen.build,
 }
 PAGES_BELOW: dict[str, tuple[Place, Build]] = {
     "/runs/{name}": (RUNS, run_page.build),

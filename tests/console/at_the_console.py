@@ -112,10 +112,10 @@ class Visitor:
         )
 
     def prefers(self, scheme: str) -> None:
-        """`light` or `dark`."""
-        self.driver.execute_cdp_cmd(
-            "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-        )
+        """`light` or `dark`; without motion, as colours that are on their way have no contrast yet."""
+        wanted = {"prefers-color-scheme": scheme, "prefers-reduced-motion": "reduce"}
+        features = [{"name": name, "value": value} for name, value in wanted.items()]
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
 
     def picture(self, path: Path) -> None:
         """What is seen now, as PNG."""

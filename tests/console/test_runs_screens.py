@@ -223,7 +223,7 @@ def test_an_engineer_keeps_people_and_makes_a_bundle(house: House) -> None:
     ada.clicks("[data-name=remove-Grace]")
     ada.clicks("[role=dialog] [data-name=yes]")
     ada.sees(".q-notification", "last engineer")
-    ada.clicks(".q-notification button", "close")
+    ada.clicks(".q-notification.bg-negative button")
     ada.clicks("[data-name=make-bundle]")
     name = ada.sees("[data-name=bundle]", "zip")
     path = f"/api/v1/support-bundles/{name}"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -17,6 +19,8 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.select import Select
 
+LOOK_EVERY_S = 0.15
+"""Looking costs the browser, and others, time."""
 WIDE, NARROW = (1400, 900), (400, 800)
 _SERIOUS = ("serious", "critical")
 
@@ -51,7 +55,10 @@ class Visitor:
                 ".join('\\n')",
                 selector,
             )
-            return texts if texts and words in texts else ""
+            if texts and words in texts:
+                return texts
+            time.sleep(LOOK_EVERY_S)
+            return ""
 
         return str(cells.wait_until(there, f"{words!r} in {selector}"))
 
@@ -97,10 +104,11 @@ class Visitor:
         from selenium.common.exceptions import WebDriverException
 
         def done() -> bool:
-            try:
-                return do()
-            except WebDriverException:
-                return False
+            with suppress(WebDriverException):
+                if do():
+                    return True
+            time.sleep(LOOK_EVERY_S)
+            return False
 
         cells.wait_until(done, what)
 

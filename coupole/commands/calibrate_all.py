@@ -9,8 +9,9 @@ from typing import Annotated
 
 import typer
 
+from coupole.calibration.campaign_steps import MESH, STEPS
 from coupole.commands.calibrate_geometry import RepeatabilityDeg, RepeatabilityMm
-from coupole.commands.campaign import MESH, STEPS, Campaign, Repeatability
+from coupole.commands.campaign import Campaign, Repeatability
 from coupole.commands.common import JsonOption, fail
 from coupole.errors import CoupoleError, InputError
 

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+from coupole.calibration.campaign_steps import OBJECT, STEPS, Step
 from coupole.commands import calibrate_geometry, calibrate_lens, calibrate_light
 from coupole.commands.simulated_support import BOARD, CERTIFICATE_OF_SIMULATED_TILE, TILE, with_things
 from coupole.errors import CalibrationRefused, Interrupted
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-OBJECT: Mapping[str, Any] = {
-    "kind": "sculpted_relief",
-    "translation_mm": [6.0, -4.0, 0.5],
-    "abc_deg": [25.0, 0.0, 0.0],
-    "stickers": {"count": 24},
-}
-"""The object on a simulated cell's support for the mesh, which the simulated scanner scans."""
-MESH = "mesh"
 
 
 @dataclass(frozen=True)
@@ -32,35 +24,6 @@ class Repeatability:
 
     mm: float
     deg: float
-
-
-@dataclass(frozen=True)
-class Step:
-    """One acquisition and the records made from it."""
-
-    name: str
-    """Of the plan, and of its template."""
-    stands: str
-    """What must be on the support, for the operator."""
-    things: tuple[Mapping[str, Any], ...]
-    """The same for a simulated cell, which places it itself (`world.settings.things`)."""
-    records: tuple[str, ...]
-
-
-STEPS = (
-    Step("darks", "nothing; close the dome, no light of the room", (), ("dark",)),
-    Step("response", "a grey card", ({"kind": "grey_card"},), ("response",)),
-    Step("flat-field", "nothing", (), ("flat-field",)),
-    Step(
-        "charuco",
-        "the ChArUco board at the centre",
-        ({"kind": "charuco_board", "square_mm": 16.0, "marker_mm": 9.6},),
-        ("camera", "hand-eye"),
-    ),
-    Step("leds", "nothing", (), ("leds",)),
-    Step("spectralon", "the white tile at the centre", ({"kind": "spectralon_tile"},), ("led-power",)),
-    Step(MESH, "the scanned object with its stickers", (OBJECT,), (MESH,)),
-)
 
 
 class Campaign:

@@ -211,7 +211,7 @@ def plan_new(
 
 def _on_the_support(template: str, rig: Path, name: str) -> Path:
     """The rig; for a simulated cell whose support a calibration needs something on, a copy that has it."""
-    from coupole.commands.campaign import STEPS
+    from coupole.calibration.campaign_steps import STEPS
     from coupole.commands.simulated_support import place_for
     from coupole.plan.cell import read_cell
     from coupole.plan.rig_devices import in_world

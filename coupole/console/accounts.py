@@ -91,6 +91,16 @@ class Accounts:
                 self.first_token = ""
         return Account(name, role)
 
+    def change_role(self, name: str, role: Role) -> None:
+        """Raises InputError: no such account, or the last engineer's; StorageError."""
+        with self._lock:
+            if name not in self._stored:
+                raise InputError(f"name: {name} has no account")
+            changed = {**self._stored, name: {**self._stored[name], "role": role.word}}
+            if _has_engineer(self._stored) and not _has_engineer(changed):
+                raise InputError("name: this is the last engineer; nobody could keep the accounts")
+            self._keep(changed)
+
     def remove(self, name: str) -> None:
         """Raises InputError: no such account, or the last engineer's; StorageError."""
         with self._lock:

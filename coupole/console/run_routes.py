@@ -1,17 +1,21 @@
-"""The console's HTTP interface to runs: their list, pictures, and the pages in their folders."""
+"""The console's HTTP interface to files: runs, their pictures and pages, and support bundles."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated
 
-from fastapi import FastAPI, Query, Response
+from fastapi import FastAPI, Query, Request, Response
 from fastapi.responses import FileResponse
 
+from coupole.console.accounts import Role
+from coupole.console.guard import account_here, is_of_this_machine
 from coupole.console.messages import Text
+from coupole.console.permission import NotAllowed
 from coupole.console.run_files import RunRow
 from coupole.console.run_results import look_page
 from coupole.console.service_parts import Service
+from coupole.console.sessions import Session
 from coupole.errors import InputError
 from coupole.viewing import report
 
@@ -53,6 +57,14 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
     def readme(run: Text) -> FileResponse:
         """What the run's folder says of itself."""
         return _file(service.runs.run(run).folder / "README.txt", "text/plain; charset=utf-8", _STILL)
+
+    @app.get("/api/v1/support-bundles/{name}", response_class=FileResponse)
+    def support_bundle(name: Text, request: Request) -> FileResponse:
+        """One that was made at the console; for engineers."""
+        session: Session = request.state.session
+        if account_here(session.account, of_this_machine=is_of_this_machine(request)).role < Role.ENGINEER:
+            raise NotAllowed(403, "support bundles: only for engineers")
+        return FileResponse(service.bundles.path(name), media_type="application/zip", filename=name)
 
     @app.get("/api/v1/runs/{run}/look", response_class=FileResponse)
     def look(run: Text) -> FileResponse:

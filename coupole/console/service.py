@@ -16,6 +16,7 @@ from coupole.console.accounts import Account, Accounts, Role
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.api import make_app
 from coupole.console.audit import Audit
+from coupole.console.calibration_status import CalibrationStatus
 from coupole.console.client import service_socket
 from coupole.console.drafts import Desk
 from coupole.console.entering import Entering
@@ -33,6 +34,7 @@ from coupole.console.service_parts import Service
 from coupole.console.sessions import Control, Session, Sessions
 from coupole.console.sockets import in_url, is_here, listen, origins_of, run_servers, tls_context
 from coupole.console.state_now import Newest, state_of
+from coupole.console.support_bundle import SupportBundles
 from coupole.console.tasks import Tasks
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
@@ -91,6 +93,7 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
 
         yield Service(
             cell=cell,
+            folder=folder,
             plans=plans,
             accounts=accounts,
             sessions=Sessions(),
@@ -103,6 +106,8 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
             runs=runs,
             sheets=FrameSheets(runs, folder / "means"),
             watch=RunWatch(runs),
+            calibrations=CalibrationStatus(cell, plans),
+            bundles=SupportBundles(cell, plans, folder),
             objects=ObjectFiles(cell, plan_files, runs, cell.state_folder / "objects"),
             tasks=parts.enter_context(contextlib.closing(Tasks(folder / "commands"))),
             state=state,

@@ -9,6 +9,7 @@ from pathlib import Path
 from coupole.console.accounts import Accounts
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.audit import Audit
+from coupole.console.calibration_status import CalibrationStatus
 from coupole.console.drafts import Desk
 from coupole.console.entering import Entering
 from coupole.console.frame_sheets import FrameSheets
@@ -19,6 +20,7 @@ from coupole.console.plan_queue import PlanQueue
 from coupole.console.run_files import RunFiles
 from coupole.console.run_watch import RunWatch
 from coupole.console.sessions import Control, Session, Sessions
+from coupole.console.support_bundle import SupportBundles
 from coupole.console.tasks import Tasks
 from coupole.plan.cell import Cell
 
@@ -28,6 +30,8 @@ class Service:
     """The parts of one cell's console."""
 
     cell: Cell
+    folder: Path
+    """Of the console's own state: accounts, log, queue."""
     plans: Path
     """Folder of the plans that may be entered."""
     accounts: Accounts
@@ -41,6 +45,8 @@ class Service:
     """Checks and draws plans while they are written."""
     runs: RunFiles
     sheets: FrameSheets
+    calibrations: CalibrationStatus
+    bundles: SupportBundles
     watch: RunWatch
     """Of the run at work."""
     objects: ObjectFiles

@@ -10,6 +10,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from coupole.errors import StorageError
 from coupole.motion.itinerary import Itinerary
@@ -24,6 +25,9 @@ from coupole.preflight.job import Job, at_pace
 from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, Whole, check
 from coupole.storage.ledger import History, ledger_of, similar_ids
 from coupole.storage.write_speed import measure_write_speed
+
+if TYPE_CHECKING:
+    from coupole.calibration.in_force import Situation
 
 _DISK_GRAIN_US = 100
 _LED_DUTIES = tuple(0.9**k for k in range(1, 33))
@@ -186,10 +190,17 @@ def calibration_refusals(job: Job, *, camera: str | None = None, temperature_c: 
     later, with the opened devices (`Situation`)."""
     if job.calibrations is None:
         return []
-    from coupole.calibration.in_force import Situation, refusals
+    from coupole.calibration.in_force import refusals
 
-    rig = job.cell.rig
-    here = Situation(
+    here = situation_of(job.cell.rig, camera=camera, temperature_c=temperature_c)
+    return refusals(job.calibrations, here)
+
+
+def situation_of(rig: Rig, *, camera: str | None = None, temperature_c: float | None = None) -> Situation:
+    """What this rig's records must hold for, now."""
+    from coupole.calibration.in_force import Situation
+
+    return Situation(
         now=datetime.now(UTC),
         simulated=in_world(rig, dry_run=False),
         size_px=(rig.sensor.width_px, rig.sensor.height_px),
@@ -199,7 +210,6 @@ def calibration_refusals(job: Job, *, camera: str | None = None, temperature_c: 
         camera=camera,
         temperature_c=temperature_c,
     )
-    return refusals(job.calibrations, here)
 
 
 def _disk_us(rig: Rig, storage: StorageFacts) -> int:

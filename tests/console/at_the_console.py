@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -16,7 +17,10 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.remote.webelement import WebElement
+from selenium.webdriver.support.select import Select
 
+LOOK_EVERY_S = 0.15
+"""Looking costs the browser, and others, time."""
 WIDE, NARROW = (1400, 900), (400, 800)
 _SETTLES_S = 3.0
 _SERIOUS = ("serious", "critical")
@@ -53,7 +57,10 @@ class Visitor:
                 ".join('\\n')",
                 selector,
             )
-            return texts if texts and words in texts else ""
+            if texts and words in texts:
+                return texts
+            time.sleep(LOOK_EVERY_S)
+            return ""
 
         return str(cells.wait_until(there, f"{words!r} in {selector}"))
 
@@ -81,6 +88,15 @@ class Visitor:
 
         self._patiently(typed, f"{selector} to type into")
 
+    def signs_out(self) -> None:
+        self.clicks("[data-name=person]")
+        self.clicks("[data-name=sign-out]")
+        self.at("#password")
+
+    def chooses(self, selector: str, value: str) -> None:
+        """From a list."""
+        self._patiently(lambda: Select(self.at(selector)).select_by_value(value) is None, f"{value} of {selector}")
+
     def presses(self, key: str) -> None:
         """A key, wherever the focus is."""
         ActionChains(self.driver).send_keys(key).perform()
@@ -90,10 +106,11 @@ class Visitor:
         from selenium.common.exceptions import WebDriverException
 
         def done() -> bool:
-            try:
-                return do()
-            except WebDriverException:
-                return False
+            with suppress(WebDriverException):
+                if do():
+                    return True
+            time.sleep(LOOK_EVERY_S)
+            return False
 
         cells.wait_until(done, what)
 
@@ -105,16 +122,10 @@ class Visitor:
         )
 
     def prefers(self, scheme: str) -> None:
-        """`light` or `dark`; and nothing moves."""
-        self.driver.execute_cdp_cmd(
-            "Emulation.setEmulatedMedia",
-            {
-                "features": [
-                    {"name": "prefers-color-scheme", "value": scheme},
-                    {"name": "prefers-reduced-motion", "value": "reduce"},
-                ]
-            },
-        )
+        """`light` or `dark`; without motion, as colours that are on their way have no contrast yet."""
+        wanted = {"prefers-color-scheme": scheme, "prefers-reduced-motion": "reduce"}
+        features = [{"name": name, "value": value} for name, value in wanted.items()]
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
 
     def picture(self, path: Path) -> None:
         """What is seen now, as PNG."""

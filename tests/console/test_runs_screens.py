@@ -48,7 +48,11 @@ class House:
 @pytest.fixture(scope="module")
 def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     cell = CellFolder(tmp_path_factory.mktemp("runs"))
+    cell.write(lights={"kind": "every", "every": 40})
     assert cell.acquire().code == 0
+    kinds = ("camera", "hand-eye", "flat-field")
+    cell.rig_data["calibrations"] = [str(cells.REPO / f"configs/calibrations/{kind}.yaml") for kind in kinds]
+    cell.write()
     with served(cell) as service:
         engineer = service.browser(token=service.token)
         for name, role in (("Grace", "engineer"), ("Ada", "operator"), ("Eve", "observer")):
@@ -104,12 +108,13 @@ def test_a_run_is_found_and_verified_in_the_table(house: House) -> None:
     ada.sees("[data-name=count]", "0 of 1 runs")
     ada.types("[data-name=search]", "relief done")
     ada.sees("[data-name=count]", "1 of 1 runs")
-    assert_usable(ada)
     ada.clicks("[data-run]", "Actions")
     ada.clicks("[data-name=verify]")
     ada.sees("[data-name=tasks] .state", "done")
     table = ada.sees("td[data-head=verified]", "20")
     assert "no" not in table
+    ada.clicks("[data-name=close]")
+    assert_usable(ada)
 
 
 def test_nothing_is_archived_before_somebody_says_so(house: House) -> None:
@@ -118,7 +123,7 @@ def test_nothing_is_archived_before_somebody_says_so(house: House) -> None:
     before = (house.run / "views/top.h5").stat().st_ino
     ada.clicks("[data-name=archive]")
     ada.sees("[role=dialog]", "read back and compared")
-    assert_usable(ada)
+    assert ada.barriers() == []
     ada.clicks("[data-name=cancel]")
     ada.clicks("[data-name=export]")
     ada.sees("[role=dialog]", "on this machine")
@@ -180,3 +185,50 @@ def test_a_report_is_shown_without_a_right_to_anything(house: House) -> None:
     assert eve.get(f"/api/v1/runs/{house.run.name}/look").status == 422, "nobody has made it"
     assert eve.get("/api/v1/runs/..%2F..%2Fetc/report").status in (404, 422)
     assert house.served.browser().get(f"/api/v1/runs/{house.run.name}/report").status == 401
+
+
+# -- calibrations ---------------------------------------------------------------------------------------------
+
+
+def test_records_in_force_and_what_they_refuse_are_told(house: House) -> None:
+    ada = house.ada
+    ada.goes_to("/calibration")
+    rows = ada.sees("[data-name=records]", "hand-eye").splitlines()
+    assert any(row.startswith("dark") and "none in force" in row for row in rows)
+    camera = next(row for row in rows if row.startswith("camera"))
+    assert "128 x 96" in camera, "it holds for larger frames"
+    plans = ada.sees("[data-name=plans]", "plan.yaml")
+    assert "128 x 96" in plans
+    ada.sees("[data-name=steps]", "On the support: a grey card.")
+    assert not ada.at("[data-name=new-campaign]").is_enabled(), "Ada is no engineer"
+    assert_usable(ada)
+
+
+# -- the system -----------------------------------------------------------------------------------------------
+
+
+def test_an_engineer_keeps_people_and_makes_a_bundle(house: House) -> None:
+    ada, engineer = house.ada, house.engineer
+    ada.goes_to("/system")
+    ada.sees("[data-name=disk]", "room for")
+    assert ada.all("[data-name=people]") == []
+    assert not ada.at("[data-name=make-bundle]").is_enabled()
+    ada.signs_out()
+    ada.signs_in("Grace", PASSWORD)
+    ada.goes_to("/system")
+    ada.sees("[data-name=people]", "Eve")
+    ada.chooses("[data-name=role-Eve]", "operator")
+    ada.sees("[data-name=log]", "make Eve operator")
+    roles = {one["name"]: one["role"] for one in engineer.get("/api/v1/accounts").document}
+    assert roles == {"Ada": "operator", "Eve": "operator", "Grace": "engineer"}
+    ada.clicks("[data-name=remove-Grace]")
+    ada.clicks("[role=dialog] [data-name=yes]")
+    ada.sees(".q-notification", "last engineer")
+    ada.clicks(".q-notification.bg-negative button")
+    ada.clicks("[data-name=make-bundle]")
+    name = ada.sees("[data-name=bundle]", "zip")
+    path = f"/api/v1/support-bundles/{name}"
+    assert house.served.browser(name="Ada", password=PASSWORD).get(path).status == 403
+    ada.types("[data-name=search-log]", "bundle")
+    assert "make Eve" not in ada.sees("[data-name=log]", "support bundle")
+    assert_usable(ada)

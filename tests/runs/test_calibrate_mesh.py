@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
+from coupole.calibration.campaign_steps import OBJECT
 from coupole.calibration.record import Input, Parameter, Record, Validity, read_record, sealed, write_record
-from coupole.commands.campaign import OBJECT
 from coupole.errors import InputError
 from coupole.geometry import transform
 from coupole.plan.plan import Pose

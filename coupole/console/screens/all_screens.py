@@ -9,7 +9,16 @@ from fastapi import FastAPI, Request
 from nicegui import app as nicegui_app
 from nicegui import ui
 
-from coupole.console.screens import object_screen, plan_screen, queue_screen, run_page, run_screen, runs_screen
+from coupole.console.screens import (
+    calibration_screen,
+    object_screen,
+    plan_screen,
+    queue_screen,
+    run_page,
+    run_screen,
+    runs_screen,
+    system_screen,
+)
 from coupole.console.screens.frame import Place, framed
 from coupole.console.screens.visit import Visit
 from coupole.console.service_parts import Service
@@ -23,6 +32,8 @@ SCREENS: dict[Place, Build] = {
     Place("/plan", "Plan", "edit_note"): plan_screen.build,
     Place("/object", "Object and dose", "category"): object_screen.build,
     RUNS: runs_screen.build,
+    Place("/calibration", "Calibration", "straighten"): calibration_screen.build,
+    Place("/system", "System", "settings"): system_screen.build,
 }
 PAGES_BELOW: dict[str, tuple[Place, Build]] = {
     "/runs/{name}": (RUNS, run_page.build),

@@ -171,3 +171,8 @@ class Choice:
             return None
         self.value = str(event.args)
         return self._on_change()
+
+
+def count(number: int, what: str) -> str:
+    """`1 day`, `2 days`."""
+    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"

@@ -99,7 +99,7 @@ class RunActions:
         if await sure(
             f"Archive {self._name}?",
             "Its frames are compressed without loss. Each view is read back and compared before it replaces the "
-            "old file. An archived run cannot be resumed in its finished views.",
+            "old file. Only complete runs are archived.",
             "Archive",
         ):
             await self._begin("archive", ["archive", self._run.folder])

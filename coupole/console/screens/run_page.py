@@ -17,7 +17,9 @@ from coupole.console.screens.frame_viewer import FrameViewer
 from coupole.console.screens.parts import (
     Choice,
     button,
+    count,
     facts,
+    facts_html,
     heading,
     moment,
     named,
@@ -35,7 +37,7 @@ from coupole.storage.run import Run
 from coupole.storage.run_status import Status
 from coupole.viewing.terminal import bytes_text, duration_text
 
-_EVENTS_SHOWN = 200
+_EVENTS_SHOWN, _LOOK_EVERY_S = 200, 2.0
 _READ_UNASKED_BYTES = 2_000_000_000
 """Of frames whose means are read without being asked for."""
 
@@ -81,6 +83,7 @@ def _read(service: Service, name: str) -> _Known:
 class _Page:
     def __init__(self, visit: Visit, known: _Known) -> None:
         self._visit, self._known, self._name = visit, known, known.row.name
+        self._row = known.row
         self._frames: list[SheetFrame] = []
         self._current = ""
         self._of_view: dict[str, list[SheetFrame]] = {}
@@ -108,23 +111,33 @@ class _Page:
                 ui.label(status.state).classes(f"chip {STATE_KINDS.get(status.state, '')}")
                 if row.simulated:
                     ui.label("simulated").classes("chip simulated")
-            left = status.frames_left
-            duration_s = sum(session.duration_s for session in status.sessions)
-            facts(
-                {
-                    "object": row.object or "not named",
-                    "begun": f"{moment(row.created)} UTC by {row.operator or 'nobody named'}",
-                    "took": f"{duration_text(duration_s)} in {_count(len(status.sessions), 'session')}",
-                    "frames": f"{row.proven} of {row.frames} proven" + (f", {left} are missing" if left else ""),
-                    "taken again": f"{status.reshot} shots",
-                    "light on the object": f"{status.dose_lux_h:.3f} lux h",
-                    "size": bytes_text(row.bytes) + (", archived" if row.archived else ""),
-                    "verified": f"{moment(row.verified)} UTC" if row.verified else "not since it last changed",
-                    **({"why it ended": status.reason} if status.reason and status.state != "done" else {}),
-                }
-            ).classes("two-columns")
+            self._facts = ui.html(facts_html(self._told(row)), sanitize=False).classes("two-columns")
+            self._facts.style("width:100%")
+            ui.timer(_LOOK_EVERY_S, self._renew)
             RunActions(self._visit, row.name, left=bool(status.frames_left), frames=row.proven)
             TaskList(self._visit, lambda task: task.words.endswith(f" {self._name}"), empty="", most=4)
+
+    async def _renew(self) -> None:
+        """What commands have changed since."""
+        row = await in_thread(self._visit.service.runs.row, self._name)
+        if row != self._row:
+            self._row = row
+            self._facts.set_content(facts_html(self._told(row)))
+
+    def _told(self, row: RunRow) -> dict[str, str]:
+        status = self._known.status
+        left, duration_s = row.frames - row.proven, sum(session.duration_s for session in status.sessions)
+        return {
+            "object": row.object or "not named",
+            "begun": f"{moment(row.created)} UTC by {row.operator or 'nobody named'}",
+            "took": f"{duration_text(duration_s)} in {count(len(status.sessions), 'session')}",
+            "frames": f"{row.proven} of {row.frames} proven" + (f", {left} are missing" if left else ""),
+            "taken again": f"{status.reshot} shots",
+            "light on the object": f"{status.dose_lux_h:.3f} lux h",
+            "size": bytes_text(row.bytes) + (", archived" if row.archived else ""),
+            "verified": f"{moment(row.verified)} UTC" if row.verified else "not since it last changed",
+            **({"why it ended": status.reason} if status.reason and status.state != "done" else {}),
+        }
 
     def _choosers(self) -> None:
         views = list(self._known.run.about["views"])
@@ -230,10 +243,6 @@ class _Page:
         plain = not (event.modifiers.alt or event.modifiers.ctrl or event.modifiers.meta or event.modifiers.shift)
         if event.action.keydown and plain and event.key.name in ("ArrowLeft", "ArrowRight"):
             await self._step(1 if event.key.name == "ArrowRight" else -1)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _numbers(about: dict[str, Any], status: Status, folder: str) -> dict[str, str]:

@@ -1,0 +1,197 @@
+"""The records in force for a cell: how old they are, how long and how well they hold, which plans they refuse; and
+the campaigns in which new ones are made."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import get_args
+
+from coupole.calibration.campaign_steps import MESH, STEPS, Step
+from coupole.calibration.in_force import NEEDED, InForce, refusals
+from coupole.calibration.record import Kind, Record, read_record
+from coupole.errors import CoupoleError, InputError
+from coupole.plan import yamlfile
+from coupole.plan.cell import Cell, read_cell
+from coupole.plan.reading import read_plan
+from coupole.preflight.checking import situation_of
+from coupole.storage.durable import make_folder
+
+OF_A_CELL = tuple(step for step in STEPS if step.name != MESH)
+"""Steps that need no object."""
+USUAL = tuple(kind for step in OF_A_CELL for kind in step.records)
+"""Kinds of records of a whole cell, in the order in which they are made."""
+_DAY_S = 86400.0
+
+
+@dataclass(frozen=True)
+class RecordRow:
+    """A kind of record, and what is in force of it."""
+
+    kind: str
+    path: Path | None = None
+    """None: no record of this kind is in force."""
+    needed: bool = False
+    """Plans that want calibrations want this kind."""
+    created: str = ""
+    """UTC, ISO 8601."""
+    age_days: float = 0.0
+    left_days: float = 0.0
+    """Until it expires; below 0 when it has."""
+    tightest: str = ""
+    """The limit that is nearest to be missed."""
+    margin: float | None = None
+    """How far below that limit, as a share of it; below 0 when it is missed; None without limits."""
+    against: tuple[str, ...] = ()
+    """Why plans must not use it here."""
+
+
+@dataclass(frozen=True)
+class PlanRow:
+    """A plan of the folder of plans, and what its records say."""
+
+    plan: str
+    wants: bool
+    """It wants calibrations at all."""
+    against: tuple[str, ...]
+    """Why its records refuse it; empty if they do not."""
+
+
+@dataclass(frozen=True)
+class StepNow:
+    """A step of a campaign."""
+
+    step: Step
+    made: tuple[str, ...]
+    """Kinds of its records that are there and accepted."""
+    missed: tuple[str, ...]
+    """Limits that its records miss."""
+
+    @property
+    def done(self) -> bool:
+        return set(self.made) == set(self.step.records)
+
+
+class CalibrationStatus:
+    """Read anew when a file has changed."""
+
+    def __init__(self, cell: Cell, plans: Path) -> None:
+        self.rig_path, self._plans = cell.document.path, plans
+        self._campaigns = cell.storage_folder / "calibrations"
+        self._lock = threading.Lock()
+        self._known: dict[str, tuple[object, object]] = {}
+
+    def records(self) -> list[RecordRow]:
+        """All kinds that a cell usually has, and others in force. Raises InputError: the rig is wrong."""
+        cell = read_cell(self.rig_path)
+        named = cell.rig.calibrations
+        rows = [_row(cell.document.resolve(path), cell) for path in ([] if named == "none" else named)]
+        kinds = [*USUAL, *(kind for kind in get_args(Kind) if kind not in USUAL), ""]
+        found = [row for kind in kinds for row in rows if row.kind == kind]
+        missing = [
+            RecordRow(kind, needed=bool(rows) and kind in NEEDED)
+            for kind in USUAL
+            if kind not in {r.kind for r in found}
+        ]
+        return sorted([*found, *missing], key=lambda row: kinds.index(row.kind))
+
+    def plans(self) -> list[PlanRow]:
+        """Plans for this rig, by name."""
+        with self._lock:
+            return [row for path in sorted(self._plans.rglob("*.yaml")) if (row := self._plan(path)) is not None]
+
+    def _plan(self, path: Path) -> PlanRow | None:
+        try:
+            document = yamlfile.read(path)
+            rig = document.data.get("rig") if "views" in document.data else None
+            if not isinstance(rig, str) or document.resolve(Path(rig)).resolve() != self.rig_path.resolve():
+                return None
+            name = str(path.relative_to(self._plans))
+            files = read_plan(path)
+            if files.record_paths is None:
+                return PlanRow(name, wants=False, against=())
+            named = [InForce(one, self._record(one)) for one in files.record_paths]
+        except InputError as error:
+            return PlanRow(str(path.relative_to(self._plans)), wants=True, against=tuple(str(error).splitlines()))
+        return PlanRow(name, wants=True, against=tuple(refusals(named, situation_of(files.cell.rig))))
+
+    def _record(self, path: Path) -> Record:
+        """Read once for all plans, as long as it is the same file."""
+        changed = path.stat().st_mtime_ns
+        known, record = self._known.get(str(path), (None, None))
+        if known != changed or not isinstance(record, Record):
+            record = read_record(path)
+            self._known[str(path)] = changed, record
+        return record
+
+    # -- campaigns --------------------------------------------------------------------------------------------
+
+    def campaign(self) -> Path | None:
+        """The folder of the newest; None without one."""
+        found = sorted(self._campaigns.iterdir()) if self._campaigns.is_dir() else []
+        return found[-1] if found else None
+
+    def new_campaign(self) -> Path:
+        """A folder for new records. Raises StorageError."""
+        folder = self._campaigns / datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+        make_folder(folder)
+        return folder
+
+    def steps(self, folder: Path) -> list[StepNow]:
+        """How far a campaign is."""
+        return [_step(step, folder) for step in OF_A_CELL]
+
+    def lines_for_the_rig(self, folder: Path) -> str:
+        """What puts a campaign's records in force for all plans of the rig."""
+        paths = [folder / f"{kind}.yaml" for kind in USUAL]
+        there = [os.path.relpath(path, self.rig_path.resolve().parent) for path in paths if path.is_file()]
+        return "\n".join(["calibrations:", *(f"  - {path}" for path in there)])
+
+
+def _row(path: Path, cell: Cell) -> RecordRow:
+    try:
+        record = read_record(path)
+    except CoupoleError as error:
+        return RecordRow("", path, against=tuple(str(error).splitlines()))
+    now = datetime.now(UTC)
+    ratios = [(limit.found / limit.limit, limit) for limit in record.limits if limit.limit > 0]
+    worst = max(ratios, key=lambda one: one[0], default=None)
+    return RecordRow(
+        kind=record.kind,
+        path=path,
+        needed=record.kind in NEEDED,
+        created=record.created.isoformat(),
+        age_days=(now - record.created).total_seconds() / _DAY_S,
+        left_days=(record.validity.expires - now).total_seconds() / _DAY_S,
+        tightest=_limit_words(worst[1].what, worst[1].found, worst[1].limit, worst[1].unit) if worst else "",
+        margin=1 - worst[0] if worst else None,
+        against=tuple(_without(path, refusals([InForce(path, record)], situation_of(cell.rig), needed=()))),
+    )
+
+
+def _step(step: Step, folder: Path) -> StepNow:
+    made, missed = [], []
+    for kind in step.records:
+        path = folder / f"{kind}.yaml"
+        if not path.is_file():
+            continue
+        try:
+            wrong = [limit for limit in read_record(path).limits if not limit.passed]
+        except CoupoleError as error:
+            missed.append(str(error))
+            continue
+        missed += [f"{kind}: {_limit_words(one.what, one.found, one.limit, one.unit)}" for one in wrong]
+        made += [] if wrong else [kind]
+    return StepNow(step, tuple(made), tuple(missed))
+
+
+def _limit_words(what: str, found: float, limit: float, unit: str) -> str:
+    return f"{what}: {found:.3g} of at most {limit:.3g} {unit}".rstrip()
+
+
+def _without(path: Path, reasons: Sequence[str]) -> list[str]:
+    return [reason.removeprefix(f"{path}: ") for reason in reasons]

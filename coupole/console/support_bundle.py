@@ -1,0 +1,155 @@
+"""A zip for whoever is asked for help: rig, plans, journals, what was printed, versions, and who asked for what at
+the console; without frames, and without anything that lets somebody in."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import re
+import shutil
+import sys
+import zipfile
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import coupole
+from coupole.errors import InputError, StorageError
+from coupole.plan.cell import Cell
+from coupole.storage.durable import make_folder
+from coupole.storage.run_json import RUN_JSON
+
+MOST_RUNS, MOST_FILE_BYTES, _MOST_KEPT = 20, 20_000_000, 5
+OF_A_RUN = (RUN_JSON, "journal.jsonl", "README.txt", "manifest.sha256", "inputs/plan.yaml", "inputs/rig.yaml")
+OF_THE_CONSOLE = ("audit.jsonl", "queue.json", "output/*", "commands/*")
+"""Its accounts and the addresses of its notifications stay where they are."""
+LEFT_OUT = "(left out)"
+_KEY = r"[\w.-]*(?:passw(?:or)?d|passphrase|secret|token|credential|api[_-]?key|authorization|cookie)[\w.-]*"
+_VALUE = r""""(?:[^"\\]|\\.)*"|'[^']*'|[^\s,;}\]"'][^\n,;}\]"']*"""
+_SECRETS = (
+    re.compile(rf"""(?i)(["']?{_KEY}["']?\s*[:=]\s*)({_VALUE})"""),
+    re.compile(r"()(\$argon2\w*\$[^\s\"']+)"),
+    re.compile(r"(://[^\s/:@\"']*:)([^\s/@\"']+)(?=@)"),
+    re.compile(r"(?i)(\bBearer\s+)([\w.~+/-]{8,}=*)"),
+)
+_README = """\
+Coupole, support bundle of {t}.
+
+versions.json   this machine, and the versions of what Coupole uses
+disk.json       of the runs
+rig/            the rig, its LED table, and its records of calibrations without their maps
+plans/          the folder of plans
+state/          faults of the arm, and other facts of the cell
+runs/           of the {runs} newest runs: description, journal, plan and rig; no frames
+console/        who asked for what; the queue; what commands and acquisitions printed
+
+There are names of people in it (who asked for what) and of objects. Values of keys that look like passwords or
+tokens are replaced by {left_out}; accounts and notifications are not in it at all.
+"""
+
+
+def without_secrets(text: str) -> str:
+    """The same text, with "(left out)" in place of values that let somebody in."""
+    for secret in _SECRETS:
+        text = secret.sub(lambda found: found[1] + _as_written(found[2]), text)
+    return text
+
+
+def _as_written(value: str) -> str:
+    """JSON and YAML stay what they are."""
+    quote = value[0] if value[:1] in ('"', "'") else ""
+    return f"{quote}{LEFT_OUT}{quote}"
+
+
+class SupportBundles:
+    """Made when somebody asks, and kept until there are newer ones."""
+
+    def __init__(self, cell: Cell, plans: Path, folder: Path) -> None:
+        """`folder`: of the console's state."""
+        self._cell, self._plans, self._console = cell, plans, folder
+        self._folder = folder / "bundles"
+
+    def make(self) -> str:
+        """Name of a new one. Raises StorageError."""
+        name = f"coupole-support-{datetime.now(UTC).strftime('%Y%m%dT%H%M%S%fZ')}.zip"
+        try:
+            make_folder(self._folder)
+            self._folder.chmod(0o700)
+            partial = self._folder / f".{name}.part"
+            with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as bundle:
+                for inside, text in self._texts():
+                    bundle.writestr(inside, text)
+            partial.replace(self._folder / name)
+            for old in sorted(self._folder.glob("*.zip"))[:-_MOST_KEPT]:
+                old.unlink()
+        except OSError as error:
+            raise StorageError(f"{self._folder}: no support bundle can be written: {error.strerror}") from error
+        return name
+
+    def path(self, name: str) -> Path:
+        """Raises InputError: there is none of this name."""
+        found = self._folder / name
+        if not re.fullmatch(r"coupole-support-\w+\.zip", name) or not found.is_file():
+            raise InputError(f"{name!r}: no such support bundle")
+        return found
+
+    def _texts(self) -> Iterator[tuple[str, str]]:
+        """Names inside, and their texts."""
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        yield "README.txt", _README.format(t=now, runs=MOST_RUNS, left_out=LEFT_OUT)
+        yield "versions.json", json.dumps(versions(), indent=2)
+        disk = shutil.disk_usage(self._cell.storage_folder if self._cell.storage_folder.is_dir() else Path.cwd())
+        reserve = self._cell.rig.storage.reserve_bytes
+        yield "disk.json", json.dumps({**disk._asdict(), "reserve": reserve}, indent=2)
+        for inside, path in self._files():
+            if (text := _text(path)) is not None:
+                yield inside, without_secrets(text)
+
+    def _files(self) -> Iterator[tuple[str, Path]]:
+        cell = self._cell
+        rig = cell.document.path
+        yield f"rig/{rig.name}", rig
+        yield f"rig/{cell.leds_path.name}", cell.leds_path
+        for record in cell.rig.calibrations if cell.rig.calibrations != "none" else ():
+            path = cell.document.resolve(record)
+            yield f"rig/calibrations/{path.name}", path
+        others = (cell.storage_folder.resolve(), cell.state_folder.resolve())
+        plans = (
+            path for path in self._plans.rglob("*.yaml") if not any(map(path.resolve().is_relative_to, others))
+        )
+        yield from _below("plans", self._plans, plans)
+        yield from _below("state", cell.state_folder, cell.state_folder.glob("*.jsonl"))
+        yield from _below("state", cell.state_folder, cell.state_folder.glob("*.yaml"))
+        runs = sorted((path.parent for path in cell.storage_folder.glob(f"*/{RUN_JSON}")), reverse=True)
+        for run in runs[:MOST_RUNS]:
+            yield from ((f"runs/{run.name}/{name}", run / name) for name in OF_A_RUN)
+        for pattern in OF_THE_CONSOLE:
+            yield from _below("console", self._console, self._console.glob(pattern))
+
+
+def versions() -> dict[str, str]:
+    """Of Coupole, Python, the system, and the packages that Coupole wants."""
+    found = {"coupole": coupole.__version__, "python": sys.version.split()[0], "system": platform.platform()}
+    for wanted in sorted(importlib.metadata.requires("coupole") or []):
+        name = re.split(r"[\s<>=!~;\[]", wanted, maxsplit=1)[0]
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def _below(inside: str, folder: Path, paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:
+    for path in sorted(paths):
+        yield f"{inside}/{path.relative_to(folder)}", path
+
+
+def _text(path: Path) -> str | None:
+    """None for what is not there, no text, or too long to be sent."""
+    try:
+        if not path.is_file() or path.stat().st_size > MOST_FILE_BYTES:
+            return None
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return None

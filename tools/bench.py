@@ -220,6 +220,15 @@ def bench_reflectance(rounds: int) -> None:
         line(**figure)
 
 
+def bench_console(rounds: int) -> None:
+    """The demo's efficiency while ten people watch it at a console, against that with nobody there; wants an idle
+    machine."""
+    from bench_console import figures
+
+    for figure in figures(ROOT, rounds):
+        line(**figure)
+
+
 def bench_workers(rounds: int) -> None:
     """Fits of the demo's samples by two workers of a cluster, against one; for two idle cores. It acquires the
     demo first, and takes 3 GB of disk."""
@@ -244,6 +253,7 @@ BENCHES: dict[str, Callable[[int], None]] = {
     "calibration": bench_calibration,
     "reflectance": bench_reflectance,
     "workers": bench_workers,
+    "console": bench_console,
 }
 
 

@@ -1,0 +1,187 @@
+"""What ten watchers at a console cost the acquisition: its efficiency with them over that without.
+
+Watchers are clients of the Run screen that speak the screens' own protocol (socket.io over WebSocket) and fetch
+each new picture, as browsers do; they draw nothing, as browsers on other machines cost this one nothing. All is on
+one machine all the same: the cell, the console, the run and the watchers.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+WATCHERS = 10
+_PASSWORD = "a long password"
+_RUNS_TAKE_S = 900.0
+
+
+@dataclass
+class Console:
+    """A served cell, asked as its command line does and as people do."""
+
+    root: Path
+    rig: Path
+    process: subprocess.Popen[str]
+    url: str
+
+    def ask(self, method: str, path: str, body: dict[str, Any] | None = None) -> Any:
+        sys.path.insert(0, str(self.root))
+        from coupole.console.client import call
+        from coupole.plan.cell import read_cell
+
+        return call(read_cell(self.rig), method, path, body)
+
+    def acquire(self, plan: Path) -> dict[str, Any]:
+        """Its figures, when it has ended. Raises RuntimeError: not all was proven."""
+        entry = self.ask("POST", "/api/v1/queue", {"plan": str(plan), "now": True})["id"]
+        end_s = time.monotonic() + _RUNS_TAKE_S
+        while time.monotonic() < end_s:
+            time.sleep(1.0)
+            found = self.ask("GET", f"/api/v1/queue/{entry}/output")
+            if found["entry"]["state"] not in ("waiting", "running"):
+                figures: dict[str, Any] = found["figures"]
+                if found["entry"]["state"] != "done" or figures["missing"]:
+                    raise RuntimeError(f"a run was not complete: {found}")
+                return figures
+        raise RuntimeError("a run took too long")
+
+
+@dataclass
+class Seen:
+    """What a watcher got."""
+
+    updates: int = 0
+    pictures: int = 0
+    bytes: int = 0
+    shots: set[str] = field(default_factory=set)
+
+
+async def _watch(url: str, cookies: dict[str, str], until: asyncio.Event, seen: Seen) -> None:
+    import aiohttp
+    import socketio
+
+    async with aiohttp.ClientSession(cookies=cookies) as http:
+        async with http.get(f"{url}/run") as reply:
+            page = await reply.text()
+        query = {
+            "client_id": _found(r"['\"]client_id['\"]: ?['\"]([0-9a-f-]+)['\"]", page),
+            "document_id": "bench",
+            "tab_id": "bench",
+            "old_tab_id": "",
+            "next_message_id": 0,
+        }
+        client = socketio.AsyncClient(http_session=http)
+
+        async def update(data: Any) -> None:
+            seen.updates += 1
+            for address in re.findall(r"/api/v1/runs/[^\"'\\ ]+", json.dumps(data)):
+                if address not in seen.shots:
+                    seen.shots.add(address)
+                    async with http.get(url + address.replace("&amp;", "&")) as picture:
+                        seen.bytes += len(await picture.read())
+                        seen.pictures += picture.status == 200
+
+        client.on("update", update)
+        headers = {"Origin": url, "Cookie": "; ".join(f"{name}={value}" for name, value in cookies.items())}
+        await client.connect(url, headers, transports=["websocket"], socketio_path="/_nicegui_ws/socket.io")
+        assert await client.call("handshake", query), "the screen did not take the watcher"
+        await until.wait()
+        await client.disconnect()
+
+
+def _found(pattern: str, text: str) -> str:
+    match = re.search(pattern, text)
+    assert match, f"no {pattern} in the page"
+    return match.group(1)
+
+
+def _watchers(url: str) -> None:
+    """Ten of them, until this process is ended; what they saw is printed then."""
+
+    async def work() -> None:
+        import aiohttp
+
+        until, all_seen = asyncio.Event(), [Seen() for _ in range(WATCHERS)]
+        loop = asyncio.get_running_loop()
+        loop.add_reader(sys.stdin, until.set)
+        async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as http:
+            asked = {"name": "Eve", "password": _PASSWORD}
+            async with http.post(f"{url}/api/v1/sign-in", json=asked) as reply:
+                reply.raise_for_status()
+                cookies = {cookie.key: cookie.value for cookie in http.cookie_jar}
+        await asyncio.gather(*(_watch(url, cookies, until, seen) for seen in all_seen))
+        print(json.dumps([[seen.updates, seen.pictures, seen.bytes] for seen in all_seen]))
+
+    asyncio.run(work())
+
+
+def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+    with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as name:
+        folder = Path(name)
+        rig, plan = _cell(root, folder)
+        console = _serve(root, rig, folder)
+        without, watched, seen = [], [], [[0, 0, 0]]
+        try:
+            console.ask("POST", "/api/v1/accounts", {"name": "Eve", "password": _PASSWORD, "role": "observer"})
+            for _ in range(rounds):
+                without.append(console.acquire(plan)["efficiency"])
+                command = [sys.executable, __file__, console.url]
+                with subprocess.Popen(
+                    command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+                ) as watchers:
+                    watched.append(console.acquire(plan)["efficiency"])
+                    seen = json.loads(watchers.communicate("\n")[0])
+        finally:
+            console.process.terminate()
+            console.process.wait()
+    value, peer = statistics.median(watched), statistics.median(without)
+    yield {
+        "name": "efficiency_with_ten_watchers",
+        "value": value,
+        "unit": "ideal/taken",
+        "peer": "nobody_watches",
+        "ratio": value / peer,
+        "updates": min(one[0] for one in seen),
+        "pictures": min(one[1] for one in seen),
+        "mb": round(sum(one[2] for one in seen) / 1e6, 1),
+    }
+
+
+def _cell(root: Path, folder: Path) -> tuple[Path, Path]:
+    """The demo's cell with a storage folder of its own."""
+    from ruamel.yaml import YAML
+
+    yaml = YAML(typ="safe")
+    rig = yaml.load(root / "configs/rigs/sim.yaml")
+    plan = yaml.load(root / "configs/plans/demo.yaml")
+    rig["dome"]["leds"] = str(root / "configs/domes/coupole.csv")
+    rig["storage"] |= {"folder": str(folder / "runs")}
+    rig.pop("calibrations", None)
+    plan |= {"rig": str(folder / "rig.yaml"), "calibrations": "none"}
+    plan["object"]["mesh"] = str((root / "configs/plans" / plan["object"]["mesh"]).resolve())
+    (folder / "rig.yaml").write_text(json.dumps(rig))
+    (folder / "plan.yaml").write_text(json.dumps(plan))
+    return folder / "rig.yaml", folder / "plan.yaml"
+
+
+def _serve(root: Path, rig: Path, folder: Path) -> Console:
+    command = [sys.executable, "-m", "coupole.commands.cli", "serve", str(rig), "--port", "0", "--json"]
+    process = subprocess.Popen(
+        [*command, "--plans", str(folder)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=root
+    )
+    assert process.stdout is not None
+    return Console(root, rig, process, json.loads(process.stdout.readline())["url"])
+
+
+if __name__ == "__main__":
+    _watchers(sys.argv[1])

@@ -15,6 +15,7 @@ import pytest
 from at_the_console import NARROW, WIDE, Visitor
 from browser import Browser, needs_chromium
 from cells import REPO, CellFolder
+from PIL import Image
 from served import Served, served
 
 from sim.world.client import World
@@ -81,6 +82,7 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Day]:
 def test_a_day_at_the_console(day: Day) -> None:
     _signs_in(day)
     _writes_a_plan(day)
+    _looks_at_the_object(day)
     _queues_two(day)
     _pauses_and_goes_on(day)
     _loses_the_browser(day)
@@ -140,6 +142,24 @@ def _writes_a_plan(day: Day) -> None:
 
 def _fills(visitor: Visitor, name: str, words: str) -> None:
     visitor.types(f"input[data-name={name}]", words + "\n")
+
+
+def _looks_at_the_object(day: Day) -> None:
+    ada, photograph = day.visitor, day.folder / "vase.png"
+    Image.effect_noise((640, 480), 90).save(photograph)
+    ada.goes_to("/object")
+    ada.sees("[data-name=light]", "5 lux h, by its plans")
+    ada.at("input[data-name=photograph]").send_keys(str(photograph))
+    ada.sees("[data-name=light]", "in its life")
+    ada.at("img[src*=photograph]")
+    _fills(ada, "amount", "0.25")
+    _fills(ada, "note", "looked at by torch")
+    ada.clicks("[data-name=enter-light]")
+    ada.sees("[data-name=light]", "0.250 lux h")
+    ada.at("[data-name=lies] img")
+    day.picture("the-object")
+    ada.goes_to("/plan")
+    assert "looked at by torch (entered by Ada)" in (day.folder / "ledger/2019.17.jsonl").read_text()
 
 
 def _queues_two(day: Day) -> None:

@@ -16,6 +16,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 import coupole
 from coupole.console.accounts import Role
 from coupole.console.asking import REFUSALS, Who
+from coupole.console.bench_routes import add_bench_routes
 from coupole.console.guard import bearer_of, guard, is_command_line, is_of_this_machine, session_of, sign_in_page
 from coupole.console.messages import Hand, NewAccount, NewEntry, SignIn, StateNow, Text
 from coupole.console.object_routes import add_object_routes
@@ -38,6 +39,7 @@ def make_app(service: Service) -> FastAPI:
     _add_people(app, service)
     add_plan_routes(app, service)
     add_object_routes(app, service)
+    add_bench_routes(app, service)
     return app
 
 

@@ -25,6 +25,7 @@ from coupole.console.acquisitions import Acquisitions
 from coupole.console.api import make_app
 from coupole.console.api_at_the_cell import add_routes_at_the_cell
 from coupole.console.audit import Audit
+from coupole.console.bench import Bench
 from coupole.console.client import service_socket
 from coupole.console.drafts import Desk
 from coupole.console.entering import Entering
@@ -79,24 +80,25 @@ def serve(
         listening = _listen(host, port)
         port = listening.getsockname()[1]
         url = f"{'https' if tls else 'http'}://{_in_url(host)}:{port}"
+        plan_files = PlanFiles(plans, cell.document.path, folder / "drawings")
         with (
             Notifier(settings, occurrences, folder) as notifier,
             Acquisitions(queue, cell, folder / "output") as acquisitions,
             contextlib.closing(Entering(cell, plans, queue, acquisitions)) as entering,
+            Bench(cell, acquisitions, plan_files, folder / "bench") as bench,
         ):
             control = Control()
             runs = RunFiles(cell.storage_folder, folder / "verified")
-            plan_files = PlanFiles(plans, cell.document.path, folder / "drawings")
             objects = ObjectFiles(cell, plan_files, runs, cell.state_folder / "objects")
             tasks, desk = Tasks(folder / "commands"), Desk()
 
             def state() -> StateNow:
                 trouble = "; ".join(filter(None, (audit.trouble, notifier.trouble)))
-                return state_of(cell, queue, acquisitions, control, trouble)
+                return state_of(cell, queue, acquisitions, bench, control, trouble)
 
             service = Service(
                 cell, plans, accounts, Sessions(), control, audit, queue, acquisitions,
-                plan_files, desk, runs, FrameSheets(runs, folder / "means"), RunWatch(runs), objects, tasks,
+                plan_files, desk, runs, FrameSheets(runs, folder / "means"), RunWatch(runs), objects, tasks, bench,
                 state=state,
                 newest=Newest(state),
                 entering=entering,

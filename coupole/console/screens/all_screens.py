@@ -9,7 +9,15 @@ from fastapi import FastAPI, Request
 from nicegui import app as nicegui_app
 from nicegui import ui
 
-from coupole.console.screens import object_screen, plan_screen, queue_screen, run_page, run_screen, runs_screen
+from coupole.console.screens import (
+    devices_screen,
+    object_screen,
+    plan_screen,
+    queue_screen,
+    run_page,
+    run_screen,
+    runs_screen,
+)
 from coupole.console.screens.frame import Place, framed
 from coupole.console.screens.visit import Visit
 from coupole.console.service_parts import Service
@@ -22,6 +30,7 @@ SCREENS: dict[Place, Build] = {
     Place("/queue", "Queue", "format_list_numbered"): queue_screen.build,
     Place("/plan", "Plan", "edit_note"): plan_screen.build,
     Place("/object", "Object and dose", "category"): object_screen.build,
+    Place("/devices", "Devices", "precision_manufacturing"): devices_screen.build,
     RUNS: runs_screen.build,
 }
 PAGES_BELOW: dict[str, tuple[Place, Build]] = {

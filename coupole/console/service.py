@@ -25,7 +25,7 @@ from coupole.console.acquisitions import Acquisitions
 from coupole.console.api import make_app
 from coupole.console.api_at_the_cell import add_routes_at_the_cell
 from coupole.console.audit import Audit
-from coupole.console.bench import Bench
+from coupole.console.bench_keeper import Bench
 from coupole.console.client import service_socket
 from coupole.console.drafts import Desk
 from coupole.console.entering import Entering
@@ -86,11 +86,12 @@ def serve(
             Acquisitions(queue, cell, folder / "output") as acquisitions,
             contextlib.closing(Entering(cell, plans, queue, acquisitions)) as entering,
             Bench(cell, acquisitions, plan_files, folder / "bench") as bench,
+            contextlib.closing(Tasks(folder / "commands")) as tasks,
+            contextlib.closing(Desk()) as desk,
         ):
             control = Control()
             runs = RunFiles(cell.storage_folder, folder / "verified")
             objects = ObjectFiles(cell, plan_files, runs, cell.state_folder / "objects")
-            tasks, desk = Tasks(folder / "commands"), Desk()
 
             def state() -> StateNow:
                 trouble = "; ".join(filter(None, (audit.trouble, notifier.trouble)))
@@ -104,19 +105,21 @@ def serve(
                 entering=entering,
                 origins=_origins(url, [host, *names, *(["localhost", "127.0.0.1"] if _is_here(host) else [])]),
                 cookie=f"coupole_session_{port}",
-                command_line=Session(
-                    Account(f"{getpass.getuser()} (command line)", Role.ENGINEER), 0.0, script=True
-                ),
+                command_line=_command_line(),
             )  # fmt: skip
             tell({"url": url, "token": accounts.first_token, "pid": os.getpid()})
-            app = make_app(service)
-            add_routes_at_the_cell(app, service, cell)
-            add_screens(app, service)
-            try:
-                asyncio.run(_run(app, listening, service_socket(cell), context))
-            finally:
-                tasks.close()
-                desk.close()
+            asyncio.run(_run(_app(service), listening, service_socket(cell), context))
+
+
+def _command_line() -> Session:
+    return Session(Account(f"{getpass.getuser()} (command line)", Role.ENGINEER), 0.0, script=True)
+
+
+def _app(service: Service) -> FastAPI:
+    app = make_app(service)
+    add_routes_at_the_cell(app, service, service.cell)
+    add_screens(app, service)
+    return app
 
 
 # -- sockets --------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from pathlib import Path
 from coupole.console.accounts import Accounts
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.audit import Audit
-from coupole.console.bench import Bench
+from coupole.console.bench_keeper import Bench
 from coupole.console.drafts import Desk
 from coupole.console.entering import Entering
 from coupole.console.frame_sheets import FrameSheets

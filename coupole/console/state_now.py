@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from coupole.console.acquisitions import Acquisitions
-from coupole.console.bench import Bench
+from coupole.console.bench_keeper import Bench
 from coupole.console.messages import EntryNow, StateNow
 from coupole.console.outlook import expected_times
 from coupole.console.plan_queue import PlanQueue

@@ -11,6 +11,7 @@ from nicegui import ui
 
 from coupole.console.screens import (
     devices_screen,
+    focus_screen,
     object_screen,
     plan_screen,
     queue_screen,
@@ -30,6 +31,7 @@ SCREENS: dict[Place, Build] = {
     Place("/queue", "Queue", "format_list_numbered"): queue_screen.build,
     Place("/plan", "Plan", "edit_note"): plan_screen.build,
     Place("/object", "Object and dose", "category"): object_screen.build,
+    Place("/focus", "Focus and expose", "center_focus_strong"): focus_screen.build,
     Place("/devices", "Devices", "precision_manufacturing"): devices_screen.build,
     RUNS: runs_screen.build,
 }

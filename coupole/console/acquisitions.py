@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,8 @@ class Acquisitions:
         self.state: State | None = None
         """Of the run at work, as its process tells it; None if there is none."""
         self.lending = Lending()
+        self.give_way: Callable[[str], object] = lambda _: None
+        """Called, again and again, when something is to begin and something else has the cell, with its name."""
         self._beginning = threading.Lock()
         self._thread = threading.Thread(target=self._watch, name="acquisitions", daemon=True)
 
@@ -124,7 +127,10 @@ class Acquisitions:
             return
         with self._beginning:
             following = self._queue.following
-            if following is None or self._had_by():
+            if following is None:
+                return
+            if self._had_by():
+                self.give_way(following.words)
                 return
             if following.hold:
                 now = utc_now()

@@ -17,6 +17,7 @@ import coupole
 from coupole.console.accounts import Role
 from coupole.console.api_at_the_cell import add_routes_at_the_cell
 from coupole.console.asking import REFUSALS, Who
+from coupole.console.bench_routes import add_bench_routes
 from coupole.console.guard import bearer_of, guard, is_command_line, is_of_this_machine, session_of, sign_in_page
 from coupole.console.messages import Hand, NewAccount, NewEntry, SignIn, StateNow, Text
 from coupole.console.object_routes import add_object_routes
@@ -40,6 +41,7 @@ def make_app(service: Service) -> FastAPI:
     add_plan_routes(app, service)
     add_object_routes(app, service)
     add_routes_at_the_cell(app, service)
+    add_bench_routes(app, service)
     return app
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coupole.console.run_files import RunFiles
 from coupole.errors import CoupoleError, InputError
-from coupole.plan.cell import read_cell
+from coupole.plan.cell import Cell, read_cell
 from coupole.plan.shot_id import Dark, Led, ShotId
 from coupole.storage.durable import make_folder
 from coupole.storage.view_reader import View
@@ -78,14 +78,7 @@ class FrameSheets:
     def places(self, name: str) -> dict[int, LedPlace]:
         """Of all LEDs of the run's own table, by id. Raises InputError."""
         if name not in self._places:
-            cell = read_cell(self._runs.run(name).rig_path)
-            support_from_base = np.linalg.inv(cell.rig.support.base_from_support.matrix())
-            x, y, z = support_from_base[:3, :3] @ cell.leds.positions_mm.T + support_from_base[:3, 3:]
-            azimuths, elevations = np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(z, np.hypot(x, y)))
-            self._places[name] = {
-                int(led): LedPlace(float(azimuth), float(elevation))
-                for led, azimuth, elevation in zip(cell.leds.ids, azimuths, elevations, strict=True)
-            }
+            self._places[name] = places_in(read_cell(self._runs.run(name).rig_path))
         return self._places[name]
 
     def known_means(self, name: str, shots: Sequence[str]) -> dict[str, float]:
@@ -124,6 +117,17 @@ class FrameSheets:
         partial = self._folder / f".{name}.part"
         partial.write_text(json.dumps(kept), encoding="utf-8")
         partial.replace(self._folder / f"{name}.json")
+
+
+def places_in(cell: Cell) -> dict[int, LedPlace]:
+    """Of all LEDs of a cell, by id."""
+    support_from_base = np.linalg.inv(cell.rig.support.base_from_support.matrix())
+    x, y, z = support_from_base[:3, :3] @ cell.leds.positions_mm.T + support_from_base[:3, 3:]
+    azimuths, elevations = np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(z, np.hypot(x, y)))
+    return {
+        int(led): LedPlace(float(azimuth), float(elevation))
+        for led, azimuth, elevation in zip(cell.leds.ids, azimuths, elevations, strict=True)
+    }
 
 
 def led_places(sheets: FrameSheets, name: str) -> dict[int, LedPlace]:

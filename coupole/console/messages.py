@@ -157,7 +157,7 @@ class StateNow(BaseModel):
     arm_fault: str
     """The fault of the arm that stands until a person confirms; empty if there is none."""
     devices: dict[str, Any]
-    """Identities of the devices of the run."""
+    """Identities of the devices that a run, or the bench, has open."""
     lent_to: str
     """To whom the cell is lent, and for what; empty if it is not. Nothing begins meanwhile."""
     queue: list[EntryNow]

@@ -16,6 +16,7 @@ from coupole.console.accounts import Account, Accounts, Role
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.api import make_app
 from coupole.console.audit import Audit
+from coupole.console.bench_keeper import Bench
 from coupole.console.calibration_status import CalibrationStatus
 from coupole.console.client import service_socket
 from coupole.console.drafts import Desk
@@ -87,9 +88,11 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
         runs = RunFiles(cell.storage_folder, folder / "verified")
         plan_files = PlanFiles(plans, cell.document.path, folder / "drawings")
 
+        bench = parts.enter_context(Bench(cell, acquisitions, plan_files, folder / "bench"))
+
         def state() -> StateNow:
             trouble = "; ".join(filter(None, (audit.trouble, notifier.trouble)))
-            return state_of(cell, queue, acquisitions, control, trouble)
+            return state_of(cell, queue, acquisitions, bench, control, trouble)
 
         yield Service(
             cell=cell,
@@ -106,6 +109,7 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
             runs=runs,
             sheets=FrameSheets(runs, folder / "means"),
             watch=RunWatch(runs),
+            bench=bench,
             calibrations=CalibrationStatus(cell, plans),
             bundles=SupportBundles(cell, plans, folder),
             objects=ObjectFiles(cell, plan_files, runs, cell.state_folder / "objects"),

@@ -9,6 +9,7 @@ from pathlib import Path
 from coupole.console.accounts import Accounts
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.audit import Audit
+from coupole.console.bench_keeper import Bench
 from coupole.console.calibration_status import CalibrationStatus
 from coupole.console.drafts import Desk
 from coupole.console.entering import Entering
@@ -51,6 +52,8 @@ class Service:
     """Of the run at work."""
     objects: ObjectFiles
     tasks: Tasks
+    bench: Bench
+    """Holds the devices while no run is at work."""
     state: Callable[[], StateNow]
     """As it is."""
     newest: Callable[[], StateNow]

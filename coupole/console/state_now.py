@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from coupole.console.acquisitions import Acquisitions
+from coupole.console.bench_keeper import Bench
 from coupole.console.messages import EntryNow, StateNow
 from coupole.console.outlook import expected_times
 from coupole.console.plan_queue import PlanQueue
@@ -46,7 +47,9 @@ class Newest:
                 self._state = self._state.model_copy(update={"trouble": str(error), "t": utc_now()})
 
 
-def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: Control, trouble: str) -> StateNow:
+def state_of(
+    cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, bench: Bench, control: Control, trouble: str
+) -> StateNow:
     """The cell at this moment."""
     at_work, entry = acquisitions.state or {}, queue.running
     begun = "halted" if queue.halted else "idle"
@@ -66,7 +69,7 @@ def state_of(cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, control: 
         left_s=at_work.get("left_s"),
         halted=queue.halted,
         arm_fault=faults[-1].message if faults else "",
-        devices=_devices(at_work["run"]) if at_work else {},
+        devices=_devices(at_work["run"]) if at_work else bench.identities,
         lent_to=acquisitions.lending.lent_to,
         queue=_entries_now(queue, at_work.get("left_s")),
         in_control=control.now.name,

@@ -11,6 +11,8 @@ from nicegui import ui
 
 from coupole.console.screens import (
     calibration_screen,
+    devices_screen,
+    focus_screen,
     object_screen,
     plan_screen,
     queue_screen,
@@ -31,6 +33,8 @@ SCREENS: dict[Place, Build] = {
     Place("/queue", "Queue", "format_list_numbered"): queue_screen.build,
     Place("/plan", "Plan", "edit_note"): plan_screen.build,
     Place("/object", "Object and dose", "category"): object_screen.build,
+    Place("/focus", "Focus and expose", "center_focus_strong"): focus_screen.build,
+    Place("/devices", "Devices", "precision_manufacturing"): devices_screen.build,
     RUNS: runs_screen.build,
     Place("/calibration", "Calibration", "straighten"): calibration_screen.build,
     Place("/system", "System", "settings"): system_screen.build,

@@ -119,6 +119,8 @@ def _buttons(visit: Visit) -> None:
                 visit.say(words, bad=bool(trouble))
         elif entry is not None:
             await visit.act(f"stop {entry.id}", lambda: visit.service.acquisitions.stop(entry), acts=False)
+        elif visit.service.bench.phase == "open":
+            await stop_bench(visit)
 
     pausing = button("Pause", pause, icon="pause", name="pause")
     stopping = button("Stop", stop, icon="stop", name="stop", kind="stop")
@@ -129,9 +131,18 @@ def _buttons(visit: Visit) -> None:
         pausing.set_text("Go on" if held else "Pause")
         pausing.props(f"icon={'play_arrow' if held else 'pause'}")
         pausing.set_enabled(visit.may_act and now.run is not None and now.state in _LIVE)
-        stopping.set_enabled(visit.may_act and now.state in (*_LIVE, "starting"))
+        at_work = now.state in (*_LIVE, "starting")
+        stopping.set_enabled(visit.may_act and (at_work or bool(now.devices)))
 
     visit.follow(show)
+
+
+async def stop_bench(visit: Visit) -> None:
+    """Stop what the open devices do."""
+    said = await visit.act("stop the devices", lambda: visit.service.bench.ask("stop"), acts=False)
+    if said is not None:
+        words = "; ".join(said["trouble"]) or "stopped: lights off, arm told to stop"
+        visit.say(words, bad=bool(said["trouble"]))
 
 
 def _person(visit: Visit) -> None:

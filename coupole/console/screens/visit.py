@@ -27,7 +27,8 @@ class Visit:
     def __init__(self, service: Service, request: Request) -> None:
         self.service = service
         self._secret = request.cookies.get(service.cookie, "")
-        self._here, self._address = is_of_this_machine(request), address_of(request)
+        self._here, self.address = is_of_this_machine(request), address_of(request)
+        """Where the browser is, as this machine sees it."""
         self._client: Client = ui.context.client
         self._followers: list[Callable[[StateNow], object]] = []
 
@@ -106,10 +107,15 @@ class Visit:
             self.say(str(error), bad=True)
             return None
         finally:
-            self.service.audit.note(account.name if account else "", f"screen: {action}", status, self._address)
+            self.service.audit.note(account.name if account else "", f"screen: {action}", status, self.address)
         if done:
             self.say(done)
         return found
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether the page is open in a browser at this moment."""
+        return self._client.has_socket_connection
 
     def say(self, words: str, *, bad: bool = False) -> None:
         """A word at the screen's foot; a bad one stays until it is closed."""

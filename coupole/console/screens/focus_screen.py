@@ -1,0 +1,248 @@
+"""Focus and expose: pictures one after the other, how sharp and how bright they are, and what light they cost."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from nicegui import ui
+
+from coupole.console.accounts import Role
+from coupole.console.permission import NotAllowed, allow
+from coupole.console.plan_fields import fields_of
+from coupole.console.screens.bench_bar import BenchBar
+from coupole.console.screens.look_picture import LookPicture
+from coupole.console.screens.meter_panel import MeterPanel
+from coupole.console.screens.parts import button, clipping_words, facts_html, histogram_svg, named, panel
+from coupole.console.screens.picture_settings import PictureSettings
+from coupole.console.screens.sharpness import Sharpness
+from coupole.console.screens.visit import Visit, in_thread
+from coupole.errors import CoupoleError, InputError
+
+_LIVE_S = 60.0
+"""Live pictures end when nobody has touched the page for so long: each is light on the object."""
+_EVERY_S = 0.1
+
+
+def build(visit: Visit) -> None:
+    """Build the screen."""
+    _Screen(visit)
+
+
+class _Screen:
+    def __init__(self, visit: Visit) -> None:
+        self._visit, self._bench = visit, visit.service.bench
+        self._live = self._asking = False
+        self._touched_s, self._given_lux_h, self._taken = 0.0, 0.0, 0
+        self._plan: str | None = None
+        self._white: list[float] | None = None
+        self._settings = PictureSettings(self._touch)
+        with ui.column().classes("screen-part") as whole:
+            bar = ui.column().classes("cell")
+            with ui.element("div").classes("columns focus") as self._parts:
+                with ui.column().classes("gap"):
+                    self._build_picture()
+                    self._build_region()
+                with ui.column().classes("gap"):
+                    self._settings.build_light(visit.service.cell)
+                    self._sharpness = Sharpness()
+                    self._build_figures()
+                    self._meter = MeterPanel(visit)
+            with bar:
+                BenchBar(visit, self._show)
+        for kind in ("pointermove", "pointerdown", "keydown", "wheel"):
+            whole.on(kind, self._touch, args=[], throttle=2.0)
+        ui.timer(_EVERY_S, self._tick)
+
+    def _build_picture(self) -> None:
+        with panel("Picture"):
+            with ui.row().classes("bar"):
+                self._live_button = button("Live", self._toggle, icon="videocam", name="live", kind="main")
+                self._once = button("One picture", self._one, icon="photo_camera", name="expose")
+                self._settings.build_marks(self._set_grid)
+            self._refused = named(ui.label().classes("bad"), "refused").props("role=alert")
+            self._picture = LookPicture(self._visit, self._settings.set_region)
+            self._words = named(ui.label("No picture yet.").classes("hint"), "picture").props("role=status")
+
+    def _set_grid(self, shown: bool) -> None:
+        self._picture.set_grid(shown)
+
+    def _build_region(self) -> None:
+        with panel("Region and loupe"):
+            ui.label("Drag on the picture to draw a region, or give it here.").classes("small")
+            self._settings.build_region(self._picture.set_region)
+            self._picture.build_loupe()
+            button("Loupe in the middle", self._picture.loupe, icon="zoom_in", name="loupe-middle")
+
+    def _build_figures(self) -> None:
+        with panel("Exposure"):
+            self._histogram = ui.html("", sanitize=False).style("width:100%")
+            self._figures = named(ui.html("", sanitize=False), "exposed").style("width:100%")
+            with ui.row().classes("bar"):
+                self._white_button = button(
+                    "White is in the region", self._take_white, icon="colorize", name="white"
+                )
+                button(
+                    "As the sensor sees it", lambda: self._settings.set_white(None), name="no-white", kind="flat"
+                )
+            self._white_words = named(ui.label().classes("small"), "white-words")
+        with panel("Light on the object"):
+            self._dose = named(ui.html("", sanitize=False), "bench-dose").style("width:100%")
+
+    # -- the bench's state --------------------------------------------------------------------------------------
+
+    def _show(self, state: dict[str, Any] | None) -> None:
+        self._parts.set_visibility(state is not None)
+        if state is None:
+            if self._live:
+                self._end_live("the devices are closed")
+            return
+        if self._plan != self._bench.plan:
+            self._plan = self._bench.plan
+            ui.timer(0.0, self._begin_with_the_plan, once=True)
+        work = state["work"] or {}
+        if self._live and work.get("kind") == "meter" and work["state"] == "running":
+            self._end_live("the plan is metered")
+        self._meter.show(work)
+        self._show_dose(state["dose"])
+        self._enable()
+
+    async def _begin_with_the_plan(self) -> None:
+        name, plans = self._bench.plan, self._visit.service.plan_files
+        if not name:
+            return
+        try:
+            fields = fields_of(plans.path(name), await in_thread(plans.read, name))
+        except CoupoleError as error:
+            self._visit.say(str(error), bad=True)
+            return
+        if fields.exposures_us:
+            self._settings.set_exposure(max(fields.exposures_us))
+
+    def _enable(self) -> None:
+        may = self._visit.may_act
+        self._live_button.set_enabled(may)
+        self._live_button.set_text("Live is on: end it" if self._live else "Live")
+        self._live_button.props(f"icon={'videocam_off' if self._live else 'videocam'}")
+        self._once.set_enabled(may and not self._live and not self._asking)
+        self._white_button.set_enabled(self._white is not None)
+
+    # -- pictures -----------------------------------------------------------------------------------------------
+
+    def _touch(self) -> None:
+        self._touched_s = time.monotonic()
+
+    async def _toggle(self) -> None:
+        if self._live:
+            self._end_live("ended")
+            return
+        self._touch()
+        begun = await self._visit.act("live pictures begin", lambda: self._settings.light_words)
+        if begun is not None:
+            self._live, self._taken, self._given_lux_h = True, 0, 0.0
+            self._refused.text = ""
+        self._enable()
+
+    def _end_live(self, why: str) -> None:
+        self._live = False
+        self._words.text = f"Live is off: {why}. It took {self._taken} pictures, {self._given_lux_h:.4f} lux h."
+        visit, account = self._visit, self._visit.account
+        words = f"screen: live pictures end: {self._taken} pictures, {self._given_lux_h:.6f} lux h; {why}"
+        visit.service.audit.note(account.name if account else "", words, 200, visit.address)
+        self._enable()
+
+    async def _tick(self) -> None:
+        if not self._live or self._asking:
+            return
+        if not self._visit.is_watched:
+            self._end_live("the page was closed")
+        elif time.monotonic() - self._touched_s > _LIVE_S:
+            self._end_live(f"nobody has touched this page for {_LIVE_S:g} s")
+        else:
+            await self._expose(live=True)
+
+    async def _one(self) -> None:
+        self._refused.text = ""
+        await self._expose(live=False)
+
+    async def _expose(self, *, live: bool) -> None:
+        self._asking = True
+        found: dict[str, Any] | None = None
+        try:
+            asked, words = self._settings.request(), self._settings.light_words
+            compared = self._settings.compared
+            if live:
+                found = await self._taken_live(asked)
+            else:
+                found = await self._visit.act(f"picture, {words}", lambda: self._asked_once(asked))
+        except (CoupoleError, NotAllowed) as error:
+            self._refused.text = str(error)
+            if live:
+                self._end_live("a picture was refused")
+        finally:
+            self._asking = False
+        if found is not None:
+            self._show_picture(found, asked, words, compared)
+        self._enable()
+
+    async def _taken_live(self, asked: dict[str, Any]) -> dict[str, Any]:
+        account = self._visit.account
+        if account is None:
+            raise NotAllowed(401, "the session is over: sign in again")
+        allow(self._visit.service, account, Role.OPERATOR, "live pictures", acts=True)
+        found = await in_thread(self._bench.ask, "frame", **asked)
+        self._taken += 1
+        self._given_lux_h += found["dose_lux_h"]
+        return found
+
+    def _asked_once(self, asked: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return self._bench.ask("frame", **asked)
+        except InputError as error:
+            self._refused.text = str(error)
+            raise
+
+    def _show_picture(self, found: dict[str, Any], asked: dict[str, Any], words: str, compared: object) -> None:
+        self._picture.show(found, asked["gains"])
+        where = found["region"] or found
+        of = "of the region" if found["region"] else "of the whole picture"
+        self._sharpness.add(where["sharpness"], compared, of)
+        self._histogram.set_content(histogram_svg(where["histograms"]))
+        self._figures.set_content(
+            facts_html(
+                {
+                    f"brightest {of}": f"{where['brightest']:.0%} of full scale",
+                    **clipping_words(where["saturated"]),
+                    "this picture gave": f"{found['dose_lux_h']:.5f} lux h",
+                }
+            )
+        )
+        self._white = found["region"]["white_point"] if found["region"] else None
+        self._white_words.text = _white_words(asked["gains"], found["region"], self._white)
+        self._words.text = f"Picture {found['number']}: {words}"
+        self._show_dose(found["dose"])
+
+    def _take_white(self) -> None:
+        self._settings.set_white(self._white)
+        self._white_words.text = "The next pictures are shown with this white point."
+
+    def _show_dose(self, dose: dict[str, Any]) -> None:
+        rows = {"since the devices were opened": f"{dose['bench_lux_h']:.4f} lux h"}
+        if dose["total_lux_h"] is not None:
+            rows["on the object in its life"] = f"{dose['total_lux_h']:.3f} lux h"
+            left = dose["left_lux_h"]
+            rows["left of its budget"] = "no budget is set" if left is None else f"{left:.4f} lux h"
+        else:
+            rows["object"] = "none; counted at the support's centre"
+        if dose["warning"]:
+            rows["warning"] = dose["warning"]
+        self._dose.set_content(facts_html(rows))
+
+
+def _white_words(gains: list[float], region: dict[str, Any] | None, white: list[float] | None) -> str:
+    shown = "R, G, B times " + ", ".join(f"{gain:.3f}" for gain in gains)
+    if region is None:
+        return f"{shown}. Draw a region on something neutral for another white point."
+    return (
+        shown if white else f"{shown}. The region gives no white point: it is clipped, too dark or has no colours."
+    )

@@ -1,0 +1,95 @@
+"""Metering the plan's exposure, and putting it into the plan."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import replace
+from typing import Any
+
+from nicegui import ui
+
+from coupole.console.plan_fields import fields_of, text_with
+from coupole.console.screens.parts import button, facts_html, named, panel, sure
+from coupole.console.screens.visit import Visit
+
+
+class MeterPanel:
+    """What `coupole meter` does, with the devices that are open."""
+
+    def __init__(self, visit: Visit) -> None:
+        self._visit, self._bench = visit, visit.service.bench
+        self._exposures_us: tuple[int, ...] = ()
+        self._shown: object = None
+        with panel("Meter the plan"):
+            self._words = named(ui.label().classes("hint"), "metering").props("role=status")
+            self._result = named(ui.html("", sanitize=False), "advice").style("width:100%")
+            with ui.row().classes("bar"):
+                self._meter = button("Meter", self._begin, icon="exposure", name="meter")
+                self._put = button("Put this exposure into the plan", self._keep, icon="edit_note", name="put")
+
+    def show(self, work: dict[str, Any]) -> None:
+        """The bench's last work."""
+        plan, may = self._bench.plan, self._visit.may_act
+        known = work, plan, may
+        if known == self._shown:
+            return
+        self._shown = known
+        metering = work.get("kind") == "meter"
+        runs, done = work.get("state") == "running", metering and work.get("state") == "done"
+        self._exposures_us = _exposures_us(work["exposure"]) if done else ()
+        self._words.text = self._words_of(work) if metering else _IDLE if plan else _NO_PLAN
+        self._result.set_content(_advice(work) if done else "")
+        self._meter.set_enabled(may and bool(plan) and not runs)
+        self._put.set_visibility(done and bool(plan))
+        self._put.set_enabled(may)
+
+    def _words_of(self, work: dict[str, Any]) -> str:
+        match work["state"]:
+            case "running":
+                return "The arm goes to the plan's views, and pictures are taken at several exposures."
+            case "done":
+                return f"Metered for {self._bench.plan or work['plan']}."
+        return f"Metering has ended: {work['why']}"
+
+    async def _begin(self) -> None:
+        if not await sure("Meter the plan", _ASKED, "Move the arm and meter"):
+            return
+        await self._visit.act(
+            f"meter {self._bench.plan}", lambda: self._bench.ask("meter", plan=self._bench.plan_path())
+        )
+
+    async def _keep(self) -> None:
+        name, plans, exposures_us = self._bench.plan, self._visit.service.plan_files, self._exposures_us
+
+        def keep() -> str:
+            text, path = plans.read(name), plans.path(name)
+            fields = replace(fields_of(path, text), exposures_us=exposures_us)
+            return plans.write(name, text_with(path, text, fields), text)
+
+        said = ", ".join(f"{one / 1000:g} ms" for one in exposures_us)
+        await self._visit.act(f"exposure of {name}: {said}", keep, acts=False, done=f"{name} has {said} now")
+
+
+_IDLE = (
+    "Finds the exposure at which nothing is clipped and the object stands above the noise, at all of its views."
+)
+_NO_PLAN = "Wants devices that were opened with a plan."
+_ASKED = (
+    "The arm drives to each view of the plan, with light at several exposures. It counts as light on the object."
+)
+
+
+def _exposures_us(exposure: dict[str, Any]) -> tuple[int, ...]:
+    return tuple(exposure["exposures_us"]) if exposure["kind"] == "bracket" else (exposure["exposure_us"],)
+
+
+def _advice(work: dict[str, Any]) -> str:
+    said = ", ".join(f"{one / 1000:g} ms" for one in _exposures_us(work["exposure"]))
+    rows = {"exposure": said}
+    for name, seen in work["views"].items():
+        rows[f"view {name}"] = (
+            f"at least {seen['shortest_us'] / 1000:.2f} ms, at most {seen['longest_us'] / 1000:.2f} ms; object on "
+            f"{seen['object_share']:.0%} of the picture"
+        )
+    remarks = "".join(f'<p class="warm small">{html.escape(remark)}</p>' for remark in work["remarks"])
+    return facts_html(rows) + remarks

@@ -169,6 +169,16 @@ class Visitor:
         ]
 
 
+def assert_usable(visitor: Visitor) -> None:
+    """Whatever is on the screen now, at both sizes, in light and dark."""
+    for size, scheme in ((NARROW, "dark"), (WIDE, "light")):
+        visitor.resizes(size)
+        visitor.prefers(scheme)
+        assert visitor.fits(), (size, visitor.too_wide())
+        assert visitor.barriers() == [], (size, scheme)
+    assert visitor.browser.troubles() == []
+
+
 @cache
 def _axe() -> str:
     package = files("axe_selenium_python")

@@ -12,7 +12,7 @@ from typing import Any
 import cells
 import h5py
 import pytest
-from at_the_console import NARROW, WIDE, Visitor
+from at_the_console import Visitor, assert_usable
 from browser import Browser as Window
 from browser import needs_chromium
 from cells import BLACK_DN, CellFolder
@@ -65,16 +65,6 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
             yield House(cell, cell.run_folder, service, engineer, ada)
         finally:
             window.driver.quit()
-
-
-def assert_usable(visitor: Visitor) -> None:
-    """Whatever is on the screen now, at both sizes, in light and dark."""
-    for size, scheme in ((NARROW, "dark"), (WIDE, "light")):
-        visitor.resizes(size)
-        visitor.prefers(scheme)
-        assert visitor.overflows() <= 0, size
-        assert visitor.barriers() == [], (size, scheme)
-    assert visitor.browser.troubles() == []
 
 
 def leds_above_the_support() -> dict[int, tuple[float, float, float]]:

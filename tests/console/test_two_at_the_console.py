@@ -13,7 +13,7 @@ from typing import Any
 import cells
 import numpy as np
 import pytest
-from at_the_console import Visitor
+from at_the_console import Visitor, assert_usable
 from browser import Browser, needs_chromium
 from cells import CellFolder
 from served import Served, served
@@ -133,6 +133,16 @@ def test_one_acts_the_other_watches_until_control_is_handed_over(two: Two) -> No
     two.max.clicks("[data-name=person]")
     two.max.clicks("[data-name=give]")
     cells.wait_until(lambda: two.state()["in_control"] == "", "nobody in control")
+
+
+SCREENS = (("/run", "No run"), ("/queue", "coffee"), ("/plan", "can be run"), ("/object", "lux h"))
+
+
+@pytest.mark.parametrize(("path", "shows"), SCREENS)
+def test_screens_are_usable_small_and_in_the_dark(two: Two, path: str, shows: str) -> None:
+    two.ada.goes_to(path)
+    two.ada.sees("main", shows)
+    assert_usable(two.ada)
 
 
 def _holds(visitor: Visitor, words: str) -> None:

@@ -109,7 +109,13 @@ def _add_cell(app: FastAPI, service: Service) -> None:
         allow(service, who, Role.OPERATOR, "queue", acts=True)
         request.state.about = asked.plan or asked.resume or asked.hold
         here = is_command_line(request)
-        enter = partial(service.entering.enter, asked, who.name, by_command_line=here)
+
+        def may_still() -> None:
+            if session_of(request, service) is None:
+                raise NotAllowed(401, "the session is over: sign in again")
+            allow(service, who, Role.OPERATOR, "queue", acts=True)
+
+        enter = partial(service.entering.enter, asked, who.name, by_command_line=here, may_still=may_still)
         quick = asked.now or bool(asked.hold)
         limiter = None if quick else service.entering.one_at_a_time
         return await to_thread.run_sync(enter, limiter=limiter, abandon_on_cancel=True)
@@ -145,7 +151,7 @@ def _add_cell(app: FastAPI, service: Service) -> None:
 
 async def _events(service: Service, request: Request) -> AsyncIterator[str]:
     before, said_s = "", 0.0
-    while session_of(request, service) is not None:
+    while session_of(request, service, used=False) is not None:
         now = service.newest()
         known = now.model_dump_json(exclude={"t"})
         if known != before or time.monotonic() - said_s > _ALIVE_EVERY_S:

@@ -4,6 +4,7 @@ answer; also if it was refused."""
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 
 from coupole.errors import StorageError
@@ -17,7 +18,7 @@ class Audit:
 
     def __init__(self, path: Path) -> None:
         make_folder(path.parent)
-        self._file = LineFile(path)
+        self._file, self._lock = LineFile(path), threading.Lock()
         self.trouble = ""
 
     def note(self, name: str, asked: str, status: int, address: str, about: str = "") -> None:
@@ -27,7 +28,8 @@ class Audit:
         if about:
             line["about"] = about
         try:
-            self._file.append([json.dumps(line, ensure_ascii=False) + "\n"])
+            with self._lock:
+                self._file.append([json.dumps(line, ensure_ascii=False) + "\n"])
             self.trouble = ""
         except StorageError as error:
             self.trouble = f"the log cannot be written: {error}"

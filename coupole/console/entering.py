@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +48,12 @@ class Entering:
         if self._checking is not None:
             self._checking.kill()
 
-    def enter(self, asked: NewEntry, by: str, *, by_command_line: bool) -> Entry:
+    def enter(
+        self, asked: NewEntry, by: str, *, by_command_line: bool, may_still: Callable[[], None] = lambda: None
+    ) -> Entry:
         """A new entry. The command line may name files anywhere, other people only plans and runs of this cell's
-        folders. Raises InputError: it cannot be run, with all problems; StorageError."""
+        folders. `may_still` raises if whoever asked may not any more, after preflight. Raises InputError: it
+        cannot be run, with all problems; StorageError."""
         if bool(asked.plan or asked.resume) == bool(asked.hold):
             raise InputError("expected either `plan` or `hold`, or `resume`")
         if asked.hold:
@@ -72,6 +76,7 @@ class Entering:
         assert files is not None
         fields["needs"] = self._needs(files, fields)
         self._refuse(Entry(id="new", by=by, entered="", **fields), asked.before)
+        may_still()
         return self._queue.add(by, before=asked.before, **fields)
 
     def move(self, number: str, before: str) -> None:

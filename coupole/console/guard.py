@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from anyio import to_thread
 from fastapi import FastAPI, Request, Response, WebSocket
 from fastapi.responses import HTMLResponse, JSONResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -43,7 +44,8 @@ def guard(app: FastAPI, service: Service) -> None:
             session = getattr(request.state, "session", None)
             name = session.account.name if session else ""
             asked, about = f"{request.method} {request.url.path}", getattr(request.state, "about", "")
-            service.audit.note(name, asked, response.status_code, address_of(request), about)
+            log = (name, asked, response.status_code, address_of(request), about)
+            await to_thread.run_sync(service.audit.note, *log)
         return response
 
     async def check(request: Request, call_next: Callable[[Request], Any]) -> Response:
@@ -145,12 +147,13 @@ def address_of(request: Request | WebSocket) -> str:
     return request.client.host if request.client else "command line"
 
 
-def session_of(request: Request | WebSocket, service: Service) -> Session | None:
+def session_of(request: Request | WebSocket, service: Service, *, used: bool = True) -> Session | None:
+    """Of who asks; None without one. Looking on does not count as using it."""
     if is_command_line(request):
         return service.command_line
     if bearer := bearer_of(request):
-        return service.sessions.of(bearer, script=True)
-    return service.sessions.of(request.cookies.get(service.cookie, ""), script=False)
+        return service.sessions.of(bearer, script=True, used=used)
+    return service.sessions.of(request.cookies.get(service.cookie, ""), script=False, used=used)
 
 
 def is_of_this_machine(request: Request | WebSocket) -> bool:

@@ -16,6 +16,11 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from coupole.errors import InputError
 from coupole.plan import yamlfile
 
+LONGEST = 100_000
+"""Characters of a plan that is written with a form."""
+MOST_AZIMUTHS = 360
+_LARGEST = 1e12
+"""Numbers beyond it are shown by the text alone."""
 ALL_ROUND = "round"
 """Name of the views that the form makes."""
 
@@ -43,7 +48,9 @@ class PlanFields:
 
 
 def fields_of(path: Path, text: str) -> PlanFields:
-    """Raises InputError: not YAML."""
+    """Raises InputError: not YAML, or too long for a form."""
+    if len(text) > LONGEST:
+        raise InputError(f"a text of more than {LONGEST:,} characters: write it in an editor of texts")
     data = yamlfile.parse(path, text).data
     measured = data.get("object") if isinstance(data.get("object"), dict) else {}
     assert isinstance(measured, dict)
@@ -61,8 +68,14 @@ def fields_of(path: Path, text: str) -> PlanFields:
 def text_with(path: Path, text: str, fields: PlanFields, target_mm: tuple[float, ...] | None = None) -> str:
     """A plan's text with these fields; `target_mm` is where its views look, if they are the form's. Raises
     InputError: not YAML."""
-    yamlfile.parse(path, text)
     before = fields_of(path, text)
+    try:
+        return _rewritten(text, before, fields, target_mm)
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError("the text has another form than the fields can change: write into it") from error
+
+
+def _rewritten(text: str, before: PlanFields, fields: PlanFields, target_mm: tuple[float, ...] | None) -> str:
     yaml = YAML(typ="rt")
     yaml.width, yaml.preserve_quotes = 110, True
     data = yaml.load(text)
@@ -127,7 +140,7 @@ def _exposures(exposure: Any) -> tuple[int, ...]:
         return ()
     several = exposure.get("exposures_us")
     found = several if isinstance(several, list) else [exposure.get("exposure_us")]
-    whole = [value for value in found if isinstance(value, int) and not isinstance(value, bool)]
+    whole = [value for value in map(_whole, found) if value is not None]
     return tuple(whole) if len(whole) == len(found) else ()
 
 
@@ -160,6 +173,8 @@ def _with_views(fields: PlanFields, views: Any) -> PlanFields:
 def _views(fields: PlanFields, target_mm: tuple[float, ...]) -> CommentedSeq:
     if not (fields.azimuths and fields.elevations_deg and fields.distance_mm):
         raise InputError("views all round want a distance, elevations and how many at each")
+    if not 1 <= fields.azimuths <= MOST_AZIMUTHS:
+        raise InputError(f"views at each elevation: expected 1 to {MOST_AZIMUTHS}, found {fields.azimuths}")
     grid = CommentedMap(
         kind="grid",
         name=ALL_ROUND,
@@ -185,8 +200,9 @@ def _target(views: Any) -> tuple[float, ...]:
 
 
 def _number(value: Any) -> float | None:
-    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+    is_one = isinstance(value, int | float) and not isinstance(value, bool)
+    return value if is_one and abs(value) <= _LARGEST else None
 
 
 def _whole(value: Any) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) else None
+    return value if isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _LARGEST else None

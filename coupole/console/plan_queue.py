@@ -213,9 +213,12 @@ class PlanQueue:
             self._kept = self._kept.model_copy(update={"halted": why})
             self._keep(self.entries, why)
 
-    def go_on(self) -> None:
-        """Begin what waits, from now on."""
+    def go_on(self, seen: str | None = None) -> None:
+        """Begin what waits, from now on. Raises InputError: `seen`, why it was halted when somebody decided, is
+        not why it is now."""
         with self._lock:
+            if seen is not None and self.halted not in (seen, ""):
+                raise InputError(f"queue: it waits for something else by now: {self.halted}")
             self._keep(self.entries, "")
 
     def _keep(self, entries: tuple[Entry, ...], halted: str) -> None:

@@ -41,12 +41,14 @@ class Sessions:
     def begin(self, account: Account, *, script: bool) -> str:
         """A new session's secret, which only its browser or script keeps."""
         secret = secrets.token_urlsafe(32)
+        now_s = self._now_s()
         with self._lock:
-            self._by_hash[_hash(secret)] = Session(account, self._now_s(), script)
+            self._by_hash = {key: one for key, one in self._by_hash.items() if now_s - one.seen_s <= IDLE_S}
+            self._by_hash[_hash(secret)] = Session(account, now_s, script)
         return secret
 
-    def of(self, secret: str, *, script: bool) -> Session | None:
-        """The session of this kind with this secret, if it is not over; it counts as used."""
+    def of(self, secret: str, *, script: bool, used: bool = True) -> Session | None:
+        """The session of this kind with this secret, if it is not over; from now on it counts as just `used`."""
         with self._lock:
             session = self._by_hash.get(_hash(secret))
             if session is None or session.script is not script:
@@ -54,7 +56,8 @@ class Sessions:
             if self._now_s() - session.seen_s > IDLE_S:
                 self._by_hash.pop(_hash(secret), None)
                 return None
-            session.seen_s = self._now_s()
+            if used:
+                session.seen_s = self._now_s()
             return session
 
     def end(self, secret: str) -> None:

@@ -3,6 +3,7 @@ the console; without frames, and without anything that lets somebody in."""
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import json
 import platform
@@ -128,6 +129,7 @@ class SupportBundles:
             yield from _below("console", self._console, self._console.glob(pattern))
 
 
+@functools.cache
 def versions() -> dict[str, str]:
     """Of Coupole, Python, the system, and the packages that Coupole wants."""
     found = {"coupole": coupole.__version__, "python": sys.version.split()[0], "system": platform.platform()}

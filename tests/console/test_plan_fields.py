@@ -71,6 +71,27 @@ def test_what_the_form_does_not_know_stays_as_it_is() -> None:
     assert plain == before
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "object: 5\n",
+        "views: 5\n",
+        "views: [{target_mm: [a, b, c]}]\n",
+        "darks_per_view: 99999999999999999999999\n",
+        "object: {dose_budget_lux_h: .inf}\n",
+    ],
+)
+def test_a_text_of_another_form_is_refused_in_words_or_left_as_it_is(text: str) -> None:
+    fields = fields_of(PATH, text)
+    wanted = replace(fields, object_id="vase", own_views=False, distance_mm=335, azimuths=2, elevations_deg=(60,))
+    try:
+        assert fields_of(PATH, text_with(PATH, text, wanted)).object_id == "vase"
+    except InputError as error:
+        assert "another form" in str(error)
+    with pytest.raises(InputError, match="1 to 360"):
+        text_with(PATH, TEXT, replace(wanted, azimuths=10**9))
+
+
 def test_a_plan_is_new_written_over_only_by_who_has_seen_it_and_stays_in_its_folder(tmp_path: Path) -> None:
     cell = CellFolder(tmp_path)
     plans = PlanFiles(tmp_path, cell.rig, tmp_path / "drawings")

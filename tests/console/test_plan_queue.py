@@ -116,6 +116,17 @@ def test_a_plan_waits_while_somebody_else_has_the_devices(
     cells.wait_until(lambda: begun, "the plan")
 
 
+def test_a_queue_that_waits_for_something_else_by_now_does_not_go_on(tmp_path: Path) -> None:
+    queue = PlanQueue(tmp_path / "queue.json")
+    queue.halt("small.yaml: stopped")
+    queue.halt("hold: change the object")
+    with pytest.raises(InputError, match="change the object"):
+        queue.go_on("small.yaml: stopped")
+    assert queue.halted
+    queue.go_on("hold: change the object")
+    assert not queue.halted
+
+
 def test_a_damaged_queue_is_refused(tmp_path: Path) -> None:
     (tmp_path / "queue.json").write_text('{"entries": [{"id": 1}]}')
     with pytest.raises(StorageError, match="the queue cannot be read"):

@@ -130,6 +130,9 @@ def test_one_acts_the_other_watches_until_control_is_handed_over(two: Two) -> No
     two.ada.sees(".q-notification", "Max is in control")
     _holds(two.max, "drink coffee")
     cells.wait_until(lambda: any("coffee" in entry["hold"] for entry in two.state()["queue"]), "Max's hold")
+    _holds(two.max, 'x" :title="window.hacked = 1" b="')
+    two.max.sees("[data-name=waiting]", "window.hacked")
+    assert two.max.browser.run("window.hacked") is None, "words of a person are only words"
     two.max.clicks("[data-name=person]")
     two.max.clicks("[data-name=give]")
     cells.wait_until(lambda: two.state()["in_control"] == "", "nobody in control")

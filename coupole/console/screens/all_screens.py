@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from fastapi import FastAPI, Request
@@ -49,6 +50,7 @@ def add_screens(app: FastAPI, service: Service) -> None:
     """Serve all screens of a cell's console. Everything they need comes from this machine."""
     nicegui_app.colors(primary="var(--accent)", negative="#b00020", positive="#1b6e3c")
     ui.add_css(Path(__file__).parent / "screens.css", shared=True)
+    nicegui_app.on_exception(_say)
     for place, build in SCREENS.items():
         _add(service, place.path, place, build)
     for path, (place, build) in PAGES_BELOW.items():
@@ -62,6 +64,14 @@ def add_screens(app: FastAPI, service: Service) -> None:
         reconnect_timeout=30.0,
         show_welcome_message=False,
     )
+
+
+def _say(error: Exception) -> None:
+    """An error that nobody expected, to whoever met it."""
+    with suppress(RuntimeError, AttributeError):  # nobody did
+        ui.notify(
+            f"{type(error).__name__}: {error}", type="negative", multi_line=True, close_button="close", timeout=0
+        )
 
 
 def _add(service: Service, path: str, place: Place, build: Build) -> None:

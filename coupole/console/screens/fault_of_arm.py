@@ -32,9 +32,13 @@ class FaultOfArm:
         account, cause = self._visit.account, str(self._cause.value or "").strip()
         faults = ArmFaults(self._visit.service.cell.state_folder)
 
+        seen = self._words.text
+
         def confirm() -> bool:
             if not cause or account is None:
                 raise InputError("expected what the cause was")
+            if (standing := faults.standing()) and standing[-1].message != seen:
+                raise InputError(f"another fault stands by now: {standing[-1].message}")
             faults.confirm(account.name, cause)
             return True
 

@@ -25,12 +25,19 @@ def button(
 ) -> ui.button:
     """Of one of the four looks; `name` is its `data-name` in the page."""
     made = ui.button(words, icon=icon, on_click=on_click, color=None)
-    return made.classes(f"b-{kind}").props(f"unelevated no-caps data-name={name}")
+    return named(made.classes(f"b-{kind}").props("unelevated no-caps"), name)
 
 
 def named(element: E, name: str) -> E:
     """The element, with a `data-name` in the page."""
-    return element.props(f"data-name={name}")
+    element._props["data-name"] = name
+    return element
+
+
+def labelled(element: E, words: str) -> E:
+    """The element, with words for who does not see it. They may be anybody's: `props` would take them for more."""
+    element._props["aria-label"] = words
+    return element
 
 
 def panel(title: str = "") -> ui.column:
@@ -109,7 +116,7 @@ def clipping_words(saturated: Mapping[str, float]) -> dict[str, str]:
 
 async def sure(title: str, words: str, yes: str) -> bool:
     """Ask before something that cannot be undone, or takes long."""
-    with ui.dialog().props(f'aria-label="{html.escape(title)}"') as dialog, ui.column().classes("panel ask"):
+    with labelled(ui.dialog(), title) as dialog, ui.column().classes("panel ask"):
         heading(title)
         ui.label(words)
         with ui.row():
@@ -122,7 +129,7 @@ async def sure(title: str, words: str, yes: str) -> bool:
 
 def link(words: str, target: str, *, name: str, new_tab: bool = True) -> ui.link:
     """To a page of this console."""
-    return ui.link(words, target, new_tab=new_tab).props(f"data-name={name}")
+    return named(ui.link(words, target, new_tab=new_tab), name)
 
 
 def moment(t: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from nicegui import ui
 
 from coupole.console.accounts import SHORTEST_PASSWORD, Account, Role
-from coupole.console.screens.parts import Choice, button, panel, sure
+from coupole.console.screens.parts import Choice, button, labelled, panel, sure
 from coupole.console.screens.visit import Visit
 
 _ROLES = {
@@ -49,8 +49,8 @@ class PeoplePanel:
 
             words, name = f"role of {account.name}", f"role-{account.name}"
             role = Choice(words, _ROLES, change, name=name, value=account.role.word)
-            button("Remove", remove, name=f"remove-{account.name}", kind="flat").props(
-                f'aria-label="remove {account.name}"'
+            labelled(
+                button("Remove", remove, name=f"remove-{account.name}", kind="flat"), f"remove {account.name}"
             )
 
     async def _add(self) -> None:

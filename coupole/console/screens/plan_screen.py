@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import html
+import math
 import secrets
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,12 +15,14 @@ from nicegui import ui
 from coupole.console.drafts import Checked, Draft
 from coupole.console.messages import NewEntry, StateNow
 from coupole.console.plan_fields import PlanFields, fields_of, text_with
-from coupole.console.screens.parts import Choice, button, facts_html, heading, named, panel, table_html
+from coupole.console.screens.parts import Choice, button, facts_html, heading, named, panel
+from coupole.console.screens.plan_verdict import figures_of, view_table
 from coupole.console.screens.visit import Visit, enter, in_background, in_thread
 from coupole.errors import InputError, Problem
-from coupole.viewing.terminal import bytes_text, duration_text
 
 _AFTER_TYPING_S = 0.6
+_LONG = 6000
+"""Characters of a text that is not read at every key."""
 _UNITS = {"mm": "mm", "m": "m", "um": "um"}
 _KINDS = {
     "round": "views all round an object",
@@ -126,6 +129,7 @@ class _Screen:
         may = self._visit.may_act and bool(self._name)
         self._save.set_enabled(may and self._text != self._saved)
         self._enter.set_enabled(may)
+        self._editor.set_enabled(self._visit.may_act)
         self._draw.set_enabled(bool(self._name))
 
     # -- the form -----------------------------------------------------------------------------------------------
@@ -204,7 +208,9 @@ class _Screen:
             fields = self._filled_fields()
             if fields == self._fields:
                 return
-            self._show_text(text_with(self._plans.path(self._name), self._text, fields))
+            text = text_with(self._plans.path(self._name), self._text, fields)
+            self._form_says.set_text("")
+            self._show_text(text)
         except InputError as error:
             self._form_says.set_text(str(error))
 
@@ -242,17 +248,23 @@ class _Screen:
         self._state(self._visit.now)
         if not self._name:
             return
-        try:
-            self._show_fields(fields_of(self._plans.path(self._name), self._text))
-        except InputError as error:
-            self._show_problems(error.problems)
-            return
         self._turn += 1
-        turn = self._turn
+        turn, long = self._turn, len(self._text) > _LONG
+
+        def show_fields() -> bool:
+            try:
+                self._show_fields(fields_of(self._plans.path(self._name), self._text))
+            except InputError as error:
+                self._show_problems(error.problems or [Problem(self._name, 0, 0, "", str(error))])
+                return False
+            return True
+
+        if not long and not show_fields():
+            return
 
         async def check() -> None:
             await asyncio.sleep(_AFTER_TYPING_S)
-            if turn != self._turn:
+            if turn != self._turn or (long and not show_fields()):
                 return
             self._verdict.set_content('<p class="hint">checking</p>')
             try:
@@ -277,8 +289,8 @@ class _Screen:
         )
         said += "" if report["refusals"] else "before it begins).</p>"
         said += "".join(f'<p class="warm">{html.escape(words)}</p>' for words in report["warnings"])
-        self._verdict.set_content(said + facts_html(_figures(found)))
-        self._views.set_content(_view_table(found))
+        self._verdict.set_content(said + facts_html(figures_of(found)))
+        self._views.set_content(view_table(found))
 
     def _show_problems(self, problems: Sequence[Problem]) -> None:
         lines = self._text.splitlines()
@@ -329,49 +341,6 @@ class _Screen:
             ).style("width:100%")
 
 
-def _figures(found: Checked) -> dict[str, str]:
-    report = found.report
-    dose = f"{report['dose_lux_h']:.3f} lux h"
-    if report["dose_before_lux_h"]:
-        dose += f" after {report['dose_before_lux_h']:.3f}"
-    if found.budget_lux_h is not None:
-        dose += f" of {found.budget_lux_h:g} in its life"
-    figures = {
-        "views, shots, frames": f"{report['views']}, {report['shots']}, {report['frames']}",
-        "duration": duration_text(report["duration_s"]),
-        "light on the object": dose,
-        "on disk": bytes_text(report["bytes"]),
-        "hottest LED board": f"{report['peak_board_c']:.1f} C",
-        "white is exposed to": "; ".join(
-            f"{white['brightest']:.0%} at {white['exposure_us'] / 1e3:g} ms ({white['verdict']})"
-            for white in report["white"]
-        )
-        or "not known: press Meter in Focus",
-    }
-    if (placed := report["object"]) is not None:
-        sides = zip(placed["low_mm"], placed["high_mm"], strict=True)
-        figures["object"] = " x ".join(f"{high - low:.0f}" for low, high in sides) + " mm"
-        lowest = placed["lowest_over_disk_mm"]
-        figures["it stands"] = "beside the disk" if lowest is None else f"{lowest:.1f} mm above the disk"
-    return figures
-
-
-def _view_table(found: Checked) -> str:
-    framed = {one["view"]: one for one in (found.report["object"] or {}).get("views", [])}
-    rows = []
-    for view in found.views:
-        seen = framed.get(view["name"])
-        field = "-" if seen is None else f"{seen['in_field']:.0%}"
-        sharp = "-" if seen is None or seen["in_focus"] is None else f"{seen['in_focus']:.0%}"
-        times = duration_text(view["duration_s"]), f"{view['dose_lux_h']:.3f}"
-        rows.append((view["name"], *times, _judged(field), _judged(sharp)))
-    return table_html(("view", "time", "lux h", "object in field", "of it sharp"), rows)
-
-
-def _judged(share: str) -> str:
-    return share if share in ("-", "100%") else f"warm|{share}"
-
-
 def _joined(values: Sequence[float]) -> str:
     return ", ".join(f"{value:g}" for value in values)
 
@@ -379,9 +348,12 @@ def _joined(values: Sequence[float]) -> str:
 def _numbers(text: str | None, what: str) -> list[float]:
     """Raises InputError."""
     try:
-        return [float(word) for word in str(text or "").replace(",", " ").split()]
-    except ValueError as error:
-        raise InputError(f"{what}: expected numbers, with commas between; found {text!r}") from error
+        found = [float(word) for word in str(text or "").replace(",", " ").split()]
+    except ValueError:
+        found = [math.nan]
+    if not all(map(math.isfinite, found)):
+        raise InputError(f"{what}: expected numbers, with commas between; found {text!r}")
+    return found
 
 
 def _tidy(value: float) -> float:

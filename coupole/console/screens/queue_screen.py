@@ -8,7 +8,7 @@ from pathlib import Path
 from nicegui import ui
 
 from coupole.console.messages import EntryNow, NewEntry, StateNow
-from coupole.console.screens.parts import Choice, button, named, panel
+from coupole.console.screens.parts import Choice, button, labelled, named, panel
 from coupole.console.screens.visit import Visit, enter, in_thread
 from coupole.viewing.terminal import bytes_text, duration_text
 
@@ -124,7 +124,7 @@ class _Screen:
             ("delete_outline", "take out", lambda: self._take_out(entry), True),
         ):
             made = button("", do, icon=icon, name=words.replace(" ", "-"), kind="flat")
-            made.props(f'dense aria-label="{words}: {entry.words[:80]}"').set_enabled(possible)
+            labelled(made, f"{words}: {entry.words[:80]}").props("dense").set_enabled(possible)
 
 
 def _named(entry: EntryNow) -> str:

@@ -29,7 +29,7 @@ from coupole.console.screens.parts import (
 from coupole.console.screens.run_actions import RunActions
 from coupole.console.screens.runs_screen import STATE_KINDS
 from coupole.console.screens.task_list import TaskList
-from coupole.console.screens.visit import Visit, enter, in_thread
+from coupole.console.screens.visit import Visit, enter, in_long_thread, in_thread
 from coupole.console.service_parts import Service
 from coupole.errors import CoupoleError
 from coupole.storage import journal
@@ -212,7 +212,7 @@ class _Page:
 
         counting = ui.timer(0.5, count)
         try:
-            means = await in_thread(
+            means = await in_long_thread(
                 self._visit.service.sheets.means, self._name, lit, lambda *now: done.__setitem__(slice(None), now)
             )
         except CoupoleError as error:

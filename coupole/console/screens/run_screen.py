@@ -67,7 +67,8 @@ class _Screen:
             f"{waiting} plans wait in the queue."
         )
         self._fault.show(now.arm_fault)
-        last = next((one for one in reversed(now.queue) if one.state in ("done", "failed", "stopped")), None)
+        ended = [one for one in now.queue if one.state in ("done", "failed", "stopped") and not one.hold]
+        last = ended[-1] if ended else None
         known = last.model_dump_json() if last else ""
         if known != self._said:
             self._said = known
@@ -81,16 +82,19 @@ class _Screen:
         run, visit = Path(last.run).name, self._visit
 
         async def resume() -> None:
+            halted = visit.now.halted
+            resuming.set_enabled(False)
             first = next((one.id for one in visit.now.queue if one.state == "waiting"), "")
             if await enter(visit, NewEntry(resume=run, before=first), f"the rest of {run}"):
-                await visit.act("go on with the queue", visit.service.queue.go_on)
+                await visit.act("go on with the queue", lambda: visit.service.queue.go_on(halted))
+            resuming.set_enabled(True)
 
         with self._after:
             ended = {"done": "is complete", "failed": "failed", "stopped": "was stopped"}[last.state]
             ui.label(f"{run or last.words} {ended}" + (f": {last.said}" if last.said else "."))
             with ui.row().classes("bar"):
                 if last.state != "done" and run and visit.may_act:
-                    button("Resume it", resume, icon="play_arrow", name="resume", kind="main")
+                    resuming = button("Resume it", resume, icon="play_arrow", name="resume", kind="main")
                 if run:
                     ui.link("look at it", f"/runs/{run}")
 

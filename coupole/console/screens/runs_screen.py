@@ -8,7 +8,7 @@ from urllib.parse import quote
 from nicegui import events, ui
 
 from coupole.console.run_files import RunRow
-from coupole.console.screens.parts import button, heading, link, moment, panel, picture_address
+from coupole.console.screens.parts import button, heading, labelled, link, moment, panel, picture_address
 from coupole.console.screens.run_actions import RunActions
 from coupole.console.screens.task_list import TaskList
 from coupole.console.screens.visit import Visit, in_thread
@@ -69,7 +69,7 @@ class _Screen:
         if row is None:
             return
         title = f"Actions of {row.name}"
-        with ui.dialog(value=True).props(f'aria-label="{title}"') as dialog, ui.column().classes("panel ask"):
+        with labelled(ui.dialog(value=True), title) as dialog, ui.column().classes("panel ask"):
             heading(row.name)
             link("Open the run", f"/runs/{quote(row.name)}", name="open-run", new_tab=False)
             try:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
 from fastapi import Request
-from nicegui import Client, run, ui
+from nicegui import Client, ui
 
 from coupole.console.accounts import Account, Role
 from coupole.console.guard import account_here, address_of, is_of_this_machine
 from coupole.console.messages import NewEntry, StateNow
 from coupole.console.permission import NotAllowed, allow
+from coupole.console.plan_queue import Entry
 from coupole.console.service_parts import Service
 from coupole.errors import CoupoleError, InputError
 
@@ -35,7 +38,7 @@ class Visit:
     @property
     def account(self) -> Account | None:
         """None when the session is over."""
-        session = self.service.sessions.of(self._secret, script=False)
+        session = self.service.sessions.of(self._secret, script=False, used=False)
         return account_here(session.account, of_this_machine=self._here) if session else None
 
     @property
@@ -64,11 +67,15 @@ class Visit:
 
     def watch(self) -> None:
         """Begin to tell the followers; called once the screen is built."""
-        before = ""
+        before, over = "", False
 
         def tell() -> None:
             nonlocal before
+            nonlocal over
             if self.account is None:
+                if over:
+                    self._client.delete()  # it did not go: it is told nothing more
+                over = True
                 ui.navigate.to("/")
                 return
             now = self.now
@@ -89,15 +96,16 @@ class Visit:
         role: Role = Role.OPERATOR,
         acts: bool = True,
         done: str = "",
+        urgent: bool = False,
     ) -> T | None:
         """Do something in a thread, if this person may; it is logged with its outcome, and the screen says why it
-        was refused. `acts`: only for who is in control. None if it was refused or failed."""
+        was refused. `acts`: only for who is in control; `urgent`: it makes something stop, and waits for nothing
+        else. None if it was refused or failed."""
         account, status = self.account, 200
         try:
-            if account is None:
-                raise NotAllowed(401, "the session is over: sign in again")
-            allow(self.service, account, role, action, acts=acts)
-            found = await in_thread(do)
+            self.service.sessions.of(self._secret, script=False)
+            self.require(action, role, acts=acts)
+            found = await _in(_URGENT if urgent else _ACTING, do)
         except NotAllowed as refusal:
             status = refusal.status
             self.say(str(refusal), bad=True)
@@ -106,11 +114,23 @@ class Visit:
             status = 422 if isinstance(error, InputError) else 409
             self.say(str(error), bad=True)
             return None
+        except Exception as error:
+            status = 500
+            self.say(f"{action}: {type(error).__name__}: {error}", bad=True)
+            raise
         finally:
-            self.service.audit.note(account.name if account else "", f"screen: {action}", status, self.address)
+            line = (account.name if account else "", f"screen: {action}", status, self.address)
+            _LOGGING.submit(self.service.audit.note, *line)
         if done:
             self.say(done)
         return found
+
+    def require(self, action: str, role: Role = Role.OPERATOR, *, acts: bool = True) -> None:
+        """Raise NotAllowed if this person may not do something at this moment."""
+        account = self.account
+        if account is None:
+            raise NotAllowed(401, "the session is over: sign in again")
+        allow(self.service, account, role, action, acts=acts)
 
     @property
     def is_watched(self) -> bool:
@@ -127,22 +147,37 @@ class Visit:
 
 async def enter(visit: Visit, asked: NewEntry, words: str) -> bool:
     """Put something in the queue; preflight is made first. Whether it is in."""
-    service, account = visit.service, visit.account
-    if not asked.hold:
-        visit.say(f"{words}: preflight is made, then it is in the queue")
-    async with service.entering.one_at_a_time:
-        entered = await visit.act(
-            f"queue {words}",
-            lambda: service.entering.enter(asked, account.name if account else "", by_command_line=False),
-            done=f"{words} is in the queue",
-        )
-    return entered is not None
+    entering, account = visit.service.entering, visit.account
+    by = account.name if account else ""
+
+    def do() -> Entry:
+        return entering.enter(asked, by, by_command_line=False, may_still=lambda: visit.require("queue"))
+
+    if asked.hold:
+        return await visit.act(f"queue {words}", do, done=f"{words} is in the queue") is not None
+    visit.say(f"{words}: preflight is made, then it is in the queue")
+    async with entering.one_at_a_time:
+        return await visit.act(f"queue {words}", do, done=f"{words} is in the queue") is not None
 
 
 async def in_thread(do: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
     """Its result; the screens go on meanwhile."""
-    found: T = await run.io_bound(do, *args, **kwargs)  # type: ignore[assignment]  # None only while all ends
-    return found
+    return await _in(_READING, do, *args, **kwargs)
+
+
+async def in_long_thread(do: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """The same for what takes minutes: one of these at a time."""
+    return await _in(_LONG, do, *args, **kwargs)
+
+
+async def _in(pool: ThreadPoolExecutor, do: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    return await asyncio.get_running_loop().run_in_executor(pool, functools.partial(do, *args, **kwargs))
+
+
+_READING, _LONG = ThreadPoolExecutor(8, "reading"), ThreadPoolExecutor(1, "reading for long")
+_ACTING, _URGENT = ThreadPoolExecutor(16, "acting"), ThreadPoolExecutor(8, "stopping")
+_LOGGING = ThreadPoolExecutor(1, "log")
+"""Who looks can keep nobody from acting, and nobody anybody from a stop."""
 
 
 def in_background(work: Callable[[], Awaitable[object]]) -> None:

@@ -1,0 +1,52 @@
+"""What preflight says of a plan, in words for a screen."""
+
+from __future__ import annotations
+
+from coupole.console.drafts import Checked
+from coupole.console.screens.parts import table_html
+from coupole.viewing.terminal import bytes_text, duration_text
+
+
+def figures_of(found: Checked) -> dict[str, str]:
+    """What the plan takes, by its preflight."""
+    report = found.report
+    dose = f"{report['dose_lux_h']:.3f} lux h"
+    if report["dose_before_lux_h"]:
+        dose += f" after {report['dose_before_lux_h']:.3f}"
+    if found.budget_lux_h is not None:
+        dose += f" of {found.budget_lux_h:g} in its life"
+    figures = {
+        "views, shots, frames": f"{report['views']}, {report['shots']}, {report['frames']}",
+        "duration": duration_text(report["duration_s"]),
+        "light on the object": dose,
+        "on disk": bytes_text(report["bytes"]),
+        "hottest LED board": f"{report['peak_board_c']:.1f} C",
+        "white is exposed to": "; ".join(
+            f"{white['brightest']:.0%} at {white['exposure_us'] / 1e3:g} ms ({white['verdict']})"
+            for white in report["white"]
+        )
+        or "not known: press Meter in Focus",
+    }
+    if (placed := report["object"]) is not None:
+        sides = zip(placed["low_mm"], placed["high_mm"], strict=True)
+        figures["object"] = " x ".join(f"{high - low:.0f}" for low, high in sides) + " mm"
+        lowest = placed["lowest_over_disk_mm"]
+        figures["it stands"] = "beside the disk" if lowest is None else f"{lowest:.1f} mm above the disk"
+    return figures
+
+
+def view_table(found: Checked) -> str:
+    """A line for each view, in the order of the visits."""
+    framed = {one["view"]: one for one in (found.report["object"] or {}).get("views", [])}
+    rows = []
+    for view in found.views:
+        seen = framed.get(view["name"])
+        field = "-" if seen is None else f"{seen['in_field']:.0%}"
+        sharp = "-" if seen is None or seen["in_focus"] is None else f"{seen['in_focus']:.0%}"
+        times = duration_text(view["duration_s"]), f"{view['dose_lux_h']:.3f}"
+        rows.append((view["name"], *times, _judged(field), _judged(sharp)))
+    return table_html(("view", "time", "lux h", "object in field", "of it sharp"), rows)
+
+
+def _judged(share: str) -> str:
+    return share if share in ("-", "100%") else f"warm|{share}"

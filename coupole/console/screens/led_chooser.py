@@ -75,6 +75,6 @@ def _svg(places: Mapping[int, LedPlace]) -> str:
         at = f'cx="{far * math.cos(angle):.3f}" cy="{-far * math.sin(angle):.3f}" r="{radius:.3f}"'
         leds.append(f'<circle {at} data-led="{led}"><title>LED {led}</title></circle>')
     return (
-        '<svg viewBox="-1.1 -1.1 2.2 2.2" role="img" aria-label="the dome from above; a click lights an LED or takes '
-        f'it out, as does the field">{"".join(leds)}</svg>'
+        '<svg viewBox="-1.1 -1.1 2.2 2.2" role="img" aria-label="the dome from above; a click lights an LED or '
+        f'takes it out">{"".join(leds)}</svg>'
     )

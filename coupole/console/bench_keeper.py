@@ -43,6 +43,8 @@ class Bench:
         """The plan whose object lies on the support; empty: nothing does, or this console has not begun it."""
         self.state: dict[str, Any] | None = None
         """As the bench told it last; None if there is none."""
+        self.stops = 0
+        """How often somebody has said stop: nothing goes on by itself after one."""
         self.closed_because = ""
         """Why the last one has ended; empty if somebody closed it."""
         self._thread = threading.Thread(target=self._watch, name="bench", daemon=True)
@@ -124,6 +126,7 @@ class Bench:
     def ask(self, command: str, **fields: Any) -> dict[str, Any]:
         """What it answers. Raises InputError with its words where it did not obey."""
         self._acted_s = time.monotonic()
+        self.stops += command == "stop"
         return obeyed(ask_bench(self._cell, command, **fields))
 
     def views(self) -> list[str]:

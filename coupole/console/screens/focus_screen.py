@@ -34,6 +34,7 @@ class _Screen:
         self._visit, self._bench = visit, visit.service.bench
         self._live = self._asking = False
         self._touched_s, self._given_lux_h, self._taken = 0.0, 0.0, 0
+        self._ending, self._stops = "", 0
         self._plan: str | None = None
         self._white: list[float] | None = None
         self._settings = PictureSettings(self._touch)
@@ -134,9 +135,10 @@ class _Screen:
 
     async def _toggle(self) -> None:
         if self._live:
-            self._end_live("ended")
+            self._ending = "ended"
             return
         self._touch()
+        self._ending, self._stops = "", self._bench.stops
         begun = await self._visit.act("live pictures begin", lambda: self._settings.light_words)
         if begun is not None:
             self._live, self._taken, self._given_lux_h = True, 0, 0.0
@@ -154,7 +156,11 @@ class _Screen:
     async def _tick(self) -> None:
         if not self._live or self._asking:
             return
-        if not self._visit.is_watched:
+        if self._ending:
+            self._end_live(self._ending)
+        elif self._stops != self._bench.stops:
+            self._end_live("stopped")
+        elif not self._visit.is_watched:
             self._end_live("the page was closed")
         elif time.monotonic() - self._touched_s > _LIVE_S:
             self._end_live(f"nobody has touched this page for {_LIVE_S:g} s")

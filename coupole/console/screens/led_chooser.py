@@ -76,5 +76,5 @@ def _svg(places: Mapping[int, LedPlace]) -> str:
         leds.append(f'<circle {at} data-led="{led}"><title>LED {led}</title></circle>')
     return (
         '<svg viewBox="-1.1 -1.1 2.2 2.2" role="img" aria-label="the dome from above; a click lights an LED or '
-        f'takes it out, as does the field">{"".join(leds)}</svg>'
+        f'takes it out">{"".join(leds)}</svg>'
     )

@@ -30,7 +30,8 @@ class Sharpness:
         best = max(self._values)
         share = f", {value / best:.0%} of the best so far" if best > 0 else ""
         self._now.text = f"{value:.4f}{share}" if value > 0 else "no more than noise"
-        self._best.text = f"best so far {best:.4f}, {words}; comparable under the same light only"
+        so_far = f"best so far {best:.4f}, " if best > 0 else ""
+        self._best.text = f"{so_far}{words}; comparable under the same light only"
         self._chart.set_content(_chart(self._values[-_KEPT:], best))
 
     def reset(self) -> None:

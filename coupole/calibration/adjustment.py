@@ -19,7 +19,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
@@ -108,7 +108,7 @@ class Adjusted(Generic[S]):
 
 def coverage_factor(degrees: Floats | float, coverage: float = 0.95) -> Floats:
     """k for a two-sided interval, from Student's distribution."""
-    return np.asarray(student.ppf(0.5 + coverage / 2, np.maximum(degrees, 1.0)))
+    return np.asarray(stdtrit(np.maximum(degrees, 1.0), 0.5 + coverage / 2))
 
 
 def adjust(

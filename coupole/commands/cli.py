@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import sys
 import traceback
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -79,11 +80,17 @@ def _options(
 ) -> None: ...
 
 
+@functools.cache
+def _commands() -> Any:
+    """What `app` describes, made once: each of some thirty signatures is read for it."""
+    return typer.main.get_command(app)
+
+
 def main() -> None:
     """Entry point: runs a command and turns Coupole's errors into messages and exit codes."""
     raise_outside_sessions()
     try:
-        code = app(standalone_mode=False)
+        code = _commands()(standalone_mode=False)
     except CoupoleError as error:
         _say(error)
         code = error.exit_code

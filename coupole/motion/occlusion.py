@@ -242,7 +242,7 @@ def hidden_by(
     if len(starts_mm):
         center_mm = starts_mm.mean(axis=0)
         reach_mm = float(np.linalg.norm(starts_mm - center_mm, axis=1).max())
-        _first_met(starts_mm, ends_mm, axes_mm, radii_mm, asked, center_mm, reach_mm, found)
+        _first_met(starts_mm, np.ascontiguousarray(ends_mm), axes_mm, radii_mm, asked, center_mm, reach_mm, found)
     return found
 
 

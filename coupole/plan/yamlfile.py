@@ -11,8 +11,10 @@ lists are accepted as tuples and text as paths.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
+import pickle
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -131,6 +133,13 @@ def read(path: Path) -> Document:
 
 def parse(path: Path, text: str) -> Document:
     """The same of a file's text; `path` is where it is, or was."""
+    return Document(path, *pickle.loads(_parsed(path, text)))
+
+
+@functools.lru_cache(maxsize=64)
+def _parsed(path: Path, text: str) -> bytes:
+    """Data and places of values and keys, pickled: one command reads some files several times, a record of a
+    calibration for a second each, and whoever reads one may change what he was given."""
     tabs = [
         Problem(str(path), number, len(line) - len(line.lstrip(" ")) + 1, "", "a tab; indent with spaces")
         for number, line in enumerate(text.split("\n"), start=1)
@@ -147,7 +156,7 @@ def parse(path: Path, text: str) -> Document:
         builder.complain(root, (), "expected a mapping of keys to values at the top of the file")
     if builder.problems:
         raise InputError(sorted(builder.problems, key=lambda problem: (problem.line, problem.column)))
-    return Document(path, data, builder.value_places, builder.key_places)
+    return pickle.dumps((data, builder.value_places, builder.key_places))
 
 
 def text_of(path: Path) -> str:

@@ -112,7 +112,8 @@ def fit_pool(pool: Pool, starts: TriangleMaterials) -> TriangleMaterials:
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
         list(threads.map(fit, range(count)))
     kd, ks = found[:, :channels], np.minimum(found[:, channels : 2 * channels], MOST_KS)
-    return TriangleMaterials(np.tile([0.0, 0.0, 1.0], (count, 1)), kd, ks, found[:, -2], found[:, -1])
+    parts = np.tile([0.0, 0.0, 1.0], (count, 1)), kd, ks, found[:, -2], found[:, -1]
+    return TriangleMaterials(*map(np.ascontiguousarray, parts))  # functions are compiled for each layout
 
 
 def nearest_cluster(

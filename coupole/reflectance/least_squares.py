@@ -5,6 +5,7 @@ Their own threads are to be turned off by the caller (`one_thread`): whole probl
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import llvmlite.binding
@@ -12,7 +13,7 @@ import numba
 import numpy as np
 from numba import types
 from numba.extending import get_cython_function_address
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 _INT, _DOUBLE, _CHAR = map(types.CPointer, (types.intc, types.float64, types.uint8))
 
@@ -35,7 +36,13 @@ _dtrsm = _routine("blas", "dtrsm", _CHAR, _CHAR, _CHAR, _CHAR, _INT, _INT, _DOUB
 
 def one_thread() -> Any:
     """While it is entered, BLAS takes one thread for each call."""
-    return threadpool_limits(1, user_api="blas")
+    return _libraries().limit(limits=1, user_api="blas")
+
+
+@functools.cache
+def _libraries() -> ThreadpoolController:
+    """Those that this process has loaded, NumPy's and SciPy's BLAS among them, looked for once."""
+    return ThreadpoolController()
 
 
 @numba.njit(cache=True, nogil=True)

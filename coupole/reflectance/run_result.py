@@ -228,8 +228,9 @@ class RunResult:
         """Those of some rows of a view's file, under some of its LEDs [leds]."""
         columns = np.arange(len(view.leds)) if leds is None else np.flatnonzero(leds)
         with h5py.File(view.path, "r") as file:
-            values = (file["f"][rows] if leds is None else file["f"][rows][:, columns]).astype(np.float32)
+            values = file["f"][rows] if leds is None else file["f"][rows][:, columns]
             centres, normals = file["centres_mm"][rows], file["normals"][rows]
+        values = values.astype(np.float32, order="C")
         _times_cosine(values, centres, normals, view.led_mm[columns])
         return TriangleSamples(
             values,

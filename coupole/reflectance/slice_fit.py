@@ -57,11 +57,13 @@ def fit_slices(
 
     def fit(first: int) -> None:
         part = slice(first, min(first + _PART, count))
+        mine = ordered(found[:, part])
         _fit_part(
             ordered(samples.values[part]), ordered(left[:, part]), ordered(samples.led_mm), ordered(camera_mm),
             ordered(samples.centres_mm[part]), ordered(samples.normals[part]), which, fits[0][0].harmonic,
-            penalties, over, found[:, part],
+            penalties, over, mine,
         )  # fmt: skip
+        found[:, part] = mine
 
     with one_thread(), ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(fit, range(0, count, _PART)))
@@ -79,7 +81,7 @@ def slice_values(
     made = np.zeros(samples.values.shape, np.float32)
     if model is not None:
         share = coefficients[..., COUNT]
-        made = np.nan_to_num(share, nan=1.0)[:, None] * model
+        made = ordered(np.nan_to_num(share, nan=1.0)[:, None] * model)
         coefficients = np.nan_to_num(coefficients[..., :COUNT])
     _add_part(
         ordered(coefficients), ordered(samples.led_mm), ordered(samples.cameras_mm[0]),
@@ -134,7 +136,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
     )  # fmt: skip
     for triangle in range(count):
         _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
-        end = 0
+        end = np.int64(0)  # no literal, for which functions would be compiled once more
         while end < channels:
             first, end = end, end + 1
             while end < channels and _same(values[triangle], used, end):

@@ -117,8 +117,8 @@ def fit_triangles(
 
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(fit, range(0, count, _PART)))
-    kd, ks = found[:, 5 : 5 + channels], found[:, 5 + channels :]
-    return TriangleMaterials(found[:, :3], kd, ks, found[:, 3], found[:, 4])
+    parts = found[:, :3], found[:, 5 : 5 + channels], found[:, 5 + channels :], found[:, 3], found[:, 4]
+    return TriangleMaterials(*map(np.ascontiguousarray, parts))  # functions are compiled for each layout
 
 
 def recoloured(

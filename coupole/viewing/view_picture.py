@@ -51,7 +51,9 @@ def write_picture(scene: Scene, path: Path) -> None:
     for k, stop in enumerate(pictures):
         _through_the_camera(sheet, pen, scene, stop, _MARGIN + k * (_CAMERA_WIDTH + _MARGIN), strip_top)
     _column(pen, scene, _MARGIN + len(pictures) * (_CAMERA_WIDTH + _MARGIN) + 8, strip_top)
-    sheet.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=4, dither=Image.Dither.NONE).save(path, optimize=True)
+    quarter = sheet.resize((sheet.width // 2, sheet.height // 2), Image.Resampling.NEAREST)
+    colours = quarter.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=4)
+    sheet.quantize(palette=colours, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 # -- the cell -----------------------------------------------------------------------------------------------------

@@ -61,8 +61,8 @@ def irradiance(
 ) -> NDArray[np.float64]:
     """[n] lux at points [n, 3] with unit normals [n, 3], unobstructed."""
     points, facing = (
-        np.atleast_2d(np.asarray(points_mm, np.float64)),
-        np.atleast_2d(np.asarray(normals, np.float64)),
+        np.atleast_2d(np.ascontiguousarray(points_mm, np.float64)),
+        np.atleast_2d(np.ascontiguousarray(normals, np.float64)),
     )
     out = np.empty(len(points))
     _irradiance(points, facing, packed(emitter), out)

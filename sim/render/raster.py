@@ -64,7 +64,7 @@ def visible_triangles(
     counts = np.zeros((-(-len(corners_mm) // _CHUNK), bands), np.int64)
     _find_bands(corners_mm, camera_from_base, lens_terms, width, height, boxes, counts)
     before = np.concatenate([[0], np.cumsum(counts.T.ravel())])
-    bounds = before[:: len(counts)] if len(counts) else np.zeros(bands + 1, np.int64)
+    bounds = before[:: len(counts)].copy() if len(counts) else np.zeros(bands + 1, np.int64)  # always in order
     members = np.empty(int(before[-1]), np.int32)
     _list_bands(boxes, before[:-1].reshape(bands, -1).T.copy(), members)
     pixels, firsts = np.empty((height, width), np.int32), np.empty(len(members), np.int32)

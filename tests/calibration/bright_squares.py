@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import fftconvolve
 from synthesis import Array
 
 BLACK_DN, WHITE_DN = 64, 4095
@@ -38,6 +37,8 @@ def defocused(picture: Array, diameter_px: float) -> Array:
     reach = int(np.ceil(diameter_px / 2)) + 1
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     disk = np.clip(diameter_px / 2 + 0.5 - np.hypot(x, y), 0.0, 1.0)
+    from scipy.signal import fftconvolve
+
     return np.maximum(fftconvolve(picture, disk / disk.sum(), mode="same"), 0.0)
 
 

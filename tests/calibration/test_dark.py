@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 import pytest
 from light_synthesis import TrueSensor, coverage
-from scipy.stats import t as student
 
 from coupole.calibration.light.dark import DarkFrame, calibrate_dark
 from coupole.errors import InputError
@@ -41,6 +40,8 @@ def test_offset_and_current_of_each_pixel_lie_in_their_intervals() -> None:
     _, offset, current = sensor.pattern()
     found = calibrate_dark(dark_frames(sensor), white_dn=4095)
     u = found.noise_dn * np.sqrt(found.cofactor[0, 0])
+    from scipy.stats import t as student
+
     k = float(student.ppf(0.975, found.degrees_of_freedom))
     inside, _ = coverage(((found.offset_dn - 64 - offset / 3.2) / u).ravel(), k)
     assert 0.93 < inside < 0.97

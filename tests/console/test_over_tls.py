@@ -16,7 +16,6 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-import schemathesis
 from cells import CellFolder
 from hypothesis import HealthCheck, Phase, given, settings
 from served import Browser, served
@@ -108,6 +107,8 @@ def test_nothing_is_said_without_tls_and_the_certificate_is_the_one_that_was_giv
 
 def _wrong(operation: Any) -> Any:
     """Requests that the schema forbids; there are none where it says nothing of what is sent."""
+    import schemathesis
+
     if operation.body.items or operation.path_parameters.items:
         return operation.as_strategy(generation_mode=schemathesis.GenerationMode.NEGATIVE)
     return operation.as_strategy()
@@ -116,6 +117,8 @@ def _wrong(operation: Any) -> Any:
 def test_no_request_that_the_schema_allows_or_forbids_makes_it_fail(
     console: Reached, engineer: Browser, scale: Callable[[int, int], int]
 ) -> None:
+    import schemathesis
+
     document = engineer.get("/openapi.json").document
     counted: dict[str, int] = {}
     for found in schemathesis.openapi.from_dict(document).get_all_operations():

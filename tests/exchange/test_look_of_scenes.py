@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import cells
-import colour
 import numpy as np
 import pytest
 import tmm
@@ -63,6 +62,8 @@ def opened(page: Page, scene: Scene, folder: Path, distance: float = 300.0) -> N
 
 def linear(spectral: np.ndarray, illuminant: str) -> np.ndarray:
     """Linear sRGB of a reflectance [81] by colour-science, 10-degree observer, white 1."""
+    import colour
+
     spectrum = colour.SpectralDistribution(spectral, WAVELENGTHS_NM)
     # The project's illuminant A is Planck's law at 2848 K of the scale of 1948; the shape is given, not looked up.
     power = colour.SpectralDistribution(light.illuminant(illuminant), WAVELENGTHS_NM)
@@ -101,6 +102,8 @@ def test_a_thin_leaf_has_the_colour_of_an_independent_transfer_matrix(tmp_path: 
 def test_gilding_looks_as_in_the_spectral_path_tracer(
     page: Page, tmp_path: Path, material: dict[str, Any]
 ) -> None:
+    import colour
+
     thing = {"kind": "sculpted_relief", "size_mm": 80, "triangles": 3000, "material": material}
     scene = scene_of(thing, illuminant="A", samples=32, depth=1, bands={"step_nm": 20}, observer="2 deg")
     opened(page, scene, tmp_path)

@@ -195,7 +195,7 @@ def test_bilinear_planes_are_as_near_to_interpolation_as_eight_bits_allow(result
     assert rms_dn(np.clip(shown, 0, 1), np.clip(sums, 0, 1)) < 1.5
 
 
-@pytest.mark.parametrize("name", ["bear", "cat"])
+@pytest.mark.parametrize("name", ["bear", pytest.param("cat", marks=pytest.mark.full)])
 def test_planes_of_a_real_object_are_as_good_as_interpolation_under_lights_left_out(
     name: str, tmp_path: Path
 ) -> None:

@@ -1,10 +1,11 @@
-"""A few of the thousands of cases of `tools/fail_every_call.py`, others every day."""
+"""One of the thousands of cases of `tools/fail_every_call.py`, another every day."""
 
 from __future__ import annotations
 
 import datetime
 import random
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import cells
@@ -14,16 +15,16 @@ from failing_calls import KINDS, Failure, acquire, cell_in, count_calls, run_cas
 
 from coupole.acquisition.recorder import RunRecorder
 
-CASES = 2
-
 
 @pytest.mark.timeout(600)
-def test_whatever_call_fails_in_whatever_way_the_cell_is_safe_and_the_run_goes_on(tmp_path: Path) -> None:
+def test_whatever_call_fails_in_whatever_way_the_cell_is_safe_and_the_run_goes_on(
+    tmp_path: Path, scale: Callable[[int, int], int]
+) -> None:
     today = datetime.datetime.now(datetime.UTC).date()
     drawn = random.Random(today.toordinal())
     (tmp_path / "calls").mkdir()
     calls = len(count_calls(tmp_path / "calls"))
-    for number in range(CASES):
+    for number in range(scale(1, 8)):
         k, kind = drawn.randint(1, calls), drawn.choice(KINDS)
         folder = tmp_path / str(number)
         folder.mkdir()

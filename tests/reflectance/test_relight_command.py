@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import av
 import cells
 import cv2
 import numpy as np
@@ -61,6 +60,8 @@ def test_a_video_turns_the_light_once_and_says_what_it_is(folder: Path, tmp_path
     assert ended.code == 0, ended.err
     assert ended.document["white"] == 2.0
     assert ended.document["frames"] == 8
+    import av
+
     with av.open(str(to)) as video:
         assert "simulated object" in video.metadata["comment"]
         assert "white 2" in video.metadata["comment"]

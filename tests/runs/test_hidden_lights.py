@@ -83,7 +83,7 @@ def test_a_run_is_resumed_without_what_it_began_without(hidden: CellFolder) -> N
     assert cells.here("verify", run).code == 0
 
 
-@pytest.mark.parametrize("arm", ["kuka", "ur10e"])
+@pytest.mark.parametrize("arm", ["kuka", pytest.param("ur10e", marks=pytest.mark.full)])
 def test_an_led_that_preflight_calls_hidden_gives_a_dark_frame(tmp_path: Path, arm: str) -> None:
     """The world's arm and the controller's are two pictures of one thing: where the controller finds that an LED
     reaches nothing of what is seen, the simulated frame has hardly any light."""

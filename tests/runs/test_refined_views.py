@@ -18,7 +18,7 @@ from cells import CellFolder
 from drawn_views import RECORDS, Drawn
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 Floats = NDArray[np.float64]
 SHIFTS = ("--arm-mm", "0.2", "--mesh-mm", "0.1", "--shape-mm", "0.15", "--scale-mm", "20", "--search-mm", "4")
@@ -78,7 +78,7 @@ def test_views_that_disagreed_by_more_than_a_millimetre_agree(made: Made) -> Non
 
 def test_poses_come_nearer_to_the_truth_and_lie_in_their_stated_regions(made: Made) -> None:
     before, after, squares = pose_errors(made)
-    assert (squares < chi2.ppf(0.95, 6)).all()
+    assert (squares < chdtri(6, 0.05)).all()
     assert np.linalg.norm(after[:, :3]) < 0.6 * np.linalg.norm(before[:, :3])
     assert np.linalg.norm(after[:, 3:]) < 0.6 * np.linalg.norm(before[:, 3:])
 
@@ -148,7 +148,7 @@ def test_in_drawn_cells_regions_hold_and_errors_shrink(made: Made) -> None:
         meshes.append([np.linalg.norm(before), np.linalg.norm(after)])
         apart.append([one.told["disagreement"][when]["median_mm"] for when in ("before", "after")])
     assert (
-        np.mean(np.array(squares) < chi2.ppf(0.95, 6)) >= 0.85
+        np.mean(np.array(squares) < chdtri(6, 0.05)) >= 0.85
     )  # of 20 cells: fewer than 17 happen in 2 % of tries
     assert np.mean(np.abs(lens) < 1.96) > 0.88
     assert np.mean(inside) > 0.9

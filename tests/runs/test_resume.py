@@ -243,7 +243,11 @@ def standing(tmp_path: Path) -> Iterator[tuple[CellFolder, World]]:
 
 @pytest.mark.parametrize(
     ("number", "code"),
-    [(signal.SIGINT, 130), (signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 129, marks=pytest.mark.full)],
+    [
+        (signal.SIGINT, 130),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.full),
+        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.full),
+    ],
 )
 def test_a_stopped_run_ends_with_its_signal_leaves_the_cell_safe_and_is_resumed(
     standing: tuple[CellFolder, World], number: signal.Signals, code: int

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
@@ -173,7 +173,7 @@ def linear(model: Model, inputs: Inputs, coverages: Sequence[float] = COVERAGES)
     effective = variance**2 / fourth if fourth > 0.0 else float("inf")
     intervals = []
     for coverage in coverages:
-        k = float(student.ppf(0.5 + coverage / 2, min(effective, 1e6)))
+        k = float(stdtrit(min(effective, 1e6), 0.5 + coverage / 2))
         intervals.append(Interval(coverage, estimate - k * combined, estimate + k * combined, "normal"))
     shares = terms.sum(axis=1) / variance if variance > 0.0 else np.zeros(len(u))
     result = Propagated(estimate, combined, tuple(intervals), 0, np.zeros(0))

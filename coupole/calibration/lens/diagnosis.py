@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from coupole.calibration.lens.hand_eye import METHODS, motions, solution
 from coupole.calibration.lens.hypotheses import Expected, Hypothesis, faults, rereadings, scatter_of
@@ -154,7 +154,7 @@ def disagreements(
         ]
     except InputError:
         return ()
-    limit = float(student.ppf(1 - _FALSE_ALARMS / (2 * 6 * len(METHODS)), _RESAMPLED))
+    limit = float(stdtrit(_RESAMPLED, 1 - _FALSE_ALARMS / (2 * 6 * len(METHODS))))
     found = []
     for one, other in combinations(METHODS, 2):
         difference = between(given[one], given[other])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
 
 import numpy as np
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from coupole.calibration.lens.hand_eye import Motions, Solution, motions, park, solution, solve
 from coupole.calibration.poses import Convention, ReportedPoses
@@ -220,4 +220,4 @@ def _by_chance(before: Solution, after: Solution) -> float:
     covariance = (before.scatter.T @ before.scatter + after.scatter.T @ after.scatter) / degrees
     step = between(before.base_from_board, after.base_from_board)
     t_squared = first * second / (first + second) * float(step @ np.linalg.solve(covariance, step))
-    return float(fisher.sf(t_squared * (degrees - size + 1) / (degrees * size), size, degrees - size + 1))
+    return float(fdtrc(size, degrees - size + 1, t_squared * (degrees - size + 1) / (degrees * size)))

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from coupole.calibration.light.irradiance import LED_SIDE_MM, Emission
 from coupole.calibration.light.spectralon import Tile
@@ -228,7 +228,7 @@ def _refuse_moved(
             gain /= noise
             best = max(best, (gain, v, float(np.hypot(*step[: len(columns)])) * share))
         gain, v, tilt_deg = best
-        if gain > chi2_distribution.isf(_UNLIKELY, 3) and tilt_deg > 0.05:
+        if gain > chdtri(3, _UNLIKELY) and tilt_deg > 0.05:
             raise InputError(
                 f"LED power: the tile was moved: view {views[v].name} sees it tilted by {tilt_deg:.2g} "
                 "deg or shifted against the other views of this place. Acquire again, or describe "

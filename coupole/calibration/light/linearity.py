@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from coupole.calibration.light.pairs import BLOCK, Estimate, Pair, refuse_all_clipped
 from coupole.calibration.rotations import Floats
@@ -87,7 +87,7 @@ def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1
     basis = np.stack([_from_line(x, x), _from_line(x, x * x)])
     worst = int(np.argmax(np.abs(deviation)))
     u_worst = float(np.sqrt(max(float(basis[:, worst] @ c_covariance @ basis[:, worst]), 0.0)))
-    unlikely = float(chi2.sf(coefficients @ np.linalg.solve(c_covariance, coefficients), 2))
+    unlikely = float(chdtrc(2, coefficients @ np.linalg.solve(c_covariance, coefficients)))
     _refuse_other_scene(ordered, fit.left, np.isfinite(signals), signals, u_signals)
     return Linearity(
         coefficients if unlikely < significance else np.zeros(2),

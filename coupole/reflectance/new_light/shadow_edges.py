@@ -39,7 +39,7 @@ def reached(mesh: PacketMesh, surface: Surface, beam: Beam) -> Codes:
     _trace(mesh, surface, beam, _asked_on_grid(codes), codes)
     open_cells = np.ones(codes[::CELL_PX, ::CELL_PX].shape, np.bool_)
     in_strips(len(open_cells) - 1, lambda cells: _close_cells(codes, cells.start, open_cells[cells]))
-    fresh = np.argwhere(open_cells)
+    fresh = np.ascontiguousarray(np.argwhere(open_cells))  # functions are compiled for each layout
     while len(fresh):
         _trace(mesh, surface, beam, _asked_in(codes, fresh), codes)
         fresh = _spread(codes, open_cells, fresh)

@@ -272,6 +272,7 @@ def long(tmp_path: Path) -> CellFolder:
     return cell
 
 
+@pytest.mark.full  # in a browser: tests/console/test_a_day_at_the_console.py
 def test_a_plan_is_checked_when_it_is_entered_and_its_run_paused_and_stopped_from_its_page(
     long: CellFolder,
 ) -> None:

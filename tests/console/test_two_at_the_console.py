@@ -171,6 +171,7 @@ def test_a_stop_by_who_watches_puts_the_light_out_at_once(two: Two) -> None:
     two.max.sees("[data-name=alarm]", "stopped")
 
 
+@pytest.mark.full  # over HTTP: tests/console/test_command_line.py
 def test_a_killed_acquisition_leaves_a_dark_cell_and_is_offered_to_be_resumed(two: Two) -> None:
     _empty(two)
     now = two.begins()

@@ -80,10 +80,12 @@ def bursts_left(bursts: Sequence[Burst], proven: Collection[ShotId]) -> list[Bur
 
 
 def views_of_grid(grid: Grid) -> list[LookAt]:
-    """Each of its views, named."""
-    given = grid.model_dump(exclude={"kind", "name", "azimuths_deg", "elevations_deg"}, exclude_unset=True)
+    """Each of its views, named; whether a name is too long is asked elsewhere."""
+    given = {
+        key: getattr(grid, key) for key in grid.model_fields_set & LookAt.model_fields.keys() - {"kind", "name"}
+    }
     return [
-        LookAt(
+        LookAt.model_construct(
             kind="look_at",
             name=f"{grid.name}-az{azimuth:g}-el{elevation:g}",
             azimuth_deg=azimuth,

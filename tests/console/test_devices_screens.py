@@ -256,13 +256,13 @@ def test_a_picture_under_two_leds_and_its_light(room: Room) -> None:
     said = ada.sees("[data-name=exposed]", "this picture gave")
     assert f"{given:.5f} lux h" in said
     assert ada.browser.run("document.querySelector('.look-picture').naturalWidth") > 0
-    lit = ada.browser.run("[...document.querySelectorAll('.led-chooser .lit')].map(one => one.dataset.led)")
+    lit = ada.browser.run("[...document.querySelectorAll('.led-chooser circle')].map(one => one.dataset.led)")
     assert sorted(lit) == ["500", "700"]
     assert words.startswith("Picture ")
-    ada.driver.execute_script(
-        "document.querySelector('.led-chooser [data-led=\"700\"]')"
-        ".dispatchEvent(new MouseEvent('click', {bubbles: true}))"
-    )
+    ada.driver.execute_script("document.querySelector('.led-chooser').scrollIntoView({block: 'center'})")
+    ActionChains(ada.driver, duration=20).move_to_element(
+        ada.at(".led-chooser [data-led='700']")
+    ).click().perform()
     cells.wait_until(lambda: ada.at("input[data-name=leds]").get_attribute("value") == "500", "one LED")
 
 

@@ -27,6 +27,7 @@ class ArmPanel:
     def __init__(self, visit: Visit) -> None:
         self._visit, self._bench = visit, visit.service.bench
         self._path: dict[str, Any] | None = None
+        self._driven = ""
         self._arm: dict[str, Any] = {}
         self._plan: str | None = None
         with ui.element("div").classes("columns"):
@@ -109,10 +110,12 @@ class ArmPanel:
         path = self._path
         if path is None:
             return
-        self._path = None
+        self._path, self._driven = None, path["path"]
         self._enable()
+        self._words.text = f"The arm drives to {path['to']}."
         work = await self._visit.act(f"drive to {path['to']}", lambda: self._bench.ask("drive", path=path["path"]))
-        self._words.text = f"The arm drives to {path['to']}." if work else "Not driven: show the path again."
+        if work is None:
+            self._words.text = "Not driven: show the path again."
 
     def _forget(self) -> None:
         self._path = None
@@ -126,10 +129,9 @@ class ArmPanel:
         self._drive.set_enabled(may and not moving and self._path is not None)
 
     def _show_work(self, work: dict[str, Any]) -> None:
-        if work.get("kind") != "drive" or self._path is not None or work["state"] == "running":
+        if work.get("kind") != "drive" or work["path"] != self._driven or work["state"] == "running":
             return
-        if not self._words.text.startswith("The arm drives"):
-            return
+        self._driven = ""
         self._picture.show_way()
         arrived = f"The arm is at {work['to']}."
         self._words.text = arrived if work["state"] == "done" else f"The arm has stopped: {work['why']}"

@@ -17,7 +17,7 @@ from coupole.console.screens.parts import button, clipping_words, facts_html, hi
 from coupole.console.screens.picture_settings import PictureSettings
 from coupole.console.screens.sharpness import Sharpness
 from coupole.console.screens.visit import Visit, in_thread
-from coupole.errors import CoupoleError, InputError
+from coupole.errors import CoupoleError
 
 _LIVE_S = 60.0
 """Live pictures end when nobody has touched the page for so long: each is light on the object."""
@@ -180,11 +180,10 @@ class _Screen:
             if live:
                 found = await self._taken_live(asked)
             else:
-                found = await self._visit.act(f"picture, {words}", lambda: self._asked_once(asked))
+                found = await self._visit.act(f"picture, {words}", lambda: self._bench.ask("frame", **asked))
         except (CoupoleError, NotAllowed) as error:
-            self._refused.text = str(error)
-            if live:
-                self._end_live("a picture was refused")
+            if not (live and self._stops != self._bench.stops):
+                self._refused.text, self._ending = str(error), "a picture was refused"
         finally:
             self._asking = False
         if found is not None:
@@ -200,13 +199,6 @@ class _Screen:
         self._taken += 1
         self._given_lux_h += found["dose_lux_h"]
         return found
-
-    def _asked_once(self, asked: dict[str, Any]) -> dict[str, Any]:
-        try:
-            return self._bench.ask("frame", **asked)
-        except InputError as error:
-            self._refused.text = str(error)
-            raise
 
     def _show_picture(self, found: dict[str, Any], asked: dict[str, Any], words: str, compared: object) -> None:
         self._picture.show(found, asked["gains"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -14,11 +13,12 @@ from coupole.console.screens.parts import named
 from coupole.errors import InputError
 
 _EMIT = """(e) => {
-  const one = e.target.closest('[data-led]');
-  if (one) emit(Number(one.dataset.led));
+  const svg = e.currentTarget.querySelector('svg');
+  const at = new DOMPoint(e.clientX, e.clientY).matrixTransform(svg.getScreenCTM().inverse());
+  emit([at.x, at.y]);
 }"""
-_MARK = """for (const one of document.querySelectorAll('.led-chooser [data-led]'))
-  one.classList.toggle('lit', %s.includes(Number(one.dataset.led)));"""
+_NEAR = 0.06
+"""Of the dome's radius, within which a click is meant for an LED."""
 
 
 class LedChooser:
@@ -30,9 +30,11 @@ class LedChooser:
         words = "" if first is None else str(first)
         self._field = named(ui.input("LEDs, by their ids", value=words, on_change=self._typed), "leds")
         self._field.classes("field")
-        self._dome = ui.html(_svg(places), sanitize=False).classes("led-chooser")
+        self._at = {led: _at(place) for led, place in places.items()}
+        self._still = "".join(f"M{x:.3f} {y:.3f}h0" for x, y in self._at.values())
+        self._dome = ui.html("", sanitize=False).classes("led-chooser").props("data-name=led-dome")
         self._dome.on("click", self._clicked, js_handler=_EMIT)
-        ui.timer(0.0, self._mark, once=True)
+        self._draw()
 
     @property
     def leds(self) -> list[int]:
@@ -40,23 +42,34 @@ class LedChooser:
         return numbers(str(self._field.value or ""), "LEDs")
 
     def _clicked(self, event: events.GenericEventArguments) -> None:
+        x, y = (float(value) for value in event.args)
+        led = min(self._at, key=lambda one: math.dist(self._at[one], (x, y)), default=None)
+        if led is None or math.dist(self._at[led], (x, y)) > _NEAR:
+            return
         try:
             leds = self.leds
         except InputError:
             leds = []
-        led = int(event.args)
         chosen = [one for one in leds if one != led] if led in leds else [*leds, led]
         self._field.set_value(", ".join(map(str, chosen)))
 
     def _typed(self) -> None:
-        self._mark()
+        self._draw()
         self._on_change()
 
-    def _mark(self) -> None:
+    def _draw(self) -> None:
         try:
-            ui.run_javascript(_MARK % json.dumps(self.leds))
+            lit = [led for led in self.leds if led in self._at]
         except InputError:
             return
+        marks = "".join(
+            f'<circle cx="{x:.3f}" cy="{y:.3f}" r="0.035" data-led="{led}"/>'
+            for led, (x, y) in ((led, self._at[led]) for led in lit)
+        )
+        self._dome.set_content(
+            '<svg viewBox="-1.1 -1.1 2.2 2.2" role="img" aria-label="the dome from above; a click lights an LED '
+            f'or takes it out"><path d="{self._still}"/>{marks}</svg>'
+        )
 
 
 def numbers(text: str, what: str) -> list[int]:
@@ -67,14 +80,7 @@ def numbers(text: str, what: str) -> list[int]:
     return list(dict.fromkeys(map(int, words)))
 
 
-def _svg(places: Mapping[int, LedPlace]) -> str:
-    radius = min(0.06, 0.6 / math.sqrt(max(1, len(places))))
-    leds = []
-    for led, place in places.items():
-        far, angle = 1 - place.elevation_deg / 90, math.radians(place.azimuth_deg)
-        at = f'cx="{far * math.cos(angle):.3f}" cy="{-far * math.sin(angle):.3f}" r="{radius:.3f}"'
-        leds.append(f'<circle {at} data-led="{led}"><title>LED {led}</title></circle>')
-    return (
-        '<svg viewBox="-1.1 -1.1 2.2 2.2" role="img" aria-label="the dome from above; a click lights an LED or '
-        f'takes it out">{"".join(leds)}</svg>'
-    )
+def _at(place: LedPlace) -> tuple[float, float]:
+    """On the picture: the zenith in the middle, elevation 0 at a radius of 1."""
+    far, angle = 1 - place.elevation_deg / 90, math.radians(place.azimuth_deg)
+    return far * math.cos(angle), -far * math.sin(angle)

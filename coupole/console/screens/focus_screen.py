@@ -34,6 +34,7 @@ class _Screen:
         self._visit, self._bench = visit, visit.service.bench
         self._live = self._asking = False
         self._touched_s, self._given_lux_h, self._taken = 0.0, 0.0, 0
+        self._stops = 0
         self._plan: str | None = None
         self._white: list[float] | None = None
         self._settings = PictureSettings(self._touch)
@@ -137,11 +138,16 @@ class _Screen:
             self._end_live("ended")
             return
         self._touch()
-        begun = await self._visit.act("live pictures begin", lambda: self._settings.light_words)
-        if begun is not None:
+        stops = await self._visit.act("live pictures begin", self._stops_so_far)
+        if stops is not None:
+            self._stops = stops
             self._live, self._taken, self._given_lux_h = True, 0, 0.0
             self._refused.text = ""
         self._enable()
+
+    def _stops_so_far(self) -> int:
+        stops: int = self._bench.ask("state")["stops"]
+        return stops
 
     def _end_live(self, why: str) -> None:
         self._live = False
@@ -158,8 +164,16 @@ class _Screen:
             self._end_live("the page was closed")
         elif time.monotonic() - self._touched_s > _LIVE_S:
             self._end_live(f"nobody has touched this page for {_LIVE_S:g} s")
+        elif self._was_stopped:
+            self._end_live("it was stopped")
         else:
             await self._expose(live=True)
+
+    @property
+    def _was_stopped(self) -> bool:
+        """Since live pictures began, as far as is known; the bench itself refuses the next one in any case."""
+        state = self._bench.state
+        return state is not None and state["stops"] > self._stops
 
     async def _one(self) -> None:
         self._refused.text = ""
@@ -178,7 +192,7 @@ class _Screen:
         except (CoupoleError, NotAllowed) as error:
             self._refused.text = str(error)
             if live:
-                self._end_live("a picture was refused")
+                self._end_live("it was stopped" if self._was_stopped else "a picture was refused")
         finally:
             self._asking = False
         if found is not None:
@@ -190,7 +204,7 @@ class _Screen:
         if account is None:
             raise NotAllowed(401, "the session is over: sign in again")
         allow(self._visit.service, account, Role.OPERATOR, "live pictures", acts=True)
-        found = await in_thread(self._bench.ask, "frame", **asked)
+        found = await in_thread(self._bench.ask, "frame", **asked, stops=self._stops)
         self._taken += 1
         self._given_lux_h += found["dose_lux_h"]
         return found

@@ -121,6 +121,17 @@ class Bench:
             self._closing = f"closed, because {what} begins"
             threading.Thread(target=self._close, args=(self._closing,), daemon=True).start()
 
+    def stop(self) -> list[str]:
+        """Stop what it does; what is not sure then. One that does not obey (it is being opened or closed) is
+        ended, as by Ctrl-C. Raises InputError: it is not this console's, and does not obey."""
+        try:
+            return list(self.ask("stop")["trouble"])
+        except InputError:
+            if (task := self._running) is None:
+                raise
+            task.stop()
+            return ["not sure: the devices do not answer; their process was told to make the cell safe and end"]
+
     def ask(self, command: str, **fields: Any) -> dict[str, Any]:
         """What it answers. Raises InputError with its words where it did not obey."""
         self._acted_s = time.monotonic()

@@ -25,7 +25,7 @@ from typing import Any, Literal
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import Safeguard, unsure
 from coupole.acquisition.runtime_folder import named_after, runtime_folder
-from coupole.acquisition.user_socket import UserSocket, exchange
+from coupole.acquisition.user_socket import PATIENCE_S, UserSocket, exchange
 from coupole.errors import InputError, reason
 from coupole.viewing.progress import Progress
 
@@ -35,6 +35,7 @@ State = dict[str, Any]
 """`run`, `rig`, `pid`, `light_after_lux_h`, `state` (running, pausing, paused, stopping); from the first burst on
 `Progress` too."""
 _SAFE_WITHIN_S = 4.0
+_LOOK_PATIENCE_S = 0.5
 
 
 # -- the side of the acquisition ------------------------------------------------------------------------------
@@ -123,22 +124,23 @@ def ask(run: Path, command: Command) -> State:
 
 def running() -> list[State]:
     """States of all acquisitions of this user on this machine, the newest last; one that does not answer is
-    `silent`."""
+    `silent`, and known only by its `socket`, a file's name."""
     return sorted(_running(), key=lambda state: str(Path(state["run"]).name))
 
 
 def _running() -> Iterator[State]:
     for path in runtime_folder().glob("*.sock"):
         try:
-            yield _exchange(path, "state")
+            yield _exchange(path, "state", _LOOK_PATIENCE_S)
         except (ConnectionRefusedError, FileNotFoundError):  # of a process that was killed, or has just ended
             continue
         except (OSError, ValueError) as error:
-            yield {"version": VERSION, "run": "", "rig": "", "pid": 0, "state": "silent", "trouble": [str(error)]}
+            about = {"version": VERSION, "run": "", "rig": "", "pid": 0, "socket": path.name}
+            yield {**about, "state": "silent", "trouble": [str(error)]}
 
 
-def _exchange(path: Path, command: Command) -> State:
-    found = exchange(path, {"version": VERSION, "command": command})
+def _exchange(path: Path, command: Command, patience_s: float = PATIENCE_S) -> State:
+    found = exchange(path, {"version": VERSION, "command": command}, patience_s)
     if "error" in found:
         raise ValueError(found["error"])
     return found

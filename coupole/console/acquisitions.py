@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from coupole.acquisition.run_control import Command, State, ask, running
-from coupole.acquisition.runtime_folder import is_in_use
+from coupole.acquisition.runtime_folder import is_in_use, named_after
 from coupole.console.lending import Lending
 from coupole.console.plan_queue import Entry, PlanQueue
 from coupole.errors import CoupoleError, InputError
@@ -60,11 +60,22 @@ class Acquisitions:
         self._thread.join()
 
     def tell(self, run: str, command: Command) -> State:
-        """`pause`, `go-on` or `stop` to the run with this name. Raises InputError: it is not being acquired."""
+        """`pause`, `go-on` or `stop` to the run with this name; one that the queue has begun and that does not
+        answer is stopped as by Ctrl-C. Raises InputError: it is not being acquired, or does not answer."""
         for state in [self.state] if self.state and Path(self.state["run"]).name == run else running():
             if Path(state["run"]).name == run and self._is_ours(state):
-                return ask(Path(state["run"]), command)
+                return self._told(state, command)
         raise InputError(f"{run}: is not being acquired in this cell")
+
+    def _told(self, state: State, command: Command) -> State:
+        try:
+            return ask(Path(state["run"]), command)
+        except InputError:
+            entry = self._queue.running
+            if command != "stop" or entry is None or entry.pid != state["pid"]:
+                raise
+            self.stop(entry)
+            return {**state, "trouble": ["not sure: the run does not answer; its process was told to end"]}
 
     def stop(self, entry: Entry) -> None:
         """Stop what an entry has begun, also before its run has a name: as Ctrl-C does. Raises InputError."""
@@ -121,7 +132,7 @@ class Acquisitions:
 
     def _look(self) -> None:
         entry = self._queue.running
-        self.state = next((state for state in running() if self._is_ours(state)), None)
+        self.state = self._at_work()
         if entry is not None:
             self._look_after(entry)
             return
@@ -137,6 +148,18 @@ class Acquisitions:
                 self._queue.conclude(following.id, halt=following.words, state="done", begun=now, ended=now)
             else:
                 self._begin(following)
+
+    def _at_work(self) -> State | None:
+        """The state of this cell's run; `silent`, and else as last known, while its process does not answer."""
+        found, entry = running(), self._queue.running
+        last = self.state
+        if last is None and entry is not None and entry.run:  # begun by a service before this one
+            last = {"run": entry.run, "rig": self._rig, "pid": entry.pid, "light_after_lux_h": {}}
+        if last is not None:
+            socket = named_after(Path(last["run"]), "sock").name
+            if any(state["state"] == "silent" and state["socket"] == socket for state in found):
+                return {**last, "state": "silent"}
+        return next((state for state in found if self._is_ours(state)), None)
 
     def _begin(self, entry: Entry) -> None:
         self._queue.change(entry.id, state="running", begun=utc_now())  # first: it must never be begun twice

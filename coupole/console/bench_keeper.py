@@ -43,8 +43,6 @@ class Bench:
         """The plan whose object lies on the support; empty: nothing does, or this console has not begun it."""
         self.state: dict[str, Any] | None = None
         """As the bench told it last; None if there is none."""
-        self.stops = 0
-        """How often somebody has said stop: nothing goes on by itself after one."""
         self.closed_because = ""
         """Why the last one has ended; empty if somebody closed it."""
         self._thread = threading.Thread(target=self._watch, name="bench", daemon=True)
@@ -123,10 +121,20 @@ class Bench:
             self._closing = f"closed, because {what} begins"
             threading.Thread(target=self._close, args=(self._closing,), daemon=True).start()
 
+    def stop(self) -> list[str]:
+        """Stop what it does; what is not sure then. One that does not obey (it is being opened or closed) is
+        ended, as by Ctrl-C. Raises InputError: it is not this console's, and does not obey."""
+        try:
+            return list(self.ask("stop")["trouble"])
+        except InputError:
+            if (task := self._running) is None:
+                raise
+            task.stop()
+            return ["not sure: the devices do not answer; their process was told to make the cell safe and end"]
+
     def ask(self, command: str, **fields: Any) -> dict[str, Any]:
         """What it answers. Raises InputError with its words where it did not obey."""
         self._acted_s = time.monotonic()
-        self.stops += command == "stop"
         return obeyed(ask_bench(self._cell, command, **fields))
 
     def views(self) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,6 +55,13 @@ class Lending:
             except OSError as error:
                 raise InputError(f"process {pid}: {error.strerror}") from error
             self._loan = _Loan(pid, process, f"{who}: {what}")
+
+    def interrupt(self) -> None:
+        """End what the cell is lent for, as Ctrl-C does. Raises InputError: it is not lent."""
+        with self._lock:
+            if not self.lent_to or self._loan is None:
+                raise InputError("the cell is not lent")
+            signal.pidfd_send_signal(self._loan.process, signal.SIGINT)
 
     def give_back(self, pid: int) -> None:
         """Raises InputError: this process has not borrowed it."""

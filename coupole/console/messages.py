@@ -125,9 +125,12 @@ class StateNow(BaseModel):
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
-    state: Literal["idle", "starting", "running", "pausing", "paused", "stopping", "concluding", "halted"]
+    state: Literal[
+        "idle", "starting", "running", "pausing", "paused", "stopping", "concluding", "halted", "silent"
+    ]
     """`halted`: the queue waits for a person; `starting`: a plan is checked, and devices are opened; `concluding`:
-    devices are closed, the report is made."""
+    devices are closed, the report is made; `silent`: the run's process does not answer, all else is what it told
+    last."""
     t: str
     """When this was so, UTC."""
     rig: str

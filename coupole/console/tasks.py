@@ -13,16 +13,20 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from coupole.errors import InputError
 from coupole.storage.durable import make_folder
 from coupole.storage.line_file import utc_now
 
 MOST_AT_ONCE, _MOST_KEPT, _MOST_SAID = 4, 100, 20_000
-_PATIENCE_S = 3.0
+_PATIENCE_S = 20.0
+"""A cell is made safe before its process ends."""
+_COUPOLE = (sys.executable, "-m", "coupole.commands.cli")
+_BOUND = Path(__file__).with_name("bound_process.py")
 
 
 @dataclass
@@ -93,12 +97,14 @@ class Task:
 
 
 class Tasks:
-    """All tasks of a service's life, the newest last. They end with the service."""
+    """All tasks of a service's life, the newest last. They end with the service, also if it is killed."""
 
     def __init__(self, folder: Path) -> None:
         """`folder`: for what processes print."""
         self._folder, self._lock = folder, threading.Lock()
         self._tasks: OrderedDict[str, Task] = OrderedDict()
+        self._beginner = ThreadPoolExecutor(1, "tasks")
+        """The kernel interrupts a bound process when the thread ends that has begun it: this one lives as long."""
 
     def begin(self, words: str, command: Sequence[str], by: str) -> Task:
         """Begin `coupole COMMAND... --json`. Raises InputError: too many are under way."""
@@ -109,13 +115,7 @@ class Tasks:
             number = secrets.token_hex(6)
             said, found = self._folder / f"{number}.log", self._folder / f"{number}.json"
             with said.open("wb") as errors, found.open("wb") as figures:
-                process = subprocess.Popen(
-                    [sys.executable, "-m", "coupole.commands.cli", *command, "--json"],
-                    stdin=subprocess.DEVNULL,
-                    stdout=figures,
-                    stderr=errors,
-                    start_new_session=True,
-                )
+                process = self._beginner.submit(_begun, [*_COUPOLE, *command, "--json"], figures, errors).result()
             task = Task(number, words, tuple(command), by, utc_now(), process, self._folder)
             self._tasks[number] = task
             self._forget_old()
@@ -133,15 +133,17 @@ class Tasks:
         return list(reversed(self._tasks.values()))
 
     def close(self) -> None:
-        """Stop what is under way."""
+        """Stop what is under way; what has not ended after 20 s is killed."""
         running = [task for task in self._tasks.values() if task.running]
         for task in running:
             task.stop()
+        end_s = time.monotonic() + _PATIENCE_S
         for task in running:
             try:
-                task.wait(_PATIENCE_S)
+                task.wait(max(0.0, end_s - time.monotonic()))
             except subprocess.TimeoutExpired:
                 task.process.kill()
+        self._beginner.shutdown()
 
     def _forget_old(self) -> None:
         for number, task in list(self._tasks.items()):
@@ -151,3 +153,14 @@ class Tasks:
                 del self._tasks[number]
                 for kind in ("log", "json"):
                     (self._folder / f"{number}.{kind}").unlink(missing_ok=True)
+
+
+def _begun(command: Sequence[str], figures: BinaryIO, errors: BinaryIO) -> subprocess.Popen[bytes]:
+    """A process that ends with the thread that calls this."""
+    return subprocess.Popen(
+        [sys.executable, "-I", "-S", _BOUND, str(os.getpid()), *command],
+        stdin=subprocess.DEVNULL,
+        stdout=figures,
+        stderr=errors,
+        start_new_session=True,
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import time
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import cells
 import pytest
 from cells import CellFolder
 
+from coupole.acquisition.runtime_folder import named_after
 from coupole.console import acquisitions as module
 from coupole.console import plan_queue
 from coupole.console.accounts import Accounts, Role
@@ -164,3 +166,26 @@ def test_control_passes_to_another_when_its_holder_is_gone_for_five_minutes(tmp_
     with pytest.raises(InputError, match="last engineer"):
         accounts.remove("Ida")
     assert [account.name for account in Accounts(tmp_path / "accounts.json").listed()] == ["Ada", "Ida", "Max"]
+
+
+def test_a_run_that_falls_silent_is_still_at_work_and_a_stop_interrupts_its_process(
+    queue: PlanQueue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Acquisitions(queue, read_cell(CellFolder(tmp_path).rig), tmp_path / "output")
+    entry = queue.add("Ada", plan="one.yaml")
+    with subprocess.Popen(["sleep", "60"]) as process:
+        found._process = process
+        queue.change(entry.id, state="running", pid=process.pid)
+        run = tmp_path / "run"
+        told = {"run": str(run), "rig": found._rig, "pid": process.pid, "state": "running", "proven": 52}
+        silent = {"run": "", "rig": "", "pid": 0, "state": "silent", "socket": named_after(run, "sock").name}
+        for states in ([told], [silent], [silent]):
+            monkeypatch.setattr(module, "running", lambda states=states: states)
+            found._look()
+        assert found.state == {**told, "state": "silent"}
+        found.state = None  # of a service that has just begun
+        found._look()
+        assert found.state is not None
+        assert (found.state["state"], found.state["run"]) == ("silent", str(run))
+        assert "does not answer" in found.tell("run", "stop")["trouble"][0]
+        assert process.wait(10.0) == -signal.SIGINT

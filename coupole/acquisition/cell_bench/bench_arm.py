@@ -80,8 +80,9 @@ class BenchArm:
                 del self._shown[old]
         return self._paths.figures(path)
 
-    def drive(self, number: str) -> dict[str, Any]:
-        """Begin to follow a path that was shown. Raises InputError if the arm is not where it begins."""
+    def drive(self, number: str, stops: int) -> dict[str, Any]:
+        """Begin to follow a path that was shown; `stops` of the works when it was asked. Raises InputError if the
+        arm is not where it begins."""
         path = self._shown.get(number)
         if path is None:
             raise InputError(f"path: expected one that `plan_path` has shown, found {number!r}")
@@ -93,11 +94,12 @@ class BenchArm:
                 f"path {number} begins {off_deg:.2f} deg from where the arm stands: plan it anew and look at it"
             )
         work = Work("drive", {"path": path.id, "to": path.to}, lambda control: self._follow(path, control))
-        self._works.begin(work)
+        self._works.begin(work, stops)
         return work.figures()
 
-    def jog(self, asked: JogAsked) -> dict[str, Any]:
-        """Begin a motion by hand, or renew it. Raises InputError if it must not be."""
+    def jog(self, asked: JogAsked, stops: int) -> dict[str, Any]:
+        """Begin a motion by hand, or renew it; `stops` of the works when it was asked. Raises
+        InputError if it must not be."""
         consoles = self._cell.rig.console.at_the_cell
         if asked.at not in consoles:
             raise InputError(
@@ -110,7 +112,7 @@ class BenchArm:
         hold = _Hold(next(self._numbers), asked)
         about = {"hold": hold.number, "axis": asked.axis, "direction": asked.direction}
         work = Work("jog", about, lambda control: self._go_on(hold, control))
-        self._works.begin(work)
+        self._works.begin(work, stops)
         self._hold, hold.work = hold, work
         return work.figures()
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from coupole.acquisition.cell_bench.bench_devices import BenchDevices
 from coupole.acquisition.cell_bench.bench_requests import FrameAsked, LoupeAsked
+from coupole.acquisition.cell_bench.bench_work import Works
 from coupole.acquisition.dose import FlashMeter
 from coupole.acquisition.looking import lux_of_leds
 from coupole.acquisition.opened_cell import OpenedCell
@@ -33,21 +34,25 @@ _MOST_LOUPE_PX = 2048
 class BenchFrames:
     """Takes one picture at a time; the last ones lie in a folder that only this user can enter."""
 
-    def __init__(self, cell: Cell, opened: OpenedCell, job: Job | None, devices: BenchDevices) -> None:
+    def __init__(
+        self, cell: Cell, opened: OpenedCell, job: Job | None, devices: BenchDevices, works: Works
+    ) -> None:
         self._cell, self._opened, self._devices = cell, opened, devices
-        self._job = job
+        self._job, self._works = job, works
         self._lux = lux_of_leds(cell, job)
         self.begin_counting()
         self._last: Shot | None = None
-        self._number = self._stops = 0
+        self._number = 0
         self._folder = named_after(cell.state_folder, "frames")
         shutil.rmtree(self._folder, ignore_errors=True)  # of a bench that was killed
         self._folder.mkdir(mode=0o700)
 
-    def frame(self, asked: FrameAsked) -> dict[str, Any]:
-        """Expose under each light in turn, and add up. Raises InputError, DoseBudgetReached, DeviceError."""
+    def frame(self, asked: FrameAsked, stops: int) -> dict[str, Any]:
+        """Expose under each light in turn, and add up; after a stop nothing more is lit: `stops` of the works when
+        it was asked. Raises InputError, DoseBudgetReached, DeviceError."""
         self._refuse_what_there_is_not(asked)
-        stops = self._stops
+        if asked.stops not in (None, stops):
+            raise InputError("frame: the bench was stopped since; look at its state, and ask anew")
         with self._devices.in_use:
             before_lux_h = self._shots.given_lux_h
             shot = self._exposed(asked, stops)
@@ -105,10 +110,6 @@ class BenchFrames:
         self._meter = FlashMeter(job, self._opened, "bench", 1.0) if job and job.plan.object else None
         self._shots = SingleShots(self._cell, self._opened, self._lux, self._meter)
 
-    def stop(self) -> None:
-        """Pictures that are under way, or wait, light nothing more."""
-        self._stops += 1
-
     def release(self) -> None:
         """The camera is free for others."""
         self._shots.disarm()
@@ -123,7 +124,7 @@ class BenchFrames:
         shots = []
         try:
             for led, panel in lights or [(NO_LED, 0)]:
-                if self._stops != stops or self._opened.made_safe:
+                if self._works.stops != stops or self._opened.made_safe:
                     raise InputError("frame: it was stopped before its last light")
                 shots.append(self._shots.take(led, asked.exposure_us, asked.gain_db, panel))
                 self._shots.rest()

@@ -101,6 +101,8 @@ class FrameAsked(_Request):
     marks: list[Literal["saturation", "focus"]] = []
     gains: _Gains = [1.0, 1.0, 1.0]
     """White point: of R, G, B in the JPEG."""
+    stops: Annotated[int, Field(ge=0)] | None = None
+    """As a state told it: nothing is lit if a stop came since."""
 
 
 class LoupeAsked(_Request):

@@ -67,7 +67,8 @@ class BenchService:
         self.closing = threading.Event()
         self._devices = BenchDevices(cell, opened)
         self._arm = BenchArm(cell, opened, job, self.works)
-        self._frames = BenchFrames(cell, opened, job, self._devices)
+        self._frames = BenchFrames(cell, opened, job, self._devices, self.works)
+        self._ending = False
         self._asked_s = time.monotonic()
 
     @property
@@ -84,12 +85,13 @@ class BenchService:
 
     def answer(self, line: bytes) -> dict[str, Any]:
         """The answer to a request; an `error` with its `kind` where it was not obeyed."""
+        stops = self.works.stops
         try:
             request = read_request(line)
             self._asked_s = time.monotonic()
-            if self.closing.is_set():
+            if self._ending or self.closing.is_set():
                 raise InputError("the bench is closing")
-            return {"version": VERSION, **self._obey(request)}
+            return {"version": VERSION, **self._obey(request, stops)}
         except CoupoleError as error:
             if isinstance(error, DeviceError):
                 self._devices.failed(error)
@@ -111,7 +113,8 @@ class BenchService:
         """The same for a caller in this process."""
         return self.answer(json.dumps({"version": VERSION, "command": command, **fields}).encode())
 
-    def _obey(self, request: Request) -> dict[str, Any]:
+    def _obey(self, request: Request, stops: int) -> dict[str, Any]:
+        """`stops` of the works before the request was read."""
         match request:
             case StateAsked():
                 return self._state()
@@ -121,19 +124,20 @@ class BenchService:
             case PathAsked():
                 return self._arm.plan_path(request)
             case DriveAsked():
-                return self._arm.drive(request.path)
+                return self._arm.drive(request.path, stops)
             case JogAsked():
-                return self._arm.jog(request)
+                return self._arm.jog(request, stops)
             case FrameAsked():
                 self._refuse_while_metering()
-                return {**self._frames.frame(request), "dose": self._frames.dose()}
+                return {**self._frames.frame(request, stops), "dose": self._frames.dose()}
             case LoupeAsked():
                 return self._frames.loupe(request)
             case MeterAsked():
-                return self._begin_metering(request)
+                return self._begin_metering(request, stops)
             case StopAsked():
                 return {"trouble": self._stop(), **self._state()}
             case CloseAsked():
+                self._ending = True
                 trouble = self._stop()
                 self.closing.set()
                 return {"trouble": trouble}
@@ -142,7 +146,7 @@ class BenchService:
         if (work := self.works.running) is not None and work.kind == "meter":
             raise InputError("box and camera are metering; stop it or let it end")
 
-    def _begin_metering(self, asked: MeterAsked) -> dict[str, Any]:
+    def _begin_metering(self, asked: MeterAsked, stops: int) -> dict[str, Any]:
         small = metering_job(self._arm.job_of(Path(asked.plan)))
         self._arm.refuse_motion()
         wanted = exposure_advice.Request(asked.saturated, asked.snr, asked.share)
@@ -157,14 +161,12 @@ class BenchService:
             return advice.figures()
 
         work = Work("meter", {"plan": asked.plan}, meter)
-        self.works.begin(work)
+        self.works.begin(work, stops)
         return work.figures()
 
     def _stop(self) -> list[str]:
         """What is not sure then. Pictures that are under way have ended, with their light, when this returns."""
-        self._frames.stop()
-        if self.works.last is not None:
-            self.works.last.stop()
+        self.works.stop()
         trouble = unsure(self._opened.halt(), _STOPPED_WITHIN_S)
         if self.works.last is not None:
             self.works.last.join(_STOPPED_WITHIN_S)
@@ -190,10 +192,12 @@ class BenchService:
             "arm": arm,
             "dose": self._frames.dose(),
             "work": self.works.last.figures() if self.works.last else None,
+            "stops": self.works.stops,
         }
 
     def end(self) -> None:
         """Stop what is under way, make the cell safe, enter the light that was given."""
+        self._ending = True
         self.closing.set()
         self._stop()
         self._opened.make_safe()

@@ -61,14 +61,26 @@ class Works:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self.last: Work | None = None
+        self.stops = 0
+        """How often a stop was asked."""
 
-    def begin(self, work: Work) -> None:
-        """Raises InputError while another is under way."""
+    def begin(self, work: Work, stops: int) -> None:
+        """`stops` as it was when the work was asked. Raises InputError if a stop came since, or while another is
+        under way."""
         with self._lock:
+            if self.stops != stops:
+                raise InputError(f"{work.kind}: it was stopped before it began")
             if self.last is not None and self.last.is_running:
                 raise InputError(f"{self.last.kind} is under way; stop it or let it end")
             self.last = work
             work.begin()
+
+    def stop(self) -> None:
+        """Returns at once; what was asked before and has not begun never begins."""
+        with self._lock:
+            self.stops += 1
+            if self.last is not None:
+                self.last.stop()
 
     @property
     def running(self) -> Work | None:

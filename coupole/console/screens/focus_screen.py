@@ -138,12 +138,17 @@ class _Screen:
             self._ending = "ended"
             return
         self._touch()
-        self._ending, self._stops = "", self._bench.stops
-        begun = await self._visit.act("live pictures begin", lambda: self._settings.light_words)
-        if begun is not None:
+        self._ending = ""
+        stops = await self._visit.act("live pictures begin", self._stops_so_far)
+        if stops is not None:
+            self._stops = stops
             self._live, self._taken, self._given_lux_h = True, 0, 0.0
             self._refused.text = ""
         self._enable()
+
+    def _stops_so_far(self) -> int:
+        stops: int = self._bench.ask("state")["stops"]
+        return stops
 
     def _end_live(self, why: str) -> None:
         self._live = False
@@ -158,14 +163,27 @@ class _Screen:
             return
         if self._ending:
             self._end_live(self._ending)
-        elif self._stops != self._bench.stops:
-            self._end_live("stopped")
         elif not self._visit.is_watched:
             self._end_live("the page was closed")
         elif time.monotonic() - self._touched_s > _LIVE_S:
             self._end_live(f"nobody has touched this page for {_LIVE_S:g} s")
+        elif self._was_stopped:
+            self._end_live("stopped")
         else:
             await self._expose(live=True)
+
+    @property
+    def _was_stopped(self) -> bool:
+        """Since live pictures began, as far as is known; the bench itself refuses the next one in any case."""
+        state = self._bench.state
+        return state is not None and state["stops"] > self._stops
+
+    async def _stopped_meanwhile(self) -> bool:
+        """The same, as the bench tells it now."""
+        try:
+            return await in_thread(self._stops_so_far) > self._stops
+        except CoupoleError:  # the devices are closed
+            return True
 
     async def _one(self) -> None:
         self._refused.text = ""
@@ -182,7 +200,9 @@ class _Screen:
             else:
                 found = await self._visit.act(f"picture, {words}", lambda: self._bench.ask("frame", **asked))
         except (CoupoleError, NotAllowed) as error:
-            if not (live and self._stops != self._bench.stops):
+            if live and await self._stopped_meanwhile():
+                self._ending = "stopped"
+            else:
                 self._refused.text, self._ending = str(error), "a picture was refused"
         finally:
             self._asking = False
@@ -195,7 +215,7 @@ class _Screen:
         if account is None:
             raise NotAllowed(401, "the session is over: sign in again")
         allow(self._visit.service, account, Role.OPERATOR, "live pictures", acts=True)
-        found = await in_thread(self._bench.ask, "frame", **asked)
+        found = await in_thread(self._bench.ask, "frame", **asked, stops=self._stops)
         self._taken += 1
         self._given_lux_h += found["dose_lux_h"]
         return found

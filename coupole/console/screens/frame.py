@@ -22,9 +22,10 @@ WORDS = {
     "paused": "paused: lights off, arm still",
     "stopping": "stopping",
     "concluding": "concluding: the report is made",
+    "silent": "the run does not answer",
     "halted": "waits for a person",
 }
-AT_WORK = ("starting", "running", "pausing", "paused", "stopping", "concluding")
+AT_WORK = ("starting", "running", "pausing", "paused", "stopping", "concluding", "silent")
 _LIVE = ("running", "pausing", "paused")
 
 
@@ -86,7 +87,7 @@ def _state(visit: Visit) -> None:
     chip = ui.label().classes("chip state").props("role=status data-name=state")
 
     def show(now: StateNow) -> None:
-        words = WORDS[now.state]
+        words = f"lent to {now.lent_to}" if now.lent_to and now.state == "idle" else WORDS[now.state]
         if now.state in _LIVE:
             words += f": {now.view or '-'}, {now.proven} of {now.frames}"
             words += f", {duration_text(now.left_s)} left" if now.left_s is not None else ""
@@ -119,8 +120,11 @@ def _buttons(visit: Visit) -> None:
                 visit.say(words, bad=bool(trouble))
         elif entry is not None:
             await visit.act(f"stop {entry.id}", lambda: visit.service.acquisitions.stop(entry), acts=False)
-        elif visit.service.bench.phase == "open":
+        elif visit.service.bench.phase != "closed":
             await stop_bench(visit)
+        elif now.lent_to:
+            lending = visit.service.acquisitions.lending
+            await visit.act(f"stop what the cell is lent for: {now.lent_to}", lending.interrupt, acts=False)
 
     pausing = button("Pause", pause, icon="pause", name="pause")
     stopping = button("Stop", stop, icon="stop", name="stop", kind="stop")
@@ -131,18 +135,34 @@ def _buttons(visit: Visit) -> None:
         pausing.set_text("Go on" if held else "Pause")
         pausing.props(f"icon={'play_arrow' if held else 'pause'}")
         pausing.set_enabled(visit.may_act and now.run is not None and now.state in _LIVE)
-        at_work = now.state in (*_LIVE, "starting")
-        stopping.set_enabled(visit.may_act and (at_work or bool(now.devices)))
+        stopping.set_enabled(visit.may_act and can_be_stopped(now))
 
     visit.follow(show)
 
 
+def can_be_stopped(now: StateNow) -> bool:
+    """Something is at work, has the devices open, or may move and light by what the cell is lent for."""
+    runs = any(entry.state == "running" for entry in now.queue)
+    return runs or now.state in AT_WORK or bool(now.devices) or bool(now.lent_to)
+
+
+def light_words(now: StateNow) -> str:
+    """What the header says of light: that none is given only while nobody can give any."""
+    if now.run:
+        budget = f" of {now.dose_budget:g}" if now.dose_budget else ""
+        return f"light on {now.object or 'the object'}: {now.dose_before + now.dose:.3f} lux h{budget}"
+    if now.devices or now.lent_to:
+        return (
+            "light may be given: the devices are open" if now.devices else "light may be given: the cell is lent"
+        )
+    return "no light is given" if now.state in ("idle", "halted", "concluding") else "light may be given"
+
+
 async def stop_bench(visit: Visit) -> None:
     """Stop what the open devices do."""
-    said = await visit.act("stop the devices", lambda: visit.service.bench.ask("stop"), acts=False)
+    said = await visit.act("stop the devices", visit.service.bench.stop, acts=False)
     if said is not None:
-        words = "; ".join(said["trouble"]) or "stopped: lights off, arm told to stop"
-        visit.say(words, bad=bool(said["trouble"]))
+        visit.say("; ".join(said) or "stopped: lights off, arm told to stop", bad=bool(said))
 
 
 def _person(visit: Visit) -> None:
@@ -213,10 +233,7 @@ def _dose(visit: Visit) -> None:
 
     def show(now: StateNow) -> None:
         total = now.dose_before + now.dose
-        text = f"light on {now.object or 'the object'}: {total:.3f} lux h" if now.run else "no light is given"
-        if now.run and now.dose_budget:
-            text += f" of {now.dose_budget:g}"
-        words.text = text
+        words.text = light_words(now)
         bar.set_value(min(1.0, total / now.dose_budget) if now.run and now.dose_budget else 0.0)
         bar.set_visibility(bool(now.run and now.dose_budget))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -66,7 +67,7 @@ class RunFiles:
     def __init__(self, folder: Path, notes: Path) -> None:
         """`notes`: folder for what is noted of runs, such as when they were verified."""
         self.folder, self._notes, self._lock = folder, notes, threading.Lock()
-        self._rows: dict[str, tuple[float, RunRow]] = {}
+        self._rows: dict[str, tuple[str, RunRow]] = {}
         self._proven: dict[str, tuple[float, dict[ShotId, FrameProven]]] = {}
         self._pictures = functools.lru_cache(_PICTURES_KEPT)(self._picture)
 
@@ -135,17 +136,33 @@ class RunFiles:
             coding=coding,
         )
 
-    def note_verified(self, name: str, t: str) -> None:
-        """It was read back at `t` without a fault."""
-        self._notes.mkdir(parents=True, exist_ok=True)
-        (self._notes / name).write_text(f"{t} {self._changed_s(name)!r}", encoding="utf-8")
+    def fingerprint(self, name: str) -> str:
+        """Of names, sizes and times of all files in a run's folder: another one once any was written, put in or
+        taken out."""
+        folder = self.folder / name
+        found = hashlib.sha256()
+        for path in sorted(folder.rglob("*")):
+            try:
+                about = path.stat()
+            except OSError:  # it was taken away while we looked
+                continue
+            if not path.is_dir():
+                found.update(f"{path.relative_to(folder)}\0{about.st_size}\0{about.st_mtime_ns}\0".encode())
+        return found.hexdigest()
 
-    def _verified(self, name: str) -> str:
+    def note_verified(self, name: str, t: str, before: str) -> None:
+        """It was read back at `t` without a fault. Nothing is noted unless its `fingerprint` is still the one from
+        `before` it was read."""
+        if self.fingerprint(name) == before:
+            self._notes.mkdir(parents=True, exist_ok=True)
+            (self._notes / name).write_text(f"{t} {before}", encoding="utf-8")
+
+    def _verified(self, name: str, fingerprint: str) -> str:
         try:
-            t, changed_s = (self._notes / name).read_text(encoding="utf-8").split()
+            t, noted = (self._notes / name).read_text(encoding="utf-8").split()
         except (OSError, ValueError):
             return ""
-        return t if changed_s == repr(self._changed_s(name)) else ""
+        return t if noted == fingerprint else ""
 
     def _changed_s(self, name: str) -> float:
         """When the newest of a run's journal and views was written."""
@@ -155,12 +172,12 @@ class RunFiles:
 
     def row(self, name: str) -> RunRow:
         """One of them."""
-        changed_s = self._changed_s(name)
-        known_s, row = self._rows.get(name, (-1.0, None))
-        if row is None or known_s != changed_s or row.state in ("running", "paused", "created"):
+        fingerprint = self.fingerprint(name)
+        known, row = self._rows.get(name, ("", None))
+        if row is None or known != fingerprint or row.state in ("running", "paused", "created"):
             row = self._read_row(name)
-            self._rows[name] = changed_s, row
-        verified = self._verified(name)
+            self._rows[name] = fingerprint, row
+        verified = self._verified(name, fingerprint)
         return row if verified == row.verified else RunRow(**{**vars(row), "verified": verified})
 
     def _read_row(self, name: str) -> RunRow:
@@ -185,7 +202,7 @@ class RunFiles:
             frames=sum(count for _, count in found.views.values()),
             bytes=sum(path.stat().st_blocks * 512 for path in views),
             archived=archived,
-            verified=self._verified(name),
+            verified="",
             thumbnail=thumbnail,
         )
 

@@ -26,6 +26,7 @@ from coupole.storage.line_file import utc_now, utc_text
 from coupole.storage.run import Run
 
 _NEWEST_S = 0.1
+_ENDED_TOLD = 20
 
 
 class Newest:
@@ -81,8 +82,11 @@ def state_of(
 
 def _entries_now(queue: PlanQueue, left_s: float | None) -> list[EntryNow]:
     times = expected_times(queue.entries, datetime.now(UTC), left_s=left_s, halted=bool(queue.halted))
+    ended = [entry.id for entry in queue.entries if entry.ended]
     found = []
     for entry in queue.entries:
+        if entry.id in ended[:-_ENDED_TOLD]:
+            continue
         begin, end = (utc_text(time) if time else None for time in times.get(entry.id, (None, None)))
         found.append(EntryNow(**dict(entry), expected_begin=begin, expected_end=end))
     return found

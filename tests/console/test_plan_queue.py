@@ -19,6 +19,7 @@ from coupole.console.accounts import Accounts, Role
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.sessions import Control
+from coupole.console.state_now import _entries_now
 from coupole.errors import InputError, StorageError
 from coupole.plan.cell import read_cell
 
@@ -153,3 +154,20 @@ def test_control_passes_to_another_when_its_holder_is_gone_for_five_minutes(tmp_
     with pytest.raises(InputError, match="last engineer"):
         accounts.remove("Ida")
     assert [account.name for account in Accounts(tmp_path / "accounts.json").listed()] == ["Ada", "Ida", "Max"]
+
+
+def test_a_hundred_ended_entries_are_kept_and_what_others_printed_is_taken_away(
+    queue: PlanQueue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan_queue, "write_synced", lambda path, text: path.write_text(text))
+    output = tmp_path / "output"
+    output.mkdir()
+    holds = [queue.add("Ada", hold="turn it").id for _ in range(105)]
+    for number in holds[:103]:
+        (output / f"{number}.log").write_text("said")
+        queue.change(number, state="done", ended="2026-01-01T00:00:00.000Z")
+    queue.halt("wait")
+    assert [entry.id for entry in PlanQueue(tmp_path / "queue.json").entries] == holds[3:]
+    with Acquisitions(queue, read_cell(CellFolder(tmp_path).rig), output):
+        assert {path.stem for path in output.iterdir()} == set(holds[3:103])
+    assert [entry.id for entry in _entries_now(queue, None)] == holds[83:]

@@ -17,12 +17,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from coupole.console.keeping_newest import keep_newest
 from coupole.errors import InputError
 from coupole.storage.durable import make_folder
 from coupole.storage.line_file import utc_now
 
 MOST_AT_ONCE, _MOST_KEPT, _MOST_SAID = 4, 100, 20_000
 _PATIENCE_S = 3.0
+_FORMER_KEPT = 50
 
 
 @dataclass
@@ -96,9 +98,10 @@ class Tasks:
     """All tasks of a service's life, the newest last. They end with the service."""
 
     def __init__(self, folder: Path) -> None:
-        """`folder`: for what processes print."""
+        """`folder`: for what processes print; of former lives the newest stay, for whoever looks for a fault."""
         self._folder, self._lock = folder, threading.Lock()
         self._tasks: OrderedDict[str, Task] = OrderedDict()
+        keep_newest(folder, _FORMER_KEPT)
 
     def begin(self, words: str, command: Sequence[str], by: str) -> Task:
         """Begin `coupole COMMAND... --json`. Raises InputError: too many are under way."""

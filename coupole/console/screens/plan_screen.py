@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import html
-import secrets
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -304,7 +303,7 @@ class _Screen:
         service, draft = self._visit.service, Draft(self._plans.path(self._name), self._text)
         self._draw.set_enabled(False)
         self._drawing.set_text("drawing: paths are planned")
-        folder = service.plan_files.drawings / secrets.token_hex(8)
+        folder = service.plan_files.new_drawing()
         try:
             png, page = await service.desk.draw(draft, folder)
         except InputError as error:

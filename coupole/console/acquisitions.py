@@ -51,6 +51,7 @@ class Acquisitions:
 
     def __enter__(self) -> Acquisitions:
         self._folder.mkdir(parents=True, exist_ok=True)
+        self._forget_old()
         self._thread.start()
         return self
 
@@ -217,6 +218,15 @@ class Acquisitions:
         halt = "" if code == 0 else f"{entry.words}: {why}"
         run = str(found.get("run", entry.run))
         self._queue.conclude(entry.id, halt=halt, state=state, ended=utc_now(), exit_code=code, run=run, said=why)
+        self._forget_old()
+
+    def _forget_old(self) -> None:
+        """Take away what processes printed whose entries the queue has no longer."""
+        known = {entry.id for entry in self._queue.entries}
+        for path in self._folder.iterdir():
+            if path.suffix in (".log", ".json") and path.stem not in known:
+                with contextlib.suppress(OSError):
+                    path.unlink()
 
     def _files(self, entry: Entry) -> tuple[Path, Path]:
         return self._folder / f"{entry.id}.log", self._folder / f"{entry.id}.json"

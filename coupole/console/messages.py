@@ -164,7 +164,7 @@ class StateNow(BaseModel):
     lent_to: str
     """To whom the cell is lent, and for what; empty if it is not. Nothing begins meanwhile."""
     queue: list[EntryNow]
-    """All entries, in their order."""
+    """All entries that run or wait, after the 20 that ended last, in their order."""
     in_control: str
     """Who may act; empty: any operator."""
     asked_by: str

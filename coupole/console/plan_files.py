@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import secrets
 import threading
 from pathlib import Path
 
+from coupole.console.keeping_newest import keep_newest
 from coupole.console.retaking import name_of_retake, retaking_plan
 from coupole.errors import InputError, StorageError
 from coupole.plan import yamlfile
@@ -17,15 +19,22 @@ from coupole.storage.run import Run
 
 _DEEPEST = 3
 _LONGEST = 1_000_000
+_DRAWINGS_KEPT = 50
 
 
 class PlanFiles:
     """Plans below a folder, by their paths relative to it."""
 
     def __init__(self, folder: Path, rig: Path, drawings: Path) -> None:
-        """`rig`: which new plans name; `drawings`: folder for pictures of plans."""
+        """`rig`: which new plans name; `drawings`: folder for pictures of plans, of which the newest are kept."""
         self.folder, self._rig, self.drawings = folder.resolve(), rig.resolve(), drawings
         self._lock = threading.Lock()
+        keep_newest(drawings, _DRAWINGS_KEPT)
+
+    def new_drawing(self) -> Path:
+        """A folder for pictures of a plan, to be made."""
+        keep_newest(self.drawings, _DRAWINGS_KEPT - 1)
+        return self.drawings / secrets.token_hex(8)
 
     def names(self) -> list[str]:
         """Of all plans, sorted: files with `views`."""

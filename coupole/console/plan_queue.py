@@ -15,7 +15,7 @@ from coupole.storage.durable import make_folder, write_synced
 from coupole.storage.line_file import utc_now
 
 EntryState = Literal["waiting", "running", "done", "failed", "stopped"]
-MOST_WAITING = 200
+MOST_WAITING, MOST_ENDED = 200, 100
 
 
 class Needs(BaseModel):
@@ -95,7 +95,8 @@ class _Kept(BaseModel):
 
 
 class PlanQueue:
-    """Entries in their order. Every change is on the disk when the call returns."""
+    """Entries in their order, with the `MOST_ENDED` that ended last. Every change is on the disk when the call
+    returns."""
 
     def __init__(self, path: Path) -> None:
         """Raises StorageError: the file cannot be read."""
@@ -222,6 +223,8 @@ class PlanQueue:
             self._keep(self.entries, "")
 
     def _keep(self, entries: tuple[Entry, ...], halted: str) -> None:
+        forgotten = {entry.id for entry in [entry for entry in entries if entry.ended][:-MOST_ENDED]}
+        entries = tuple(entry for entry in entries if entry.id not in forgotten)
         kept = _Kept(halted=halted, entries=entries)
         try:
             make_folder(self._path.parent)

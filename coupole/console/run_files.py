@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import threading
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from coupole.errors import CoupoleError, InputError, StorageError
 from coupole.plan.shot_id import Led, ShotId
-from coupole.storage import frame_file
+from coupole.storage import frame_file, journal
+from coupole.storage.journal import Follower
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 from coupole.storage.run_json import RUN_JSON
@@ -20,6 +23,7 @@ from coupole.viewing.raw_preview import Coding, Figures, figures, look
 
 PICTURE_WIDTHS = (160, 320, 640, 1280, 2048)
 _PICTURES_KEPT = 600
+_RUNS_FOLLOWED = 4
 
 
 @dataclass(frozen=True)
@@ -60,14 +64,54 @@ class Frame:
     coding: Coding
 
 
+class _Followed:
+    """The proven frames of one run; only what its journal has gained is read."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._lock = path, threading.Lock()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._follower, self._proven = Follower(self._path), dict[ShotId, FrameProven]()
+        self._inode = self._size = 0
+
+    def event(self, shot: ShotId) -> FrameProven | None:
+        """Raises StorageError."""
+        with self._lock:
+            self._read()
+            return self._proven.get(shot)
+
+    def all(self) -> dict[ShotId, FrameProven]:
+        """Raises StorageError."""
+        with self._lock:
+            self._read()
+            return dict(self._proven)
+
+    def _read(self) -> None:
+        try:
+            about = self._path.stat()
+        except OSError:
+            self._begin()
+            return
+        if about.st_ino != self._inode or about.st_size < self._size:
+            self._begin()
+        try:
+            news = self._follower.news()
+        except StorageError:
+            self._begin()
+            raise
+        self._proven |= {event.shot: event for event in news if isinstance(event, FrameProven)}
+        self._inode, self._size = about.st_ino, about.st_size
+
+
 class RunFiles:
     """Runs in a cell's storage folder, by the names of their folders."""
 
     def __init__(self, folder: Path, notes: Path) -> None:
         """`notes`: folder for what is noted of runs, such as when they were verified."""
         self.folder, self._notes, self._lock = folder, notes, threading.Lock()
-        self._rows: dict[str, tuple[float, RunRow]] = {}
-        self._proven: dict[str, tuple[float, dict[ShotId, FrameProven]]] = {}
+        self._rows: dict[str, tuple[str, RunRow]] = {}
+        self._followed: OrderedDict[str, _Followed] = OrderedDict()
         self._pictures = functools.lru_cache(_PICTURES_KEPT)(self._picture)
 
     def names(self) -> list[str]:
@@ -93,12 +137,16 @@ class RunFiles:
 
     def proven(self, name: str) -> dict[ShotId, FrameProven]:
         """Raises InputError, StorageError."""
-        run, changed_s = self.run(name), self._changed_s(name)
+        return self._follow(name).all()
+
+    def _follow(self, name: str) -> _Followed:
+        """The frames of the runs that were asked for last are kept."""
+        path = self.run(name).journal_path
         with self._lock:
-            known_s, found = self._proven.get(name, (0.0, {}))
-            if known_s != changed_s:
-                found = run.proven()
-                self._proven[name] = changed_s, found
+            found = self._followed.setdefault(name, _Followed(path))
+            self._followed.move_to_end(name)
+            while len(self._followed) > _RUNS_FOLLOWED:
+                self._followed.popitem(last=False)
         return found
 
     def view(self, name: str, events: Sequence[FrameProven]) -> View:
@@ -135,39 +183,50 @@ class RunFiles:
             coding=coding,
         )
 
-    def note_verified(self, name: str, t: str) -> None:
-        """It was read back at `t` without a fault."""
-        self._notes.mkdir(parents=True, exist_ok=True)
-        (self._notes / name).write_text(f"{t} {self._changed_s(name)!r}", encoding="utf-8")
+    def fingerprint(self, name: str) -> str:
+        """Of names, sizes and times of all files in a run's folder: another one once any was written, put in or
+        taken out."""
+        folder = self.folder / name
+        found = hashlib.sha256()
+        for path in sorted(folder.rglob("*")):
+            try:
+                about = path.stat()
+            except OSError:  # it was taken away while we looked
+                continue
+            if not path.is_dir():
+                found.update(f"{path.relative_to(folder)}\0{about.st_size}\0{about.st_mtime_ns}\0".encode())
+        return found.hexdigest()
 
-    def _verified(self, name: str) -> str:
+    def note_verified(self, name: str, t: str, before: str) -> None:
+        """It was read back at `t` without a fault. Nothing is noted unless its `fingerprint` is still the one from
+        `before` it was read."""
+        if self.fingerprint(name) == before:
+            self._notes.mkdir(parents=True, exist_ok=True)
+            (self._notes / name).write_text(f"{t} {before}", encoding="utf-8")
+
+    def _verified(self, name: str, fingerprint: str) -> str:
         try:
-            t, changed_s = (self._notes / name).read_text(encoding="utf-8").split()
+            t, noted = (self._notes / name).read_text(encoding="utf-8").split()
         except (OSError, ValueError):
             return ""
-        return t if changed_s == repr(self._changed_s(name)) else ""
-
-    def _changed_s(self, name: str) -> float:
-        """When the newest of a run's journal and views was written."""
-        folder = self.folder / name
-        paths = [folder / "journal.jsonl", *(folder / "views").glob("*.h5")]
-        return max((path.stat().st_mtime for path in paths if path.exists()), default=0.0)
+        return t if noted == fingerprint else ""
 
     def row(self, name: str) -> RunRow:
         """One of them."""
-        changed_s = self._changed_s(name)
-        known_s, row = self._rows.get(name, (-1.0, None))
-        if row is None or known_s != changed_s or row.state in ("running", "paused", "created"):
+        fingerprint = self.fingerprint(name)
+        known, row = self._rows.get(name, ("", None))
+        if row is None or known != fingerprint or row.state in ("running", "paused", "created"):
             row = self._read_row(name)
-            self._rows[name] = changed_s, row
-        verified = self._verified(name)
+            self._rows[name] = fingerprint, row
+        verified = self._verified(name, fingerprint)
         return row if verified == row.verified else RunRow(**{**vars(row), "verified": verified})
 
     def _read_row(self, name: str) -> RunRow:
         try:
             run = self.run(name)
-            found, proven = status(run), self.proven(name)
-            thumbnail = str(_typical(proven) or "")
+            found = status(run)
+            proven = sum(count for count, _ in found.views.values())
+            thumbnail = _typical(run) if proven else ""
             archived = bool(proven) and all(
                 frame_file.read_layout(run.view_path(view)).archived for view in run.about["views"]
             )
@@ -181,11 +240,11 @@ class RunFiles:
             created=run.about["created"],
             operator=str(run.about.get("operator", "")),
             simulated=run.simulated,
-            proven=sum(count for count, _ in found.views.values()),
+            proven=proven,
             frames=sum(count for _, count in found.views.values()),
             bytes=sum(path.stat().st_blocks * 512 for path in views),
             archived=archived,
-            verified=self._verified(name),
+            verified="",
             thumbnail=thumbnail,
         )
 
@@ -194,7 +253,7 @@ class RunFiles:
             wanted = ShotId.parse(shot)
         except ValueError as error:
             raise InputError(f"{shot!r}: expected a shot such as top/led0417/e0") from error
-        event = self.proven(name).get(wanted)
+        event = self._follow(name).event(wanted)
         if event is None:
             raise InputError(f"{shot}: not proven in {name}")
         return event
@@ -206,8 +265,12 @@ class RunFiles:
         return look(view.pixels(event.index), coding, width_px, saturation=saturation, focus=False)
 
 
-def _typical(proven: dict[ShotId, FrameProven]) -> ShotId | None:
-    """A shot with light from the middle of a run's first view."""
-    lit = [shot for shot in proven if shot.is_shot and isinstance(shot.light, Led)]
-    lit = [shot for shot in lit if shot.view == lit[0].view]
-    return lit[len(lit) // 2] if lit else None
+def _typical(run: Run) -> str:
+    """A proven shot with light from the middle of a run's first view; empty without one."""
+    lit: list[ShotId] = []
+    for event in journal.read(run.journal_path):
+        if isinstance(event, FrameProven) and event.shot.is_shot and isinstance(event.shot.light, Led):
+            if lit and event.shot.view != lit[0].view:
+                break
+            lit.append(event.shot)
+    return str(lit[len(lit) // 2]) if lit else ""

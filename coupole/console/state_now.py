@@ -16,7 +16,7 @@ from coupole.console.messages import EntryNow, StateNow
 from coupole.console.outlook import expected_times
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.sessions import Control
-from coupole.errors import CoupoleError, InputError
+from coupole.errors import CoupoleError
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell
 from coupole.plan.rig_devices import in_world
@@ -26,6 +26,7 @@ from coupole.storage.line_file import utc_now, utc_text
 from coupole.storage.run import Run
 
 _NEWEST_S = 0.1
+_ENDED_TOLD = 20
 
 
 class Newest:
@@ -52,6 +53,8 @@ def state_of(
 ) -> StateNow:
     """The cell at this moment."""
     at_work, entry = acquisitions.state or {}, queue.running
+    if not at_work:
+        _forget_runs()
     begun = "halted" if queue.halted else "idle"
     if entry is not None:
         begun = "concluding" if entry.run else "starting"
@@ -81,40 +84,55 @@ def state_of(
 
 def _entries_now(queue: PlanQueue, left_s: float | None) -> list[EntryNow]:
     times = expected_times(queue.entries, datetime.now(UTC), left_s=left_s, halted=bool(queue.halted))
+    ended = [entry.id for entry in queue.entries if entry.ended]
     found = []
     for entry in queue.entries:
+        if entry.id in ended[:-_ENDED_TOLD]:
+            continue
         begin, end = (utc_text(time) if time else None for time in times.get(entry.id, (None, None)))
         found.append(EntryNow(**dict(entry), expected_begin=begin, expected_end=end))
     return found
 
 
-@functools.lru_cache(4)
 def _devices(run: str) -> dict[str, Any]:
-    """Identities of a run's devices, which do not change."""
+    """Identities of a run's devices; none if they cannot be read."""
     try:
-        return dict(Run(Path(run)).about["devices"])
-    except (InputError, KeyError):
+        return _devices_when(run)
+    except (CoupoleError, KeyError):
         return {}
+
+
+@functools.lru_cache(4)
+def _devices_when(run: str) -> dict[str, Any]:
+    """Identities of a run's devices, which do not change while it runs. Raises InputError, KeyError."""
+    return dict(Run(Path(run)).about["devices"])
 
 
 _NO_OBJECT = {"object": "", "dose_before": 0.0, "dose_budget": None}
 
 
 def _object_of(cell: Cell, run: str) -> dict[str, Any]:
-    """Of a run that is being acquired."""
-    return _object_when(cell.ledger_folder, cell.former_ledger_folder, run)
+    """Of a run that is being acquired; nothing if it cannot be read."""
+    try:
+        return _object_when(cell.ledger_folder, cell.former_ledger_folder, run)
+    except CoupoleError:
+        return _NO_OBJECT
 
 
 @functools.lru_cache(4)
 def _object_when(ledgers: Path, former: Path, run: str) -> dict[str, Any]:
-    """A run's object, the light on it that is not this run's, and its budget; they do not change while it runs."""
-    try:
-        opened = Run(Path(run))
-        named = opened.about.get("object") or ""
-        plan = yamlfile.read(opened.plan_path).data
-        history = Ledger(ledgers, named, former).read() if named else History()
-    except CoupoleError:
-        return _NO_OBJECT
+    """A run's object, the light on it that is not this run's, and its budget; they do not change while it runs.
+    Raises InputError, StorageError."""
+    opened = Run(Path(run))
+    named = opened.about.get("object") or ""
+    plan = yamlfile.read(opened.plan_path).data
+    history = Ledger(ledgers, named, former).read() if named else History()
     before = sum(entry.dose_lux_h for entry in history.entries if entry.run != opened.folder.name)
     budget = (plan.get("object") or {}).get("dose_budget_lux_h")
     return {"object": named, "dose_before": before, "dose_budget": budget}
+
+
+def _forget_runs() -> None:
+    """A run that goes on later is read anew: its object may have received other light meanwhile."""
+    _devices_when.cache_clear()
+    _object_when.cache_clear()

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from coupole.console.keeping_newest import keep_newest
 from coupole.errors import InputError
 from coupole.storage.durable import make_folder
 from coupole.storage.line_file import utc_now
@@ -27,6 +28,7 @@ _PATIENCE_S = 20.0
 """A cell is made safe before its process ends."""
 _COUPOLE = (sys.executable, "-m", "coupole.commands.cli")
 _BOUND = Path(__file__).with_name("bound_process.py")
+_FORMER_KEPT = 50
 
 
 @dataclass
@@ -100,11 +102,12 @@ class Tasks:
     """All tasks of a service's life, the newest last. They end with the service, also if it is killed."""
 
     def __init__(self, folder: Path) -> None:
-        """`folder`: for what processes print."""
+        """`folder`: for what processes print; of former lives the newest stay, for whoever looks for a fault."""
         self._folder, self._lock = folder, threading.Lock()
         self._tasks: OrderedDict[str, Task] = OrderedDict()
         self._beginner = ThreadPoolExecutor(1, "tasks")
         """The kernel interrupts a bound process when the thread ends that has begun it: this one lives as long."""
+        keep_newest(folder, _FORMER_KEPT)
 
     def begin(self, words: str, command: Sequence[str], by: str) -> Task:
         """Begin `coupole COMMAND... --json`. Raises InputError: too many are under way."""

@@ -21,6 +21,7 @@ from coupole.console.accounts import Accounts, Role
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.plan_queue import PlanQueue
 from coupole.console.sessions import Control
+from coupole.console.state_now import _entries_now
 from coupole.errors import InputError, StorageError
 from coupole.plan.cell import read_cell
 
@@ -189,3 +190,20 @@ def test_a_run_that_falls_silent_is_still_at_work_and_a_stop_interrupts_its_proc
         assert (found.state["state"], found.state["run"]) == ("silent", str(run))
         assert "does not answer" in found.tell("run", "stop")["trouble"][0]
         assert process.wait(10.0) == -signal.SIGINT
+
+
+def test_a_hundred_ended_entries_are_kept_and_what_others_printed_is_taken_away(
+    queue: PlanQueue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan_queue, "write_synced", lambda path, text: path.write_text(text))
+    output = tmp_path / "output"
+    output.mkdir()
+    holds = [queue.add("Ada", hold="turn it").id for _ in range(105)]
+    for number in holds[:103]:
+        (output / f"{number}.log").write_text("said")
+        queue.change(number, state="done", ended="2026-01-01T00:00:00.000Z")
+    queue.halt("wait")
+    assert [entry.id for entry in PlanQueue(tmp_path / "queue.json").entries] == holds[3:]
+    with Acquisitions(queue, read_cell(CellFolder(tmp_path).rig), output):
+        assert {path.stem for path in output.iterdir()} == set(holds[3:103])
+    assert [entry.id for entry in _entries_now(queue, None)] == holds[83:]

@@ -152,7 +152,7 @@ class _Screen:
             self._lies.set_content('<p class="hint">No plan names a mesh of it.</p>')
             return
         self._lies.set_content('<p class="hint">drawing</p>')
-        path = service.plan_files.drawings / secrets.token_hex(8) / "object.png"
+        path = service.plan_files.new_drawing() / "object.png"
         try:
             text = await in_thread(service.plan_files.read, name)
             await service.desk.draw_object(Draft(service.plan_files.path(name), text), path)

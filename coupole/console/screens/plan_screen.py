@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import html
 import math
-import secrets
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -316,7 +315,7 @@ class _Screen:
         service, draft = self._visit.service, Draft(self._plans.path(self._name), self._text)
         self._draw.set_enabled(False)
         self._drawing.set_text("drawing: paths are planned")
-        folder = service.plan_files.drawings / secrets.token_hex(8)
+        folder = service.plan_files.new_drawing()
         try:
             png, page = await service.desk.draw(draft, folder)
         except InputError as error:

@@ -12,7 +12,7 @@ from coupole.console.messages import NewEntry
 from coupole.console.run_results import export_folder, look_page, reflectance_folder, stands_alone
 from coupole.console.screens.export_dialog import ExportDialog
 from coupole.console.screens.parts import button, link, sure
-from coupole.console.screens.visit import Visit, enter, in_background
+from coupole.console.screens.visit import Visit, enter, in_background, in_thread
 from coupole.console.tasks import Task
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
@@ -87,9 +87,10 @@ class RunActions:
             in_background(lambda: _when_done(task, then))
 
     async def _verify(self) -> None:
-        runs = self._visit.service.runs
+        runs, name = self._visit.service.runs, self._name
+        before = await in_thread(runs.fingerprint, name)
         await self._begin(
-            "verify", ["verify", self._run.folder], lambda _: runs.note_verified(self._name, utc_now())
+            "verify", ["verify", self._run.folder], lambda _: runs.note_verified(name, utc_now(), before)
         )
 
     async def _report(self) -> None:

@@ -1,0 +1,21 @@
+"""Folders of what a console makes for a while, such as pictures: the newest stay."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from pathlib import Path
+
+
+def keep_newest(folder: Path, count: int) -> None:
+    """Take all files and folders out of a folder but the `count` that were written last."""
+    written = []
+    for path in folder.iterdir() if folder.is_dir() else ():
+        with contextlib.suppress(OSError):  # another took it away while we looked
+            written.append((path.stat().st_mtime_ns, path))
+    for _, path in sorted(written)[: max(0, len(written) - count)]:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with contextlib.suppress(OSError):
+                path.unlink()

@@ -174,7 +174,7 @@ def test_a_run_that_falls_silent_is_still_at_work_and_a_stop_interrupts_its_proc
 ) -> None:
     found = Acquisitions(queue, read_cell(CellFolder(tmp_path).rig), tmp_path / "output")
     entry = queue.add("Ada", plan="one.yaml")
-    with subprocess.Popen(["sleep", "60"]) as process:
+    with subprocess.Popen(["sleep", "12"]) as process:
         found._process = process
         queue.change(entry.id, state="running", pid=process.pid)
         run = tmp_path / "run"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import multiprocessing
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -91,10 +92,13 @@ class Desk:
 
     def __init__(self) -> None:
         self._pool: ProcessPoolExecutor | None = None
+        self._turn = asyncio.Lock()
 
-    async def check(self, draft: Draft) -> Checked:
-        """Raises InputError: it takes too long, or the process died of it."""
-        found: Checked = await self._do(check_draft, draft)
+    async def check(self, draft: Draft, is_wanted: Callable[[], bool] = lambda: True) -> Checked | None:
+        """None if it is no longer wanted when its turn comes. Raises InputError: it takes too long, or the process
+        died of it."""
+        async with self._turn:
+            found: Checked | None = await self._do_now(check_draft, draft) if is_wanted() else None
         return found
 
     async def draw(self, draft: Draft, folder: Path) -> tuple[Path, Path]:
@@ -113,22 +117,36 @@ class Desk:
         return found
 
     async def _do(self, work: Any, *arguments: Any) -> Any:
+        async with self._turn:
+            return await self._do_now(work, *arguments)
+
+    async def _do_now(self, work: Any, *arguments: Any) -> Any:
         if self._pool is None:
             self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+        pool = self._pool
         try:
-            future = asyncio.get_running_loop().run_in_executor(self._pool, work, *arguments)
-            return await asyncio.wait_for(future, _PATIENCE_S)
+            return await asyncio.wait_for(asyncio.wrap_future(pool.submit(work, *arguments)), _PATIENCE_S)
         except TimeoutError as error:
-            self.close()
+            self._end(pool)
             raise InputError(f"the plan could not be read within {_PATIENCE_S:g} s") from error
         except BrokenProcessPool as error:
-            self.close()
+            self._end(pool)
             raise InputError("the process that reads plans died of this one: is its mesh too large?") from error
+        except asyncio.CancelledError:
+            self._end(pool)
+            task = asyncio.current_task()
+            if task is not None and task.cancelling():
+                raise
+            raise InputError("the process that reads plans was ended") from None
 
     def close(self) -> None:
         """End the process."""
         if self._pool is not None:
-            for process in list((self._pool._processes or {}).values()):
-                process.kill()
-            self._pool.shutdown(wait=False, cancel_futures=True)
+            self._end(self._pool)
+
+    def _end(self, pool: ProcessPoolExecutor) -> None:
+        for process in list((pool._processes or {}).values()):
+            process.kill()
+        pool.shutdown(wait=False, cancel_futures=True)
+        if self._pool is pool:
             self._pool = None

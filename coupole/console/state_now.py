@@ -89,9 +89,14 @@ def _entries_now(queue: PlanQueue, left_s: float | None) -> list[EntryNow]:
     for entry in queue.entries:
         if entry.id in ended[:-_ENDED_TOLD]:
             continue
-        begin, end = (utc_text(time) if time else None for time in times.get(entry.id, (None, None)))
+        begin, end = (utc_text(_rounded(time)) if time else None for time in times.get(entry.id, (None, None)))
         found.append(EntryNow(**dict(entry), expected_begin=begin, expected_end=end))
     return found
+
+
+def _rounded(time: datetime) -> datetime:
+    """To 10 s: what is expected does not change with every look."""
+    return datetime.fromtimestamp(round(time.timestamp(), -1), UTC)
 
 
 def _devices(run: str) -> dict[str, Any]:

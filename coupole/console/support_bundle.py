@@ -14,6 +14,7 @@ import zipfile
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import coupole
 from coupole.errors import InputError, StorageError
@@ -26,12 +27,19 @@ OF_A_RUN = (RUN_JSON, "journal.jsonl", "README.txt", "manifest.sha256", "inputs/
 OF_THE_CONSOLE = ("audit.jsonl", "queue.json", "output/*", "commands/*")
 """Its accounts and the addresses of its notifications stay where they are."""
 LEFT_OUT = "(left out)"
-_KEY = r"[\w.-]*(?:passw(?:or)?d|passphrase|secret|token|credential|api[_-]?key|authorization|cookie)[\w.-]*"
-_VALUE = r""""(?:[^"\\]|\\.)*"|'[^']*'|[^\s,;}\]"'][^\n,;}\]"']*"""
+_KEY = (
+    r"(?<![\w.-])[\w.-]*(?:passw(?:or)?d|passphrase|pwd|secret|token|credential|api[_-]?key|private[_-]?key|"
+    r"authorization|cookie|hooks?)[\w.-]*"
+)
+_ENTRY = re.compile(rf"""(?i)((["']?){_KEY}\2\s*[:=])([ \t]*)(\S.*)?$""")
+_IS_KEY = re.compile(rf"(?i){_KEY}")
+_QUOTED = re.compile(r"""("(?:[^"\\]|\\.)*"|'(?:[^']|'')*')(?=\s*(?:[,}\]]|$))""")
+_LEAD = re.compile(r"[ \t]*(?:#[ \t]*)?")
 _SECRETS = (
-    re.compile(rf"""(?i)(["']?{_KEY}["']?\s*[:=]\s*)({_VALUE})"""),
+    re.compile(r"(?s)(-----BEGIN [A-Z ]*PRIVATE KEY-----)(.*?)(?=-----END|\Z)"),
     re.compile(r"()(\$argon2\w*\$[^\s\"']+)"),
     re.compile(r"(://[^\s/:@\"']*:)([^\s/@\"']+)(?=@)"),
+    re.compile(r"(?i)(https?://)([^\s\"']*hook[^\s\"']*)"),
     re.compile(r"(?i)(\bBearer\s+)([\w.~+/-]{8,}=*)"),
 )
 _README = """\
@@ -53,14 +61,68 @@ tokens are replaced by {left_out}; accounts and notifications are not in it at a
 def without_secrets(text: str) -> str:
     """The same text, with "(left out)" in place of values that let somebody in."""
     for secret in _SECRETS:
-        text = secret.sub(lambda found: found[1] + _as_written(found[2]), text)
-    return text
+        text = secret.sub(lambda found: f"{found[1]}{LEFT_OUT}", text)
+    if not _IS_KEY.search(text):
+        return text
+    if (whole := _json_without(text)) is not None:
+        return whole
+    kept: list[str] = []
+    below: tuple[int, bool] | None = None
+    for line in text.splitlines(keepends=True):
+        if below is not None and _is_below(line, *below):
+            continue
+        document = _json_without(line) if line.startswith(("{", "[")) else None
+        safe, below = (document, None) if document is not None else _line_without(line)
+        kept.append(safe)
+    return "".join(kept)
 
 
-def _as_written(value: str) -> str:
-    """JSON and YAML stay what they are."""
-    quote = value[0] if value[:1] in ('"', "'") else ""
-    return f"{quote}{LEFT_OUT}{quote}"
+def _json_without(text: str) -> str | None:
+    """None if it is no document of JSON; unchanged if no key in it names a secret."""
+    try:
+        document = json.loads(text)
+    except ValueError:
+        return None
+    found = _value_without(document)
+    if found == document:
+        return text
+    return json.dumps(found, ensure_ascii=False, indent=2 if "\n" in text.strip() else None) + "\n"
+
+
+def _value_without(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {
+            key: LEFT_OUT if _IS_KEY.fullmatch(key) and inner else _value_without(inner)
+            for key, inner in value.items()
+        }
+    if isinstance(value, list):
+        return [_value_without(inner) for inner in value]
+    return without_secrets(value) if isinstance(value, str) and _IS_KEY.search(value) else value
+
+
+def _line_without(line: str) -> tuple[str, tuple[int, bool] | None]:
+    """A line of YAML or of words, and the column beyond which lines after it are of a value left out (and whether
+    items of a list may stand at that column itself)."""
+    words, end = line.rstrip("\r\n"), line[len(line.rstrip("\r\n")) :]
+    if (entry := _ENTRY.search(words)) is None:
+        return line, None
+    value = entry[4] or ""
+    if (quoted := _QUOTED.match(value)) is not None:
+        quote = value[0]
+        rest, below = _line_without(value[quoted.end() :])
+        return f"{words[: entry.start()]}{entry[1]}{entry[3]}{quote}{LEFT_OUT}{quote}{rest}{end}", below
+    begin = words[: entry.start()]
+    lead = _LEAD.match(words)
+    column = len(begin) if not begin.strip("-# \t") else len(lead[0]) if lead else 0
+    return f"{begin}{entry[1]} {LEFT_OUT}{end}", (column, value.startswith("#") or not value)
+
+
+def _is_below(line: str, column: int, items: bool) -> bool:
+    """Whether a line goes on with a value whose key stands at this column."""
+    lead = _LEAD.match(line)
+    at = len(lead[0]) if lead else 0
+    rest = line[at:]
+    return not rest.strip() or at > column or (items and at == column and rest.startswith("-"))
 
 
 class SupportBundles:

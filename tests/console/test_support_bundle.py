@@ -77,3 +77,28 @@ def test_nothing_else_is_served_as_a_bundle(tmp_path: Path, name: str) -> None:
     (tmp_path / "accounts.json").write_text("{}")
     with pytest.raises(InputError):
         bundles.path(name)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "password: LE,AK\nafter: 1\n",
+        "token: LE'AK\nafter: 1\n",
+        "  password: |\n    LE\n\n    AK\nafter: 1\n",
+        "tokens: [LE, AK]\nafter: 1\n",
+        "tokens:\n- LE\n- AK\nafter: 1\n",
+        "mail:\n  - pwd: >\n      LE\n    after: 1\n",
+        "private_key: LE\n  AK\nafter: 1\n",
+        "# password: LE\n#   AK\nafter: 1\n",
+        "mail: {user: me, password: LE,\n  token: AK}\nafter: 1\n",
+        'password: "LE\n  AK"\nafter: 1\n',
+        "to https://chat.example.org/hooks/LEAK\nafter: 1\n",
+        "-----BEGIN PRIVATE KEY-----\nLE\nAK\n-----END PRIVATE KEY-----\nafter: 1\n",
+        '{"mail": {"tokens": ["LE", "AK"]}, "after: 1": "password: LEAK"}\n',
+    ],
+)
+def test_the_whole_of_a_secret_is_left_out(text: str) -> None:
+    found = without_secrets(text)
+    assert ("LE" in found, "AK" in found) == (False, False), found
+    assert "after: 1" in found
+    assert LEFT_OUT in found

@@ -267,10 +267,12 @@ class _Screen:
                 return
             self._verdict.set_content('<p class="hint">checking</p>')
             try:
-                found = await self._visit.service.desk.check(Draft(self._plans.path(self._name), self._text))
+                found = await self._visit.service.desk.check(
+                    Draft(self._plans.path(self._name), self._text), lambda: turn == self._turn
+                )
             except InputError as error:
                 found = Checked(problems=(Problem(self._name, 0, 0, "", str(error)),))
-            if turn == self._turn:
+            if found is not None and turn == self._turn:
                 self._show_checked(found)
 
         in_background(check)

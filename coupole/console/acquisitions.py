@@ -92,9 +92,11 @@ class Acquisitions:
             return self._queue.add(by, at_once=True, **fields)
 
     def lend(self, pid: int, who: str, what: str) -> None:
-        """Give the cell to a process for its work, until it gives it back or ends; nothing begins meanwhile.
-        Raises InputError: something has the cell."""
+        """Give the cell to a process for its work, until it gives it back or ends; nothing begins meanwhile. One
+        that has it keeps it. Raises InputError: something else has the cell."""
         with self._beginning:
+            if self.lending.has(pid):
+                return
             if why := self._had_by() or ("the queue is about to begin a plan" if self._queue.following else ""):
                 raise InputError(why)
             self.lending.lend(pid, who, what)

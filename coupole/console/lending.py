@@ -45,6 +45,11 @@ class Lending:
                 self._end()
             return self._loan.words if self._loan else ""
 
+    def has(self, pid: int) -> bool:
+        """Whether the cell is lent to this process."""
+        with self._lock:
+            return bool(self.lent_to) and self._loan is not None and self._loan.pid == pid
+
     def lend(self, pid: int, who: str, what: str) -> None:
         """Raises InputError: it is lent, or there is no such process."""
         with self._lock:

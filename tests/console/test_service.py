@@ -179,6 +179,24 @@ def test_a_name_that_another_site_has_pointed_here_is_refused(staffed: Staffed) 
 # -- what they may do -----------------------------------------------------------------------------------------
 
 
+def test_screens_work_only_with_a_session_and_from_the_consoles_own_pages(staffed: Staffed) -> None:
+    url, upgrade = staffed.served.url, {"Connection": "Upgrade", "Upgrade": "websocket"}
+    upgrade |= {"Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="}
+    asked = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
+    ada, nobody = staffed.signed_in("Ada"), staffed.served.browser()
+    assert ada.get(asked, Origin=url, **upgrade).status == 101
+    assert ada.get(asked, Origin="https://evil.example", **upgrade).status == 403
+    assert ada.get(asked, **upgrade).status == 403
+    assert nobody.get(asked, Origin=url, **upgrade).status == 403
+    assert nobody.get("/_nicegui_ws/socket.io/?EIO=4&transport=polling").status == 401
+    page = ada.get("/run", Accept="text/html")
+    assert page.status == 200
+    assert "default-src 'self'" in page.headers["Content-Security-Policy"]
+    asked_for = nobody.get("/run", Accept="text/html")
+    assert asked_for.status == 401
+    assert "Sign in" in asked_for.text
+
+
 def test_an_observer_looks_and_changes_nothing(staffed: Staffed) -> None:
     eve = staffed.signed_in("Eve")
     assert eve.state()["simulated"] is True

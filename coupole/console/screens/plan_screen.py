@@ -129,7 +129,8 @@ class _Screen:
         self._save.set_enabled(may and self._text != self._saved)
         self._enter.set_enabled(may)
         self._editor.set_enabled(self._visit.may_act)
-        self._draw.set_enabled(bool(self._name))
+        self._draw.set_enabled(may)
+        self._round.set_enabled(may)
 
     # -- the form -----------------------------------------------------------------------------------------------
 
@@ -215,6 +216,8 @@ class _Screen:
 
     async def _all_round(self) -> None:
         """Views at three elevations, looking at the middle of the mesh, from where the lens is focused."""
+        if not self._visit.may_act:
+            return
         path, rig = self._plans.path(self._name), self._visit.service.cell.rig
         try:
             low, high = await self._visit.service.desk.bounds(Draft(path, self._text))
@@ -314,6 +317,8 @@ class _Screen:
     # -- the cell -----------------------------------------------------------------------------------------------
 
     async def _draw_cell(self) -> None:
+        if not self._visit.may_act:
+            return
         service, draft = self._visit.service, Draft(self._plans.path(self._name), self._text)
         self._draw.set_enabled(False)
         self._drawing.set_text("drawing: paths are planned")

@@ -163,13 +163,18 @@ def _looks_at_the_object(day: Day) -> None:
 
 
 def _queues_two(day: Day) -> None:
+    """Behind a hold: while nothing runs, preflight is not put last."""
     ada = day.visitor
-    ada.clicks("[data-name=enter]")
-    ada.sees(".q-notification", "is in the queue")
     ada.goes_to("/queue")
-    ada.clicks("[data-name=enter]")
-    cells.wait_until(lambda: len(day.state()["queue"]) == 2, "two entries")
+    ada.types("input[data-name=hold]", "put the vase on the support")
+    ada.clicks("[data-name=enter-hold]")
+    ada.sees("[data-name=halted]", "put the vase")
+    for number in (1, 2):
+        ada.clicks("[data-name=enter]")
+        cells.wait_until(lambda: len(day.state()["queue"]) == number + 1, f"entry {number}")  # noqa: B023
+    ada.sees("[data-name=sum]", "all that waits")
     day.picture("the-queue")
+    ada.clicks("[data-name=go-on]")
 
 
 def _pauses_and_goes_on(day: Day) -> None:
@@ -200,14 +205,18 @@ def _stops(day: Day) -> None:
     ada.clicks("[data-name=stop]")
     ada.sees(".q-notification", "lights off")
     now = day.until("halted")
-    assert [entry["state"] for entry in now["queue"]] == ["stopped", "waiting"]
+    assert [entry["state"] for entry in now["queue"]] == ["done", "stopped", "waiting"]
     assert cells.safe(day.world)
     ada.sees("[data-name=alarm]", "vase.yaml")
     day.picture("stopped")
 
 
 def _resumes(day: Day) -> None:
-    ada, stopped = day.visitor, day.state()["queue"][0]
+    ada, stopped = day.visitor, day.state()["queue"][1]
+    ada.goes_to("/queue")
+    ada.clicks("[data-name=take-out]")
+    cells.wait_until(lambda: len(day.state()["queue"]) == 2, "the second taken out")
+    ada.goes_to("/run")
     ada.clicks("[data-name=resume]")
     resumed = cells.wait_until(lambda: _entry(day, resume=stopped["run"]), "the resume in the queue")
     assert resumed["needs"]["frames"] < stopped["needs"]["frames"]
@@ -222,7 +231,7 @@ def _entry(day: Day, **fields: str) -> dict[str, Any]:
 
 
 def _looks_at_frames(day: Day) -> None:
-    ada, run = day.visitor, Path(day.state()["queue"][0]["run"]).name
+    ada, run = day.visitor, Path(day.state()["queue"][1]["run"]).name
     ada.goes_to("/runs")
     ada.sees("[data-name=runs]", run)
     day.picture("the-runs")
@@ -235,15 +244,16 @@ def _looks_at_frames(day: Day) -> None:
 
 def _takes_a_view_again(day: Day) -> None:
     ada = day.visitor
+    day.until("idle")
     before = len(day.state()["queue"])
     ada.clicks("[data-name=retake]")
     cells.wait_until(lambda: len(day.state()["queue"]) > before, "the view in the queue")
     again = day.state()["queue"][-1]
-    assert again["needs"]["frames"] * 2 == day.state()["queue"][0]["needs"]["frames"]
+    assert again["needs"]["frames"] * 2 == day.state()["queue"][1]["needs"]["frames"]
 
 
 def _archives(day: Day) -> None:
-    ada, run = day.visitor, Path(day.state()["queue"][0]["run"])
+    ada, run = day.visitor, Path(day.state()["queue"][1]["run"])
     size = sum(path.stat().st_size for path in run.glob("views/*.h5"))
     ada.clicks("[data-name=archive]")
     ada.clicks("[role=dialog] button", "Archive")

@@ -6,6 +6,7 @@ Each step's picture is kept for the docs, in the folder that COUPOLE_SCREENSHOTS
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -115,7 +116,8 @@ def _writes_a_plan(day: Day) -> None:
     ada.clicks("[data-name=make]")
     ada.sees("[data-name=verdict]", "can be run")
     _fills(ada, "object", "2019.17")
-    _fills(ada, "mesh", str(REPO / "configs/objects/relief.ply"))
+    shutil.copy(REPO / "configs/objects/relief.ply", day.folder / "relief.ply")
+    _fills(ada, "mesh", "relief.ply")
     _fills(ada, "azimuths", "2")
     _fills(ada, "elevations", "60")
     _fills(ada, "every", "5")

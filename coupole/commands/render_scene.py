@@ -27,7 +27,7 @@ def render(
     width: Annotated[
         int | None, typer.Option("--width", min=4, help="Of the pictures, if less than the scene's.")
     ] = None,
-    step: Annotated[int | None, typer.Option("--step", help="Between bands, nm: 5, 10, 20 or 40.")] = None,
+    step: Annotated[int | None, typer.Option("--step", help="Between bands, nm: 5, 10, 20, 40.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Render a scene in spectral bands: an EXR of all bands and a PNG for each camera, and a summary."""
@@ -59,7 +59,8 @@ def render(
         print(json.dumps({"folder": str(out), **summary}))
         return
     for seen in summary["cameras"].values():
-        console.print(f"{out / seen['files']['png']}: white {seen['white_cd_m2']:.4g} cd/m2, simulated")
+        made = seen["files"].get("film") or seen["files"]["png"]
+        console.print(f"{out / made}: white {seen['white_cd_m2']:.4g} cd/m2, simulated")
 
 
 def read_scene(path: Path) -> tuple[Document, Scene]:

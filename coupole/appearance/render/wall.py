@@ -15,7 +15,7 @@ from coupole.appearance.render.materials import Gilt, metal_index
 from coupole.appearance.render.model import unit
 from coupole.appearance.render.objects import Arcature
 from coupole.appearance.render.pictures import SYNTHETIC, write_png
-from coupole.appearance.render.scene_file import Caustic, Scene
+from coupole.appearance.render.scene_file import Caustic, PlainScene
 from coupole.appearance.render.spectra import luminous, power, reflectance, scaled
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
@@ -24,7 +24,7 @@ _PART = 500_000
 
 
 def write_wall(
-    scene: Scene, folder: Path, stem: Path, white: Array, progress: Callable[[int, int], None]
+    scene: PlainScene, folder: Path, stem: Path, white_power: Array, progress: Callable[[int, int], None]
 ) -> dict[str, Any]:
     """Write `stem`.png, the colour of a white wall, with the brightest 0.5 % of the cells shown as white; returns
     figures.
@@ -36,9 +36,10 @@ def write_wall(
     light = next(light for light in scene.lights if isinstance(light, Distant))
     sun = _sun(light, thing, folder, scene.name)
     lit, share_by_gold = _lit(scene.caustic, scene.seed, thing, _niche(thing, folder), sun, progress)
-    xyz = colour.tristimulus(lit / np.pi, range(lit.shape[-1]), 5, scene.observer)
+    eye = colour.eye(scene.observer, sun.irradiance, white_power, 5)
+    xyz = eye.tristimulus(lit / np.pi)
     brightest = float(np.quantile(xyz[..., 1], 0.995))
-    picture, _ = colour.displayed(colour.adapted(xyz / brightest, white, scene.display.adaptation))
+    picture, _ = colour.displayed(colour.adapted(xyz / brightest, eye.white, scene.display.adaptation))
     about = f"{scene.name}, light on the back wall: {SYNTHETIC}; {scene.caustic.photons} photons"
     write_png(stem.with_suffix(".png"), picture, about)
     return {

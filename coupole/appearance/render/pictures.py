@@ -55,6 +55,8 @@ def write(
         "mean_cd_m2": round(float(eye.luminance(found.radiance).mean()), 6),
         "outside_srgb": round(outside, 6),
         "denoised": scene.display.denoised,
+        "samples": found.samples,
+        "noise": None if found.noise is None else round(found.noise, 5),
     }
     if len(found.stokes) > 1:
         degree = degree_of_linear_polarisation(found.stokes)

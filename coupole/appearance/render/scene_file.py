@@ -131,7 +131,9 @@ class Scene(Model):
     observer: Literal["10 deg", "2 deg"] = "10 deg"
     bands: Bands = Bands()
     samples: Annotated[int, Field(ge=1, le=1_000_000)] = 64
-    """Paths through each pixel."""
+    """Paths through each pixel; at most, where a `noise` is wanted."""
+    noise: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """Relative standard error of luminance that half of the pixels shall have at most."""
     depth: Annotated[int, Field(ge=1, le=100)] = 8
     """Surfaces that a path meets at most."""
     seed: Annotated[int, Field(ge=0, le=2**31)] = 1

@@ -19,12 +19,21 @@ Progress = Callable[[str, int, int], None]
 """Camera, passes done, passes in all."""
 
 
-def reduced(scene: Scene, *, samples: int | None, width_px: int | None, step_nm: int | None) -> Scene:
+def reduced(
+    scene: Scene,
+    *,
+    samples: int | None = None,
+    width_px: int | None = None,
+    step_nm: int | None = None,
+    noise: float | None = None,
+) -> Scene:
     """The scene with fewer samples, narrower pictures or coarser bands, for a quick look."""
     cameras = [camera.narrowed(width_px) if width_px else camera for camera in scene.cameras]
     changed = {**scene.model_dump(mode="json"), "cameras": [camera.model_dump() for camera in cameras]}
     if samples:
         changed["samples"] = samples
+    if noise:
+        changed["noise"] = noise
     if step_nm:
         changed["bands"] = {"step_nm": step_nm}
     return Scene.model_validate(changed)

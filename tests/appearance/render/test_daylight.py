@@ -182,3 +182,25 @@ def test_eyes_luminance_of_a_spectrum_is_that_of_v_lambda() -> None:
 def test_a_renderer_has_plain_lights() -> None:
     with opened(scene([plane(GREY)], [DAYLIGHT]), HERE) as renderer:
         assert [one.kind for one in renderer.scene.lights] == ["distant", "environment"]
+
+
+def test_a_picture_has_the_noise_that_was_asked_for_and_the_samples_that_it_takes() -> None:
+    lamp = {
+        "kind": "area",
+        "position_mm": [300, 0, 300],
+        "target_mm": [0, 0, 0],
+        "width_mm": 200,
+        "height_mm": 200,
+    }
+    lights = [{**lamp, "luminance_cd_m2": 5000, "spectrum": illuminant("D65")}]
+    most = {"samples": 4096, "bands": {"step_nm": 40}}
+    coarse, fine = (rendered(scene([plane(GREY)], lights, noise=noise, **most)) for noise in (0.012, 0.004))
+    assert coarse.noise is not None
+    assert fine.noise is not None
+    assert (coarse.noise <= 0.012, fine.noise <= 0.004) == (True, True)
+    assert 4 * coarse.samples <= fine.samples <= 4096
+    true = rendered(scene([plane(GREY)], lights, seed=99, **most)).radiance
+    off = (
+        np.median(np.abs(fine.radiance / true - 1.0)[..., 5]) / 0.6745
+    )  # of a normal: median to standard deviation
+    assert off == pytest.approx(fine.noise, rel=0.5)

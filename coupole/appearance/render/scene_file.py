@@ -100,6 +100,15 @@ class Caustic(Model):
     cell_mm: Positive = 4.0
 
 
+class Gathered(Model):
+    """Sunlight that gold sends onto matt surfaces, by photons gathered by the eye, in place of paths."""
+
+    photons: Annotated[int, Field(ge=1000, le=100_000_000)] = 2_000_000
+    """Of each sun."""
+    radius_mm: Positive = 4.0
+    """About what the eye sees: less is sharper, and needs more photons."""
+
+
 class Film(Model):
     """A picture for each time from `begins` to `ends`; all have the white of the first."""
 
@@ -142,6 +151,7 @@ class Scene(Model):
     display: Display = Display()
     outputs: Outputs = Outputs()
     caustic: Caustic | None = None
+    gathered: Gathered | None = None
     film: Film | None = None
 
     @model_validator(mode="after")
@@ -158,6 +168,8 @@ class Scene(Model):
             raise ValueError(
                 "`caustic` needs an object of kind `arcature` and a light of kind `distant` or `daylight`"
             )
+        if self.gathered is not None and (self.polarisation or not kinds & {"distant", "daylight"}):
+            raise ValueError("`gathered` needs a light of kind `distant` or `daylight`, and no polarisation")
         if self.film is not None and "daylight" not in kinds:
             raise ValueError("`film` needs a light of kind `daylight`, whose time it moves")
         return self

@@ -9,10 +9,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from coupole.appearance.render import pictures, variant, wall
+from coupole.appearance.render import by_gold, pictures, variant, wall
 from coupole.appearance.render.film import write_film
-from coupole.appearance.render.rendering import Renderer, opened
-from coupole.appearance.render.scene_file import Film, Scene
+from coupole.appearance.render.rendering import Renderer, Spectral, opened
+from coupole.appearance.render.scene_file import Camera, Film, Scene
 from coupole.appearance.render.spectra import power
 
 Progress = Callable[[str, int, int], None]
@@ -70,7 +70,7 @@ def _still(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[st
         written_by = _written_by(renderer)
         seen = {}
         for camera in scene.cameras:
-            found = renderer.render(camera, partial(progress, camera.name))
+            found = _seen(renderer, camera, folder, partial(progress, camera.name))
             stem = out / f"{scene.name}-{camera.name}"
             seen[camera.name] = pictures.write(renderer.scene, found, stem, eye=eye, written_by=written_by)
         summary: dict[str, Any] = {"renderer": written_by, "cameras": seen}
@@ -125,7 +125,7 @@ def _frame(scene: Scene, folder: Path, stem: Path) -> dict[str, Any]:
         if known["of"] == digest:
             return known
     with opened(scene, folder) as renderer:
-        found = renderer.render(scene.cameras[0])
+        found = _seen(renderer, scene.cameras[0], folder, lambda done, total: None)
         eye = pictures.eye_of(renderer.scene, folder)
         written_by = _written_by(renderer)
         seen = pictures.write(renderer.scene, found, stem, eye=eye, written_by=written_by, with_spectra=False)
@@ -134,5 +134,13 @@ def _frame(scene: Scene, folder: Path, stem: Path) -> dict[str, Any]:
     return made
 
 
+def _seen(renderer: Renderer, camera: Camera, folder: Path, progress: Callable[[int, int], None]) -> Spectral:
+    gathered = renderer.scene.gathered
+    if gathered is None:
+        return renderer.render(camera, progress)
+    return by_gold.render(renderer.scene, gathered, camera, folder, progress)
+
+
 def _written_by(renderer: Renderer) -> str:
-    return f"Mitsuba {renderer.version}, {renderer.variant_name}"
+    photons = "" if renderer.scene.gathered is None else ", and photons gathered by the eye"
+    return f"Mitsuba {renderer.version}, {renderer.variant_name}{photons}"

@@ -78,6 +78,12 @@ def _lit(
     return np.asarray(lit), by_gold
 
 
+def gold_reflectance(gilt: Gilt, folder: Path) -> caustic.Reflectance:
+    """Of the covered share, by cosine; the bole's light is neglected."""
+    leaf = _leaf(gilt, folder)
+    return lambda cosines: layered.at_cosine(leaf, cosines)
+
+
 def _sun(light: Distant, thing: Arcature, folder: Path, scene_name: str) -> caustic.Sun:
     """In the niche's frame."""
     direction = thing.scene_from_thing()[:3, :3].T @ np.array(unit(light.direction))
@@ -91,14 +97,12 @@ def _sun(light: Distant, thing: Arcature, folder: Path, scene_name: str) -> caus
 
 def _niche(thing: Arcature, folder: Path) -> caustic.Niche:
     parts = arcature.arcature(thing.radius_mm, thing.height_mm, thing.depth_mm)
-    leaf = _leaf(thing.gilt, folder)
-    return caustic.Niche(
-        parts.gilded_mm, parts.stone_mm, lambda cosines: layered.at_cosine(leaf, cosines), thing.gilt.roughness
-    )
+    reflectance = gold_reflectance(thing.gilt, folder)
+    return caustic.Niche(parts.gilded_mm, parts.stone_mm, reflectance, thing.gilt.roughness)
 
 
 def _leaf(gilt: Gilt, folder: Path) -> Array:
-    """Specular part of the covered share, as in `layered.Sheet`; the bole's light is neglected."""
+    """Specular part of the covered share, as in `layered.Sheet`."""
     index = metal_index(gilt.gold)
     if gilt.holes > 0.0:
         index = gilding.leaf_index(index, gilt.holes)

@@ -1,4 +1,4 @@
-"""Commands that people begin at the console, when the console is killed."""
+"""Commands that people begin at the console, and processes that compute for it, when the console is killed."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import cells
+import pytest
 
 _CONSOLE = """
 import sys, threading, time
@@ -25,15 +26,28 @@ time.sleep(60)
 """
 
 
-def test_what_a_killed_console_has_begun_is_interrupted_and_nothing_is_before(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", _CONSOLE, tmp_path]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as console:
-        assert console.stdout is not None
-        number, running = console.stdout.readline().split()
+_COMPUTES = """
+import os, time
+from coupole.console import warm_process
+warm_process._IMPORTED = []
+process = warm_process.WarmProcess("computes")
+print(process.run(os.getpid, 60.0), True, flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("console", [_CONSOLE, _COMPUTES], ids=["commands", "computes"])
+def test_what_a_killed_console_has_begun_is_interrupted_and_nothing_is_before(
+    tmp_path: Path, console: str
+) -> None:
+    command = [sys.executable, "-c", console, tmp_path]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        number, running = process.stdout.readline().split()
         began = os.pidfd_open(int(number))
         try:
             assert running == "True", "the thread that asked for it has ended, the console has not"
-            console.kill()
+            process.kill()
             cells.wait_until(lambda: _ended(began), "the end of what it has begun")
         finally:
             if not _ended(began):

@@ -101,7 +101,7 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
             folder=folder,
             plans=plans,
             accounts=accounts,
-            sessions=Sessions(),
+            sessions=Sessions(holds=accounts.holds),
             control=control,
             audit=audit,
             queue=queue,

@@ -36,9 +36,9 @@ def renew_report(run: Run) -> Path:
     if run.in_use:
         return report.write(run)
     with run.locked():
-        manifest.forget(run.folder, [report.NAME])
+        manifest.forget(run.folder, [run.report_path.name])
         path = report.write(run, in_use=False)
-        manifest.enter(run.folder, [report.NAME])
+        manifest.enter(run.folder, [run.report_path.name])
     return path
 
 

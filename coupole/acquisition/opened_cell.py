@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from coupole.acquisition.runtime_folder import in_use
+from coupole.acquisition.safeguard import Safeguard
 from coupole.acquisition.signals import held
 from coupole.devices import Camera, Clock, Identity, LedBox, Robot, SystemClock
 from coupole.plan.cell import Cell
 from coupole.plan.registry import WORLD, load_class, settings_class
 from coupole.plan.rig import Rig, Sensor
 from coupole.plan.rig_devices import device_for, in_world
-from coupole.preflight.job import Job
 from coupole.preflight.simulated_world import coarse, world_config
 
+if TYPE_CHECKING:
+    from coupole.preflight.job import Job
+
 _LONGEST_WATCHDOG_S = 60.0
-_SAFE_WITHIN_S = 15.0
-"""Longer than any driver's time-outs for switching off and stopping; what hangs longer is given up and told."""
 
 
 @dataclass
@@ -69,36 +68,6 @@ class OpenedCell:
             if safeguard.trouble:
                 self.trouble.append(f"not sure that it is safe ({safeguard.what}): {safeguard.trouble}")
         self.lights_confirmed, self.arm_confirmed = not done[0].trouble, not done[1].trouble
-
-
-class Safeguard:
-    """One action that makes a cell safe, in a thread of its own, so that none waits for another."""
-
-    def __init__(self, what: str, act: Callable[[], None]) -> None:
-        self.what, self._act = what, act
-        self.trouble = f"no answer within {_SAFE_WITHIN_S:g} s"
-        """Why it is not sure to be done; empty when it is done."""
-        self._thread = threading.Thread(target=self._run, name=what, daemon=True)
-        self._thread.start()
-
-    def wait(self, at_most_s: float = _SAFE_WITHIN_S) -> None:
-        self._thread.join(at_most_s)
-
-    def _run(self) -> None:
-        try:
-            self._act()
-        except BaseException as error:  # noqa: BLE001  whatever it is, the other safeguards go on
-            self.trouble = str(error) or type(error).__name__
-        else:
-            self.trouble = ""
-
-
-def unsure(done: Sequence[Safeguard], within_s: float) -> list[str]:
-    """What is not sure to be done of it after a while."""
-    end_s = time.monotonic() + within_s
-    for safeguard in done:
-        safeguard.wait(max(0.0, end_s - time.monotonic()))
-    return [f"not sure: {safeguard.what}: {safeguard.trouble}" for safeguard in done if safeguard.trouble]
 
 
 @contextmanager

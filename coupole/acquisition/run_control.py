@@ -23,8 +23,8 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from coupole.acquisition.observer import Control
-from coupole.acquisition.opened_cell import Safeguard, unsure
 from coupole.acquisition.runtime_folder import named_after, runtime_folder
+from coupole.acquisition.safeguard import Safeguard, unsure
 from coupole.acquisition.user_socket import PATIENCE_S, UserSocket, exchange
 from coupole.errors import InputError, reason
 from coupole.viewing.progress import Progress

@@ -36,28 +36,17 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Check everything about a plan that can be checked without devices."""
-    from coupole.preflight.checking import preflight_of
-    from coupole.preflight.job import read_job, without_hidden
-    from coupole.storage.run import Run
+    from coupole.preflight.files import Files, check_files
     from coupole.viewing.preflight_table import document_of, show_preflight, show_views
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     try:
-        job = read_job(plan or plan_of(resume), rig)
-        run = Run(resume) if resume else None
-        if run is not None:
-            run.refuse_changes(job.inputs)
+        files = Files(plan or plan_of(resume), rig, resume, output)
+        job, report = check_files(files, paths=not no_paths, measure=not no_disk_speed)
     except InputError as error:
         fail(error, as_json=as_json, found={"ok": False, "refusals": []})
         raise
-    if run is not None or not no_paths:
-        job = without_hidden(job, run.hidden_leds if run else None)
-    folder = run.folder if run else output or job.cell.storage_folder
-    allocated_bytes, proven = (run.allocated_bytes(), run.proven()) if run else (0, {})
-    job, report = preflight_of(
-        job, folder, paths=not no_paths, allocated_bytes=allocated_bytes, proven=proven, measure=not no_disk_speed
-    )
     show_preflight(console, report, name=job.plan.name, rig=job.cell.rig.name)
     show_views(console, report)
     if as_json:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 import json
 import re
 import secrets
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,12 @@ class Account:
 
     name: str
     role: Role
+    key: str = field(default="", compare=False, repr=False)
+    """By which it is told from another one of that name, made later."""
+
+
+FIRST_ENGINEER = Account("first engineer", Role.ENGINEER)
+"""Whoever signs in with the token, until an engineer has an account."""
 
 
 class Accounts:
@@ -76,10 +83,20 @@ class Accounts:
         """All, by name."""
         return [Account(name, Role.of(kept["role"])) for name, kept in sorted(self._stored.items())]
 
+    def holds(self, account: Account) -> bool:
+        """Whether somebody still is who signed in: the account is there, with this role; and of the first engineer
+        that no engineer has an account yet."""
+        if account == FIRST_ENGINEER:
+            return not _has_engineer(self._stored)
+        kept = self._stored.get(account.name)
+        return kept is not None and kept["role"] == account.role.word and _key(kept) == account.key
+
     def add(self, name: str, password: str, role: Role) -> Account:
         """A new account, on the disk when this returns. Raises InputError, StorageError."""
         if not _NAME.fullmatch(name):
             raise InputError("name: expected at most 64 letters, digits, spaces, dots, hyphens; a letter first")
+        if name == FIRST_ENGINEER.name:
+            raise InputError(f"name: {name} is whoever signs in with the token")
         if not SHORTEST_PASSWORD <= len(password) <= LONGEST_PASSWORD:
             raise InputError(f"password: expected {SHORTEST_PASSWORD} to {LONGEST_PASSWORD} characters")
         hashed = self._hasher.hash(password)
@@ -130,7 +147,7 @@ class Accounts:
                 others = [one for one in self._failures if now_s - one[0] < _FORGOTTEN_AFTER_S]
                 self._failures = [*others[-_MOST_KEPT:], (now_s, here, name)]
                 return None
-        return Account(name, Role.of(kept["role"])) if kept else None
+        return Account(name, Role.of(kept["role"]), _key(kept)) if kept else None
 
     def sign_in_first(self, token: str) -> Account | None:
         """An engineer with the token of a start without an engineer's account; once."""
@@ -138,7 +155,7 @@ class Accounts:
             if not self.first_token or not hmac.compare_digest(token.encode(), self.first_token.encode()):
                 return None
             self.first_token = ""
-        return Account("first engineer", Role.ENGINEER)
+        return FIRST_ENGINEER
 
     def _keep(self, stored: dict[str, dict[str, Any]]) -> None:
         try:
@@ -150,6 +167,11 @@ class Accounts:
         except OSError as error:
             raise StorageError(f"{self._path}: the account cannot be kept: {error.strerror}") from error
         self._stored = stored
+
+
+def _key(kept: dict[str, Any]) -> str:
+    """Differs for each account, as its password is hashed with a salt of its own."""
+    return hashlib.sha256(kept["password"].encode()).hexdigest()
 
 
 def _has_engineer(stored: dict[str, dict[str, Any]]) -> bool:

@@ -20,6 +20,7 @@ from typing import Any
 
 from coupole.acquisition.run_control import Command, State, ask, running
 from coupole.acquisition.runtime_folder import is_in_use, named_after
+from coupole.console.growing_file import end_of_file
 from coupole.console.lending import Lending
 from coupole.console.plan_queue import Entry, PlanQueue
 from coupole.errors import CoupoleError, InputError
@@ -105,8 +106,7 @@ class Acquisitions:
         """What an entry's process has printed (the last 64 KiB), and its figures as of `acquire --json`, once they
         are there."""
         said, figures = self._files(entry)
-        text = said.read_bytes()[-_MOST_SAID_BYTES:].decode(errors="replace") if said.is_file() else ""
-        return text, _last_document(figures)
+        return end_of_file(said, _MOST_SAID_BYTES), _last_document(figures)
 
     def _had_by(self) -> str:
         """Who has the cell; empty if nobody."""
@@ -244,7 +244,5 @@ def _last_document(path: Path) -> dict[str, Any]:
 
 
 def _last_line(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1]
-    except (OSError, IndexError):
-        return ""
+    lines = end_of_file(path, _MOST_SAID_BYTES).strip().splitlines()
+    return lines[-1] if lines else ""

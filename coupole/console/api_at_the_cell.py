@@ -1,5 +1,5 @@
 """Routes of the HTTP interface for what is done with the cell besides runs: its loan, light by hand, the queue's
-order."""
+order, its preflight."""
 
 from __future__ import annotations
 
@@ -32,6 +32,14 @@ def add_routes_at_the_cell(app: FastAPI, service: Service) -> None:
         limiter = service.entering.one_at_a_time
         await to_thread.run_sync(service.entering.move, entry, asked.before, limiter=limiter)
         return service.state()
+
+    @app.delete("/api/v1/preflight", responses=REFUSALS)
+    def give_up(who: Who) -> dict[str, str]:
+        """Give up the preflight that is being made: what it is of is not entered."""
+        allow(service, who, Role.OPERATOR, "give up a preflight")
+        words = service.entering.preflight.words
+        service.entering.preflight.give_up()
+        return {"given_up": words}
 
     @app.get("/api/v1/queue/{entry}/output", responses=REFUSALS)
     def output(entry: Text) -> Output:

@@ -18,7 +18,7 @@ from coupole.errors import CoupoleError, InputError
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell, read_cell
 from coupole.plan.reading import read_plan
-from coupole.preflight.checking import situation_of
+from coupole.preflight.situation import situation_of
 from coupole.storage.durable import make_folder
 
 OF_A_CELL = tuple(step for step in STEPS if step.name != MESH)

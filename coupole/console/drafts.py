@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from coupole.console.warm_process import WarmProcess
 from coupole.errors import CoupoleError, InputError, Problem
 
 _PATIENCE_S = 300.0
@@ -88,10 +86,10 @@ def bounds_of_mesh(draft: Draft) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 class Desk:
-    """The process that reads drafts; a new one after it died."""
+    """The process that reads drafts."""
 
     def __init__(self) -> None:
-        self._pool: ProcessPoolExecutor | None = None
+        self._process = WarmProcess("reads plans")
         self._turn = asyncio.Lock()
 
     async def check(self, draft: Draft, is_wanted: Callable[[], bool] = lambda: True) -> Checked | None:
@@ -121,32 +119,12 @@ class Desk:
             return await self._do_now(work, *arguments)
 
     async def _do_now(self, work: Any, *arguments: Any) -> Any:
-        if self._pool is None:
-            self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
-        pool = self._pool
         try:
-            return await asyncio.wait_for(asyncio.wrap_future(pool.submit(work, *arguments)), _PATIENCE_S)
-        except TimeoutError as error:
-            self._end(pool)
-            raise InputError(f"the plan could not be read within {_PATIENCE_S:g} s") from error
-        except BrokenProcessPool as error:
-            self._end(pool)
-            raise InputError("the process that reads plans died of this one: is its mesh too large?") from error
+            return await asyncio.to_thread(self._process.run, work, _PATIENCE_S, 0, *arguments)
         except asyncio.CancelledError:
-            self._end(pool)
-            task = asyncio.current_task()
-            if task is not None and task.cancelling():
-                raise
-            raise InputError("the process that reads plans was ended") from None
+            self._process.end()
+            raise
 
     def close(self) -> None:
         """End the process."""
-        if self._pool is not None:
-            self._end(self._pool)
-
-    def _end(self, pool: ProcessPoolExecutor) -> None:
-        for process in list((pool._processes or {}).values()):
-            process.kill()
-        pool.shutdown(wait=False, cancel_futures=True)
-        if self._pool is pool:
-            self._pool = None
+        self._process.end()

@@ -1,16 +1,12 @@
 """Reads and checks what is to be acquired, and enters it in the queue.
 
-Preflight is a process of its own at the lowest priority, `coupole check --json`: what it computes must not take
-time from a run. While something is acquired it does not measure the disk's speed either, as that takes all of it.
+Preflight is made by a process of its own (`entry_preflight`). While something is acquired it does not measure the
+disk's speed, as that takes all of it.
 """
 
 from __future__ import annotations
 
-import json
-import os
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +15,7 @@ from typing import Any
 from anyio import CapacityLimiter
 
 from coupole.console.acquisitions import Acquisitions
+from coupole.console.entry_preflight import EntryPreflight
 from coupole.console.messages import NewEntry
 from coupole.console.outlook import at_work_of, too_little_disk, too_much_light
 from coupole.console.plan_queue import Entry, Needs, PlanQueue
@@ -27,10 +24,9 @@ from coupole.plan.cell import Cell, read_cell
 from coupole.plan.plan import possible_path
 from coupole.plan.reading import PlanFiles, read_plan
 from coupole.plan.yamlfile import read
+from coupole.preflight.files import Files
 from coupole.storage.ledger import ledger_of
 from coupole.storage.run import Run
-
-_LOWEST_PRIORITY = 19
 
 
 class Entering:
@@ -39,14 +35,13 @@ class Entering:
     def __init__(self, cell: Cell, plans: Path, queue: PlanQueue, acquisitions: Acquisitions) -> None:
         self._cell, self._plans, self._queue, self._acquisitions = cell, plans, queue, acquisitions
         self._rig = cell.document.path.resolve()
-        self._checking: subprocess.Popen[str] | None = None
+        self.preflight = EntryPreflight()
         self.one_at_a_time = CapacityLimiter(1)
         """For threads that call `enter` and `move`: each counts what the ones before have entered."""
 
     def close(self) -> None:
         """End what is being checked."""
-        if self._checking is not None:
-            self._checking.kill()
+        self.preflight.close()
 
     def enter(
         self, asked: NewEntry, by: str, *, by_command_line: bool, may_still: Callable[[], None] = lambda: None
@@ -74,7 +69,7 @@ class Entering:
             return self._acquisitions.begin_at_once(by, **fields)
         files = plan or (read_plan(run.plan_path) if run else None)
         assert files is not None
-        fields["needs"] = self._needs(files, fields)
+        fields["needs"] = self._needs(files, fields, by)
         self._refuse(Entry(id="new", by=by, entered="", **fields), asked.before)
         may_still()
         return self._queue.add(by, before=asked.before, **fields)
@@ -105,20 +100,16 @@ class Entering:
 
     # -- preflight --------------------------------------------------------------------------------------------
 
-    def _needs(self, files: PlanFiles, fields: dict[str, Any]) -> Needs:
+    def _needs(self, files: PlanFiles, fields: dict[str, Any], by: str) -> Needs:
         """Raises InputError: preflight refuses it, with all refusals."""
-        asked = ["--rig", str(self._rig), fields["plan"]] if fields["plan"] else []
-        asked += ["--resume", fields["resume"]] if fields["resume"] else []
-        asked += ["--output", fields["output"]] if fields["output"] else []
-        if self._acquisitions.state is not None:
-            asked.append("--no-disk-speed")
+        run = Path(fields["resume"]) if fields["resume"] else None
+        plan, rig = (Path(fields["plan"]), self._rig) if fields["plan"] else (files.document.path, None)
+        asked = Files(plan, rig, run, Path(fields["output"]) if fields["output"] else None)
         begun_s = time.monotonic()
-        found = self._checked(asked)
-        named = fields["plan"] or fields["resume"]
-        if found.get("refusals"):
-            raise InputError([_problem(named, refusal) for refusal in found["refusals"]])
-        if "error" in found:
-            raise InputError(found["error"])
+        told = self.preflight.of(asked, by, beside_a_run=self._acquisitions.state is not None)
+        if told.problems:
+            raise InputError(told.problems)
+        found = told.document
         thing = files.plan.object
         return Needs(
             duration_s=found["duration_s"],
@@ -131,20 +122,6 @@ class Entering:
             folder=fields["resume"] or fields["output"] or str(self._cell.storage_folder.resolve()),
             warnings=tuple(found["warnings"]),
         )
-
-    def _checked(self, asked: list[str]) -> dict[str, Any]:
-        command = [sys.executable, "-m", "coupole.commands.cli", "check", *asked, "--json"]
-        with subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as self._checking:
-            os.setpriority(os.PRIO_PROCESS, self._checking.pid, _LOWEST_PRIORITY)
-            out, err = self._checking.communicate()
-        try:
-            found: dict[str, Any] = json.loads(out)
-        except ValueError as error:
-            last = (err.strip().splitlines() or ["it was killed"])[-1]
-            raise InputError(f"preflight ended without a result: {last}") from error
-        return found
 
     # -- with what runs and waits before ------------------------------------------------------------------------
 

@@ -165,6 +165,9 @@ class StateNow(BaseModel):
     """To whom the cell is lent, and for what; empty if it is not. Nothing begins meanwhile."""
     queue: list[EntryNow]
     """All entries that run or wait, after the 20 that ended last, in their order."""
+    checking: str
+    """What preflight is being made of, for whom, since when and how far it is; empty if of nothing. What else is
+    entered waits for it."""
     in_control: str
     """Who may act; empty: any operator."""
     asked_by: str

@@ -17,7 +17,6 @@ from coupole.console.run_results import look_page
 from coupole.console.service_parts import Service
 from coupole.console.sessions import Session
 from coupole.errors import InputError
-from coupole.viewing import report
 
 _STILL = (
     "sandbox allow-popups; default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; "
@@ -51,7 +50,7 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
     @app.get("/api/v1/runs/{run}/report", response_class=FileResponse)
     def report_page(run: Text) -> FileResponse:
         """The run's report, without the right to run scripts."""
-        return _file(service.runs.run(run).folder / report.NAME, "text/html", _STILL)
+        return _file(service.runs.run(run).report_path, "text/html", _STILL)
 
     @app.get("/api/v1/runs/{run}/readme", response_class=FileResponse)
     def readme(run: Text) -> FileResponse:

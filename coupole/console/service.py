@@ -89,17 +89,19 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
         plan_files = PlanFiles(plans, cell.document.path, folder / "drawings")
 
         bench = parts.enter_context(Bench(cell, acquisitions, plan_files, folder / "bench"))
+        entering = parts.enter_context(contextlib.closing(Entering(cell, plans, queue, acquisitions)))
 
         def state() -> StateNow:
             trouble = "; ".join(filter(None, (audit.trouble, notifier.trouble)))
-            return state_of(cell, queue, acquisitions, bench, control, trouble)
+            checking = entering.preflight.words
+            return state_of(cell, queue, acquisitions, bench, control, checking=checking, trouble=trouble)
 
         yield Service(
             cell=cell,
             folder=folder,
             plans=plans,
             accounts=accounts,
-            sessions=Sessions(),
+            sessions=Sessions(holds=accounts.holds),
             control=control,
             audit=audit,
             queue=queue,
@@ -116,7 +118,7 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
             tasks=parts.enter_context(contextlib.closing(Tasks(folder / "commands"))),
             state=state,
             newest=Newest(state),
-            entering=parts.enter_context(contextlib.closing(Entering(cell, plans, queue, acquisitions))),
+            entering=entering,
             origins=origins,
             cookie=cookie,
             command_line=Session(Account(f"{getpass.getuser()} (command line)", Role.ENGINEER), 0.0, script=True),

@@ -34,8 +34,13 @@ class Session:
 class Sessions:
     """All sessions, in memory: after a restart everybody signs in anew."""
 
-    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._now_s, self._lock = now_s, threading.Lock()
+    def __init__(
+        self,
+        now_s: Callable[[], float] = time.monotonic,
+        holds: Callable[[Account], bool] = lambda _: True,
+    ) -> None:
+        """`holds` tells whether somebody still is who signed in; a session is over as soon as that is not so."""
+        self._now_s, self._holds, self._lock = now_s, holds, threading.Lock()
         self._by_hash: dict[str, Session] = {}
 
     def begin(self, account: Account, *, script: bool) -> str:
@@ -53,7 +58,7 @@ class Sessions:
             session = self._by_hash.get(_hash(secret))
             if session is None or session.script is not script:
                 return None
-            if self._now_s() - session.seen_s > IDLE_S:
+            if self._now_s() - session.seen_s > IDLE_S or not self._holds(session.account):
                 self._by_hash.pop(_hash(secret), None)
                 return None
             if used:
@@ -63,11 +68,6 @@ class Sessions:
     def end(self, secret: str) -> None:
         with self._lock:
             self._by_hash.pop(_hash(secret), None)
-
-    def end_of(self, name: str) -> None:
-        """All of a person."""
-        with self._lock:
-            self._by_hash = {key: one for key, one in self._by_hash.items() if one.account.name != name}
 
     def token(self, session: Session) -> str:
         """For one request of this session."""

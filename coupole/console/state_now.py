@@ -49,9 +49,16 @@ class Newest:
 
 
 def state_of(
-    cell: Cell, queue: PlanQueue, acquisitions: Acquisitions, bench: Bench, control: Control, trouble: str
+    cell: Cell,
+    queue: PlanQueue,
+    acquisitions: Acquisitions,
+    bench: Bench,
+    control: Control,
+    *,
+    checking: str,
+    trouble: str,
 ) -> StateNow:
-    """The cell at this moment."""
+    """The cell at this moment; `checking` is what preflight is being made of."""
     at_work, entry = acquisitions.state or {}, queue.running
     if not at_work:
         _forget_runs()
@@ -75,6 +82,7 @@ def state_of(
         devices=_devices(at_work["run"]) if at_work else bench.identities,
         lent_to=acquisitions.lending.lent_to,
         queue=_entries_now(queue, at_work.get("left_s")),
+        checking=checking,
         in_control=control.now.name,
         asked_by=control.now.asked_by,
         trouble=trouble,

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from coupole.console.growing_file import GrowingFile
 from coupole.console.keeping_newest import keep_newest
 from coupole.errors import InputError
 from coupole.storage.durable import make_folder
@@ -46,6 +47,10 @@ class Task:
     folder: Path = field(repr=False)
     begun_s: float = field(default_factory=time.monotonic)
     ended_s: float | None = None
+    _found: dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        self._log = GrowingFile(self.folder / f"{self.id}.log", _MOST_SAID)
 
     @property
     def running(self) -> bool:
@@ -65,20 +70,20 @@ class Task:
     @property
     def said(self) -> str:
         """The end of what it printed for people."""
-        try:
-            text = (self.folder / f"{self.id}.log").read_text(encoding="utf-8", errors="replace")
-        except OSError:
-            return ""
-        return text[-_MOST_SAID:]
+        return self._log.text
 
     @property
     def found(self) -> dict[str, Any]:
-        """Its `--json`; empty if there is none."""
-        try:
-            found = json.loads((self.folder / f"{self.id}.json").read_text(encoding="utf-8").splitlines()[-1])
-        except (OSError, ValueError, IndexError):
+        """Its `--json`; empty until it has ended, and if there is none."""
+        if self.running:
             return {}
-        return found if isinstance(found, dict) else {}
+        if self._found is None:
+            try:
+                found = json.loads((self.folder / f"{self.id}.json").read_text(encoding="utf-8").splitlines()[-1])
+            except (OSError, ValueError, IndexError):
+                found = {}
+            self._found = found if isinstance(found, dict) else {}
+        return self._found
 
     @property
     def why(self) -> str:

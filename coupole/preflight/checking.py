@@ -7,16 +7,14 @@ import shutil
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from coupole.errors import StorageError
 from coupole.motion.itinerary import Itinerary
 from coupole.plan.bursts import Pace
 from coupole.plan.rig import Rig
-from coupole.plan.rig_devices import in_world, runs_tables
+from coupole.plan.rig_devices import runs_tables
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.commissioned import commissioning_refusals
 from coupole.preflight.exposure_scale import ExposedWhite, exposed_white, exposure_scale
@@ -25,9 +23,6 @@ from coupole.preflight.job import Job, at_pace
 from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, Whole, check
 from coupole.storage.ledger import History, ledger_of, similar_ids
 from coupole.storage.write_speed import measure_write_speed
-
-if TYPE_CHECKING:
-    from coupole.calibration.in_force import Situation
 
 _DISK_GRAIN_US = 100
 _LED_DUTIES = tuple(0.9**k for k in range(1, 33))
@@ -42,14 +37,19 @@ def preflight_of(
     allocated_bytes: int = 0,
     proven: Collection[ShotId] = (),
     measure: bool = True,
+    say: Callable[[str], object] = lambda _: None,
 ) -> tuple[Job, Report]:
     """Preflight's report on a job whose run would be in `folder`, and the job at the pace that LEDs and the
     measured speed of that disk allow.
 
     Without `paths` collisions are not checked. For a resumed run, `allocated_bytes` are already on the disk
-    and the `proven` frames are not taken again. The disk's speed is not known unless it is to `measure`.
+    and the `proven` frames are not taken again. The disk's speed is not known unless it is to `measure`; `say` is
+    called with each step in words.
     """
+    if measure:
+        say("the disk's speed is measured")
     storage = storage_of(folder, job.cell.rig, allocated_bytes, measure=measure)
+    say("paths, heat, light and time are reckoned")
     job, report = check_job(job, storage, paths=paths, proven=proven)
     if measure and not storage.write_bytes_s and not storage.trouble:
         report.warnings.append(f"storage {folder}: too little room to measure the disk's speed; none is assumed")
@@ -191,25 +191,10 @@ def calibration_refusals(job: Job, *, camera: str | None = None, temperature_c: 
     if job.calibrations is None:
         return []
     from coupole.calibration.in_force import refusals
+    from coupole.preflight.situation import situation_of
 
     here = situation_of(job.cell.rig, camera=camera, temperature_c=temperature_c)
     return refusals(job.calibrations, here)
-
-
-def situation_of(rig: Rig, *, camera: str | None = None, temperature_c: float | None = None) -> Situation:
-    """What this rig's records must hold for, now."""
-    from coupole.calibration.in_force import Situation
-
-    return Situation(
-        now=datetime.now(UTC),
-        simulated=in_world(rig, dry_run=False),
-        size_px=(rig.sensor.width_px, rig.sensor.height_px),
-        focal_length_mm=rig.lens.focal_length_mm,
-        focus_distance_mm=rig.lens.focus_distance_mm,
-        f_number=rig.lens.f_number,
-        camera=camera,
-        temperature_c=temperature_c,
-    )
 
 
 def _disk_us(rig: Rig, storage: StorageFacts) -> int:

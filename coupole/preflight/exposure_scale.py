@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,9 @@ from coupole.calibration.light.irradiance import irradiance_per_flux
 from coupole.calibration.record import Record
 from coupole.errors import InputError
 from coupole.plan.light_selection import leds_of_plan
-from coupole.preflight.job import Job
+
+if TYPE_CHECKING:
+    from coupole.preflight.job import Job
 
 HOW_TO_KNOW = "`white_response` in the rig makes it known (docs/how-to/expose-and-focus.md)"
 UNDER_EXPOSED = 0.05

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
 from coupole.plan.rig import Rig, Sensor
 from coupole.plan.rig_devices import camera_kind, device_for, ledbox_stand_in, stand_in_for, world_problems
 from coupole.preflight.exposure_scale import exposure_scale, white_share
-from coupole.preflight.job import Job
+
+if TYPE_CHECKING:
+    from coupole.preflight.job import Job
 
 DRY_RUN_WIDTH_PX = 128
 DRY_RUN_PICTURES = 48

@@ -172,6 +172,11 @@ class Run:
         return False
 
     @property
+    def report_path(self) -> Path:
+        """The page that its conclusion writes; it may be missing."""
+        return self.folder / "report.html"
+
+    @property
     def plan_path(self) -> Path:
         """The plan to go on with: the run's own copy, or in runs without copies the file that was named."""
         return self._input("plan")

@@ -28,13 +28,11 @@ from coupole.viewing.report_pictures import (
 from coupole.viewing.run_coverage import Coverage, coverage_of
 from coupole.viewing.run_sample import SampledView, sampled_views
 
-NAME = "report.html"
-
 
 def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> Path:
     """Write the run's report into its folder, or to another file; also of an incomplete run. Whoever holds the
     run's lock says whether it is `in_use`."""
-    path = path or run.folder / NAME
+    path = path or run.report_path
     made = _page(run, status(run, in_use=in_use))
     try:
         write_synced(path, made)

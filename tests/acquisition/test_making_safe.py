@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from coupole.acquisition import opened_cell
+from coupole.acquisition import opened_cell, safeguard
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.errors import DeviceLost
 
@@ -81,7 +81,7 @@ def test_lights_and_arm_wait_neither_for_each_other() -> None:
 
 
 def test_what_hangs_is_given_up_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(opened_cell, "_SAFE_WITHIN_S", 0.05)
+    monkeypatch.setattr(safeguard, "_SAFE_WITHIN_S", 0.05)
     for_ever, disarmed = threading.Event(), threading.Event()
     cell = cell_of(stop=lambda: for_ever.wait() and None, disarm=disarmed.set)
     cell.make_safe()

@@ -15,8 +15,8 @@ import pytest
 
 from coupole.acquisition import run_control, runtime_folder, user_socket
 from coupole.acquisition.observer import Control
-from coupole.acquisition.opened_cell import Safeguard
 from coupole.acquisition.run_control import RunControl, ask, running
+from coupole.acquisition.safeguard import Safeguard
 from coupole.errors import InputError
 from coupole.viewing.progress import Progress
 

@@ -16,11 +16,12 @@ from cells import CellFolder
 
 from coupole.console.acquisitions import Acquisitions
 from coupole.console.entering import Entering
+from coupole.console.entry_preflight import Found
 from coupole.console.lending import begun_here
 from coupole.console.messages import NewEntry
 from coupole.console.outlook import expected_times
 from coupole.console.plan_queue import Entry, PlanQueue
-from coupole.errors import InputError
+from coupole.errors import InputError, Problem
 from coupole.plan.cell import read_cell
 from coupole.storage.ledger import Ledger
 
@@ -33,6 +34,7 @@ class Desk:
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.cell_folder = CellFolder(folder)
         self.needs: dict[str, Any] = dict(NEEDS)
+        self.problems: tuple[Problem, ...] = ()
         plan = self.cell_folder.plan_data
         for name, budget in (("small", 3.5), ("free", None), ("strict", 2.0)):
             thing = {**plan["object"], "dose_budget_lux_h": budget}
@@ -41,7 +43,7 @@ class Desk:
         self.queue = PlanQueue(folder / "queue.json")
         self.acquisitions = Acquisitions(self.queue, cell, folder / "output")
         self.entering = Entering(cell, folder, self.queue, self.acquisitions)
-        monkeypatch.setattr(self.entering, "_checked", lambda _: self.needs)
+        monkeypatch.setattr(self.entering.preflight, "of", lambda *_, **__: Found(self.problems, self.needs))
 
     def enter(self, **asked: Any) -> Entry:
         return self.entering.enter(NewEntry(**asked), "Ada", by_command_line=False)
@@ -104,13 +106,12 @@ def test_the_disk_must_take_all_that_waits(desk: Desk, monkeypatch: pytest.Monke
 
 
 def test_what_preflight_refuses_or_cannot_say_is_not_entered(desk: Desk) -> None:
-    desk.needs |= {"ok": False, "refusals": ["view top: unreachable", "storage: full"]}
+    desk.problems = tuple(
+        Problem("free.yaml", 0, 0, "", one) for one in ("view top: unreachable", "storage: full")
+    )
     with pytest.raises(InputError) as refused:
         desk.enter(plan="free.yaml")
     assert [problem.message for problem in refused.value.problems] == ["view top: unreachable", "storage: full"]
-    desk.needs = {"error": "relief.ply: is no mesh"}
-    with pytest.raises(InputError, match="is no mesh"):
-        desk.enter(plan="free.yaml")
     for name in ("\0", "free.yaml/below", "x" * 2000, "."):
         for asked in ({"plan": name}, {"resume": name}):
             with pytest.raises(InputError):

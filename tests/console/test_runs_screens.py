@@ -55,9 +55,10 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     cell.write()
     with served(cell) as service:
         engineer = service.browser(token=service.token)
-        for name, role in (("Grace", "engineer"), ("Ada", "operator"), ("Eve", "observer")):
+        for name, role in (("Ada", "operator"), ("Eve", "observer"), ("Grace", "engineer")):
             made = engineer.post("/api/v1/accounts", {"name": name, "password": PASSWORD, "role": role})
             assert made.status == 200, made.text
+        engineer = service.browser(name="Grace", password=PASSWORD)
         window = Window()
         try:
             ada = Visitor(window, service.url)

@@ -83,7 +83,7 @@ def test_a_wrong_password_is_refused_and_after_five_the_right_one_too(staffed: S
     somebody = staffed.served.browser()
     for password in ("", "wrong", "a long passwore", PASSWORD[:-1], PASSWORD + " "):
         assert somebody.sign_in(name="Nobody", password=password).status == 401
-    made = staffed.engineer.post("/api/v1/accounts", {"name": "Nobody", "password": PASSWORD, "role": "engineer"})
+    made = staffed.engineer.post("/api/v1/accounts", {"name": "Nobody", "password": PASSWORD, "role": "operator"})
     assert made.status == 200
     assert somebody.sign_in(name="Nobody", password=PASSWORD).status == 401
     assert staffed.signed_in("Eve").state()["state"] == "idle", "others are not kept out"

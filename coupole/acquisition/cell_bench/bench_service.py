@@ -42,9 +42,10 @@ from coupole.acquisition.cell_bench.bench_requests import (
 from coupole.acquisition.cell_bench.bench_work import Work, Works
 from coupole.acquisition.looking import metered, metering_job
 from coupole.acquisition.observer import Control
-from coupole.acquisition.opened_cell import OpenedCell, open_cell, unsure
+from coupole.acquisition.opened_cell import OpenedCell, open_cell
 from coupole.acquisition.operator import ask_to_begin, identity_printer
 from coupole.acquisition.runtime_folder import is_in_use
+from coupole.acquisition.safeguard import unsure
 from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.user_socket import UserSocket
 from coupole.errors import CoupoleError, DeviceError, InputError

@@ -69,25 +69,23 @@ class PeoplePanel:
 
     async def _change(self, account: Account, role: Role) -> None:
         service, name = self._visit.service, account.name
-
-        def change() -> None:
-            service.accounts.change_role(name, role)
-            service.sessions.end_of(name)
-
         await self._visit.act(
-            f"make {name} {role.word}", change, role=Role.ENGINEER, acts=False, done=f"{name} is {role.word} now"
+            f"make {name} {role.word}",
+            lambda: service.accounts.change_role(name, role),
+            role=Role.ENGINEER,
+            acts=False,
+            done=f"{name} is {role.word} now",
         )
         self._show()
 
     async def _remove(self, account: Account) -> None:
         service, name = self._visit.service, account.name
-
-        def remove() -> None:
-            service.accounts.remove(name)
-            service.sessions.end_of(name)
-
         if await sure(f"Remove {name}?", f"{name} is signed out and cannot sign in any more.", "Remove"):
             await self._visit.act(
-                f"remove account {name}", remove, role=Role.ENGINEER, acts=False, done=f"{name} is removed"
+                f"remove account {name}",
+                lambda: service.accounts.remove(name),
+                role=Role.ENGINEER,
+                acts=False,
+                done=f"{name} is removed",
             )
             self._show()

@@ -34,6 +34,9 @@ class _Screen:
                 )
                 self._hold.classes("field")
                 button("Hold there", self._enter_hold, icon="pan_tool", name="enter-hold")
+            with ui.row().classes("bar") as self._checking:
+                self._checked = named(ui.label(), "checking").props("role=status")
+                button("Give it up", self._give_up, name="give-up", kind="flat")
             with ui.row().classes("bar") as self._halted:
                 self._why = named(ui.label(), "halted").classes("warm")
                 button("Go on with the queue", self._go_on, icon="play_arrow", name="go-on", kind="main")
@@ -61,6 +64,10 @@ class _Screen:
     async def _go_on(self) -> None:
         await self._visit.act("go on with the queue", self._queue.go_on)
 
+    async def _give_up(self) -> None:
+        preflight = self._visit.service.entering.preflight
+        await self._visit.act(f"give up preflight of {preflight.words}", preflight.give_up, acts=False)
+
     async def _take_out(self, entry: EntryNow) -> None:
         await self._visit.act(f"take out {entry.words}", lambda: self._queue.remove(entry.id))
 
@@ -72,6 +79,8 @@ class _Screen:
     def _show(self, now: StateNow) -> None:
         self._why.text = now.halted
         self._halted.set_visibility(bool(now.halted))
+        self._checked.text = f"Preflight of {now.checking}"
+        self._checking.set_visibility(bool(now.checking))
         known = (now.halted, tuple(now.queue), self._visit.may_act)
         if known == self._shown:
             return

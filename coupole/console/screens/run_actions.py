@@ -16,7 +16,6 @@ from coupole.console.screens.visit import Visit, enter, in_background, in_thread
 from coupole.console.tasks import Task
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
-from coupole.viewing import report
 
 _LOOK_EVERY_S = 0.3
 
@@ -58,7 +57,7 @@ class RunActions:
     def _look(self) -> None:
         """Links to what there is by now."""
         run, page = self._run.folder, look_page(self._cell, self._run)
-        there = [(run / report.NAME).is_file(), (run / "README.txt").is_file(), stands_alone(page)]
+        there = [self._run.report_path.is_file(), (run / "README.txt").is_file(), stands_alone(page)]
         if there == self._there:
             return
         self._there = there

@@ -1,0 +1,40 @@
+"""What makes a cell safe, each action by itself; what is not sure to be done is told."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+_SAFE_WITHIN_S = 15.0
+"""Longer than any driver's time-outs for switching off and stopping; what hangs longer is given up and told."""
+
+
+class Safeguard:
+    """One action that makes a cell safe, in a thread of its own, so that none waits for another."""
+
+    def __init__(self, what: str, act: Callable[[], None]) -> None:
+        self.what, self._act = what, act
+        self.trouble = f"no answer within {_SAFE_WITHIN_S:g} s"
+        """Why it is not sure to be done; empty when it is done."""
+        self._thread = threading.Thread(target=self._run, name=what, daemon=True)
+        self._thread.start()
+
+    def wait(self, at_most_s: float = _SAFE_WITHIN_S) -> None:
+        self._thread.join(at_most_s)
+
+    def _run(self) -> None:
+        try:
+            self._act()
+        except BaseException as error:  # noqa: BLE001  whatever it is, the other safeguards go on
+            self.trouble = str(error) or type(error).__name__
+        else:
+            self.trouble = ""
+
+
+def unsure(done: Sequence[Safeguard], within_s: float) -> list[str]:
+    """What is not sure to be done of it after a while."""
+    end_s = time.monotonic() + within_s
+    for safeguard in done:
+        safeguard.wait(max(0.0, end_s - time.monotonic()))
+    return [f"not sure: {safeguard.what}: {safeguard.trouble}" for safeguard in done if safeguard.trouble]

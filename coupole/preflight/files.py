@@ -1,0 +1,57 @@
+"""Files, read and checked: what `coupole check` says of a plan, or of what is left of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coupole.preflight.job import Job
+    from coupole.preflight.preflight import Report
+
+
+@dataclass(frozen=True)
+class Files:
+    """What is to be checked."""
+
+    plan: Path
+    rig: Path | None = None
+    """None: the plan's."""
+    resume: Path | None = None
+    """The run of which only what is left is checked."""
+    output: Path | None = None
+    """Parent folder of the run; None: the rig's."""
+
+
+def check_files(
+    files: Files,
+    *,
+    paths: bool = True,
+    measure: bool = True,
+    say: Callable[[str], object] = lambda _: None,
+) -> tuple[Job, Report]:
+    """The job at the pace that LEDs and disk allow, and preflight's report on it.
+
+    Without `paths` collisions are not checked; the disk's speed is not known unless it is to `measure`; `say` is
+    called with each step in words. Raises InputError: a file is wrong, or not what the run began with;
+    StorageError.
+    """
+    from coupole.preflight.checking import preflight_of
+    from coupole.preflight.job import read_job, without_hidden
+    from coupole.storage.run import Run
+
+    say("plan, mesh and records are read")
+    job = read_job(files.plan, files.rig)
+    run = Run(files.resume) if files.resume else None
+    if run is not None:
+        run.refuse_changes(job.inputs)
+    if run is not None or paths:
+        say("paths and hidden lights are reckoned")
+        job = without_hidden(job, run.hidden_leds if run else None)
+    folder = run.folder if run else files.output or job.cell.storage_folder
+    allocated_bytes, proven = (run.allocated_bytes(), run.proven()) if run else (0, {})
+    return preflight_of(
+        job, folder, paths=paths, allocated_bytes=allocated_bytes, proven=proven, measure=measure, say=say
+    )

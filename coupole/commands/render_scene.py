@@ -58,6 +58,8 @@ def render(
     if as_json:
         print(json.dumps({"folder": str(out), **summary}))
         return
+    for remark in summary["remarks"]:
+        console.print(remark, markup=False)
     for seen in summary["cameras"].values():
         console.print(f"{out / seen['files']['png']}: white {seen['white_cd_m2']:.4g} cd/m2, simulated")
 

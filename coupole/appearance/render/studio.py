@@ -9,7 +9,7 @@ from typing import Any
 
 from coupole.appearance.render import pictures, variant, wall
 from coupole.appearance.render.rendering import opened
-from coupole.appearance.render.scene_file import Scene
+from coupole.appearance.render.scene_file import Scene, remarks
 
 Progress = Callable[[str, int, int], None]
 """Camera, passes done, passes in all."""
@@ -58,5 +58,6 @@ def render(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[st
         "depth": scene.depth,
         "seed": scene.seed,
         "observer": f"CIE {scene.observer}",
+        "remarks": remarks(scene),
         **summary,
     }

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coupole.appearance.matter.pigments import Pigment
 from coupole.appearance.spectra.grid import STEP_NM, WAVELENGTHS_NM, Array
@@ -61,7 +62,7 @@ class PaintFile:
             *(np.interp(WAVELENGTHS_NM, self.wavelengths_nm, v) for v in (self.absorption, self.scattering)),
         )
 
-    def covered(self) -> Array:
+    def covered(self) -> NDArray[np.bool_]:
         """[81] of bool: the bands that were measured."""
         nm = self.wavelengths_nm
         return np.asarray((nm[0] - STEP_NM / 2 <= WAVELENGTHS_NM) & (nm[-1] + STEP_NM / 2 >= WAVELENGTHS_NM))

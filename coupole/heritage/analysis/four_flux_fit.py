@@ -23,7 +23,7 @@ from coupole.appearance.spectra.grid import Array
 from coupole.heritage.analysis import layer_fit
 from coupole.heritage.analysis.layer_fit import Coefficients, Film
 
-DRAWS = 300
+DRAWS = 150
 """Of all inputs, for uncertainties (JCGM 101)."""
 
 

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coupole.appearance.matter.glossy_face import Face
 from coupole.appearance.spectra.grid import Array
@@ -80,7 +81,7 @@ class Coefficients:
         return np.sqrt(self.covariance[:, 1, 1])
 
     @property
-    def determined(self) -> Array:
+    def determined(self) -> NDArray[np.bool_]:
         """[n] of bool: whether the films show their grounds enough to tell S."""
         known = self.u_scattering < LEAST_DETERMINED * self.scattering
         return np.asarray(known & (self.unlike > _LEAST_UNLIKE))
@@ -171,8 +172,8 @@ def _start(films: Sequence[Film], face: Face) -> tuple[Array, Array]:
     y = np.stack([film.seen for film in films], axis=1)
     best = np.full(len(y), np.inf)
     k, s = np.zeros(len(y)), np.ones(len(y))
-    for sigma in np.geomspace(0.01, 20.0, 23):
-        for ratio in np.geomspace(1e-4, 30.0, 23):
+    for sigma in np.geomspace(0.02, 20.0, 13):
+        for ratio in np.geomspace(1e-3, 30.0, 13):
             here = np.full(len(y), sigma / thickest)
             cost = np.sum((y - _seen(ratio * here, here, films, face)) ** 2, axis=1)
             nearer = cost < best

@@ -1,10 +1,11 @@
 """Which model a paint layer deserves, and the size of its grains (seed 000, sections 3.4 and 3.5).
 
-Two fluxes hold for light that is diffuse from the outset: diffuse illumination, or a layer that scatters so much
-that nothing arrives at its ground unscattered. Under directional light (a dome's LEDs, 45:0) a thin or clear
-layer needs four. Where spectra under directional light were measured, they decide. Otherwise the film is computed
-with four fluxes for grains that scatter to all sides alike, for which K = 2 k and S = 3 s/4 (Mudgett and
-Richards, Appl. Opt. 10, 1485, 1971), and two fluxes suffice if no band differs by more than twice the noise.
+Two fluxes hold for light that is diffuse inside the layer: under diffuse illumination, or where the layer
+scatters so much that nothing reaches its ground unscattered. A thin or clear layer under directional light (a
+dome's LEDs, 45:0) needs four; one that hides its ground needs K/S only, from R_inf. Where spectra under
+directional light were measured, they decide. Otherwise the film is computed with four fluxes for grains that
+scatter to all sides alike, for which K = 2 k and S = 3 s/4 (Mudgett and Richards, Appl. Opt. 10, 1485, 1971): two
+fluxes suffice if what is seen of the ground by light that reached it unscattered is no more than twice the noise.
 """
 
 from __future__ import annotations
@@ -46,38 +47,32 @@ class GrainRatio:
 
 def deserved(found: Coefficients, films: list[Film], face: Face, noise: float) -> Deserved:
     """From K and S alone."""
-    if not found.determined.any():
+    sure = found.determined
+    if not sure.any():
         return Deserved(
             "K/S only", "the films hide their grounds in every band: they tell K/S, not K and S", 0.0, 0.0
         )
     k, s = np.maximum(found.absorption, 0.0), found.scattering
-    difference, unscattered = 0.0, 0.0
+    total = 4.0 / 3.0 * s
+    difference, unscattered, through = 0.0, 0.0, 0.0
     for film in films:
         if film.ground is None:
             continue
         h, ground = film.thickness_mm, film.ground
-        total = 4.0 / 3.0 * s
         layer = four_flux.Layer(k, s, 0.5 * k, 0.5 * total, 0.5 * total, h)
+        rho, tau, _, _, direct = four_flux.response(layer)
         directional, _ = four_flux.reflectances(layer, four_flux.Background(ground, ground))
-        diffuse = kubelka_munk.over(*kubelka_munk.layer(k, s, h), ground)
-        shown = face.passing * np.abs(directional - diffuse) / (1.0 - face.inner * diffuse)
-        difference = max(difference, float(shown[found.determined].max()))
-        unscattered = max(unscattered, float(np.exp(-(0.5 * k + total) * h)[found.determined].max()))
-    limit = 2.0 * noise
-    if difference <= limit:
-        return Deserved(
-            "two fluxes",
-            f"directional light changes no band by more than {difference:.3f}; twice the noise is {limit:.3f}",
-            difference,
-            unscattered,
-        )
-    return Deserved(
-        "four fluxes",
-        f"under directional light a band would differ by {difference:.3f} from two fluxes, twice the noise is "
-        f"{limit:.3f} (grains that scatter to all sides alike); two fluxes hold for diffuse light",
-        difference,
-        unscattered,
+        diffuse = kubelka_munk.over(rho, tau, ground)
+        leaving = face.passing / (1.0 - face.inner * diffuse)
+        difference = max(difference, float((leaving * np.abs(directional - diffuse))[sure].max()))
+        unscattered = max(unscattered, float(direct[sure].max()))
+        through = max(through, float((leaving * direct * ground * tau / (1.0 - rho * ground))[sure].max()))
+    because = (
+        f"of directional light {100.0 * unscattered:.2g} % reaches the ground unscattered, and adds up to "
+        f"{through:.3f} to what is seen; twice the noise is {2.0 * noise:.3f}"
     )
+    model: Model = "two fluxes" if through <= 2.0 * noise else "four fluxes"
+    return Deserved(model, because, difference, unscattered)
 
 
 def deserved_by_measurement(

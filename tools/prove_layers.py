@@ -3,9 +3,9 @@
     python tools/prove_layers.py [--rounds N]
 
 Of each kind of films (two grounds, opaque and thin, a series) for several paints it prints how often the 95 %
-interval holds the truth, and of a walk of photons how often that of the reflectance over another ground does, and how
-far K and S of a film are off for twice its thickness, where two fluxes are a model. Exits with 1 if the mean of a
-kind is outside 93 to 97 %.
+interval holds the truth, and of a walk of photons how often that of the reflectance over another ground does, and
+how far K and S of a film are off for twice its thickness, where two fluxes are a model. Exits with 1 if the mean
+of a kind is outside 93 to 97 %.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
 from coupole.commands.dose_ledger import dose
 from coupole.commands.layer import layer
+from coupole.commands.recipe import recipe
 from coupole.commands.reflectance import reflectance_app
 from coupole.commands.render_scene import render
 from coupole.commands.show import show
@@ -56,6 +57,7 @@ for command in (
     dose,
     render,
     layer,
+    recipe,
     show,
     budget,
     planning.schema,

@@ -17,13 +17,23 @@ from pydantic import Field
 
 from coupole.appearance.matter import gilding, kubelka_munk, lacquer, layered
 from coupole.appearance.matter.glossy_face import InternalReflectance
+from coupole.appearance.matter.pigments import from_opaque, opaque_reflectance
 from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.optics.thin_film import Film, stack_power
 from coupole.appearance.render.bands import Description
 from coupole.appearance.render.equivalent import equivalent_index
 from coupole.appearance.render.model import Index, Model, Positive, Roughness, Share
 from coupole.appearance.render.refraction import IndexFile, Refraction, complex_index, real_index
-from coupole.appearance.render.spectra import Bole, Constant, Reflectance, internal, matt
+from coupole.appearance.render.spectra import (
+    Bole,
+    Colouring,
+    Constant,
+    MeasuredPaint,
+    Reflectance,
+    coefficients,
+    internal,
+    matt,
+)
 from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex
 
 THINNEST_NM = 1e-3
@@ -42,12 +52,13 @@ class Paint(Model):
     """A pigment in a glossy binder; with a thickness, as a layer over a ground (Kubelka-Munk, Saunderson)."""
 
     kind: Literal["paint"]
-    pigment: Reflectance
-    """Of an opaque layer: measured as it is seen under its face, otherwise inside the binder."""
+    pigment: Colouring
+    """Of an opaque layer: measured as it is seen under its face, otherwise inside the binder. Or K and S."""
     thickness_mm: Positive | None = None
     ground: Reflectance = Constant(kind="constant", value=0.0)
     """As `pigment`: measured under a face of the same index, otherwise inside the binder."""
     scattering_per_mm: Positive = 30.0
+    """Of a pigment whose reflectance is given; a paint file has its own."""
     index: Refraction = indices.BINDER
     roughness: Roughness = 0.25
 
@@ -170,11 +181,13 @@ def under_face(body: InternalReflectance, index: Array) -> Array:
 def paint_inside(paint: Paint, folder: Path) -> InternalReflectance:
     """[81]."""
     index = real_index(paint.index, folder)
-    opaque = internal(paint.pigment, folder, index)
+    if isinstance(paint.pigment, MeasuredPaint):
+        pigment = coefficients(paint.pigment, folder, needs_mm=paint.thickness_mm is not None)
+    else:
+        pigment = from_opaque("", internal(paint.pigment, folder, index), paint.scattering_per_mm)
     if paint.thickness_mm is None:
-        return opaque
-    absorption = kubelka_munk.k_over_s(opaque.values) * paint.scattering_per_mm
-    rho, tau = kubelka_munk.layer(absorption, paint.scattering_per_mm, paint.thickness_mm)
+        return opaque_reflectance(pigment)
+    rho, tau = kubelka_munk.layer(pigment.absorption, pigment.scattering, paint.thickness_mm)
     ground = internal(paint.ground, folder, index)
     return InternalReflectance(kubelka_munk.over(rho, tau, ground.values))
 

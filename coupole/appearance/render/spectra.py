@@ -11,6 +11,8 @@ from pydantic import Field
 
 from coupole.appearance.matter import typical
 from coupole.appearance.matter.glossy_face import BARE, InternalReflectance, MeasuredReflectance, face
+from coupole.appearance.matter.paint_file import read_paint
+from coupole.appearance.matter.pigments import Pigment
 from coupole.appearance.render.model import Model, Share
 from coupole.appearance.spectra import light, measured, resampling
 from coupole.appearance.spectra.grid import BANDS, STEP_NM, WAVELENGTHS_NM, Array
@@ -63,6 +65,13 @@ class Measured(Model):
     """How its face was seen; bare: it had none (matt powder), so that it holds inside a binder as it was seen."""
 
 
+class MeasuredPaint(Model):
+    """K and S of a paint in a file, as `coupole layer` writes it (`coupole.appearance.matter.paint_file`)."""
+
+    kind: Literal["paint_file"]
+    path: Path
+
+
 class MeasuredPower(Model):
     """Power of a light by wavelength, measured."""
 
@@ -72,6 +81,8 @@ class MeasuredPower(Model):
 
 
 Reflectance = Annotated[Constant | Shape | Bole | Measured, Field(discriminator="kind")]
+Colouring = Annotated[Constant | Shape | Bole | Measured | MeasuredPaint, Field(discriminator="kind")]
+"""Of a paint."""
 
 
 class Illuminant(Model):
@@ -133,6 +144,17 @@ def internal(spectrum: Reflectance, folder: Path, index: ArrayLike) -> InternalR
         return face(index, spectrum.sample).inside(seen)
     except InputError as error:
         raise InputError(f"{folder / spectrum.path}: {error}") from error
+
+
+def coefficients(paint: MeasuredPaint, folder: Path, *, needs_mm: bool) -> Pigment:
+    """K and S [81], ends held. Raises InputError, also if they are not per mm where they must be."""
+    found = read_paint(folder / paint.path)
+    if needs_mm and found.unit != "per mm":
+        raise InputError(
+            f"{folder / paint.path}: is {found.unit}; a layer of a thickness needs K and S per mm: measure it with "
+            "its thickness, or leave out thickness_mm for an opaque one"
+        )
+    return found.on_grid()
 
 
 def matt(spectrum: Reflectance, folder: Path) -> MeasuredReflectance:

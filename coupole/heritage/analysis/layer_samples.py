@@ -89,7 +89,7 @@ def read_samples(given: LayerGiven, folder: Path) -> Samples:
     more = given.directional
     if more is not None:
         paths |= {more.over_black, more.over_white, more.transmittance}
-    spectra = {path: _on_grid(folder / path) for path in sorted(paths)}
+    spectra = {path: spectrum_on_grid(folder / path) for path in sorted(paths)}
     bands = np.all([np.isfinite(values) for values in spectra.values()], axis=0)
     if bands.sum() < _LEAST_BANDS:
         raise InputError(
@@ -131,7 +131,7 @@ def paint_file(given: LayerGiven, samples: Samples, found: Coefficients, four: F
     return PaintFile(given.name, unit, given.binder_index, nm, ratio * s, s, u_k, u_s, told, other)
 
 
-def _on_grid(path: Path) -> Array:
+def spectrum_on_grid(path: Path) -> Array:
     """[81], NaN outside the measurement. Raises InputError for gaps."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a spectrum")

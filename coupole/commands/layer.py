@@ -60,7 +60,7 @@ def layer(
         else:
             if any(path is not None for path in (over_black, over_white, black, white, opaque, thickness_um)):
                 raise InputError(f"{samples}: names the films; leave out --over-black and the like")
-            given, folder = _read(samples)
+            given, folder = read_films(samples)
         document = _solved(given, folder, other_grinding, out)
     except CoupoleError as error:
         fail(error, as_json=as_json)
@@ -69,6 +69,15 @@ def layer(
         print(json.dumps(document))
     else:
         _say(document, console)
+
+
+def read_films(path: Path) -> tuple[LayerGiven, Path]:
+    """A YAML file of films, and the folder of its paths. Raises InputError with line and column."""
+    from coupole.heritage.analysis.layer_samples import LayerGiven
+    from coupole.plan import yamlfile
+
+    document = yamlfile.read(path)
+    return document.validate(LayerGiven), path.parent
 
 
 # -- helpers --------------------------------------------------------------------------------------------------
@@ -121,14 +130,6 @@ def _given(
             "films": films,
         }
     )
-
-
-def _read(path: Path) -> tuple[LayerGiven, Path]:
-    from coupole.heritage.analysis.layer_samples import LayerGiven
-    from coupole.plan import yamlfile
-
-    document = yamlfile.read(path)
-    return document.validate(LayerGiven), path.parent
 
 
 def _solved(given: LayerGiven, folder: Path, other: Path | None, out: Path | None) -> dict[str, Any]:

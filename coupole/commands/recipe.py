@@ -131,6 +131,7 @@ def _told(recipe: Recipe, under: Sequence[Match]) -> dict[str, Any]:
         "shares": recipe.shares,
         "half_widths": recipe.half_widths,
         "rms": recipe.rms,
+        "misfit": recipe.misfit,
         "worst": recipe.worst,
         "worst_nm": recipe.worst_nm,
         "delta_e00": {m.light: m.delta_e00 for m in under},

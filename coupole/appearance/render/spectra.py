@@ -151,8 +151,8 @@ def coefficients(paint: MeasuredPaint, folder: Path, *, needs_mm: bool) -> Pigme
     found = read_paint(folder / paint.path)
     if needs_mm and found.unit != "per mm":
         raise InputError(
-            f"{folder / paint.path}: is {found.unit}; a layer of a thickness needs K and S per mm: measure it with "
-            "its thickness, or leave out thickness_mm for an opaque one"
+            f"{folder / paint.path}: is {found.unit}; a layer of a thickness needs K and S per mm: measure it "
+            "with its thickness, or leave out thickness_mm for an opaque one"
         )
     return found.on_grid()
 

@@ -28,7 +28,7 @@ _REFINED = 6
 _WORTH = 16.0
 """Squared standard uncertainties by which one paint more must improve a recipe to be worth it."""
 _EXPLAINED = 1.5
-"""Root mean square residual over the noise up to which a recipe explains the target."""
+"""Root mean square residual over its uncertainty up to which a recipe explains the target."""
 _LEAST_BANDS = 10
 _DARKEST = 1e-4
 
@@ -45,6 +45,8 @@ class Recipe:
     """[81], what the mixture shows, NaN in bands that were not compared."""
     rms: float
     """Root mean square of what it misses."""
+    misfit: float
+    """The same over what noise and the uncertainty of the paints' K and S explain."""
     worst: float
     """Largest difference, recipe less target, of the mean over five bands."""
     worst_nm: float
@@ -69,21 +71,20 @@ class Found:
 
     @property
     def is_explained(self) -> bool:
-        """Whether the best recipe misses the target by no more than noise does."""
-        return self.best.rms <= _EXPLAINED * self.noise
+        """Whether noise, and K and S of the paints, explain what the best recipe misses."""
+        return self.best.misfit <= _EXPLAINED
 
     def verdict(self) -> str:
         """In plain words."""
         best = self.best
-        times = best.rms / self.noise
         if self.is_explained:
-            return f"the palette explains the target: it is missed by {times:.1f} times the noise"
+            return f"the palette explains the target, missed by {best.misfit:.1f} times its uncertainty"
         kind = "lighter" if best.worst > 0.0 else "darker"
         lacks = "absorbs" if best.worst > 0.0 else "absorbs less, or scatters more,"
         return (
-            f"no mixture of this palette is the target: it is missed by {times:.1f} times the noise, most about "
-            f"{best.worst_nm:g} nm, where the recipe is {abs(best.worst):.3f} {kind}. A paint is missing that "
-            f"{lacks} there"
+            f"no mixture of this palette is the target: it is missed by {best.misfit:.1f} times its uncertainty, "
+            f"most about {best.worst_nm:g} nm, where the recipe is {abs(best.worst):.3f} {kind}. A paint is missing "
+            f"that {lacks} there"
         )
 
 
@@ -109,7 +110,7 @@ def find(target: Array, palette: Sequence[Paint], face: Face, noise: float, at_m
         refined = sorted((problem.refined(subset) for subset in ranked), key=lambda found: found[0])
         before = [subset for _, subset, _ in refined[:3]]
         recipes.append(problem.recipe(refined[0][1], refined[0][2]))
-    return Found(tuple(recipes), _chosen(recipes, int(bands.sum()), noise), target, bands, noise)
+    return Found(tuple(recipes), _chosen(recipes, int(bands.sum())), target, bands, noise)
 
 
 def _subsets(count: int, size: int, before: Sequence[tuple[int, ...]]) -> Iterable[tuple[int, ...]]:
@@ -124,11 +125,11 @@ def _subsets(count: int, size: int, before: Sequence[tuple[int, ...]]) -> Iterab
     }
 
 
-def _chosen(recipes: Sequence[Recipe], bands: int, noise: float) -> int:
+def _chosen(recipes: Sequence[Recipe], bands: int) -> int:
     """The fewest to which one more paint adds nothing beyond noise, or what no palette explains."""
-    scale = max(noise, recipes[-1].rms)
+    scale = max(1.0, recipes[-1].misfit)
     for number, (one, more) in enumerate(pairwise(recipes)):
-        if bands * (one.rms**2 - more.rms**2) / scale**2 < _WORTH:
+        if bands * (one.misfit**2 - more.misfit**2) / scale**2 < _WORTH:
             return number
     return len(recipes) - 1
 
@@ -165,20 +166,25 @@ class _Problem:
         return float(np.mean((self._seen(subset, shares) - self.target) ** 2))
 
     def refined(self, subset: tuple[int, ...]) -> tuple[float, tuple[int, ...], Array]:
-        """Mean square residual, and shares that are not negative."""
+        """Squared residuals over their variances, and shares that are not negative."""
         from scipy.optimize import least_squares
 
         if len(subset) == 1:
-            return self.roughly(subset), subset, np.ones(1)
+            return self._cost(subset, np.ones(1)), subset, np.ones(1)
         start = np.maximum(self._linear(subset), 1e-6)
+        u = np.sqrt(self.noise**2 + self._of_palette(subset, start / start.sum()))
         found = least_squares(
-            lambda c: np.append((self._seen(subset, c) - self.target) / self.noise, c.sum() - 1.0),
+            lambda c: np.append((self._seen(subset, c) - self.target) / u, c.sum() - 1.0),
             start / start.sum(),
             bounds=(0.0, 2.0),
             x_scale=np.maximum(start / start.sum(), 1e-3),
         )
         shares = found.x / found.x.sum()
-        return float(np.mean((self._seen(subset, shares) - self.target) ** 2)), subset, shares
+        return 2.0 * float(found.cost), subset, shares
+
+    def _cost(self, subset: tuple[int, ...], shares: Array) -> float:
+        u2 = self.noise**2 + self._of_palette(subset, shares)
+        return float(np.sum((self._seen(subset, shares) - self.target) ** 2 / u2))
 
     def recipe(self, subset: tuple[int, ...], shares: Array) -> Recipe:
         seen = self._seen(subset, shares)
@@ -188,12 +194,15 @@ class _Problem:
         whole = np.full(len(self.bands), np.nan)
         whole[self.bands] = seen
         names = [self.palette[i].name for i in subset]
-        widths = COVERAGE_FACTOR * self._uncertainty(subset, shares, missed)
+        variance = self.noise**2 + self._of_palette(subset, shares)
+        misfit = float(np.sqrt(np.mean(missed**2 / variance)))
+        widths = COVERAGE_FACTOR * self._uncertainty(subset, shares, max(1.0, misfit) ** 2 * variance)
         return Recipe(
             dict(zip(names, map(float, shares), strict=True)),
             dict(zip(names, map(float, widths), strict=True)),
             whole,
             float(np.sqrt(np.mean(missed**2))),
+            misfit,
             float(smooth[at]),
             float(WAVELENGTHS_NM[self.bands][at]),
         )
@@ -215,8 +224,8 @@ class _Problem:
         k, s = self.k[:, columns] @ shares, self.s[:, columns] @ shares
         return self.face.seen(InternalReflectance(kubelka_munk.opaque(k / s))).values
 
-    def _uncertainty(self, subset: tuple[int, ...], shares: Array, missed: Array) -> Array:
-        """Standard uncertainty of the shares: noise, what the recipe misses, and K and S of the palette."""
+    def _uncertainty(self, subset: tuple[int, ...], shares: Array, variance: Array) -> Array:
+        """Standard uncertainty of the shares, from the variance [bands] of recipe less target."""
         count = len(subset)
         if count == 1:
             return np.zeros(1)
@@ -228,9 +237,8 @@ class _Problem:
         # Shares sum to 1: only changes within that plane count.
         _, _, rows = np.linalg.svd(np.ones((1, count)))
         plane = rows[1:].T
-        gain = plane @ np.linalg.pinv(slopes @ plane)
-        freedom = max(1, len(missed) - count + 1)
-        variance = max(self.noise**2, float(np.sum(missed**2)) / freedom) + self._of_palette(subset, shares)
+        weight = 1.0 / np.sqrt(variance)
+        gain = plane @ np.linalg.pinv(weight[:, None] * (slopes @ plane)) * weight
         return np.asarray(np.sqrt(np.einsum("ib,b,ib->i", gain, variance, gain)))
 
     def _of_palette(self, subset: tuple[int, ...], shares: Array) -> Array:

@@ -83,8 +83,8 @@ class Found:
         lacks = "absorbs" if best.worst > 0.0 else "absorbs less, or scatters more,"
         return (
             f"no mixture of this palette is the target: it is missed by {best.misfit:.1f} times its uncertainty, "
-            f"most about {best.worst_nm:g} nm, where the recipe is {abs(best.worst):.3f} {kind}. A paint is missing "
-            f"that {lacks} there"
+            f"most about {best.worst_nm:g} nm, where the recipe is {abs(best.worst):.3f} {kind}. A paint is "
+            f"missing that {lacks} there"
         )
 
 

@@ -70,6 +70,19 @@ def test_without_noise_k_and_s_come_back_from_every_kind_of_films() -> None:
     assert found.scattering == pytest.approx([s for _, s in truth], rel=0.02)
 
 
+def test_an_error_of_thickness_is_one_of_k_and_s_and_noise_is_the_rest() -> None:
+    films = [
+        Film(in_air(np.full(3, two_fluxes(5.0, 20.0, H_MM, g))), np.full(3, g), str(g), 0.0, H_MM, 0.02 * H_MM)
+        for g in (BLACK, WHITE)
+    ]
+
+    found = layer_fit.fit(films, FACE, 1e-5)
+
+    assert found.u_scattering / found.scattering == pytest.approx(np.full(3, 0.02), rel=0.02)
+    assert found.u_absorption / found.absorption == pytest.approx(np.full(3, 0.02), rel=0.02)
+    assert np.all(found.noise_share < 0.01)
+
+
 def test_a_film_that_hides_its_ground_tells_no_scattering() -> None:
     rng = np.random.default_rng(3)
     hiding = [

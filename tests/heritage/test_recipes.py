@@ -147,6 +147,9 @@ def test_differences_are_those_of_colour_science_and_a_metameric_pair_has_an_ind
         assert match.delta_e00 == pytest.approx(float(colour.delta_E(*lab, method="CIE 2000")), abs=0.05)
     assert under[0].metamerism == 0.0
     assert under[1].metamerism > 0.5
+    darker = colour_match.matches(one, 0.9 * one, ["D65", "A"])[1]
+    assert darker.delta_e00 > 1.0
+    assert darker.metamerism == pytest.approx(0.0, abs=1e-9)
     same = colour_match.matches(one, one, ["D65", "LED-B3"])
     assert [match.delta_e00 for match in same] == [0.0, 0.0]
 
@@ -184,6 +187,19 @@ def test_a_band_that_a_paint_does_not_know_is_not_compared(tmp_path: Path) -> No
     half[1].scattering[:] = np.nan
     with pytest.raises(InputError, match="0 common bands"):
         recipe_search.find(on_grid(target({"white": 1.0})), half, FACE, NOISE, 2)
+
+
+def test_a_library_is_not_known_where_its_k_or_s_are_no_coefficients(tmp_path: Path) -> None:
+    path = library(tmp_path, ["white", "red"])
+    name, *values = path.read_text().splitlines()[1].split("\t")
+    values[0], values[len(NM) + 40] = "-0.3", "-0.1"
+    path.write_text(path.read_text().splitlines()[0] + "\n" + "\t".join([name, *values]) + "\n")
+
+    red = read_palette([path])[1]
+
+    unknown = WAVELENGTHS_NM[np.isnan(red.absorption + red.scattering)]
+    assert {400.0, 600.0} <= set(unknown)
+    assert set(unknown) <= {*WAVELENGTHS_NM[:5], 595.0, 600.0, 605.0, *WAVELENGTHS_NM[77:]}
 
 
 def test_the_command_tells_shares_lights_costs_and_draws_them(
